@@ -1,0 +1,1 @@
+"""The lease engine: synchronous, deterministic, no I/O. Events in, effects out; time comes in as `now`."""

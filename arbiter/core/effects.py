@@ -1,0 +1,69 @@
+"""Everything that the core can ask of the world, as imperatives. Performed in order by `host.executor`. Plain values only."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from schemas.ids import ClientId, GpuId, RequestId
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """Answer a request. `body` is merged into {"re", "epoch", "ok": true}."""
+
+    client: ClientId
+    request: RequestId
+    body: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Refuse:
+    """Answer a request with a typed error; `code` is one of `schemas.errors.CODES`."""
+
+    client: ClientId
+    request: RequestId
+    code: str
+    message: str
+    hint: str
+    details: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Push:
+    """Send a push; `body` holds "push" and its fields (shapes in `schemas.wire`). A client that is away gets nothing: the
+    lease's ttl and re-attachment cover that."""
+
+    client: ClientId
+    body: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class JournalPut:
+    """Write a record durably *before* any later effect of the same batch. Failure posts JournalFailed(key) and drops the rest of
+    the batch that names the same key's lease."""
+
+    key: str  # "lease:L3-17" or "residue:PID@START:GPU"
+    record: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class JournalDelete:
+    key: str
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Read a card now; posts MemorySampled or ProbeFailed. A second Sample while one is under way is merged into a fresh one after it."""
+
+    gpu: GpuId
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A fact for history, subscribers, telemetry and the log. `kind` is one of `core.explain.NOTE_KINDS`."""
+
+    kind: str
+    data: Mapping[str, Any]
+
+
+Effect = Reply | Refuse | Push | JournalPut | JournalDelete | Sample | Note

@@ -1,0 +1,218 @@
+"""Everything that can happen to the core, as past-tense facts. Made by `rpc.session` (requests), `host` (probes, deaths, journal)
+and `inbox` (time). Frozen; plain values only."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
+
+
+# -- clients -------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class ClientConnected:
+    """A connection said hello. The pid and uid come from the kernel, never from the message."""
+
+    client: ClientId
+    process: ProcessKey
+    uid: int
+    name: str
+    instance: str
+
+
+@dataclass(frozen=True, slots=True)
+class ClientLeft:
+    """A connection said bye or was dropped for misconduct; its process may live on."""
+
+    client: ClientId
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessDied:
+    """The kernel says that a process is gone (pidfd). Every client, lease and use of it ends."""
+
+    process: ProcessKey
+
+
+# -- requests ------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """A lease as asked for (validated; mirrors `schemas.wire.LeaseSpec`)."""
+
+    consumer: str
+    key: ModelKey
+    gpu: str
+    exclusive: bool
+    load_peak_bytes: int
+    steady_bytes: int
+    residue_bytes: int
+    priority: int
+    evictable: bool
+    ttl_s: float
+    min_residency_s: float
+    deny_on_deadline: bool
+
+
+@dataclass(frozen=True, slots=True)
+class AcquireRequested:
+    client: ClientId
+    request: RequestId
+    nonce: str
+    spec: Spec
+    wait_timeout_s: float | None
+    traceparent: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReadyReported:
+    client: ClientId
+    request: RequestId
+    lease: LeaseId
+    token: Token
+    measured_bytes: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class UseBegan:
+    client: ClientId
+    request: RequestId
+    lease: LeaseId
+    token: Token
+    use: UseId
+    label: str
+
+
+@dataclass(frozen=True, slots=True)
+class UseEnded:
+    client: ClientId
+    request: RequestId
+    lease: LeaseId
+    token: Token
+    use: UseId
+
+
+@dataclass(frozen=True, slots=True)
+class Renewed:
+    client: ClientId
+    request: RequestId
+    leases: tuple[tuple[LeaseId, Token], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RevokeAcknowledged:
+    client: ClientId
+    request: RequestId
+    lease: LeaseId
+    token: Token
+    safe_point_eta_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class UnloadStarted:
+    client: ClientId
+    request: RequestId
+    lease: LeaseId
+    token: Token
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseReported:
+    """The holder let go. `exiting`: its process will end, so even the residue must come back."""
+
+    client: ClientId
+    request: RequestId
+    lease: LeaseId
+    token: Token
+    exiting: bool
+
+
+@dataclass(frozen=True, slots=True)
+class CancelRequested:
+    client: ClientId
+    request: RequestId
+    lease: LeaseId
+
+
+@dataclass(frozen=True, slots=True)
+class ReattachedLease:
+    lease: LeaseId
+    token: Token
+    spec: Spec
+    held: bool  # False: still loading
+    measured_bytes: int | None
+    uses: tuple[UseId, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Reattached:
+    client: ClientId
+    request: RequestId
+    leases: tuple[ReattachedLease, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class OomReported:
+    client: ClientId
+    request: RequestId
+    lease: LeaseId
+    token: Token
+    requested_bytes: int
+    allocated_bytes: int | None
+
+
+# -- the machine ---------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class ProcessUse:
+    """Bytes of one process on one card; evidence, not authority. `process` has start_ticks 0 where only a pid is known."""
+
+    process: ProcessKey
+    name: str
+    used_bytes: int | None  # None: the driver does not say
+
+
+@dataclass(frozen=True, slots=True)
+class MemorySampled:
+    """One reading of one card. `taken_at` is the monotonic time at which the read *began*."""
+
+    gpu: GpuId
+    taken_at: float
+    used_bytes: int
+    total_bytes: int
+    processes: tuple[ProcessUse, ...] | None  # None: this backend cannot list processes
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeFailed:
+    """A reading failed or hung. Unknown: it never counts as free."""
+
+    gpu: GpuId
+    at: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class JournalFailed:
+    """A record could not be written: the grant that it was for has not been sent and is withdrawn."""
+
+    key: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """First event after a restart on the same boot: the journal's records, by key. Empty journal: no such event."""
+
+    records: Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """`next_deadline()` has come."""
+
+
+Event = (
+    ClientConnected | ClientLeft | ProcessDied | AcquireRequested | ReadyReported | UseBegan | UseEnded | Renewed
+    | RevokeAcknowledged | UnloadStarted | ReleaseReported | CancelRequested | Reattached | OomReported | MemorySampled
+    | ProbeFailed | JournalFailed | Recovered | Tick
+)  # fmt: skip

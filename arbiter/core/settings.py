@@ -1,0 +1,41 @@
+"""What the core is told at its construction: the cards and the constants of design §12."""
+
+from dataclasses import dataclass, field
+
+from schemas import defaults as d
+from schemas.ids import GpuId
+
+
+@dataclass(frozen=True, slots=True)
+class GpuInfo:
+    """One card. `capacity_bytes` is the budget: what the card has, or less where the operator caps it."""
+
+    id: GpuId
+    index: int
+    name: str
+    capacity_bytes: int
+    reserve_bytes: int = d.RESERVE_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Constants of the engine. Seconds are monotonic, sizes are bytes."""
+
+    epoch: int
+    gpus: tuple[GpuInfo, ...]
+    ageing_s_per_point: float = d.AGEING_S_PER_POINT
+    revoke_resend_s: float = d.REVOKE_RESEND_S
+    revoke_remind_s: float = d.REVOKE_REMIND_S
+    revoke_deadline_s: float = d.REVOKE_DEADLINE_S
+    verify_timeout_s: float = d.VERIFY_TIMEOUT_S
+    verify_poll_s: tuple[float, ...] = d.VERIFY_POLL_S
+    verify_slow_poll_s: float = d.VERIFY_SLOW_POLL_S
+    verify_tolerance_bytes: int = d.VERIFY_TOLERANCE_BYTES
+    sample_max_age_s: float = d.SAMPLE_MAX_AGE_S
+    probe_period_s: float = d.PROBE_PERIOD_S
+    fence_grace_s: float = d.FENCE_GRACE_S
+    waiters_max: int = d.WAITERS_MAX
+    leases_per_client_max: int = d.LEASES_PER_CLIENT_MAX
+    uses_per_lease_max: int = d.USES_PER_LEASE_MAX
+    learnt: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Durations learnt by earlier runs, per consumer: {"drain_s", "unload_s", "verify_s", "load_s"}; basis of ETAs."""

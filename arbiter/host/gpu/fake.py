@@ -1,0 +1,195 @@
+"""Reader of simulated cards (`schemas.fakegpu`): what NVML is to a real one. It also makes a card's folder.
+
+Reading lets time pass on the card: a death is noticed, and what is due comes back. It never allocates.
+"""
+
+import contextlib
+import fcntl
+import os
+import threading
+import time
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from arbiter.core.events import ProcessUse
+from arbiter.host.gpu.probe import Card, Reading
+from schemas import fakegpu
+from schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
+from schemas.ids import GpuId, ProcessKey
+from schemas.units import parse_bytes
+
+_HANG_POLL_S = 0.05  # how soon a simulated hang notices that it was switched off
+
+
+class FakeProbe:
+    """`GpuProbe` over card folders. Raises NoGpu for a folder that holds no card."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        self._folders: dict[GpuId, Path] = {}
+        self._closed = threading.Event()
+        for folder in folders:
+            try:
+                config = fakegpu.parse_config((folder / fakegpu.CARD_FILE).read_text())
+            except FileNotFoundError:
+                raise NoGpu(
+                    f"no simulated card in {folder}", hint="start with --gpu fake:8GiB to make one"
+                ) from None
+            self._folders[GpuId(config.uuid)] = folder
+
+    def cards(self) -> tuple[Card, ...]:
+        found = []
+        for gpu, folder in self._folders.items():
+            config = fakegpu.parse_config((folder / fakegpu.CARD_FILE).read_text())
+            found.append(Card(gpu, config.index, config.name, config.capacity_bytes))
+        return tuple(sorted(found, key=lambda card: card.index))
+
+    def sample(self, gpu: GpuId) -> Reading:
+        if gpu not in self._folders:
+            raise UnknownGpu(f"no simulated card {gpu}", details={"known": sorted(self._folders)})
+        folder = self._folders[gpu]
+        try:
+            self._suffer(folder)
+            with locked(folder):
+                card = _settled(folder)
+        except (ConfigError, OSError, UnicodeDecodeError) as error:
+            raise ProbeFailed(f"the simulated card in {folder} cannot be read: {error}") from error
+        processes = None
+        if not card.config.faults.hide_processes:
+            processes = tuple(
+                ProcessUse(process.key, process.name, process.own_bytes)
+                for process in card.processes.values()
+                if process.own_bytes and process.died_at_s is None
+            )
+        return Reading(card.used_bytes, card.config.capacity_bytes, processes)
+
+    def close(self) -> None:
+        self._closed.set()
+
+    def _suffer(self, folder: Path) -> None:
+        """Fail or hang as the card's faults say; a hang ends with the fault or with `close`."""
+        while (fault := fakegpu.parse_config((folder / fakegpu.CARD_FILE).read_text()).faults.probe) != "ok":
+            if fault == "fail":
+                raise ProbeFailed("the probe fails because gpu.json says so", hint='set faults.probe to "ok"')
+            if self._closed.wait(_HANG_POLL_S):
+                raise ProbeFailed("the probe was closed while it hung")
+
+
+def open_cards(text: str, runtime: Path) -> FakeProbe:
+    """Probe for what stands behind `fake:` in `--gpu`: a size (makes or keeps the card in RUNTIME/fakegpu) or a folder.
+
+    Sizes may be listed, `8GiB,16GiB`: the second card lies in RUNTIME/fakegpu-1, and so on. Raises ConfigError.
+    """
+    if "/" in text:
+        return FakeProbe([Path(text)])
+    try:
+        sizes = [parse_bytes(part) for part in text.split(",")]
+    except ValueError as error:
+        raise ConfigError(
+            f"--gpu fake:{text}: {error}", hint="write fake:8GiB or fake:/path/to/card"
+        ) from None
+    folders = []
+    for index, size in enumerate(sizes):
+        folder = runtime / ("fakegpu" if index == 0 else f"fakegpu-{index}")
+        make_card(folder, size, index=index)
+        folders.append(folder)
+    return FakeProbe(folders)
+
+
+def make_card(
+    folder: Path, capacity_bytes: int, *, index: int = 0, release_lag_s: float = fakegpu.RELEASE_LAG_S
+) -> None:
+    """Make a card in `folder`, or keep the one there. Raises ConfigError if that one is in use with another capacity."""
+    boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    wanted = fakegpu.CardConfig(
+        uuid=f"GPU-fake-{uuid.uuid4()}",
+        name="Simulated GPU",
+        index=index,
+        capacity_bytes=capacity_bytes,
+        release_lag_s=release_lag_s,
+        boot_id=boot_id,
+    )
+    folder.mkdir(mode=0o750, parents=True, exist_ok=True)
+    with locked(folder):
+        path = folder / fakegpu.CARD_FILE
+        existing = path.read_text() if path.exists() else None
+        if existing is not None and fakegpu.parse_config(existing).boot_id == boot_id:
+            _settled(folder)  # so that processes which died since do not count as using it
+        names = [name for name in os.listdir(folder) if fakegpu.is_process_file(name)]
+        plan = fakegpu.plan_folder(wanted, existing, names)
+        for name in plan.remove:
+            (folder / name).unlink()
+        if plan.fresh_log:
+            (folder / fakegpu.LOG_FILE).unlink(missing_ok=True)
+        for name, text in plan.write.items():
+            _replace(folder / name, text)
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the card's lock. Blocks as long as somebody else has it; the kernel frees it when its holder dies."""
+    lock = os.open(folder / fakegpu.LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)
+
+
+def _settled(folder: Path) -> fakegpu.Card:
+    """The card now; the lock is held. Deaths and returns since the last reading are written down."""
+    names = [
+        name for name in os.listdir(folder) if name == fakegpu.CARD_FILE or fakegpu.is_process_file(name)
+    ]
+    texts = {name: (folder / name).read_text() for name in names}
+    change = fakegpu.read_card(texts, _tail(folder / fakegpu.LOG_FILE))
+    change = change.then(lambda card: fakegpu.settle(card, time.monotonic(), _alive))
+    for step in change.steps:
+        _perform(folder, step)
+    return change.card
+
+
+def _perform(folder: Path, step: fakegpu.Step) -> None:
+    if step.name and step.text is None:
+        (folder / step.name).unlink(missing_ok=True)
+    elif step.text is not None:
+        _replace(folder / step.name, step.text)
+    if step.line:
+        log = os.open(folder / fakegpu.LOG_FILE, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o660)
+        try:
+            os.write(log, step.line.encode())
+        finally:
+            os.close(log)
+
+
+def _replace(path: Path, text: str) -> None:
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text(text)
+    temporary.rename(path)
+
+
+def _tail(log: Path) -> str:
+    try:
+        with log.open("rb") as file:
+            end = file.seek(0, os.SEEK_END)
+            file.seek(max(0, end - fakegpu.LOG_TAIL_BYTES))
+            return file.read().decode(errors="replace")
+    except FileNotFoundError:
+        return ""
+
+
+def _alive(key: ProcessKey) -> bool:
+    try:
+        alive, start_ticks = fakegpu.parse_stat(Path(f"/proc/{key.pid}/stat").read_text())
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return alive and key.start_ticks in (0, start_ticks)
+
+
+def card_texts(folder: Path) -> Mapping[str, str]:
+    """All texts of a card, read under its lock: for tests and for people who look inside."""
+    with locked(folder):
+        names = [
+            name for name in os.listdir(folder) if name == fakegpu.CARD_FILE or fakegpu.is_process_file(name)
+        ]
+        return {name: (folder / name).read_text() for name in names}

@@ -1,0 +1,98 @@
+"""Bytes ↔ requests. Nothing that a peer sends makes this raise anything but a typed error.
+
+Must not know sockets, sessions or the core. Requests are validated by `schemas.wire`; replies and pushes are plain maps.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgpack
+from pydantic import ValidationError
+
+from schemas.errors import BadFrame, BadRequest, MessageTooLarge, UnknownOp, VramError
+from schemas.wire import OPS, REQUEST, Request
+
+FIELDS_MAX = 20  # problems listed in one reply; the peer's text is never echoed at length
+_OPS = frozenset(OPS)
+
+
+class Undecodable(Exception):
+    """A frame that is no request: the typed error to answer with, and the id to answer to if one could be read."""
+
+    def __init__(self, error: VramError, request_id: int | None) -> None:
+        super().__init__(error.message)
+        self.error = error
+        self.request_id = request_id
+
+
+def decode(payload: bytes | memoryview, size_max: int) -> Request:
+    """One frame to one request. Raises Undecodable with BadFrame, MessageTooLarge, UnknownOp or BadRequest."""
+    if len(payload) > size_max:
+        too_large = MessageTooLarge(
+            f"the message has {len(payload)} bytes, the limit is {size_max}",
+            hint="send less in one message",
+            details={"size_bytes": len(payload), "limit_bytes": size_max},
+        )
+        raise Undecodable(too_large, None)
+    try:
+        message = msgpack.unpackb(payload, raw=False, strict_map_key=True)
+    except (ValueError, msgpack.UnpackException, RecursionError) as error:
+        raise Undecodable(
+            BadFrame(f"the frame is not one msgpack value: {error or type(error).__name__}"), None
+        ) from error
+    if not isinstance(message, dict):
+        kind = type(message).__name__
+        raise Undecodable(
+            BadFrame(f"a request is a msgpack map, not {kind}", hint='{"op": …, "id": n, …}'), None
+        )
+    raw_id = message.get("id")
+    request_id = raw_id if type(raw_id) is int and 0 <= raw_id < 1 << 53 else None
+    op = message.get("op")
+    if not isinstance(op, str):
+        problem = BadRequest(
+            "the request has no op", details={"fields": [{"field": "op", "problem": "missing or no text"}]}
+        )
+        raise Undecodable(problem, request_id)
+    if op not in _OPS:
+        raise Undecodable(UnknownOp(f"unknown op {op[:64]!r}", details={"known": list(OPS)}), request_id)
+    try:
+        return REQUEST.validate_python(message)
+    except ValidationError as error:
+        raise Undecodable(_bad_request(op, error), request_id) from error
+
+
+def _bad_request(op: str, error: ValidationError) -> BadRequest:
+    fields = []
+    for finding in error.errors(include_url=False, include_context=False, include_input=False)[:FIELDS_MAX]:
+        path = [str(part)[:64] for part in finding["loc"]]
+        if path and path[0] == op:
+            path = path[1:]  # the union's tag, no field of the message
+        fields.append({"field": ".".join(path), "problem": finding["msg"]})
+    first = fields[0] if fields else {"field": "", "problem": "invalid"}
+    more = f" and {error.error_count() - 1} more" if error.error_count() > 1 else ""
+    return BadRequest(
+        f"{op}: {first['field']}: {first['problem']}{more}",
+        hint="details.fields lists what is wrong",
+        details={"fields": fields},
+    )
+
+
+def encode(body: Mapping[str, Any]) -> bytes:
+    """One reply or push to one frame."""
+    packed: bytes = msgpack.packb(body, use_bin_type=True)
+    return packed
+
+
+def reply(request_id: int, epoch: int, body: Mapping[str, Any]) -> bytes:
+    """`{"re", "epoch", "ok": true, …}`"""
+    return encode({"re": request_id, "epoch": epoch, "ok": True, **body})
+
+
+def refusal(request_id: int | None, epoch: int, error: Mapping[str, Any]) -> bytes:
+    """`{"re", "epoch", "ok": false, "error"}`; `re` is null where the request had no readable id."""
+    return encode({"re": request_id, "epoch": epoch, "ok": False, "error": error})
+
+
+def push(seq: int, epoch: int, body: Mapping[str, Any]) -> bytes:
+    """`{"push", "seq", "epoch", …}`"""
+    return encode({**body, "seq": seq, "epoch": epoch})

@@ -1,0 +1,242 @@
+"""The socket: one ROUTER on `ipc://`, drained from the event loop. Frames in, frames out; must not know what they mean.
+
+libzmq's file descriptor is edge-triggered: it becomes readable once when something happened, and any call on the socket (a send
+too) may consume that edge. So the reader drains until the socket is empty, and every send outside a drain schedules one.
+"""
+
+import asyncio
+import contextlib
+import errno
+import fcntl
+import logging
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import zmq
+
+from arbiter.rpc.peer import parse_peer_address
+from schemas.config import check_endpoint
+from schemas.errors import AlreadyRunning, ConfigError, InternalError
+
+log = logging.getLogger(__name__)
+
+DRAIN_MAX = 256
+"""Messages handled in one go; then timers and deaths get their turn before the rest."""
+SEND_QUEUE_MAX = 4096
+"""Messages queued per peer that does not read; more are dropped, and the peer's own ttl decides."""
+SELF_TEST_S = 2.0
+LINGER_MS = 200
+"""At shutdown answers under way get so long to leave."""
+
+OnFrame = Callable[[bytes, bool, str | None, bytes], None]
+"""`on_frame(routing_id, delimiter, peer_address, payload)`"""
+
+
+class SocketLock:
+    """One daemon per socket path: a lock file beside the socket, held as long as the process lives.
+
+    Needed because libzmq silently takes over an existing socket path at bind. The file stays: removing it would let two daemons lock
+    two files of one name. A dead daemon's lock is gone with it, and its stale socket is replaced by the bind.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._fd: int | None = None
+
+    def acquire(self) -> None:
+        """Raises AlreadyRunning with the pid of the holder, ConfigError where the file cannot be made."""
+        try:
+            fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o640)
+        except OSError as error:
+            raise ConfigError(
+                f"{self._path}: {error.strerror}", hint="choose a folder that the daemon may write"
+            ) from error
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            text = os.read(fd, 32).decode("ascii", "replace").strip()
+            os.close(fd)
+            pid = int(text) if text.isdecimal() else None
+            raise AlreadyRunning(
+                f"an arbiter (pid {text or 'unknown'}) already serves {self._path.with_suffix('')}",
+                hint="stop it first, or give this one another --endpoint",
+                details={"pid": pid, "lock": str(self._path)},
+            ) from error
+        os.ftruncate(fd, 0)
+        os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
+        self._fd = fd
+
+    def release(self) -> None:
+        if self._fd is not None:
+            os.close(self._fd)
+            self._fd = None
+
+
+def socket_path(endpoint: str) -> Path:
+    """The path of an `ipc://` endpoint. Raises ConfigError for everything that the daemon does not serve."""
+    try:
+        return Path(check_endpoint(endpoint).removeprefix("ipc://"))
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def lock_path(path: Path) -> Path:
+    return path.with_name(path.name + ".lock")
+
+
+def make_private_folder(folder: Path, group: int | None) -> None:
+    """Make the runtime folder 0700, or 0750 with the operators' group. A folder of another user is refused, not trusted."""
+    mode = 0o700 if group is None else 0o750
+    try:
+        made = not folder.exists()
+        folder.mkdir(mode=mode, parents=True, exist_ok=True)
+        found = folder.stat()
+        if found.st_uid not in (os.getuid(), 0):
+            raise ConfigError(
+                f"{folder} belongs to uid {found.st_uid}", hint="choose another folder for the socket"
+            )
+        if not stat.S_ISDIR(found.st_mode):
+            raise ConfigError(f"{folder} is no folder")
+        if made and group is not None:
+            os.chown(folder, -1, group)
+            folder.chmod(mode)
+    except OSError as error:
+        raise ConfigError(
+            f"{folder}: {error.strerror}", hint="choose a folder that the daemon may write"
+        ) from error
+
+
+class RouterServer:
+    """Owns the ROUTER. `bind`, then `start` inside the running loop, then `send` from its thread, then `close`."""
+
+    def __init__(self, path: Path, message_max_bytes: int, group: int | None) -> None:
+        self._path = path
+        self._group = group
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.ROUTER)
+        # Larger frames must reach us to be answered with a typed error; libzmq cuts the connection beyond this.
+        self._socket.setsockopt(zmq.MAXMSGSIZE, 4 * message_max_bytes)
+        # A send to a peer that is gone fails instead of vanishing.
+        self._socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        # A second connection under a living one's routing id must not take its pushes over.
+        self._socket.setsockopt(zmq.ROUTER_HANDOVER, 0)
+        self._socket.setsockopt(zmq.SNDHWM, SEND_QUEUE_MAX)
+        self._socket.setsockopt(zmq.RCVHWM, SEND_QUEUE_MAX)
+        self._socket.setsockopt(zmq.LINGER, LINGER_MS)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._on_frame: OnFrame | None = None
+        self._draining = False
+        self._drain_scheduled = False
+        self.dropped = 0
+
+    def bind(self) -> None:
+        """Bind with mode 0660 from the first instant. The caller holds the lock. Raises ConfigError."""
+        previous = os.umask(0o117)
+        try:
+            self._socket.bind(f"ipc://{self._path}")
+        except zmq.ZMQError as error:
+            raise ConfigError(
+                f"cannot bind ipc://{self._path}: {error.strerror}", hint="choose another --endpoint"
+            ) from error
+        finally:
+            os.umask(previous)
+        os.chmod(self._path, 0o660)
+        if self._group is not None:
+            os.chown(self._path, -1, self._group)
+        self._self_test()
+
+    def _self_test(self) -> None:
+        """Send one frame to ourselves: the identity of every peer hangs on the kernel's word being there and readable."""
+        with self._context.socket(zmq.DEALER) as probe:
+            probe.setsockopt(zmq.LINGER, 0)
+            probe.connect(f"ipc://{self._path}")
+            probe.send(b"")
+            if not self._socket.poll(int(SELF_TEST_S * 1000)):
+                raise InternalError(f"the socket did not answer its own self-test within {SELF_TEST_S:g} s")
+            frame = self._socket.recv_multipart(copy=False)[-1]
+        address = _peer_address(frame)
+        try:
+            found = parse_peer_address(address or "")
+        except ValueError as error:
+            raise InternalError(
+                "this libzmq does not tell who the peer is", hint="use pyzmq ≥ 27 with libzmq ≥ 4.3"
+            ) from error
+        if (found.uid, found.pid) != (os.geteuid(), os.getpid()):
+            raise InternalError(f"the kernel names a wrong peer: {address} for pid {os.getpid()}")
+
+    def start(self, loop: asyncio.AbstractEventLoop, on_frame: OnFrame) -> None:
+        self._loop, self._on_frame = loop, on_frame
+        loop.add_reader(self._socket.fileno(), self._drain)
+        self._schedule_drain()
+
+    def send(self, routing_id: bytes, delimiter: bool, payload: bytes) -> bool:
+        """Queue one message. False where the peer is gone (EHOSTUNREACH) or its queue is full (EAGAIN)."""
+        frames = [routing_id, b"", payload] if delimiter else [routing_id, payload]
+        try:
+            self._socket.send_multipart(frames, zmq.NOBLOCK)
+        except zmq.ZMQError as error:
+            if error.errno not in (errno.EHOSTUNREACH, errno.EAGAIN):
+                raise
+            self.dropped += 1
+            return False
+        finally:
+            self._schedule_drain()
+        return True
+
+    def stop_receiving(self) -> None:
+        """Shutdown, first half: no request is read any more; answers can still be sent."""
+        if self._loop is not None:
+            self._loop.remove_reader(self._socket.fileno())
+            self._on_frame = None
+
+    def close(self) -> None:
+        """Shutdown, second half. The socket's file goes away; the lock is still held by the caller."""
+        self.stop_receiving()
+        self._loop = None
+        self._socket.close()
+        self._context.term()
+        with contextlib.suppress(FileNotFoundError):
+            self._path.unlink()
+
+    def _schedule_drain(self) -> None:
+        if self._loop is not None and not self._draining and not self._drain_scheduled:
+            self._drain_scheduled = True
+            self._loop.call_soon(self._drain)
+
+    def _drain(self) -> None:
+        """Read until empty, or until `DRAIN_MAX`, and then again after others had their turn."""
+        self._drain_scheduled = False
+        if self._draining or self._on_frame is None:
+            return
+        self._draining = True
+        try:
+            for _ in range(DRAIN_MAX):
+                if self._on_frame is None:
+                    return
+                try:
+                    frames = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
+                except zmq.Again:
+                    return
+                self._deliver(frames)
+        finally:
+            self._draining = False
+        self._schedule_drain()
+
+    def _deliver(self, frames: list[zmq.Frame]) -> None:
+        """`[id, payload]` from a DEALER, `[id, "", payload]` from a REQ; any other count of frames is no message of ours."""
+        assert self._on_frame is not None
+        routing_id = frames[0].bytes
+        delimiter = len(frames) == 3 and len(frames[1]) == 0
+        # anything else goes on as an empty payload, which the codec answers with BadFrame
+        payload = frames[-1].bytes if len(frames) == 2 or delimiter else b""
+        self._on_frame(routing_id, delimiter, _peer_address(frames[-1]), payload)
+
+
+def _peer_address(frame: zmq.Frame) -> str | None:
+    try:
+        address = frame.get("Peer-Address")
+    except zmq.ZMQError:  # a transport without it
+        return None
+    return address if isinstance(address, str) else None

@@ -1,0 +1,78 @@
+"""The demo's programs: started by `python -m`, watched, and ended again. Only processes started here are ever signalled."""
+
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from schemas.errors import SidecarUnavailable
+
+STOP_GRACE_S = 15.0
+LOG_TAIL_LINES = 15
+
+
+@dataclass(slots=True)
+class Program:
+    """One child process and where its output goes."""
+
+    name: str
+    process: asyncio.subprocess.Process
+    log: Path
+
+    def tail(self) -> str:
+        """The last lines that it printed, for error messages."""
+        lines = self.log.read_text(errors="replace").splitlines()
+        return "\n".join(lines[-LOG_TAIL_LINES:])
+
+
+@dataclass(slots=True)
+class Programs:
+    """All children of one demo, in the order of their start; `stop` ends them in reverse."""
+
+    log_dir: Path
+    environ: Mapping[str, str]
+    running: dict[str, Program] = field(default_factory=dict)
+
+    async def start(self, name: str, *arguments: str) -> Program:
+        """Start `python -m ARGUMENTS`; its output goes to `<log_dir>/<name>.log`."""
+        log = self.log_dir / f"{name}.log"
+        with log.open("wb") as sink:
+            process = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", *arguments,
+                stdin=asyncio.subprocess.DEVNULL, stdout=sink, stderr=sink, env=dict(os.environ) | dict(self.environ),
+            )  # fmt: skip
+        program = self.running[name] = Program(name, process, log)
+        return program
+
+    def pids(self) -> dict[int, str]:
+        """Pid → name of everything started, also of what has ended since."""
+        return {program.process.pid: program.name for program in self.running.values()}
+
+    def check(self) -> None:
+        """Raises SidecarUnavailable for a program that ended although nobody asked it to."""
+        for program in self.running.values():
+            if program.process.returncode is not None:
+                raise SidecarUnavailable(
+                    f"{program.name} ended with exit code {program.process.returncode}:\n{program.tail()}",
+                    hint=f"its whole output is in {program.log}",
+                )
+
+    async def stop(self, name: str) -> None:
+        """SIGTERM, then SIGKILL after a grace period."""
+        program = self.running[name]
+        if program.process.returncode is not None:
+            return
+        program.process.send_signal(signal.SIGTERM)
+        try:
+            await asyncio.wait_for(program.process.wait(), STOP_GRACE_S)
+        except TimeoutError:
+            program.process.kill()
+            await program.process.wait()
+
+    async def stop_all(self) -> None:
+        """End everything that still runs, last started first: clients leave before the arbiter does."""
+        for name in reversed(list(self.running)):
+            await self.stop(name)

@@ -1,0 +1,157 @@
+"""A small asyncio ROUTER server for the programs that are not the arbiter (sidecars, runner): one msgpack map per frame.
+
+It owns the socket, decoding, size limits and the error reply for frames that are no messages. It knows nothing of ops: a handler
+gets the decoded map and may answer at once, later, or several times. Speaks to DEALER (one frame) and REQ (empty delimiter) peers alike.
+Only `ipc://` and loopback `tcp://` endpoints are bound; an ipc socket gets mode 0660.
+"""
+
+import asyncio
+import contextlib
+import fcntl
+import os
+import stat
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import msgpack
+import zmq
+import zmq.asyncio
+
+from schemas.defaults import IMAGE_MESSAGE_MAX_BYTES
+from schemas.errors import AlreadyRunning, BadFrame, ConfigError, MessageTooLarge, VramError
+
+Message = dict[str, Any]
+MAX_DEPTH_BYTES = IMAGE_MESSAGE_MAX_BYTES + 64 * 1024  # an image plus its envelope
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """Whoever sent a message: where to answer, and which process the kernel says it is (None on tcp)."""
+
+    identity: bytes
+    delimiter: bool
+    pid: int | None
+
+
+Handler = Callable[[Peer, Message], Awaitable[None]]
+ErrorReply = Callable[[VramError], Message]
+
+
+class RouterServer:
+    """`async with RouterServer(endpoint, on_error) as server: await server.serve(handler)`.
+
+    Each message is handled in a task of its own, so that a slow one never delays `ping` or `revoke`; at most `concurrent_max` run, then reading
+    stops and ZeroMQ's own queue holds the rest (high-water mark `queue_max` per peer).
+    Raises ConfigError for a foreign endpoint, AlreadyRunning when a living server owns it.
+    """
+
+    def __init__(self, endpoint: str, on_error: ErrorReply, *, concurrent_max: int = 64, queue_max: int = 256) -> None:
+        if not endpoint.startswith(("ipc://", "tcp://127.0.0.1:", "tcp://localhost:")):
+            raise ConfigError(f"cannot serve on {endpoint}", hint="use ipc://PATH or tcp://127.0.0.1:PORT")
+        self.endpoint = endpoint
+        self._on_error = on_error
+        self._slots = asyncio.Semaphore(concurrent_max)
+        self._queue_max = queue_max
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._stack = contextlib.ExitStack()
+        self._send_lock = asyncio.Lock()
+        self._socket: zmq.asyncio.Socket | None = None
+
+    async def __aenter__(self) -> Self:
+        if self.endpoint.startswith("ipc://"):
+            self._claim(Path(self.endpoint.removeprefix("ipc://")))
+        socket: zmq.asyncio.Socket = zmq.asyncio.Context.instance().socket(zmq.ROUTER)
+        self._stack.callback(socket.close, 0)
+        socket.setsockopt(zmq.MAXMSGSIZE, 4 * MAX_DEPTH_BYTES)  # beyond this libzmq drops the peer; below we can answer
+        socket.setsockopt(zmq.SNDHWM, self._queue_max)
+        socket.setsockopt(zmq.RCVHWM, self._queue_max)
+        old_umask = os.umask(0o117)
+        try:
+            socket.bind(self.endpoint)
+        finally:
+            os.umask(old_umask)
+        self._socket = socket
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._stack.close()
+
+    def _claim(self, path: Path) -> None:
+        """Binding steals an existing ipc path without a word: a locked file beside it tells a living owner from a stale socket."""
+        path.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
+        lock = os.open(f"{path}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660)
+        self._stack.callback(os.close, lock)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            owner = os.pread(lock, 32, 0).decode(errors="replace").strip()
+            self._stack.close()
+            raise AlreadyRunning(f"{path} is served by process {owner or '?'}", hint="stop it first") from None
+        os.ftruncate(lock, 0)
+        os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
+        if path.exists() and stat.S_ISSOCK(path.stat().st_mode):
+            path.unlink()
+
+    async def serve(self, handler: Handler) -> None:
+        """Read until cancelled."""
+        assert self._socket is not None, "serve() belongs inside `async with`"
+        while True:
+            await self._slots.acquire()
+            try:
+                frames = await self._socket.recv_multipart(copy=False)
+                identity, delimiter, payload = frames[0].bytes, len(frames) == 3, frames[-1]
+                peer = Peer(identity, delimiter, _pid(payload))
+                message = self._decode(frames)
+            except VramError as error:
+                self._slots.release()
+                await self.send(Peer(identity, delimiter, None), self._on_error(error))
+                continue
+            except BaseException:
+                self._slots.release()
+                raise
+            task = asyncio.create_task(self._run(handler, peer, message))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+    async def _run(self, handler: Handler, peer: Peer, message: Message) -> None:
+        try:
+            await handler(peer, message)
+        finally:
+            self._slots.release()
+
+    @staticmethod
+    def _decode(frames: list[zmq.Frame]) -> Message:
+        payload = frames[-1]
+        if len(payload) > MAX_DEPTH_BYTES:
+            raise MessageTooLarge(
+                f"a message of {len(payload)} bytes; the limit is {MAX_DEPTH_BYTES}", hint="send a smaller image"
+            )
+        try:
+            message = msgpack.unpackb(payload.buffer, raw=False, strict_map_key=True)
+        except (ValueError, msgpack.exceptions.UnpackException, RecursionError) as error:
+            raise BadFrame(f"not msgpack: {error}", hint="send one msgpack map per message") from None
+        if not isinstance(message, dict):
+            raise BadFrame(f"a msgpack {type(message).__name__}, not a map", hint="send one msgpack map per message")
+        return message
+
+    async def send(self, peer: Peer, message: Message) -> None:
+        """Answer or push. A peer that is gone or too slow gets nothing."""
+        assert self._socket is not None
+        payload = msgpack.packb(message, use_bin_type=True)
+        frames = [peer.identity, b"", payload] if peer.delimiter else [peer.identity, payload]
+        async with self._send_lock:
+            await self._socket.send_multipart(frames)
+
+
+def _pid(frame: zmq.Frame) -> int | None:
+    try:
+        address = str(frame.get("Peer-Address"))  # localhost:UID:GID:PID on ipc, an ip address on tcp
+    except zmq.ZMQError:
+        return None
+    tail = address.rsplit(":", 3)
+    return int(tail[3]) if len(tail) == 4 and all(part.isdecimal() for part in tail[1:]) else None

@@ -1,0 +1,209 @@
+"""The base of every runner: ticks at a rate, deadlines with a policy, timings, a trace span per tick.
+
+Subclasses say what is sensed and decided (`_decide`) and how it reaches the robot (`_apply`); between the two the deadline
+policy acts, so that DROP really withholds a late action. Knows no robot, simulator, skill or socket.
+
+One tick:
+ 1. decide: sensors → world state → inference → safety (subclass)
+ 2. was the slot over before the decision was there? DROP and RAISE withhold the action
+ 3. apply, or hold (subclass)
+ 4. measure; under RAISE a missed deadline ends the run
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from opentelemetry import propagate, trace
+
+from runner import telemetry
+from runner.clock import Clock, SystemClock
+from runner.protocols import DeadlineMissed, DeadlinePolicy
+from schemas.world import Action, RunResult, TickResult
+
+TIMINGS_KEPT = 36_000  # twenty minutes at 30 Hz; older timings leave the percentiles, never the counts
+
+
+@dataclass(slots=True)
+class Decision:
+    """What one tick wants to do, and where its time went."""
+
+    action: Action | None = None
+    sensors_ms: float = 0.0
+    world_state_ms: float = 0.0
+    inference_ms: float = 0.0
+    safety_ms: float = 0.0
+    chunk_index: int | None = None
+    safety_violations: tuple[str, ...] = ()
+    reset: bool = False
+
+
+@dataclass(slots=True)
+class Applied:
+    """What became of it."""
+
+    action_applied: bool
+    step_idx: int | None = None
+    episode_idx: int | None = None
+    reward: float | None = None
+    terminated: bool | None = None
+    truncated: bool | None = None
+
+
+def percentile(values: Sequence[float], share: float) -> float:
+    """Percentile by linear interpolation between the two nearest ranks; 0.0 for no values. `share` runs from 0 to 1."""
+    if not values:
+        return 0.0
+    ordered = sorted(values)
+    rank = share * (len(ordered) - 1)
+    low = math.floor(rank)
+    high = min(low + 1, len(ordered) - 1)
+    return ordered[low] + (ordered[high] - ordered[low]) * (rank - low)
+
+
+class RunnerBase(ABC):
+    """`rate_hz` 0 runs as fast as it can, without deadlines. Raises DeadlineMissed from `tick` and `run` under RAISE."""
+
+    def __init__(
+        self,
+        *,
+        rate_hz: float = 30.0,
+        deadline_policy: DeadlinePolicy = DeadlinePolicy.WARN,
+        clock: Clock | None = None,
+    ) -> None:
+        if not math.isfinite(rate_hz) or rate_hz < 0:
+            raise ValueError(f"rate_hz must be 0 or more, not {rate_hz}")
+        self.rate_hz = rate_hz
+        self.deadline_policy = deadline_policy
+        self.clock: Clock = clock or SystemClock()
+        self.tick_idx = 0
+        self.deadline_misses = 0
+        self.last_error: str = ""
+        self._due_s: float | None = None  # when the present tick should have begun
+        self._tick_ms: deque[float] = deque(maxlen=TIMINGS_KEPT)
+        self._inference_ms: deque[float] = deque(maxlen=TIMINGS_KEPT)
+        self._trace_id: str | None = None
+
+    # -- what a subclass provides --
+    @abstractmethod
+    def activate(self) -> None:
+        """Acquire what a run needs. Raises when it cannot."""
+
+    @abstractmethod
+    def deactivate(self) -> None:
+        """Let go of everything; repeatable."""
+
+    @abstractmethod
+    def _decide(self, tick_idx: int) -> Decision: ...
+
+    @abstractmethod
+    def _apply(self, decision: Decision) -> Applied:
+        """Carry the decision out; `decision.action` None means hold."""
+
+    def _finished(self) -> bool:
+        """Whether the run is over by itself, asked before every tick."""
+        return False
+
+    def _success(self) -> bool | None:
+        return None
+
+    # -- the loop --
+    @property
+    def period_s(self) -> float | None:
+        return 1.0 / self.rate_hz if self.rate_hz > 0 else None
+
+    def tick(self) -> TickResult:
+        """One turn. See the module's docstring for its steps."""
+        with trace.get_tracer("runner").start_as_current_span(telemetry.SPAN_TICK) as span:
+            carrier: dict[str, str] = {}
+            propagate.inject(carrier)
+            context = span.get_span_context()
+            if context.is_valid and self._trace_id is None:
+                self._trace_id = f"{context.trace_id:032x}"
+            return self._tick(carrier or None)
+
+    def _tick(self, trace_context: dict[str, str] | None) -> TickResult:
+        started_s = self.clock.now_s()
+        due_s = started_s if self._due_s is None else self._due_s
+        deadline_s = math.inf if self.period_s is None else due_s + self.period_s
+        decision = self._decide(self.tick_idx)  # 1
+        withheld = self.clock.now_s() > deadline_s and self.deadline_policy is not DeadlinePolicy.WARN  # 2
+        if withheld and not decision.reset:
+            decision.action = None
+        apply_s = self.clock.now_s()
+        applied = self._apply(decision)  # 3
+        ended_s = self.clock.now_s()
+        missed = ended_s > deadline_s
+        result = TickResult(
+            stamp_ns=self.clock.now_ns(),
+            tick_idx=self.tick_idx,
+            tick_ms=(ended_s - started_s) * 1e3,
+            sensors_ms=decision.sensors_ms,
+            world_state_ms=decision.world_state_ms,
+            inference_ms=decision.inference_ms,
+            safety_ms=decision.safety_ms,
+            hal_ms=(ended_s - apply_s) * 1e3,
+            chunk_index=decision.chunk_index,
+            safety_violations=decision.safety_violations,
+            action_applied=applied.action_applied,
+            deadline_missed=missed,
+            step_idx=applied.step_idx,
+            episode_idx=applied.episode_idx,
+            reward=applied.reward,
+            terminated=applied.terminated,
+            truncated=applied.truncated,
+            trace_context=trace_context,
+        )
+        self.tick_idx += 1
+        self._tick_ms.append(result.tick_ms)
+        if not decision.reset:
+            self._inference_ms.append(result.inference_ms)
+        if missed:  # 4
+            self.deadline_misses += 1
+            trace.get_current_span().add_event(telemetry.EVENT_DEADLINE_MISSED, {"tick_ms": result.tick_ms})
+            if self.deadline_policy is DeadlinePolicy.RAISE:
+                raise DeadlineMissed(
+                    f"tick {result.tick_idx} took {result.tick_ms:.1f} ms of its {1e3 / self.rate_hz:.1f} ms",
+                    hint="lower the rate or choose the policy warn or drop",
+                )
+        return result
+
+    def run(self, max_ticks: int | None = None) -> RunResult:
+        """Tick until `_finished` or `max_ticks` more ticks. A long tick costs its own slots, never those after it."""
+        first = self.tick_idx
+        self._due_s = self.clock.now_s()
+        try:
+            while not self._finished() and (max_ticks is None or self.tick_idx - first < max_ticks):
+                self.tick()
+                self._wait_for_next_slot()
+        finally:
+            self._due_s = None
+        return self.result()
+
+    def _wait_for_next_slot(self) -> None:
+        """Sleep to the next slot of the grid that is still to come: deadlines resynchronise, no burst catches up."""
+        if self.period_s is None or self._due_s is None:
+            return
+        self._due_s += self.period_s
+        behind_s = self.clock.now_s() - self._due_s
+        if behind_s > 0:
+            self._due_s += math.ceil(behind_s / self.period_s) * self.period_s
+        self.clock.sleep_s(self._due_s - self.clock.now_s())
+
+    def result(self) -> RunResult:
+        """The run so far."""
+        ticks, inferences = list(self._tick_ms), list(self._inference_ms)
+        return RunResult(
+            n_ticks=self.tick_idx,
+            success=self._success(),
+            budget_violations=self.deadline_misses,
+            avg_inference_ms=sum(inferences) / len(inferences) if inferences else 0.0,
+            p99_inference_ms=percentile(inferences, 0.99),
+            avg_tick_ms=sum(ticks) / len(ticks) if ticks else 0.0,
+            p99_tick_ms=percentile(ticks, 0.99),
+            trace_id=self._trace_id,
+        )

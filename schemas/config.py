@@ -1,0 +1,211 @@
+"""The arbiter's configuration: one model, one YAML file, every key with purpose, default and range.
+
+Pure: `load_config(text, name)` takes the text of a file; the daemon reads the file. `configs/arbiter.yaml` states the same
+keys with the same defaults, and a test holds both together. No key is required: an empty file is the default configuration.
+"""
+
+from collections.abc import Collection, Mapping
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from schemas import defaults as d
+from schemas.units import ByteSize
+from schemas.yamltext import Path, config_error, parse_yaml, problems_of
+
+Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class GpuConfig(_Section):
+    """Which cards are leased and how much of each."""
+
+    source: Annotated[str, Field(pattern=r"^(nvml|fake:.+)$")] = "nvml"
+    """`nvml`: the NVIDIA cards of this machine. `fake:8GiB`: one simulated card. `fake:FOLDER`: the card in that folder."""
+    reserve_bytes: ByteSize = d.RESERVE_BYTES
+    """Bytes of every card that are never leased: driver, display, allocator slack."""
+    capacity_bytes: dict[str, ByteSize] = Field(default_factory=dict)
+    """Cap per card, by UUID or index as text: lease out less than the card has. A card that is not named has no cap."""
+
+
+class SchedulingConfig(_Section):
+    """Who is next."""
+
+    ageing_s_per_point: Seconds = d.AGEING_S_PER_POINT
+    """A waiter gains one point of priority per so many seconds, so that nobody starves."""
+
+
+class RevokeConfig(_Section):
+    """The ladder towards a holder that is asked to leave."""
+
+    resend_s: Annotated[float, Field(ge=0.01, le=60, allow_inf_nan=False)] = d.REVOKE_RESEND_S
+    """`revoke` is sent again at this interval until the holder acknowledges it."""
+    remind_s: Seconds = d.REVOKE_REMIND_S
+    """After this long without a safe point the history says so."""
+    deadline_s: Seconds = d.REVOKE_DEADLINE_S
+    """After this long the waiter's own policy applies: keep waiting (`wait`) or a typed error (`deny`)."""
+
+
+class VerifyConfig(_Section):
+    """Was the memory really given back?"""
+
+    timeout_s: Seconds = d.VERIFY_TIMEOUT_S
+    """A verification ends with a verdict after this long."""
+    poll_s: Annotated[
+        tuple[Annotated[float, Field(ge=0.001, le=10, allow_inf_nan=False)], ...],
+        Field(min_length=1, max_length=16),
+    ] = d.VERIFY_POLL_S
+    """Pauses between samples; the last one repeats."""
+    slow_poll_s: Seconds = d.VERIFY_SLOW_POLL_S
+    """Pause between samples after a verdict that does not allow a grant."""
+    tolerance_bytes: ByteSize = d.VERIFY_TOLERANCE_BYTES
+    """Difference between expected and measured bytes that is no difference."""
+
+
+class ProbeConfig(_Section):
+    """Reading the cards."""
+
+    deadline_s: Seconds = d.PROBE_DEADLINE_S
+    """A reading that takes longer has failed: the card is unknown, which blocks grants."""
+    period_s: Seconds = d.PROBE_PERIOD_S
+    """Background readings while anybody holds or waits."""
+    sample_max_age_s: Seconds = d.SAMPLE_MAX_AGE_S
+    """An older reading does not gate a grant; a fresh one is taken first."""
+
+
+class LeaseConfig(_Section):
+    """Life of a lease on the daemon's side."""
+
+    fence_grace_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = d.FENCE_GRACE_S
+    """After a lease's ttl and this grace without the arbiter a client unloads by itself."""
+
+
+class LimitsConfig(_Section):
+    """Every queue and message has a limit; its breach is a typed error."""
+
+    message_max_bytes: Annotated[ByteSize, Field(ge=4096, le=64 * d.MIB)] = d.MESSAGE_MAX_BYTES
+    """Largest request."""
+    sessions_max: Annotated[int, Field(ge=1, le=65_536)] = d.SESSIONS_MAX
+    """Connections at a time."""
+    waiters_max: Annotated[int, Field(ge=1, le=1_000_000)] = d.WAITERS_MAX
+    """Queued leases at a time."""
+    leases_per_client_max: Annotated[int, Field(ge=1, le=4096)] = d.LEASES_PER_CLIENT_MAX
+    """Live leases of one client."""
+    uses_per_lease_max: Annotated[int, Field(ge=1, le=65_536)] = d.USES_PER_LEASE_MAX
+    """Uses of one lease at a time."""
+    rate_per_client_per_s: Annotated[int, Field(ge=10, le=1_000_000)] = d.RATE_PER_CLIENT_PER_S
+    """Requests a second of one connection; a burst of one second's worth is allowed."""
+    subscribers_max: Annotated[int, Field(ge=0, le=65_536)] = d.SUBSCRIBERS_MAX
+    """Connections that receive every event."""
+
+
+class HistoryConfig(_Section):
+    """What happened, kept on disk."""
+
+    max_events: Annotated[int, Field(ge=100, le=10_000_000)] = d.HISTORY_MAX_EVENTS
+    """Older events are dropped beyond this number."""
+    days: Annotated[float, Field(gt=0, le=3650, allow_inf_nan=False)] = d.HISTORY_DAYS
+    """Older events are dropped after this many days."""
+
+
+class WireConfig(_Section):
+    """The socket."""
+
+    endpoint: str | None = None
+    """`ipc:///run/vram-arbiter/arbiter.sock`. Null: `VRAM_ARBITER_ENDPOINT`, else `arbiter.sock` in the runtime folder."""
+    heartbeat_s: Annotated[float, Field(ge=0.1, le=60, allow_inf_nan=False)] = d.HEARTBEAT_S
+    """How often clients are asked to say that they are there."""
+    operators_group: Annotated[str, Field(min_length=1, max_length=64)] | None = None
+    """Unix group that may connect and act as operator beside the daemon's own user and root. Null: nobody else."""
+
+    @field_validator("endpoint")
+    @classmethod
+    def _ipc_only(cls, value: str | None) -> str | None:
+        return None if value is None else check_endpoint(value)
+
+
+class StateConfig(_Section):
+    """Files that outlive the daemon."""
+
+    dir: Annotated[str, Field(min_length=1)] | None = None
+    """Folder of journal and history. Null: `$STATE_DIRECTORY` under systemd, else `~/.local/state/vram-arbiter`; with a
+    simulated card `state` in the runtime folder."""
+
+
+class LogConfig(_Section):
+    """The daemon's log on stderr."""
+
+    format: Literal["human", "json"] = "human"
+    """`human`: one readable line each. `json`: one object a line."""
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    """Lowest level that is written."""
+
+
+class ArbiterConfig(_Section):
+    """Everything that an operator can set. Sizes may be written `8GiB`, `450MiB`, `5.3GB` or in bytes."""
+
+    gpu: GpuConfig = GpuConfig()
+    scheduling: SchedulingConfig = SchedulingConfig()
+    revoke: RevokeConfig = RevokeConfig()
+    verify: VerifyConfig = VerifyConfig()
+    probe: ProbeConfig = ProbeConfig()
+    lease: LeaseConfig = LeaseConfig()
+    limits: LimitsConfig = LimitsConfig()
+    history: HistoryConfig = HistoryConfig()
+    wire: WireConfig = WireConfig()
+    state: StateConfig = StateConfig()
+    log: LogConfig = LogConfig()
+
+
+IPC_PATH_MAX = 107
+"""sun_path of a unix socket on Linux holds 108 bytes with the closing zero."""
+
+
+def check_endpoint(endpoint: str) -> str:
+    """The endpoint itself if the daemon can serve it. Raises ValueError that says what to write instead."""
+    scheme, separator, path = endpoint.partition("://")
+    if not separator or scheme not in ("ipc", "tcp"):
+        raise ValueError(f"{endpoint!r} is no endpoint; write ipc:///run/vram-arbiter/arbiter.sock")
+    if scheme == "tcp":
+        raise ValueError(
+            "tcp:// is refused: without CURVE keys anybody on the network could take leases; write ipc://PATH"
+        )
+    if not path.startswith("/"):
+        raise ValueError(
+            f"an ipc:// endpoint needs an absolute path, not {path!r}; write ipc:///run/vram-arbiter/arbiter.sock"
+        )
+    if len(path.encode()) > IPC_PATH_MAX:
+        raise ValueError(
+            f"the socket path has {len(path.encode())} bytes, Linux allows {IPC_PATH_MAX}; choose a shorter folder"
+        )
+    return endpoint
+
+
+def known_keys() -> Mapping[Path, Collection[str]]:
+    """The keys of every section, by path: what suggestions for a mistyped key are taken from."""
+    found: dict[Path, Collection[str]] = {(): list(ArbiterConfig.model_fields)}
+    for name, field in ArbiterConfig.model_fields.items():
+        section = field.annotation
+        if isinstance(section, type) and issubclass(section, BaseModel):
+            found[(name,)] = list(section.model_fields)
+    return found
+
+
+def load_config(text: str, name: str) -> ArbiterConfig:
+    """Read the text of a configuration file; `name` is how errors call the file.
+
+    Raises ConfigError with every mistake, each with its line: `arbiter.yaml:12: verify.tiemout_s: unknown key; did you mean
+    timeout_s?`
+    """
+    source = parse_yaml(text, name)
+    data = source.data
+    if isinstance(data, dict):
+        # `verify:` with all its keys commented out is an empty section, not a mistake
+        data = {key: {} if value is None and (key,) in known_keys() else value for key, value in data.items()}
+    try:
+        return ArbiterConfig.model_validate(data)
+    except ValidationError as error:
+        raise config_error(name, problems_of(error, source, known_keys())) from error

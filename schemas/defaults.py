@@ -1,0 +1,46 @@
+"""Every default of the product, each a named constant (design §12). Pure constants; the core may import this."""
+
+KIB = 1024
+MIB = 1024 * KIB
+GIB = 1024 * MIB
+
+WIRE_VERSION = 1
+
+# Leases
+LEASE_TTL_S = 10.0
+RENEW_FRACTION = 1 / 3  # clients renew every ttl/3
+FENCE_GRACE_S = 5.0  # after ttl + grace without the arbiter a client unloads by itself
+MIN_RESIDENCY_S = 2.0
+PRIORITY = 50
+PRIORITY_MAX = 100
+AGEING_S_PER_POINT = 5.0  # one priority point per 5 s waited
+
+# The ladder towards a holder
+REVOKE_RESEND_S = 0.25
+REVOKE_REMIND_S = 2.0
+REVOKE_DEADLINE_S = 30.0
+
+# Measurement
+VERIFY_TIMEOUT_S = 10.0
+VERIFY_POLL_S = (0.005, 0.020, 0.050)  # adaptive: 5 → 20 → 50 ms
+VERIFY_SLOW_POLL_S = 0.5  # after a verdict that does not allow a grant
+VERIFY_TOLERANCE_BYTES = 64 * MIB  # allocator granularity and driver bookkeeping
+PROBE_DEADLINE_S = 2.0
+PROBE_PERIOD_S = 1.0  # background samples while anybody holds or waits
+SAMPLE_MAX_AGE_S = 2.0  # an older sample does not gate a grant
+RESERVE_BYTES = 300 * MIB
+RESIDUE_BYTES = 450 * MIB  # a live CUDA process keeps its context
+
+# Limits
+MESSAGE_MAX_BYTES = 1 * MIB
+IMAGE_MESSAGE_MAX_BYTES = 16 * MIB  # sidecar and runner wires only
+SESSIONS_MAX = 1024
+WAITERS_MAX = 16_384
+LEASES_PER_CLIENT_MAX = 64
+USES_PER_LEASE_MAX = 256
+RATE_PER_CLIENT_PER_S = 2000
+SUBSCRIBERS_MAX = 64
+HISTORY_MAX_EVENTS = 200_000
+HISTORY_DAYS = 7
+HEARTBEAT_S = 2.0
+NAME_MAX_CHARS = 128

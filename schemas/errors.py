@@ -1,0 +1,212 @@
+"""All errors that cross a process border: one tree, one table from wire codes to types.
+
+The type says who must act: `CallerError` (the program that asked), `OperatorError` (a person), `TransientError`
+(nobody: wait or retry), `InternalError` (us).
+"""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+
+class VramError(Exception):
+    """Root of the product's errors.
+
+    `code` is stable and goes over the wire, `message` says what happened, `hint` what to do, `details` the numbers.
+    """
+
+    code: ClassVar[str] = "internal"
+
+    def __init__(self, message: str, *, hint: str = "", details: Mapping[str, Any] | None = None) -> None:
+        super().__init__(f"{message} ({hint})" if hint else message)
+        self.message = message
+        self.hint = hint
+        self.details: dict[str, Any] = dict(details or {})
+
+    def to_wire(self) -> dict[str, Any]:
+        """The `error` map of a reply."""
+        return {"code": self.code, "message": self.message, "hint": self.hint, "details": self.details}
+
+
+class CallerError(VramError):
+    """The calling program asked for something it must not or cannot ask for."""
+
+
+class OperatorError(VramError):
+    """A person has to change a file, a flag or the machine."""
+
+
+class TransientError(VramError):
+    """Time or a retry helps."""
+
+
+class InternalError(VramError):
+    """A defect of ours; the story is in the details."""
+
+
+# -- the wire itself ---------------------------------------------------------------------------------------------
+class BadFrame(CallerError):
+    code = "bad_frame"  # not msgpack, not a map
+
+
+class BadRequest(CallerError):
+    code = "bad_request"  # a map, but with wrong fields; details.fields lists them
+
+
+class UnknownOp(CallerError):
+    code = "unknown_op"  # details.known lists the ops
+
+
+class MessageTooLarge(CallerError):
+    code = "message_too_large"
+
+
+class VersionMismatch(CallerError):
+    code = "version_mismatch"
+
+
+class UnknownSession(TransientError):
+    code = "unknown_session"  # no hello yet, or the arbiter restarted: say hello and re-attach
+
+
+class NotPermitted(CallerError):
+    code = "not_permitted"  # role or process does not allow it
+
+
+class LimitExceeded(CallerError):
+    code = "limit_exceeded"  # details.limit names it
+
+
+# -- leases -----------------------------------------------------------------------------------------------------
+class VramInsufficient(CallerError):
+    code = "vram_insufficient"  # can never fit: details.needed_bytes, capacity_bytes, pinned
+
+
+class UnknownGpu(CallerError):
+    code = "unknown_gpu"
+
+
+class UnknownLease(CallerError):
+    code = "unknown_lease"
+
+
+class StaleToken(CallerError):
+    code = "stale_token"  # the lease was granted again or never to you
+
+
+class LeaseRevoking(TransientError):
+    code = "lease_revoking"  # the holder was asked to leave: no new use begins
+
+
+class LeaseExpired(CallerError):
+    code = "lease_expired"
+
+
+class LeaseLost(CallerError):
+    code = "lease_lost"  # revoked, expired or fenced: acquire again
+
+
+class BadState(CallerError):
+    code = "bad_state"  # the request does not fit the lease's state; details.story
+
+
+class WaitTimeout(TransientError):
+    code = "wait_timeout"  # details.why explains who blocked
+
+
+class HolderBusy(TransientError):
+    code = "holder_busy"  # deadline of the ladder passed under the policy `deny`
+
+
+class Cancelled(CallerError):
+    code = "cancelled"
+
+
+class JournalUnavailable(OperatorError):
+    code = "journal_unavailable"
+
+
+# -- the daemon --------------------------------------------------------------------------------------------------
+class ArbiterUnreachable(TransientError):
+    code = "arbiter_unreachable"
+
+
+class AlreadyRunning(OperatorError):
+    code = "already_running"
+
+
+class ConfigError(OperatorError):
+    code = "config_error"  # details.fields: path, line, problem
+
+
+class NoGpu(OperatorError):
+    code = "no_gpu"
+
+
+class ProbeFailed(TransientError):
+    code = "probe_failed"
+
+
+# -- sidecars ----------------------------------------------------------------------------------------------------
+class Evicted(TransientError):
+    code = "evicted"  # never to be read as "object not found"
+
+
+class NotResident(TransientError):
+    code = "not_resident"
+
+
+class Loading(TransientError):
+    code = "loading"
+
+
+class ModelError(CallerError):
+    code = "model_error"
+
+
+class OutOfMemory(TransientError):
+    code = "oom"  # the card was full: real or simulated
+
+
+class SidecarUnavailable(TransientError):
+    code = "sidecar_unavailable"  # cannot be started or reached; details.exit_code, log
+
+
+# -- runner and reasoner -----------------------------------------------------------------------------------------
+class GoalRejected(CallerError):
+    code = "goal_rejected"
+
+
+class FrameStale(TransientError):
+    code = "frame_stale"  # no frame young enough: fail closed
+
+
+class UnknownSkill(CallerError):
+    code = "unknown_skill"
+
+
+class ManifestInvalid(OperatorError):
+    code = "manifest_invalid"
+
+
+class LlmError(TransientError):
+    code = "llm_error"
+
+
+def _leaves(cls: type[VramError]) -> list[type[VramError]]:
+    found = [cls] if "code" in cls.__dict__ and cls is not VramError else []
+    for child in cls.__subclasses__():
+        found += _leaves(child)
+    return found
+
+
+CODES: dict[str, type[VramError]] = {cls.code: cls for cls in _leaves(VramError)}
+"""Wire code → type."""
+
+
+def from_wire(error: Mapping[str, Any]) -> VramError:
+    """Rebuild the typed error of a reply; an unknown code (a newer server) becomes InternalError with the code kept."""
+    cls = CODES.get(str(error.get("code")), InternalError)
+    details = dict(error.get("details") or {})
+    if cls is InternalError:
+        details.setdefault("code", error.get("code"))
+    return cls(str(error.get("message", "")), hint=str(error.get("hint", "")), details=details)

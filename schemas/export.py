@@ -1,0 +1,74 @@
+"""JSON Schemas of everything that crosses a process border or lies in a file, made from the models themselves.
+
+One document a subject: `rskill.json` and the like have a root for editors, the documents of the wires list every message under
+`$defs`. Makes texts only; `python -m schemas export` writes them.
+"""
+
+import importlib
+import json
+import pkgutil
+from types import ModuleType
+from typing import Any, Literal, is_typeddict
+
+from pydantic import BaseModel, TypeAdapter
+
+import schemas
+
+ROOTS: dict[str, str] = {"rskill": "schemas.manifest:RSkillManifest"}
+"""Documents with a single root: name → `module:class`."""
+
+_DIALECT = "https://json-schema.org/draft/2020-12/schema"
+
+
+def documents() -> dict[str, str]:
+    """File name → text of every JSON Schema, the same on every machine."""
+    found: dict[str, dict[str, Any]] = {}
+    for name, place in ROOTS.items():
+        module, _, attribute = place.partition(":")
+        model: type[BaseModel] = getattr(importlib.import_module(module), attribute)
+        found[name] = model.model_json_schema()
+    for name in modules():
+        module_schema = _of_module(importlib.import_module(f"schemas.{name}"))
+        if module_schema["$defs"]:
+            found[name] = {"title": f"schemas.{name}", **module_schema}
+    return {
+        f"{name}.json": json.dumps(
+            {"$schema": _DIALECT, **schema}, indent=1, ensure_ascii=False, sort_keys=True
+        )
+        + "\n"
+        for name, schema in sorted(found.items())
+    }
+
+
+def modules() -> list[str]:
+    """Names of the modules of `schemas`; each that defines models gets its document. Packages have roots instead."""
+    return [
+        found.name
+        for found in pkgutil.iter_modules(schemas.__path__)
+        if not found.ispkg and found.name[0] != "_"
+    ]
+
+
+def public_models(module: ModuleType) -> list[type]:
+    """The models and typed dicts that a module defines and does not hide behind an underscore, by name."""
+    return [
+        value
+        for name, value in sorted(vars(module).items())
+        if isinstance(value, type)
+        and not name.startswith("_")
+        and value.__module__ == module.__name__
+        and (issubclass(value, BaseModel) or is_typeddict(value))
+    ]
+
+
+def _of_module(module: ModuleType) -> dict[str, Any]:
+    mode: Literal["validation"] = "validation"
+    inputs: list[tuple[str, Literal["validation"], TypeAdapter[Any]]] = [
+        (model.__name__, mode, TypeAdapter(model)) for model in public_models(module)
+    ]
+    schemas, definitions = TypeAdapter.json_schemas(inputs)
+    defs = dict(definitions.get("$defs", {}))
+    for (name, _), schema in schemas.items():
+        if schema != {"$ref": f"#/$defs/{name}"}:
+            defs[name] = schema
+    return {"$defs": defs}

@@ -1,0 +1,449 @@
+"""The simulated card: the format of its folder and every change that can happen to it, as pure functions. No I/O, no clock.
+
+One folder per card:
+    gpu.json          what the card is, how it lags, which faults are on (`CardConfig`); people may edit it while it is in use
+    PID-START.json    one file per process with bytes on the card (`ProcessFile`); any `*.json` beside gpu.json counts, so a
+                      stowaway is a file with the pid of some living process
+    log.jsonl         append-only, one line per change (`LogLine`), for timelines and for the independent checker
+    lock              flock'ed exclusively around every reading and every change
+
+Reader and writer do the I/O: take the lock, hand all texts to `read_card`, call transitions, perform their `Step`s in order.
+A step first replaces one process file (temporary file + rename), then appends that file's `last` to the log. So a kill at any
+instant leaves a readable card, and at most one line unwritten, which `read_card` orders to be appended by whoever comes next.
+
+It behaves as a card under a caching framework does: a context on first touch stays until the process ends; a freed block goes to
+the process's cache and only `empty_cache` gives it back; memory comes back `release_lag_s` late, also that of a dead process;
+what does not fit raises `SimulatedOutOfMemory` in the process that asked.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Literal, TypedDict
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from schemas.defaults import NAME_MAX_CHARS
+from schemas.errors import ConfigError, OutOfMemory
+from schemas.ids import ProcessKey
+from schemas.units import ByteSize, format_bytes
+
+CARD_FILE = "gpu.json"
+LOG_FILE = "log.jsonl"
+LOCK_FILE = "lock"
+FOLDER_VARIABLE = "VRAM_FAKE_GPU"
+LOG_TAIL_BYTES = 8192  # of the log's end are enough to find its last line
+RELEASE_LAG_S = 0.5  # the driver gives memory back 0.5-1.5 s after an exit
+
+Lag = Annotated[float, Field(ge=0, le=3600)]
+Alive = Callable[[ProcessKey], bool]
+
+
+class SimulatedOutOfMemory(OutOfMemory):
+    """The simulated card is full; stands for `torch.OutOfMemoryError`. details: requested_bytes, free_bytes, capacity_bytes."""
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Faults(_Frozen):
+    """What goes wrong on purpose. `leak_bytes` of every process's emptied cache stay with it until it exits."""
+
+    probe: Literal["ok", "fail", "hang"] = "ok"
+    leak_bytes: ByteSize = 0
+    hide_processes: bool = False  # the probe cannot list processes, as inside some containers
+
+
+class CardConfig(_Frozen):
+    """`gpu.json`. `throttle_bytes_per_s` is how fast a simulated load fills the card (None: at once)."""
+
+    uuid: Annotated[str, Field(min_length=1, max_length=64)]
+    name: Annotated[str, Field(max_length=NAME_MAX_CHARS)] = "Simulated GPU"
+    index: Annotated[int, Field(ge=0)] = 0
+    capacity_bytes: Annotated[ByteSize, Field(gt=0)]
+    release_lag_s: Lag = RELEASE_LAG_S
+    throttle_bytes_per_s: Annotated[ByteSize, Field(gt=0)] | None = None
+    boot_id: str = ""  # of the machine's boot that the process files belong to
+    faults: Faults = Faults()
+
+
+class Returning(_Frozen):
+    """Bytes that a process let go of and that are free again at `due_s` (monotonic)."""
+
+    bytes: Annotated[int, Field(ge=0)]
+    due_s: float
+
+
+class LogLine(TypedDict):
+    """One line of the log. `delta` is what it changed on the card; the sum of all deltas is `used_after`.
+
+    ops: context, alloc, cache (freed into the process's cache), free (let go of: still on the card), leak, returned (free again),
+    oom (refused: delta 0), died (noticed: delta 0).
+    """
+
+    seq: int
+    t: float  # monotonic seconds
+    pid: int
+    start: int
+    name: str
+    op: str
+    label: str
+    bytes: int
+    delta: int
+    process_bytes: int  # this process's bytes on the card afterwards
+    used_after: int
+    capacity: int
+
+
+class ProcessFile(_Frozen):
+    """Bytes of one process. `start_ticks` 0: known by pid only."""
+
+    pid: Annotated[int, Field(gt=0)]
+    start_ticks: Annotated[int, Field(ge=0)] = 0
+    name: Annotated[str, Field(max_length=NAME_MAX_CHARS)] = ""
+    context_bytes: ByteSize = 0
+    allocated_bytes: ByteSize = 0
+    cached_bytes: ByteSize = 0
+    leaked_bytes: ByteSize = 0
+    returning: tuple[Returning, ...] = ()
+    died_at_s: float | None = None  # when its death was first noticed
+    last: dict[str, Any] | None = None  # its newest LogLine
+
+    @property
+    def key(self) -> ProcessKey:
+        return ProcessKey(self.pid, self.start_ticks)
+
+    @property
+    def own_bytes(self) -> int:
+        """What a driver lists for the process."""
+        return self.context_bytes + self.allocated_bytes + self.cached_bytes + self.leaked_bytes
+
+    @property
+    def on_card_bytes(self) -> int:
+        """What the device total counts for it: also what is on its way back."""
+        return self.own_bytes + sum(part.bytes for part in self.returning)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One atomic piece of I/O: replace (or, without `text`, remove) the file `name`, then append `line` to the log."""
+
+    name: str
+    text: str | None
+    line: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """A card as of one reading. Transitions return the next one."""
+
+    config: CardConfig
+    processes: Mapping[str, ProcessFile]
+    seq: int = 0
+
+    @property
+    def used_bytes(self) -> int:
+        return sum(process.on_card_bytes for process in self.processes.values())
+
+    @property
+    def free_bytes(self) -> int:
+        return max(0, self.config.capacity_bytes - self.used_bytes)
+
+    def process(self, key: ProcessKey) -> ProcessFile | None:
+        return self.processes.get(file_name(key))
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What a transition did: the next card, the steps that make it so on disk, and the refusal, if it was one."""
+
+    card: Card
+    steps: tuple[Step, ...] = ()
+    error: SimulatedOutOfMemory | None = None
+
+    def then(self, transition: Callable[[Card], "Change"]) -> "Change":
+        """Chain another transition, unless this one was refused."""
+        if self.error is not None:
+            return self
+        after = transition(self.card)
+        return replace(after, steps=self.steps + after.steps)
+
+
+def file_name(key: ProcessKey) -> str:
+    """Name of the file that a process writes for itself."""
+    return f"{key.pid}-{key.start_ticks}.json"
+
+
+def is_process_file(name: str) -> bool:
+    """Whether a file of the folder is a process's account (temporary files are not)."""
+    return name.endswith(".json") and name != CARD_FILE
+
+
+# -- texts -----------------------------------------------------------------------------------------------------------
+def parse_config(text: str | bytes) -> CardConfig:
+    """Read `gpu.json`. Raises ConfigError."""
+    try:
+        return CardConfig.model_validate_json(text)
+    except ValidationError as error:
+        raise ConfigError(
+            f"{CARD_FILE} of a simulated card is wrong: {_first(error)}", hint="correct it"
+        ) from None
+
+
+def dump_config(config: CardConfig) -> str:
+    """Text of `gpu.json`, made to be edited."""
+    return config.model_dump_json(indent=2) + "\n"
+
+
+def read_card(texts: Mapping[str, str], log_tail: str) -> Change:
+    """A card from the texts of its files and the end of its log. The steps mend what a killed process left unfinished.
+
+    Raises ConfigError for a file that is not what it should be.
+    """
+    if CARD_FILE not in texts:
+        raise ConfigError(
+            f"the folder of a simulated card has no {CARD_FILE}",
+            hint="start the arbiter with --gpu fake:8GiB",
+        )
+    processes = {}
+    for name in sorted(texts):
+        if is_process_file(name):
+            try:
+                processes[name] = ProcessFile.model_validate_json(texts[name])
+            except ValidationError as error:
+                hint = "remove it if no process owns it"
+                raise ConfigError(
+                    f"{name} of a simulated card is wrong: {_first(error)}", hint=hint
+                ) from None
+    logged = _last_seq(log_tail)
+    missing = [
+        p.last for p in processes.values() if p.last is not None and int(p.last.get("seq", 0)) > logged
+    ]
+    torn = bool(log_tail) and not log_tail.endswith("\n")
+    steps: tuple[Step, ...] = ()
+    if torn or missing:
+        missing.sort(key=lambda line: int(line["seq"]))
+        lines = "".join(_dump(line) for line in missing)
+        steps = (Step("", None, ("\n" if torn else "") + lines),)
+    seq = max([logged, *(int(line["seq"]) for line in missing)])
+    return Change(Card(parse_config(texts[CARD_FILE]), processes, seq), steps)
+
+
+def _last_seq(log_tail: str) -> int:
+    for line in reversed(log_tail.split("\n")[:-1]):  # what follows the last newline is torn
+        try:
+            return int(json.loads(line)["seq"])
+        except (ValueError, TypeError, KeyError):
+            continue  # torn once, and ended since
+    return 0
+
+
+def _dump(line: Mapping[str, Any]) -> str:
+    return json.dumps(line, separators=(",", ":")) + "\n"
+
+
+def _first(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    return f"{'.'.join(str(part) for part in problem['loc']) or 'the text'}: {problem['msg']}"
+
+
+def parse_stat(text: str) -> tuple[bool, int]:
+    """(alive, start_ticks) of the text of /proc/PID/stat. A zombie is dead: the kernel has taken its memory already."""
+    fields = text.rpartition(")")[2].split()
+    return fields[0] not in "ZXx", int(fields[19])
+
+
+# -- transitions -----------------------------------------------------------------------------------------------------
+def settle(card: Card, now: float, alive: Alive) -> Change:
+    """Let time pass: notice deaths, and let what is due come back."""
+    change = Change(card)
+    for name, process in card.processes.items():
+        if process.died_at_s is None and not alive(process.key):
+            process = process.model_copy(update={"died_at_s": now})
+            change = change.then(_step(name, process, now, "died", process.on_card_bytes, 0))
+        if process.died_at_s is not None and now >= process.died_at_s + card.config.release_lag_s:
+            change = change.then(_return(name, process, now, process.on_card_bytes, {
+                "context_bytes": 0, "allocated_bytes": 0, "cached_bytes": 0, "leaked_bytes": 0, "returning": (),
+            })).then(_remove(name))  # fmt: skip
+            continue
+        due = sum(part.bytes for part in process.returning if part.due_s <= now)
+        if due:
+            rest = tuple(part for part in process.returning if part.due_s > now)
+            change = change.then(_return(name, process, now, due, {"returning": rest}))
+    return change
+
+
+def touch(card: Card, key: ProcessKey, name: str, context_bytes: int, now: float) -> Change:
+    """The first use of the card by a process puts its context there; later ones change nothing."""
+    process = card.process(key) or ProcessFile(pid=key.pid, start_ticks=key.start_ticks, name=name)
+    if process.context_bytes or not context_bytes:
+        return Change(card)
+    grown = process.model_copy(update={"context_bytes": context_bytes})
+    return _grow(card, process, grown, now, "context", "context", context_bytes, context_bytes)
+
+
+def allocate(card: Card, key: ProcessKey, name: str, label: str, size: int, now: float) -> Change:
+    """Put `size` bytes on the card for a process, from its own cache first. Refused with `error` if they do not fit."""
+    process = card.process(key) or ProcessFile(pid=key.pid, start_ticks=key.start_ticks, name=name)
+    cached = min(process.cached_bytes, size)
+    grown = process.model_copy(
+        update={
+            "allocated_bytes": process.allocated_bytes + size,
+            "cached_bytes": process.cached_bytes - cached,
+        }
+    )
+    return _grow(card, process, grown, now, "alloc", label, size, size - cached)
+
+
+def free(card: Card, key: ProcessKey, label: str, size: int, now: float) -> Change:
+    """A block goes back to its process's cache; nobody else gets anything. Raises ValueError for more than is allocated."""
+    process = card.process(key)
+    if process is None or process.allocated_bytes < size:
+        raise ValueError(f"process {key} frees {size} bytes that it has not")
+    after = process.model_copy(
+        update={
+            "allocated_bytes": process.allocated_bytes - size,
+            "cached_bytes": process.cached_bytes + size,
+        }
+    )
+    return _step(file_name(key), after, now, "cache", size, 0, label)(card)
+
+
+def empty_cache(card: Card, key: ProcessKey, now: float) -> Change:
+    """A process gives its cache back to the card, where it is free `release_lag_s` later, less what leaks."""
+    process = card.process(key)
+    if process is None or not process.cached_bytes:
+        return Change(card)
+    leak = min(process.cached_bytes, max(0, card.config.faults.leak_bytes - process.leaked_bytes))
+    freed = process.cached_bytes - leak
+    change, name = Change(card), file_name(key)
+    process = process.model_copy(update={"cached_bytes": freed, "leaked_bytes": process.leaked_bytes + leak})
+    if leak:
+        change = change.then(_step(name, process, now, "leak", leak, 0))
+    process = process.model_copy(update={"cached_bytes": 0, "returning": _later(process, freed, card, now)})
+    return change.then(_step(name, process, now, "free", freed, 0))
+
+
+def leave(card: Card, key: ProcessKey, now: float) -> Change:
+    """A process destroys its context and everything with it, as at an orderly exit."""
+    process = card.process(key)
+    if process is None or not process.own_bytes:
+        return Change(card)
+    freed = process.own_bytes
+    after = process.model_copy(update={
+        "context_bytes": 0, "allocated_bytes": 0, "cached_bytes": 0, "leaked_bytes": 0,
+        "returning": _later(process, freed, card, now),
+    })  # fmt: skip
+    return _step(file_name(key), after, now, "free", freed, 0)(card)
+
+
+def _later(process: ProcessFile, size: int, card: Card, now: float) -> tuple[Returning, ...]:
+    if not size:
+        return process.returning
+    return (*process.returning, Returning(bytes=size, due_s=now + card.config.release_lag_s))
+
+
+def _grow(
+    card: Card,
+    before: ProcessFile,
+    after: ProcessFile,
+    now: float,
+    op: str,
+    label: str,
+    size: int,
+    delta: int,
+) -> Change:
+    name = file_name(before.key)
+    if delta <= card.config.capacity_bytes - card.used_bytes:
+        return _step(name, after, now, op, size, delta, label)(card)
+    refused = _step(name, before, now, "oom", size, 0, label)(card)
+    return replace(refused, error=_out_of_memory(card, before, size))
+
+
+def _out_of_memory(card: Card, process: ProcessFile, size: int) -> SimulatedOutOfMemory:
+    others = "".join(
+        f" Process {other.pid} ({other.name or '?'}) has {format_bytes(other.on_card_bytes)} in use."
+        for other in card.processes.values()
+        if other.key != process.key and other.on_card_bytes
+    )
+    config = card.config
+    return SimulatedOutOfMemory(
+        f"CUDA out of memory (simulated). Tried to allocate {format_bytes(size)}. GPU {config.index} has a total capacity of "
+        f"{format_bytes(config.capacity_bytes)} of which {format_bytes(card.free_bytes)} is free. "
+        f"This process has {format_bytes(process.own_bytes)} in use.{others}",
+        details={
+            "requested_bytes": size,
+            "free_bytes": card.free_bytes,
+            "capacity_bytes": config.capacity_bytes,
+            "allocated_bytes": process.own_bytes,
+        },
+    )
+
+
+def _step(
+    name: str, process: ProcessFile, now: float, op: str, size: int, delta: int, label: str = ""
+) -> Callable[[Card], Change]:
+    def transition(card: Card) -> Change:
+        line: LogLine = {
+            "seq": card.seq + 1, "t": now, "pid": process.pid, "start": process.start_ticks, "name": process.name, "op": op,
+            "label": label, "bytes": size, "delta": delta, "process_bytes": process.on_card_bytes,
+            "used_after": card.used_bytes + delta, "capacity": card.config.capacity_bytes,
+        }  # fmt: skip
+        written = process.model_copy(update={"last": dict(line)})
+        after = Card(card.config, {**card.processes, name: written}, card.seq + 1)
+        return Change(after, (Step(name, written.model_dump_json(exclude_defaults=True), _dump(line)),))
+
+    return transition
+
+
+def _return(
+    name: str, process: ProcessFile, now: float, size: int, update: Mapping[str, object]
+) -> Callable[[Card], Change]:
+    return _step(name, process.model_copy(update=update), now, "returned", size, -size)
+
+
+def _remove(name: str) -> Callable[[Card], Change]:
+    def transition(card: Card) -> Change:
+        processes = {other: process for other, process in card.processes.items() if other != name}
+        return Change(replace(card, processes=processes), (Step(name, None),))
+
+    return transition
+
+
+# -- making one ------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class FolderPlan:
+    """How to bring a folder to hold a card: files to write (by name), process files to remove, whether the log starts anew."""
+
+    write: Mapping[str, str] = field(default_factory=dict)
+    remove: tuple[str, ...] = ()
+    fresh_log: bool = False
+
+
+def plan_folder(wanted: CardConfig, existing: str | None, process_files: Iterable[str]) -> FolderPlan:
+    """Make a card, or keep the one that is there: a restarted daemon must find what living processes still hold.
+
+    Process files of an earlier boot are void. Raises ConfigError if the card is in use with another capacity.
+    """
+    processes = tuple(process_files)
+    if existing is None:
+        return FolderPlan({CARD_FILE: dump_config(wanted)}, processes, fresh_log=True)
+    current = parse_config(existing)
+    if current.boot_id != wanted.boot_id:
+        return FolderPlan(
+            {CARD_FILE: dump_config(wanted.model_copy(update={"uuid": current.uuid}))},
+            processes,
+            fresh_log=True,
+        )
+    if current.capacity_bytes == wanted.capacity_bytes:
+        return FolderPlan()
+    if processes:
+        raise ConfigError(
+            f"a simulated card of {format_bytes(current.capacity_bytes)} is in use here, not one of "
+            f"{format_bytes(wanted.capacity_bytes)}",
+            hint="stop the processes that use it, or choose another runtime folder",
+        )
+    return FolderPlan(
+        {CARD_FILE: dump_config(wanted.model_copy(update={"uuid": current.uuid}))}, fresh_log=True
+    )

@@ -1,0 +1,108 @@
+"""The runner's wire: goals, frames and state, on one ZeroMQ ROUTER socket.
+
+Request {"op": …, "id": n, …} → reply {"re": n, "ok": true, …} | {"re": n, "ok": false, "error": {…}}.
+A goal's progress comes as pushes to whoever sent it: {"push": "feedback", …} and exactly one {"push": "result", …} per accepted goal.
+"""
+
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+
+from schemas.wire import Name, Seconds
+
+
+class _Call(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    id: Annotated[int, Field(ge=0, lt=1 << 53)]
+    traceparent: Annotated[str, Field(max_length=64)] | None = None
+
+
+class SendGoal(_Call):
+    """Execute a skill. One goal at a time; a second is refused with `goal_rejected`. `deadline_s` 0 takes the manifest's."""
+
+    op: Literal["goal"]
+    goal_id: Name
+    rskill_id: Name
+    revision: str = ""
+    prompt: Annotated[str, Field(max_length=2000)] = ""
+    goal_params: dict[str, Any] = Field(default_factory=dict)
+    deadline_s: Seconds = 0.0
+
+
+class CancelGoal(_Call):
+    op: Literal["cancel"]
+    goal_id: Name
+
+
+class GetResult(_Call):
+    """The result of a goal that ended (the last 64 are kept): for a client that reconnected."""
+
+    op: Literal["result"]
+    goal_id: Name
+
+
+class GetFrame(_Call):
+    """Latest frame of a camera, no older than `max_age_ms`, else `frame_stale`. "" takes the runner's first camera."""
+
+    op: Literal["frame"]
+    camera: str = ""
+    max_age_ms: Annotated[float, Field(gt=0, le=60_000)] = 500.0
+
+
+class GetState(_Call):
+    op: Literal["state"]
+
+
+class GetSkills(_Call):
+    op: Literal["skills"]
+
+
+class GetGroundTruth(_Call):
+    """Simulator only: what is really there. For judges, never for planners."""
+
+    op: Literal["ground_truth"]
+
+
+class PingRunner(_Call):
+    op: Literal["ping"]
+
+
+class ShutdownRunner(_Call):
+    op: Literal["shutdown"]
+
+
+RunnerRequest = Annotated[
+    SendGoal | CancelGoal | GetResult | GetFrame | GetState | GetSkills | GetGroundTruth | PingRunner | ShutdownRunner,
+    Field(discriminator="op"),
+]
+RUNNER_REQUEST: TypeAdapter[RunnerRequest] = TypeAdapter(RunnerRequest)
+
+
+class FrameReply(TypedDict):
+    camera: str
+    encoding: Literal["jpeg", "png"]
+    data: bytes
+    width: int
+    height: int
+    stamp_monotonic_ns: int
+    age_ms: float
+    camera_model: NotRequired[dict[str, Any]]  # schemas.world.CameraModel: K, T_base_camera, support_plane_z
+
+
+class FeedbackPush(TypedDict):
+    push: Literal["feedback"]
+    goal_id: str
+    progress: float  # 0..1
+    state: str  # e.g. "acquiring", "running"
+    tick_idx: int
+    detail: str
+
+
+class ResultPush(TypedDict):
+    push: Literal["result"]
+    goal_id: str
+    status: Literal["succeeded", "failed", "canceled", "deadline"]
+    success: bool
+    code: str  # "" or a code of schemas.errors
+    message: str
+    data: dict[str, Any]

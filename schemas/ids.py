@@ -1,0 +1,69 @@
+"""Identifiers that the whole product shares.
+
+Standard library only: this is the one schema module that the sans-IO core may import besides `schemas.defaults`.
+"""
+
+from dataclasses import dataclass
+from typing import NewType, Self
+
+LeaseId = NewType("LeaseId", str)
+"""Names one lease for ever, e.g. `L3-17` (epoch 3, serial 17)."""
+
+GpuId = NewType("GpuId", str)
+"""UUID of a card as its driver reports it, e.g. `GPU-5b6c…`."""
+
+ClientId = NewType("ClientId", str)
+"""Names one connection to the arbiter (the hex of its ZeroMQ routing id)."""
+
+UseId = NewType("UseId", str)
+"""Names one busy interval on a lease; chosen by whoever begins it."""
+
+RequestId = NewType("RequestId", int)
+"""Counts the requests of one connection; replies repeat it."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Token:
+    """Fencing token. Strictly increasing over all grants, also across restarts of the daemon.
+
+    `epoch` counts starts of the daemon, `serial` counts grants within an epoch.
+    """
+
+    epoch: int
+    serial: int
+
+    def __str__(self) -> str:
+        return f"{self.epoch}.{self.serial}"
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read `epoch.serial`. Raises ValueError on anything else."""
+        epoch, dot, serial = text.partition(".")
+        if not dot or not epoch.isdecimal() or not serial.isdecimal():
+            raise ValueError(f"a token is written EPOCH.SERIAL, not {text!r}")
+        return cls(int(epoch), int(serial))
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class ProcessKey:
+    """One process for ever: a pid alone is reused, a pid with its start time is not.
+
+    `start_ticks` is field 22 of /proc/PID/stat (clock ticks since boot).
+    """
+
+    pid: int
+    start_ticks: int
+
+    def __str__(self) -> str:
+        return f"{self.pid}@{self.start_ticks}"
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class ModelKey:
+    """What a lease is for: the same key can be reused without a reload."""
+
+    model_id: str
+    revision: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.model_id}@{self.revision}" if self.revision else self.model_id

@@ -1,0 +1,19 @@
+"""rSkill manifests: the field's `rskill.yaml` files, read unchanged and checked field by field."""
+
+from schemas.manifest.load import load_manifest, parse_manifest
+from schemas.manifest.manifest import RSkillManifest
+from schemas.manifest.problems import ManifestError, Problem
+from schemas.manifest.vocabulary import Kind, License, ModelFamily, Role, SkillAction
+
+__all__ = [
+    "Kind",
+    "License",
+    "ManifestError",
+    "ModelFamily",
+    "Problem",
+    "RSkillManifest",
+    "Role",
+    "SkillAction",
+    "load_manifest",
+    "parse_manifest",
+]

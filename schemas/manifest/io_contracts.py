@@ -1,0 +1,247 @@
+"""What goes into and comes out of a policy: its processors, pictures, state vector and action vector."""
+
+import math
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from schemas.control import CARTESIAN_MODES, GRIPPER_MODES, JOINT_MODES, ControlMode
+from schemas.manifest.contracts import Block, Finite, PositiveInt
+from schemas.manifest.problems import Problem, raise_if
+from schemas.manifest.vocabulary import JOINT_SPACE_LAYOUTS, TASK_SPACE_LAYOUTS, ActionRepresentation
+
+FileUri = Annotated[
+    str,
+    Field(
+        pattern=r"^(?:hf://[A-Za-z0-9][A-Za-z0-9._-]*/[A-Za-z0-9._-]+(?:@[A-Za-z0-9._-]+)?|local://[A-Za-z0-9._-]+)"
+        r"/[A-Za-z0-9._/-]+\.[A-Za-z0-9]+$"
+    ),
+]
+
+
+class Processors(Block):
+    """The two files that turn observations into a policy's input and its output into actions."""
+
+    preprocessor_uri: Annotated[
+        FileUri, Field(description="a file: hf://OWNER/REPO[@REV]/FILE.EXT or local://FOLDER/FILE.EXT")
+    ]
+    postprocessor_uri: Annotated[
+        FileUri, Field(description="a file: hf://OWNER/REPO[@REV]/FILE.EXT or local://FOLDER/FILE.EXT")
+    ]
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Self:
+        if self.preprocessor_uri == self.postprocessor_uri:
+            raise_if([Problem(("postprocessor_uri",), "must be another file than preprocessor_uri")])
+        return self
+
+
+class ImagePreprocessing(Block):
+    """What was done to the pictures in training. `aliases` maps the robot's camera names to the policy's."""
+
+    flip_180: bool = False
+    flip_vertical: bool = False
+    input_template: str = "observation.images.{cam}"
+    aliases: dict[str, str] = Field(default_factory=dict)
+    norm_tag: str | None = None
+    image_max_crops: Annotated[int, Field(ge=1)] | None = None
+    resize_width: PositiveInt | None = None
+    resize_height: PositiveInt | None = None
+
+    @model_validator(mode="after")
+    def _pair(self) -> Self:
+        if (self.resize_width is None) != (self.resize_height is None):
+            missing = "resize_width" if self.resize_width is None else "resize_height"
+            raise_if([Problem((missing,), "is required: width and height are given together")])
+        return self
+
+
+class StateBindings(Block):
+    """Where the parts of a task-space state vector come from on this robot."""
+
+    eef_frame: str | None = None
+    base_frame: str | None = None
+    world_frame: str | None = "map"
+    gripper_qpos_joints: tuple[str, ...] = ()
+    quaternion_convention: Literal["xyzw", "wxyz"] = "xyzw"
+
+
+class StateContract(Block):
+    """The proprioception that the checkpoint was trained on: a named layout, a width, and bindings for task-space layouts."""
+
+    layout: (
+        Annotated[
+            str, Field(pattern=r"^[a-z0-9][a-z0-9_]*$", description="the name of a layout, e.g. 'rc365'")
+        ]
+        | None
+    ) = None
+    dim: PositiveInt | None = None
+    bindings: StateBindings | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        needed = TASK_SPACE_LAYOUTS.get(self.layout or "", ())
+        problems = []
+        if self.bindings is None:
+            if needed:
+                problems.append(
+                    Problem(
+                        ("bindings",), f"is required for layout {self.layout!r}, with {' and '.join(needed)}"
+                    )
+                )
+        elif needed:
+            for field in needed:
+                if not getattr(self.bindings, field):
+                    problems.append(Problem(("bindings", field), f"is required for layout {self.layout!r}"))
+        elif self.layout is None or self.layout in JOINT_SPACE_LAYOUTS:
+            problems.append(
+                Problem(
+                    ("bindings",), f"is not allowed for layout {self.layout!r}: joint values need no source"
+                )
+            )
+        raise_if(problems)
+        return self
+
+
+_SLOT_RULES: tuple[tuple[frozenset[ControlMode], str, str, str], ...] = (
+    # modes                                     ee   frame joint_names     R required, F forbidden, - free
+    (JOINT_MODES, "F", "F", "-"),
+    (CARTESIAN_MODES, "R", "R", "F"),
+    (GRIPPER_MODES, "R", "F", "F"),
+    (frozenset({ControlMode.BODY_TWIST}), "F", "R", "F"),
+    (frozenset({ControlMode.COMPOSITE_MODE}), "F", "F", "F"),
+)
+
+
+class ActionSlot(Block):
+    """A slice of the action vector, both ends inclusive, and where it goes; `discard` drops it."""
+
+    range: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
+    control_mode: ControlMode | None = None
+    discard: bool = False
+    ee: str | None = None
+    frame: str | None = None
+    joint_names: tuple[str, ...] = ()
+    input_bounds: tuple[Finite, Finite] | None = None
+
+    @property
+    def width(self) -> int:
+        """Number of values in the slice."""
+        return self.range[1] - self.range[0] + 1
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        problems = []
+        if self.width < 1:
+            problems.append(
+                Problem(("range",), f"must be [first, last] with last ≥ first, not {list(self.range)}")
+            )
+        if self.discard:
+            problems += [
+                Problem((field,), "is not allowed in a discarded slot")
+                for field in ("control_mode", "ee", "frame", "joint_names", "input_bounds")
+                if getattr(self, field)
+            ]
+        elif self.control_mode is None:
+            problems.append(Problem(("control_mode",), "is required unless the slot is discarded"))
+        else:
+            problems += self._check_mode(self.control_mode)
+        if self.input_bounds is not None and not self.input_bounds[0] < self.input_bounds[1]:
+            problems.append(Problem(("input_bounds",), "must be [low, high] with high > low"))
+        raise_if(problems)
+        return self
+
+    def _check_mode(self, mode: ControlMode) -> list[Problem]:
+        problems = []
+        for modes, *rules in _SLOT_RULES:
+            if mode not in modes:
+                continue
+            for field, rule in zip(("ee", "frame", "joint_names"), rules, strict=True):
+                given = bool(getattr(self, field))
+                if (rule == "R" and not given) or (rule == "F" and given):
+                    verb = "is required for" if rule == "R" else "is not allowed for"
+                    problems.append(Problem((field,), f"{verb} {mode.value!r}"))
+        if self.joint_names and len(self.joint_names) != self.width and not problems:
+            problems.append(
+                Problem(
+                    ("joint_names",),
+                    f"has {len(self.joint_names)} names for {self.width} values of the action vector",
+                )
+            )
+        if mode is ControlMode.COMPOSITE_MODE and self.width != 1:
+            problems.append(Problem(("range",), f"must cover one value for {mode.value!r}, not {self.width}"))
+        return problems
+
+
+_DIM_MAX = 4096  # far above any robot; keeps the check of the cover cheap
+
+_DELTA_WIDTH = {
+    ActionRepresentation.DELTA_EE_6D: 6,
+    ActionRepresentation.DELTA_EE_6D_PLUS_GRIPPER: 6,
+    ActionRepresentation.DELTA_EE_3D_PLUS_GRIPPER: 3,
+}
+
+
+class ActionContract(Block):
+    """The action vector of the checkpoint. With `slots`, each of its `dim` values lies in exactly one slot."""
+
+    dim: Annotated[int, Field(gt=0, le=_DIM_MAX)]
+    representation: ActionRepresentation | None = None
+    slots: Annotated[tuple[ActionSlot, ...], Field(min_length=1)] | None = None
+    cartesian_delta_scale: tuple[Annotated[float, Field(gt=0)], ...] | None = None
+    joint_units: Literal["degrees", "radians"] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        raise_if([*self._check_cover(), *self._check_scale()])
+        return self
+
+    def _check_cover(self) -> list[Problem]:
+        if self.slots is None:
+            return []
+        problems = []
+        owner: dict[int, int] = {}
+        for index, slot in enumerate(self.slots):
+            first, last = slot.range
+            if last >= self.dim:
+                problems.append(
+                    Problem(("slots", index, "range"), f"ends at {last}, beyond the {self.dim} values of dim")
+                )
+            for value in range(first, min(last, self.dim - 1) + 1):
+                if value in owner:
+                    problems.append(
+                        Problem(
+                            ("slots", index, "range"),
+                            f"covers value {value}, which slots[{owner[value]}] covers already",
+                        )
+                    )
+                    break
+                owner[value] = index
+        missing = [value for value in range(self.dim) if value not in owner]
+        if missing and not problems:
+            problems.append(
+                Problem(
+                    ("slots",),
+                    f"must cover every value of dim; not covered: {missing}. Discard what is unused",
+                )
+            )
+        return problems
+
+    def _check_scale(self) -> list[Problem]:
+        scale = self.cartesian_delta_scale
+        if scale is None:
+            return []
+        slots = self.slots or ()
+        widths = [slot.width for slot in slots if slot.control_mode is ControlMode.CARTESIAN_DELTA]
+        if not slots and self.representation in _DELTA_WIDTH:
+            widths = [_DELTA_WIDTH[self.representation]]
+        if not all(math.isfinite(value) for value in scale):
+            return [Problem(("cartesian_delta_scale",), "must be finite")]
+        if not widths or set(widths) != {len(scale)}:
+            return [
+                Problem(
+                    ("cartesian_delta_scale",),
+                    f"has {len(scale)} values; the cartesian_delta slots have {widths or 'none'}",
+                )
+            ]
+        return []

@@ -1,0 +1,167 @@
+"""The tools that a reasoner may call, as frozen values discriminated by `tool`.
+
+Only the shapes: what a call does, whether it is allowed and who serves it are the reasoner's business. The same classes give
+the function schemas that are offered to a language model, so that what is offered and what is accepted cannot drift apart.
+"""
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
+
+from schemas.errors import BadRequest, UnknownOp
+
+Text = Annotated[str, Field(max_length=4096)]
+
+
+class _Tool(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+    rationale: Annotated[
+        Text,
+        Field(
+            validation_alias=AliasChoices("rationale", "rational"),
+            description="One sentence: why this call, now.",
+        ),
+    ] = ""
+
+
+class ExecuteRskill(_Tool):
+    """Run an installed skill on the robot and wait for its result. The only tool that moves anything."""
+
+    tool: Literal["execute_rskill"] = "execute_rskill"
+    rskill_id: Annotated[
+        str, Field(min_length=1, max_length=256, description="Name of the skill, OWNER/REPOSITORY.")
+    ]
+    prompt: Annotated[Text, Field(description="What the skill is to do, in words.")] = ""
+    goal_params_json: Annotated[
+        Text, Field(description="JSON object with the skill's structured parameters; empty for none.")
+    ] = ""
+    deadline_s: Annotated[
+        float,
+        Field(
+            ge=0, allow_inf_nan=False, description="Seconds until it is cancelled; 0: as the manifest says."
+        ),
+    ] = 0.0
+    patience_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    progress_tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+
+    @field_validator("goal_params_json")
+    @classmethod
+    def _is_json_object(cls, text: str) -> str:
+        if text:
+            try:
+                value = json.loads(text)
+            except ValueError as error:
+                raise ValueError(f"must be empty or a JSON object: {error}") from error
+            if not isinstance(value, dict):
+                raise ValueError("must be empty or a JSON object")
+        return text
+
+    @property
+    def goal_params(self) -> dict[str, Any]:
+        """The structured parameters as a dict; empty if none were given."""
+        params: dict[str, Any] = json.loads(self.goal_params_json) if self.goal_params_json else {}
+        return params
+
+
+class LocateInView(_Tool):
+    """Look for an object in a camera's present picture. Moves nothing."""
+
+    tool: Literal["locate_in_view"] = "locate_in_view"
+    query: Annotated[Text, Field(min_length=1, description="The object, in words, e.g. `red cube`.")]
+    camera: Annotated[
+        str, Field(max_length=128, description="Name of the camera; empty: the default one.")
+    ] = ""
+    detector: Annotated[
+        str, Field(max_length=256, description="Name of the detector; empty: the default one.")
+    ] = ""
+
+
+class QueryScene(_Tool):
+    """Ask a question about a camera's present picture and get a sentence back. Moves nothing."""
+
+    tool: Literal["query_scene"] = "query_scene"
+    question: Annotated[Text, Field(min_length=1, description="A question that the picture can answer.")]
+    camera: Annotated[
+        str, Field(max_length=128, description="Name of the camera; empty: the default one.")
+    ] = ""
+
+
+class LifecycleTransition(_Tool):
+    """Configure, activate, deactivate or clean up a component that the reasoner is allowed to manage."""
+
+    tool: Literal["lifecycle_transition"] = "lifecycle_transition"
+    node: Annotated[str, Field(min_length=1, max_length=256, description="Name of the component.")]
+    transition: Literal["configure", "activate", "deactivate", "cleanup"]
+
+
+class EmitPrompt(_Tool):
+    """Say something to another component or to the operator. Moves nothing."""
+
+    tool: Literal["emit_prompt"] = "emit_prompt"
+    target_topic: Annotated[
+        str, Field(pattern=r"^/\S+$", max_length=256, description="Where to, starting with `/`.")
+    ]
+    text: Annotated[Text, Field(min_length=1)]
+    metadata_json: Text = ""
+
+
+ToolCall = ExecuteRskill | LocateInView | QueryScene | LifecycleTransition | EmitPrompt
+
+TOOLS: dict[str, type[ToolCall]] = {
+    "execute_rskill": ExecuteRskill,
+    "locate_in_view": LocateInView,
+    "query_scene": QueryScene,
+    "lifecycle_transition": LifecycleTransition,
+    "emit_prompt": EmitPrompt,
+}
+
+TOOL_CALL: TypeAdapter[ToolCall] = TypeAdapter(Annotated[ToolCall, Field(discriminator="tool")])
+
+
+def parse_tool_call(name: str, arguments: str | Mapping[str, Any]) -> ToolCall:
+    """Read a call as language models make it: the function's name and its arguments, a JSON text or a mapping.
+
+    Raises UnknownOp for a tool that does not exist and BadRequest, field by field, for wrong arguments.
+    """
+    if name not in TOOLS:
+        raise UnknownOp(
+            f"there is no tool {name!r}", hint=f"choose from {', '.join(TOOLS)}", details={"known": [*TOOLS]}
+        )
+    if isinstance(arguments, str):
+        try:
+            arguments = json.loads(arguments or "{}")
+        except ValueError as error:
+            raise BadRequest(f"{name}: the arguments are not JSON: {error}") from error
+    if not isinstance(arguments, Mapping):
+        raise BadRequest(f"{name}: the arguments are not a JSON object")
+    try:
+        return TOOL_CALL.validate_python({**arguments, "tool": name})
+    except ValidationError as error:
+        fields = [
+            {"path": ".".join(map(str, item["loc"][1:])) or name, "problem": item["msg"]}
+            for item in error.errors(include_url=False, include_input=False)
+        ]
+        text = "; ".join(f"{field['path']}: {field['problem']}" for field in fields)
+        raise BadRequest(f"{name}: {text}", details={"fields": fields}) from error
+
+
+def function_schema(tool: type[ToolCall]) -> dict[str, Any]:
+    """The OpenAI-style function description of a tool: `{"type": "function", "function": {name, description, parameters}}`."""
+    parameters = tool.model_json_schema(by_alias=False)
+    name = parameters["properties"].pop("tool")["const"]
+    description = " ".join(parameters.pop("description").split())
+    parameters.pop("title", None)
+    for field in parameters["properties"].values():
+        field.pop("title", None)
+    return {
+        "type": "function",
+        "function": {"name": name, "description": description, "parameters": parameters},
+    }
+
+
+def function_schemas(names: Iterable[str] | None = None) -> list[dict[str, Any]]:
+    """Function descriptions of the named tools, or of all. Raises KeyError for a name that is no tool."""
+    return [function_schema(TOOLS[name]) for name in (TOOLS if names is None else names)]

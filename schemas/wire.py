@@ -1,0 +1,319 @@
+"""The arbiter's wire: one msgpack map per frame over ZeroMQ ROUTER/DEALER.
+
+Request   {"op": …, "id": n, …fields, "traceparent"?}            client → arbiter
+Reply     {"re": n, "epoch": e, "ok": true, …}                   arbiter → client
+          {"re": n, "epoch": e, "ok": false, "error": {"code", "message", "hint", "details"}}
+Push      {"push": "revoke" | "granted" | "denied" | "lost" | "event", "seq": n, "epoch": e, …}
+
+Requests are validated here (frozen, unknown keys refused). Replies and pushes are plain maps: the shapes are the TypedDicts below,
+because dumping a model costs more than the whole codec. New fields always have defaults; a type never changes.
+
+The life of a lease on the wire: `acquire` → reply `loading` (granted at once) or `queued`, then push `granted` → `ready` →
+`use_begin`/`use_end`… → push `revoke` → `revoke_ack` → `unloading` → `release`. `renew` keeps all leases of a connection alive.
+"""
+
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+
+from schemas import defaults as d
+
+Name = Annotated[str, Field(min_length=1, max_length=d.NAME_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]+$")]
+LeaseIdText = Annotated[str, Field(min_length=1, max_length=64)]
+TokenPair = Annotated[tuple[int, int], Field(description="[epoch, serial]")]
+Seconds = Annotated[float, Field(ge=0, le=86_400 * 365, allow_inf_nan=False)]
+Bytes = Annotated[int, Field(ge=0, le=1 << 50)]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Footprint(_Frozen):
+    """Bytes that a model puts on a GPU: at the worst moment of loading, when resident, and after unloading while its process lives."""
+
+    load_peak_bytes: Bytes
+    steady_bytes: Bytes
+    residue_bytes: Bytes = d.RESIDUE_BYTES
+
+
+class LeaseSpec(_Frozen):
+    """What a lease is to be. `evictable=False` pins it: nobody makes it leave."""
+
+    consumer: Name
+    model_id: Name
+    revision: Annotated[str, Field(max_length=d.NAME_MAX_CHARS)] = ""
+    gpu: Name = "any"  # uuid, index or `any`
+    mode: Literal["exclusive", "shared"] = "shared"
+    footprint: Footprint
+    priority: Annotated[int, Field(ge=0, le=d.PRIORITY_MAX)] = d.PRIORITY
+    evictable: bool = True
+    ttl_s: Annotated[float, Field(ge=0.5, le=3600)] = d.LEASE_TTL_S
+    min_residency_s: Seconds = d.MIN_RESIDENCY_S
+    on_deadline: Literal["wait", "deny"] = "wait"  # what a waiter gets when a holder outstays the ladder's deadline
+
+
+class _Request(_Frozen):
+    id: Annotated[int, Field(ge=0, lt=1 << 53)]
+    traceparent: Annotated[str, Field(max_length=64)] | None = None
+
+
+class Hello(_Request):
+    """First message of a connection. `instance` names the client object, to find its leases again after a reconnect."""
+
+    op: Literal["hello"]
+    version: int = d.WIRE_VERSION
+    name: Name
+    instance: Name
+    role: Literal["client", "observer", "operator"] = "client"
+
+
+class Acquire(_Request):
+    """Ask for a lease. The same `nonce` from the same process is the same request: a repeat never makes a second lease."""
+
+    op: Literal["acquire"]
+    nonce: Name
+    spec: LeaseSpec
+    wait_timeout_s: Seconds | None = None  # None waits for ever
+
+
+class _OnLease(_Request):
+    lease_id: LeaseIdText
+    token: TokenPair
+
+
+class Ready(_OnLease):
+    """The model is loaded; `measured_bytes` is what the holder sees of its own allocation (None: it cannot tell)."""
+
+    op: Literal["ready"]
+    measured_bytes: Bytes | None = None
+
+
+class UseBegin(_OnLease):
+    """Begin a use. Any client that knows the token may; the use ends with that client's process at the latest."""
+
+    op: Literal["use_begin"]
+    use_id: Name
+    label: Annotated[str, Field(max_length=d.NAME_MAX_CHARS)] = ""
+
+
+class UseEnd(_OnLease):
+    op: Literal["use_end"]
+    use_id: Name
+
+
+class LeaseRef(_Frozen):
+    lease_id: LeaseIdText
+    token: TokenPair
+
+
+class Renew(_Request):
+    op: Literal["renew"]
+    leases: Annotated[tuple[LeaseRef, ...], Field(max_length=d.LEASES_PER_CLIENT_MAX)]
+
+
+class RevokeAck(_OnLease):
+    """The holder heard `revoke`; `safe_point_eta_s` is its guess of when it will be between uses."""
+
+    op: Literal["revoke_ack"]
+    safe_point_eta_s: Seconds | None = None
+
+
+class Unloading(_OnLease):
+    op: Literal["unloading"]
+
+
+class Release(_OnLease):
+    """The holder has let go of the bytes (its process lives on: residue) or is about to exit (`exiting`)."""
+
+    op: Literal["release"]
+    exiting: bool = False
+
+
+class Cancel(_Request):
+    """Give up a queued acquire."""
+
+    op: Literal["cancel"]
+    lease_id: LeaseIdText
+
+
+class ReattachLease(_Frozen):
+    lease_id: LeaseIdText
+    token: TokenPair
+    spec: LeaseSpec
+    state: Literal["loading", "held"]
+    measured_bytes: Bytes | None = None
+    use_ids: Annotated[tuple[Name, ...], Field(max_length=d.USES_PER_LEASE_MAX)] = ()
+
+
+class Reattach(_Request):
+    """After a reconnect: what this client still holds. The reply says per lease `kept` or why not."""
+
+    op: Literal["reattach"]
+    leases: Annotated[tuple[ReattachLease, ...], Field(max_length=d.LEASES_PER_CLIENT_MAX)]
+
+
+class Oom(_Request):
+    """The consumer's allocation failed. Raises the learnt footprint of its model."""
+
+    op: Literal["oom"]
+    lease_id: LeaseIdText
+    token: TokenPair
+    requested_bytes: Bytes
+    allocated_bytes: Bytes | None = None
+
+
+class Status(_Request):
+    op: Literal["status"]
+
+
+class Why(_Request):
+    op: Literal["why"]
+    consumer: Name
+
+
+class History(_Request):
+    op: Literal["history"]
+    after: int = 0  # sequence number of the last event already seen
+    limit: Annotated[int, Field(ge=1, le=5000)] = 500
+    kinds: tuple[str, ...] = ()
+
+
+class Subscribe(_Request):
+    """Receive every history event as a push `event` from now on."""
+
+    op: Literal["subscribe"]
+
+
+class Ping(_Request):
+    op: Literal["ping"]
+
+
+class Bye(_Request):
+    """The client closes its socket. Its leases are released; a process that lives on keeps its residue."""
+
+    op: Literal["bye"]
+
+
+Request = Annotated[
+    Hello | Acquire | Ready | UseBegin | UseEnd | Renew | RevokeAck | Unloading | Release | Cancel | Reattach | Oom
+    | Status | Why | History | Subscribe | Ping | Bye,
+    Field(discriminator="op"),
+]  # fmt: skip
+REQUEST: TypeAdapter[Request] = TypeAdapter(Request)
+OPS: tuple[str, ...] = (
+    "hello", "acquire", "ready", "use_begin", "use_end", "renew", "revoke_ack", "unloading", "release", "cancel",
+    "reattach", "oom", "status", "why", "history", "subscribe", "ping", "bye",
+)  # fmt: skip
+
+
+# -- shapes of replies and pushes ---------------------------------------------------------------------------------
+class LeaseView(TypedDict):
+    """A lease as replies, pushes and `status` show it."""
+
+    lease_id: str
+    token: list[int] | None  # None while queued
+    state: str
+    consumer: str
+    model: str
+    gpu: str | None
+    mode: str
+    priority: int
+    evictable: bool
+    charge_bytes: int
+    uses: int
+    pid: int
+    since_s: float  # seconds in this state
+    waited_s: NotRequired[float]
+    position: NotRequired[int]
+    ttl_left_s: NotRequired[float]
+
+
+class AcquireReply(TypedDict):
+    state: Literal["loading", "queued"]
+    lease: LeaseView
+
+
+class WelcomeReply(TypedDict):
+    version: int
+    boot_id: str
+    server: str
+    role: str
+    heartbeat_s: float
+    grace_s: float
+
+
+class RenewReply(TypedDict):
+    alive: list[str]
+    gone: list[dict[str, Any]]  # {"lease_id", "error": {...}}
+
+
+class RevokePush(TypedDict):
+    """Asked to leave. Sent again every `REVOKE_RESEND_S` until acknowledged; idempotent."""
+
+    push: Literal["revoke"]
+    lease_id: str
+    token: list[int]
+    reason: str
+    wanted_by: str
+    deadline_in_s: float
+
+
+class GrantedPush(TypedDict):
+    push: Literal["granted"]
+    lease: LeaseView
+
+
+class DeniedPush(TypedDict):
+    push: Literal["denied"]
+    lease_id: str
+    error: dict[str, Any]
+
+
+class LostPush(TypedDict):
+    """The lease is gone without the holder's doing (expired, fenced): unload and acquire again."""
+
+    push: Literal["lost"]
+    lease_id: str
+    token: list[int]
+    error: dict[str, Any]
+
+
+class EventPush(TypedDict):
+    """One history event, for subscribers."""
+
+    push: Literal["event"]
+    event: dict[str, Any]  # {"seq", "at_wall_s", "kind", "lease_id"?, …}
+
+
+class GpuView(TypedDict):
+    gpu: str
+    index: int
+    name: str
+    capacity_bytes: int
+    reserve_bytes: int
+    charged_bytes: int
+    stowaway_bytes: int
+    measured_used_bytes: int | None  # None: unknown, blocks grants
+    sample_age_s: float | None
+    pressure_bytes: int
+    blocked: str  # why nothing is granted now, "" if grants are possible
+    processes: list[dict[str, Any]]  # {"pid", "name", "used_bytes", "lease_ids", "residue_bytes", "stowaway"}
+
+
+class StatusReply(TypedDict):
+    epoch: int
+    phase: Literal["recovering", "serving"]
+    uptime_s: float
+    gpus: list[GpuView]
+    leases: list[LeaseView]  # live ones: held, loading, …, then the queue in order
+    clients: int
+
+
+class WhyReply(TypedDict):
+    """Answer to *why is CONSUMER not running*: one entry per live lease of that consumer."""
+
+    consumer: str
+    leases: list[dict[str, Any]]
+    # {"lease_id", "state", "needed_bytes", "free_bytes", "deficit_bytes", "condition", "blockers": [{"lease_id", "consumer",
+    #  "bytes", "state", "uses", "condition"}], "next": str, "eta_s": float | None, "eta_source": "learnt" | "none", "text": str}

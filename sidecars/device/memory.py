@@ -1,0 +1,106 @@
+"""The device memory that a model lives in, as the sidecar's host sees it: real, simulated, or none.
+
+Calls block and belong to the host's worker thread. Nothing here knows of leases.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """One allocation of `size_bytes`; hand it back to `free` exactly once."""
+
+    label: str
+    size_bytes: int
+    number: int
+
+
+class DeviceMemory(Protocol):
+    """Bytes on one card for this process.
+
+    `allocate` raises `schemas.errors.OutOfMemory` when the card is full, and nothing is allocated then. As in every caching
+    framework, `free` gives nothing back to the card: `empty_cache` does. The context that `touch` makes stays until the process
+    ends (or `close`). `used_bytes` is what this process has on the card, context and caches included; None if that cannot be told.
+    """
+
+    @property
+    def torch_device(self) -> str:
+        """Where the model's weights go: `cpu` or `cuda:N`."""
+        ...
+
+    def touch(self) -> None: ...
+
+    def allocate(self, label: str, size_bytes: int) -> Block: ...
+
+    def free(self, block: Block) -> None: ...
+
+    def empty_cache(self) -> None: ...
+
+    def used_bytes(self) -> int | None: ...
+
+    def throttle_bytes_per_s(self) -> int | None: ...
+
+    def close(self) -> None: ...
+
+
+class NoDevice:
+    """A process that puts nothing on any card: every allocation is free and nothing is measured."""
+
+    torch_device = "cpu"
+
+    def __init__(self) -> None:
+        self._number = 0
+
+    def touch(self) -> None:
+        pass
+
+    def allocate(self, label: str, size_bytes: int) -> Block:
+        self._number += 1
+        return Block(label, size_bytes, self._number)
+
+    def free(self, block: Block) -> None:
+        pass
+
+    def empty_cache(self) -> None:
+        pass
+
+    def used_bytes(self) -> int | None:
+        return None
+
+    def throttle_bytes_per_s(self) -> int | None:
+        return None
+
+    def close(self) -> None:
+        pass
+
+
+def fill(
+    memory: DeviceMemory,
+    label: str,
+    size_bytes: int,
+    *,
+    bytes_per_s: int | None,
+    wait: Callable[[float], bool],
+    piece_bytes: int = 128 * 1024 * 1024,
+) -> list[Block]:
+    """Allocate `size_bytes` piece by piece, as a loader does shard by shard, no faster than `bytes_per_s`.
+
+    `wait(seconds)` sleeps and says whether to stop early (the rest then stays unallocated). On OutOfMemory every piece is freed
+    before the error goes on.
+    """
+    blocks: list[Block] = []
+    left = size_bytes
+    try:
+        while left > 0:
+            piece = min(piece_bytes, left)
+            blocks.append(memory.allocate(label, piece))
+            left -= piece
+            if bytes_per_s and wait(piece / bytes_per_s):
+                break
+    except BaseException:
+        for block in blocks:
+            memory.free(block)
+        raise
+    return blocks

@@ -1,0 +1,129 @@
+"""The configuration: file and model say the same, and every mistake is named with its line."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from schemas import defaults
+from schemas.config import ArbiterConfig, load_config
+from schemas.errors import ConfigError
+from schemas.yamltext import parse_yaml
+
+EXAMPLE = Path(__file__).parents[2] / "configs" / "arbiter.yaml"
+
+
+def test_the_example_equals_the_defaults() -> None:
+    assert load_config(EXAMPLE.read_text(), "arbiter.yaml") == ArbiterConfig()
+
+
+def test_the_example_states_every_key() -> None:
+    stated = yaml.safe_load(EXAMPLE.read_text())
+    wanted = {
+        name: set(type(getattr(ArbiterConfig(), name)).model_fields) for name in ArbiterConfig.model_fields
+    }
+    assert {name: set(section) for name, section in stated.items()} == wanted
+
+
+def test_every_key_of_the_example_has_a_comment_with_its_default() -> None:
+    lines = EXAMPLE.read_text().splitlines()
+    for path, at in parse_yaml(EXAMPLE.read_text(), "arbiter.yaml").lines.items():
+        if len(path) != 2 or isinstance(path[1], int):
+            continue
+        comment = []
+        for line in reversed(lines[: at - 1]):
+            if not line.lstrip().startswith("#"):
+                break
+            comment.append(line)
+        assert "Default:" in " ".join(comment), f"{path} has no comment that states its default"
+
+
+def test_every_key_of_the_model_has_a_description() -> None:
+    for name in ArbiterConfig.model_fields:
+        section = type(getattr(ArbiterConfig(), name))
+        for key, field in section.model_fields.items():
+            assert field.description, f"{name}.{key} says nothing about itself"
+
+
+def test_the_defaults_are_the_products_constants() -> None:
+    config = ArbiterConfig()
+    assert config.gpu.reserve_bytes == defaults.RESERVE_BYTES
+    assert config.revoke.deadline_s == defaults.REVOKE_DEADLINE_S
+    assert config.verify.poll_s == defaults.VERIFY_POLL_S
+    assert config.verify.tolerance_bytes == defaults.VERIFY_TOLERANCE_BYTES
+    assert config.limits.rate_per_client_per_s == defaults.RATE_PER_CLIENT_PER_S
+    assert config.history.max_events == defaults.HISTORY_MAX_EVENTS
+
+
+def test_an_empty_file_is_the_default() -> None:
+    assert load_config("", "x.yaml") == ArbiterConfig()
+    assert load_config("verify:\n  # nothing here\n", "x.yaml") == ArbiterConfig()
+
+
+def test_sizes_are_read_as_people_write_them() -> None:
+    config = load_config("gpu:\n  reserve_bytes: 0.5GiB\n  capacity_bytes: {'0': 8GiB}\n", "x.yaml")
+    assert config.gpu.reserve_bytes == 2**29
+    assert config.gpu.capacity_bytes == {"0": 8 * 2**30}
+
+
+def problem(text: str) -> str:
+    with pytest.raises(ConfigError) as raised:
+        load_config(text, "arbiter.yaml")
+    assert raised.value.details["fields"]
+    return raised.value.message
+
+
+def test_a_mistyped_key_is_named_with_line_and_suggestion() -> None:
+    text = "# comment\nverify:\n  poll_s: [0.01]\n  tiemout_s: 3\n"
+    assert problem(text) == "arbiter.yaml:4: verify.tiemout_s: unknown key; did you mean timeout_s?"
+
+
+def test_a_mistyped_section_is_named() -> None:
+    assert problem("verfiy:\n  timeout_s: 1\n") == "arbiter.yaml:1: verfiy: unknown key; did you mean verify?"
+
+
+def test_a_key_that_resembles_nothing_lists_the_known_ones() -> None:
+    assert "known here: days, max_events" in problem("history:\n  zzz: 1\n")
+
+
+def test_every_mistake_of_a_file_is_reported() -> None:
+    text = "limits:\n  sessions_max: 0\nverify:\n  timeout_s: soon\n  tolerance_bytes: 12 parsecs\n"
+    lines = problem(text).splitlines()
+    assert [line.split(": ")[0] for line in lines] == ["arbiter.yaml:2", "arbiter.yaml:4", "arbiter.yaml:5"]
+    assert "not a size: '12 parsecs'" in lines[2]
+
+
+def test_a_wrong_list_item_is_named_by_its_place() -> None:
+    assert problem("verify:\n  poll_s:\n    - 0.1\n    - -2\n").startswith(
+        "arbiter.yaml:4: verify.poll_s[1]: "
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "words"),
+    [
+        ("gpu: [\n", 2, "not valid YAML"),
+        ("gpu: {}\ngpu: {}\n", 2, "key given twice; first in line 1"),
+        ("gpu: !!python/object/apply:os.getcwd []\n", 1, "not valid YAML"),
+        ("gpu:\n\treserve_bytes: 1\n", 2, "not valid YAML"),
+        ("- 1\n", 1, "valid dictionary"),
+        ("42", 1, "valid dictionary"),
+        ("wire:\n  endpoint: tcp://0.0.0.0:5555\n", 2, "without CURVE keys"),
+        ("wire:\n  endpoint: ipc://relative.sock\n", 2, "absolute path"),
+        ("wire:\n  endpoint: ipc:///" + "x" * 120 + "\n", 2, "Linux allows 107"),
+        ("wire:\n  endpoint: nonsense\n", 2, "is no endpoint"),
+        ("gpu:\n  source: cuda\n", 2, "pattern"),
+    ],
+)
+def test_bad_text_is_a_config_error_with_a_line(text: str, line: int, words: str) -> None:
+    message = problem(text)
+    assert message.startswith(f"arbiter.yaml:{line}: ")
+    assert words in message
+
+
+def test_aliases_that_multiply_end_in_an_error() -> None:
+    text = "a: &a [x, x, x, x, x, x, x, x, x, x]\n"
+    text += "".join(
+        f"{n}: &{n} [{', '.join([f'*{p}'] * 10)}]\n" for p, n in zip("abcdef", "bcdefg", strict=True)
+    )
+    assert "more than" in problem(text)

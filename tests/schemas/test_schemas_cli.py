@@ -1,0 +1,95 @@
+"""`python -m schemas` as people run it, and the exported JSON Schemas that must not drift from the models."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import schemas
+from schemas.__main__ import main
+from schemas.export import documents, modules, public_models
+
+SAMPLES = sorted((Path(__file__).parent / "manifests").glob("*.yaml"))
+EXPORTED = Path(schemas.__file__).parent / "json"
+
+
+def test_check_says_ok_for_good_files() -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "schemas", "check", *map(str, SAMPLES)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert result.stdout.splitlines() == [f"{path}: ok" for path in SAMPLES]
+
+
+def test_check_names_every_wrong_field_and_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrong = tmp_path / "rskill.yaml"
+    text = SAMPLES[0].read_text(encoding="utf-8")
+    wrong.write_text(text.replace("chunk_size: 1", "chunk_size: 0") + "colour: red\n", encoding="utf-8")
+    assert main(["check", str(tmp_path), str(SAMPLES[1])]) == 1
+    out, err = capsys.readouterr()
+    lines = out.splitlines()
+    assert [line.partition(": ")[2].partition(":")[0] for line in lines[:2]] == ["chunk_size", "colour"]
+    assert lines[0].startswith(f"{wrong}:")
+    assert lines[2] == f"{SAMPLES[1]}: ok"
+    assert err == "1 of 2 files are invalid\n"
+
+
+def test_check_of_a_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(tmp_path / "none.yaml")]) == 1
+    assert capsys.readouterr().out == f"{tmp_path / 'none.yaml'}: cannot be read: No such file or directory\n"
+
+
+def test_warnings_go_beside_the_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = next(path for path in SAMPLES if path.stem == "vlm").read_text(encoding="utf-8")
+    (tmp_path / "rskill.yaml").write_text(text.replace('role: "s2"', 'role: "s1"'), encoding="utf-8")
+    assert main(["check", str(tmp_path)]) == 0
+    out, err = capsys.readouterr()
+    assert out == f"{tmp_path / 'rskill.yaml'}: ok\n"
+    assert err.startswith("warning: ")
+    assert "role: " in err
+
+
+@pytest.mark.parametrize("arguments", [[], ["check"], ["export"], ["make"], ["export", "a", "b"]])
+def test_wrong_usage_ends_with_two(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+
+
+def test_export_writes_valid_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "new" / "schemas"
+    assert main(["export", str(folder)]) == 0
+    assert capsys.readouterr().out.splitlines() == [str(folder / name) for name in documents()]
+    rskill = json.loads((folder / "rskill.json").read_text(encoding="utf-8"))
+    assert rskill["required"] == [
+        "name", "version", "kind", "embodiment_tags", "chunk_size", "latency_budget", "description", "actions",
+    ]  # fmt: skip
+
+
+def test_export_into_a_file_fails_clearly(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    assert main(["export", str(tmp_path / "file")]) == 1
+    assert capsys.readouterr().err.startswith(f"cannot write to {tmp_path / 'file'}: ")
+
+
+def test_committed_schemas_are_those_of_the_models() -> None:
+    committed = {path.name: path.read_text(encoding="utf-8") for path in EXPORTED.glob("*.json")}
+    stale = sorted(
+        name for name in committed.keys() | documents().keys() if committed.get(name) != documents().get(name)
+    )
+    assert not stale, f"run `python -m schemas export schemas/json`; drifted: {', '.join(stale)}"
+
+
+@pytest.mark.parametrize("name", modules())
+def test_every_public_model_is_exported(name: str) -> None:
+    module = sys.modules.get(f"schemas.{name}") or __import__(f"schemas.{name}", fromlist=[name])
+    models = public_models(module)
+    if models:
+        assert {model.__name__ for model in models} <= set(json.loads(documents()[f"{name}.json"])["$defs"])

@@ -1,0 +1,187 @@
+"""World types: what is misshapen is refused, what is bytes survives JSON, geometry is right."""
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from schemas.control import ControlMode
+from schemas.world import (
+    PAYLOAD_OF_MODE,
+    Action,
+    CameraModel,
+    DetectedObject,
+    Detection,
+    FrameEncoding,
+    JointState,
+    Pose,
+    RunResult,
+    SensorFrame,
+    TickResult,
+    WorldState,
+)
+
+STAMPS = {"stamp_monotonic_ns": 1_000_000_000, "stamp_wall_ns": 2}
+SIZE = {"width": 2, "height": 1}
+
+
+def frame(**fields: Any) -> SensorFrame:
+    return SensorFrame(**({"sensor_id": "front", "encoding": "rgb8", **STAMPS, **SIZE} | fields))
+
+
+@given(st.binary(min_size=6, max_size=6))
+def test_frame_bytes_survive_json_and_python(data: bytes) -> None:
+    original = frame(data=data)
+    assert SensorFrame.model_validate_json(original.model_dump_json()) == original
+    assert SensorFrame.model_validate(json.loads(original.model_dump_json())) == original
+    assert SensorFrame.model_validate(original.model_dump()) == original
+    assert original.model_dump()["data"] == data
+
+
+@pytest.mark.parametrize(
+    "fields", [{"topic": "/front"}, {"handle": 7}, {"handle": "cuda:1", "data": b"", "topic": ""}]
+)
+def test_frame_may_point_elsewhere(fields: dict[str, Any]) -> None:
+    assert frame(**fields).data is None
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({}, "exactly one of data, topic and handle must be set, not none"),
+        ({"data": b"", "topic": ""}, "must be set, not none"),
+        ({"data": b"123456", "topic": "/x"}, "not data, topic"),
+        ({"data": b"12345"}, "rgb8 of 2 × 1 needs 6 bytes of data, not 5"),
+        ({"data": b"123456", "encoding": "depth16"}, "depth16 of 2 × 1 needs 4 bytes"),
+        ({"data": "not base64!"}, "must be standard base64"),
+        ({"data": b"123456", "width": 0}, "greater than 0"),
+        ({"data": b"123456", "colour": 1}, "Extra inputs"),
+    ],
+)
+def test_wrong_frame_is_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        frame(**fields)
+
+
+def test_compressed_frames_have_any_length() -> None:
+    assert frame(data=b"\xff\xd8", encoding=FrameEncoding.JPEG).data == b"\xff\xd8"
+
+
+def test_age_of_a_frame() -> None:
+    assert frame(topic="/x").age_s(1_250_000_000) == pytest.approx(0.25)
+
+
+def test_joint_state_lengths_agree() -> None:
+    state = JointState(name=("a", "b"), position=(0.0, 1.0), velocity=(0, 0), stamp_ns=1)
+    assert state.effort == ()
+    with pytest.raises(ValidationError, match="position has 1 values for 2 joints"):
+        JointState(name=("a", "b"), position=(0.0,), stamp_ns=1)
+    with pytest.raises(ValidationError, match="velocity has 1 values"):
+        JointState(name=("a", "b"), position=(0, 0), velocity=(0,), stamp_ns=1)
+    with pytest.raises(ValidationError, match="unique"):
+        JointState(name=("a", "a"), position=(0, 0), stamp_ns=1)
+    with pytest.raises(ValidationError, match="finite"):
+        JointState(name=("a",), position=(float("nan"),), stamp_ns=1)
+
+
+def test_world_state_round_trip_and_stale_components() -> None:
+    state = WorldState(
+        stamp_ns=5,
+        joint_state=JointState(name=("a",), position=(0.5,), stamp_ns=4),
+        base_pose=Pose(xyz=(1, 2, 0), frame_id="odom"),
+        base_twist=(0.1, 0, 0, 0, 0, 0.2),
+        image_frames={"front": frame(data=b"123456")},
+        detected_objects=(DetectedObject(label="cube", confidence=0.9, box=(0, 0, 5, 5)),),
+        diagnostics={"joints": "ok", "front": "stale", "base": "error"},
+    )
+    assert state.stale == ("base", "front")
+    assert WorldState.model_validate_json(state.model_dump_json()) == state
+
+
+def test_quaternion_must_have_length_one() -> None:
+    with pytest.raises(ValidationError, match="length 1"):
+        Pose(xyz=(0, 0, 0), quat_xyzw=(0, 0, 0, 2), frame_id="map")
+
+
+PAYLOADS: dict[str, Any] = {
+    "joint_targets": [[0.0, 1.0]],
+    "joint_velocities": [[0.0, 1.0]],
+    "joint_torques": [[0.0, 1.0]],
+    "cartesian_pose": [{"xyz": [0, 0, 0], "frame_id": "base"}],
+    "cartesian_delta": [[0, 0, 0.01, 0, 0, 0]],
+    "cartesian_twist": [[0, 0, 0.01, 0, 0, 0]],
+    "body_twist": [[0.1, 0, 0, 0, 0, 0]],
+    "foot_placements": [{"leg": "left"}],
+    "gripper": [0.5],
+    "dex_hand_joints": [[0.1] * 6],
+    "composite_mode": [-1.0],
+}
+
+
+@given(st.sampled_from(list(ControlMode)), st.sets(st.sampled_from(sorted(PAYLOADS))))
+def test_action_carries_exactly_the_payload_of_its_mode(mode: ControlMode, given_fields: set[str]) -> None:
+    fields = {"control_mode": mode, **{name: PAYLOADS[name] for name in given_fields}}
+    if given_fields == {PAYLOAD_OF_MODE[mode]}:
+        action = Action.model_validate(fields)
+        assert len(action.rows) == 1
+        assert Action.model_validate_json(action.model_dump_json()) == action
+    else:
+        with pytest.raises(ValidationError, match="is carried by"):
+            Action.model_validate(fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"horizon": 2}, "joint_targets has 1 rows, horizon says 2"),
+        ({"joint_targets": [[0, 1], [0]], "horizon": 2}, "different lengths"),
+        ({"joint_names": ["a"]}, "joint_names has 1 names for rows of 2"),
+        ({"joint_targets": [[float("inf"), 0]]}, "finite"),
+        ({"confidence": 1.5}, "less than or equal to 1"),
+    ],
+)
+def test_wrong_action_is_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        Action.model_validate({"control_mode": "joint_position", "joint_targets": [[0, 1]]} | fields)
+
+
+def test_wire_numbers_of_control_modes() -> None:
+    assert [mode.wire_number for mode in ControlMode] == list(range(13))
+    assert ControlMode.COMPOSITE_MODE.wire_number == 12
+
+
+def test_camera_puts_a_pixel_on_the_plane() -> None:
+    looking_down = CameraModel(
+        K=((100, 0, 50), (0, 100, 50), (0, 0, 1)),
+        T_base_camera=((1, 0, 0, 0.2), (0, -1, 0, 0.0), (0, 0, -1, 1.0), (0, 0, 0, 1)),
+    )
+    assert looking_down.ground_point(50, 50) == pytest.approx((0.2, 0.0, 0.0))
+    assert looking_down.ground_point(150, 50) == pytest.approx((1.2, 0.0, 0.0))
+    assert looking_down.model_copy(update={"support_plane_z": 2.0}).ground_point(50, 50) is None
+    level = looking_down.model_copy(
+        update={"T_base_camera": ((0, 0, 1, 0), (-1, 0, 0, 0), (0, -1, 0, 1), (0, 0, 0, 1))}
+    )
+    assert level.ground_point(50, 50) is None
+    assert level.ground_point(50, 150) == pytest.approx((1.0, 0.0, 0.0))
+
+
+def test_wrong_camera_is_refused() -> None:
+    unit = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
+    with pytest.raises(ValidationError, match="focal lengths"):
+        CameraModel(K=((0, 0, 0), (0, 0, 0), (0, 0, 1)), T_base_camera=unit)
+    with pytest.raises(ValidationError, match="last row"):
+        CameraModel(K=((1, 0, 0), (0, 1, 0), (0, 0, 1)), T_base_camera=(*unit[:3], (0, 0, 0, 2)))
+
+
+def test_detection_box_is_ordered() -> None:
+    assert Detection(label="cube", confidence=1, box=(0, 2, 4, 6)).center == (2, 4)
+    with pytest.raises(ValidationError, match="x_max > x_min"):
+        Detection(label="cube", confidence=1, box=(4, 2, 0, 6))
+
+
+def test_results_have_plain_defaults() -> None:
+    assert TickResult(stamp_ns=1, tick_idx=0, tick_ms=1.5).action_applied
+    assert RunResult(n_ticks=3).success is None
