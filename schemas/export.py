@@ -14,7 +14,10 @@ from pydantic import BaseModel, TypeAdapter
 
 import schemas
 
-ROOTS: dict[str, str] = {"rskill": "schemas.manifest:RSkillManifest"}
+ROOTS: dict[str, str] = {
+    "rskill": "schemas.manifest:RSkillManifest",
+    "arbiter": "schemas.config:ArbiterConfig",
+}
 """Documents with a single root: name → `module:class`."""
 
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"

@@ -46,6 +46,7 @@ class GetFrame(_Call):
 
     op: Literal["frame"]
     camera: str = ""
+    encoding: Literal["jpeg", "png"] = "jpeg"  # models want png: jpeg's artefacts cost them accuracy
     max_age_ms: Annotated[float, Field(gt=0, le=60_000)] = 500.0
 
 

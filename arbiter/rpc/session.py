@@ -13,6 +13,7 @@ from arbiter.core import events as ev
 from arbiter.rpc import codec
 from arbiter.rpc.peer import Peer, Role, identify, is_operator
 from schemas import wire as w
+from schemas.defaults import WIRE_VERSION
 from schemas.errors import BadState, LimitExceeded, NotPermitted, UnknownSession, VersionMismatch, VramError
 from schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
 
@@ -235,16 +236,16 @@ class SessionTable:
         )
 
     def _check_version(self, hello: w.Hello) -> None:
-        if hello.version != w.d.WIRE_VERSION:
+        if hello.version != WIRE_VERSION:
             raise VersionMismatch(
-                f"the arbiter speaks version {w.d.WIRE_VERSION} of the wire, the client {hello.version}",
+                f"the arbiter speaks version {WIRE_VERSION} of the wire, the client {hello.version}",
                 hint="install the same version of the client and of the arbiter",
-                details={"server": w.d.WIRE_VERSION, "client": hello.version},
+                details={"server": WIRE_VERSION, "client": hello.version},
             )
 
     def _welcome(self, session: Session, hello: w.Hello) -> None:
         welcome: w.WelcomeReply = {
-            "version": w.d.WIRE_VERSION,
+            "version": WIRE_VERSION,
             "boot_id": self._settings.boot_id,
             "server": self._settings.server,
             "role": session.role,

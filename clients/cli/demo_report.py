@@ -45,7 +45,9 @@ def read_log(text: str, names: Mapping[int, str]) -> CardStory:
             entry = json.loads(line)
         except ValueError:
             continue
-        points.append(Point(entry["t"], names.get(entry["pid"], f"pid {entry['pid']}"), entry["process_bytes"]))
+        points.append(
+            Point(entry["t"], names.get(entry["pid"], f"pid {entry['pid']}"), entry["process_bytes"])
+        )
         peak = max(peak, entry["used_after"])
         if entry["op"] == "oom":
             refused.append(entry["t"])
@@ -53,7 +55,10 @@ def read_log(text: str, names: Mapping[int, str]) -> CardStory:
 
 
 def read_samples(
-    samples: Sequence[tuple[float, Mapping[str, Any]]], names: Mapping[int, str], events: Iterable[Mapping[str, Any]], wall_offset_s: float
+    samples: Sequence[tuple[float, Mapping[str, Any]]],
+    names: Mapping[int, str],
+    events: Iterable[Mapping[str, Any]],
+    wall_offset_s: float,
 ) -> CardStory:
     """The same for a real card, from `status` readings of the arbiter: (monotonic seconds, GpuView)."""
     points: list[Point] = []
@@ -61,7 +66,8 @@ def read_samples(
     for at_s, gpu in samples:
         peak = max(peak, gpu["measured_used_bytes"] or 0)
         points += [
-            Point(at_s, names.get(process["pid"], f"pid {process['pid']}"), process["used_bytes"] or 0) for process in gpu["processes"]
+            Point(at_s, names.get(process["pid"], f"pid {process['pid']}"), process["used_bytes"] or 0)
+            for process in gpu["processes"]
         ]
     refused = tuple(event["at_wall_s"] - wall_offset_s for event in events if event["kind"] == "oom")
     return CardStory(tuple(points), peak, refused)
@@ -105,7 +111,14 @@ def summarise(
 
 
 def draw_timeline(
-    path: Path, story: CardStory, capacity_bytes: int, events: Sequence[Mapping[str, Any]], *, start_s: float, wall_offset_s: float, title: str
+    path: Path,
+    story: CardStory,
+    capacity_bytes: int,
+    events: Sequence[Mapping[str, Any]],
+    *,
+    start_s: float,
+    wall_offset_s: float,
+    title: str,
 ) -> None:
     """Stacked bytes per program over seconds since the start; capacity as a line; evictions and refusals marked."""
     import matplotlib
@@ -127,16 +140,30 @@ def draw_timeline(
         at_s = event["at_wall_s"] - wall_offset_s - start_s
         if event["kind"] == "revoke_asked":
             axes.axvline(at_s, color="#333333", linestyle=":", linewidth=1)
-            axes.annotate(f"evict {event.get('consumer', '')}", (at_s, capacity_bytes / GIB * 1.08), rotation=30, fontsize=8)
+            axes.annotate(
+                f"evict {event.get('consumer', '')}",
+                (at_s, capacity_bytes / GIB * 1.08),
+                rotation=30,
+                fontsize=8,
+            )
     for at_s in story.refused_at_s:
-        axes.plot([at_s - start_s], [capacity_bytes / GIB], marker="x", color="#d00000", markersize=11, markeredgewidth=3)
+        axes.plot(
+            [at_s - start_s],
+            [capacity_bytes / GIB],
+            marker="x",
+            color="#d00000",
+            markersize=11,
+            markeredgewidth=3,
+        )
     axes.set(xlabel="seconds", ylabel="GiB on the card", ylim=(0, capacity_bytes / GIB * 1.25), title=title)
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
 
-def _stacks(points: Sequence[Point], names: Sequence[str], start_s: float) -> tuple[list[float], list[list[float]]]:
+def _stacks(
+    points: Sequence[Point], names: Sequence[str], start_s: float
+) -> tuple[list[float], list[list[float]]]:
     held = dict.fromkeys(names, 0)
     times: list[float] = []
     stacks: list[list[float]] = [[] for _ in names]

@@ -78,8 +78,8 @@ class SceneConfig(BaseModel):
                 width_px=480,
                 height_px=360,
                 fovy_deg=43.0,
-                pos_m=(-0.08, 0.12, 0.60),
-                look_at_m=(0.486, 0.023, 0.20),
+                pos_m=(-0.08, 0.20, 0.60),
+                look_at_m=(0.467, 0.053, 0.20),
             ),
             "wrist": CameraSpec(
                 parent="gripper",

@@ -68,7 +68,7 @@ def build_model(layout: Layout, config: SceneConfig) -> Any:
     spec.visual.headlight.specular = [0.0] * 3
     _add_world(spec, layout, config, mujoco)
     base = _add_base(spec, config, mujoco)
-    arm = _arm_spec(mujoco)
+    arm = arm_spec(mujoco)
     mount = base.add_frame(pos=list(config.mount_in_base_m))
     spec.attach(arm, frame=mount, prefix=ARM_PREFIX)
     for item in layout.objects:
@@ -173,7 +173,7 @@ def _add_base(spec: Any, config: SceneConfig, mujoco: Any) -> Any:
     return base
 
 
-def _arm_spec(mujoco: Any) -> Any:
+def arm_spec(mujoco: Any) -> Any:
     """The wheel's arm without its meshes, clothed in primitives; fingers are boxes that grasp well."""
     arm = mujoco.MjSpec.from_file(str(arm_mjcf_path()))
     for geom in list(arm.geoms):

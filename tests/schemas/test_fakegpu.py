@@ -1,4 +1,4 @@
-"""The simulated card as pure transitions: bytes never exceed the capacity, nothing is lost, and a kill at any instant leaves a readable card."""
+"""The simulated card as pure transitions: never over capacity, nothing lost, and a kill at any instant leaves it readable."""
 
 import json
 

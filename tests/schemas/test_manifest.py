@@ -1,5 +1,4 @@
 """Manifests: valid ones of every kind load, wrong ones say where and why, whatever the file looks like."""
-# ruff: noqa: E501 -- one case a line reads better than wrapped ones
 
 from pathlib import Path
 

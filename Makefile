@@ -1,0 +1,54 @@
+# Every target sets up what it needs first; see .ci/setup. `make` alone says what there is.
+
+SEED ?= 0
+ARBITER ?= on
+GPU ?= fake:8GiB
+OUT ?= out/demo
+ARGS ?=
+
+BIN := .venv/bin
+CORE := .venv-core/bin
+# Two workers: more only make the tests of timing fight for the cores of a small machine.
+WORKERS ?= 2
+
+.DEFAULT_GOAL := help
+.PHONY: help setup setup-core demo test test-core lint format bench schemas clean
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' Makefile
+
+setup: ## environment with everything (.venv)
+	@bash .ci/setup full
+
+setup-core: ## environment of the base install (.venv-core)
+	@bash .ci/setup core
+
+demo: setup ## find, navigate, grab in 8 GiB: SEED=0 ARBITER=on|off GPU=fake:8GiB|nvml OUT=out/demo
+	$(BIN)/vramctl demo --seed $(SEED) --arbiter $(ARBITER) --gpu $(GPU) --out $(OUT) $(ARGS)
+
+test: setup ## the whole product; ARGS goes to pytest
+	$(BIN)/pytest -q -n $(WORKERS) --dist loadfile -m "not e2e" $(ARGS)
+	$(BIN)/pytest -q -m e2e $(ARGS)
+
+test-core: setup-core ## the base install alone, in seconds
+	$(CORE)/pytest -q -n $(WORKERS) --dist loadfile -m "not heavy and not e2e and not gpu" $(ARGS)
+
+lint: setup ## style, types and who may import whom
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: setup ## rewrite the code in the project's style
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: setup ## measure grants and handovers against bare ZeroMQ
+	$(BIN)/python -m pytest -q -s tests/bench $(ARGS)
+
+schemas: setup ## write the JSON Schemas anew after a model changed
+	$(BIN)/python -m schemas export schemas/json
+
+clean: ## remove environments, caches and outputs
+	rm -rf .venv .venv-core build dist out .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

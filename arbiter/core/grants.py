@@ -1,0 +1,153 @@
+"""Who gets a card next: one pass over the cards that changed.
+
+Per card, in this order (the numbers stand in `_serve`):
+  1. under pressure: ask idle holders to leave, grant nothing
+  2. nobody waits: done
+  3. blocked (recovering, reading unknown, a load under way): grant nothing, ask nobody
+  4. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading
+  5. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out already
+  6. backfill: the first waiter behind the head that fits, evicts nobody and cannot delay the head
+"""
+
+from collections.abc import Mapping
+
+from arbiter.core import eviction, explain, policy
+from arbiter.core.lease import Lease, LeaseState
+from arbiter.core.measure import note_pressure
+from arbiter.core.state import Core, Gpu
+from schemas.ids import LeaseId
+
+
+def schedule(core: Core) -> None:
+    """Serve every card that changed. A grant on one card may free a waiter's place on another, so until nothing is dirty."""
+    pending = True
+    while pending:
+        pending = False
+        for gpu in core.gpus.values():
+            if gpu.dirty:
+                gpu.dirty = False
+                pending = True
+                _serve(core, gpu)
+
+
+def _serve(core: Core, gpu: Gpu) -> None:
+    note_pressure(core, gpu)
+    gpu.blocked = policy.blocked(core, gpu)
+    if gpu.pressed and core.recovering is None:  # 1
+        _relieve(core, gpu)
+        return
+    head = gpu.queue.head()
+    if head is None or gpu.blocked:  # 2, 3
+        return
+    if policy.fits(gpu, head):  # 4
+        _grant_if_measured(core, gpu, head)
+        return
+    leaving = policy.leaving(gpu)
+    if not policy.fits(gpu, head, leaving):  # 5
+        if _ask_victims(core, gpu, head, leaving):
+            leaving = policy.leaving(gpu)
+    else:
+        head.reason = "room is being made"
+    _backfill(core, gpu, head, leaving)  # 6
+
+
+def _relieve(core: Core, gpu: Gpu) -> None:
+    leaving = policy.leaving(gpu)
+    over = gpu.ledger.total_if(leaving) - gpu.ledger.budget_bytes
+    if over <= 0:
+        return
+    for victim in policy.choose_relief(core, gpu, leaving, over):
+        eviction.ask(core, gpu, victim, None, "the card holds more than its budget")
+    policy.wake_when_evictable(core, gpu, None)
+
+
+def _grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> bool:
+    room = policy.measured_room_bytes(core, gpu)
+    need = policy.measured_need_bytes(gpu, lease)
+    if room is None or (room < need and policy.sample_is_behind(gpu)):
+        lease.reason = "waits for a fresh reading of the card"
+        core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
+        return False
+    if room < need:
+        lease.reason = "the ledger has room, the card does not: measured memory is not free yet"
+        gpu.blocked = lease.reason
+        return False
+    grant(core, gpu, lease)
+    return True
+
+
+def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int]) -> bool:
+    if head.planned_gpu is not None and head.planned_gpu != gpu.info.id and core.gpus[head.planned_gpu].evictions:
+        return False  # another card is being emptied for it
+    plan = policy.choose_victims(core, gpu, head, leaving)
+    if plan is None:
+        head.reason = "nobody who could make room may be asked now"
+        policy.wake_when_evictable(core, gpu, head)
+        return False
+    if len(head.gpus) > 1 and not policy.is_best_place(core, gpu, head, plan):
+        return False
+    head.planned_gpu = gpu.info.id
+    head.reason = "room is being made"
+    for victim in plan:
+        eviction.ask(core, gpu, victim, head, f"{head.spec.consumer} needs the room")
+    return True
+
+
+def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int]) -> None:
+    if len(gpu.queue) < 2 or head.spec.exclusive:
+        return
+    if any(True for _ in gpu.in_state(LeaseState.UNLOADING, LeaseState.VERIFYING)):
+        return  # the head's room is about to come; a load now would only be in its way
+    spare = policy.spare_beside_bytes(core, gpu, head, leaving)
+    if gpu.queue.smallest_need_bytes() > spare + policy.largest_fold_bytes(gpu):
+        return
+    for lease in gpu.queue.behind_head():
+        if policy.added_bytes(gpu, lease) <= spare and policy.fits(gpu, lease):
+            _grant_if_measured(core, gpu, lease)
+            return
+
+
+def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
+    """Give the lease its card and its token. The record goes to the journal before the holder hears of it."""
+    core.dequeue(lease)
+    token = core.next_token()
+    lease.token = token
+    lease.gpu = gpu.info.id
+    lease.move(LeaseState.LOADING, core.now, "granted")
+    lease.granted_at = core.now
+    lease.reason = ""
+    gpu.residents[lease.id] = lease
+    gpu.ledger.charge(lease.id, lease.process, lease.load_peak_bytes, lease.load_peak_bytes, core.now)
+    gpu.changed_at = core.now
+    core.granted.append((token, gpu.info.id))
+    _collect_evictions(core, gpu, lease)
+    lease.expires_at = core.now + lease.spec.ttl_s
+    core.timers.set(("ttl", lease.id), lease.expires_at)
+    core.record_lease(lease)
+    if lease.answered:
+        core.push(lease, {"push": "granted", "lease": explain.view(core, lease)})
+        lease.request = None
+    else:
+        assert lease.request is not None, f"{lease.id} was never asked for"
+        core.reply(lease.client, lease.request, {"state": "loading", "lease": explain.view(core, lease)})
+        lease.answered = True
+    core.note(
+        "granted",
+        lease,
+        charge_bytes=lease.load_peak_bytes,
+        waited_ms=(core.now - lease.arrived_at) * 1e3,
+        evicted=[e.consumer for e in lease.evicted],
+        reason="fits after " + ", ".join(e.consumer for e in lease.evicted) + " left" if lease.evicted else "fits",
+    )
+    gpu.blocked = policy.blocked(core, gpu)
+
+
+def _collect_evictions(core: Core, gpu: Gpu, lease: Lease) -> None:
+    """Who left for this lease, or for a waiter that has gone since; the rest stays on the card's list."""
+    mine = [
+        e
+        for e in gpu.evictions
+        if e.wanted_by == lease.id or (e.verdict and (e.wanted_by is None or e.wanted_by not in core.waiting))
+    ]
+    lease.evicted = [e for e in mine if e.verdict]
+    gpu.evictions = [e for e in gpu.evictions if e not in mine]

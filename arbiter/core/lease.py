@@ -1,0 +1,156 @@
+"""One lease: its states, the one table of legal moves, and its story.
+
+Knows nothing of bytes on a card (`ledger`), of order (`queue`) or of clients beyond their ids.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from types import MappingProxyType
+
+from arbiter.core.events import Spec
+from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
+
+
+class LeaseState(StrEnum):
+    """Where a lease is. The words are those of the wire."""
+
+    QUEUED = "queued"
+    LOADING = "loading"
+    HELD = "held"
+    REVOKING = "revoking"
+    UNLOADING = "unloading"
+    VERIFYING = "verifying"
+    RELEASED = "released"
+    EXPIRED = "expired"
+    LOST = "lost"
+    DENIED = "denied"
+    CANCELLED = "cancelled"
+
+
+_S = LeaseState
+_GONE = {_S.EXPIRED, _S.LOST}
+
+TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
+    {
+        _S.QUEUED: frozenset({_S.LOADING, _S.DENIED, _S.CANCELLED}),
+        # denied from loading: the grant could not be journalled, so it was never sent
+        _S.LOADING: frozenset({_S.HELD, _S.VERIFYING, _S.DENIED, *_GONE}),
+        _S.HELD: frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING, *_GONE}),
+        _S.REVOKING: frozenset({_S.UNLOADING, _S.VERIFYING, *_GONE}),
+        _S.UNLOADING: frozenset({_S.VERIFYING, *_GONE}),
+        _S.VERIFYING: frozenset({_S.RELEASED}),
+        _S.RELEASED: frozenset(),
+        _S.EXPIRED: frozenset(),
+        _S.LOST: frozenset(),
+        _S.DENIED: frozenset(),
+        _S.CANCELLED: frozenset(),
+    }
+)
+"""State → states that may follow. Everything else is illegal."""
+
+TERMINAL = frozenset(state for state, following in TRANSITIONS.items() if not following)
+RESIDENT = frozenset({_S.LOADING, _S.HELD, _S.REVOKING, _S.UNLOADING, _S.VERIFYING})
+"""States in which the lease has a card and is charged there."""
+LEAVING = frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING})
+EXPIRING = frozenset({_S.LOADING, _S.HELD, _S.REVOKING, _S.UNLOADING})
+"""States that a holder must renew."""
+
+
+class IllegalTransition(Exception):
+    """A move that the table forbids. The lease is unchanged; the message carries its story."""
+
+    def __init__(self, lease: "Lease", to: LeaseState) -> None:
+        super().__init__(f"{lease.id}: {lease.state} → {to} is not legal; story: {lease.told()}")
+        self.lease_id = lease.id
+
+
+@dataclass(frozen=True, slots=True)
+class Use:
+    """A busy interval. It ends with the client that marked it at the latest."""
+
+    id: UseId
+    client: ClientId
+    process: ProcessKey
+    label: str
+    began_at: float
+
+
+@dataclass(slots=True)
+class Eviction:
+    """One holder's way out, from the first `revoke` to the verdict. Times are monotonic seconds."""
+
+    lease: LeaseId
+    consumer: str
+    charge_bytes: int
+    wanted_by: LeaseId | None  # None: nobody waits, the card is under pressure
+    wanted_consumer: str
+    reason: str
+    asked_at: float
+    next_push_at: float
+    acked_at: float | None = None
+    safe_point_eta_s: float | None = None
+    reminded: bool = False
+    overdue: bool = False  # the ladder's deadline has passed
+    unloading_at: float | None = None
+    released_at: float | None = None
+    verdict_at: float | None = None
+    verdict: str = ""
+
+
+@dataclass(slots=True)
+class Lease:
+    """A live lease. `load_peak_bytes` is the spec's, raised by what was learnt; the spec itself is never changed."""
+
+    id: LeaseId
+    nonce: str
+    spec: Spec
+    process: ProcessKey
+    client: ClientId
+    arrived_at: float
+    arrival: int  # strictly increasing, breaks ties
+    load_peak_bytes: int
+    steady_bytes: int
+    gpus: tuple[GpuId, ...]  # where it may be placed
+    state: LeaseState = LeaseState.QUEUED
+    since: float = 0.0
+    token: Token | None = None
+    gpu: GpuId | None = None
+    measured_bytes: int | None = None
+    uses: dict[tuple[ProcessKey, UseId], Use] = field(default_factory=dict)
+    granted_at: float = 0.0
+    ready_at: float = 0.0
+    last_used_at: float = 0.0
+    expires_at: float = 0.0
+    wait_timeout_s: float | None = None
+    request: RequestId | None = None  # the acquire that is not answered yet, or was answered `loading`
+    answered: bool = False
+    exiting: bool = False
+    attached: bool = True  # False after a restart until its holder has come back
+    traceparent: str | None = None
+    reason: str = ""  # why it waits, in words; for people
+    planned_gpu: GpuId | None = None  # a card where somebody was asked to leave for it
+    eviction: Eviction | None = None
+    evicted: list[Eviction] = field(default_factory=list)  # who left for it
+    story: list[tuple[float, LeaseState, str]] = field(default_factory=list)  # as long as the table's longest path
+
+    def move(self, to: LeaseState, now: float, why: str) -> None:
+        """Go to another state. Raises IllegalTransition, and then nothing has changed."""
+        if to not in TRANSITIONS[self.state]:
+            raise IllegalTransition(self, to)
+        self.state = to
+        self.since = now
+        self.story.append((now, to, why))
+
+    def told(self) -> str:
+        """The story in one line."""
+        return "; ".join(f"{at:.3f} {state} ({why})" for at, state, why in self.story) or "new"
+
+    def priority_at(self, now: float, ageing_s_per_point: float) -> int:
+        """Priority with one point for every `ageing_s_per_point` waited."""
+        return self.spec.priority + int(max(0.0, now - self.arrived_at) / ageing_s_per_point)
+
+    @property
+    def residue_bytes(self) -> int:
+        """What its process is expected to keep after unloading."""
+        return 0 if self.exiting else self.spec.residue_bytes

@@ -1,0 +1,274 @@
+"""The bytes of one card: who is charged what, what processes keep, what strangers hold.
+
+Ledger and measurement are two gates. Booked bytes are what was granted; evidence (per-process readings) is only added on
+top where somebody holds more than was booked. Knows nothing of states, order or time beyond `now`.
+
+One process shares one context among its leases, so an account counts max(its charges together, its residue): a residue is
+folded into the next lease of the same process and never charged twice.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from arbiter.core.events import MemorySampled
+from arbiter.core.settings import GpuInfo
+from schemas.ids import LeaseId, ProcessKey
+
+NOTHING: Mapping[LeaseId, int] = {}
+
+
+@dataclass(slots=True)
+class Charge:
+    """`approved_bytes` fitted when they were granted; what lies above came later, by the holder's own word (pressure)."""
+
+    booked_bytes: int
+    approved_bytes: int
+    debt: bool = False  # its lease is over, its bytes are not measured gone
+
+
+@dataclass(slots=True)
+class Account:
+    """One process on one card."""
+
+    process: ProcessKey
+    changed_at: float
+    charges: dict[LeaseId, Charge] = field(default_factory=dict)
+    residue_bytes: int = 0
+    residue_floor_bytes: int = 0  # declared; a larger residue was measured and may shrink down to this
+    measured_bytes: int = 0  # evidence newer than the last change; 0: none
+
+    def booked_bytes(self) -> int:
+        return max(sum(charge.booked_bytes for charge in self.charges.values()), self.residue_bytes)
+
+    def approved_bytes(self) -> int:
+        return max(sum(charge.approved_bytes for charge in self.charges.values()), self.residue_bytes)
+
+
+@dataclass(frozen=True, slots=True)
+class Stranger:
+    """A stowaway: a process that holds bytes and has no account."""
+
+    process: ProcessKey
+    name: str
+    used_bytes: int
+
+
+class GpuLedger:
+    """All bytes of one card. Every method that changes something takes `now`."""
+
+    def __init__(self, info: GpuInfo, tolerance_bytes: int) -> None:
+        self._tolerance_bytes = tolerance_bytes
+        self.info = info
+        self.budget_bytes = info.capacity_bytes - info.reserve_bytes
+        self.accounts: dict[ProcessKey, Account] = {}
+        self.strangers: dict[ProcessKey, Stranger] = {}
+        self.unnamed_bytes = 0  # used, but in nobody's list, beyond the fixed reserve
+        self.overhead_bytes: int | None = None  # the driver's own; None: never seen
+        self._owner: dict[LeaseId, ProcessKey] = {}
+        self._total: int | None = None
+
+    # -- reading ---------------------------------------------------------------------------------------------------
+    def total_bytes(self) -> int:
+        """Booked bytes, evidence above them, and stowaways."""
+        if self._total is None:
+            self._total = sum(self._occupied(account) for account in self.accounts.values()) + self.stowaway_bytes()
+        return self._total
+
+    def stowaway_bytes(self) -> int:
+        return sum(stranger.used_bytes for stranger in self.strangers.values()) + self.unnamed_bytes
+
+    def booked_bytes(self) -> int:
+        """Sum over processes of what was granted or is kept, without any evidence."""
+        return sum(account.booked_bytes() for account in self.accounts.values())
+
+    def approved_bytes(self) -> int:
+        return sum(account.approved_bytes() for account in self.accounts.values())
+
+    def pressure_bytes(self) -> int:
+        """By how much everything together exceeds the budget."""
+        return max(0, self.total_bytes() - self.budget_bytes)
+
+    def charge_bytes(self, lease: LeaseId) -> int:
+        owner = self._owner.get(lease)
+        return 0 if owner is None else self.accounts[owner].charges[lease].booked_bytes
+
+    def leases(self) -> Iterable[LeaseId]:
+        return self._owner.keys()
+
+    def is_debt(self, lease: LeaseId) -> bool:
+        return self.accounts[self._owner[lease]].charges[lease].debt
+
+    def drift_bytes(self, process: ProcessKey) -> int:
+        """How far a process was seen above what is booked for it."""
+        account = self.accounts[process]
+        return self._occupied(account) - account.booked_bytes()
+
+    def total_if(
+        self, leaving: Mapping[LeaseId, int] = NOTHING, joining: tuple[ProcessKey, int] | None = None
+    ) -> int:
+        """Total bytes if some leases left (each keeping the residue given) and a process got so many more."""
+        total = self.total_bytes()
+        if not leaving and joining is None:
+            return total
+        by_process: dict[ProcessKey, dict[LeaseId, int]] = {}
+        for lease, residue_bytes in leaving.items():
+            owner = self._owner.get(lease)
+            if owner is not None:
+                by_process.setdefault(owner, {})[lease] = residue_bytes
+        if joining is not None:
+            by_process.setdefault(joining[0], {})
+        for process, going in by_process.items():
+            more_bytes = joining[1] if joining is not None and joining[0] == process else 0
+            account = self.accounts.get(process)
+            if account is None:
+                stranger = self._stranger_of(process)
+                total += max(0, more_bytes - (stranger.used_bytes if stranger else 0))
+                continue
+            total += self._after(account, going, more_bytes) - self._occupied(account)
+        return total
+
+    def process_after_bytes(self, process: ProcessKey, going: Mapping[LeaseId, int], *, dead: bool) -> int:
+        """What a process may still hold once these leases are gone. A dead one without other debts: nothing."""
+        account = self.accounts.get(process)
+        if account is None:
+            return 0
+        staying = sum(charge.booked_bytes for lease, charge in account.charges.items() if lease not in going)
+        if dead and not staying:
+            return 0
+        if dead:
+            return staying
+        return max(staying, account.residue_floor_bytes, *going.values())
+
+    def total_after_bytes(self, process: ProcessKey, going: Mapping[LeaseId, int], *, dead: bool) -> int:
+        """Total bytes once these leases of one process are gone: what a verification expects at most."""
+        account = self.accounts.get(process)
+        if account is None:
+            return self.total_bytes()
+        return self.total_bytes() - self._occupied(account) + self.process_after_bytes(process, going, dead=dead)
+
+    def _after(self, account: Account, going: Mapping[LeaseId, int], more_bytes: int) -> int:
+        if not going:
+            booked = max(sum(c.booked_bytes for c in account.charges.values()) + more_bytes, account.residue_bytes)
+            return self._with_evidence(booked, account.measured_bytes)
+        staying = sum(charge.booked_bytes for lease, charge in account.charges.items() if lease not in going)
+        return max(staying + more_bytes, account.residue_floor_bytes, *going.values())
+
+    def _occupied(self, account: Account) -> int:
+        return self._with_evidence(account.booked_bytes(), account.measured_bytes)
+
+    def _with_evidence(self, booked_bytes: int, measured_bytes: int) -> int:
+        return measured_bytes if measured_bytes > booked_bytes + self._tolerance_bytes else booked_bytes
+
+    def _stranger_of(self, process: ProcessKey) -> Stranger | None:
+        return self.strangers.get(process) or self.strangers.get(ProcessKey(process.pid, 0))
+
+    # -- changing --------------------------------------------------------------------------------------------------
+    def charge(self, lease: LeaseId, process: ProcessKey, booked_bytes: int, approved_bytes: int, now: float) -> None:
+        """Book a grant (or, after a restart, what somebody says he holds)."""
+        account = self._open(process, now)
+        account.charges[lease] = Charge(booked_bytes, approved_bytes)
+        self._owner[lease] = process
+        self._changed(account, now)
+
+    def recharge(self, lease: LeaseId, booked_bytes: int, now: float) -> None:
+        """The holder is ready: book what it says it holds. What exceeds the grant was never approved."""
+        account = self.accounts[self._owner[lease]]
+        charge = account.charges[lease]
+        charge.booked_bytes = booked_bytes
+        charge.approved_bytes = min(charge.approved_bytes, booked_bytes)
+        self._changed(account, now)
+
+    def to_debt(self, lease: LeaseId) -> None:
+        """The lease is over; its bytes stay charged until measured gone."""
+        self.accounts[self._owner[lease]].charges[lease].debt = True
+
+    def drop(self, lease: LeaseId, residue_bytes: int, floor_bytes: int, now: float) -> int:
+        """The bytes of a lease came back but for a residue. Returns the residue now charged to its process.
+
+        Never more than was charged before: what a process holds beyond that is evidence, not a booking.
+        """
+        account = self.accounts[self._owner.pop(lease)]
+        before_bytes = account.approved_bytes()
+        del account.charges[lease]
+        floor_bytes = max(account.residue_floor_bytes, floor_bytes)
+        account.residue_bytes = min(max(residue_bytes, floor_bytes), before_bytes)
+        account.residue_floor_bytes = min(floor_bytes, account.residue_bytes)
+        self._changed(account, now)
+        self._close_if_empty(account)
+        return account.residue_bytes
+
+    def set_residue(self, process: ProcessKey, residue_bytes: int, now: float) -> None:
+        """Charge (or, with 0, forget) what a process keeps outside its leases."""
+        account = self._open(process, now)
+        account.residue_bytes = residue_bytes
+        account.residue_floor_bytes = min(account.residue_floor_bytes, residue_bytes)
+        self._changed(account, now)
+        self._close_if_empty(account)
+
+    def observe(self, sample: MemorySampled, *, quiet: bool) -> None:
+        """Take evidence from a reading. `quiet`: nobody loads or unloads, so the unexplained rest means something."""
+        self._total = None
+        booked = self.booked_bytes()
+        if sample.processes is None:
+            if quiet:
+                self.unnamed_bytes = max(0, sample.used_bytes - booked - self.info.reserve_bytes)
+                if not self.accounts:
+                    self.overhead_bytes = min(sample.used_bytes, self.info.reserve_bytes)
+            return
+        named_bytes = 0
+        strangers: dict[ProcessKey, Stranger] = {}
+        seen: set[ProcessKey] = set()
+        by_pid = {process.pid: account for process, account in self.accounts.items()}
+        complete = True
+        for use in sample.processes:
+            account = self.accounts.get(use.process)
+            if account is None and use.process.start_ticks == 0:
+                account = by_pid.get(use.process.pid)
+            if account is None:
+                strangers[use.process] = Stranger(use.process, use.name, use.used_bytes or 0)
+                named_bytes += use.used_bytes or 0
+                complete = complete and use.used_bytes is not None
+            elif use.used_bytes is None:
+                named_bytes += account.booked_bytes()
+                complete = False
+            else:
+                named_bytes += use.used_bytes
+                seen.add(account.process)
+                if sample.taken_at > account.changed_at:
+                    account.measured_bytes = use.used_bytes
+        for account in self.accounts.values():
+            if account.process not in seen and sample.taken_at > account.changed_at:
+                account.measured_bytes = 0
+        self.strangers = strangers
+        if quiet:
+            rest_bytes = max(0, sample.used_bytes - named_bytes)
+            self.unnamed_bytes = max(0, rest_bytes - self.info.reserve_bytes)
+            if complete:
+                self.overhead_bytes = min(rest_bytes, self.info.reserve_bytes)
+
+    def _open(self, process: ProcessKey, now: float) -> Account:
+        account = self.accounts.get(process)
+        if account is None:
+            account = self.accounts[process] = Account(process, now)
+            self.strangers.pop(process, None)
+            self.strangers.pop(ProcessKey(process.pid, 0), None)
+        return account
+
+    def _close_if_empty(self, account: Account) -> None:
+        if not account.charges and not account.residue_bytes:
+            del self.accounts[account.process]
+
+    def _changed(self, account: Account, now: float) -> None:
+        account.changed_at = now
+        account.measured_bytes = 0  # older evidence no longer says anything about this account
+        self._total = None
+
+
+def process_bytes(sample: MemorySampled, process: ProcessKey) -> int | None:
+    """Bytes of a process in a reading: 0 if it is not listed, None if the reading cannot say."""
+    if sample.processes is None:
+        return None
+    for use in sample.processes:
+        if use.process == process or (use.process.start_ticks == 0 and use.process.pid == process.pid):
+            return use.used_bytes
+    return 0

@@ -1,0 +1,315 @@
+"""Readings of a card: what they say about stowaways, pressure and the verifications under way.
+
+Starts, polls and ends verifications; the judgement itself is in `verify`. A failed reading is *unknown*: it frees nothing.
+"""
+
+from arbiter.core.events import MemorySampled, ProbeFailed
+from arbiter.core.lease import EXPIRING, Lease, LeaseState
+from arbiter.core.state import Core, Ended, Gpu
+from arbiter.core.verify import Judgement, Verdict, Verification, grown_since, judge
+from schemas.ids import GpuId, LeaseId, ProcessKey
+
+
+# -- readings ------------------------------------------------------------------------------------------------------
+def on_sample(core: Core, sample: MemorySampled) -> None:
+    """A reading arrived. One older than the newest is dropped; one of an unknown card too."""
+    gpu = core.gpus.get(sample.gpu)
+    if gpu is None or (gpu.sample is not None and sample.taken_at < gpu.sample.taken_at):
+        return
+    if gpu.asked_at is not None and sample.taken_at >= gpu.asked_at:
+        gpu.asked_at = None
+    gpu.sample = sample
+    gpu.sample_arrived_at = core.now
+    if gpu.failed_at is not None:
+        gpu.failed_at, gpu.failure = None, ""
+        core.note("probe_ok", gpu=gpu.info.id)
+    known = {stranger.process: stranger.used_bytes for stranger in gpu.ledger.strangers.values()}
+    gpu.ledger.observe(sample, quiet=gpu.quiet() and sample.taken_at > gpu.changed_at)
+    _note_stowaways(core, gpu, known)
+    _shrink_residues(core, gpu, sample)
+    for verification in list(gpu.verifications.values()):
+        if sample.taken_at > verification.confirmed_at:
+            _weigh(core, gpu, verification, sample)
+    note_pressure(core, gpu)
+    core.wake(gpu)
+
+
+def on_probe_failed(core: Core, event: ProbeFailed) -> None:
+    """Unknown. Grants stop until a good reading comes; said once per outage."""
+    gpu = core.gpus.get(event.gpu)
+    if gpu is None:
+        return
+    gpu.asked_at = None
+    if gpu.failed_at is None:
+        core.note("probe_failed", gpu=event.gpu, reason=event.reason)
+    gpu.failed_at, gpu.failure = event.at, event.reason
+    core.wake(gpu)
+
+
+def on_probe_due(core: Core, gpu_id: str) -> None:
+    """Time for a background reading; `handle` sets the next one while anybody is interested."""
+    gpu = core.gpus[GpuId(gpu_id)]
+    gpu.asked_at = None  # a reading that never came must not silence the next one
+    core.want_sample(gpu, core.now)
+    core.wake(gpu)  # an old sample no longer carries a grant
+
+
+def note_pressure(core: Core, gpu: Gpu) -> None:
+    """Say when pressure begins and when it ends."""
+    pressure_bytes = gpu.ledger.pressure_bytes()
+    if bool(pressure_bytes) == gpu.pressed:
+        return
+    gpu.pressed = bool(pressure_bytes)
+    over = [
+        {"pid": account.process.pid, "over_bytes": gpu.ledger.drift_bytes(account.process)}
+        for account in gpu.ledger.accounts.values()
+        if gpu.ledger.drift_bytes(account.process)
+    ]
+    core.note(
+        "pressure",
+        gpu=gpu.info.id,
+        pressure_bytes=pressure_bytes,
+        stowaway_bytes=gpu.ledger.stowaway_bytes(),
+        holders=over,
+        reason="more is held than the budget" if pressure_bytes else "pressure is over",
+    )
+
+
+def _note_stowaways(core: Core, gpu: Gpu, known: dict[ProcessKey, int]) -> None:
+    tolerance = core.settings.verify_tolerance_bytes
+    for stranger in gpu.ledger.strangers.values():
+        if stranger.process not in known or stranger.used_bytes > known[stranger.process] + tolerance:
+            core.note(
+                "stowaway",
+                gpu=gpu.info.id,
+                pid=stranger.process.pid,
+                name=stranger.name,
+                used_bytes=stranger.used_bytes,
+                reason="holds bytes without a lease; charged as reserve",
+            )
+
+
+def _shrink_residues(core: Core, gpu: Gpu, sample: MemorySampled) -> None:
+    """A measured leftover that came back later, and the residue of a process that is neither here nor on the card."""
+    if sample.processes is None:
+        return
+    tolerance = core.settings.verify_tolerance_bytes
+    connected = {client.process for client in core.clients.values()}
+    waiting_for = {verification.process for verification in gpu.verifications.values()}
+    for account in list(gpu.ledger.accounts.values()):
+        process = account.process
+        if account.charges or process in waiting_for or sample.taken_at <= account.changed_at:
+            continue
+        floor = account.residue_floor_bytes
+        if not account.measured_bytes and process not in connected and core.recovering is None:
+            floor = 0
+        target = max(floor, account.measured_bytes)
+        if target + tolerance < account.residue_bytes:
+            gpu.ledger.set_residue(process, target, core.now)
+            core.record_residue(gpu, process, target)
+
+
+# -- verifications -------------------------------------------------------------------------------------------------
+def begin_for_lease(core: Core, gpu: Gpu, lease: Lease, *, alive: bool, grace_s: float = 0.0) -> None:
+    """Measure a lease's bytes away. Its charge is in the ledger and stays there until the verdict."""
+    began = lease.eviction.unloading_at if lease.eviction and lease.eviction.unloading_at else core.now
+    baseline = gpu.sample if gpu.sample is not None and gpu.sample.taken_at <= began else None
+    if baseline is None and lease.id in gpu.baselines:
+        baseline = gpu.baselines[lease.id]
+    gpu.baselines.pop(lease.id, None)
+    comparable = baseline is not None and 0.0 < lease.ready_at <= baseline.taken_at
+    verification = Verification(
+        key=lease.id,
+        process=lease.process,
+        lease=lease.id,
+        consumer=lease.spec.consumer,
+        residue_bytes=lease.spec.residue_bytes,
+        baseline=baseline,
+        baseline_comparable=comparable,
+        confirmed_at=core.now,
+        not_before=core.now + grace_s,
+        deadline_at=core.now + grace_s + core.settings.verify_timeout_s,
+        next_poll_at=0.0,
+        alive=alive,
+        exiting=lease.exiting,
+    )
+    _begin(core, gpu, verification)
+
+
+def begin_for_residue(core: Core, gpu: Gpu, process: ProcessKey) -> None:
+    """The process died and had only a residue here: measure that away too."""
+    verification = Verification(
+        key=f"residue:{process}",
+        process=process,
+        lease=None,
+        consumer=str(process),
+        residue_bytes=0,
+        baseline=gpu.sample,
+        baseline_comparable=gpu.sample is not None and gpu.sample.taken_at > gpu.ledger.accounts[process].changed_at,
+        confirmed_at=core.now,
+        not_before=core.now,
+        deadline_at=core.now + core.settings.verify_timeout_s,
+        next_poll_at=0.0,
+        alive=False,
+    )
+    _begin(core, gpu, verification)
+
+
+def _begin(core: Core, gpu: Gpu, verification: Verification) -> None:
+    gpu.verifications[verification.key] = verification
+    verification.next_poll_at = core.now + core.settings.verify_poll_s[0]
+    _set_poll(core, gpu)
+
+
+def on_poll_due(core: Core, gpu_id: str) -> None:
+    """Read the card for all verifications that are due, and say `stale` where no reading came in time."""
+    gpu = core.gpus[GpuId(gpu_id)]
+    for verification in gpu.verifications.values():
+        if verification.next_poll_at > core.now:
+            continue
+        verification.polls += 1
+        if core.now >= verification.deadline_at and not verification.overdue:
+            verification.overdue = True
+            core.wake(gpu)
+            if verification.last_used_bytes is None:
+                _announce(core, gpu, verification, Judgement(Verdict.STALE, False, 0))
+        steps = core.settings.verify_poll_s
+        step = core.settings.verify_slow_poll_s if verification.overdue else steps[min(verification.polls, len(steps) - 1)]
+        verification.next_poll_at = core.now + step
+        if not verification.overdue:
+            verification.next_poll_at = min(verification.next_poll_at, max(verification.deadline_at, core.now + steps[0]))
+    core.want_sample(gpu, core.now)
+    _set_poll(core, gpu)
+
+
+def _set_poll(core: Core, gpu: Gpu) -> None:
+    if gpu.verifications:
+        core.timers.set(("verify", gpu.info.id), min(v.next_poll_at for v in gpu.verifications.values()))
+    else:
+        core.timers.clear(("verify", gpu.info.id))
+
+
+def _weigh(core: Core, gpu: Gpu, verification: Verification, sample: MemorySampled) -> None:
+    if verification.key not in gpu.verifications:  # resolved together with an earlier one
+        return
+    judgement = judge(
+        verification, gpu.ledger, sample, _grown_by_right(gpu, verification, sample), core.settings.verify_tolerance_bytes
+    )
+    if judgement is None:
+        return
+    _announce(core, gpu, verification, judgement, sample)
+    if judgement.resolved:
+        _resolve(core, gpu, verification, judgement)
+
+
+def _grown_by_right(gpu: Gpu, verification: Verification, sample: MemorySampled) -> int:
+    """What other leaseholders may have grown since the baseline without telling: up to what they are charged."""
+    baseline = verification.baseline
+    if baseline is None:
+        return 0
+    if baseline.processes is not None and sample.processes is not None:
+        then = {use.process.pid: use.used_bytes or 0 for use in baseline.processes}
+        now = {use.process.pid: use.used_bytes or 0 for use in sample.processes}
+        return sum(
+            max(0, min(now.get(account.process.pid, 0), account.booked_bytes()) - then.get(account.process.pid, 0))
+            for account in gpu.ledger.accounts.values()
+            if account.process != verification.process
+        )
+    return sum(
+        gpu.ledger.charge_bytes(lease.id)
+        for lease in gpu.residents.values()
+        if lease.process != verification.process
+        and (lease.state is LeaseState.LOADING or lease.ready_at > baseline.taken_at)
+    )
+
+
+def _announce(
+    core: Core, gpu: Gpu, verification: Verification, judgement: Judgement, sample: MemorySampled | None = None
+) -> None:
+    """Tell a verdict once; an unresolved one that repeats is silent."""
+    if verification.verdict is judgement.verdict and not judgement.resolved:
+        return
+    verification.verdict = judgement.verdict
+    core.note(
+        "verified",
+        lease_id=verification.lease,
+        consumer=verification.consumer,
+        gpu=gpu.info.id,
+        verdict=str(judgement.verdict),
+        resolved=judgement.resolved,
+        ms=(core.now - verification.confirmed_at) * 1e3,
+        before_bytes=None if verification.baseline is None else verification.baseline.used_bytes,
+        after_bytes=None if sample is None else sample.used_bytes,
+        residue_bytes=judgement.residue_bytes,
+        culprits=[{"pid": pid, "name": name, "bytes": count} for pid, name, count in judgement.culprits],
+    )
+
+
+def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgement) -> None:
+    del gpu.verifications[verification.key]
+    _set_poll(core, gpu)
+    gpu.changed_at = core.now
+    core.wake(gpu)
+    process = verification.process
+    if verification.lease is None:
+        gpu.ledger.set_residue(process, 0, core.now)
+        core.record_residue(gpu, process, 0)
+        return
+    residue = gpu.ledger.drop(verification.lease, judgement.residue_bytes, verification.kept_bytes, core.now)
+    account = gpu.ledger.accounts.get(process)
+    if account is not None and not account.charges and not verification.alive:
+        gpu.ledger.set_residue(process, 0, core.now)
+        residue = 0
+    core.record_residue(gpu, process, residue)
+    core.forget(f"lease:{verification.lease}")
+    _close_eviction(core, gpu, verification, judgement)
+    lease = core.leases.get(verification.lease)
+    if lease is not None and lease.state is LeaseState.VERIFYING:
+        lease.move(LeaseState.RELEASED, core.now, str(judgement.verdict))
+        core.end(lease, None)
+    if core.recovering is not None:
+        core.recovering.discard(verification.lease)
+
+
+def _close_eviction(core: Core, gpu: Gpu, verification: Verification, judgement: Judgement) -> None:
+    core.learn(verification.consumer, "verify_s", core.now - verification.confirmed_at)
+    for eviction in gpu.evictions:
+        if eviction.lease == verification.lease:
+            eviction.verdict, eviction.verdict_at = str(judgement.verdict), core.now
+
+
+# -- leases that end without their holder's word ---------------------------------------------------------------------
+def lose(core: Core, lease: Lease, to: LeaseState, error: dict[str, object], *, alive: bool, grace_s: float) -> None:
+    """A resident lease is over (expired or lost); its bytes become a debt and are measured away."""
+    gpu = core.gpu_of(lease)
+    lease.uses.clear()
+    gpu.ledger.to_debt(lease.id)
+    core.record_lease(lease, debt=True)
+    if lease.eviction is not None:
+        lease.eviction.released_at = core.now
+        lease.eviction.unloading_at = lease.eviction.unloading_at or core.now
+    begin_for_lease(core, gpu, lease, alive=alive, grace_s=grace_s)
+    lease.move(to, core.now, str(error["message"]))
+    core.end(lease, error)
+
+
+def on_expiry_due(core: Core, lease_id: str) -> None:
+    """A holder did not renew. It may still be loading until it fences itself, so no verdict before that."""
+    lease = core.leases[LeaseId(lease_id)]
+    if lease.state not in EXPIRING:
+        return
+    error = {
+        "code": "lease_expired",
+        "message": f"{lease.id} was not renewed for {lease.spec.ttl_s:g} s",
+        "hint": "unload, then acquire again",
+        "details": {"ttl_s": lease.spec.ttl_s},
+    }
+    core.note("expired", lease, reason=error["message"])
+    token = lease.token
+    assert token is not None, f"{lease.id} expires without a token"
+    core.push(
+        lease,
+        {"push": "lost", "lease_id": lease.id, "token": [token.epoch, token.serial], "error": error},
+    )
+    grace_s = core.settings.fence_grace_s if lease.attached else 0.0  # a restart's deadline has the grace in it
+    lose(core, lease, LeaseState.EXPIRED, error, alive=True, grace_s=grace_s)

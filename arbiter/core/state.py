@@ -1,0 +1,280 @@
+"""The whole state of the engine and the small verbs that every step uses: note, refuse, push, wake.
+
+Data and bookkeeping only: no decision is taken here.
+"""
+
+from collections import OrderedDict, deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from arbiter.core.effects import Effect, JournalDelete, JournalPut, Note, Push, Refuse, Reply, Sample
+from arbiter.core.events import MemorySampled
+from arbiter.core.lease import LEAVING, RESIDENT, Eviction, Lease, LeaseState
+from arbiter.core.ledger import GpuLedger
+from arbiter.core.queue import WaitQueue
+from arbiter.core.settings import GpuInfo, Settings
+from arbiter.core.timers import Timers
+from arbiter.core.verify import Verification
+from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token
+
+ENDED_REMEMBERED = 1024
+LEARNT_REMEMBERED = 32
+IDLE_PROBE_S = 10.0  # how long after the last client a card is still read in the background
+
+
+class Refused(Exception):
+    """A request cannot be done; raised before anything has changed. `code` is a wire code."""
+
+    def __init__(self, code: str, message: str, hint: str, **details: Any) -> None:
+        super().__init__(message)
+        self.code = code
+        self.message = message
+        self.hint = hint
+        self.details = details
+
+    def wire(self) -> dict[str, Any]:
+        return {"code": self.code, "message": self.message, "hint": self.hint, "details": self.details}
+
+
+@dataclass(frozen=True, slots=True)
+class Client:
+    id: ClientId
+    process: ProcessKey
+    name: str
+    instance: str
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """What is remembered of a lease that is over, so that late messages get a true answer."""
+
+    lease: LeaseId
+    process: ProcessKey
+    nonce: str
+    token: Token | None
+    state: LeaseState
+    error: Mapping[str, Any] | None
+
+
+@dataclass(slots=True)
+class Gpu:
+    """One card: its ledger, who is on it, who waits for it, what was measured."""
+
+    info: GpuInfo
+    ledger: GpuLedger
+    queue: WaitQueue
+    residents: dict[LeaseId, Lease] = field(default_factory=dict)
+    verifications: dict[str, Verification] = field(default_factory=dict)
+    evictions: list[Eviction] = field(default_factory=list)  # not yet counted to a grant
+    sample: MemorySampled | None = None
+    sample_arrived_at: float = 0.0
+    failed_at: float | None = None  # last failed reading, None after a good one
+    failure: str = ""
+    asked_at: float | None = None  # last Sample asked for, None if its answer is here
+    changed_at: float = 0.0  # last grant, ready or verdict
+    blocked: str = ""
+    dirty: bool = True
+    pressed: bool = False  # a pressure note is out
+
+    def in_state(self, *states: LeaseState) -> Iterator[Lease]:
+        return (lease for lease in self.residents.values() if lease.state in states)
+
+    def quiet(self) -> bool:
+        """Nobody loads or unloads: an unexplained rest in a reading means something."""
+        return not self.verifications and not any(
+            lease.state in LEAVING or lease.state is LeaseState.LOADING for lease in self.residents.values()
+        )
+
+
+class Core:
+    """State plus the effects of the event being handled."""
+
+    def __init__(self, settings: Settings, now: float) -> None:
+        self.settings = settings
+        self.started_at = now
+        self.now = now
+        self.out: list[Effect] = []
+        self.gpus: dict[GpuId, Gpu] = {
+            info.id: Gpu(
+                info, GpuLedger(info, settings.verify_tolerance_bytes), WaitQueue(settings.ageing_s_per_point)
+            )
+            for info in sorted(settings.gpus, key=lambda info: info.index)
+        }
+        self.leases: dict[LeaseId, Lease] = {}
+        self.waiting: dict[LeaseId, Lease] = {}
+        self.nonces: dict[tuple[ProcessKey, str], LeaseId] = {}
+        self.clients: dict[ClientId, Client] = {}
+        self.ended: OrderedDict[LeaseId, Ended] = OrderedDict()
+        self.timers = Timers()
+        self.serial = 0
+        self.arrivals = 0
+        self.last_token = Token(settings.epoch, 0)
+        self.granted: list[tuple[Token, GpuId]] = []  # by the event being handled; invariants look at it
+        self.last_client_at = now
+        self.recovering: set[LeaseId] | None = None  # None: serving; else the leases still to be accounted for
+        self.learnt_peaks: dict[str, int] = {}  # by "consumer key"
+        self.durations: dict[str, dict[str, deque[float]]] = {}
+        for consumer, medians in sorted(settings.learnt.items()):
+            for phase, seconds in sorted(medians.items()):
+                self.learn(consumer, phase, seconds)
+
+    # -- effects ---------------------------------------------------------------------------------------------------
+    def reply(self, client: ClientId, request: RequestId, body: Mapping[str, Any]) -> None:
+        self.out.append(Reply(client, request, body))
+
+    def refuse(self, client: ClientId, request: RequestId, refused: Refused) -> None:
+        self.out.append(Refuse(client, request, refused.code, refused.message, refused.hint, refused.details))
+
+    def push(self, lease: Lease, body: Mapping[str, Any]) -> None:
+        self.out.append(Push(self.voice_of(lease), body))
+
+    def note(self, kind: str, lease: Lease | None = None, **data: Any) -> None:
+        facts: dict[str, Any] = {}
+        if lease is not None:
+            facts = {"lease_id": lease.id, "consumer": lease.spec.consumer, "gpu": lease.gpu}
+            if lease.token is not None:
+                facts["token"] = [lease.token.epoch, lease.token.serial]
+            if lease.traceparent is not None:
+                facts["traceparent"] = lease.traceparent
+        self.out.append(Note(kind, {**facts, **data}))
+
+    def journal(self, key: str, record: Mapping[str, Any]) -> None:
+        self.out.append(JournalPut(key, record))
+
+    def forget(self, key: str) -> None:
+        self.out.append(JournalDelete(key))
+
+    def want_sample(self, gpu: Gpu, not_before: float) -> None:
+        """Ask for a reading that begins at `not_before` or later, unless such a one is under way."""
+        if gpu.asked_at is None or gpu.asked_at < not_before:
+            gpu.asked_at = self.now
+            self.out.append(Sample(gpu.info.id))
+
+    # -- bookkeeping -----------------------------------------------------------------------------------------------
+    def voice_of(self, lease: Lease) -> ClientId:
+        """Where pushes about a lease go: its client, or another living connection of the same process."""
+        client = self.clients.get(lease.client)
+        if client is not None and client.process == lease.process:
+            return lease.client
+        others = sorted(c.id for c in self.clients.values() if c.process == lease.process)
+        return others[0] if others else lease.client
+
+    def next_lease_id(self) -> LeaseId:
+        self.serial += 1
+        return LeaseId(f"L{self.settings.epoch}-{self.serial}")
+
+    def next_token(self) -> Token:
+        self.serial += 1
+        return Token(self.settings.epoch, self.serial)
+
+    def next_arrival(self) -> int:
+        self.arrivals += 1
+        return self.arrivals
+
+    def gpu_of(self, lease: Lease) -> Gpu:
+        """The card of a resident lease."""
+        assert lease.gpu is not None, f"{lease.id} has no card"
+        return self.gpus[lease.gpu]
+
+    def wake(self, gpu: Gpu) -> None:
+        """Something changed that a waiter of this card may have waited for."""
+        gpu.dirty = True
+
+    def dequeue(self, lease: Lease) -> None:
+        self.waiting.pop(lease.id, None)
+        self.timers.clear(("wait", lease.id))
+        for gpu_id in lease.gpus:
+            self.gpus[gpu_id].queue.discard(lease)
+            self.wake(self.gpus[gpu_id])
+
+    def end(self, lease: Lease, error: Mapping[str, Any] | None) -> None:
+        """Drop a lease that reached a terminal state; a bounded memory of it stays."""
+        del self.leases[lease.id]
+        for kind in ("ttl", "revoke"):
+            self.timers.clear((kind, lease.id))
+        if lease.gpu is not None:
+            gpu = self.gpus[lease.gpu]
+            gpu.residents.pop(lease.id, None)
+            self.wake(gpu)
+        self.remember(Ended(lease.id, lease.process, lease.nonce, lease.token, lease.state, error))
+
+    def remember(self, ended: Ended) -> None:
+        self.ended[ended.lease] = ended
+        while len(self.ended) > ENDED_REMEMBERED:
+            _, oldest = self.ended.popitem(last=False)
+            if self.nonces.get((oldest.process, oldest.nonce)) == oldest.lease:
+                del self.nonces[oldest.process, oldest.nonce]
+
+    def learn(self, consumer: str, phase: str, seconds: float) -> None:
+        """Remember how long a phase (`drain_s`, `unload_s`, `verify_s`, `load_s`) took for a consumer."""
+        phases = self.durations.setdefault(consumer, {})
+        phases.setdefault(phase, deque(maxlen=LEARNT_REMEMBERED)).append(max(0.0, seconds))
+
+    def record_lease(self, lease: Lease, *, debt: bool = False) -> None:
+        """Write a resident lease (or its debt) to the journal."""
+        spec = lease.spec
+        gpu = self.gpu_of(lease)
+        assert lease.token is not None, f"{lease.id} is resident without a token"
+        self.journal(
+            f"lease:{lease.id}",
+            {
+                "lease_id": lease.id,
+                "token": [lease.token.epoch, lease.token.serial],
+                "state": "debt" if debt else str(lease.state),
+                "gpu": lease.gpu,
+                "pid": lease.process.pid,
+                "start_ticks": lease.process.start_ticks,
+                "nonce": lease.nonce,
+                "charge_bytes": gpu.ledger.charge_bytes(lease.id),
+                "load_peak_bytes": lease.load_peak_bytes,
+                "measured_bytes": lease.measured_bytes,
+                "exiting": lease.exiting,
+                "spec": {
+                    "consumer": spec.consumer,
+                    "model_id": spec.key.model_id,
+                    "revision": spec.key.revision,
+                    "gpu": spec.gpu,
+                    "exclusive": spec.exclusive,
+                    "load_peak_bytes": spec.load_peak_bytes,
+                    "steady_bytes": spec.steady_bytes,
+                    "residue_bytes": spec.residue_bytes,
+                    "priority": spec.priority,
+                    "evictable": spec.evictable,
+                    "ttl_s": spec.ttl_s,
+                    "min_residency_s": spec.min_residency_s,
+                    "deny_on_deadline": spec.deny_on_deadline,
+                },
+            },
+        )
+
+    def record_residue(self, gpu: Gpu, process: ProcessKey, residue_bytes: int) -> None:
+        """Write (or, with 0, delete) what a process keeps."""
+        key = f"residue:{process}:{gpu.info.id}"
+        if not residue_bytes:
+            self.forget(key)
+            return
+        self.journal(
+            key,
+            {
+                "pid": process.pid,
+                "start_ticks": process.start_ticks,
+                "gpu": gpu.info.id,
+                "residue_bytes": residue_bytes,
+            },
+        )
+
+    def active(self, gpu: Gpu) -> bool:
+        """Is anybody interested in this card?"""
+        return bool(
+            self.clients
+            or gpu.residents
+            or gpu.verifications
+            or len(gpu.queue)
+            or self.recovering
+            or self.now - self.last_client_at <= IDLE_PROBE_S
+        )
+
+
+def resident(lease: Lease) -> bool:
+    return lease.state in RESIDENT

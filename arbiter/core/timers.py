@@ -1,0 +1,47 @@
+"""Deadlines by name. Setting a later time for a name is cheap (renewals do it all the time); nothing here reads a clock."""
+
+from heapq import heappop, heappush
+
+type TimerKey = tuple[str, str]
+"""(kind, subject), e.g. ("ttl", "L3-17")."""
+
+
+class Timers:
+    """A heap with lazy corrections: an entry is checked against the true time only when it comes up."""
+
+    def __init__(self) -> None:
+        self._due: dict[TimerKey, float] = {}
+        self._heap: list[tuple[float, TimerKey]] = []
+
+    def __contains__(self, key: TimerKey) -> bool:
+        return key in self._due
+
+    def set(self, key: TimerKey, at: float) -> None:
+        before = self._due.get(key)
+        self._due[key] = at
+        if before is None or at < before:
+            heappush(self._heap, (at, key))
+
+    def clear(self, key: TimerKey) -> None:
+        self._due.pop(key, None)
+
+    def next_at(self) -> float | None:
+        """When the earliest timer is due."""
+        while self._heap:
+            at, key = self._heap[0]
+            due = self._due.get(key)
+            if due == at:
+                return at
+            heappop(self._heap)
+            if due is not None and due > at:
+                heappush(self._heap, (due, key))
+        return None
+
+    def pop_due(self, now: float) -> TimerKey | None:
+        """Take the earliest timer that is due, or None."""
+        at = self.next_at()
+        if at is None or at > now:
+            return None
+        _, key = heappop(self._heap)
+        del self._due[key]
+        return key

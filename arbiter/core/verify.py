@@ -1,0 +1,142 @@
+"""Did the memory really come back? Pure judgement of readings; starts nothing, drops nothing.
+
+A released lease stays charged until a verdict. Targets (all that can be checked must hold, twice in a row):
+  a. ledger bound: the card shows no more than everything else is charged;
+  b. delta bound: it shows less than before by what the lease held;
+  c. evidence: its process shows no more than it may keep.
+The device total decides; per-process figures are evidence and name the culprit. No reading means unknown, never free.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from arbiter.core.events import MemorySampled
+from arbiter.core.ledger import GpuLedger, process_bytes
+from schemas.ids import LeaseId, ProcessKey
+
+
+class Verdict(StrEnum):
+    VERIFIED = "verified"
+    RESIDUE = "residue"
+    CONTESTED = "contested"
+    STALE = "stale"
+    UNVERIFIABLE = "unverifiable"
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """`resolved`: the charge may go, but for `residue_bytes`. Otherwise the bytes stay charged and the polling goes on."""
+
+    verdict: Verdict
+    resolved: bool
+    residue_bytes: int
+    culprits: tuple[tuple[int, str, int], ...] = ()  # (pid, name, bytes)
+
+
+@dataclass(slots=True)
+class Verification:
+    """One release, expiry or death under measurement."""
+
+    key: str
+    process: ProcessKey
+    lease: LeaseId | None  # None: only a residue of a dead process
+    consumer: str
+    residue_bytes: int  # what may stay while the process lives
+    baseline: MemorySampled | None  # newest reading in which the bytes were still there
+    baseline_comparable: bool  # the lease was resident and ready when it was taken
+    confirmed_at: float  # only readings that began later count
+    not_before: float  # no verdict earlier: a lost holder may still be loading until it fences itself
+    deadline_at: float
+    next_poll_at: float
+    polls: int = 0
+    alive: bool = True
+    exiting: bool = False
+    last_used_bytes: int | None = None  # of the newest counting reading
+    verdict: Verdict | None = None  # announced, but not resolved
+    overdue: bool = False
+
+    @property
+    def vanishes(self) -> bool:
+        """The process is dead or promised to be: nothing may stay."""
+        return self.exiting or not self.alive
+
+    @property
+    def kept_bytes(self) -> int:
+        return 0 if self.vanishes else self.residue_bytes
+
+    def going(self) -> Mapping[LeaseId, int]:
+        """The lease on its way out and what it leaves behind, as the ledger wants it."""
+        return {} if self.lease is None else {self.lease: self.kept_bytes}
+
+
+def judge(
+    v: Verification, ledger: GpuLedger, sample: MemorySampled, grown_bytes: int, tolerance_bytes: int
+) -> Judgement | None:
+    """Judge a counting reading. None: not yet. `grown_bytes`: what others may have grown since the baseline, by right."""
+    used = sample.used_bytes
+    stable = v.last_used_bytes is not None and abs(used - v.last_used_bytes) <= tolerance_bytes
+    v.last_used_bytes = used
+    expected = ledger.process_after_bytes(v.process, v.going(), dead=v.vanishes)
+    held = process_bytes(sample, v.process)
+    overhead = ledger.info.reserve_bytes if ledger.overhead_bytes is None else ledger.overhead_bytes
+    bound_a = ledger.total_after_bytes(v.process, v.going(), dead=v.vanishes) + overhead
+    bound_b = _delta_bound(v, ledger, expected, grown_bytes)
+    short_bytes = max(used - bound_a, 0 if bound_b is None else used - bound_b)
+    evident = held is None or held <= expected + tolerance_bytes
+    if short_bytes <= tolerance_bytes and evident and stable and sample.taken_at > v.not_before:
+        return Judgement(Verdict.VERIFIED, True, v.kept_bytes)
+    if not v.overdue:
+        return None
+    return _late(v, ledger, sample, expected, held, short_bytes, bound_a, bound_b, tolerance_bytes)
+
+
+def _delta_bound(v: Verification, ledger: GpuLedger, expected: int, grown_bytes: int) -> int | None:
+    if v.baseline is None:
+        return None
+    held_then = process_bytes(v.baseline, v.process)
+    if held_then is None:
+        if not v.baseline_comparable:
+            return None
+        held_then = ledger.accounts[v.process].booked_bytes()
+    return v.baseline.used_bytes - (held_then - expected) + grown_bytes
+
+
+def _late(
+    v: Verification,
+    ledger: GpuLedger,
+    sample: MemorySampled,
+    expected: int,
+    held: int | None,
+    short_bytes: int,
+    bound_a: int,
+    bound_b: int | None,
+    tolerance_bytes: int,
+) -> Judgement:
+    """The time is up. Say whose bytes these are, as far as this backend can tell."""
+    if held is not None:
+        name = next((use.name for use in sample.processes or () if use.process.pid == v.process.pid), v.consumer)
+        if held > expected + tolerance_bytes:
+            culprits = ((v.process.pid, name, held),)
+            if v.alive:
+                return Judgement(Verdict.RESIDUE, True, held, culprits)
+            return Judgement(Verdict.CONTESTED, False, held, culprits)
+        return Judgement(Verdict.CONTESTED, True, v.kept_bytes, grown_since(v, ledger, sample))
+    if bound_b is None:
+        return Judgement(Verdict.UNVERIFIABLE, False, v.kept_bytes)
+    if v.alive:
+        return Judgement(Verdict.RESIDUE, True, expected + short_bytes)
+    # a dead process holds nothing for ever: if the ledger explains the card, what is left belongs to others
+    return Judgement(Verdict.CONTESTED, sample.used_bytes <= bound_a + tolerance_bytes, 0)
+
+
+def grown_since(v: Verification, ledger: GpuLedger, sample: MemorySampled) -> tuple[tuple[int, str, int], ...]:
+    """Others that hold more than at the baseline, the largest first: (pid, name, bytes grown)."""
+    grown: list[tuple[int, str, int]] = []
+    for use in sample.processes or ():
+        if use.process.pid == v.process.pid or not use.used_bytes:
+            continue
+        then = (process_bytes(v.baseline, use.process) or 0) if v.baseline is not None else 0
+        if use.used_bytes > then and (v.baseline is not None or use.process in ledger.strangers):
+            grown.append((use.process.pid, use.name, use.used_bytes - then))
+    return tuple(sorted(grown, key=lambda item: (-item[2], item[0])))

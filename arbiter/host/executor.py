@@ -1,0 +1,127 @@
+"""Performs effects, in order: one match over all of them. Slow ones (samples) end by posting an event.
+
+Runs on the thread of the event loop and never blocks, except for journal writes (a local SQLite commit without fsync, tens of
+microseconds). Must not decide anything; sockets, files and threads are behind the protocols below.
+"""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+from arbiter.core import effects as fx
+from arbiter.core import events as ev
+from schemas.errors import JournalUnavailable
+from schemas.ids import ClientId, GpuId, RequestId
+
+log = logging.getLogger(__name__)
+
+
+class Outbox(Protocol):
+    """The way to the clients (`rpc.session.SessionTable`)."""
+
+    def reply(self, client: ClientId, request: RequestId, body: Mapping[str, Any]) -> None: ...
+
+    def refuse(self, client: ClientId, request: RequestId, error: Mapping[str, Any]) -> None: ...
+
+    def push(self, client: ClientId, body: Mapping[str, Any]) -> None: ...
+
+    def broadcast(self, event: Mapping[str, Any]) -> None: ...
+
+
+class Records(Protocol):
+    """The journal. `apply` writes all changes or none; None deletes. Raises JournalUnavailable."""
+
+    def apply(self, changes: Sequence[tuple[str, Mapping[str, Any] | None]]) -> None: ...
+
+
+class Chronicle(Protocol):
+    """The history: gives a fact its number and time, and keeps it."""
+
+    def append(self, kind: str, data: Mapping[str, Any]) -> Mapping[str, Any]: ...
+
+
+class Executor:
+    """`perform` is called by the inbox with the effects of one event."""
+
+    def __init__(
+        self,
+        outbox: Outbox,
+        journal: Records,
+        history: Chronicle,
+        sample: Callable[[GpuId], None],
+        post: Callable[[ev.Event], None],
+        log_event: Callable[[Mapping[str, Any]], None],
+    ) -> None:
+        self._outbox = outbox
+        self._journal = journal
+        self._history = history
+        self._sample = sample
+        self._post = post
+        self._log_event = log_event
+
+    def perform(self, effects: Sequence[fx.Effect]) -> None:
+        """One batch. A grant is on disk before its holder hears of it: consecutive journal effects are one transaction, and if that
+        fails, what the batch still has to say about those leases is not said (the waiting request is refused instead)."""
+        refused: dict[str, JournalUnavailable] = {}  # lease id → why
+        index = 0
+        while index < len(effects):
+            effect = effects[index]
+            if isinstance(effect, fx.JournalPut | fx.JournalDelete):
+                run = []
+                while index < len(effects) and isinstance(
+                    found := effects[index], fx.JournalPut | fx.JournalDelete
+                ):
+                    run.append(found)
+                    index += 1
+                self._write(run, refused)
+                continue
+            index += 1
+            if refused and (why := refused.get(_lease_of(effect) or "")) is not None:
+                if isinstance(effect, fx.Reply):
+                    self._outbox.refuse(effect.client, effect.request, why.to_wire())
+                continue
+            self._do(effect)
+
+    def _do(self, effect: fx.Effect) -> None:
+        match effect:
+            case fx.Reply(client, request, body):
+                self._outbox.reply(client, request, body)
+            case fx.Refuse(client, request, code, message, hint, details):
+                error = {"code": code, "message": message, "hint": hint, "details": dict(details)}
+                self._outbox.refuse(client, request, error)
+            case fx.Push(client, body):
+                self._outbox.push(client, body)
+            case fx.Sample(gpu):
+                self._sample(gpu)
+            case fx.Note(kind, data):
+                event = self._history.append(kind, data)
+                self._log_event(event)
+                self._outbox.broadcast(event)
+            case fx.JournalPut() | fx.JournalDelete():
+                self._write([effect], {})
+
+    def _write(
+        self, run: Sequence[fx.JournalPut | fx.JournalDelete], refused: dict[str, JournalUnavailable]
+    ) -> None:
+        changes = [(e.key, e.record if isinstance(e, fx.JournalPut) else None) for e in run]
+        try:
+            self._journal.apply(changes)
+        except JournalUnavailable as error:
+            log.error("journal: %s", error)
+            for key, record in changes:
+                if record is not None:
+                    refused[key.removeprefix("lease:")] = error
+                    self._post(ev.JournalFailed(key, error.message))
+
+
+def _lease_of(effect: fx.Effect) -> str | None:
+    """The lease that an effect speaks of, if any."""
+    match effect:
+        case fx.Reply(_, _, body) | fx.Push(_, body):
+            lease = body.get("lease")
+            found = lease.get("lease_id") if isinstance(lease, Mapping) else body.get("lease_id")
+        case fx.Note(_, data):
+            found = data.get("lease_id")
+        case _:
+            return None
+    return found if isinstance(found, str) else None

@@ -1,0 +1,207 @@
+"""What happened: every fact of the core as an event with number and wall time, the newest in memory, all of them in SQLite.
+
+`append` costs the loop one dict; a thread writes them twice a second and answers questions about events that memory no longer
+holds. Losing the last half second in a crash loses explanations, never leases. A broken database is put aside and reported; without a
+writable one the history lives in memory only. Must not know what the events mean.
+"""
+
+import asyncio
+import json
+import logging
+import queue
+import sqlite3
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+log = logging.getLogger(__name__)
+
+RING_EVENTS = 2000
+FLUSH_S = 0.5
+BUFFER_MAX = 20_000
+"""Events waiting for a disk that does not answer; beyond this the oldest are dropped and counted."""
+PRUNE_EVERY_EVENTS = 2000
+CLOSE_S = 5.0
+
+Done = Callable[[Mapping[str, Any]], None]
+Event = Mapping[str, Any]
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS events (seq INTEGER PRIMARY KEY, at_wall_s REAL NOT NULL, kind TEXT NOT NULL, json TEXT NOT NULL);
+CREATE INDEX IF NOT EXISTS events_by_time ON events (at_wall_s);
+"""
+_QUESTION = """
+SELECT json FROM events WHERE seq > ? AND (? = '[]' OR kind IN (SELECT value FROM json_each(?))) ORDER BY seq LIMIT ?
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class _Question:
+    after: int
+    limit: int
+    kinds: tuple[str, ...]
+    done: Done
+
+
+class History:
+    """Numbers and keeps events. `open` before the loop runs, `start` inside it, `close` at the end (writes what is left)."""
+
+    def __init__(self, store: "_Store | None", last_seq: int, wall: Callable[[], float] = time.time) -> None:
+        self._store = store
+        self._wall = wall
+        self._last_seq = last_seq
+        self._ring: deque[Event] = deque(maxlen=RING_EVENTS)
+        self._buffer: deque[Event] = deque(maxlen=BUFFER_MAX)
+        self._work: queue.SimpleQueue[Sequence[Event] | _Question | None] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    @classmethod
+    def open(cls, folder: Path, max_events: int, days: float) -> Self:
+        """Open or make `history.sqlite`; numbering goes on where it ended. Never fails: without a disk it is memory only."""
+        path = folder / "history.sqlite"
+        for attempt in (1, 2):
+            try:
+                store = _Store(path, max_events, days)
+                return cls(store, store.last_seq())
+            except sqlite3.DatabaseError as error:
+                log.error("history %s: %s", path, error)
+                if attempt == 1 and not isinstance(error, sqlite3.OperationalError) and path.exists():
+                    aside = path.with_name(f"{path.name}.corrupt-{int(time.time())}")
+                    path.rename(aside)
+                    log.error("history put aside as %s", aside)
+                    continue
+                break
+        log.error("history is kept in memory only")
+        return cls(None, 0)
+
+    def start(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        if self._store is not None:
+            self._thread = threading.Thread(
+                target=self._run, args=(self._store,), name="history", daemon=True
+            )
+            self._thread.start()
+
+    @property
+    def last_seq(self) -> int:
+        return self._last_seq
+
+    def append(self, kind: str, data: Mapping[str, Any]) -> Event:
+        """Give a fact its number and wall time, keep it, and return the event."""
+        self._last_seq += 1
+        event = {"seq": self._last_seq, "at_wall_s": self._wall(), "kind": kind, **data}
+        self._ring.append(event)
+        if self._store is not None:
+            self._buffer.append(event)
+            if self._timer is None and self._loop is not None:
+                self._timer = self._loop.call_later(FLUSH_S, self._flush)
+        return event
+
+    def read(self, after: int, limit: int, kinds: tuple[str, ...], done: Done) -> None:
+        """Events after a number, oldest first: `done({"events", "last_seq"})`, at once or later on the loop's thread."""
+        first = self._ring[0]["seq"] if self._ring else self._last_seq + 1
+        if self._thread is None or after + 1 >= first:
+            wanted = frozenset(kinds)
+            found = [e for e in self._ring if e["seq"] > after and (not wanted or e["kind"] in wanted)]
+            done({"events": found[:limit], "last_seq": self._last_seq})
+            return
+        self._flush()
+        self._work.put(_Question(after, limit, kinds, done))
+
+    def close(self) -> None:
+        """Write what is left and end the thread."""
+        self._flush()
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._thread is not None:
+            self._work.put(None)
+            self._thread.join(CLOSE_S)
+            self._thread = None
+        self._loop = None
+
+    def _flush(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._buffer and self._thread is not None:
+            self._work.put(tuple(self._buffer))
+            self._buffer.clear()
+
+    # -- the thread ----------------------------------------------------------------------------------------------
+    def _run(self, store: "_Store") -> None:
+        while (work := self._work.get()) is not None:
+            try:
+                if isinstance(work, _Question):
+                    body = {
+                        "events": store.find(work.after, work.limit, work.kinds),
+                        "last_seq": self._last_seq,
+                    }
+                    self._answer(work.done, body)
+                else:
+                    store.add(work)
+            except sqlite3.Error as error:
+                log.error("history: %s", error)
+                if isinstance(work, _Question):
+                    self._answer(work.done, {"events": [], "last_seq": self._last_seq, "problem": str(error)})
+        store.close()
+
+    def _answer(self, done: Done, body: Mapping[str, Any]) -> None:
+        if (loop := self._loop) is not None:
+            try:
+                loop.call_soon_threadsafe(done, body)
+            except RuntimeError:
+                pass  # the loop closed meanwhile: nobody waits for the answer
+
+
+class _Store:
+    """The table. Made by the main thread, used by the history thread alone."""
+
+    def __init__(self, path: Path, max_events: int, days: float) -> None:
+        self._max_events = max_events
+        self._days = days
+        self._since_prune = 0
+        self._db = sqlite3.connect(path, isolation_level=None, timeout=1.0, check_same_thread=False)
+        try:
+            path.chmod(0o600)
+            self._db.execute("PRAGMA journal_mode=WAL")
+            self._db.execute("PRAGMA synchronous=NORMAL")
+            self._db.executescript(_SCHEMA)
+        except BaseException:
+            self._db.close()
+            raise
+
+    def last_seq(self) -> int:
+        return int(self._db.execute("SELECT COALESCE(MAX(seq), 0) FROM events").fetchone()[0])
+
+    def add(self, events: Sequence[Event]) -> None:
+        rows = [
+            (e["seq"], e["at_wall_s"], e["kind"], json.dumps(e, separators=(",", ":"), default=str))
+            for e in events
+        ]
+        with self._db:
+            self._db.execute("BEGIN IMMEDIATE")
+            self._db.executemany("INSERT OR REPLACE INTO events VALUES (?, ?, ?, ?)", rows)
+            self._since_prune += len(rows)
+            if self._since_prune >= PRUNE_EVERY_EVENTS:
+                self.prune(time.time())
+
+    def prune(self, wall_s: float) -> None:
+        """Drop what is beyond the number or the age."""
+        self._since_prune = 0
+        self._db.execute(
+            "DELETE FROM events WHERE seq <= (SELECT MAX(seq) FROM events) - ?", (self._max_events,)
+        )
+        self._db.execute("DELETE FROM events WHERE at_wall_s < ?", (wall_s - self._days * 86_400,))
+
+    def find(self, after: int, limit: int, kinds: tuple[str, ...]) -> list[Event]:
+        wanted = json.dumps(list(kinds))
+        return [json.loads(text) for (text,) in self._db.execute(_QUESTION, (after, wanted, wanted, limit))]
+
+    def close(self) -> None:
+        self._db.close()

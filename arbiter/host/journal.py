@@ -1,0 +1,182 @@
+"""What must survive the daemon: one record per lease and residue, in SQLite.
+
+Records are written before a grant is sent. WAL with `synchronous=NORMAL` does not fsync each commit: a commit survives the death of the
+daemon (it is in the kernel's page cache) but perhaps not a power cut, and that is enough, since a power cut empties the GPU too: a new
+boot id voids every record. Only the epoch must never go back, so it also lies in a file of its own, fsynced once per start. A corrupt
+database is put aside and reported, never repaired by guessing. Must not know what the records mean.
+"""
+
+import json
+import logging
+import os
+import sqlite3
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from schemas.errors import ConfigError, JournalUnavailable
+
+log = logging.getLogger(__name__)
+
+SCHEMA_VERSION = 1
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, json TEXT NOT NULL) WITHOUT ROWID;
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """What a start found. `put_aside` names the corrupt file that was moved away; `voided` counts records of an earlier boot."""
+
+    epoch: int
+    records: Mapping[str, Mapping[str, Any]]
+    put_aside: Path | None = None
+    problem: str = ""
+    voided: int = 0
+
+
+class Journal:
+    """One connection, used by one thread. `open` makes it; the database stays locked against a second daemon's writes by the
+    daemon's own lock file, not here."""
+
+    def __init__(self, connection: sqlite3.Connection, opened: Opened) -> None:
+        self._connection = connection
+        self.opened = opened
+
+    @classmethod
+    def open(cls, folder: Path, boot_id: str, *, wall_s: float | None = None) -> Self:
+        """Open or make the journal in `folder`, and count a new epoch. Raises ConfigError if the folder cannot be written.
+
+        1. Read; corrupt: put aside, start empty. 2. Another boot id: drop the records. 3. Epoch = 1 + the greatest known.
+        """
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            path = folder / "journal.sqlite"
+            put_aside, problem = None, ""
+            try:
+                connection = _connect(path)
+                meta, records = _read(connection)  # 1
+            except (sqlite3.DatabaseError, ValueError) as error:
+                if isinstance(error, sqlite3.OperationalError) and not _is_corruption(error):
+                    raise
+                problem = str(error)
+                put_aside = _put_aside(path)
+                log.error("journal corrupt (%s): put aside as %s", problem, put_aside)
+                connection = _connect(path)
+                meta, records = _read(connection)
+            voided = 0
+            if meta.get("boot_id") not in (None, boot_id):  # 2
+                voided, records = len(records), {}
+            wall_s = time.time() if wall_s is None else wall_s
+            epoch = _next_epoch(folder, meta, put_aside is not None, wall_s)  # 3
+            with connection:
+                connection.execute("BEGIN IMMEDIATE")
+                if voided:
+                    connection.execute("DELETE FROM records")
+                values = {"schema": str(SCHEMA_VERSION), "boot_id": boot_id, "epoch": str(epoch)}
+                connection.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
+        except (OSError, sqlite3.OperationalError) as error:
+            raise ConfigError(
+                f"the state folder {folder} cannot be used: {error}",
+                hint="make it writable, or choose another --state-dir",
+            ) from error
+        return cls(connection, Opened(epoch, records, put_aside, problem, voided))
+
+    def apply(self, changes: Sequence[tuple[str, Mapping[str, Any] | None]]) -> None:
+        """Write all changes in one transaction; None deletes. Raises JournalUnavailable (nothing is written then)."""
+        try:
+            with self._connection:
+                self._connection.execute("BEGIN IMMEDIATE")
+                for key, record in changes:
+                    if record is None:
+                        self._connection.execute("DELETE FROM records WHERE key = ?", (key,))
+                    else:
+                        text = json.dumps(record, separators=(",", ":"))
+                        self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (key, text))
+        except sqlite3.Error as error:
+            raise JournalUnavailable(
+                f"the journal cannot be written: {error}", hint="see the disk of the daemon's state folder"
+            ) from error
+
+    def close(self) -> None:
+        self._connection.close()
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    connection = sqlite3.connect(path, isolation_level=None, timeout=1.0)
+    try:
+        path.chmod(0o600)
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("PRAGMA synchronous=NORMAL")
+        connection.executescript(_SCHEMA)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _read(connection: sqlite3.Connection) -> tuple[dict[str, str], dict[str, dict[str, Any]]]:
+    """(meta, records). Raises sqlite3.DatabaseError or ValueError for what cannot be trusted."""
+    try:
+        check = connection.execute("PRAGMA quick_check").fetchone()[0]
+        if check != "ok":
+            raise sqlite3.DatabaseError(f"quick_check says {check}")
+        meta = dict(connection.execute("SELECT name, value FROM meta"))
+        if meta.get("schema") not in (None, str(SCHEMA_VERSION)):
+            raise sqlite3.DatabaseError(f"schema {meta['schema']}, this daemon knows {SCHEMA_VERSION}")
+        records = {}
+        for key, text in connection.execute("SELECT key, json FROM records ORDER BY key"):
+            record = json.loads(text)
+            if not isinstance(record, dict):
+                raise ValueError(f"record {key} is no map")
+            records[key] = record
+    except BaseException:
+        connection.close()
+        raise
+    return meta, records
+
+
+def _is_corruption(error: sqlite3.OperationalError) -> bool:
+    """Read-only, locked or full is the machine's trouble; a wrong or half schema is the file's."""
+    return error.sqlite_errorcode & 0xFF in (
+        sqlite3.SQLITE_ERROR,
+        sqlite3.SQLITE_CORRUPT,
+        sqlite3.SQLITE_NOTADB,
+    )
+
+
+def _put_aside(path: Path) -> Path:
+    """Move the database and its WAL away under the first free name, so that nothing is lost for whoever wants to look."""
+    number = 1
+    while (aside := path.with_name(f"{path.name}.corrupt-{number}")).exists():
+        number += 1
+    path.rename(aside)
+    for suffix in ("-wal", "-shm"):
+        beside = path.with_name(path.name + suffix)
+        if beside.exists():
+            beside.rename(aside.with_name(aside.name + suffix))
+    return aside
+
+
+def _next_epoch(folder: Path, meta: Mapping[str, str], corrupt: bool, wall_s: float) -> int:
+    """Greater than every epoch before, also if one of its two places was lost, and if both were (minutes since 1970)."""
+    path = folder / "epoch"
+    known = [int(meta["epoch"])] if meta.get("epoch", "").isdecimal() else []
+    try:
+        text = path.read_text(errors="replace").strip()
+        known += [int(text)] if text.isdecimal() else []
+    except FileNotFoundError:
+        pass
+    if not known and corrupt:
+        known = [int(wall_s // 60)]
+    epoch = max(known, default=0) + 1
+    temporary = folder / "epoch.tmp"
+    with temporary.open("w") as file:
+        file.write(f"{epoch}\n")
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.rename(path)
+    return epoch

@@ -1,0 +1,44 @@
+"""sd_notify in thirty lines: tells the service manager READY, STATUS, WATCHDOG and STOPPING over its datagram socket.
+
+No socket (not started by systemd): every call does nothing. Must not know what the daemon does.
+"""
+
+import os
+import socket
+from collections.abc import Mapping
+
+
+class Notifier:
+    """`NOTIFY_SOCKET` and `WATCHDOG_USEC` of systemd's notification protocol (sd_notify(3))."""
+
+    def __init__(self, environ: Mapping[str, str]) -> None:
+        self._address = environ.get("NOTIFY_SOCKET", "")
+        if self._address.startswith("@"):
+            self._address = "\0" + self._address[1:]  # abstract namespace
+        usec, pid = environ.get("WATCHDOG_USEC", ""), environ.get("WATCHDOG_PID", "")
+        mine = not pid or pid == str(os.getpid())
+        self.watchdog_s: float | None = int(usec) / 1e6 if usec.isdecimal() and int(usec) and mine else None
+        """The manager kills the daemon if it hears nothing for so long; None: no watchdog."""
+
+    def ready(self, status: str) -> None:
+        self._send(f"READY=1\nSTATUS={status}\nMAINPID={os.getpid()}")
+
+    def status(self, text: str) -> None:
+        self._send(f"STATUS={text}")
+
+    def watchdog(self) -> None:
+        self._send("WATCHDOG=1")
+
+    def stopping(self, reason: str) -> None:
+        self._send(f"STOPPING=1\nSTATUS={reason}")
+
+    def _send(self, message: str) -> None:
+        if not self._address:
+            return
+        try:
+            with socket.socket(
+                socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK
+            ) as out:
+                out.sendto(message.encode(), self._address)
+        except OSError:
+            pass  # a manager that does not listen must not stop the daemon

@@ -1,0 +1,125 @@
+"""The one place that owns the core: events in, one after the other, effects out to the executor, one timer for time.
+
+All of it runs on the thread of the event loop; other threads post through `loop.call_soon_threadsafe(inbox.post, event)`. Nothing
+else may touch the core, except the two reads that answer `status` and `why`. `now` is `time.monotonic()`: the clock of the event
+loop's timers and of the probes' time stamps.
+"""
+
+import asyncio
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from arbiter.core.effects import Effect
+from arbiter.core.events import Event, Tick
+
+log = logging.getLogger(__name__)
+
+TIMER_FLOOR_S = 0.001
+"""A deadline that has passed is served this soon, and not in a busy loop."""
+
+
+class Core(Protocol):
+    """`arbiter.core.arbiter.Arbiter`, as the inbox needs it."""
+
+    def handle(self, event: Event, now: float) -> list[Effect]: ...
+
+    def next_deadline(self) -> float | None: ...
+
+    def status(self, now: float) -> dict[str, Any]: ...
+
+    def why(self, consumer: str, now: float) -> dict[str, Any]: ...
+
+
+class Inbox:
+    """Owns the core.
+
+    `perform` runs the effects of one event; it may post events, which are handled after it returned. `failed` is called once with the
+    exception if the core raises: its state can no longer be trusted, so nothing is handled after that.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        perform: Callable[[Sequence[Effect]], None],
+        failed: Callable[[BaseException], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._core = core
+        self._perform = perform
+        self._failed = failed
+        self._clock = clock
+        self._queue: deque[Event] = deque()
+        self._busy = False
+        self._closed = False
+        self._timer: asyncio.TimerHandle | None = None
+        self._deadline: float | None = None
+        self._handled = 0
+
+    def post(self, event: Event) -> None:
+        """Handle an event now, or right after the one that is being handled."""
+        self._queue.append(event)
+        if self._busy or self._closed:
+            return
+        self._busy = True
+        try:
+            while self._queue and not self._closed:
+                self._handle(self._queue.popleft())
+        finally:
+            self._busy = False
+        self._arm()
+
+    def status(self) -> dict[str, Any]:
+        return self._core.status(self._clock())
+
+    def why(self, consumer: str) -> dict[str, Any]:
+        return self._core.why(consumer, self._clock())
+
+    @property
+    def handled(self) -> int:
+        """Events handled so far: the watchdog is fed as long as the core answers."""
+        return self._handled
+
+    @property
+    def closed(self) -> bool:
+        return self._closed
+
+    def close(self) -> None:
+        """Nothing is handled from here on; what was granted stays granted in the journal."""
+        self._closed = True
+        self._queue.clear()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _handle(self, event: Event) -> None:
+        try:
+            effects = self._core.handle(event, self._clock())
+            self._handled += 1
+            self._perform(effects)
+        except Exception as error:  # outermost: a core that raised has an unknown state
+            log.critical("the core failed on %s: %s", event, error, exc_info=error)
+            self.close()
+            self._failed(error)
+
+    def _arm(self) -> None:
+        """One timer for the core's next deadline; armed again only when that has changed."""
+        if self._closed:
+            return
+        deadline = self._core.next_deadline()
+        if deadline == self._deadline and (self._timer is not None or deadline is None):
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._deadline = deadline
+        if deadline is not None:
+            loop = asyncio.get_running_loop()
+            wait_s = max(TIMER_FLOOR_S, deadline - self._clock())
+            self._timer = loop.call_later(wait_s, self._tick)
+
+    def _tick(self) -> None:
+        self._timer = None
+        self.post(Tick())

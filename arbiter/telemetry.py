@@ -1,0 +1,86 @@
+"""The daemon's log: one line per fact, for people or as JSON, on stderr. Must not know where the facts come from."""
+
+import json
+import logging
+import sys
+import time
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from schemas.units import format_bytes
+
+events_log = logging.getLogger("arbiter.events")
+
+_WARNINGS = frozenset(
+    {"probe_failed", "pressure", "stowaway", "oom", "lost", "expired", "deadline_passed", "journal_put_aside"}
+)
+_DETAILS = frozenset({"use_began", "use_ended", "reminded", "revoke_acked", "probe_ok"})
+
+
+def set_up_logging(form: Literal["human", "json"], level: str) -> None:
+    """Configure the root logger once, at the start of the program."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Json() if form == "json" else _Human())
+    root = logging.getLogger()
+    for old in list(root.handlers):
+        root.removeHandler(old)
+    root.addHandler(handler)
+    root.setLevel(level.upper())
+
+
+def level_of(kind: str) -> int:
+    """How loud an event of the history is in the log."""
+    if kind in _WARNINGS:
+        return logging.WARNING
+    return logging.DEBUG if kind in _DETAILS else logging.INFO
+
+
+def log_event(event: Mapping[str, Any]) -> None:
+    """One event of the history as one line of the log."""
+    level = level_of(str(event["kind"]))
+    if events_log.isEnabledFor(level):
+        events_log.log(level, "%s", sentence(event), extra={"event": dict(event)})
+
+
+def sentence(event: Mapping[str, Any]) -> str:
+    """`granted L1-4 (detector): reason="fits", needed=4.94 GiB`"""
+    skip = {"seq", "at_wall_s", "kind", "lease_id", "consumer"}
+    parts = [
+        f"{key.removesuffix('_bytes')}={_value(key, value)}"
+        for key, value in event.items()
+        if key not in skip
+    ]
+    words = [str(event["kind"]), *(str(event[key]) for key in ("lease_id",) if key in event)]
+    if "consumer" in event:
+        words.append(f"({event['consumer']})")
+    return " ".join(words) + (": " + ", ".join(parts) if parts else "")
+
+
+def _value(key: str, value: object) -> str:
+    if key.endswith("_bytes") and isinstance(value, int):
+        return format_bytes(value)
+    if isinstance(value, float):
+        return f"{value:.3f}".rstrip("0").rstrip(".")
+    return json.dumps(value, default=str, ensure_ascii=False)
+
+
+class _Human(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        clock = time.strftime("%H:%M:%S", time.localtime(record.created))
+        line = f"{clock}.{int(record.msecs):03d} {record.levelname.lower():<8} {record.getMessage()}"
+        return line + ("\n" + self.formatException(record.exc_info) if record.exc_info else "")
+
+
+class _Json(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        line: dict[str, Any] = {
+            "at_wall_s": round(record.created, 6),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if (event := getattr(record, "event", None)) is not None:
+            line["event"] = event
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str, ensure_ascii=False)

@@ -1,0 +1,139 @@
+"""The planner that needs no language model: find the named object, navigate to it, grab it, ask whether it is grasped.
+
+Written as a generator, so that the script reads top-down: it yields a tool call and receives its outcome. It says nothing about VRAM:
+which model is resident when is the arbiter's business.
+"""
+
+import json
+import re
+from collections.abc import Generator
+from dataclasses import dataclass
+
+from reasoner.palette import Palette
+from reasoner.planner import Episode, Finish, Outcome, says_yes
+from schemas.errors import BadRequest
+from schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall
+
+ATTEMPTS_MAX = 3
+LOOKS_MAX = 3  # repeats of a locate that gave no answer about the scene
+TURNS_RAD = (0.35, -0.70, 0.35)  # look left, look right, back to the middle
+NAVIGATE_DEADLINE_S = 30.0
+GRAB_DEADLINE_S = 40.0
+
+_TASK = re.compile(
+    r"\s*(?:grab|grasp|pick up|pick|fetch|take|lift)\s+(?:the\s+|a\s+|an\s+)?(.+?)\s*\.?\s*", re.IGNORECASE
+)
+
+Script = Generator[ToolCall, Outcome, Finish]
+
+
+def object_of(task: str) -> str:
+    """`grab the red cube` → `red cube`. Raises BadRequest for a task that the script cannot do."""
+    match = _TASK.fullmatch(task)
+    if match is None:
+        raise BadRequest(
+            f"the scripted planner cannot do {task!r}",
+            hint='say, for example, "grab the red cube", or use a language model',
+        )
+    return match[1].lower()
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A place in the frame of the mobile base, metres."""
+
+    x: float
+    y: float
+    z: float
+
+
+class ScriptedPlanner:
+    """`Planner` by script. Raises BadRequest or UnknownSkill at construction for a task that cannot be done here."""
+
+    def __init__(self, task: str, palette: Palette) -> None:
+        self._script = _script(
+            object_of(task),
+            palette.first("navigate").id,
+            palette.first("grasp").id,
+            can_query=palette.can_query,
+        )
+
+    async def decide(self, episode: Episode) -> ToolCall | Finish:
+        try:
+            return self._script.send(episode.steps[-1].outcome) if episode.steps else next(self._script)
+        except StopIteration as stop:
+            finish: Finish = stop.value
+            return finish
+
+
+def _script(thing: str, navigate: str, grab: str, *, can_query: bool) -> Script:
+    if can_query:
+        yield QueryScene(
+            question="Which objects are on the table?", rationale="get an overview before moving"
+        )
+    reason = ""
+    for attempt in range(1, ATTEMPTS_MAX + 1):
+        point = yield from _find(thing, navigate)
+        if point is None:
+            return Finish(False, reason or f"the {thing} was not seen")
+        arrived = yield _drive(navigate, point, f"stand in front of the {thing}")
+        if arrived.status != "succeeded":
+            reason = f"could not drive to the {thing}: {arrived.text}"
+            continue
+        closer = yield from _locate(thing)
+        if closer is not None:
+            yield _drive(navigate, closer, "correct what the view from afar got wrong")
+        outcome = yield ExecuteRskill(
+            rskill_id=grab,
+            prompt=f"grab the {thing}",
+            deadline_s=GRAB_DEADLINE_S,
+            rationale=f"attempt {attempt} of {ATTEMPTS_MAX}",
+        )
+        if outcome.status != "succeeded":
+            reason = f"the grab failed: {outcome.text}"
+            continue
+        if not can_query:
+            return Finish(True, "the grab ended; there is no scene VLM to confirm it")
+        grasped = yield from _ask(f"Has the robot gripper grasped the {thing}?")
+        if grasped is not None and says_yes(grasped):
+            return Finish(True, f"the scene VLM confirms: {grasped}")
+        reason = f"not grasped after attempt {attempt}: {grasped or 'the scene VLM gave no answer'}"
+    return Finish(False, reason)
+
+
+def _find(thing: str, navigate: str) -> Generator[ToolCall, Outcome, Point | None]:
+    """Look; where it is not seen, turn and look again."""
+    for turn in (*TURNS_RAD, None):
+        point = yield from _locate(thing)
+        if point is not None or turn is None:
+            return point
+        yield ExecuteRskill(
+            rskill_id=navigate, deadline_s=NAVIGATE_DEADLINE_S, rationale=f"the {thing} is not in view: look around",
+            goal_params_json=json.dumps({"turn_rad": turn}),
+        )  # fmt: skip
+    return None
+
+
+def _locate(thing: str) -> Generator[ToolCall, Outcome, Point | None]:
+    for _ in range(LOOKS_MAX):
+        outcome = yield LocateInView(query=thing, rationale=f"where is the {thing}?")
+        if outcome.status == "found":
+            return Point(*outcome.data["point_base_m"])
+        if outcome.status == "not_seen":
+            return None
+    return None
+
+
+def _ask(question: str) -> Generator[ToolCall, Outcome, str | None]:
+    for _ in range(LOOKS_MAX):
+        outcome = yield QueryScene(question=question)
+        if outcome.status == "answered":
+            return outcome.text
+    return None
+
+
+def _drive(navigate: str, point: Point, why: str) -> ExecuteRskill:
+    target = {"target_point": {"x": point.x, "y": point.y, "z": point.z}}
+    return ExecuteRskill(
+        rskill_id=navigate, deadline_s=NAVIGATE_DEADLINE_S, rationale=why, goal_params_json=json.dumps(target)
+    )

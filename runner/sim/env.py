@@ -1,0 +1,308 @@
+"""One simulated robot before one table: step it, look through its cameras, ask for the truth.
+
+The whole episode follows from the seed. An env belongs to one thread: MuJoCo's EGL contexts are bound to the thread that
+made them. Must not know policies, skills, goals or the arbiter.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+from runner.sim.config import ARM_JOINTS, BASE_JOINTS, CONTROL_DT_S, REST_POSE, SceneConfig, wrap_angle
+from runner.sim.layout import Layout, make_layout
+from runner.sim.scene import ARM_PREFIX, FIXED_FINGER_GEOM, GRASP_SITE, MOVING_FINGER_GEOM, build_model
+from schemas.world import CameraModel
+
+HELD_LIFT_M = 0.03  # a thing is held when its centre is this far above where it would rest on the table
+MAX_BASE_SPEED_M_S = 0.5
+MAX_BASE_TURN_RAD_S = 1.2
+SETTLE_STEPS = 6
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ObjectTruth:
+    """An object's centre in the map and in the base frame (metres), its turn about the vertical, its height over rest."""
+
+    name: str
+    position_map: tuple[float, float, float]
+    position_base: tuple[float, float, float]
+    yaw_base_rad: float
+    lift_m: float
+    touching_fingers: int
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class GroundTruth:
+    """What is really so, for evaluation, datasets and the demo's verdict; no skill may read it."""
+
+    objects: dict[str, ObjectTruth]
+    base_pose: tuple[float, float, float]
+    held: str | None
+    target: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class SeenObject:
+    """An object in an image: its box (x_min, y_min, x_max, y_max; pixels, max exclusive) and how many pixels show it."""
+
+    name: str
+    box: tuple[int, int, int, int]
+    pixels: int
+
+
+class SimEnv:
+    """SO-101 on a planar base, stepped at 30 Hz.
+
+    Arm targets are six joint angles in radians in the order of `ARM_JOINTS`; base velocities are (vx, vy, wz) in the base's
+    own frame, in m/s and rad/s. Call `close` (or use `with`) in the thread that rendered.
+    """
+
+    def __init__(self, config: SceneConfig | None = None) -> None:
+        os.environ.setdefault("MUJOCO_GL", "egl")
+        self.config = config or SceneConfig()
+        self._renderers: dict[str, Any] = {}
+        self._layout: Layout | None = None
+        self._model: Any = None
+        self._data: Any = None
+
+    # -- life --------------------------------------------------------------------------------------------------
+    def reset(self, seed: int, *, names: tuple[str, ...] | None = None) -> None:
+        """Build the scene of a seed and let it settle; the arm is at rest, the base at its start."""
+        import mujoco
+
+        self.close()
+        self._layout = make_layout(seed, self.config, names=names)
+        self._model = build_model(self._layout, self.config)
+        self._data = mujoco.MjData(self._model)
+        self._substeps = round(CONTROL_DT_S / self.config.timestep_s)
+        self._arm_q = [int(self._model.joint(ARM_PREFIX + n).qposadr[0]) for n in ARM_JOINTS]
+        self._arm_v = [int(self._model.joint(ARM_PREFIX + n).dofadr[0]) for n in ARM_JOINTS]
+        self._arm_u = [int(self._model.actuator(ARM_PREFIX + n).id) for n in ARM_JOINTS]
+        self._arm_range = self._model.actuator_ctrlrange[self._arm_u].copy()
+        self._base_q = [int(self._model.joint(n).qposadr[0]) for n in BASE_JOINTS]
+        self._base_u = [int(self._model.actuator(n).id) for n in BASE_JOINTS]
+        self._base_body = int(self._model.body("base_link").id)
+        self._fingers = tuple(
+            int(self._model.geom(ARM_PREFIX + n).id) for n in (FIXED_FINGER_GEOM, MOVING_FINGER_GEOM)
+        )
+        self._geom_of = {o.name: int(self._model.geom(o.name).id) for o in self._layout.objects}
+        self.place(self._layout.base_start, REST_POSE)
+        for _ in range(SETTLE_STEPS):
+            self.step(None, None)
+        self.steps = 0
+
+    def place(self, base_pose: Sequence[float], arm: Sequence[float] | None = None) -> None:
+        """Teleport base (x, y, yaw) and optionally the arm; for datasets, tests and evaluation only."""
+        import mujoco
+
+        for q, u, value in zip(self._base_q, self._base_u, base_pose, strict=True):
+            self._data.qpos[q] = value
+            self._data.ctrl[u] = value
+        if arm is not None:
+            for q, v, u, value in zip(self._arm_q, self._arm_v, self._arm_u, arm, strict=True):
+                self._data.qpos[q] = value
+                self._data.qvel[v] = 0.0
+                self._data.ctrl[u] = value
+        mujoco.mj_forward(self._model, self._data)
+
+    def close(self) -> None:
+        """Give the rendering contexts back. The env can be reset again afterwards."""
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # -- acting ------------------------------------------------------------------------------------------------
+    def step(
+        self,
+        arm_target: Mapping[str, float] | Sequence[float] | None,
+        base_velocity: Sequence[float] | None = None,
+    ) -> None:
+        """Advance 1/30 s. None keeps the last arm target, or stands still.
+
+        Joint targets are clipped to the servos' ranges, base speeds to the platform's. Raises ValueError for a wrong number
+        of values or one that is not finite, and KeyError for a missing joint; nothing has moved then.
+        """
+        import mujoco
+
+        if arm_target is not None:
+            values = (
+                [float(arm_target[n]) for n in ARM_JOINTS]
+                if isinstance(arm_target, Mapping)
+                else [float(v) for v in arm_target]
+            )
+            if len(values) != len(ARM_JOINTS) or not all(map(math.isfinite, values)):
+                raise ValueError(f"an arm target is {len(ARM_JOINTS)} finite joint angles in rad, not {values}")
+        twist = [float(v) for v in base_velocity] if base_velocity is not None else [0.0, 0.0, 0.0]
+        if len(twist) != 3 or not all(map(math.isfinite, twist)):
+            raise ValueError(f"a base velocity is three finite numbers (vx, vy, wz), not {twist}")
+        if arm_target is not None:
+            for u, value, (low, high) in zip(self._arm_u, values, self._arm_range, strict=True):
+                self._data.ctrl[u] = min(max(value, low), high)
+        speed = math.hypot(twist[0], twist[1])
+        shrink = min(1.0, MAX_BASE_SPEED_M_S / speed) if speed > 0 else 1.0
+        turn = min(max(twist[2], -MAX_BASE_TURN_RAD_S), MAX_BASE_TURN_RAD_S)
+        ux, uy, uyaw = self._base_u
+        dt = self.config.timestep_s
+        for _ in range(self._substeps):
+            yaw = float(self._data.ctrl[uyaw])
+            self._data.ctrl[ux] += dt * shrink * (twist[0] * math.cos(yaw) - twist[1] * math.sin(yaw))
+            self._data.ctrl[uy] += dt * shrink * (twist[0] * math.sin(yaw) + twist[1] * math.cos(yaw))
+            self._data.ctrl[uyaw] += dt * turn
+            mujoco.mj_step(self._model, self._data)
+        mujoco.mj_forward(self._model, self._data)
+        self.steps = getattr(self, "steps", 0) + 1
+
+    # -- state the robot itself knows ----------------------------------------------------------------------------
+    @property
+    def time_s(self) -> float:
+        """Simulated seconds since the scene was built."""
+        return float(self._data.time)
+
+    @property
+    def target(self) -> str:
+        """Name of the object this episode is about."""
+        return self.layout.target
+
+    @property
+    def layout(self) -> Layout:
+        """The seeded layout of the running episode. Raises RuntimeError before the first reset."""
+        if self._layout is None:
+            raise RuntimeError("call reset(seed) before using the simulator")
+        return self._layout
+
+    def joint_state(self) -> dict[str, float]:
+        """Measured arm joint angles in rad, by name, in the order of `ARM_JOINTS`."""
+        return {n: float(self._data.qpos[q]) for n, q in zip(ARM_JOINTS, self._arm_q, strict=True)}
+
+    def joint_velocity(self) -> dict[str, float]:
+        """Measured arm joint velocities in rad/s, by name."""
+        return {n: float(self._data.qvel[v]) for n, v in zip(ARM_JOINTS, self._arm_v, strict=True)}
+
+    def joint_limits(self) -> dict[str, tuple[float, float]]:
+        """Lowest and highest joint target in rad, by name."""
+        return {
+            n: (float(low), float(high)) for n, (low, high) in zip(ARM_JOINTS, self._arm_range, strict=True)
+        }
+
+    def base_pose(self) -> tuple[float, float, float]:
+        """Odometry: x, y (m) and yaw (rad) of the base in the map frame."""
+        x, y, yaw = (float(self._data.qpos[q]) for q in self._base_q)
+        return x, y, wrap_angle(yaw)
+
+    def gripper_position(self) -> tuple[float, float, float]:
+        """The grasp point between the fingers, in the base frame (forward kinematics)."""
+        return self._to_base(self._data.site(ARM_PREFIX + GRASP_SITE).xpos)
+
+    # -- cameras -----------------------------------------------------------------------------------------------
+    def render(self, camera: str) -> Any:
+        """RGB image, uint8, height × width × 3. Raises KeyError for an unknown camera."""
+        import mujoco
+
+        spec = self.config.cameras[camera]
+        renderer = self._renderer(camera)
+        renderer.update_scene(self._data, camera)
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = int(spec.shadows)
+        return renderer.render().copy()
+
+    def camera_model(self, camera: str) -> CameraModel:
+        """Intrinsics and present pose of a camera in the base frame, with the table top as support plane."""
+        import numpy as np
+
+        spec = self.config.cameras[camera]
+        focal = spec.height_px / 2.0 / math.tan(math.radians(spec.fovy_deg) / 2.0)
+        seen = self._data.camera(camera)
+        # MuJoCo looks along -z with y up; the pinhole convention is z forward, y down.
+        axes = np.asarray(seen.xmat).reshape(3, 3) @ np.diag([1.0, -1.0, -1.0])
+        rotation = self._base_rotation().T @ axes
+        position = self._to_base(seen.xpos)
+        rows = [(*(float(v) for v in rotation[i]), position[i]) for i in range(3)]
+        return CameraModel(
+            K=(
+                (focal, 0.0, spec.width_px / 2.0),
+                (0.0, focal, spec.height_px / 2.0),
+                (0.0, 0.0, 1.0),
+            ),
+            T_base_camera=(rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0)),
+            support_plane_z=self.config.table_top_z_m,
+        )
+
+    def seen_objects(self, camera: str) -> dict[str, SeenObject]:
+        """Truth about an image: boxes of the objects' visible pixels, by segmentation."""
+        import numpy as np
+
+        renderer = self._renderer(camera)
+        renderer.enable_segmentation_rendering()
+        renderer.update_scene(self._data, camera)
+        ids = renderer.render()[:, :, 0].copy()
+        renderer.disable_segmentation_rendering()
+        seen = {}
+        for name, geom in self._geom_of.items():
+            ys, xs = np.nonzero(ids == geom)
+            if len(xs):
+                box = (int(xs.min()), int(ys.min()), int(xs.max()) + 1, int(ys.max()) + 1)
+                seen[name] = SeenObject(name, box, len(xs))
+        return seen
+
+    def _renderer(self, camera: str) -> Any:
+        import mujoco
+
+        spec = self.config.cameras[camera]
+        if camera not in self._renderers:
+            self._renderers[camera] = mujoco.Renderer(self._model, spec.height_px, spec.width_px)
+        return self._renderers[camera]
+
+    # -- truth -------------------------------------------------------------------------------------------------
+    def ground_truth(self) -> GroundTruth:
+        """Where everything really is, and what the gripper really holds."""
+        objects = {o.name: self._truth(o.name, o.rest_z_m) for o in self.layout.objects}
+        held = [t for t in objects.values() if t.touching_fingers == 2 and t.lift_m >= HELD_LIFT_M]
+        name = max(held, key=lambda t: t.lift_m).name if held else None
+        return GroundTruth(objects, self.base_pose(), name, self.target)
+
+    def held_object(self) -> str | None:
+        """Name of the object between both fingers, its centre at least 3 cm above where it would rest; else None."""
+        return self.ground_truth().held
+
+    def is_held_above_table(self, name: str) -> bool:
+        """Whether this object is the held one. Raises KeyError for a name that is not in the scene."""
+        truth = self.ground_truth()
+        return truth.objects[name].name == truth.held
+
+    def _truth(self, name: str, rest_z_m: float) -> ObjectTruth:
+        body = self._data.body(name)
+        position = tuple(float(v) for v in body.xpos)
+        turn = self._base_rotation().T @ body.xmat.reshape(3, 3)
+        touching = {
+            finger
+            for contact in self._data.contact
+            for finger in self._fingers
+            if {int(contact.geom1), int(contact.geom2)} == {finger, self._geom_of[name]}
+        }
+        return ObjectTruth(
+            name=name,
+            position_map=(position[0], position[1], position[2]),
+            position_base=self._to_base(body.xpos),
+            yaw_base_rad=math.atan2(float(turn[1, 0]), float(turn[0, 0])),
+            lift_m=position[2] - self.config.table_top_z_m - rest_z_m,
+            touching_fingers=len(touching),
+        )
+
+    def _base_rotation(self) -> Any:
+        return self._data.xmat[self._base_body].reshape(3, 3)
+
+    def _to_base(self, point: Any) -> tuple[float, float, float]:
+        local = self._base_rotation().T @ (point - self._data.xpos[self._base_body])
+        return float(local[0]), float(local[1]), float(local[2])

@@ -1,0 +1,95 @@
+"""Planar navigation without a GPU: where to stand to grab a point, and how to get there.
+
+Pure geometry and a bounded P-controller; the table is the only obstacle and the base's front never crosses its edge. Must not
+know MuJoCo or goals.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from runner.sim.config import SceneConfig, wrap_angle
+
+EDGE_CLEARANCE_M = 0.025
+REACHED_M = 0.006
+REACHED_RAD = 0.015
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Pose2D:
+    """x, y in metres, yaw in radians, in the map frame unless a name says otherwise."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float = 0.0
+
+
+def to_map(base: Pose2D, x_m: float, y_m: float) -> tuple[float, float]:
+    """A point of the base frame in the map frame."""
+    cos, sin = math.cos(base.yaw_rad), math.sin(base.yaw_rad)
+    return base.x_m + cos * x_m - sin * y_m, base.y_m + sin * x_m + cos * y_m
+
+
+def front_reach_m(config: SceneConfig, yaw_rad: float) -> float:
+    """How far the base's box reaches along the map's x from its origin, at this yaw."""
+    front = config.mount_in_base_m[0] + 0.05
+    return front * abs(math.cos(yaw_rad)) + config.base_half_size_m[1] * abs(math.sin(yaw_rad))
+
+
+def standoff_pose(target_map_m: tuple[float, float], config: SceneConfig) -> Pose2D:
+    """Where the base must stand, square to the table, so that the target lies on the arm's grasp spot.
+
+    Kept clear of the table's edge: a target deep on the table is then out of reach, but nothing is hit.
+    """
+    spot_x, spot_y = config.grasp_spot_in_base_m
+    limit = config.table_edge_x_m - EDGE_CLEARANCE_M - front_reach_m(config, 0.0)
+    return Pose2D(min(target_map_m[0] - spot_x, limit), target_map_m[1] - spot_y, 0.0)
+
+
+class PlanarController:
+    """Velocity commands towards a goal pose; call once per control step."""
+
+    def __init__(
+        self,
+        goal: Pose2D,
+        config: SceneConfig,
+        *,
+        max_speed_m_s: float = 0.35,
+        max_turn_rad_s: float = 0.8,
+        gain_per_s: float = 3.0,
+        max_accel_m_s2: float = 0.8,
+        control_dt_s: float = 1.0 / 30.0,
+    ) -> None:
+        self.goal = goal
+        self._config, self._gain, self._dt = config, gain_per_s, control_dt_s
+        self._max_speed, self._max_turn, self._max_accel = max_speed_m_s, max_turn_rad_s, max_accel_m_s2
+        self._speed = 0.0
+
+    def distance_m(self, pose: Pose2D) -> float:
+        """Straight distance left."""
+        return math.hypot(self.goal.x_m - pose.x_m, self.goal.y_m - pose.y_m)
+
+    def reached(self, pose: Pose2D) -> bool:
+        """Within 6 mm and 0.015 rad of the goal."""
+        turn = wrap_angle(self.goal.yaw_rad - pose.yaw_rad)
+        return self.distance_m(pose) <= REACHED_M and abs(turn) <= REACHED_RAD
+
+    def command(self, pose: Pose2D) -> tuple[float, float, float]:
+        """(vx, vy, wz) in the base frame, m/s and rad/s; never one that would carry the front over the table's edge."""
+        gap = self.distance_m(pose)
+        wanted = min(self._max_speed, self._gain * gap)
+        self._speed = min(wanted, self._speed + self._max_accel * self._dt)
+        vx_map = vy_map = 0.0
+        if gap > 1e-6:
+            vx_map = self._speed * (self.goal.x_m - pose.x_m) / gap
+            vy_map = self._speed * (self.goal.y_m - pose.y_m) / gap
+        room = self._config.table_edge_x_m - EDGE_CLEARANCE_M / 2 - pose.x_m - front_reach_m(self._config, pose.yaw_rad)
+        vx_map = min(vx_map, max(0.0, room) * self._gain)
+        turn = self._gain * wrap_angle(self.goal.yaw_rad - pose.yaw_rad)
+        cos, sin = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
+        return (
+            cos * vx_map + sin * vy_map,
+            -sin * vx_map + cos * vy_map,
+            min(max(turn, -self._max_turn), self._max_turn),
+        )

@@ -1,0 +1,170 @@
+"""What both training scripts share: labelled frames on disk, words for objects, seeding, small-tokenizer BPE.
+
+A data set is a folder with `labels.jsonl`, one JSON object per frame, and the PNGs it names. This module must not know
+the simulator that made the frames (it reads files only) nor either model. torch and friends are imported late.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import json
+import os
+import random
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+LABELS_FILE: Final = "labels.jsonl"
+# Below this many visible pixels (at the frame's own size) a thing is too hidden for a fair yes or no.
+MIN_VISIBLE_PIXELS: Final = 40
+
+
+class BadDataset(ValueError):
+    """The folder is no data set of labelled frames; the message says which line or file is at fault."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class SeenObject:
+    """One thing that shows in a frame. `box` is (x0, y0, x1, y1) in pixels, of its visible part."""
+
+    name: str
+    box: tuple[float, float, float, float]
+    clear: bool  # visible enough that a detector must find it; otherwise it is neither right nor wrong
+
+    @property
+    def colour(self) -> str:
+        """First word of the name."""
+        return self.name.split(" ", 1)[0]
+
+    @property
+    def shape(self) -> str:
+        """The rest of the name."""
+        return self.name.split(" ", 1)[1]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Frame:
+    """One labelled image. `scene` groups frames of the same episode: a split never parts them."""
+
+    image: Path
+    camera: str
+    scene: str
+    kind: str
+    objects: tuple[SeenObject, ...]
+    held: str | None
+
+
+def split_by_scene(frames: Sequence[Frame], held_out: float, seed: int) -> tuple[list[Frame], list[Frame]]:
+    """(training, held-out) frames; whole scenes go to one side, at least one scene to each."""
+    scenes = sorted({frame.scene for frame in frames})
+    if len(scenes) < 2:
+        raise BadDataset("a data set needs at least two scenes, or nothing can be held out")
+    random.Random(f"split-{seed}").shuffle(scenes)
+    count = min(len(scenes) - 1, max(1, round(len(scenes) * held_out)))
+    away = set(scenes[:count])
+    return [f for f in frames if f.scene not in away], [f for f in frames if f.scene in away]
+
+
+def seed_everything(seed: int, threads: int) -> None:
+    """Same seed, same thread count, same library versions: same checkpoint."""
+    import numpy as np
+    import torch
+
+    os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
+    random.seed(seed)
+    np.random.seed(seed)
+    torch.manual_seed(seed)
+    torch.set_num_threads(threads)
+
+
+def load_pixels(frames: Sequence[Frame], size: tuple[int, int]) -> Any:
+    """uint8 tensor (frames, 3, height, width); every image resized to `size` = (width, height)."""
+    import numpy as np
+    import torch
+    from PIL import Image
+
+    out = np.empty((len(frames), size[1], size[0], 3), dtype=np.uint8)
+    for index, frame in enumerate(frames):
+        with Image.open(frame.image) as image:
+            rgb = image.convert("RGB")
+            out[index] = np.asarray(rgb if rgb.size == size else rgb.resize(size, Image.Resampling.BICUBIC))
+    return torch.from_numpy(out).permute(0, 3, 1, 2)
+
+
+def jitter_colours(images: Any, generator: Any, strength: float) -> Any:
+    """Float images (n, 3, h, w) in 0..1 under random exposure, white balance and noise; hue names stay true."""
+    import torch
+
+    count = images.shape[0]
+    gain = 1.0 + strength * (2 * torch.rand(count, 1, 1, 1, generator=generator) - 1)
+    balance = 1.0 + 0.3 * strength * (2 * torch.rand(count, 3, 1, 1, generator=generator) - 1)
+    offset = 0.3 * strength * (2 * torch.rand(count, 1, 1, 1, generator=generator) - 1)
+    noise = 0.02 * torch.randn(images.shape, generator=generator)
+    return (images * gain * balance + offset + noise).clamp(0.0, 1.0)
+
+
+def cosine_with_warmup(step: int, total: int, warmup: int) -> float:
+    """Factor on the learning rate: linear to 1 over `warmup` steps, then a cosine down to 0.02."""
+    import math
+
+    if step < warmup:
+        return (step + 1) / warmup
+    done = min(1.0, (step - warmup) / max(1, total - warmup))
+    return 0.02 + 0.98 * 0.5 * (1.0 + math.cos(math.pi * done))
+
+
+def byte_alphabet() -> list[str]:
+    """The 256 printable stand-ins for bytes that byte-level BPE works on, in a fixed order."""
+    from tokenizers.pre_tokenizers import ByteLevel
+
+    return sorted(ByteLevel.alphabet())
+
+
+def learn_merges(words: Iterable[str], *, suffix: str) -> tuple[list[str], list[tuple[str, str]]]:
+    """(tokens, merges) of a BPE that makes each word one token, pieces shared where they can be.
+
+    `words` are already in byte-level form; `suffix` closes a word (CLIP: `</w>`, Qwen: none). Ties are broken by
+    the alphabet, so that the same words give the same tokenizer on every machine.
+    """
+    pieces = {word: [*word[:-1], word[-1] + suffix] for word in sorted(set(words)) if word}
+    tokens: list[str] = []
+    merges: list[tuple[str, str]] = []
+    while True:
+        pairs: collections.Counter[tuple[str, str]] = collections.Counter()
+        for parts in pieces.values():
+            pairs.update(zip(parts, parts[1:], strict=False))
+        if not pairs:
+            return tokens, merges
+        best = min(pairs, key=lambda pair: (-pairs[pair], pair))
+        merges.append(best)
+        tokens.append(best[0] + best[1])
+        for parts in pieces.values():
+            at = 0
+            while at < len(parts) - 1:
+                if (parts[at], parts[at + 1]) == best:
+                    parts[at : at + 2] = [best[0] + best[1]]
+                at += 1
+
+
+def batches(count: int, size: int, seed: int) -> Iterator[list[int]]:
+    """Endless shuffled batches of indices; the last batch of a pass is filled from the next."""
+    rng = random.Random(f"batches-{seed}")
+    queue: list[int] = []
+    while True:
+        while len(queue) < size:
+            order = list(range(count))
+            rng.shuffle(order)
+            queue += order
+        yield queue[:size]
+        del queue[:size]
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """Stable, readable JSON with a newline at the end."""
+    path.write_text(json.dumps(value, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def folder_bytes(folder: Path) -> int:
+    """Size of all files under a folder."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

@@ -1,0 +1,88 @@
+"""The demo's judgement and its reading of the card's log."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clients.cli.demo_display import describe
+from clients.cli.demo_report import CardStory, Point, draw_timeline, read_log, read_samples, summarise
+
+GIB = 1 << 30
+SWITCH = {
+    "kind": "switch", "at_wall_s": 103.0, "seq": 4, "consumer": "grab", "switched": True, "verified": True,
+    "evicted": [{"consumer": "detector", "lease_id": "L1-1", "verdict": "verified", "charge_bytes": 5 * GIB}],
+    "wait_ms": 1.0, "drain_ms": 2.0, "unload_ms": 3.0, "verify_ms": 4.0, "load_ms": 5.0, "total_ms": 15.0,
+}  # fmt: skip
+LOAD = SWITCH | {"seq": 5, "switched": False, "evicted": []}
+SUCCESS = {"status": "success", "vlm_confirmed": True, "attempts": 1, "reason": "held"}
+HELD = {"held_above_table": {"red cube": True, "blue ball": False}}
+
+
+def line(pid: int, t: float, op: str, process: int, used: int) -> str:
+    return json.dumps({"pid": pid, "t": t, "op": op, "process_bytes": process, "used_after": used}) + "\n"
+
+
+def summary(**changes: Any) -> dict[str, Any]:
+    story = CardStory((), 5 * GIB, ())
+    given: dict[str, Any] = {
+        "seed": 3, "arbiter": True, "task": "grab the red cube", "story": story, "capacity_bytes": 8 * GIB, "events": [LOAD, SWITCH],
+        "reasoner": SUCCESS, "truth": HELD, "target": "red cube", "seconds": 61.23,
+    }  # fmt: skip
+    return summarise(**(given | changes))
+
+
+def test_the_log_gives_bytes_by_program_peak_and_refusals() -> None:
+    text = line(7, 1.0, "alloc", 5, 5) + line(8, 2.0, "oom", 0, 5) + line(8, 3.0, "alloc", 4, 9) + '{"torn'
+    story = read_log(text, {7: "detector"})
+    assert story == CardStory(
+        (Point(1.0, "detector", 5), Point(2.0, "pid 8", 0), Point(3.0, "pid 8", 4)), 9, (2.0,)
+    )
+
+
+def test_samples_of_a_real_card_give_the_same_story() -> None:
+    gpu = {
+        "measured_used_bytes": 6,
+        "processes": [{"pid": 7, "used_bytes": 5}, {"pid": 9, "used_bytes": None}],
+    }
+    story = read_samples([(1.0, gpu)], {7: "grab"}, [{"kind": "oom", "at_wall_s": 12.0}], wall_offset_s=10.0)
+    assert story == CardStory((Point(1.0, "grab", 5), Point(1.0, "pid 9", 0)), 6, (2.0,))
+
+
+def test_completed_needs_all_three_witnesses() -> None:
+    assert summary()["completed"]
+    assert not summary(truth={"held_above_table": {"red cube": False}})["completed"]
+    assert not summary(target="blue ball")["completed"]
+    assert not summary(reasoner=SUCCESS | {"vlm_confirmed": False})["completed"]
+    assert not summary(reasoner=SUCCESS | {"status": "failure"})["completed"]
+    assert not summary(reasoner={})["completed"]
+
+
+def test_switches_are_counted_apart_from_loads_beside_others() -> None:
+    told = summary()
+    assert (told["switches"], told["switches_verified"]) == (1, 1)
+    assert told["loads"][1] == {
+        "consumer": "grab", "evicted": ["detector"], "verdicts": ["verified"],
+        "wait_ms": 1.0, "drain_ms": 2.0, "unload_ms": 3.0, "verify_ms": 4.0, "load_ms": 5.0, "total_ms": 15.0,
+    }  # fmt: skip
+    assert summary(events=[SWITCH | {"verified": False}])["switches_verified"] == 0
+
+
+def test_events_read_as_sentences() -> None:
+    assert describe(SWITCH) == "grab took over from detector in 15 ms"
+    assert describe(LOAD) == "grab loaded beside the others in 5 ms, nobody evicted"
+    assert describe({"kind": "denied", "consumer": "x", "reason": "too big"}) == "x: denied (too big)"
+
+
+@pytest.mark.heavy
+def test_a_timeline_is_drawn_even_of_nothing(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="needs the runner extra")
+    story = CardStory(
+        (Point(1.0, "detector", GIB), Point(2.0, "detector", 0), Point(2.5, "grab", 2 * GIB)), 2 * GIB, (2.2,)
+    )
+    events = [{"kind": "revoke_asked", "at_wall_s": 101.9, "consumer": "detector"}]
+    for number, told in enumerate((story, CardStory((), 0, ()))):
+        path = tmp_path / f"{number}.png"
+        draw_timeline(path, told, 8 * GIB, events, start_s=0.5, wall_offset_s=100.0, title="t")
+        assert path.read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,104 @@
+"""The set-up script finds an interpreter that works, and says what to do when there is none."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TREE = Path(__file__).parents[2]
+TOOLS = ("bash", "cat", "cksum", "dirname", "env", "rm", "uname")
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """A copy of what the script reads, in a folder without environments, and a PATH with nothing but the basic tools."""
+    folder = tmp_path / "project"
+    (folder / ".ci").mkdir(parents=True)
+    for name in (".ci/setup", "pyproject.toml", "constraints.txt"):
+        shutil.copy(TREE / name, folder / name)
+    (folder / "bin").mkdir()
+    for tool in TOOLS:
+        found = shutil.which(tool)
+        assert found is not None
+        (folder / "bin" / tool).symlink_to(found)
+    return folder
+
+
+def script(folder: Path, name: str, body: str) -> None:
+    path = folder / "bin" / name
+    path.write_text(f"#!{folder}/bin/bash\n{body}\n", encoding="utf-8")
+    path.chmod(0o755)
+
+
+def set_up(folder: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [str(folder / ".ci/setup"), *arguments],
+        env={"PATH": str(folder / "bin"), "HOME": str(folder)} | environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+@pytest.mark.parametrize("arguments", [[], ["everything"]])
+def test_usage(project: Path, arguments: list[str]) -> None:
+    result = set_up(project, *arguments)
+    assert result.returncode == 2
+    assert result.stderr == "usage: .ci/setup full|core\n"
+
+
+def test_without_uv_and_python_it_says_what_to_install(project: Path) -> None:
+    script(
+        project, "python3.12", "echo 'pyenv: python3.12: command not found' >&2; exit 127"
+    )  # a shim that refuses
+    result = set_up(project, "core")
+    assert result.returncode == 1
+    assert "neither uv nor a Python that runs was found" in result.stderr
+    assert "apt-get install python3" in result.stderr
+
+
+def test_with_uv_but_no_python_it_asks_uv_and_names_the_remedy(project: Path) -> None:
+    script(project, "uv", '[ "$1" = --version ] && exit 0; echo "uv $*" >&2; exit 1')
+    result = set_up(project, "core")
+    assert result.returncode == 1
+    assert "uv python install 3.12" in result.stderr
+    assert "pyenv install 3.12" in result.stderr
+
+
+def test_it_takes_the_first_interpreter_that_works_and_works_once(project: Path) -> None:
+    log = project / "log"
+    script(project, "python3.12", "exit 127")
+    (project / "bin" / "python3.13").symlink_to(sys.executable)
+    script(
+        project,
+        "uv",
+        f'[ "$1" = --version ] && exit 0; echo "$*" >>{log}; [ "$1" != venv ] || '
+        f'{{ mkdir -p "${{@: -1}}/bin"; ln -s {sys.executable} "${{@: -1}}/bin/python"; }}',
+    )
+    (project / "bin" / "mkdir").symlink_to(str(shutil.which("mkdir")))
+    (project / "bin" / "ln").symlink_to(str(shutil.which("ln")))
+    first = set_up(project, "core")
+    assert first.returncode == 0, first.stderr
+    made, installed = log.read_text(encoding="utf-8").splitlines()
+    assert made == f"venv --quiet --clear --python {project}/bin/python3.13 .venv-core"
+    assert installed == "pip install --python .venv-core/bin/python -c constraints.txt -e .[dev]"
+
+    assert set_up(project, "core").returncode == 0
+    assert len(log.read_text(encoding="utf-8").splitlines()) == 2, "nothing changed, nothing to do"
+
+    with open(project / "constraints.txt", "a", encoding="utf-8") as file:
+        file.write("# changed\n")
+    assert set_up(project, "core").returncode == 0
+    assert log.read_text(encoding="utf-8").splitlines()[2:] == [installed], (
+        "only the packages are installed anew"
+    )
+
+
+def test_python_can_be_chosen(project: Path) -> None:
+    script(project, "uv", '[ "$1" = --version ] && exit 0; echo "uv $*" >&2; exit 1')
+    (project / "bin" / "python3.13").symlink_to(sys.executable)
+    result = set_up(project, "core", PYTHON=os.path.realpath(sys.executable))
+    assert f"making .venv-core with {os.path.realpath(sys.executable)}" in result.stderr

@@ -1,0 +1,50 @@
+"""Files that are shipped as data: the manifests load, the constraints are plain, nothing speaks of the machine it was made on."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from schemas.manifest import load_manifest
+
+TREE = Path(__file__).parents[2]
+MANIFESTS = sorted((TREE / "configs").rglob("rskill.yaml"))
+CONSTRAINTS = [
+    line
+    for line in (TREE / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    if not line.startswith("#")
+]
+
+
+def test_there_are_skills() -> None:
+    assert MANIFESTS
+
+
+@pytest.mark.parametrize("path", MANIFESTS, ids=lambda path: path.parent.name)
+def test_shipped_manifest_loads_without_a_warning(path: Path) -> None:
+    assert load_manifest(path).warnings() == []
+
+
+def test_constraints_are_plain_versions() -> None:
+    odd = [line for line in CONSTRAINTS if not re.fullmatch(r"[A-Za-z0-9._-]+==[0-9][0-9A-Za-z.]*", line)]
+    assert not odd, "no addresses, no local paths, no local version labels"
+
+
+def test_every_dependency_is_constrained() -> None:
+    project = tomllib.loads((TREE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    wanted = [
+        *project["dependencies"],
+        *(name for extra in project["optional-dependencies"].values() for name in extra),
+    ]
+    names = {re.split(r"[\[<>=!~; ]", text, maxsplit=1)[0].lower().replace("_", "-") for text in wanted} - {
+        "vram-arbiter"
+    }
+    assert names <= {line.partition("==")[0].lower().replace("_", "-") for line in CONSTRAINTS}
+
+
+@pytest.mark.parametrize("script", [".ci/setup", ".ci/run"])
+def test_scripts_can_be_run(script: str) -> None:
+    path = TREE / script
+    assert path.stat().st_mode & 0o111
+    assert path.read_text(encoding="utf-8").startswith("#!/usr/bin/env bash\n")

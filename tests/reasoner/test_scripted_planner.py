@@ -1,0 +1,178 @@
+"""The script's decisions, driven by hand: no sockets, no clock."""
+
+import asyncio
+from collections.abc import Callable
+
+import pytest
+
+from reasoner.llm.scripted import ScriptedPlanner, object_of
+from reasoner.loop import REPEATS_MAX, Result, run_episode
+from reasoner.palette import Palette, Skill
+from reasoner.planner import Episode, Finish, Outcome
+from schemas.errors import BadRequest, LlmError, UnknownSkill
+from schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall
+
+NAVIGATE = Skill("lab/navigate", "ros_action", "drive", ("navigate",))
+GRAB = Skill("lab/grab", "vla", "grab", ("pick", "grasp"))
+DETECTOR = Skill("lab/detector", "detector", "see", ("detect",))
+PALETTE = Palette((NAVIGATE, GRAB, DETECTOR))
+
+FOUND = Outcome("found", "there", data={"point_base_m": [0.4, 0.1, 0.2]})
+DONE = Outcome("succeeded", "")
+YES = Outcome("answered", "Yes, the gripper holds the red cube.")
+NO = Outcome("answered", "No, the gripper is empty.")
+
+
+def play(
+    world: Callable[[ToolCall, int], Outcome], palette: Palette = PALETTE
+) -> tuple[Result, list[ToolCall]]:
+    """Run the script against a world that answers (call, how many calls of this tool came before)."""
+    calls: list[ToolCall] = []
+
+    async def dispatch(call: ToolCall) -> Outcome:
+        before = sum(other.tool == call.tool for other in calls)
+        calls.append(call)
+        return world(call, before)
+
+    planner = ScriptedPlanner("grab the red cube", palette)
+    return asyncio.run(run_episode("grab the red cube", planner, palette, dispatch)), calls
+
+
+def test_finds_drives_corrects_grabs_and_asks() -> None:
+    def world(call: ToolCall, _: int) -> Outcome:
+        match call:
+            case LocateInView():
+                return FOUND
+            case QueryScene():
+                return YES
+            case _:
+                return DONE
+
+    result, calls = play(world)
+    assert [call.tool for call in calls] == [
+        "query_scene", "locate_in_view", "execute_rskill", "locate_in_view", "execute_rskill", "execute_rskill", "query_scene",
+    ]  # fmt: skip
+    drive, correct, grab = (call for call in calls if isinstance(call, ExecuteRskill))
+    assert drive.rskill_id == correct.rskill_id == NAVIGATE.id
+    assert drive.goal_params == {"target_point": {"x": 0.4, "y": 0.1, "z": 0.2}}
+    assert (grab.rskill_id, grab.prompt) == (GRAB.id, "grab the red cube")
+    assert result["status"] == "success"
+    assert result["attempts"] == 1
+    assert result["vlm_confirmed"]
+
+
+def test_retries_at_most_three_times() -> None:
+    def world(call: ToolCall, _: int) -> Outcome:
+        return FOUND if isinstance(call, LocateInView) else NO if isinstance(call, QueryScene) else DONE
+
+    result, calls = play(world)
+    assert result["status"] == "failure"
+    assert result["attempts"] == 3
+    assert not result["vlm_confirmed"]
+    assert sum(isinstance(call, ExecuteRskill) and call.rskill_id == GRAB.id for call in calls) == 3
+    assert "not grasped after attempt 3" in result["reason"]
+
+
+def test_looks_around_when_not_seen_and_gives_up_without_grabbing() -> None:
+    def world(call: ToolCall, _: int) -> Outcome:
+        return (
+            Outcome("not_seen", "")
+            if isinstance(call, LocateInView)
+            else NO
+            if isinstance(call, QueryScene)
+            else DONE
+        )
+
+    result, calls = play(world)
+    turns = [call.goal_params["turn_rad"] for call in calls if isinstance(call, ExecuteRskill)]
+    assert turns == [0.35, -0.70, 0.35]
+    assert result["attempts"] == 0
+    assert result["reason"] == "the red cube was not seen"
+
+
+def test_evicted_is_not_absent() -> None:
+    """The defect of the field: an evicted detector that answers as if the object were not there makes the robot turn away."""
+
+    def world(call: ToolCall, before: int) -> Outcome:
+        match call:
+            case LocateInView():
+                return Outcome("evicted", "not resident", "evicted") if before == 0 else FOUND
+            case QueryScene():
+                return YES
+            case _:
+                return DONE
+
+    result, calls = play(world)
+    assert [call.tool for call in calls][1:4] == ["locate_in_view", "locate_in_view", "execute_rskill"]
+    assert "target_point" in calls[3].model_dump_json()
+    assert result["status"] == "success"
+
+
+def test_a_failed_drive_or_grab_is_a_retry_with_its_reason() -> None:
+    def world(call: ToolCall, before: int) -> Outcome:
+        match call:
+            case ExecuteRskill(rskill_id=GRAB.id):
+                return Outcome("failed", "CUDA out of memory (simulated)", "oom")
+            case LocateInView():
+                return FOUND
+            case QueryScene():
+                return NO
+            case _:
+                return DONE
+
+    result, _ = play(world)
+    assert result["status"] == "failure"
+    assert result["attempts"] == 3
+    assert "out of memory" in result["reason"]
+
+
+def test_an_unclear_answer_is_not_a_yes() -> None:
+    def world(call: ToolCall, _: int) -> Outcome:
+        return (
+            FOUND
+            if isinstance(call, LocateInView)
+            else Outcome("answered", "Maybe.")
+            if isinstance(call, QueryScene)
+            else DONE
+        )
+
+    assert play(world)[0]["status"] == "failure"
+
+
+def test_task_and_skills_are_checked_before_anything_moves() -> None:
+    assert object_of("Pick up the blue ball.") == "blue ball"
+    with pytest.raises(BadRequest, match="cannot do"):
+        object_of("sing a song")
+    with pytest.raises(UnknownSkill, match="can grasp"):
+        ScriptedPlanner("grab the red cube", Palette((NAVIGATE,)))
+
+
+def test_a_perception_skill_is_never_executed_whatever_a_planner_says() -> None:
+    class Rogue:
+        async def decide(self, episode: Episode) -> ToolCall | Finish:
+            return Finish(True, "") if episode.steps else ExecuteRskill(rskill_id=DETECTOR.id)
+
+    async def dispatch(call: ToolCall) -> Outcome:
+        raise AssertionError(f"{call} must not be dispatched")
+
+    result = asyncio.run(run_episode("x", Rogue(), PALETTE, dispatch))
+    assert result["steps"][0]["status"] == "refused"
+    assert result["steps"][0]["code"] == "not_permitted"
+
+
+def test_a_planner_that_repeats_itself_or_fails_ends_the_episode() -> None:
+    class Parrot:
+        async def decide(self, episode: Episode) -> ToolCall | Finish:
+            return QueryScene(question="Is it there?")
+
+    class Mute:
+        async def decide(self, episode: Episode) -> ToolCall | Finish:
+            raise LlmError("no answer")
+
+    async def dispatch(call: ToolCall) -> Outcome:
+        return NO
+
+    repeated = asyncio.run(run_episode("x", Parrot(), PALETTE, dispatch))
+    assert repeated["status"] == "failure"
+    assert len(repeated["steps"]) == REPEATS_MAX
+    assert "no answer" in asyncio.run(run_episode("x", Mute(), PALETTE, dispatch))["reason"]
