@@ -9,14 +9,28 @@ the client gives it up by itself. Nobody waits for ever: each request and each w
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
+from clients.records import (
+    ContactLost,
+    Denied,
+    Event,
+    Failed,
+    Gone,
+    Granted,
+    HistoryEvent,
+    LeaseRecord,
+    Message,
+    Refused,
+    Replied,
+    RevokeAsked,
+    TokenPair,
+    Up,
+    UseLost,
+)  # fmt: skip
 from schemas import defaults as d
 from schemas.errors import ArbiterUnreachable, LeaseLost, UnknownSession, VramError, WaitTimeout, from_wire
-
-Message = dict[str, Any]
-TokenPair = tuple[int, int]
 
 HELLO_TIMEOUT_S = 2.0  # an unanswered hello is said again on a fresh socket
 REFUSED_RETRY_S = 1.0  # after a refused hello (a full server may have room later)
@@ -28,122 +42,7 @@ GONE_CODES = frozenset({"lease_lost", "lease_expired", "unknown_lease", "stale_t
 """Replies that say that the lease is no longer ours."""
 
 
-# -- what the owner is told -----------------------------------------------------------------------------------------
-@dataclass(frozen=True, slots=True)
-class Up:
-    """Greeted and re-attached; requests flow. `epoch` changes with every start of the daemon."""
-
-    epoch: int
-
-
-@dataclass(frozen=True, slots=True)
-class ContactLost:
-    """Open a fresh socket (the old one may still carry stale messages) and call `connected`."""
-
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class Refused:
-    """The arbiter does not want this client (version, role, full)."""
-
-    error: VramError
-
-
-@dataclass(frozen=True, slots=True)
-class Replied:
-    request_id: int
-    body: Message
-
-
-@dataclass(frozen=True, slots=True)
-class Failed:
-    request_id: int
-    error: VramError
-
-
-@dataclass(frozen=True, slots=True)
-class Granted:
-    nonce: str
-    record: "LeaseRecord"
-
-
-@dataclass(frozen=True, slots=True)
-class Denied:
-    nonce: str
-    error: VramError
-
-
-@dataclass(frozen=True, slots=True)
-class RevokeAsked:
-    """Asked to leave, or told again; `record.server_uses` is what the arbiter counts now (None: it did not say)."""
-
-    record: "LeaseRecord"
-    push: Message
-    first: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Gone:
-    """A lease that ended without our doing. `fenced`: we ended it, the arbiter may not know."""
-
-    record: "LeaseRecord"
-    error: VramError
-    fenced: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class UseLost:
-    """A use on somebody else's lease could not be renewed after a reconnect."""
-
-    use_id: str
-    error: VramError
-
-
-@dataclass(frozen=True, slots=True)
-class HistoryEvent:
-    event: Message
-
-
-Event = (
-    Up
-    | ContactLost
-    | Refused
-    | Replied
-    | Failed
-    | Granted
-    | Denied
-    | RevokeAsked
-    | Gone
-    | UseLost
-    | HistoryEvent
-)
-
-
-# -- what it remembers ----------------------------------------------------------------------------------------------
-@dataclass(slots=True)
-class LeaseRecord:
-    """One granted lease, as this client believes it."""
-
-    lease_id: str
-    token: TokenPair
-    nonce: str
-    spec: Message
-    view: Message
-    confirmed_at: float  # when the last message that the arbiter confirmed was *sent*
-    renewed_at: float
-    held: bool = False  # False: still loading
-    measured_bytes: int | None = None
-    uses: set[str] = field(default_factory=set)
-    revoke: Message | None = None
-    server_uses: int | None = None
-    released: bool = False
-
-    @property
-    def ttl_s(self) -> float:
-        return float(self.spec.get("ttl_s", d.LEASE_TTL_S))
-
-
+# -- what it remembers --------------------------------------------------------------------------------------------------
 @dataclass(slots=True)
 class _Waiter:
     nonce: str

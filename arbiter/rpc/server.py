@@ -7,7 +7,6 @@ too) may consume that edge. So the reader drains until the socket is empty, and 
 import asyncio
 import contextlib
 import errno
-import fcntl
 import logging
 import os
 import stat
@@ -18,7 +17,7 @@ import zmq
 
 from arbiter.rpc.peer import parse_peer_address
 from schemas.config import check_endpoint
-from schemas.errors import AlreadyRunning, ConfigError, InternalError
+from schemas.errors import ConfigError, InternalError
 
 log = logging.getLogger(__name__)
 
@@ -34,56 +33,12 @@ OnFrame = Callable[[bytes, bool, str | None, bytes], None]
 """`on_frame(routing_id, delimiter, peer_address, payload)`"""
 
 
-class SocketLock:
-    """One daemon per socket path: a lock file beside the socket, held as long as the process lives.
-
-    Needed because libzmq silently takes over an existing socket path at bind. The file stays: removing it would let two daemons lock
-    two files of one name. A dead daemon's lock is gone with it, and its stale socket is replaced by the bind.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._fd: int | None = None
-
-    def acquire(self) -> None:
-        """Raises AlreadyRunning with the pid of the holder, ConfigError where the file cannot be made."""
-        try:
-            fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o640)
-        except OSError as error:
-            raise ConfigError(
-                f"{self._path}: {error.strerror}", hint="choose a folder that the daemon may write"
-            ) from error
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            text = os.read(fd, 32).decode("ascii", "replace").strip()
-            os.close(fd)
-            pid = int(text) if text.isdecimal() else None
-            raise AlreadyRunning(
-                f"an arbiter (pid {text or 'unknown'}) already serves {self._path.with_suffix('')}",
-                hint="stop it first, or give this one another --endpoint",
-                details={"pid": pid, "lock": str(self._path)},
-            ) from error
-        os.ftruncate(fd, 0)
-        os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
-        self._fd = fd
-
-    def release(self) -> None:
-        if self._fd is not None:
-            os.close(self._fd)
-            self._fd = None
-
-
 def socket_path(endpoint: str) -> Path:
     """The path of an `ipc://` endpoint. Raises ConfigError for everything that the daemon does not serve."""
     try:
         return Path(check_endpoint(endpoint).removeprefix("ipc://"))
     except ValueError as error:
         raise ConfigError(str(error)) from error
-
-
-def lock_path(path: Path) -> Path:
-    return path.with_name(path.name + ".lock")
 
 
 def make_private_folder(folder: Path, group: int | None) -> None:
@@ -219,7 +174,10 @@ class RouterServer:
                     frames = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
                 except zmq.Again:
                     return
-                self._deliver(frames)
+                try:
+                    self._deliver(frames)
+                except Exception:  # outermost: one bad message must not cost the others their wake-up
+                    log.exception("a message could not be handled")
         finally:
             self._draining = False
         self._schedule_drain()

@@ -181,9 +181,11 @@ async def _boot(
     client = None
     if arbiter:
         source = gpu if gpu == "nvml" else f"fake:{runtime}/fakegpu"
-        await programs.start(
-            "arbiter", "arbiter", "--gpu", source, *(["--capacity", BUDGET] if gpu == "nvml" else [])
-        )
+        config = runtime / "arbiter.yaml"
+        config.write_text(
+            f'gpu:\n  capacity_bytes: {{"0": {BUDGET}}}\n'
+        )  # a larger real card is budgeted like the small one
+        await programs.start("arbiter", "arbiter", "--gpu", source, "--config", str(config))
         client = await stack.enter_async_context(_arbiter_client(runtime))
     device = "cuda" if gpu == "nvml" else f"fake:{runtime}/fakegpu"
     for name, rskill in SIDECARS.items():

@@ -156,7 +156,8 @@ def draw_timeline(
             markeredgewidth=3,
         )
     axes.set(xlabel="seconds", ylabel="GiB on the card", ylim=(0, capacity_bytes / GIB * 1.25), title=title)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8)
+    if times:
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 

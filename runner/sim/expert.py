@@ -59,6 +59,11 @@ class GrabExpert:
         """Whether the lift is finished."""
         return self.phase is Phase.DONE
 
+    @property
+    def lifting(self) -> bool:
+        """Whether the object should be between the fingers by now."""
+        return self.phase in (Phase.LIFT, Phase.DONE)
+
     def _believed(self) -> tuple[float, float, float]:
         x, y, z = self._env.ground_truth().objects[self._name].position_base
         return x + self._offset[0], y + self._offset[1], z

@@ -55,6 +55,47 @@ class Frame:
     held: str | None
 
 
+def read_frames(folder: Path, cameras: Sequence[str] | None = None) -> list[Frame]:
+    """All frames of a data set (of these cameras), in file order. Raises BadDataset."""
+    labels = folder / LABELS_FILE
+    if not labels.is_file():
+        raise BadDataset(f"{labels} is missing: make a data set with `python -m runner.sim.dataset scenes`")
+    frames: list[Frame] = []
+    for number, line in enumerate(labels.read_text(encoding="utf-8").splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            frame = _frame(folder, json.loads(line))
+        except (KeyError, TypeError, ValueError) as error:
+            raise BadDataset(f"{labels}:{number}: {error!r}") from error
+        if cameras is None or frame.camera in cameras:
+            frames.append(frame)
+    if not frames:
+        raise BadDataset(f"{labels} has no frame of the cameras {list(cameras or ())}")
+    return frames
+
+
+def _frame(folder: Path, raw: Mapping[str, Any]) -> Frame:
+    image = folder / str(raw["image"])
+    objects = tuple(
+        SeenObject(
+            name=str(item["name"]),
+            box=(float(item["box"][0]), float(item["box"][1]), float(item["box"][2]), float(item["box"][3])),
+            clear=int(item["pixels"]) >= MIN_VISIBLE_PIXELS,
+        )
+        for item in raw["objects"]
+    )
+    held = raw["held"]
+    return Frame(
+        image=image,
+        camera=str(raw["camera"]),
+        scene=str(raw.get("scene", image.stem.split("_")[0])),
+        kind=str(raw.get("mode", "")),
+        objects=objects,
+        held=None if held is None else str(held),
+    )
+
+
 def split_by_scene(frames: Sequence[Frame], held_out: float, seed: int) -> tuple[list[Frame], list[Frame]]:
     """(training, held-out) frames; whole scenes go to one side, at least one scene to each."""
     scenes = sorted({frame.scene for frame in frames})

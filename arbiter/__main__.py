@@ -1,0 +1,142 @@
+"""`vram-arbiter`: parse, check, run. Everything else is in `daemon`."""
+
+import argparse
+import asyncio
+import os
+import sys
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+
+from schemas.config import ArbiterConfig, load_config
+from schemas.errors import AlreadyRunning, ConfigError, InternalError, NoGpu, ProbeFailed, VramError
+
+EXIT_USAGE, EXIT_ALREADY_RUNNING, EXIT_NO_GPU, EXIT_DEFECT = 2, 3, 4, 70
+
+_EPILOG = """\
+exit codes:
+  0   stopped by SIGTERM or SIGINT (leases stay with their holders), or --check-config found nothing
+  2   wrong flags or configuration
+  3   another arbiter serves this socket or uses this state folder
+  4   no GPU: no NVIDIA driver or no card (--gpu fake:8GiB simulates one)
+  70  a defect: the core's state became invalid; the log says how, a restart recovers the leases
+
+environment:
+  VRAM_ARBITER_ENDPOINT   endpoint, if neither --endpoint nor wire.endpoint is given
+  VRAM_ARBITER_RUNTIME    folder of the sockets and of the simulated card (else RUNTIME_DIRECTORY,
+                          XDG_RUNTIME_DIR/vram-arbiter or /tmp/vram-arbiter-UID)
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    made = argparse.ArgumentParser(
+        prog="vram-arbiter",
+        description="Leases GPU memory to processes: one daemon per machine, no configuration needed.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    made.add_argument(
+        "--config",
+        metavar="FILE",
+        type=Path,
+        help="YAML file; every key is explained in configs/arbiter.yaml",
+    )
+    made.add_argument(
+        "--gpu",
+        metavar="SOURCE",
+        help="nvml (default): the NVIDIA cards; fake:8GiB: a simulated card in the runtime folder; fake:FOLDER: that one",
+    )
+    made.add_argument("--endpoint", metavar="URL", help="where to listen, ipc:///absolute/path")
+    made.add_argument("--state-dir", metavar="DIR", help="folder of journal and history")
+    made.add_argument(
+        "--log-format", choices=("human", "json"), help="human (default) or one JSON object a line"
+    )
+    made.add_argument("--log-level", choices=("debug", "info", "warning", "error"), help="info (default)")
+    made.add_argument("--check-config", action="store_true", help="check flags and configuration, then exit")
+    made.add_argument("--version", action="version", version=f"vram-arbiter {version()}")
+    return made
+
+
+def version() -> str:
+    try:
+        return metadata.version("vram-arbiter")
+    except metadata.PackageNotFoundError:  # run from a source tree that is not installed
+        return "0+source"
+
+
+def effective_config(flags: argparse.Namespace) -> ArbiterConfig:
+    """The file's configuration with the flags over it. Raises ConfigError."""
+    config = ArbiterConfig()
+    if flags.config is not None:
+        try:
+            text = flags.config.read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(
+                f"{flags.config}: {error}", hint="--config needs a readable YAML file"
+            ) from error
+        config = load_config(text, str(flags.config))
+    values = config.model_dump()
+    for section, key, value, flag in (
+        ("gpu", "source", flags.gpu, "--gpu"),
+        ("wire", "endpoint", flags.endpoint, "--endpoint"),
+        ("state", "dir", flags.state_dir, "--state-dir"),
+        ("log", "format", flags.log_format, "--log-format"),
+        ("log", "level", flags.log_level, "--log-level"),
+    ):
+        if value is None:
+            continue
+        values[section][key] = value
+        try:
+            ArbiterConfig.model_validate(values)
+        except ValueError as error:
+            raise ConfigError(f"{flag}: {_first_problem(error)}", hint="see vram-arbiter --help") from error
+    return ArbiterConfig.model_validate(values)
+
+
+def _first_problem(error: ValueError) -> str:
+    from pydantic import ValidationError
+
+    if isinstance(error, ValidationError):
+        return error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
+    return str(error)
+
+
+def exit_code_of(error: VramError) -> int:
+    match error:
+        case AlreadyRunning():
+            return EXIT_ALREADY_RUNNING
+        case NoGpu() | ProbeFailed():
+            return EXIT_NO_GPU
+        case InternalError():
+            return EXIT_DEFECT
+        case _:
+            return EXIT_USAGE
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Returns the exit code; prints errors of the operator as one line without a traceback."""
+    flags = parser().parse_args(argv)
+    try:
+        config = effective_config(flags)
+        from arbiter.daemon import Daemon, find_places  # late: --help and --version need none of it
+        from arbiter.telemetry import set_up_logging
+
+        places = find_places(config, os.environ, os.getuid())
+        if flags.check_config:
+            print(
+                f"{flags.config or 'built-in configuration'}: ok (would serve {places.endpoint}, gpu {config.gpu.source})"
+            )
+            return 0
+        set_up_logging(config.log.format, config.log.level)
+
+        async def serve() -> int:
+            return await Daemon(config, os.environ, version()).run()
+
+        return asyncio.run(serve())
+    except VramError as error:
+        print(f"vram-arbiter: {error}", file=sys.stderr)
+        return exit_code_of(error)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,322 @@
+"""The daemon: the only place where real parts are put together, with the order of start and of stop.
+
+Start: folders and locks → journal → cards → core (told what the journal remembers; its processes are watched) → socket → READY. A failure
+on the way undoes what was done. Stop: no more requests → nothing more is decided → files are written → socket goes. Leases survive a
+stop: their holders keep what they have and re-attach. Must not decide anything about leases.
+"""
+
+import asyncio
+import contextlib
+import logging
+import os
+import resource
+import signal
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from arbiter import telemetry
+from arbiter.core.arbiter import Arbiter
+from arbiter.core.effects import Effect
+from arbiter.core.events import ProcessDied, Recovered, Tick
+from arbiter.core.settings import GpuInfo, Settings
+from arbiter.host.executor import Executor
+from arbiter.host.gpu.fake import open_cards
+from arbiter.host.gpu.nvml import NvmlProbe
+from arbiter.host.gpu.probe import Card, GpuProbe
+from arbiter.host.history import History
+from arbiter.host.journal import Journal
+from arbiter.host.lockfile import LockFile
+from arbiter.host.probing import Prober, within
+from arbiter.host.systemd import Notifier
+from arbiter.host.watch import ProcessWatch
+from arbiter.inbox import Inbox
+from arbiter.rpc.peer import group_id, start_ticks
+from arbiter.rpc.server import RouterServer, make_private_folder, socket_path
+from arbiter.rpc.session import SessionSettings, SessionTable
+from schemas.config import ArbiterConfig
+from schemas.endpoints import arbiter_endpoint, runtime_dir
+from schemas.errors import ConfigError
+from schemas.ids import ProcessKey
+from schemas.units import format_bytes
+
+log = logging.getLogger(__name__)
+
+EXIT_OK = 0
+EXIT_DEFECT = 70
+"""EX_SOFTWARE: an invariant was violated or the core raised."""
+PROBE_START_S = 30.0
+"""Without persistence mode the NVIDIA driver needs seconds to initialise its cards."""
+OPEN_FILES = 65_536
+STATUS_EVERY_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Where everything is: flags first, then the configuration, then the environment."""
+
+    endpoint: str
+    socket: Path
+    runtime: Path
+    state: Path
+
+
+def find_places(config: ArbiterConfig, environ: Mapping[str, str], uid: int) -> Places:
+    """Raises ConfigError for an endpoint that the daemon does not serve."""
+    runtime = Path(runtime_dir(environ, uid))
+    endpoint = config.wire.endpoint or arbiter_endpoint(environ, uid)
+    if config.state.dir is not None:
+        state = Path(config.state.dir)
+    elif under_systemd := environ.get("STATE_DIRECTORY"):
+        state = Path(under_systemd.split(":")[0])
+    elif config.gpu.source.startswith("fake:"):
+        state = runtime / "state"  # a simulated card is as short-lived as the runtime folder
+    else:
+        home = environ.get("XDG_STATE_HOME") or str(Path(environ.get("HOME", "/")) / ".local" / "state")
+        state = Path(home) / "vram-arbiter"
+    return Places(endpoint, socket_path(endpoint), runtime.absolute(), state.absolute())
+
+
+def open_probe(source: str, runtime: Path) -> GpuProbe:
+    """The backend of `gpu.source`. Raises NoGpu or ConfigError. A simulated card is never a fallback: it has to be asked for."""
+    kind, _, what = source.partition(":")
+    return open_cards(what, runtime) if kind == "fake" else NvmlProbe()
+
+
+def budget(cards: Sequence[Card], config: ArbiterConfig) -> tuple[GpuInfo, ...]:
+    """What of each card is leased out. Raises ConfigError for a cap on a card that is not there, or a reserve larger than a card."""
+    caps = dict(config.gpu.capacity_bytes)
+    found = []
+    for card in cards:
+        by_id, by_index = caps.pop(card.id, None), caps.pop(str(card.index), None)
+        capacity = min(size for size in (card.total_bytes, by_id, by_index) if size is not None)
+        if capacity <= config.gpu.reserve_bytes:
+            raise ConfigError(
+                f"gpu.reserve_bytes ({format_bytes(config.gpu.reserve_bytes)}) leaves nothing of {card.name} "
+                f"({format_bytes(capacity)})",
+                hint="lower the reserve or raise the cap",
+            )
+        found.append(GpuInfo(card.id, card.index, card.name, capacity, config.gpu.reserve_bytes))
+    if caps:
+        known = ", ".join(f"{card.index} ({card.id})" for card in cards)
+        raise ConfigError(
+            f"gpu.capacity_bytes names no card of this machine: {', '.join(caps)}", hint=f"cards: {known}"
+        )
+    return tuple(found)
+
+
+def core_settings(config: ArbiterConfig, epoch: int, gpus: tuple[GpuInfo, ...]) -> Settings:
+    return Settings(
+        epoch=epoch,
+        gpus=gpus,
+        ageing_s_per_point=config.scheduling.ageing_s_per_point,
+        revoke_resend_s=config.revoke.resend_s,
+        revoke_remind_s=config.revoke.remind_s,
+        revoke_deadline_s=config.revoke.deadline_s,
+        verify_timeout_s=config.verify.timeout_s,
+        verify_poll_s=config.verify.poll_s,
+        verify_slow_poll_s=config.verify.slow_poll_s,
+        verify_tolerance_bytes=config.verify.tolerance_bytes,
+        sample_max_age_s=config.probe.sample_max_age_s,
+        probe_period_s=config.probe.period_s,
+        fence_grace_s=config.lease.fence_grace_s,
+        waiters_max=config.limits.waiters_max,
+        leases_per_client_max=config.limits.leases_per_client_max,
+        uses_per_lease_max=config.limits.uses_per_lease_max,
+    )
+
+
+class Daemon:
+    """`await Daemon(config, environ, version).run()` serves until SIGTERM or SIGINT and returns the exit code.
+
+    Raises the operator's errors (ConfigError, AlreadyRunning, NoGpu, ProbeFailed) before it serves.
+    """
+
+    def __init__(self, config: ArbiterConfig, environ: Mapping[str, str], version: str) -> None:
+        self._config = config
+        self._environ = environ
+        self._server_name = f"vram-arbiter {version}"
+        self._exit_code = EXIT_OK
+        self._stop = asyncio.Event()
+
+    async def run(self) -> int:
+        config = self._config
+        places = find_places(config, self._environ, os.getuid())
+        group = self._operators_group()
+        boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        loop = asyncio.get_running_loop()
+        notifier = Notifier(self._environ)
+        raise_open_files()
+        with contextlib.ExitStack() as undo:
+            # folders and locks
+            make_private_folder(places.socket.parent, group)
+            make_private_folder(places.state, None)
+            if config.gpu.source.startswith("fake:"):
+                make_private_folder(places.runtime, group)
+            for path, protects in (
+                (places.socket.with_name(places.socket.name + ".lock"), str(places.socket)),
+                (places.state / "lock", str(places.state)),
+            ):
+                lock = LockFile(path, protects)
+                lock.acquire()
+                undo.callback(lock.release)
+            # journal and history
+            journal = Journal.open(places.state, boot_id)
+            undo.callback(journal.close)
+            history = History.open(places.state, config.history.max_events, config.history.days)
+            history.start(loop)
+            undo.callback(history.close)
+            # cards
+            probe = await within(
+                PROBE_START_S, lambda: open_probe(config.gpu.source, places.runtime), "the GPU driver"
+            )
+            try:
+                cards = await within(PROBE_START_S, probe.cards, "the GPU driver")
+                gpus = budget(cards, config)
+            except BaseException:
+                probe.close()
+                raise
+            # core
+            core = Arbiter(core_settings(config, journal.opened.epoch, gpus), time.monotonic())
+            effects: list[Sequence[Effect]] = []
+            executor: Executor | None = None
+
+            def perform(batch: Sequence[Effect]) -> None:
+                effects.append(batch) if executor is None else executor.perform(batch)
+
+            inbox = Inbox(core, perform, self._core_failed)
+            prober = Prober(probe, [gpu.id for gpu in gpus], config.probe.deadline_s, loop, inbox.post)
+            undo.callback(prober.close)
+            undo.callback(inbox.close)
+            # socket
+            server = RouterServer(places.socket, config.limits.message_max_bytes, group)
+            undo.callback(server.close)
+            server.bind()
+
+            def died(process: ProcessKey) -> None:
+                sessions.process_died(process)
+                inbox.post(ProcessDied(process))
+
+            watch = ProcessWatch(loop, start_ticks, died)
+            undo.callback(watch.close)
+            sessions = SessionTable(
+                self._session_settings(journal.opened.epoch, boot_id, group),
+                server,
+                inbox,
+                history.read,
+                watch.add,
+                time.monotonic,
+            )
+            executor = Executor(sessions, journal, history, prober.sample, inbox.post, telemetry.log_event)
+            # what was before
+            self._tell_start(history, journal, places, gpus)
+            if journal.opened.records or journal.opened.put_aside:
+                inbox.post(Recovered(journal.opened.records))
+                for process in processes_of(journal.opened.records):
+                    watch.add(process)
+            else:
+                inbox.post(Tick())  # first reading of the cards
+            # open for business
+            for number in (signal.SIGTERM, signal.SIGINT):
+                loop.add_signal_handler(number, self._stop.set)
+                undo.callback(loop.remove_signal_handler, number)
+            server.start(loop, sessions.receive)
+            undo.callback(server.stop_receiving)
+            notifier.ready(self._status_text(gpus))
+            beat = loop.create_task(self._beat(inbox, sessions, notifier, gpus))
+            undo.callback(beat.cancel)
+            await self._stop.wait()
+            notifier.stopping("stopping" if self._exit_code == EXIT_OK else "the core failed")
+            telemetry.log_event(
+                history.append("stopped", {"exit_code": self._exit_code, "leases_kept": True})
+            )
+        return self._exit_code
+
+    def _operators_group(self) -> int | None:
+        name = self._config.wire.operators_group
+        if name is None:
+            return None
+        if (number := group_id(name)) is None:
+            raise ConfigError(
+                f"wire.operators_group: no group {name!r} on this machine", hint=f"groupadd {name}"
+            )
+        return number
+
+    def _session_settings(self, epoch: int, boot_id: str, group: int | None) -> SessionSettings:
+        limits = self._config.limits
+        return SessionSettings(
+            epoch=epoch,
+            boot_id=boot_id,
+            server=self._server_name,
+            heartbeat_s=self._config.wire.heartbeat_s,
+            grace_s=self._config.lease.fence_grace_s,
+            message_max_bytes=limits.message_max_bytes,
+            sessions_max=limits.sessions_max,
+            rate_per_s=limits.rate_per_client_per_s,
+            subscribers_max=limits.subscribers_max,
+            operators_gid=group,
+        )
+
+    def _tell_start(
+        self, history: History, journal: Journal, places: Places, gpus: Sequence[GpuInfo]
+    ) -> None:
+        found = journal.opened
+        if found.put_aside is not None:
+            facts = {"file": str(found.put_aside), "problem": found.problem}
+            telemetry.log_event(history.append("journal_put_aside", facts))
+        started = {
+            "server": self._server_name,
+            "epoch": found.epoch,
+            "endpoint": places.endpoint,
+            "state_dir": str(places.state),
+            "gpus": [{"gpu": g.id, "name": g.name, "capacity_bytes": g.capacity_bytes} for g in gpus],
+            "records": len(found.records),
+            "records_of_earlier_boot": found.voided,
+        }
+        telemetry.log_event(history.append("started", started))
+
+    def _core_failed(self, error: BaseException) -> None:
+        """Nothing is decided any more; the journal holds what was granted, and the next start recovers it."""
+        log.critical("stopping: %s: %s", type(error).__name__, error)
+        self._exit_code = EXIT_DEFECT
+        self._stop.set()
+
+    def _status_text(self, gpus: Sequence[GpuInfo]) -> str:
+        return f"serving {', '.join(f'{g.name} ({format_bytes(g.capacity_bytes)})' for g in gpus)}"
+
+    async def _beat(
+        self, inbox: Inbox, sessions: SessionTable, notifier: Notifier, gpus: Sequence[GpuInfo]
+    ) -> None:
+        """Feeds the watchdog only if the core handled an event just now, on this very thread: a stuck core starves it."""
+        period_s = min(STATUS_EVERY_S, (notifier.watchdog_s or 3 * STATUS_EVERY_S) / 3)
+        last = ""
+        while True:
+            await asyncio.sleep(period_s)
+            if notifier.watchdog_s is not None:
+                before = inbox.handled
+                inbox.post(Tick())
+                if inbox.handled > before:
+                    notifier.watchdog()
+            text = f"{self._status_text(gpus)}; {len(sessions)} clients"
+            if text != last:
+                notifier.status(text)
+                last = text
+
+
+def processes_of(records: Mapping[str, Mapping[str, object]]) -> list[ProcessKey]:
+    """The processes that the journal's records belong to, each once."""
+    found = set()
+    for record in records.values():
+        pid, ticks = record.get("pid"), record.get("start_ticks")
+        if isinstance(pid, int) and isinstance(ticks, int) and pid > 0:
+            found.add(ProcessKey(pid, ticks))
+    return sorted(found)
+
+
+def raise_open_files() -> None:
+    """A connection and a pidfd per client need more than the usual soft limit of 1,024 descriptors."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = OPEN_FILES if hard == resource.RLIM_INFINITY else min(OPEN_FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))

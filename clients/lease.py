@@ -1,0 +1,325 @@
+"""The lease as its holder sees it: uses, the way out, and why it ended. asyncio; made by `clients.aio`, never by hand.
+
+It owns no socket: everything that goes over the wire goes through the `Driver`. The way out is one task per lease
+(`_leave`), whoever starts it: a `revoke`, `give_up`, or the loss of the lease. It waits for the safe point, never cuts a use short.
+"""
+
+import asyncio
+import inspect
+import logging
+import uuid
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+from clients.protocol import GONE_CODES, ClientProtocol
+from clients.records import LeaseRecord, TokenPair
+from schemas.errors import ArbiterUnreachable, BadState, LeaseLost, LeaseRevoking, VramError
+from schemas.wire import LeaseSpec
+
+log = logging.getLogger(__name__)
+
+LeaseState = Literal["loading", "held", "revoking", "unloading", "gone"]
+Unload = Callable[[], Awaitable[None]]
+OnRevoke = Callable[["Lease", Mapping[str, Any]], Awaitable[None] | None]
+OnLost = Callable[["Lease", VramError], Awaitable[None] | None]
+SafePointEta = Callable[[], float | None]
+
+RETRY_UNLOADING_S = 0.25
+"""Somebody else's use is still on the lease: the arbiter pushes when it ends; this only covers a lost push."""
+RELEASE_TIMEOUT_S = 5.0
+"""A release that the arbiter does not hear ends by ttl there; a holder does not wait longer for it."""
+
+
+class Driver(Protocol):
+    """What a lease needs of its client."""
+
+    protocol: ClientProtocol
+
+    def now(self) -> float: ...
+
+    async def reply(self, request_id: int) -> dict[str, Any]:
+        """Send what is to be sent and wait for that answer. Raises its typed error."""
+        ...
+
+    def pump(self) -> None:
+        """Send what is to be sent; nobody waits."""
+        ...
+
+    def spawn(self, work: Awaitable[None], name: str) -> "asyncio.Task[None]":
+        """Run work that outlives the caller; the client waits for it at its end."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Callbacks:
+    """What the holder does when the arbiter wants something. `unload` frees the bytes; it runs at a safe point, at most once."""
+
+    unload: Unload | None = None
+    on_revoke: OnRevoke | None = None
+    on_lost: OnLost | None = None
+    safe_point_eta_s: SafePointEta | None = None
+
+
+@dataclass(slots=True)
+class _Progress:
+    """Wakes whoever waits for a change of a lease."""
+
+    waiters: set["asyncio.Future[None]"] = field(default_factory=set)
+
+    def changed(self) -> None:
+        for waiter in self.waiters:
+            if not waiter.done():
+                waiter.set_result(None)
+        self.waiters.clear()
+
+    async def wait(self, timeout_s: float | None = None) -> None:
+        waiter: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.waiters.add(waiter)
+        try:
+            await asyncio.wait_for(waiter, timeout_s)
+        except TimeoutError:
+            pass
+        finally:
+            self.waiters.discard(waiter)
+
+
+class Lease:
+    """A granted lease. Free it by `give_up` (runs `unload`) or by `release` (you freed the bytes yourself)."""
+
+    def __init__(self, driver: Driver, record: LeaseRecord, spec: LeaseSpec, callbacks: Callbacks) -> None:
+        self.spec = spec
+        self.error: VramError | None = None
+        self._driver = driver
+        self._record = record
+        self._callbacks = callbacks
+        self._uses: set[str] = set()
+        self._asked = False  # to leave: no new uses
+        self._unloading = False
+        self._unloaded = False
+        self._gone = False  # the lease itself
+        self._over = False  # lease gone and unload done
+        self._progress = _Progress()
+        self._leaving: asyncio.Task[None] | None = None
+
+    # -- what it is ------------------------------------------------------------------------------------------------
+    @property
+    def lease_id(self) -> str:
+        return self._record.lease_id
+
+    @property
+    def token(self) -> TokenPair:
+        """Fencing token (epoch, serial): hand it with the lease id to whoever marks uses of its own on this lease."""
+        return self._record.token
+
+    @property
+    def view(self) -> Mapping[str, Any]:
+        """`schemas.wire.LeaseView` as it was at the grant."""
+        return self._record.view
+
+    @property
+    def gpu(self) -> str:
+        return str(self._record.view.get("gpu"))
+
+    @property
+    def uses(self) -> int:
+        """Uses that this holder began and has not ended."""
+        return len(self._uses)
+
+    @property
+    def revoking(self) -> bool:
+        return self._asked and not self._gone
+
+    @property
+    def state(self) -> LeaseState:
+        if self._gone:
+            return "gone"
+        if self._unloading:
+            return "unloading"
+        if self._asked:
+            return "revoking"
+        return "held" if self._record.held else "loading"
+
+    def __repr__(self) -> str:
+        return f"<Lease {self.lease_id} {self.spec.consumer} {self.state}>"
+
+    # -- the holder's part -----------------------------------------------------------------------------------------
+    async def ready(self, measured_bytes: int | None = None) -> None:
+        """The model is loaded: `measured_bytes` is what the holder sees of its own allocation. Raises LeaseLost, BadState."""
+        self._raise_if_gone()
+        await self._driver.reply(
+            self._driver.protocol.ready(self._record, measured_bytes, self._driver.now())
+        )
+        self._progress.changed()
+
+    @asynccontextmanager
+    async def use(self, label: str = "") -> AsyncIterator[None]:
+        """Mark a busy interval: nobody makes the holder leave inside it. Raises LeaseRevoking or LeaseLost before it begins.
+
+        A lease can be *lost* within a use (expired, fenced): look at `state` where a use is long.
+        """
+        self._raise_if_gone()
+        if self._asked:
+            raise LeaseRevoking(
+                f"{self.lease_id} was asked to leave", hint="acquire again after it is released"
+            )
+        use_id = f"{self.lease_id}/{uuid.uuid4().hex[:12]}"
+        protocol, now = self._driver.protocol, self._driver.now
+        self._uses.add(use_id)
+        try:
+            await self._driver.reply(protocol.use_begin(self._record, use_id, label, now()))
+            yield
+        finally:
+            self._uses.discard(use_id)
+            protocol.use_end(self._record, use_id, now())
+            self._driver.pump()
+            self._progress.changed()
+
+    async def oom(self, requested_bytes: int, allocated_bytes: int | None = None) -> None:
+        """Tell the arbiter that an allocation failed: it raises the footprint that it knows of this model."""
+        await self._driver.reply(
+            self._driver.protocol.oom(self._record, requested_bytes, allocated_bytes, self._driver.now())
+        )
+
+    async def release(self, *, exiting: bool = False) -> None:
+        """The bytes are freed already (`exiting`: the process ends now). Idempotent; a lease that is gone is released.
+
+        Without the arbiter it gives up after 5 s: the lease then ends by its ttl.
+        """
+        self._asked = True
+        if self._gone:
+            return
+        self._unloaded = True
+        await self._release(exiting=exiting)
+        self._end()
+
+    async def give_up(self) -> None:
+        """Leave of our own will: no new uses, wait for those that run, then `unload` and release. Idempotent."""
+        self._start_leaving()
+        await self.wait_gone()
+
+    async def wait_gone(self) -> None:
+        """Until the lease has ended and its `unload`, if any, is done."""
+        while not self._over:
+            await self._progress.wait()
+
+    # -- the arbiter's part (called by the client) --------------------------------------------------------------------
+    def revoke_asked(self, push: Mapping[str, Any], first: bool) -> None:
+        if first and not self._gone:
+            eta = self._callbacks.safe_point_eta_s
+            self._driver.protocol.revoke_ack(self._record, eta() if eta else None, self._driver.now())
+            if not self._asked and self._callbacks.on_revoke is not None:
+                self._driver.spawn(self._call(self._callbacks.on_revoke, push), f"on_revoke {self.lease_id}")
+            self._start_leaving()
+        self._progress.changed()
+
+    def lost(self, error: VramError, fenced: bool) -> None:
+        """The lease ended without us. The bytes must go all the same, at the next safe point."""
+        if self._gone:
+            return
+        self._gone, self._asked, self.error = True, True, error
+        self._driver.spawn(self._after_loss(error, fenced), f"lost {self.lease_id}")
+        self._progress.changed()
+
+    # -- steps -------------------------------------------------------------------------------------------------------
+    def _raise_if_gone(self) -> None:
+        if self._gone:
+            raise self.error or LeaseLost(f"{self.lease_id} was released", hint="acquire again")
+
+    def _start_leaving(self) -> None:
+        self._asked = True
+        if self._leaving is None and not self._gone:
+            self._leaving = self._driver.spawn(self._leave(), f"leave {self.lease_id}")
+
+    async def _leave(self) -> None:
+        """1. Wait for the safe point: loaded, no local use. 2. Announce; others' uses make the arbiter refuse. 3. Unload. 4. Release."""
+        while True:
+            while not self._gone and (self._uses or not self._record.held):  # 1
+                await self._progress.wait()
+            if self._gone:
+                return
+            try:
+                await self._driver.reply(
+                    self._driver.protocol.unloading(self._record, self._driver.now())
+                )  # 2
+                break
+            except BadState:
+                await self._progress.wait(RETRY_UNLOADING_S)
+            except ArbiterUnreachable:
+                continue  # no contact: stay resident; back in contact or fenced, whichever comes first
+            except VramError as error:
+                if error.code not in GONE_CODES:
+                    raise
+                return  # `lost` has been told
+        self._unloading = True
+        await self._unload_once()  # 3
+        if not self._gone:
+            await self._release(exiting=False)  # 4
+        self._end()
+
+    async def _after_loss(self, error: VramError, fenced: bool) -> None:
+        while self._uses:
+            await self._progress.wait()
+        if not self._unloading:
+            await self._unload_once()
+        if fenced:  # the arbiter may live: tell it as soon as it can be reached
+            self._driver.protocol.release(self._record, False, self._driver.now(), RELEASE_TIMEOUT_S)
+            self._driver.pump()
+        if self._callbacks.on_lost is not None:
+            await self._call(self._callbacks.on_lost, error)
+        self._end()
+
+    async def _unload_once(self) -> None:
+        if self._unloaded:
+            return
+        self._unloaded = True
+        if self._callbacks.unload is None:
+            return
+        try:
+            await self._callbacks.unload()
+        except Exception:
+            log.exception("unload of %s failed; the arbiter will measure what is left", self.spec.consumer)
+
+    async def _release(self, *, exiting: bool) -> None:
+        request = self._driver.protocol.release(self._record, exiting, self._driver.now(), RELEASE_TIMEOUT_S)
+        try:
+            await self._driver.reply(request)
+        except ArbiterUnreachable:
+            log.warning("the arbiter did not hear the release of %s; it ends by its ttl", self.lease_id)
+        except VramError as error:
+            if error.code not in GONE_CODES:
+                raise
+
+    async def _call(self, callback: Callable[..., Awaitable[None] | None], argument: object) -> None:
+        try:
+            result = callback(self, argument)
+            if inspect.isawaitable(result):
+                await result
+        except Exception:
+            log.exception("callback of %s failed", self.lease_id)
+
+    def _end(self) -> None:
+        self._gone = self._over = self._asked = True
+        self._progress.changed()
+
+
+class ForeignUse:
+    """A use on somebody else's lease, begun with its token. End it; a client that goes away ends it too."""
+
+    def __init__(self, driver: Driver, lease_id: str, token: TokenPair, use_id: str) -> None:
+        self.lease_id = lease_id
+        self.token = token
+        self.use_id = use_id
+        self.lost: VramError | None = None
+        """Why the use ended early (the lease was gone after a restart of the arbiter), or None."""
+        self._driver = driver
+        self._ended = False
+
+    async def end(self) -> None:
+        """Idempotent; does not wait for the arbiter's answer."""
+        if self._ended:
+            return
+        self._ended = True
+        self._driver.protocol.foreign_use_end(self.lease_id, self.token, self.use_id, self._driver.now())
+        self._driver.pump()

@@ -1,0 +1,322 @@
+"""Trains the demo's open-vocabulary detector: a small OwlViT from scratch, saved as any zero-shot hub checkpoint.
+
+`python -m sidecars.training.detector --data DIR --out DIR [--smoke]`. DIR holds `labels.jsonl` and PNGs. The result is
+read by `AutoProcessor` and `AutoModelForZeroShotObjectDetection` like google/owlvit-base-patch32. This script must not
+know the simulator or the sidecar that will serve the model.
+
+Loss: each patch whose centre lies in the middle of a thing (or the patch nearest to it) must say yes to the queries that
+name it and no to all others; its box is fitted by L1 and GIoU. Patches that only touch the thing are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import random
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from sidecars.training import common, queries
+from sidecars.training.common import Frame
+
+PAD, START, END = "<|pad|>", "<|startoftext|>", "<|endoftext|>"
+MAX_TOKENS: Final = 16
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Recipe:
+    """Everything a run depends on beside its data."""
+
+    seed: int = 7
+    threads: int = 1
+    camera: str = "front"
+    image_px: int = 320
+    patch_px: int = 16
+    width: int = 128
+    layers: int = 4
+    text_width: int = 64
+    text_layers: int = 2
+    batch: int = 16
+    learning_rate: float = 1.5e-3
+    budget_s: float = 660.0
+    max_steps: int = 100_000
+    held_out: float = 0.12
+    strange_queries: int = 10
+
+
+SMOKE: Final = Recipe(
+    image_px=128, patch_px=16, width=48, layers=2, text_width=32, text_layers=1, batch=8, budget_s=8.0, max_steps=40,
+    held_out=0.25, strange_queries=4,
+)  # fmt: skip
+
+
+def build_tokenizer(folder: Path, words: Sequence[str]) -> None:
+    """Write a CLIP-format BPE tokenizer. Pad is id 0 (OWL masks queries that start with it), end the greatest id."""
+    from transformers import CLIPTokenizer
+
+    alphabet = common.byte_alphabet()
+    tokens, merges = common.learn_merges(words, suffix="</w>")
+    vocab = [PAD, *alphabet, *(letter + "</w>" for letter in alphabet), *dict.fromkeys(tokens), START, END]
+    tokenizer = CLIPTokenizer(
+        vocab={token: index for index, token in enumerate(vocab)},
+        merges=merges,
+        unk_token=END,
+        bos_token=START,
+        eos_token=END,
+        pad_token=PAD,
+        model_max_length=MAX_TOKENS,
+    )
+    tokenizer.save_pretrained(folder)
+
+
+def build_processor(folder: Path, image_px: int, words: Sequence[str]) -> Any:
+    """The processor as `AutoProcessor` will read it back from `folder`."""
+    from transformers import CLIPTokenizer, OwlViTImageProcessor, OwlViTProcessor
+
+    build_tokenizer(folder, words)
+    size = {"height": image_px, "width": image_px}
+    image_processor = OwlViTImageProcessor(size=size, crop_size=size, do_center_crop=False)
+    processor = OwlViTProcessor(image_processor=image_processor, tokenizer=CLIPTokenizer.from_pretrained(folder))
+    processor.save_pretrained(folder)
+    return processor
+
+
+def build_model(recipe: Recipe, tokenizer: Any) -> Any:
+    """A fresh OwlViT; its position tables start as sines, which spares it learning what is next to what."""
+    import torch
+    from transformers import OwlViTConfig, OwlViTForObjectDetection
+
+    config = OwlViTConfig(
+        text_config={
+            "vocab_size": len(tokenizer),
+            "hidden_size": recipe.text_width,
+            "intermediate_size": 2 * recipe.text_width,
+            "num_hidden_layers": recipe.text_layers,
+            "num_attention_heads": 4,
+            "max_position_embeddings": MAX_TOKENS,
+            "pad_token_id": tokenizer.pad_token_id,
+            "bos_token_id": tokenizer.bos_token_id,
+            "eos_token_id": tokenizer.eos_token_id,
+        },
+        vision_config={
+            "hidden_size": recipe.width,
+            "intermediate_size": 2 * recipe.width,
+            "num_hidden_layers": recipe.layers,
+            "num_attention_heads": 4,
+            "image_size": recipe.image_px,
+            "patch_size": recipe.patch_px,
+        },
+        projection_dim=recipe.text_width,
+    )
+    # eager attention in bfloat16 is twice as fast as the fused one on CPUs that multiply bfloat16
+    model = OwlViTForObjectDetection._from_config(config, attn_implementation="eager")
+    vision = model.owlvit.vision_model.embeddings
+    side = recipe.image_px // recipe.patch_px
+    with torch.no_grad():
+        vision.position_embedding.weight[1:] = 0.3 * _sine_table(side, recipe.width)
+        vision.patch_embedding.weight.normal_(std=(3 * recipe.patch_px**2) ** -0.5)
+        model.class_head.logit_shift.bias.fill_(-0.5)
+        model.class_head.logit_scale.bias.fill_(8.0)
+    return model
+
+
+def _sine_table(side: int, width: int) -> Any:
+    import torch
+
+    quarter = width // 4
+    at = torch.arange(side, dtype=torch.float32)[:, None] / side
+    angles = at * (2 * torch.pi * torch.logspace(-0.5, 0.9, quarter, 2.0 * 2.0))
+    line = torch.cat([angles.sin(), angles.cos()], dim=1)
+    grid = torch.cat([line[:, None].expand(side, side, -1), line[None].expand(side, side, -1)], dim=-1)
+    return torch.nn.functional.pad(grid.reshape(side * side, -1), (0, width - 4 * quarter))
+
+
+@dataclasses.dataclass(slots=True)
+class Targets:
+    """Labels of a batch on the patch grid: which thing a patch stands for, and which it only touches."""
+
+    names: list[list[str]]
+    boxes: Any  # (batch, things, 4) centre-size in 0..1, zero where padded
+    owner: Any  # (batch, patches) index of the thing, -1 for none
+    touched: Any  # (batch, patches, things) bool: neither yes nor no
+
+
+def make_targets(things: Sequence[Sequence[tuple[str, Any, bool]]], side: int) -> Targets:
+    """`things`: per image (name, box x0 y0 x1 y1 in 0..1, clear)."""
+    import torch
+
+    most = max(1, max(len(row) for row in things))
+    boxes = torch.zeros(len(things), most, 4)
+    owner = torch.full((len(things), side * side), -1, dtype=torch.long)
+    touched = torch.zeros(len(things), side * side, most, dtype=torch.bool)
+    middle = (torch.arange(side) + 0.5) / side
+    my, mx = (grid.reshape(-1) for grid in torch.meshgrid(middle, middle, indexing="ij"))
+    half = 0.5 / side
+    for b, row in enumerate(things):
+        # the smallest last: where two things share a patch, it goes to the smaller
+        for t, (_, box, clear) in sorted(enumerate(row), key=lambda item: -_area(item[1][1])):
+            x0, y0, x1, y1 = (float(v) for v in box)
+            cx, cy, w, h = (x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0
+            boxes[b, t] = torch.tensor([cx, cy, w, h])
+            touched[b, :, t] = (mx + half > x0) & (mx - half < x1) & (my + half > y0) & (my - half < y1)
+            if clear:
+                core = ((mx - cx).abs() < 0.3 * w) & ((my - cy).abs() < 0.3 * h)
+                core[((mx - cx) ** 2 + (my - cy) ** 2).argmin()] = True
+                owner[b, core] = t
+    return Targets([[name for name, _, _ in row] for row in things], boxes, owner, touched)
+
+
+def _area(box: Any) -> float:
+    return float((box[2] - box[0]) * (box[3] - box[1]))
+
+
+def loss_of(model: Any, pixels: Any, targets: Targets, asked: Sequence[queries.Query], ids: Any, mask: Any) -> Any:
+    """Focal classification over (patch, query) plus box loss over owning patches."""
+    import torch
+    from torch.nn import functional
+    from torchvision.ops import generalized_box_iou_loss
+
+    batch = pixels.shape[0]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        grid, _ = model.image_embedder(pixels)
+        words = model.owlvit.text_projection(
+            model.owlvit.text_model(input_ids=ids, attention_mask=mask).pooler_output
+        )
+    words = words.float()
+    words = words / words.norm(dim=-1, keepdim=True)
+    patches = grid.flatten(1, 2).float()
+    logits, _ = model.class_predictor(patches, words[None].expand(batch, -1, -1))
+    predicted = model.box_predictor(patches, grid)
+
+    most = targets.boxes.shape[1]
+    answers = torch.zeros(batch, most, len(asked))
+    for b, names in enumerate(targets.names):
+        for t, name in enumerate(names):
+            colour, shape = name.split(" ", 1)
+            answers[b, t] = torch.tensor([float(query.matches(colour, shape)) for query in asked])
+    owned = targets.owner >= 0
+    owner = targets.owner.clamp(min=0)
+    wanted = torch.gather(answers, 1, owner[..., None].expand(-1, -1, len(asked))) * owned[..., None]
+    # a patch that touches a thing without owning it may say either to the thing's own queries
+    unsure = torch.einsum("bpt,btq->bpq", targets.touched.float(), answers) > 0
+    weight = 1.0 - (unsure & (wanted == 0)).float()
+    chance = logits.sigmoid()
+    raw = functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
+    focus = torch.where(wanted > 0, 1 - chance, chance) ** 2
+    alpha = torch.where(wanted > 0, 0.75, 0.25)
+    count = wanted.sum().clamp(min=1.0)
+    class_loss = (raw * focus * alpha * weight).sum() / count
+
+    truth = torch.gather(targets.boxes, 1, owner[..., None].expand(-1, -1, 4))[owned]
+    mine = predicted[owned]
+    if len(truth) == 0:
+        return class_loss
+    box_loss = functional.l1_loss(mine, truth, reduction="sum") / len(truth)
+    iou_loss = generalized_box_iou_loss(_corners(mine), _corners(truth), reduction="mean")
+    return class_loss + 3.0 * box_loss + 0.5 * iou_loss
+
+
+def _corners(boxes: Any) -> Any:
+    import torch
+
+    return torch.cat([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2], dim=1)
+
+
+def augment(
+    rng: random.Random, generator: Any, images: Any, frames: Sequence[Frame], size_px: int
+) -> tuple[Any, list[list[tuple[str, Any, bool]]]]:
+    """Random zoom, shift, mirror and light; boxes follow. Returns float images in 0..1 and their things."""
+    import torch
+    from torch.nn import functional
+
+    height, width = images.shape[-2:]
+    out = torch.empty(len(frames), 3, size_px, size_px)
+    things: list[list[tuple[str, Any, bool]]] = []
+    for index, frame in enumerate(frames):
+        zoom = 1.0 if rng.random() < 0.4 else rng.uniform(0.45, 1.0)
+        stretch = rng.uniform(0.92, 1.0) if zoom < 1.0 else 1.0
+        w, h = zoom * width, zoom * height * stretch
+        x, y = rng.uniform(0, width - w), rng.uniform(0, height - h)
+        x0, y0, x1, y1 = round(x), round(y), round(x + w), round(y + h)
+        crop = images[index : index + 1, :, y0:y1, x0:x1].float() / 255.0
+        crop = functional.interpolate(crop, (size_px, size_px), mode="bilinear", antialias=True, align_corners=False)
+        mirror = rng.random() < 0.5
+        out[index] = crop[0].flip(-1) if mirror else crop[0]
+        row: list[tuple[str, Any, bool]] = []
+        for seen in frame.objects:
+            left, top = (seen.box[0] - x0) / (x1 - x0), (seen.box[1] - y0) / (y1 - y0)
+            right, bottom = (seen.box[2] - x0) / (x1 - x0), (seen.box[3] - y0) / (y1 - y0)
+            cut = (max(0.0, left), max(0.0, top), min(1.0, right), min(1.0, bottom))
+            if cut[2] <= cut[0] or cut[3] <= cut[1]:
+                continue
+            whole = (cut[2] - cut[0]) * (cut[3] - cut[1]) / ((right - left) * (bottom - top))
+            box = (1 - cut[2], cut[1], 1 - cut[0], cut[3]) if mirror else cut
+            row.append((seen.name, box, seen.clear and whole > 0.6))
+        things.append(row)
+    return common.jitter_colours(out, generator, 0.12), things
+
+
+def train(recipe: Recipe, frames: Sequence[Frame], out: Path) -> tuple[Any, Any, dict[str, Any]]:
+    """Train on `frames`; returns (processor, model, figures of the run)."""
+    import torch
+
+    common.seed_everything(recipe.seed, recipe.threads)
+    colours = sorted({thing.colour for frame in frames for thing in frame.objects})
+    shapes = sorted({thing.shape for frame in frames for thing in frame.objects})
+    processor = build_processor(out, recipe.image_px, queries.every_word(colours, shapes))
+    model = build_model(recipe, processor.tokenizer)
+    model.train()
+    from PIL import Image
+
+    with Image.open(frames[0].image) as first:
+        pixels = common.load_pixels(frames, first.size)
+    mean = torch.tensor(processor.image_processor.image_mean)[:, None, None]
+    std = torch.tensor(processor.image_processor.image_std)[:, None, None]
+    plain = [p for n, p in model.named_parameters() if p.ndim < 2 or "embedding" in n]
+    decayed = [p for n, p in model.named_parameters() if not (p.ndim < 2 or "embedding" in n)]
+    optimizer = torch.optim.AdamW(
+        [{"params": decayed, "weight_decay": 0.03}, {"params": plain, "weight_decay": 0.0}],
+        lr=recipe.learning_rate,
+        betas=(0.9, 0.98),
+    )
+    rng = random.Random(f"detector-{recipe.seed}")
+    generator = torch.Generator().manual_seed(recipe.seed)
+    started, step, shown = time.monotonic(), 0, 0.0
+    losses: list[float] = []
+    for chosen in common.batches(len(frames), recipe.batch, recipe.seed):
+        done = max((time.monotonic() - started) / recipe.budget_s, step / recipe.max_steps)
+        if done >= 1.0:
+            break
+        factor = common.cosine_with_warmup(round(done * 1000), 1000, 30)
+        for group in optimizer.param_groups:
+            group["lr"] = recipe.learning_rate * factor
+        picked = [frames[i] for i in chosen]
+        images, things = augment(rng, generator, pixels[chosen], picked, recipe.image_px)
+        asked = queries.sample_queries(rng, colours, shapes, recipe.strange_queries)
+        text = processor.tokenizer(
+            [query.text for query in asked], padding="max_length", truncation=True, return_tensors="pt"
+        )
+        targets = make_targets(things, recipe.image_px // recipe.patch_px)
+        loss = loss_of(model, (images - mean) / std, targets, asked, text["input_ids"], text["attention_mask"])
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+        step += 1
+        losses.append(loss.item())
+        if done - shown >= 0.05:
+            shown = done
+            recent = sum(losses[-50:]) / len(losses[-50:])
+            print(f"{time.monotonic() - started:6.0f} s  step {step:5d}  loss {recent:.3f}", flush=True)
+    model.eval()
+    return processor, model, {
+        "steps": step,
+        "train_frames": len(frames),
+        "train_s": round(time.monotonic() - started, 1),
+        "loss_first": round(sum(losses[:10]) / len(losses[:10]), 3),
+        "loss_last": round(sum(losses[-10:]) / len(losses[-10:]), 3),
+    }
