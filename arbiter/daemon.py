@@ -18,7 +18,6 @@ from pathlib import Path
 
 from arbiter import telemetry
 from arbiter.core.arbiter import Arbiter
-from arbiter.core.effects import Effect
 from arbiter.core.events import ProcessDied, Recovered, Tick
 from arbiter.core.settings import GpuInfo, Settings
 from arbiter.host.executor import Executor
@@ -141,90 +140,14 @@ class Daemon:
         self._stop = asyncio.Event()
 
     async def run(self) -> int:
-        config = self._config
-        places = find_places(config, self._environ, os.getuid())
-        group = self._operators_group()
-        boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-        loop = asyncio.get_running_loop()
         notifier = Notifier(self._environ)
         raise_open_files()
         with contextlib.ExitStack() as undo:
-            # folders and locks
-            make_private_folder(places.socket.parent, group)
-            make_private_folder(places.state, None)
-            if config.gpu.source.startswith("fake:"):
-                make_private_folder(places.runtime, group)
-            for path, protects in (
-                (places.socket.with_name(places.socket.name + ".lock"), str(places.socket)),
-                (places.state / "lock", str(places.state)),
-            ):
-                lock = LockFile(path, protects)
-                lock.acquire()
-                undo.callback(lock.release)
-            # journal and history
-            journal = Journal.open(places.state, boot_id)
-            undo.callback(journal.close)
-            history = History.open(places.state, config.history.max_events, config.history.days)
-            history.start(loop)
-            undo.callback(history.close)
-            # cards
-            probe = await within(
-                PROBE_START_S, lambda: open_probe(config.gpu.source, places.runtime), "the GPU driver"
-            )
-            try:
-                cards = await within(PROBE_START_S, probe.cards, "the GPU driver")
-                gpus = budget(cards, config)
-            except BaseException:
-                probe.close()
-                raise
-            # core
-            core = Arbiter(core_settings(config, journal.opened.epoch, gpus), time.monotonic())
-            effects: list[Sequence[Effect]] = []
-            executor: Executor | None = None
-
-            def perform(batch: Sequence[Effect]) -> None:
-                effects.append(batch) if executor is None else executor.perform(batch)
-
-            inbox = Inbox(core, perform, self._core_failed)
-            prober = Prober(probe, [gpu.id for gpu in gpus], config.probe.deadline_s, loop, inbox.post)
-            undo.callback(prober.close)
-            undo.callback(inbox.close)
-            # socket
-            server = RouterServer(places.socket, config.limits.message_max_bytes, group)
-            undo.callback(server.close)
-            server.bind()
-
-            def died(process: ProcessKey) -> None:
-                sessions.process_died(process)
-                inbox.post(ProcessDied(process))
-
-            watch = ProcessWatch(loop, start_ticks, died)
-            undo.callback(watch.close)
-            sessions = SessionTable(
-                self._session_settings(journal.opened.epoch, boot_id, group),
-                server,
-                inbox,
-                history.read,
-                watch.add,
-                time.monotonic,
-            )
-            executor = Executor(sessions, journal, history, prober.sample, inbox.post, telemetry.log_event)
-            # what was before
-            self._tell_start(history, journal, places, gpus)
-            if journal.opened.records or journal.opened.put_aside:
-                inbox.post(Recovered(journal.opened.records))
-                for process in processes_of(journal.opened.records):
-                    watch.add(process)
-            else:
-                inbox.post(Tick())  # first reading of the cards
-            # open for business
+            gpus, inbox, sessions, history = await self._start(undo)
             for number in (signal.SIGTERM, signal.SIGINT):
-                loop.add_signal_handler(number, self._stop.set)
-                undo.callback(loop.remove_signal_handler, number)
-            server.start(loop, sessions.receive)
-            undo.callback(server.stop_receiving)
-            notifier.ready(self._status_text(gpus))
-            beat = loop.create_task(self._beat(inbox, sessions, notifier, gpus))
+                asyncio.get_running_loop().add_signal_handler(number, self._stop.set)
+            notifier.ready(status_text(gpus))
+            beat = asyncio.get_running_loop().create_task(self._beat(inbox, sessions, notifier, gpus))
             undo.callback(beat.cancel)
             await self._stop.wait()
             notifier.stopping("stopping" if self._exit_code == EXIT_OK else "the core failed")
@@ -232,6 +155,73 @@ class Daemon:
                 history.append("stopped", {"exit_code": self._exit_code, "leases_kept": True})
             )
         return self._exit_code
+
+    async def _start(
+        self, undo: contextlib.ExitStack
+    ) -> tuple[tuple[GpuInfo, ...], Inbox, SessionTable, History]:
+        """1. Folders and locks. 2. Journal and history. 3. Cards. 4. Core and the parts around it. 5. The past. 6. The socket."""
+        config, loop = self._config, asyncio.get_running_loop()
+        places = find_places(config, self._environ, os.getuid())
+        group = self._operators_group()
+        self._take_folders(places, group, undo)  # 1
+        boot = boot_id()
+        journal = Journal.open(places.state, boot)  # 2
+        undo.callback(journal.close)
+        history = History.open(places.state, config.history.max_events, config.history.days)
+        history.start(loop)
+        undo.callback(history.close)
+        probe, gpus = await self._open_cards(places)  # 3
+
+        core = Arbiter(core_settings(config, journal.opened.epoch, gpus), time.monotonic())  # 4
+        inbox = Inbox(core, lambda effects: executor.perform(effects), self._core_failed)
+        prober = Prober(probe, [gpu.id for gpu in gpus], config.probe.deadline_s, loop, inbox.post)
+        undo.callback(prober.close)
+        undo.callback(inbox.close)
+        server = RouterServer(places.socket, config.limits.message_max_bytes, group)
+        undo.callback(server.close)
+
+        def died(process: ProcessKey) -> None:
+            sessions.process_died(process)
+            inbox.post(ProcessDied(process))
+
+        watch = ProcessWatch(loop, start_ticks, died)
+        undo.callback(watch.close)
+        settings = self._session_settings(journal.opened.epoch, boot, group)
+        sessions = SessionTable(settings, server, inbox, history.read, watch.add, time.monotonic)
+        executor = Executor(sessions, journal, history, prober.sample, inbox.post, telemetry.log_event)
+
+        self._tell_start(history, journal, places, gpus)  # 5
+        if journal.opened.records or journal.opened.put_aside:
+            inbox.post(Recovered(journal.opened.records))
+            for process in processes_of(journal.opened.records):
+                watch.add(process)
+        else:
+            inbox.post(Tick())  # lets the core ask for its first readings
+        server.bind()  # 6
+        server.start(loop, sessions.receive)
+        undo.callback(server.stop_receiving)
+        return gpus, inbox, sessions, history
+
+    def _take_folders(self, places: Places, group: int | None, undo: contextlib.ExitStack) -> None:
+        make_private_folder(places.socket.parent, group)
+        make_private_folder(places.state, None)
+        if self._config.gpu.source.startswith("fake:"):
+            make_private_folder(places.runtime, group)
+        socket_lock = places.socket.with_name(places.socket.name + ".lock")
+        for path, protects in ((socket_lock, places.socket), (places.state / "lock", places.state)):
+            lock = LockFile(path, str(protects))
+            lock.acquire()
+            undo.callback(lock.release)
+
+    async def _open_cards(self, places: Places) -> tuple[GpuProbe, tuple[GpuInfo, ...]]:
+        source = self._config.gpu.source
+        probe = await within(PROBE_START_S, lambda: open_probe(source, places.runtime), "the GPU driver")
+        try:
+            cards = await within(PROBE_START_S, probe.cards, "the GPU driver")
+            return probe, budget(cards, self._config)
+        except BaseException:
+            probe.close()
+            raise
 
     def _operators_group(self) -> int | None:
         name = self._config.wire.operators_group
@@ -282,9 +272,6 @@ class Daemon:
         self._exit_code = EXIT_DEFECT
         self._stop.set()
 
-    def _status_text(self, gpus: Sequence[GpuInfo]) -> str:
-        return f"serving {', '.join(f'{g.name} ({format_bytes(g.capacity_bytes)})' for g in gpus)}"
-
     async def _beat(
         self, inbox: Inbox, sessions: SessionTable, notifier: Notifier, gpus: Sequence[GpuInfo]
     ) -> None:
@@ -298,10 +285,19 @@ class Daemon:
                 inbox.post(Tick())
                 if inbox.handled > before:
                     notifier.watchdog()
-            text = f"{self._status_text(gpus)}; {len(sessions)} clients"
+            text = f"{status_text(gpus)}; {len(sessions)} clients"
             if text != last:
                 notifier.status(text)
                 last = text
+
+
+def status_text(gpus: Sequence[GpuInfo]) -> str:
+    return f"serving {', '.join(f'{gpu.name} ({format_bytes(gpu.capacity_bytes)})' for gpu in gpus)}"
+
+
+def boot_id() -> str:
+    """Changes with every boot of the machine, and only then."""
+    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def processes_of(records: Mapping[str, Mapping[str, object]]) -> list[ProcessKey]:

@@ -77,8 +77,12 @@ def _grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> bool:
 
 
 def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int]) -> bool:
-    if head.planned_gpu is not None and head.planned_gpu != gpu.info.id and core.gpus[head.planned_gpu].evictions:
-        return False  # another card is being emptied for it
+    if head.planned_gpu is not None and head.planned_gpu != gpu.info.id:
+        if any(e.wanted_by == head.id for e in core.gpus[head.planned_gpu].evictions):
+            return False  # another card is being emptied for it
+    if policy.residue_under_measurement(gpu):
+        head.reason = "a dead process's memory is being measured"
+        return False
     plan = policy.choose_victims(core, gpu, head, leaving)
     if plan is None:
         head.reason = "nobody who could make room may be asked now"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
 
-from arbiter.core.events import Spec
+from arbiter.core.events import MemorySampled, Spec
 from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 
 
@@ -128,6 +128,7 @@ class Lease:
     exiting: bool = False
     attached: bool = True  # False after a restart until its holder has come back
     traceparent: str | None = None
+    baseline: MemorySampled | None = None  # the card as it was when the unloading began
     reason: str = ""  # why it waits, in words; for people
     planned_gpu: GpuId | None = None  # a card where somebody was asked to leave for it
     eviction: Eviction | None = None

@@ -205,6 +205,10 @@ class GpuLedger:
         self._changed(account, now)
         self._close_if_empty(account)
 
+    def bury(self, process: ProcessKey) -> None:
+        """The process died: it is not expected to keep anything. What is charged stays until measured gone."""
+        self.accounts[process].residue_floor_bytes = 0
+
     def observe(self, sample: MemorySampled, *, quiet: bool) -> None:
         """Take evidence from a reading. `quiet`: nobody loads or unloads, so the unexplained rest means something."""
         self._total = None

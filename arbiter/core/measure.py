@@ -112,11 +112,7 @@ def _shrink_residues(core: Core, gpu: Gpu, sample: MemorySampled) -> None:
 # -- verifications -------------------------------------------------------------------------------------------------
 def begin_for_lease(core: Core, gpu: Gpu, lease: Lease, *, alive: bool, grace_s: float = 0.0) -> None:
     """Measure a lease's bytes away. Its charge is in the ledger and stays there until the verdict."""
-    began = lease.eviction.unloading_at if lease.eviction and lease.eviction.unloading_at else core.now
-    baseline = gpu.sample if gpu.sample is not None and gpu.sample.taken_at <= began else None
-    if baseline is None and lease.id in gpu.baselines:
-        baseline = gpu.baselines[lease.id]
-    gpu.baselines.pop(lease.id, None)
+    baseline = lease.baseline or gpu.sample
     comparable = baseline is not None and 0.0 < lease.ready_at <= baseline.taken_at
     verification = Verification(
         key=lease.id,

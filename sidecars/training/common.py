@@ -30,7 +30,12 @@ class SeenObject:
 
     name: str
     box: tuple[float, float, float, float]
-    clear: bool  # visible enough that a detector must find it; otherwise it is neither right nor wrong
+    pixels: int
+
+    @property
+    def clear(self) -> bool:
+        """Visible enough that a detector must find it; otherwise finding it is neither right nor wrong."""
+        return self.pixels >= MIN_VISIBLE_PIXELS
 
     @property
     def colour(self) -> str:
@@ -45,13 +50,17 @@ class SeenObject:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Frame:
-    """One labelled image. `scene` groups frames of the same episode: a split never parts them."""
+    """One labelled image. `scene` groups frames of the same episode: a split never parts them.
+
+    `objects` are those that show in the image, `present` names all that exist in the scene.
+    """
 
     image: Path
     camera: str
     scene: str
-    kind: str
+    stage: str
     objects: tuple[SeenObject, ...]
+    present: tuple[str, ...]
     held: str | None
 
 
@@ -76,22 +85,23 @@ def read_frames(folder: Path, cameras: Sequence[str] | None = None) -> list[Fram
 
 
 def _frame(folder: Path, raw: Mapping[str, Any]) -> Frame:
-    image = folder / str(raw["image"])
     objects = tuple(
         SeenObject(
-            name=str(item["name"]),
+            name=f"{item['colour']} {item['shape']}",
             box=(float(item["box"][0]), float(item["box"][1]), float(item["box"][2]), float(item["box"][3])),
-            clear=int(item["pixels"]) >= MIN_VISIBLE_PIXELS,
+            pixels=int(item["pixels"]),
         )
         for item in raw["objects"]
+        if item["box"] is not None
     )
     held = raw["held"]
     return Frame(
-        image=image,
+        image=folder / str(raw["file"]),
         camera=str(raw["camera"]),
-        scene=str(raw.get("scene", image.stem.split("_")[0])),
-        kind=str(raw.get("mode", "")),
+        scene=str(raw["seed"]),
+        stage=str(raw["stage"]),
         objects=objects,
+        present=tuple(f"{item['colour']} {item['shape']}" for item in raw["objects"]),
         held=None if held is None else str(held),
     )
 

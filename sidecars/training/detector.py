@@ -119,7 +119,7 @@ def build_model(recipe: Recipe, tokenizer: Any) -> Any:
     with torch.no_grad():
         vision.position_embedding.weight[1:] = 0.3 * _sine_table(side, recipe.width)
         vision.patch_embedding.weight.normal_(std=(3 * recipe.patch_px**2) ** -0.5)
-        model.class_head.logit_shift.bias.fill_(-0.5)
+        model.class_head.logit_shift.bias.fill_(-1.2)
         model.class_head.logit_scale.bias.fill_(8.0)
     return model
 

@@ -1,0 +1,288 @@
+"""Pure decisions about one card: does it fit, is the measurement willing, who should leave, who may pass the head.
+
+Nothing here changes anything but one timer (`wake_when_evictable`).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
+
+from arbiter.core.lease import LEAVING, Lease, LeaseState
+from arbiter.core.ledger import NOTHING, process_bytes
+from arbiter.core.state import Core, Gpu
+from schemas.ids import LeaseId
+
+EXACT_SEARCH_MAX = 12  # candidates; beyond that the search is greedy
+_WAKE_SLACK_S = 0.001  # so that a wake-up for an ageing step does not come a rounding error too early
+
+type _Covers = Callable[[Mapping[LeaseId, int]], bool]
+
+
+# -- fits ------------------------------------------------------------------------------------------------------------
+def blocked(core: Core, gpu: Gpu) -> str:
+    """Why nothing can be granted on this card now, whoever asks; "" if grants are possible."""
+    if core.recovering is not None:
+        return "recovering after a restart: holders have to come back first"
+    if gpu.failed_at is not None:
+        return f"the card cannot be read: {gpu.failure}"
+    if gpu.sample is None:
+        return "the card has not been read yet"
+    loading = next(gpu.in_state(LeaseState.LOADING), None)
+    if loading is not None:
+        return f"{loading.spec.consumer} is loading"
+    if gpu.pressed:
+        return f"pressure: {gpu.ledger.pressure_bytes()} bytes more than the budget are held"
+    return ""
+
+
+def leaving(gpu: Gpu) -> dict[LeaseId, int]:
+    """Leases whose bytes are on their way back, with the residue each leaves. Those that outstayed a deadline do not count."""
+    going: dict[LeaseId, int] = {}
+    for lease in gpu.residents.values():
+        if lease.state not in LEAVING:
+            continue
+        verification = gpu.verifications.get(lease.id)
+        late = verification.overdue if verification else bool(lease.eviction and lease.eviction.overdue)
+        if not late:
+            going[lease.id] = lease.residue_bytes
+    for verification in gpu.verifications.values():  # debts
+        if verification.lease is not None and verification.lease not in gpu.residents and not verification.overdue:
+            going[verification.lease] = verification.kept_bytes
+    return going
+
+
+def residue_under_measurement(gpu: Gpu) -> bool:
+    """A dead process's residue may come back any moment: nobody is asked to leave meanwhile."""
+    return any(v.lease is None and not v.overdue for v in gpu.verifications.values())
+
+
+def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool:
+    """Would the ledger hold this waiter at its load peak, once these leases are gone?"""
+    if lease.spec.exclusive:
+        if any(other not in going for other in gpu.ledger.leases()):
+            return False
+    elif any(other.spec.exclusive and other.id not in going for other in gpu.residents.values()):
+        return False
+    return gpu.ledger.total_if(going, (lease.process, lease.load_peak_bytes)) <= gpu.ledger.budget_bytes
+
+
+def added_bytes(gpu: Gpu, lease: Lease) -> int:
+    """What a grant would add to the ledger: the load peak less the residue it is folded with."""
+    return gpu.ledger.total_if(joining=(lease.process, lease.load_peak_bytes)) - gpu.ledger.total_bytes()
+
+
+def largest_fold_bytes(gpu: Gpu) -> int:
+    """The most that any waiter's need may shrink by what its process already holds here."""
+    ledger = gpu.ledger
+    folded = [account.residue_bytes + account.measured_bytes for account in ledger.accounts.values()]
+    return max([*folded, *(stranger.used_bytes for stranger in ledger.strangers.values())], default=0)
+
+
+# -- the measurement ---------------------------------------------------------------------------------------------------
+def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
+    """Free bytes by the newest reading, less the leases that it cannot have seen. None: no reading young enough."""
+    sample = gpu.sample
+    if sample is None or gpu.failed_at is not None or core.now - sample.taken_at > core.settings.sample_max_age_s:
+        return None
+    unseen = sum(
+        gpu.ledger.charge_bytes(lease.id)
+        for lease in gpu.residents.values()
+        if max(lease.granted_at, lease.ready_at) > sample.taken_at
+    )
+    return min(gpu.info.capacity_bytes, sample.total_bytes) - sample.used_bytes - unseen
+
+
+def measured_need_bytes(gpu: Gpu, lease: Lease) -> int:
+    """What the reading must have free: the load peak less what the process already holds (its context)."""
+    account = gpu.ledger.accounts.get(lease.process)
+    if account is not None and account.charges:
+        return lease.load_peak_bytes
+    own = None if gpu.sample is None else process_bytes(gpu.sample, lease.process)
+    if own is None:
+        own = account.residue_bytes if account is not None else 0
+    return max(0, lease.load_peak_bytes - own)
+
+
+def sample_is_behind(gpu: Gpu) -> bool:
+    """Something was granted, became ready or came back since the newest reading began."""
+    return gpu.sample is None or gpu.sample.taken_at < gpu.changed_at
+
+
+# -- victims -----------------------------------------------------------------------------------------------------------
+def choose_victims(core: Core, gpu: Gpu, waiter: Lease, going: Mapping[LeaseId, int]) -> list[Lease] | None:
+    """The cheapest holders whose leaving lets the waiter in. None: nobody may be asked now, or it would not help.
+
+    Idle holders may be asked by anyone once they have had their minimum residency, holders in use only by a waiter of
+    at least their priority (they finish first). If a set with fewer holders in use is only a residency away, it is waited for.
+    """
+    priority = waiter.priority_at(core.now, core.settings.ageing_s_per_point)
+    willing = [
+        lease
+        for lease in gpu.in_state(LeaseState.HELD)
+        if lease.spec.evictable and (not lease.uses or lease.spec.priority <= priority)
+    ]
+    now = _cheapest(gpu, waiter, going, [lease for lease in willing if residency_ends_at(lease) <= core.now])
+    if now is not None and not _in_use(now):
+        return now
+    later = _cheapest(gpu, waiter, going, willing)
+    if now is None or later is None or _in_use(later) < _in_use(now):
+        return None
+    return now
+
+
+def choose_relief(core: Core, gpu: Gpu, going: Mapping[LeaseId, int], over_bytes: int) -> list[Lease]:
+    """Idle holders to ask while the card is under pressure: the cheapest that cover it, or all of them."""
+    idle = [
+        lease
+        for lease in gpu.in_state(LeaseState.HELD)
+        if lease.spec.evictable and not lease.uses and residency_ends_at(lease) <= core.now
+    ]
+    ledger = gpu.ledger
+    total = ledger.total_if(going)
+
+    def covers(more: Mapping[LeaseId, int]) -> bool:
+        return total - ledger.total_if({**going, **more}) >= over_bytes
+
+    return _search(idle, covers, _freed(gpu, going, idle)) if covers(_leave(idle)) else idle
+
+
+def residency_ends_at(lease: Lease) -> float:
+    return lease.ready_at + lease.spec.min_residency_s
+
+
+def wake_when_evictable(core: Core, gpu: Gpu, waiter: Lease | None) -> None:
+    """Look again when a residency ends or the waiter has aged enough to ask somebody in use."""
+    ageing_s = core.settings.ageing_s_per_point
+    times: list[float] = []
+    for lease in gpu.in_state(LeaseState.HELD):
+        if not lease.spec.evictable:
+            continue
+        times.append(residency_ends_at(lease))
+        if waiter is not None and lease.uses:
+            gap = lease.spec.priority - waiter.spec.priority
+            times.append(waiter.arrived_at + gap * ageing_s + _WAKE_SLACK_S)
+    later = [at for at in times if at > core.now]
+    if later:
+        core.timers.set(("plan", gpu.info.id), min(later))
+
+
+def is_best_place(core: Core, gpu: Gpu, waiter: Lease, plan: Sequence[Lease]) -> bool:
+    """Of several cards that a waiter could be placed on, is emptying this one the cheapest? Wakes the better one."""
+    best, best_cost = gpu, _cost(plan, gpu.info.index)
+    for gpu_id in waiter.gpus:
+        other = core.gpus[gpu_id]
+        if other is gpu or other.queue.head() is not waiter or blocked(core, other):
+            continue
+        going = leaving(other)
+        if fits(other, waiter, going):
+            return False  # room comes there anyway
+        rival = choose_victims(core, other, waiter, going)
+        if rival is not None and _cost(rival, other.info.index) < best_cost:
+            best, best_cost = other, _cost(rival, other.info.index)
+    if best is gpu:
+        return True
+    core.wake(best)
+    return False
+
+
+def _cost(plan: Sequence[Lease], index: int) -> tuple[int, int, int, int, int]:
+    return (
+        _in_use(plan),
+        max((lease.spec.priority for lease in plan), default=0),
+        len(plan),
+        sum(lease.steady_bytes for lease in plan),
+        index,
+    )
+
+
+def _in_use(plan: Sequence[Lease]) -> int:
+    return sum(1 for lease in plan if lease.uses)
+
+
+def _leave(leases: Sequence[Lease]) -> dict[LeaseId, int]:
+    return {lease.id: lease.residue_bytes for lease in leases}
+
+
+def _freed(gpu: Gpu, going: Mapping[LeaseId, int], candidates: Sequence[Lease]) -> dict[LeaseId, int]:
+    total = gpu.ledger.total_if(going)
+    return {
+        lease.id: total - gpu.ledger.total_if({**going, lease.id: lease.residue_bytes}) for lease in candidates
+    }
+
+
+def _cheapest(
+    gpu: Gpu, waiter: Lease, going: Mapping[LeaseId, int], candidates: Sequence[Lease]
+) -> list[Lease] | None:
+    if waiter.spec.exclusive:
+        must = list(candidates)
+    else:
+        must = [lease for lease in candidates if lease.spec.exclusive]
+    base = {**going, **_leave(must)}
+    if fits(gpu, waiter, base):
+        return must
+    rest = [lease for lease in candidates if lease.id not in base]
+
+    def covers(more: Mapping[LeaseId, int]) -> bool:
+        return fits(gpu, waiter, {**base, **more})
+
+    if not rest or not covers(_leave(rest)):
+        return None
+    return must + _search(rest, covers, _freed(gpu, base, rest))
+
+
+def _search(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]) -> list[Lease]:
+    """Cheapest covering set; all candidates together do cover. Fewest in use, then lowest priority, fewest, least bytes, LRU."""
+    if len(candidates) > EXACT_SEARCH_MAX:
+        return _greedy(candidates, covers, freed)
+    idle = [lease for lease in candidates if not lease.uses]
+    busy = [lease for lease in candidates if lease.uses]
+    count = next(
+        k for k in range(len(busy) + 1) if any(covers(_leave([*idle, *some])) for some in combinations(busy, k))
+    )
+    for ceiling in sorted({lease.spec.priority for lease in candidates}):
+        calm = [lease for lease in idle if lease.spec.priority <= ceiling]
+        lively = [lease for lease in busy if lease.spec.priority <= ceiling]
+        for size in range(len(calm) + 1):
+            found = [
+                [*some, *others]
+                for some in combinations(lively, count)
+                for others in combinations(calm, size)
+                if covers(_leave([*some, *others]))
+            ]
+            if found:
+                return min(found, key=lambda plan: _fineness(plan, freed))
+    return list(candidates)  # pragma: no cover - the highest ceiling admits the set that `count` was found with
+
+
+def _fineness(plan: Sequence[Lease], freed: Mapping[LeaseId, int]) -> tuple[int, float, tuple[int, ...]]:
+    return (
+        sum(freed[lease.id] for lease in plan),
+        max(lease.last_used_at for lease in plan),
+        tuple(lease.arrival for lease in plan),
+    )
+
+
+def _greedy(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]) -> list[Lease]:
+    """Cheap classes first, the largest of a class first; then give back whoever turns out not to be needed."""
+    order = sorted(
+        candidates,
+        key=lambda lease: (bool(lease.uses), lease.spec.priority, -freed[lease.id], lease.last_used_at, lease.arrival),
+    )
+    plan: list[Lease] = []
+    for lease in order:
+        plan.append(lease)
+        if covers(_leave(plan)):
+            break
+    for lease in reversed(list(plan)):
+        without = [other for other in plan if other is not lease]
+        if covers(_leave(without)):
+            plan = without
+    return plan
+
+
+def spare_beside_bytes(core: Core, gpu: Gpu, head: Lease, going: Mapping[LeaseId, int]) -> int:
+    """How much a waiter behind the head may take and stay without delaying it.
+
+    Counts what the head's plan frees; while there is no plan, everything that could ever be freed.
+    """
+    freed = going if fits(gpu, head, going) else {**_leave(list(gpu.residents.values())), **going}
+    return gpu.ledger.budget_bytes - gpu.ledger.total_if(freed, (head.process, head.load_peak_bytes))

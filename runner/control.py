@@ -1,0 +1,172 @@
+"""The control thread: one thread owns a runner, its robot or simulator and its cameras; the event loop sends it work.
+
+MuJoCo's rendering contexts belong to the thread that made them, and a control loop must not wait behind sockets. So the event
+loop never touches the runner: it posts callables, which run between two ticks, and awaits what they return.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from runner.protocols import Goal, SkillEnded
+from schemas.errors import InternalError, VramError
+from schemas.world import RunResult
+
+log = logging.getLogger(__name__)
+
+MAILBOX_MAX = 256
+
+
+class Controlled(Protocol):
+    """A runner that can be driven from outside between its ticks."""
+
+    def activate(self) -> None: ...
+
+    def run(self, max_ticks: int | None = None) -> RunResult: ...
+
+    def deactivate(self) -> None: ...
+
+    def request_stop(self) -> None: ...
+
+    @property
+    def mailbox(self) -> Mailbox: ...
+
+    def begin_skill(self, skill: Any, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None: ...
+
+    def end_skill(self) -> None: ...
+
+
+class Mailbox:
+    """Work for the control thread, in order. Closed when the thread ends: what was posted then fails at once."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._posted: deque[tuple[Callable[[], Any], Callable[[Any, BaseException | None], None]]] = deque()
+        self._closed = False
+
+    def post(self, work: Callable[[], Any], deliver: Callable[[Any, BaseException | None], None]) -> None:
+        """Any thread. `deliver(result, error)` is called on the control thread. Raises InternalError when it has ended."""
+        with self._lock:
+            if self._closed or len(self._posted) >= MAILBOX_MAX:
+                raise InternalError(
+                    "the control thread does not take work", hint="see the runner's log; restart it"
+                )
+            self._posted.append((work, deliver))
+
+    def run_pending(self) -> None:
+        """Control thread only: do everything posted so far."""
+        for _ in range(len(self._posted)):
+            with self._lock:
+                work, deliver = self._posted.popleft()
+            try:
+                result = work()
+            except Exception as error:  # noqa: BLE001 — belongs to whoever posted it, never to the loop
+                deliver(None, error)
+            else:
+                deliver(result, None)
+
+    def close(self) -> None:
+        """Refuse further work and fail what still waits."""
+        with self._lock:
+            self._closed = True
+            left = list(self._posted)
+            self._posted.clear()
+        for _, deliver in left:
+            deliver(None, InternalError("the control thread has ended", hint="restart the runner"))
+
+
+class ControlThread:
+    """`async with ControlThread(runner)`: activates the runner in its own thread, runs it, stops it at exit.
+
+    Raises what `activate` raised. `ended` resolves when the run is over, with its RunResult or its error.
+    """
+
+    def __init__(self, runner: Controlled, *, max_ticks: int | None = None) -> None:
+        self.runner = runner
+        self._max_ticks = max_ticks
+        self._thread = threading.Thread(target=self._main, name="control", daemon=True)
+        self._loop: asyncio.AbstractEventLoop
+        self._ready: asyncio.Future[None]
+        self.ended: asyncio.Future[RunResult]
+
+    async def __aenter__(self) -> ControlThread:
+        self._loop = asyncio.get_running_loop()
+        self._ready = self._loop.create_future()
+        self.ended = self._loop.create_future()
+        self._thread.start()
+        await self._ready
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.runner.request_stop()
+        await asyncio.wait([self.ended])
+        await asyncio.to_thread(self._thread.join)
+        if not self.ended.cancelled() and (error := self.ended.exception()) is not None:
+            log.error("the control loop ended with %s: %s", type(error).__name__, error)
+
+    def _main(self) -> None:
+        try:
+            self.runner.activate()
+        except BaseException as error:  # noqa: BLE001 — handed to whoever awaits the start
+            self.runner.mailbox.close()
+            self.runner.deactivate()
+            self._settle(self._ready, None, error)
+            self._settle(self.ended, None, InternalError("the control loop never started"))
+            return
+        self._settle(self._ready, None, None)
+        result: RunResult | None = None
+        failure: BaseException | None = None
+        try:
+            result = self.runner.run(self._max_ticks)
+        except BaseException as error:  # noqa: BLE001 — the thread's outermost frame
+            log.exception("the control loop failed")
+            failure = error
+        finally:
+            self.runner.mailbox.close()
+            self.runner.deactivate()
+        self._settle(self.ended, result, failure)
+
+    def _settle(self, future: asyncio.Future[Any], result: Any, error: BaseException | None) -> None:
+        def settle() -> None:
+            if future.done():
+                return
+            if error is None:
+                future.set_result(result)
+            else:
+                future.set_exception(error)
+
+        try:
+            self._loop.call_soon_threadsafe(settle)
+        except RuntimeError:
+            log.debug("the event loop closed before the control thread did")
+
+    async def call[T](self, work: Callable[[], T]) -> T:
+        """Run `work` on the control thread between two ticks. Raises what it raises, InternalError when the thread has ended."""
+        future: asyncio.Future[T] = self._loop.create_future()
+        self.runner.mailbox.post(work, lambda result, error: self._settle(future, result, error))
+        return await future
+
+    async def run_skill(self, skill: Any, goal: Goal) -> SkillEnded:
+        """Give the arm to a started skill until it is done or fails. Cancelling takes the arm back: it holds."""
+        ended: asyncio.Future[SkillEnded] = self._loop.create_future()
+        await self.call(
+            lambda: self.runner.begin_skill(skill, goal, lambda end: self._settle(ended, end, None))
+        )
+        waiting = asyncio.ensure_future(ended)
+        try:
+            done, _ = await asyncio.wait([waiting, self.ended], return_when=asyncio.FIRST_COMPLETED)
+            if waiting not in done:
+                raise InternalError("the control loop ended during the goal", hint="see the runner's log")
+            return waiting.result()
+        finally:
+            if not waiting.done():
+                waiting.cancel()
+                try:
+                    await self.call(self.runner.end_skill)
+                except VramError:
+                    log.debug("the control thread ended before the skill did")

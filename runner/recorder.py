@@ -1,0 +1,98 @@
+"""Writes the episode as H.264 video: RGB pictures with a caption, encoded by ffmpeg on a thread of its own.
+
+The control thread only hands a picture over: when the encoder is slow, pictures are dropped and counted, never waited for.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from pathlib import Path
+from typing import Any
+
+log = logging.getLogger(__name__)
+
+QUEUE_MAX = 30  # pictures; two to three seconds of video
+LINE_PX = 22
+FONT_SCALE = 0.5
+
+
+class Recorder:
+    """`Recorder(path, fps)`; `submit(rgb, lines)` from any one thread; `close()` finishes the file. Needs even picture sizes."""
+
+    def __init__(self, path: Path, *, fps: float) -> None:
+        self.path = path
+        self.fps = fps
+        self.written = 0
+        self.dropped = 0
+        self.error: str = ""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._queue: queue.Queue[tuple[Any, tuple[str, ...]] | None] = queue.Queue(maxsize=QUEUE_MAX)
+        self._thread = threading.Thread(target=self._encode, name="recorder", daemon=True)
+        self._thread.start()
+
+    def submit(self, rgb: Any, lines: tuple[str, ...]) -> None:
+        """Hand over one picture (uint8, height × width × 3); it must not be changed afterwards."""
+        try:
+            self._queue.put_nowait((rgb, lines))
+        except queue.Full:
+            self.dropped += 1
+
+    def close(self) -> None:
+        """Encode what is queued, finish the file; repeatable."""
+        if self._thread.is_alive():
+            self._queue.put(None)
+            self._thread.join()
+
+    def _encode(self) -> None:
+        writer: Any = None
+        try:
+            while (item := self._queue.get()) is not None:
+                if self.error:
+                    continue  # keep the queue moving, so that close() never waits for a dead encoder
+                rgb, lines = item
+                try:
+                    if writer is None:
+                        writer = self._open(rgb.shape[1], rgb.shape[0])
+                    writer.send(_caption(rgb, lines))
+                    self.written += 1
+                except (OSError, RuntimeError) as error:  # ffmpeg missing, disk full: the robot goes on
+                    self.error = str(error)
+                    log.error("no video: %s", error)
+        finally:
+            if writer is not None:
+                writer.close()
+
+    def _open(self, width: int, height: int) -> Any:
+        import imageio_ffmpeg
+
+        writer = imageio_ffmpeg.write_frames(
+            str(self.path),
+            (width, height),
+            fps=self.fps,
+            codec="libx264",
+            macro_block_size=2,
+            output_params=["-preset", "veryfast", "-crf", "26", "-threads", "1", "-movflags", "+faststart"],
+        )
+        writer.send(None)
+        return writer
+
+
+def _caption(rgb: Any, lines: tuple[str, ...]) -> Any:
+    """A copy of the picture with a dark strip above and the lines on it."""
+    import cv2
+    import numpy as np
+
+    if not lines:
+        return np.ascontiguousarray(rgb)
+    picture = rgb.copy()
+    height = LINE_PX * len(lines) + 8
+    picture[:height] //= 3
+    for index, line in enumerate(lines):
+        text = line.encode("ascii", "replace").decode()  # OpenCV's fonts know ASCII only
+        cv2.putText(
+            picture, text, (8, LINE_PX * (index + 1) - 2), cv2.FONT_HERSHEY_SIMPLEX, FONT_SCALE, (255, 255, 255), 1,
+            cv2.LINE_AA,
+        )  # fmt: skip
+    return picture
