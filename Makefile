@@ -44,7 +44,7 @@ format: setup ## rewrite the code in the project's style
 	$(BIN)/ruff format .
 
 bench: setup ## measure grants and handovers against bare ZeroMQ
-	$(BIN)/python -m pytest -q -s tests/bench $(ARGS)
+	$(BIN)/python tests/bench/bench_wire.py $(ARGS)
 
 schemas: setup ## write the JSON Schemas anew after a model changed
 	$(BIN)/python -m schemas export schemas/json

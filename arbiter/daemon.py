@@ -24,7 +24,7 @@ from arbiter.host.executor import Executor
 from arbiter.host.gpu.fake import open_cards
 from arbiter.host.gpu.nvml import NvmlProbe
 from arbiter.host.gpu.probe import Card, GpuProbe
-from arbiter.host.history import History
+from arbiter.host.history import CLEAN_END, History
 from arbiter.host.journal import Journal
 from arbiter.host.lockfile import LockFile
 from arbiter.host.probing import Prober, within
@@ -152,7 +152,7 @@ class Daemon:
             await self._stop.wait()
             notifier.stopping("stopping" if self._exit_code == EXIT_OK else "the core failed")
             telemetry.log_event(
-                history.append("stopped", {"exit_code": self._exit_code, "leases_kept": True})
+                history.append(CLEAN_END, {"exit_code": self._exit_code, "leases_kept": True})
             )
         return self._exit_code
 
@@ -172,7 +172,9 @@ class Daemon:
         undo.callback(history.close)
         probe, gpus = await self._open_cards(places)  # 3
 
-        core = Arbiter(core_settings(config, journal.opened.epoch, gpus), time.monotonic())  # 4
+        settings = core_settings(config, journal.opened.epoch, gpus)
+        try_records(journal, settings)
+        core = Arbiter(settings, time.monotonic())  # 4
         inbox = Inbox(core, lambda effects: executor.perform(effects), self._core_failed)
         prober = Prober(probe, [gpu.id for gpu in gpus], config.probe.deadline_s, loop, inbox.post)
         undo.callback(prober.close)
@@ -186,8 +188,8 @@ class Daemon:
 
         watch = ProcessWatch(loop, start_ticks, died)
         undo.callback(watch.close)
-        settings = self._session_settings(journal.opened.epoch, boot, group)
-        sessions = SessionTable(settings, server, inbox, history.read, watch.add, time.monotonic)
+        wire = self._session_settings(journal.opened.epoch, boot, group)
+        sessions = SessionTable(wire, server, inbox, history.read, watch.add, time.monotonic)
         executor = Executor(sessions, journal, history, prober.sample, inbox.post, telemetry.log_event)
 
         self._tell_start(history, journal, places, gpus)  # 5
@@ -298,6 +300,18 @@ def status_text(gpus: Sequence[GpuInfo]) -> str:
 def boot_id() -> str:
     """Changes with every boot of the machine, and only then."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+
+
+def try_records(journal: Journal, settings: Settings) -> None:
+    """Let a core that is thrown away read the journal's records; what it cannot read is put aside instead of stopping every start."""
+    if not journal.opened.records:
+        return
+    now = time.monotonic()
+    try:
+        Arbiter(settings, now).handle(Recovered(journal.opened.records), now)
+    except Exception as error:
+        log.exception("the core cannot read the journal's records")
+        journal.put_aside(f"{type(error).__name__}: {error}")
 
 
 def processes_of(records: Mapping[str, Mapping[str, object]]) -> list[ProcessKey]:

@@ -6,6 +6,7 @@ loop's timers and of the probes' time stamps.
 """
 
 import asyncio
+import json
 import logging
 import time
 from collections import deque
@@ -101,8 +102,15 @@ class Inbox:
             self._perform(effects)
         except Exception as error:  # outermost: a core that raised has an unknown state
             log.critical("the core failed on %s: %s", event, error, exc_info=error)
+            log.critical("state of the core: %s", self._state())
             self.close()
             self._failed(error)
+
+    def _state(self) -> str:
+        try:
+            return json.dumps(self.status(), default=str)
+        except Exception as error:  # the state may be what is broken
+            return f"unreadable: {error!r}"
 
     def _arm(self) -> None:
         """One timer for the core's next deadline; armed again only when that has changed."""

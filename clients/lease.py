@@ -96,6 +96,7 @@ class Lease:
         self._callbacks = callbacks
         self._uses: set[str] = set()
         self._asked = False  # to leave: no new uses
+        self._own_will = False  # the holder itself leaves, so it is not loading any more
         self._unloading = False
         self._unloaded = False
         self._gone = False  # the lease itself
@@ -195,8 +196,13 @@ class Lease:
         self._end()
 
     async def give_up(self) -> None:
-        """Leave of our own will: no new uses, wait for those that run, then `unload` and release. Idempotent."""
+        """Leave of our own will: no new uses, wait for those that run, then `unload` and release. Idempotent.
+
+        Before `ready` it means that the load failed or was given up: `unload` frees what there is.
+        """
+        self._own_will = True
         self._start_leaving()
+        self._progress.changed()
         await self.wait_gone()
 
     async def wait_gone(self) -> None:
@@ -233,35 +239,41 @@ class Lease:
             self._leaving = self._driver.spawn(self._leave(), f"leave {self.lease_id}")
 
     async def _leave(self) -> None:
-        """1. Wait for the safe point: loaded, no local use. 2. Announce; others' uses make the arbiter refuse. 3. Unload. 4. Release."""
-        while True:
-            while not self._gone and (self._uses or not self._record.held):  # 1
+        """1. Wait for the safe point: no local use, not loading. 2. Announce, until no use of others is on it. 3. Unload. 4. Release."""
+        while not self._gone:
+            if self._uses or not (self._record.held or self._own_will):  # 1
                 await self._progress.wait()
-            if self._gone:
-                return
-            try:
-                await self._driver.reply(
-                    self._driver.protocol.unloading(self._record, self._driver.now())
-                )  # 2
-                break
-            except BadState:
+            elif not self._record.held or await self._announced():  # 2
+                self._unloading = True
+                await self._unload_once()  # 3
+                if not self._gone:
+                    await self._release(exiting=False)  # 4
+                self._end()
+
+    async def _announced(self) -> bool:
+        """Say `unloading`. False: not now; somebody else's use is on the lease, or there is no contact."""
+        request = self._driver.protocol.unloading(self._record, self._driver.now())
+        try:
+            await self._driver.reply(request)
+        except BadState as error:
+            if error.details.get("uses"):
                 await self._progress.wait(RETRY_UNLOADING_S)
-            except ArbiterUnreachable:
-                continue  # no contact: stay resident; back in contact or fenced, whichever comes first
-            except VramError as error:
-                if error.code not in GONE_CODES:
-                    raise
-                return  # `lost` has been told
-        self._unloading = True
-        await self._unload_once()  # 3
-        if not self._gone:
-            await self._release(exiting=False)  # 4
-        self._end()
+                return False
+        except ArbiterUnreachable:
+            return False  # stay resident: back in contact or fenced, whichever comes first
+        except VramError as error:
+            if error.code not in GONE_CODES:
+                raise
+            await self._progress.wait(RETRY_UNLOADING_S)  # `lost` is told by the protocol
+            return False
+        return True
 
     async def _after_loss(self, error: VramError, fenced: bool) -> None:
         while self._uses:
             await self._progress.wait()
-        if not self._unloading:
+        if self._unloading and self._leaving is not None:
+            await asyncio.wait([self._leaving])
+        else:
             await self._unload_once()
         if fenced:  # the arbiter may live: tell it as soon as it can be reached
             self._driver.protocol.release(self._record, False, self._driver.now(), RELEASE_TIMEOUT_S)

@@ -76,6 +76,7 @@ class ClientProtocol:
     """One connection's state machine. `phase` is `down`, `greeting`, `reattaching` or `up`."""
 
     def __init__(self, *, name: str, instance: str, role: str = "client") -> None:
+        self.instance = instance
         self._hello = {
             "op": "hello",
             "version": d.WIRE_VERSION,

@@ -47,7 +47,9 @@ class RouterServer:
     Raises ConfigError for a foreign endpoint, AlreadyRunning when a living server owns it.
     """
 
-    def __init__(self, endpoint: str, on_error: ErrorReply, *, concurrent_max: int = 64, queue_max: int = 256) -> None:
+    def __init__(
+        self, endpoint: str, on_error: ErrorReply, *, concurrent_max: int = 64, queue_max: int = 256
+    ) -> None:
         if not endpoint.startswith(("ipc://", "tcp://127.0.0.1:", "tcp://localhost:")):
             raise ConfigError(f"cannot serve on {endpoint}", hint="use ipc://PATH or tcp://127.0.0.1:PORT")
         self.endpoint = endpoint
@@ -64,7 +66,9 @@ class RouterServer:
             self._claim(Path(self.endpoint.removeprefix("ipc://")))
         socket: zmq.asyncio.Socket = zmq.asyncio.Context.instance().socket(zmq.ROUTER)
         self._stack.callback(socket.close, 0)
-        socket.setsockopt(zmq.MAXMSGSIZE, 4 * MAX_DEPTH_BYTES)  # beyond this libzmq drops the peer; below we can answer
+        socket.setsockopt(
+            zmq.MAXMSGSIZE, 4 * MAX_DEPTH_BYTES
+        )  # beyond this libzmq drops the peer; below we can answer
         socket.setsockopt(zmq.SNDHWM, self._queue_max)
         socket.setsockopt(zmq.RCVHWM, self._queue_max)
         old_umask = os.umask(0o117)
@@ -91,7 +95,9 @@ class RouterServer:
         except BlockingIOError:
             owner = os.pread(lock, 32, 0).decode(errors="replace").strip()
             self._stack.close()
-            raise AlreadyRunning(f"{path} is served by process {owner or '?'}", hint="stop it first") from None
+            raise AlreadyRunning(
+                f"{path} is served by process {owner or '?'}", hint="stop it first"
+            ) from None
         os.ftruncate(lock, 0)
         os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
         if path.exists() and stat.S_ISSOCK(path.stat().st_mode):
@@ -129,14 +135,17 @@ class RouterServer:
         payload = frames[-1]
         if len(payload) > MAX_DEPTH_BYTES:
             raise MessageTooLarge(
-                f"a message of {len(payload)} bytes; the limit is {MAX_DEPTH_BYTES}", hint="send a smaller image"
+                f"a message of {len(payload)} bytes; the limit is {MAX_DEPTH_BYTES}",
+                hint="send a smaller image",
             )
         try:
             message = msgpack.unpackb(payload.buffer, raw=False, strict_map_key=True)
         except (ValueError, msgpack.exceptions.UnpackException, RecursionError) as error:
             raise BadFrame(f"not msgpack: {error}", hint="send one msgpack map per message") from None
         if not isinstance(message, dict):
-            raise BadFrame(f"a msgpack {type(message).__name__}, not a map", hint="send one msgpack map per message")
+            raise BadFrame(
+                f"a msgpack {type(message).__name__}, not a map", hint="send one msgpack map per message"
+            )
         return message
 
     async def send(self, peer: Peer, message: Message) -> None:

@@ -154,18 +154,17 @@ class ControlThread:
     async def run_skill(self, skill: Any, goal: Goal) -> SkillEnded:
         """Give the arm to a started skill until it is done or fails. Cancelling takes the arm back: it holds."""
         ended: asyncio.Future[SkillEnded] = self._loop.create_future()
-        await self.call(
-            lambda: self.runner.begin_skill(skill, goal, lambda end: self._settle(ended, end, None))
-        )
-        waiting = asyncio.ensure_future(ended)
         try:
-            done, _ = await asyncio.wait([waiting, self.ended], return_when=asyncio.FIRST_COMPLETED)
-            if waiting not in done:
+            await self.call(
+                lambda: self.runner.begin_skill(skill, goal, lambda end: self._settle(ended, end, None))
+            )
+            await asyncio.wait([ended, self.ended], return_when=asyncio.FIRST_COMPLETED)
+            if not ended.done():
                 raise InternalError("the control loop ended during the goal", hint="see the runner's log")
-            return waiting.result()
+            return ended.result()
         finally:
-            if not waiting.done():
-                waiting.cancel()
+            if not ended.done():  # cancelled, deadline, or the loop died: the mailbox keeps the order
+                ended.cancel()
                 try:
                     await self.call(self.runner.end_skill)
                 except VramError:

@@ -23,12 +23,19 @@ class _Section(BaseModel):
 class GpuConfig(_Section):
     """Which cards are leased and how much of each."""
 
-    source: Annotated[str, Field(pattern=r"^(nvml|fake:.+)$")] = "nvml"
+    source: str = "nvml"
     """`nvml`: the NVIDIA cards of this machine. `fake:8GiB`: one simulated card. `fake:FOLDER`: the card in that folder."""
     reserve_bytes: ByteSize = d.RESERVE_BYTES
     """Bytes of every card that are never leased: driver, display, allocator slack."""
     capacity_bytes: dict[str, ByteSize] = Field(default_factory=dict)
     """Cap per card, by UUID or index as text: lease out less than the card has. A card that is not named has no cap."""
+
+    @field_validator("source")
+    @classmethod
+    def _known_source(cls, value: str) -> str:
+        if value != "nvml" and not (value.startswith("fake:") and len(value) > len("fake:")):
+            raise ValueError(f"{value!r} is no source of cards; write nvml, fake:8GiB or fake:FOLDER")
+        return value
 
 
 class SchedulingConfig(_Section):

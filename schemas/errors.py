@@ -172,6 +172,10 @@ class SidecarUnavailable(TransientError):
 
 
 # -- runner and reasoner -----------------------------------------------------------------------------------------
+class RunnerUnreachable(TransientError):
+    code = "runner_unreachable"  # it does not answer: not running, or hanging
+
+
 class GoalRejected(CallerError):
     code = "goal_rejected"
 

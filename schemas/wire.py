@@ -257,6 +257,7 @@ class RevokePush(TypedDict):
     reason: str
     wanted_by: str
     deadline_in_s: float
+    uses: NotRequired[int]  # what still runs on the lease, whoever marked it; `unloading` is refused before 0
 
 
 class GrantedPush(TypedDict):

@@ -3,9 +3,12 @@ and `inbox` (time). Frozen; plain values only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
+
+BYE: Final = "bye"
+"""`ClientLeft.reason` of a connection that took its leave: only then are its resident leases released."""
 
 
 # -- clients -------------------------------------------------------------------------------------------------------

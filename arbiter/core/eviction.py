@@ -3,6 +3,9 @@
 A holder is only ever *asked*. It unloads by itself at its safe point; the core refuses its `unloading` before that.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 from arbiter.core.lease import Eviction, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 from schemas.ids import LeaseId
@@ -111,7 +114,7 @@ def _deadline(core: Core, holder: Lease, eviction: Eviction) -> None:
     )
 
 
-def deny(core: Core, waiter: Lease, error: dict[str, object]) -> None:
+def deny(core: Core, waiter: Lease, error: Mapping[str, Any]) -> None:
     """End a waiter's wait with a typed error."""
     waiter.move(LeaseState.DENIED, core.now, str(error["message"]))
     core.dequeue(waiter)

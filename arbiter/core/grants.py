@@ -77,9 +77,9 @@ def _grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> bool:
 
 
 def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int]) -> bool:
-    if head.planned_gpu is not None and head.planned_gpu != gpu.info.id:
-        if any(e.wanted_by == head.id for e in core.gpus[head.planned_gpu].evictions):
-            return False  # another card is being emptied for it
+    elsewhere = head.planned_gpu is not None and head.planned_gpu != gpu.info.id
+    if elsewhere and any(e.wanted_by == head.id for other in core.gpus.values() for e in other.evictions):
+        return False  # another card is being emptied for it
     if policy.residue_under_measurement(gpu):
         head.reason = "a dead process's memory is being measured"
         return False
@@ -141,7 +141,9 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
         charge_bytes=lease.load_peak_bytes,
         waited_ms=(core.now - lease.arrived_at) * 1e3,
         evicted=[e.consumer for e in lease.evicted],
-        reason="fits after " + ", ".join(e.consumer for e in lease.evicted) + " left" if lease.evicted else "fits",
+        reason="fits after " + ", ".join(e.consumer for e in lease.evicted) + " left"
+        if lease.evicted
+        else "fits",
     )
     gpu.blocked = policy.blocked(core, gpu)
 

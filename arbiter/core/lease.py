@@ -133,7 +133,9 @@ class Lease:
     planned_gpu: GpuId | None = None  # a card where somebody was asked to leave for it
     eviction: Eviction | None = None
     evicted: list[Eviction] = field(default_factory=list)  # who left for it
-    story: list[tuple[float, LeaseState, str]] = field(default_factory=list)  # as long as the table's longest path
+    story: list[tuple[float, LeaseState, str]] = field(
+        default_factory=list
+    )  # as long as the table's longest path
 
     def move(self, to: LeaseState, now: float, why: str) -> None:
         """Go to another state. Raises IllegalTransition, and then nothing has changed."""

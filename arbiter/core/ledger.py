@@ -71,7 +71,9 @@ class GpuLedger:
     def total_bytes(self) -> int:
         """Booked bytes, evidence above them, and stowaways."""
         if self._total is None:
-            self._total = sum(self._occupied(account) for account in self.accounts.values()) + self.stowaway_bytes()
+            self._total = (
+                sum(self._occupied(account) for account in self.accounts.values()) + self.stowaway_bytes()
+            )
         return self._total
 
     def stowaway_bytes(self) -> int:
@@ -144,11 +146,15 @@ class GpuLedger:
         account = self.accounts.get(process)
         if account is None:
             return self.total_bytes()
-        return self.total_bytes() - self._occupied(account) + self.process_after_bytes(process, going, dead=dead)
+        return (
+            self.total_bytes() - self._occupied(account) + self.process_after_bytes(process, going, dead=dead)
+        )
 
     def _after(self, account: Account, going: Mapping[LeaseId, int], more_bytes: int) -> int:
         if not going:
-            booked = max(sum(c.booked_bytes for c in account.charges.values()) + more_bytes, account.residue_bytes)
+            booked = max(
+                sum(c.booked_bytes for c in account.charges.values()) + more_bytes, account.residue_bytes
+            )
             return self._with_evidence(booked, account.measured_bytes)
         staying = sum(charge.booked_bytes for lease, charge in account.charges.items() if lease not in going)
         return max(staying + more_bytes, account.residue_floor_bytes, *going.values())
@@ -163,7 +169,9 @@ class GpuLedger:
         return self.strangers.get(process) or self.strangers.get(ProcessKey(process.pid, 0))
 
     # -- changing --------------------------------------------------------------------------------------------------
-    def charge(self, lease: LeaseId, process: ProcessKey, booked_bytes: int, approved_bytes: int, now: float) -> None:
+    def charge(
+        self, lease: LeaseId, process: ProcessKey, booked_bytes: int, approved_bytes: int, now: float
+    ) -> None:
         """Book a grant (or, after a restart, what somebody says he holds)."""
         account = self._open(process, now)
         account.charges[lease] = Charge(booked_bytes, approved_bytes)

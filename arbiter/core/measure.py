@@ -3,10 +3,13 @@
 Starts, polls and ends verifications; the judgement itself is in `verify`. A failed reading is *unknown*: it frees nothing.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 from arbiter.core.events import MemorySampled, ProbeFailed
 from arbiter.core.lease import EXPIRING, Lease, LeaseState
-from arbiter.core.state import Core, Ended, Gpu
-from arbiter.core.verify import Judgement, Verdict, Verification, grown_since, judge
+from arbiter.core.state import Core, Gpu
+from arbiter.core.verify import Judgement, Verdict, Verification, judge
 from schemas.ids import GpuId, LeaseId, ProcessKey
 
 
@@ -141,7 +144,8 @@ def begin_for_residue(core: Core, gpu: Gpu, process: ProcessKey) -> None:
         consumer=str(process),
         residue_bytes=0,
         baseline=gpu.sample,
-        baseline_comparable=gpu.sample is not None and gpu.sample.taken_at > gpu.ledger.accounts[process].changed_at,
+        baseline_comparable=gpu.sample is not None
+        and gpu.sample.taken_at > gpu.ledger.accounts[process].changed_at,
         confirmed_at=core.now,
         not_before=core.now,
         deadline_at=core.now + core.settings.verify_timeout_s,
@@ -170,10 +174,16 @@ def on_poll_due(core: Core, gpu_id: str) -> None:
             if verification.last_used_bytes is None:
                 _announce(core, gpu, verification, Judgement(Verdict.STALE, False, 0))
         steps = core.settings.verify_poll_s
-        step = core.settings.verify_slow_poll_s if verification.overdue else steps[min(verification.polls, len(steps) - 1)]
+        step = (
+            core.settings.verify_slow_poll_s
+            if verification.overdue
+            else steps[min(verification.polls, len(steps) - 1)]
+        )
         verification.next_poll_at = core.now + step
         if not verification.overdue:
-            verification.next_poll_at = min(verification.next_poll_at, max(verification.deadline_at, core.now + steps[0]))
+            verification.next_poll_at = min(
+                verification.next_poll_at, max(verification.deadline_at, core.now + steps[0])
+            )
     core.want_sample(gpu, core.now)
     _set_poll(core, gpu)
 
@@ -189,7 +199,11 @@ def _weigh(core: Core, gpu: Gpu, verification: Verification, sample: MemorySampl
     if verification.key not in gpu.verifications:  # resolved together with an earlier one
         return
     judgement = judge(
-        verification, gpu.ledger, sample, _grown_by_right(gpu, verification, sample), core.settings.verify_tolerance_bytes
+        verification,
+        gpu.ledger,
+        sample,
+        _grown_by_right(gpu, verification, sample),
+        core.settings.verify_tolerance_bytes,
     )
     if judgement is None:
         return
@@ -207,7 +221,11 @@ def _grown_by_right(gpu: Gpu, verification: Verification, sample: MemorySampled)
         then = {use.process.pid: use.used_bytes or 0 for use in baseline.processes}
         now = {use.process.pid: use.used_bytes or 0 for use in sample.processes}
         return sum(
-            max(0, min(now.get(account.process.pid, 0), account.booked_bytes()) - then.get(account.process.pid, 0))
+            max(
+                0,
+                min(now.get(account.process.pid, 0), account.booked_bytes())
+                - then.get(account.process.pid, 0),
+            )
             for account in gpu.ledger.accounts.values()
             if account.process != verification.process
         )
@@ -220,7 +238,11 @@ def _grown_by_right(gpu: Gpu, verification: Verification, sample: MemorySampled)
 
 
 def _announce(
-    core: Core, gpu: Gpu, verification: Verification, judgement: Judgement, sample: MemorySampled | None = None
+    core: Core,
+    gpu: Gpu,
+    verification: Verification,
+    judgement: Judgement,
+    sample: MemorySampled | None = None,
 ) -> None:
     """Tell a verdict once; an unresolved one that repeats is silent."""
     if verification.verdict is judgement.verdict and not judgement.resolved:
@@ -275,7 +297,9 @@ def _close_eviction(core: Core, gpu: Gpu, verification: Verification, judgement:
 
 
 # -- leases that end without their holder's word ---------------------------------------------------------------------
-def lose(core: Core, lease: Lease, to: LeaseState, error: dict[str, object], *, alive: bool, grace_s: float) -> None:
+def lose(
+    core: Core, lease: Lease, to: LeaseState, error: Mapping[str, Any], *, alive: bool, grace_s: float
+) -> None:
     """A resident lease is over (expired or lost); its bytes become a debt and are measured away."""
     gpu = core.gpu_of(lease)
     lease.uses.clear()
@@ -307,5 +331,7 @@ def on_expiry_due(core: Core, lease_id: str) -> None:
         lease,
         {"push": "lost", "lease_id": lease.id, "token": [token.epoch, token.serial], "error": error},
     )
-    grace_s = core.settings.fence_grace_s if lease.attached else 0.0  # a restart's deadline has the grace in it
+    grace_s = (
+        core.settings.fence_grace_s if lease.attached else 0.0
+    )  # a restart's deadline has the grace in it
     lose(core, lease, LeaseState.EXPIRED, error, alive=True, grace_s=grace_s)

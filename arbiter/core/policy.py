@@ -45,7 +45,11 @@ def leaving(gpu: Gpu) -> dict[LeaseId, int]:
         if not late:
             going[lease.id] = lease.residue_bytes
     for verification in gpu.verifications.values():  # debts
-        if verification.lease is not None and verification.lease not in gpu.residents and not verification.overdue:
+        if (
+            verification.lease is not None
+            and verification.lease not in gpu.residents
+            and not verification.overdue
+        ):
             going[verification.lease] = verification.kept_bytes
     return going
 
@@ -81,7 +85,11 @@ def largest_fold_bytes(gpu: Gpu) -> int:
 def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
     """Free bytes by the newest reading, less the leases that it cannot have seen. None: no reading young enough."""
     sample = gpu.sample
-    if sample is None or gpu.failed_at is not None or core.now - sample.taken_at > core.settings.sample_max_age_s:
+    if (
+        sample is None
+        or gpu.failed_at is not None
+        or core.now - sample.taken_at > core.settings.sample_max_age_s
+    ):
         return None
     unseen = sum(
         gpu.ledger.charge_bytes(lease.id)
@@ -205,7 +213,8 @@ def _leave(leases: Sequence[Lease]) -> dict[LeaseId, int]:
 def _freed(gpu: Gpu, going: Mapping[LeaseId, int], candidates: Sequence[Lease]) -> dict[LeaseId, int]:
     total = gpu.ledger.total_if(going)
     return {
-        lease.id: total - gpu.ledger.total_if({**going, lease.id: lease.residue_bytes}) for lease in candidates
+        lease.id: total - gpu.ledger.total_if({**going, lease.id: lease.residue_bytes})
+        for lease in candidates
     }
 
 
@@ -236,7 +245,9 @@ def _search(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId
     idle = [lease for lease in candidates if not lease.uses]
     busy = [lease for lease in candidates if lease.uses]
     count = next(
-        k for k in range(len(busy) + 1) if any(covers(_leave([*idle, *some])) for some in combinations(busy, k))
+        k
+        for k in range(len(busy) + 1)
+        if any(covers(_leave([*idle, *some])) for some in combinations(busy, k))
     )
     for ceiling in sorted({lease.spec.priority for lease in candidates}):
         calm = [lease for lease in idle if lease.spec.priority <= ceiling]
@@ -250,7 +261,9 @@ def _search(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId
             ]
             if found:
                 return min(found, key=lambda plan: _fineness(plan, freed))
-    return list(candidates)  # pragma: no cover - the highest ceiling admits the set that `count` was found with
+    return list(
+        candidates
+    )  # pragma: no cover - the highest ceiling admits the set that `count` was found with
 
 
 def _fineness(plan: Sequence[Lease], freed: Mapping[LeaseId, int]) -> tuple[int, float, tuple[int, ...]]:
@@ -265,7 +278,13 @@ def _greedy(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId
     """Cheap classes first, the largest of a class first; then give back whoever turns out not to be needed."""
     order = sorted(
         candidates,
-        key=lambda lease: (bool(lease.uses), lease.spec.priority, -freed[lease.id], lease.last_used_at, lease.arrival),
+        key=lambda lease: (
+            bool(lease.uses),
+            lease.spec.priority,
+            -freed[lease.id],
+            lease.last_used_at,
+            lease.arrival,
+        ),
     )
     plan: list[Lease] = []
     for lease in order:

@@ -110,9 +110,12 @@ class Core:
         self.serial = 0
         self.arrivals = 0
         self.last_token = Token(settings.epoch, 0)
+        self.unanswered: list[Lease] = []  # acquires of the event being handled
         self.granted: list[tuple[Token, GpuId]] = []  # by the event being handled; invariants look at it
         self.last_client_at = now
-        self.recovering: set[LeaseId] | None = None  # None: serving; else the leases still to be accounted for
+        self.recovering: set[LeaseId] | None = (
+            None  # None: serving; else the leases still to be accounted for
+        )
         self.learnt_peaks: dict[str, int] = {}  # by "consumer key"
         self.durations: dict[str, dict[str, deque[float]]] = {}
         for consumer, medians in sorted(settings.learnt.items()):

@@ -115,7 +115,9 @@ def _late(
 ) -> Judgement:
     """The time is up. Say whose bytes these are, as far as this backend can tell."""
     if held is not None:
-        name = next((use.name for use in sample.processes or () if use.process.pid == v.process.pid), v.consumer)
+        name = next(
+            (use.name for use in sample.processes or () if use.process.pid == v.process.pid), v.consumer
+        )
         if held > expected + tolerance_bytes:
             culprits = ((v.process.pid, name, held),)
             if v.alive:
@@ -130,7 +132,9 @@ def _late(
     return Judgement(Verdict.CONTESTED, sample.used_bytes <= bound_a + tolerance_bytes, 0)
 
 
-def grown_since(v: Verification, ledger: GpuLedger, sample: MemorySampled) -> tuple[tuple[int, str, int], ...]:
+def grown_since(
+    v: Verification, ledger: GpuLedger, sample: MemorySampled
+) -> tuple[tuple[int, str, int], ...]:
     """Others that hold more than at the baseline, the largest first: (pid, name, bytes grown)."""
     grown: list[tuple[int, str, int]] = []
     for use in sample.processes or ():

@@ -1,7 +1,7 @@
 """What happened: every fact of the core as an event with number and wall time, the newest in memory, all of them in SQLite.
 
-`append` costs the loop one dict; a thread writes them twice a second and answers questions about events that memory no longer
-holds. Losing the last half second in a crash loses explanations, never leases. A broken database is put aside and reported; without a
+`append` costs the loop one dict; a thread writes them every 0.2 s and answers questions about events that memory no longer
+holds. Losing the last moment in a crash loses explanations, never leases. A broken database is put aside and reported; without a
 writable one the history lives in memory only. Must not know what the events mean.
 """
 
@@ -21,11 +21,15 @@ from typing import Any, Self
 log = logging.getLogger(__name__)
 
 RING_EVENTS = 2000
-FLUSH_S = 0.5
+FLUSH_S = 0.2
+SKIPPED_AFTER_CRASH = 2000
+"""Numbers left out after a start that no stop preceded: those of the last, unwritten events may be known to subscribers."""
 BUFFER_MAX = 20_000
 """Events waiting for a disk that does not answer; beyond this the oldest are dropped and counted."""
 PRUNE_EVERY_EVENTS = 2000
 CLOSE_S = 5.0
+CLEAN_END = "stopped"
+"""Kind of the last event of an orderly stop."""
 
 Done = Callable[[Mapping[str, Any]], None]
 Event = Mapping[str, Any]
@@ -177,7 +181,11 @@ class _Store:
             raise
 
     def last_seq(self) -> int:
-        return int(self._db.execute("SELECT COALESCE(MAX(seq), 0) FROM events").fetchone()[0])
+        """The number after which numbering goes on: never one that was given out before."""
+        row = self._db.execute("SELECT seq, kind FROM events ORDER BY seq DESC LIMIT 1").fetchone()
+        if row is None:
+            return 0
+        return int(row[0]) + (0 if row[1] == CLEAN_END else SKIPPED_AFTER_CRASH)
 
     def add(self, events: Sequence[Event]) -> None:
         rows = [

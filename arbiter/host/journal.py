@@ -42,7 +42,9 @@ class Journal:
     """One connection, used by one thread. `open` makes it; the database stays locked against a second daemon's writes by the
     daemon's own lock file, not here."""
 
-    def __init__(self, connection: sqlite3.Connection, opened: Opened) -> None:
+    def __init__(self, path: Path, boot_id: str, connection: sqlite3.Connection, opened: Opened) -> None:
+        self._path = path
+        self._boot_id = boot_id
         self._connection = connection
         self.opened = opened
 
@@ -72,18 +74,22 @@ class Journal:
                 voided, records = len(records), {}
             wall_s = time.time() if wall_s is None else wall_s
             epoch = _next_epoch(folder, meta, put_aside is not None, wall_s)  # 3
-            with connection:
-                connection.execute("BEGIN IMMEDIATE")
-                if voided:
-                    connection.execute("DELETE FROM records")
-                values = {"schema": str(SCHEMA_VERSION), "boot_id": boot_id, "epoch": str(epoch)}
-                connection.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
+            _write_meta(connection, boot_id, epoch, drop_records=voided > 0)
         except (OSError, sqlite3.OperationalError) as error:
             raise ConfigError(
                 f"the state folder {folder} cannot be used: {error}",
                 hint="make it writable, or choose another --state-dir",
             ) from error
-        return cls(connection, Opened(epoch, records, put_aside, problem, voided))
+        return cls(path, boot_id, connection, Opened(epoch, records, put_aside, problem, voided))
+
+    def put_aside(self, problem: str) -> None:
+        """The database is sound but nobody understands its records: start with an empty one, in the same epoch."""
+        self._connection.close()
+        aside = _put_aside(self._path)
+        log.error("journal not understood (%s): put aside as %s", problem, aside)
+        self._connection = _connect(self._path)
+        _write_meta(self._connection, self._boot_id, self.opened.epoch, drop_records=False)
+        self.opened = Opened(self.opened.epoch, {}, aside, problem)
 
     def apply(self, changes: Sequence[tuple[str, Mapping[str, Any] | None]]) -> None:
         """Write all changes in one transaction; None deletes. Raises JournalUnavailable (nothing is written then)."""
@@ -116,6 +122,15 @@ def _connect(path: Path) -> sqlite3.Connection:
         connection.close()
         raise
     return connection
+
+
+def _write_meta(connection: sqlite3.Connection, boot_id: str, epoch: int, *, drop_records: bool) -> None:
+    with connection:
+        connection.execute("BEGIN IMMEDIATE")
+        if drop_records:
+            connection.execute("DELETE FROM records")
+        values = {"schema": str(SCHEMA_VERSION), "boot_id": boot_id, "epoch": str(epoch)}
+        connection.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
 
 
 def _read(connection: sqlite3.Connection) -> tuple[dict[str, str], dict[str, dict[str, Any]]]:

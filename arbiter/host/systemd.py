@@ -7,6 +7,9 @@ import os
 import socket
 from collections.abc import Mapping
 
+READY_S = 1.0
+"""READY is worth a wait if the manager's queue is full; everything else is dropped then, to never hold up the loop."""
+
 
 class Notifier:
     """`NOTIFY_SOCKET` and `WATCHDOG_USEC` of systemd's notification protocol (sd_notify(3))."""
@@ -21,7 +24,7 @@ class Notifier:
         """The manager kills the daemon if it hears nothing for so long; None: no watchdog."""
 
     def ready(self, status: str) -> None:
-        self._send(f"READY=1\nSTATUS={status}\nMAINPID={os.getpid()}")
+        self._send(f"READY=1\nSTATUS={status}\nMAINPID={os.getpid()}", READY_S)
 
     def status(self, text: str) -> None:
         self._send(f"STATUS={text}")
@@ -32,13 +35,12 @@ class Notifier:
     def stopping(self, reason: str) -> None:
         self._send(f"STOPPING=1\nSTATUS={reason}")
 
-    def _send(self, message: str) -> None:
+    def _send(self, message: str, timeout_s: float = 0.0) -> None:
         if not self._address:
             return
         try:
-            with socket.socket(
-                socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK
-            ) as out:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as out:
+                out.settimeout(timeout_s)
                 out.sendto(message.encode(), self._address)
         except OSError:
             pass  # a manager that does not listen must not stop the daemon

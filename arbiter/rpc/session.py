@@ -100,6 +100,10 @@ class SessionTable:
         self._watch = watch
         self._clock = clock
         self._sessions: dict[ClientId, Session] = {}
+        self._instances: dict[tuple[ProcessKey, str], ClientId] = {}
+        self._moved: dict[
+            ClientId, ClientId
+        ] = {}  # connections that their instance has replaced → the newest one
         self._strangers_budget = float(settings.rate_per_s)
         self._strangers_at = clock()
 
@@ -143,22 +147,22 @@ class SessionTable:
     def process_died(self, process: ProcessKey) -> None:
         """The kernel said so: forget its connections. The core hears it from whoever watches."""
         for session in [s for s in self._sessions.values() if s.peer.process == process]:
-            del self._sessions[session.client]
+            self._drop(session)
 
     def __len__(self) -> int:
         return len(self._sessions)
 
     # -- out ---------------------------------------------------------------------------------------------------
     def reply(self, client: ClientId, request: RequestId, body: Mapping[str, Any]) -> None:
-        if session := self._sessions.get(client):
+        if session := self._sessions.get(self._moved.get(client, client)):
             self._send(session, codec.reply(request, self._settings.epoch, body))
 
     def refuse(self, client: ClientId, request: RequestId, error: Mapping[str, Any]) -> None:
-        if session := self._sessions.get(client):
+        if session := self._sessions.get(self._moved.get(client, client)):
             self._send(session, codec.refusal(request, self._settings.epoch, error))
 
     def push(self, client: ClientId, body: Mapping[str, Any]) -> None:
-        if session := self._sessions.get(client):
+        if session := self._sessions.get(self._moved.get(client, client)):
             session.seq += 1
             self._send(session, codec.push(session.seq, self._settings.epoch, body))
 
@@ -225,9 +229,23 @@ class SessionTable:
             budget=float(self._settings.rate_per_s - 1),
             heard_at=now,
         )
+        self._replace_earlier(session)
         self._sessions[session.client] = session
         self._connect(session)
         self._welcome(session, hello)
+
+    def _replace_earlier(self, session: Session) -> None:
+        """A client object that comes back on a new connection: the old one is gone, though ROUTER never says so. What the core still
+        sends to the old one goes to the new one; its leases and waits are not ended, the client re-attaches them."""
+        key = (session.peer.process, session.instance)
+        earlier = self._instances.get(key)
+        if earlier is not None and earlier in self._sessions:
+            del self._sessions[earlier]
+            for old, new in self._moved.items():
+                if new == earlier:
+                    self._moved[old] = session.client
+            self._moved[earlier] = session.client
+        self._instances[key] = session.client
 
     def _connect(self, session: Session) -> None:
         uid = session.peer.credentials.uid
@@ -276,8 +294,17 @@ class SessionTable:
         self._leave(min(silent, key=lambda s: s.heard_at), "silent while connections were needed")
 
     def _leave(self, session: Session, reason: str) -> None:
+        for client in (*self._drop(session), session.client):
+            self._decisions.post(ev.ClientLeft(client, reason))
+
+    def _drop(self, session: Session) -> list[ClientId]:
+        """Forget a connection; returns the earlier connections that it stood for."""
         del self._sessions[session.client]
-        self._decisions.post(ev.ClientLeft(session.client, reason))
+        self._instances.pop((session.peer.process, session.instance), None)
+        earlier = [old for old, new in self._moved.items() if new == session.client]
+        for old in earlier:
+            del self._moved[old]
+        return earlier
 
     def _send(self, session: Session, payload: bytes) -> None:
         if not self._wire.send(session.routing_id, session.delimiter, payload):
@@ -309,7 +336,7 @@ class SessionTable:
                 self._subscribe(session, re)
             case w.Bye():
                 self.reply(client, re, {})
-                self._leave(session, "bye")
+                self._leave(session, ev.BYE)
             case w.Acquire():
                 session.leased = True
                 post(

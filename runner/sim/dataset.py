@@ -127,7 +127,9 @@ def scene_captures(env: SimEnv, kinematics: ArmKinematics, seed: int) -> Iterato
     yield capture(env, "wrist", "standoff")
     angle, miss = rng.uniform(-math.pi, math.pi), rng.random() < 0.34
     reach = rng.uniform(0.040, 0.055) if miss else 0.0
-    expert = GrabExpert(env, kinematics, name, (reach * math.cos(angle), reach * math.sin(angle)))
+    expert = GrabExpert(
+        env, kinematics, name, offset_m=(reach * math.cos(angle), reach * math.sin(angle)), retry=not miss
+    )
     shot = rng.randint(5, 35)
     for step in range(90):
         env.step(expert.act())
@@ -177,12 +179,16 @@ def write_scenes(out: Path, count: int, seed: int) -> dict[str, int]:
 # -- grab demonstrations ------------------------------------------------------------------------------------------
 @dataclasses.dataclass(slots=True)
 class Demonstration:
-    """One recorded grab: per step both views (uint8), the measured joints and the expert's target (float32, rad)."""
+    """One recorded grab: per step both views (uint8), the measured joints and the expert's target (float32, rad).
+
+    `point` is where the object really is in the base frame (m): a second thing to learn from, no input.
+   """
 
     front: list[Any] = dataclasses.field(default_factory=list)
     wrist: list[Any] = dataclasses.field(default_factory=list)
     state: list[list[float]] = dataclasses.field(default_factory=list)
     action: list[list[float]] = dataclasses.field(default_factory=list)
+    point: list[tuple[float, float, float]] = dataclasses.field(default_factory=list)
 
 
 def demonstrate(env: SimEnv, kinematics: ArmKinematics, seed: int) -> tuple[Demonstration, bool]:
@@ -206,6 +212,7 @@ def demonstrate(env: SimEnv, kinematics: ArmKinematics, seed: int) -> tuple[Demo
         demo.front.append(policy_view(env.render("front"), "front"))
         demo.wrist.append(policy_view(env.render("wrist"), "wrist"))
         demo.state.append(list(env.joint_state().values()))
+        demo.point.append(env.ground_truth().objects[name].position_base)
         target = expert.act()
         demo.action.append(target)
         if burst == 0 and not expert.lifting and rng.random() < 0.12:
@@ -241,7 +248,7 @@ def write_grab(out: Path, episodes: int, seed: int) -> dict[str, int]:
                     raise RuntimeError("the expert fails too often: the scene and the expert do not fit together")
     for key in ("front", "wrist"):
         np.save(out / f"{key}.npy", np.stack([image for demo in kept for image in getattr(demo, key)]))
-    for key in ("state", "action"):
+    for key in ("state", "action", "point"):
         np.save(out / f"{key}.npy", np.asarray([row for d in kept for row in getattr(d, key)], dtype=np.float32))
     lengths = [len(demo.action) for demo in kept]
     np.save(out / "episode_length.npy", np.asarray(lengths, dtype=np.int64))

@@ -264,6 +264,7 @@ class SimEnv:
 
         spec = self.config.cameras[camera]
         if camera not in self._renderers:
+            self._model.vis.quality.offsamples = spec.samples
             self._renderers[camera] = mujoco.Renderer(self._model, spec.height_px, spec.width_px)
         return self._renderers[camera]
 

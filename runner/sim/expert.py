@@ -7,25 +7,29 @@ from __future__ import annotations
 
 import enum
 import math
-from typing import Any
 
 from runner.sim.config import ARM_JOINTS, CONTROL_DT_S, REST_POSE
 from runner.sim.env import SimEnv
 from runner.sim.kinematics import ArmKinematics
 
-OPEN_RAD = 0.75
+OPEN_RAD = 0.80
 CLOSED_RAD = -0.10
+LOWEST_M = 0.0135  # of the grasp point above the table: the finger tips clear it by 3 mm
 PAN_AXIS_X_M = 0.119  # the shoulder's pan axis in the base frame
 HOVER_M = 0.060  # of the grasp point above the object's centre
 # The open fixed finger is nearer to the grasp point than a turned cube's corner: descend this much short of the object's
 # centre, towards the arm, and make up for it while closing.
-SHY_M = 0.009
+SHY_M = 0.013
 LIFT_STRAIGHT_M = 0.04
 CARRY_POSE = (0.0, -0.70, 0.45, 0.85, 0.0)
-CARRY_SPEED_RAD_S = 1.8
-SPEED_M_S = 0.30
-CLOSE_STEPS = 9
-GRIPPER_SPEED_RAD_S = 4.0
+CARRY_REACHED_RAD = 0.06
+# Targets lead the arm by at most this much; the servos' lag turns it into a speed of about 0.35 m/s. Leading from where the
+# arm is, not from where it was told to be, makes the target a function of what the cameras and joints show.
+LEAD_M = 0.022
+LEAD_RAD = 0.13
+NARROWEST_HOLD_RAD = 0.12  # the gripper closes beyond this only when nothing is between the fingers
+CLOSE_STEPS = (5, 14)
+STILL_RAD_S = 0.15
 
 
 class Phase(enum.Enum):
@@ -41,17 +45,23 @@ class Phase(enum.Enum):
 class GrabExpert:
     """Produces one joint target per control step until `done`; closed loop on the true object pose.
 
-    `offset_m` shifts where the expert believes the object to be: a way to record misses.
+    `offset_m` shifts where the expert believes the object to be, and `retry` False lets it lift an empty gripper: together a
+    way to record misses.
     """
 
     def __init__(
-        self, env: SimEnv, kinematics: ArmKinematics, name: str, offset_m: tuple[float, float] = (0.0, 0.0)
+        self,
+        env: SimEnv,
+        kinematics: ArmKinematics,
+        name: str,
+        *,
+        offset_m: tuple[float, float] = (0.0, 0.0),
+        retry: bool = True,
     ) -> None:
-        self._env, self._kinematics, self._name, self._offset = env, kinematics, name, offset_m
+        self._env, self._kinematics, self._name = env, kinematics, name
+        self._offset, self._retry = offset_m, retry
         self.phase = Phase.APPROACH
         self._in_phase = 0
-        self._joints = list(env.joint_state().values())
-        self._reference = env.gripper_position()
         self._object = self._believed()
 
     @property
@@ -77,62 +87,62 @@ class GrabExpert:
         gx, gy, gz = self._env.gripper_position()
         heading = math.atan2(oy, ox - PAN_AXIS_X_M)
         sx, sy = ox - SHY_M * math.cos(heading), oy - SHY_M * math.sin(heading)
-        low = max(oz, self._floor_z())
+        low = max(oz, self._env.config.table_top_z_m + LOWEST_M)
         aside = math.hypot(gx - sx, gy - sy)
-        if self.phase is Phase.APPROACH and aside < 0.010 and gz - oz < HOVER_M + 0.02:
-            self._enter(Phase.DESCEND)
-        if self.phase is Phase.DESCEND and gz - low < 0.004 and aside < 0.008:
-            self._enter(Phase.CLOSE)
-        if self.phase is Phase.CLOSE and self._in_phase > CLOSE_STEPS:
-            self._enter(Phase.LIFT)
+        self._advance(aside, gz, oz, low)
         match self.phase:
             case Phase.APPROACH:
                 return self._towards((sx, sy, oz + HOVER_M), OPEN_RAD)
             case Phase.DESCEND:
-                blocked = aside > 0.03 and gz - oz < 0.03
-                return self._towards((sx, sy, oz + HOVER_M if blocked else low), OPEN_RAD)
+                return self._towards((sx, sy, low), OPEN_RAD)
             case Phase.CLOSE:
                 return self._towards((ox, oy, low), CLOSED_RAD)
             case Phase.LIFT if gz < low + LIFT_STRAIGHT_M:
-                return self._towards((ox, oy, low + LIFT_STRAIGHT_M + 0.02), CLOSED_RAD)
+                return self._towards((ox, oy, low + LIFT_STRAIGHT_M + 0.03), CLOSED_RAD)
             case _:
                 return self._carry()
 
-    def _carry(self) -> list[float]:
-        """Joint-space move to the pose in which a held thing is shown to the cameras."""
-        stride = CARRY_SPEED_RAD_S * CONTROL_DT_S
-        arm = [
-            here + min(max(there - here, -stride), stride)
-            for here, there in zip(self._joints[:5], CARRY_POSE, strict=True)
-        ]
-        if arm == list(CARRY_POSE):
-            self._enter(Phase.DONE)
-        self._joints = [*arm, CLOSED_RAD]
-        return list(self._joints)
-
-    def _floor_z(self) -> float:
-        return self._env.config.table_top_z_m + 0.0135
+    def _advance(self, aside: float, gz: float, oz: float, low: float) -> None:
+        """Enter the next phase when the present one has done its work, or the first again when it went wrong."""
+        grip = self._env.joint_state()["gripper"]
+        match self.phase:
+            case Phase.APPROACH if aside < 0.007 and gz - oz < HOVER_M + 0.02 and grip > 0.9 * OPEN_RAD:
+                self._enter(Phase.DESCEND)
+            case Phase.DESCEND if gz - low < 0.004 and aside < 0.008:
+                self._enter(Phase.CLOSE)
+            case Phase.DESCEND if aside > 0.012 and gz - low > 0.006:
+                self._enter(Phase.APPROACH)
+            case Phase.CLOSE:
+                least, most = CLOSE_STEPS
+                still = abs(self._env.joint_velocity()["gripper"]) < STILL_RAD_S
+                if self._in_phase > most or (self._in_phase > least and still):
+                    self._enter(Phase.LIFT)
+            case Phase.LIFT | Phase.DONE if self._retry and grip < NARROWEST_HOLD_RAD:
+                self._enter(Phase.APPROACH)
+            case _:
+                pass
 
     def _enter(self, phase: Phase) -> None:
-        if phase is not self.phase:
-            self.phase, self._in_phase = phase, 0
+        self.phase, self._in_phase = phase, 0
+
+    def _carry(self) -> list[float]:
+        """Joint-space move to the pose in which a held thing is shown to the cameras."""
+        here = list(self._env.joint_state().values())[:5]
+        if self.phase is Phase.LIFT and all(
+            abs(a - b) < CARRY_REACHED_RAD for a, b in zip(here, CARRY_POSE, strict=True)
+        ):
+            self._enter(Phase.DONE)
+        arm = [a + min(max(b - a, -LEAD_RAD), LEAD_RAD) for a, b in zip(here, CARRY_POSE, strict=True)]
+        return [*arm, CLOSED_RAD]
 
     def _towards(self, goal: tuple[float, float, float], grip: float) -> list[float]:
-        """Move the reference at a bounded speed towards the goal and solve for it."""
-        stride = SPEED_M_S * CONTROL_DT_S
-        here = self._reference
+        """Joint angles for a point at most the lead ahead of the grasp point, on the straight way to the goal."""
+        here = self._env.gripper_position()
         gap = math.dist(here, goal)
-        share = 1.0 if gap <= stride else stride / gap
-        self._reference = (
-            here[0] + share * (goal[0] - here[0]),
-            here[1] + share * (goal[1] - here[1]),
-            here[2] + share * (goal[2] - here[2]),
-        )
-        joints, _ = self._kinematics.solve(self._reference, self._joints)
-        grip_stride = GRIPPER_SPEED_RAD_S * CONTROL_DT_S
-        joints[5] = self._joints[5] + min(max(grip - self._joints[5], -grip_stride), grip_stride)
-        self._joints = joints
-        return joints
+        share = 1.0 if gap <= LEAD_M else LEAD_M / gap
+        ahead = [a + share * (b - a) for a, b in zip(here, goal, strict=True)]
+        joints, _ = self._kinematics.solve(ahead, list(self._env.joint_state().values()))
+        return [*joints[:5], grip]
 
 
 class RestController:
@@ -157,12 +167,11 @@ class RestController:
 
 
 def run_expert(env: SimEnv, expert: GrabExpert, *, max_steps: int = 150, settle_steps: int = 6) -> bool:
-    """Let the expert finish; whether its object is held at the end."""
+    """Let the expert finish; whether anything is held at the end."""
     for _ in range(max_steps):
         env.step(expert.act())
         if expert.done:
             break
     for _ in range(settle_steps):
         env.step(expert.act())
-    held: Any = env.held_object()
-    return held is not None
+    return env.held_object() is not None

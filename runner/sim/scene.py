@@ -74,6 +74,7 @@ def build_model(layout: Layout, config: SceneConfig) -> Any:
     framebuffer = getattr(spec.visual, "global")  # `global` is a keyword: attribute access by name only
     framebuffer.offwidth = max(c.width_px for c in config.cameras.values())
     framebuffer.offheight = max(c.height_px for c in config.cameras.values())
+    spec.visual.quality.shadowsize = 1024
     spec.visual.map.znear = 0.01
     spec.visual.headlight.ambient = [layout.look.ambient] * 3
     spec.visual.headlight.diffuse = [0.18] * 3

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 LABELS_FILE: Final = "labels.jsonl"
 # Below this many visible pixels (at the frame's own size) a thing is too hidden for a fair yes or no.
-MIN_VISIBLE_PIXELS: Final = 40
+MIN_VISIBLE_PIXELS: Final = 100
 
 
 class BadDataset(ValueError):

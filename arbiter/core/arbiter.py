@@ -1,0 +1,182 @@
+"""The engine: events in, effects out. No clock, no sockets, no threads: the same events give the same effects.
+
+`handle` is one decision tree:
+  1. what happened
+     1.1 connections: hello, bye, death of a process
+     1.2 requests: acquire and cancel · ready, uses, renew, oom · revoke_ack, unloading, release · reattach
+     1.3 the machine: a reading, a failed reading, a failed journal write, a journal from before the restart
+     1.4 time: every timer that is due
+  2. recovery ends when everybody is accounted for
+  3. who gets a card next (its own numbered tree: `grants`), and the answer to an acquire that has to wait
+  4. background readings
+  5. invariants
+It must not know how effects are performed, nor that a wire exists.
+"""
+
+from typing import Any
+
+from arbiter.core import eviction, explain, grants, invariants, measure, recovery, requests
+from arbiter.core.effects import Effect
+from arbiter.core.events import (
+    AcquireRequested,
+    CancelRequested,
+    ClientConnected,
+    ClientLeft,
+    Event,
+    JournalFailed,
+    MemorySampled,
+    OomReported,
+    ProbeFailed,
+    ProcessDied,
+    ReadyReported,
+    Reattached,
+    Recovered,
+    ReleaseReported,
+    Renewed,
+    RevokeAcknowledged,
+    Tick,
+    UnloadStarted,
+    UseBegan,
+    UseEnded,
+)
+from arbiter.core.sessions import on_connected, on_died, on_journal_failed, on_left
+from arbiter.core.settings import Settings
+from arbiter.core.state import Core, Refused
+from schemas.ids import GpuId
+
+
+class Arbiter:
+    """The one owner of all leases. Not thread-safe: one task calls it."""
+
+    def __init__(self, settings: Settings, now: float) -> None:
+        self._core = Core(settings, now)
+        for gpu_id in self._core.gpus:
+            self._core.timers.set(("probe", gpu_id), now)  # the first reading
+
+    def handle(self, event: Event, now: float) -> list[Effect]:
+        """What is to be done, in order. Raises InvariantViolation or IllegalTransition on a defect of the engine: stop then."""
+        core = self._core
+        core.now = max(core.now, now)
+        core.out = []
+        core.granted.clear()
+        self._happened(event)  # 1
+        recovery.serve_if_accounted(core)  # 2
+        grants.schedule(core)  # 3
+        requests.answer_queued(core)
+        self._keep_reading()  # 4
+        invariants.check(core)  # 5
+        return core.out
+
+    def next_deadline(self) -> float | None:
+        """When a Tick is due (monotonic seconds); None: nothing is planned."""
+        return self._core.timers.next_at()
+
+    def status(self, now: float) -> dict[str, Any]:
+        """Shape of `schemas.wire.StatusReply`."""
+        self._core.now = max(self._core.now, now)
+        return explain.status(self._core)
+
+    def why(self, consumer: str, now: float) -> dict[str, Any]:
+        """Shape of `schemas.wire.WhyReply`."""
+        self._core.now = max(self._core.now, now)
+        return explain.why(self._core, consumer)
+
+    def learnt(self) -> dict[str, dict[str, float]]:
+        """Medians of what was learnt, in the shape of `Settings.learnt`."""
+        return explain.medians(self._core)
+
+    def _happened(self, event: Event) -> None:
+        core = self._core
+        match event:
+            # 1.1 connections
+            case ClientConnected():
+                on_connected(core, event)
+            case ClientLeft():
+                on_left(core, event)
+            case ProcessDied():
+                on_died(core, event.process)
+            # 1.3 the machine
+            case MemorySampled():
+                measure.on_sample(core, event)
+                recovery.void_at_baseline(core, event)
+            case ProbeFailed():
+                measure.on_probe_failed(core, event)
+            case JournalFailed():
+                on_journal_failed(core, event)
+            case Recovered():
+                recovery.on_recovered(core, event)
+            # 1.4 time
+            case Tick():
+                self._run_due()
+            # 1.2 requests
+            case _:
+                try:
+                    self._requested(event)
+                except Refused as refused:
+                    core.refuse(event.client, event.request, refused)
+
+    def _requested(
+        self,
+        event: AcquireRequested
+        | CancelRequested
+        | ReadyReported
+        | UseBegan
+        | UseEnded
+        | Renewed
+        | OomReported
+        | RevokeAcknowledged
+        | UnloadStarted
+        | ReleaseReported
+        | Reattached,
+    ) -> None:
+        core = self._core
+        match event:
+            case AcquireRequested():
+                requests.acquire(core, event)
+            case CancelRequested():
+                requests.cancel(core, event)
+            case ReadyReported():
+                requests.ready(core, event)
+            case UseBegan():
+                requests.use_begin(core, event)
+            case UseEnded():
+                requests.use_end(core, event)
+            case Renewed():
+                requests.renew(core, event)
+            case OomReported():
+                requests.oom(core, event)
+            case RevokeAcknowledged():
+                requests.revoke_ack(core, event)
+            case UnloadStarted():
+                requests.unloading(core, event)
+            case ReleaseReported():
+                requests.release(core, event)
+            case Reattached():
+                recovery.on_reattached(core, event)
+
+    def _run_due(self) -> None:
+        core = self._core
+        while (due := core.timers.pop_due(core.now)) is not None:
+            kind, subject = due
+            match kind:
+                case "ttl":
+                    measure.on_expiry_due(core, subject)
+                case "wait":
+                    requests.on_wait_timeout(core, subject)
+                case "revoke":
+                    eviction.on_ladder_due(core, subject)
+                case "verify":
+                    measure.on_poll_due(core, subject)
+                case "probe":
+                    measure.on_probe_due(core, subject)
+                case "recover":
+                    recovery.on_recover_due(core, subject)
+                case _:  # "plan": a residency ended, or somebody has aged
+                    core.wake(core.gpus[GpuId(subject)])
+
+    def _keep_reading(self) -> None:
+        core = self._core
+        for gpu in core.gpus.values():
+            key = ("probe", gpu.info.id)
+            if key not in core.timers and core.active(gpu):
+                core.timers.set(key, core.now + core.settings.probe_period_s)

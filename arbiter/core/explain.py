@@ -1,0 +1,333 @@
+"""Answers for people and programs: views of leases, `status`, `why`, and the record of a switch. Reads only."""
+
+from collections.abc import Sequence
+from statistics import median
+from typing import Any
+
+from arbiter.core import policy
+from arbiter.core.lease import LEAVING, Lease, LeaseState
+from arbiter.core.state import Core, Gpu
+
+NOTE_KINDS: tuple[str, ...] = (
+    "queued", "granted", "ready", "switch", "use_began", "use_ended", "revoke_asked", "revoke_acked", "reminded",
+    "deadline_passed", "unloading", "released", "verified", "denied", "cancelled", "expired", "lost", "reattached", "oom",
+    "pressure", "stowaway", "probe_failed", "probe_ok", "journal_failed", "recovered", "serving",
+)  # fmt: skip
+"""Every kind of `effects.Note`. `switch` comes with each `ready`; its field `switched` says whether anybody had to leave."""
+
+
+# -- views -------------------------------------------------------------------------------------------------------------
+def view(core: Core, lease: Lease) -> dict[str, Any]:
+    """`schemas.wire.LeaseView`."""
+    gpu = None if lease.gpu is None else core.gpus[lease.gpu]
+    shown: dict[str, Any] = {
+        "lease_id": lease.id,
+        "token": None if lease.token is None else [lease.token.epoch, lease.token.serial],
+        "state": str(lease.state),
+        "consumer": lease.spec.consumer,
+        "model": str(lease.spec.key),
+        "gpu": lease.gpu,
+        "mode": "exclusive" if lease.spec.exclusive else "shared",
+        "priority": lease.spec.priority,
+        "evictable": lease.spec.evictable,
+        "charge_bytes": lease.load_peak_bytes if gpu is None else gpu.ledger.charge_bytes(lease.id),
+        "uses": len(lease.uses),
+        "pid": lease.process.pid,
+        "since_s": core.now - lease.since,
+        "waited_s": (core.now if lease.state is LeaseState.QUEUED else lease.granted_at) - lease.arrived_at,
+    }
+    if lease.state is LeaseState.QUEUED:
+        shown["position"] = min(core.gpus[gpu_id].queue.position(lease) for gpu_id in lease.gpus)
+    elif lease.state is not LeaseState.VERIFYING:
+        shown["ttl_left_s"] = max(0.0, lease.expires_at - core.now)
+    return shown
+
+
+def gpu_view(core: Core, gpu: Gpu) -> dict[str, Any]:
+    """`schemas.wire.GpuView`."""
+    ledger = gpu.ledger
+    known = gpu.sample is not None and gpu.failed_at is None
+    return {
+        "gpu": gpu.info.id,
+        "index": gpu.info.index,
+        "name": gpu.info.name,
+        "capacity_bytes": gpu.info.capacity_bytes,
+        "reserve_bytes": gpu.info.reserve_bytes,
+        "charged_bytes": ledger.booked_bytes(),
+        "stowaway_bytes": ledger.stowaway_bytes(),
+        "measured_used_bytes": gpu.sample.used_bytes if known and gpu.sample is not None else None,
+        "sample_age_s": None if gpu.sample is None else core.now - gpu.sample.taken_at,
+        "pressure_bytes": ledger.pressure_bytes(),
+        "blocked": policy.blocked(core, gpu) or gpu.blocked,
+        "processes": _processes(gpu),
+    }
+
+
+def _processes(gpu: Gpu) -> list[dict[str, Any]]:
+    names: dict[int, tuple[str, int | None]] = {}
+    if gpu.sample is not None and gpu.sample.processes is not None:
+        names = {use.process.pid: (use.name, use.used_bytes) for use in gpu.sample.processes}
+    shown = [
+        {
+            "pid": account.process.pid,
+            "name": names.get(account.process.pid, ("", None))[0],
+            "used_bytes": names.get(account.process.pid, ("", None))[1],
+            "lease_ids": sorted(account.charges),
+            "charged_bytes": account.booked_bytes(),
+            "residue_bytes": account.residue_bytes,
+            "stowaway": False,
+        }
+        for account in gpu.ledger.accounts.values()
+    ]
+    shown += [
+        {
+            "pid": stranger.process.pid,
+            "name": stranger.name,
+            "used_bytes": stranger.used_bytes,
+            "lease_ids": [],
+            "charged_bytes": 0,
+            "residue_bytes": 0,
+            "stowaway": True,
+        }
+        for stranger in gpu.ledger.strangers.values()
+    ]
+    return shown
+
+
+def status(core: Core) -> dict[str, Any]:
+    """`schemas.wire.StatusReply`."""
+    resident = [lease for lease in core.leases.values() if lease.state is not LeaseState.QUEUED]
+    waiting = sorted(core.waiting.values(), key=lambda lease: (_best_position(core, lease), lease.arrival))
+    return {
+        "epoch": core.settings.epoch,
+        "phase": "serving" if core.recovering is None else "recovering",
+        "uptime_s": core.now - core.started_at,
+        "gpus": [gpu_view(core, gpu) for gpu in core.gpus.values()],
+        "leases": [view(core, lease) for lease in [*resident, *waiting]],
+        "clients": len(core.clients),
+    }
+
+
+def _best_position(core: Core, lease: Lease) -> int:
+    return min(core.gpus[gpu_id].queue.position(lease) for gpu_id in lease.gpus)
+
+
+# -- why ---------------------------------------------------------------------------------------------------------------
+def why(core: Core, consumer: str) -> dict[str, Any]:
+    """`schemas.wire.WhyReply`: why a consumer is not running, or that it is."""
+    mine = [lease for lease in core.leases.values() if lease.spec.consumer == consumer]
+    return {"consumer": consumer, "leases": [explain_lease(core, lease) for lease in mine]}
+
+
+def explain_lease(core: Core, lease: Lease) -> dict[str, Any]:
+    """One lease: what it needs, who stands in its way on which condition, what happens next and when."""
+    gpu = core.gpus[lease.gpu or lease.planned_gpu or lease.gpus[0]]
+    free = gpu.ledger.budget_bytes - gpu.ledger.total_bytes()
+    if lease.state is not LeaseState.QUEUED:
+        return _explain_resident(core, gpu, lease, free)
+    added = policy.added_bytes(gpu, lease)
+    deficit = max(0, added - free)
+    blockers = _blockers(core, gpu, lease, deficit)
+    position = _best_position(core, lease)
+    condition, then = _condition(core, gpu, lease, blockers, position)
+    eta = _eta(core, gpu, lease)
+    head = f"{lease.spec.consumer} needs {_gb(added)}, {_gb(max(0, free))} are free" + (
+        f", {_gb(deficit)} are missing" if deficit else ""
+    )
+    return {
+        "lease_id": lease.id,
+        "state": str(lease.state),
+        "position": position,
+        "needed_bytes": added,
+        "free_bytes": max(0, free),
+        "deficit_bytes": deficit,
+        "condition": condition,
+        "blockers": blockers,
+        "next": then,
+        "eta_s": eta,
+        "eta_source": "none" if eta is None else "learnt",
+        "text": f"{head}: {then}",
+    }
+
+
+def _explain_resident(core: Core, gpu: Gpu, lease: Lease, free: int) -> dict[str, Any]:
+    says = {
+        LeaseState.LOADING: "it was granted and is loading",
+        LeaseState.HELD: f"it is resident, {_uses(lease)}",
+        LeaseState.REVOKING: f"it was asked to leave for {_wanted_by(lease)}, {_uses(lease)}",
+        LeaseState.UNLOADING: "it is unloading",
+        LeaseState.VERIFYING: "it let go; its bytes are being measured",
+    }[lease.state]
+    return {
+        "lease_id": lease.id,
+        "state": str(lease.state),
+        "position": 0,
+        "needed_bytes": 0,
+        "free_bytes": max(0, free),
+        "deficit_bytes": 0,
+        "condition": str(lease.state),
+        "blockers": [],
+        "next": says,
+        "eta_s": None,
+        "eta_source": "none",
+        "text": f"{lease.spec.consumer}: {says}",
+    }
+
+
+def _blockers(core: Core, gpu: Gpu, waiter: Lease, deficit: int) -> list[dict[str, Any]]:
+    """Everybody who holds bytes that the waiter lacks, or holds the card alone."""
+    alone = waiter.spec.exclusive or any(lease.spec.exclusive for lease in gpu.residents.values())
+    if not deficit and not alone and not any(gpu.in_state(LeaseState.LOADING)):
+        return []
+    return [
+        {
+            "lease_id": lease.id,
+            "consumer": lease.spec.consumer,
+            "bytes": gpu.ledger.charge_bytes(lease.id),
+            "state": str(lease.state),
+            "uses": len(lease.uses),
+            "condition": _holder_condition(core, waiter, lease),
+        }
+        for lease in gpu.residents.values()
+    ]
+
+
+def _holder_condition(core: Core, waiter: Lease, holder: Lease) -> str:
+    if holder.state is LeaseState.LOADING:
+        return "is loading"
+    if holder.state in LEAVING:
+        return {
+            LeaseState.REVOKING: f"was asked to leave {_ago(core, holder)}, {_uses(holder)}",
+            LeaseState.UNLOADING: "is unloading",
+            LeaseState.VERIFYING: "let go, its bytes are being measured",
+        }[holder.state]
+    if not holder.spec.evictable:
+        return "is pinned"
+    if policy.residency_ends_at(holder) > core.now:
+        return f"may stay {policy.residency_ends_at(holder) - core.now:.1f} s more (minimum residency)"
+    priority = waiter.priority_at(core.now, core.settings.ageing_s_per_point)
+    if holder.uses and holder.spec.priority > priority:
+        return f"is in use and has priority {holder.spec.priority}, the waiter {priority}"
+    return "is in use" if holder.uses else "is idle and may be asked"
+
+
+def _condition(
+    core: Core, gpu: Gpu, lease: Lease, blockers: Sequence[dict[str, Any]], position: int
+) -> tuple[str, str]:
+    """(short condition, what happens next in words)."""
+    leaving = [other for other in gpu.residents.values() if other.state in LEAVING]
+    if position > 1:
+        ahead = gpu.queue.ahead_of(lease)
+        name = core.waiting[ahead].spec.consumer if ahead is not None else "others"
+        return "queued", f"waits behind {name} as number {position}"
+    if leaving and lease.planned_gpu == gpu.info.id:
+        return "room is being made", "; ".join(_leaving_next(core, gpu, other) for other in leaving)
+    blocked = policy.blocked(core, gpu)
+    if blocked:
+        return "blocked", f"waits: {blocked}"
+    if leaving:
+        return "room is being made", "; ".join(_leaving_next(core, gpu, other) for other in leaving)
+    if gpu.verifications:
+        names = ", ".join(v.consumer for v in gpu.verifications.values())
+        return "measuring", f"waits until the bytes of {names} are measured gone"
+    if blockers:
+        return "no room", "waits for " + ", ".join(f"{b['consumer']} ({b['condition']})" for b in blockers)
+    return "measuring", lease.reason or "waits for a reading of the card"
+
+
+def _leaving_next(core: Core, gpu: Gpu, holder: Lease) -> str:
+    charge = _gb(gpu.ledger.charge_bytes(holder.id))
+    name = holder.spec.consumer
+    if holder.state is LeaseState.REVOKING and holder.uses:
+        plural = "use" if len(holder.uses) == 1 else "uses"
+        return (
+            f"waits for {name} to finish {len(holder.uses)} {plural} (asked {_ago(core, holder)}), "
+            f"then it unloads and {charge} are verified"
+        )
+    if holder.state is LeaseState.REVOKING:
+        return f"waits for {name} to unload (asked {_ago(core, holder)}), then {charge} are verified"
+    if holder.state is LeaseState.UNLOADING:
+        return f"{name} unloads, then {charge} are verified"
+    return f"{charge} of {name} are being verified"
+
+
+def _eta(core: Core, gpu: Gpu, lease: Lease) -> float | None:
+    """Seconds until it is loaded, from learnt medians. None if anything on the way was never seen."""
+    slowest = 0.0
+    for holder in gpu.residents.values():
+        if holder.state not in LEAVING:
+            continue
+        phases = {
+            LeaseState.REVOKING: ("drain_s", "unload_s", "verify_s"),
+            LeaseState.UNLOADING: ("unload_s", "verify_s"),
+            LeaseState.VERIFYING: ("verify_s",),
+        }[holder.state]
+        times = [_median(core, holder.spec.consumer, phase) for phase in phases]
+        known = [seconds for seconds in times if seconds is not None]
+        if len(known) < len(times):
+            return None
+        slowest = max(slowest, sum(known) - (core.now - holder.since))
+    load = _median(core, lease.spec.consumer, "load_s")
+    if load is None or (not slowest and not policy.fits(gpu, lease)):
+        return None
+    return max(0.0, slowest) + load
+
+
+def _median(core: Core, consumer: str, phase: str) -> float | None:
+    seen = core.durations.get(consumer, {}).get(phase)
+    return median(seen) if seen else None
+
+
+def medians(core: Core) -> dict[str, dict[str, float]]:
+    """What was learnt, in the shape of `Settings.learnt`."""
+    return {
+        consumer: {phase: median(seen) for phase, seen in phases.items()}
+        for consumer, phases in core.durations.items()
+    }
+
+
+def _uses(lease: Lease) -> str:
+    return f"{len(lease.uses)} use{'' if len(lease.uses) == 1 else 's'} running" if lease.uses else "idle"
+
+
+def _wanted_by(lease: Lease) -> str:
+    return (lease.eviction.wanted_consumer if lease.eviction else "") or "relief of pressure"
+
+
+def _ago(core: Core, holder: Lease) -> str:
+    asked_at = holder.eviction.asked_at if holder.eviction else holder.since
+    return f"{core.now - asked_at:.1f} s ago"
+
+
+def _gb(count: int) -> str:
+    return f"{count / 1e9:.2f} GB"
+
+
+# -- switch --------------------------------------------------------------------------------------------------------------
+def switch_record(core: Core, lease: Lease) -> dict[str, Any]:
+    """Milliseconds of a grant from the acquire to `ready`, split by phase; of several victims the slowest counts."""
+    gone = lease.evicted
+    first_asked = min((e.asked_at for e in gone), default=lease.granted_at)
+    return {
+        "switched": bool(gone),
+        "evicted": [
+            {
+                "consumer": e.consumer,
+                "lease_id": e.lease,
+                "verdict": e.verdict,
+                "charge_bytes": e.charge_bytes,
+            }
+            for e in gone
+        ],
+        "verified": all(e.verdict == "verified" for e in gone),
+        "wait_ms": max(0.0, first_asked - lease.arrived_at) * 1e3,
+        "drain_ms": max((_span(e.asked_at, e.unloading_at) for e in gone), default=0.0),
+        "unload_ms": max((_span(e.unloading_at, e.released_at) for e in gone), default=0.0),
+        "verify_ms": max((_span(e.released_at, e.verdict_at) for e in gone), default=0.0),
+        "load_ms": (core.now - lease.granted_at) * 1e3,
+        "total_ms": (core.now - lease.arrived_at) * 1e3,
+    }
+
+
+def _span(start: float | None, end: float | None) -> float:
+    return 0.0 if start is None or end is None else max(0.0, end - start) * 1e3

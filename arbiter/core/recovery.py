@@ -1,0 +1,265 @@
+"""After a restart of the daemon alone: the journal says who held what, the holders come back or do not.
+
+Until every recovered lease is accounted for (re-attached, its process dead, or expired and measured gone, or the card is read
+at baseline) nothing is granted. Recovered bytes are charged from the first moment.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from arbiter.core import explain
+from arbiter.core.events import MemorySampled, Reattached, ReattachedLease, Recovered, Spec
+from arbiter.core.lease import EXPIRING, Lease, LeaseState, Use
+from arbiter.core.measure import begin_for_lease
+from arbiter.core.requests import become_held, client_of, ended_error, peak_key, touch
+from arbiter.core.state import Client, Core, Ended, Gpu, Refused
+from schemas import defaults
+from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, Token
+
+EMPTY_JOURNAL = LeaseId("journal")
+"""Stands for whoever an empty (lost) journal does not name; given up after a ttl and the fence grace."""
+
+
+def on_recovered(core: Core, event: Recovered) -> None:
+    """Charge everything that the journal names, then wait for the holders. Records of a card that is gone are dropped."""
+    core.recovering = set()
+    for key, record in sorted(event.records.items()):
+        gpu = core.gpus.get(GpuId(str(record["gpu"])))
+        if gpu is None:
+            core.forget(key)
+        elif key.startswith("residue:"):
+            process = ProcessKey(int(record["pid"]), int(record["start_ticks"]))
+            gpu.ledger.set_residue(process, int(record["residue_bytes"]), core.now)
+        else:
+            _restore(core, gpu, record)
+    if not event.records:
+        core.recovering.add(EMPTY_JOURNAL)
+        grace_s = defaults.LEASE_TTL_S + core.settings.fence_grace_s
+        core.timers.set(("recover", EMPTY_JOURNAL), core.now + grace_s)
+    core.note("recovered", leases=sorted(core.recovering), records=len(event.records))
+
+
+def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
+    lease_id = LeaseId(str(record["lease_id"]))
+    process = ProcessKey(int(record["pid"]), int(record["start_ticks"]))
+    token = Token(int(record["token"][0]), int(record["token"][1]))
+    state = str(record["state"])
+    spec = spec_from_record(record["spec"])
+    lease = Lease(
+        id=lease_id,
+        nonce=str(record["nonce"]),
+        spec=spec,
+        process=process,
+        client=ClientId(""),
+        arrived_at=core.now,
+        arrival=core.next_arrival(),
+        load_peak_bytes=int(record["load_peak_bytes"]),
+        steady_bytes=max(spec.steady_bytes, spec.residue_bytes),
+        gpus=(gpu.info.id,),
+        state=LeaseState.HELD if state == "debt" else LeaseState(state),
+        since=core.now,
+        token=token,
+        gpu=gpu.info.id,
+        measured_bytes=record["measured_bytes"],
+        granted_at=core.now,
+        ready_at=core.now,
+        last_used_at=core.now,
+        answered=True,
+        exiting=bool(record["exiting"]),
+        attached=False,
+        story=[(core.now, LeaseState.HELD, "recovered from the journal")],
+    )
+    _place(core, gpu, lease, int(record["charge_bytes"]))
+    if state == "debt":
+        gpu.ledger.to_debt(lease_id)
+        begin_for_lease(core, gpu, lease, alive=True)
+        core.remember(Ended(lease_id, process, lease.nonce, token, LeaseState.LOST, lost_error(lease_id)))
+        return
+    core.leases[lease_id] = gpu.residents[lease_id] = lease
+    core.nonces[process, lease.nonce] = lease_id
+    if lease.state is LeaseState.VERIFYING:
+        begin_for_lease(core, gpu, lease, alive=True)
+        return
+    lease.expires_at = core.now + spec.ttl_s + core.settings.fence_grace_s
+    core.timers.set(("ttl", lease_id), lease.expires_at)
+    assert core.recovering is not None, "restoring outside recovery"
+    core.recovering.add(lease_id)
+
+
+def _place(core: Core, gpu: Gpu, lease: Lease, charge_bytes: int) -> None:
+    """Charge what is there anyway. What the budget does not hold was never approved: it is pressure."""
+    room = max(0, gpu.ledger.budget_bytes - gpu.ledger.approved_bytes())
+    gpu.ledger.charge(lease.id, lease.process, charge_bytes, min(charge_bytes, room), core.now)
+    gpu.changed_at = core.now
+
+
+def spec_from_record(record: Mapping[str, Any]) -> Spec:
+    """The inverse of what `Core.record_lease` writes."""
+    return Spec(
+        consumer=str(record["consumer"]),
+        key=ModelKey(str(record["model_id"]), str(record["revision"])),
+        gpu=str(record["gpu"]),
+        exclusive=bool(record["exclusive"]),
+        load_peak_bytes=int(record["load_peak_bytes"]),
+        steady_bytes=int(record["steady_bytes"]),
+        residue_bytes=int(record["residue_bytes"]),
+        priority=int(record["priority"]),
+        evictable=bool(record["evictable"]),
+        ttl_s=float(record["ttl_s"]),
+        min_residency_s=float(record["min_residency_s"]),
+        deny_on_deadline=bool(record["deny_on_deadline"]),
+    )
+
+
+def lost_error(lease_id: LeaseId) -> dict[str, Any]:
+    return {
+        "code": "lease_lost",
+        "message": f"{lease_id} is no longer held",
+        "hint": "unload, then acquire again",
+        "details": {},
+    }
+
+
+# -- coming back -------------------------------------------------------------------------------------------------------
+def on_reattached(core: Core, event: Reattached) -> None:
+    """A client tells what it still holds. Every lease is answered for itself; nothing is lost because of a neighbour."""
+    client = client_of(core, event.client)
+    answers: list[dict[str, Any]] = []
+    for item in event.leases:
+        try:
+            lease = _reattach(core, client, item)
+        except Refused as refused:
+            answers.append({"lease_id": item.lease, "kept": False, "error": refused.wire()})
+        else:
+            answers.append({"lease_id": item.lease, "kept": True, "lease": explain.view(core, lease)})
+    core.reply(event.client, event.request, {"leases": answers})
+
+
+def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
+    lease = core.leases.get(item.lease)
+    if lease is None:
+        if item.lease in core.ended:
+            raise ended_error(core.ended[item.lease])
+        lease = _adopt(core, client, item)
+    elif lease.token != item.token:
+        raise Refused(
+            "stale_token", f"{item.token} is not the token of {item.lease}", "unload, then acquire again"
+        )
+    elif lease.process != client.process:
+        raise Refused(
+            "not_permitted", f"{item.lease} belongs to process {lease.process.pid}", "ask as its holder"
+        )
+    lease.client = client.id
+    lease.attached = True
+    if lease.state is LeaseState.LOADING and item.held:  # its `ready` was lost
+        become_held(core, lease, item.measured_bytes)
+    _restore_uses(core, lease, client, item)
+    touch(core, lease)
+    account_for(core, lease.id)
+    core.note("reattached", lease, uses=len(lease.uses), state=str(lease.state))
+    return lease
+
+
+def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLease) -> None:
+    """What this client says runs is what runs, as far as it concerns this client's process."""
+    for key, use in list(lease.uses.items()):
+        if use.process == client.process and use.id not in item.uses:
+            del lease.uses[key]
+    if lease.state in (LeaseState.HELD, LeaseState.REVOKING):
+        for use_id in item.uses:
+            began = Use(use_id, client.id, client.process, "", core.now)
+            lease.uses.setdefault((client.process, use_id), began)
+    core.wake(core.gpu_of(lease))
+
+
+def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
+    """The journal does not know this lease but its token is of an earlier epoch: its holder is believed while recovering."""
+    if core.recovering is None or item.token.epoch >= core.settings.epoch:
+        raise Refused("lease_lost", f"{item.lease} is not known", "unload, then acquire again")
+    gpus = [gpu for gpu in core.gpus.values() if item.spec.gpu in ("any", gpu.info.id, str(gpu.info.index))]
+    if not gpus:
+        raise Refused("unknown_gpu", f"there is no GPU {item.spec.gpu!r}", "unload, then acquire again")
+    gpu = gpus[0]
+    spec = item.spec
+    peak = max(
+        spec.load_peak_bytes, spec.steady_bytes, spec.residue_bytes, core.learnt_peaks.get(peak_key(spec), 0)
+    )
+    steady = max(spec.steady_bytes, spec.residue_bytes)
+    charge = peak
+    if item.held:
+        charge = steady if item.measured_bytes is None else max(item.measured_bytes, spec.residue_bytes)
+    lease = Lease(
+        id=item.lease,
+        nonce=f"adopted {item.lease}",
+        spec=spec,
+        process=client.process,
+        client=client.id,
+        arrived_at=core.now,
+        arrival=core.next_arrival(),
+        load_peak_bytes=peak,
+        steady_bytes=steady,
+        gpus=(gpu.info.id,),
+        state=LeaseState.HELD if item.held else LeaseState.LOADING,
+        since=core.now,
+        token=item.token,
+        gpu=gpu.info.id,
+        measured_bytes=item.measured_bytes,
+        granted_at=core.now,
+        ready_at=core.now,
+        last_used_at=core.now,
+        answered=True,
+        story=[(core.now, LeaseState.HELD, "adopted: the journal did not know it")],
+    )
+    _place(core, gpu, lease, charge)
+    core.leases[lease.id] = gpu.residents[lease.id] = lease
+    core.nonces[lease.process, lease.nonce] = lease.id
+    core.record_lease(lease)
+    return lease
+
+
+# -- coming to an end --------------------------------------------------------------------------------------------------
+def account_for(core: Core, lease_id: LeaseId) -> None:
+    """One lease less to wait for."""
+    if core.recovering is not None:
+        core.recovering.discard(lease_id)
+
+
+def on_recover_due(core: Core, subject: str) -> None:
+    account_for(core, LeaseId(subject))
+
+
+def void_at_baseline(core: Core, sample: MemorySampled) -> None:
+    """The card is read as good as empty: recovered leases that were resident there cannot be.
+
+    A loading lease may not have begun, and one that is smaller than what cannot be told from nothing stays.
+    """
+    gpu = core.gpus.get(sample.gpu)
+    if gpu is None or core.recovering is None or sample.taken_at < core.started_at:
+        return
+    noise_bytes = gpu.info.reserve_bytes + core.settings.verify_tolerance_bytes
+    if sample.used_bytes > noise_bytes:
+        return
+    for lease in list(gpu.residents.values()):
+        if lease.attached or lease.state not in EXPIRING - {LeaseState.LOADING}:
+            continue
+        if gpu.ledger.charge_bytes(lease.id) <= noise_bytes:
+            continue
+        gpu.ledger.drop(lease.id, 0, 0, core.now)
+        core.forget(f"lease:{lease.id}")
+        error = lost_error(lease.id)
+        core.note("lost", lease, reason="the card is empty: its bytes are gone")
+        lease.move(LeaseState.LOST, core.now, "the card is empty")
+        account_for(core, lease.id)
+        core.end(lease, error)
+    if all(g.sample is not None and g.sample.used_bytes <= noise_bytes for g in core.gpus.values()):
+        account_for(core, EMPTY_JOURNAL)
+
+
+def serve_if_accounted(core: Core) -> None:
+    """Everybody is accounted for: begin to grant."""
+    if core.recovering is None or core.recovering:
+        return
+    core.recovering = None
+    core.note("serving", seconds=core.now - core.started_at)
+    for gpu in core.gpus.values():
+        core.wake(gpu)

@@ -1,0 +1,445 @@
+"""What clients ask for, one function a request. Each checks everything first (raising Refused) and then changes things.
+
+Who may: leases belong to a process, so a request on a lease must come from a client of that process. Only uses may be begun
+and ended by anyone who knows the exact token: that is how a runner marks a goal on its policy sidecar's lease.
+"""
+
+from arbiter.core import eviction, explain
+from arbiter.core.events import (
+    AcquireRequested,
+    CancelRequested,
+    OomReported,
+    ReadyReported,
+    ReleaseReported,
+    Renewed,
+    RevokeAcknowledged,
+    Spec,
+    UnloadStarted,
+    UseBegan,
+    UseEnded,
+)
+from arbiter.core.lease import EXPIRING, LEAVING, Lease, LeaseState, Use
+from arbiter.core.measure import begin_for_lease
+from arbiter.core.state import Client, Core, Ended, Refused
+from schemas.ids import ClientId, GpuId, LeaseId, Token
+
+_HINT_ACQUIRE = "unload, then acquire again"
+
+
+# -- who and which -------------------------------------------------------------------------------------------------
+def client_of(core: Core, client: ClientId) -> Client:
+    known = core.clients.get(client)
+    if known is None:
+        raise Refused("unknown_session", "this connection has not said hello", "say hello, then re-attach")
+    return known
+
+
+def ended_error(ended: Ended) -> Refused:
+    """The answer to a late message on a lease that is over."""
+    if ended.error is not None:
+        error = ended.error
+        return Refused(str(error["code"]), str(error["message"]), str(error["hint"]), **error["details"])
+    return Refused("bad_state", f"{ended.lease} is {ended.state}", _HINT_ACQUIRE, state=str(ended.state))
+
+
+def lease_for(core: Core, lease_id: LeaseId, token: Token) -> Lease:
+    """A live lease by its exact token."""
+    lease = core.leases.get(lease_id)
+    if lease is None:
+        ended = core.ended.get(lease_id)
+        if ended is not None:
+            raise ended_error(ended)
+        raise Refused(
+            "unknown_lease", f"there is no lease {lease_id}", "acquire one; after a restart: re-attach"
+        )
+    if lease.token is None:
+        raise _bad_state(lease, "it is still queued")
+    if lease.token != token:
+        raise Refused(
+            "stale_token",
+            f"{token} is not the token of {lease_id}",
+            "use the token that came with the grant",
+            token=[lease.token.epoch, lease.token.serial],
+        )
+    return lease
+
+
+def own_lease(core: Core, client: ClientId, lease_id: LeaseId, token: Token) -> Lease:
+    """A live lease of the client's own process. Hearing from its holder keeps it alive."""
+    process = client_of(core, client).process
+    lease = lease_for(core, lease_id, token)
+    if lease.process != process:
+        raise Refused(
+            "not_permitted", f"{lease_id} belongs to process {lease.process.pid}", "ask as its holder"
+        )
+    touch(core, lease)
+    return lease
+
+
+def touch(core: Core, lease: Lease) -> None:
+    """The holder lives: its time to live starts anew."""
+    if lease.state in EXPIRING and lease.attached:
+        lease.expires_at = core.now + lease.spec.ttl_s
+        core.timers.set(("ttl", lease.id), lease.expires_at)
+
+
+def _bad_state(lease: Lease, what: str) -> Refused:
+    return Refused(
+        "bad_state",
+        f"{lease.id} is {lease.state}: {what}",
+        "see the lease's story",
+        state=str(lease.state),
+        uses=len(lease.uses),
+        story=lease.told(),
+    )
+
+
+# -- waiting ---------------------------------------------------------------------------------------------------------
+def acquire(core: Core, event: AcquireRequested) -> None:
+    """Queue a lease; the scheduling after this event may grant it in the same breath, and answers either way."""
+    client = client_of(core, event.client)
+    nonce = (client.process, event.nonce)
+    if nonce in core.nonces:
+        _acquire_again(core, event, core.nonces[nonce])
+        return
+    spec = event.spec
+    load_peak = max(
+        spec.load_peak_bytes, spec.steady_bytes, spec.residue_bytes, core.learnt_peaks.get(peak_key(spec), 0)
+    )
+    gpus = _places(core, spec, load_peak)
+    if len(core.waiting) >= core.settings.waiters_max:
+        raise Refused("limit_exceeded", "too many wait already", "try again later", limit="waiters_max")
+    owned = sum(1 for lease in core.leases.values() if lease.client == client.id)
+    if owned >= core.settings.leases_per_client_max:
+        raise Refused(
+            "limit_exceeded",
+            f"this connection has {owned} leases",
+            "release some",
+            limit="leases_per_client_max",
+        )
+    lease = Lease(
+        id=core.next_lease_id(),
+        nonce=event.nonce,
+        spec=spec,
+        process=client.process,
+        client=client.id,
+        arrived_at=core.now,
+        arrival=core.next_arrival(),
+        load_peak_bytes=load_peak,
+        steady_bytes=max(spec.steady_bytes, spec.residue_bytes),
+        gpus=gpus,
+        since=core.now,
+        wait_timeout_s=event.wait_timeout_s,
+        request=event.request,
+        traceparent=event.traceparent,
+        story=[(core.now, LeaseState.QUEUED, "acquired")],
+    )
+    core.leases[lease.id] = core.waiting[lease.id] = lease
+    core.nonces[nonce] = lease.id
+    for gpu_id in gpus:
+        core.gpus[gpu_id].queue.add(lease)
+        core.wake(core.gpus[gpu_id])
+    if event.wait_timeout_s is not None:
+        core.timers.set(("wait", lease.id), core.now + event.wait_timeout_s)
+    core.unanswered.append(lease)
+
+
+def answer_queued(core: Core) -> None:
+    """After the scheduling: whoever was not granted at once is told that it waits, and why."""
+    for lease in core.unanswered:
+        if lease.state is LeaseState.QUEUED and not lease.answered and lease.request is not None:
+            lease.answered = True
+            explained = explain.explain_lease(core, lease)
+            core.note("queued", lease, position=explained["position"], reason=explained["text"])
+            core.reply(lease.client, lease.request, {"state": "queued", "lease": explain.view(core, lease)})
+    core.unanswered.clear()
+
+
+def peak_key(spec: Spec) -> str:
+    return f"{spec.consumer} {spec.key}"
+
+
+def _acquire_again(core: Core, event: AcquireRequested, lease_id: LeaseId) -> None:
+    lease = core.leases.get(lease_id)
+    if lease is None:
+        raise ended_error(core.ended[lease_id])
+    lease.client = event.client  # the newest connection of the process is the one that listens
+    state = "queued" if lease.state is LeaseState.QUEUED else "loading"
+    core.reply(event.client, event.request, {"state": state, "lease": explain.view(core, lease)})
+
+
+def _places(core: Core, spec: Spec, load_peak: int) -> tuple[GpuId, ...]:
+    """The cards that this spec may ever be placed on."""
+    if spec.gpu == "any":
+        gpus = list(core.gpus.values())
+    else:
+        gpus = [gpu for gpu in core.gpus.values() if spec.gpu in (gpu.info.id, str(gpu.info.index))]
+    if not gpus:
+        raise Refused(
+            "unknown_gpu",
+            f"there is no GPU {spec.gpu!r}",
+            "give an uuid, an index or `any`",
+            known=[gpu.info.id for gpu in core.gpus.values()],
+        )
+    largest = max(gpus, key=lambda gpu: (gpu.ledger.budget_bytes, -gpu.info.index))
+    able: list[GpuId] = []
+    pinned: dict[str, list[dict[str, object]]] = {}
+    for gpu in gpus:
+        pins = [
+            lease
+            for lease in gpu.residents.values()
+            if not lease.spec.evictable and lease.state not in LEAVING
+        ]
+        pinned[gpu.info.id] = [
+            {"lease_id": p.id, "consumer": p.spec.consumer, "bytes": gpu.ledger.charge_bytes(p.id)}
+            for p in pins
+        ]
+        fixed = sum(gpu.ledger.charge_bytes(lease.id) for lease in pins)
+        alone = not pins or not (spec.exclusive or any(lease.spec.exclusive for lease in pins))
+        if alone and load_peak + fixed <= gpu.ledger.budget_bytes:
+            able.append(gpu.info.id)
+    if not able:
+        raise Refused(
+            "vram_insufficient",
+            f"{spec.consumer} needs {load_peak} bytes; the card has {largest.info.capacity_bytes} "
+            f"less a reserve of {largest.info.reserve_bytes}"
+            + (", and pinned leases" if any(pinned.values()) else ""),
+            "use a smaller model or a lower precision, or unpin what is resident",
+            needed_bytes=load_peak,
+            capacity_bytes=largest.info.capacity_bytes,
+            reserve_bytes=largest.info.reserve_bytes,
+            pinned=pinned[largest.info.id],
+        )
+    return tuple(able)
+
+
+def cancel(core: Core, event: CancelRequested) -> None:
+    """Give up a queued lease. One that was granted meanwhile must be released instead."""
+    client = client_of(core, event.client)
+    lease = core.leases.get(event.lease)
+    if lease is None:
+        ended = core.ended.get(event.lease)
+        if ended is not None and ended.state is LeaseState.CANCELLED:
+            core.reply(event.client, event.request, {"state": "cancelled"})
+            return
+        raise (
+            ended_error(ended) if ended else Refused("unknown_lease", f"there is no lease {event.lease}", "")
+        )
+    if lease.process != client.process:
+        raise Refused(
+            "not_permitted", f"{lease.id} belongs to process {lease.process.pid}", "ask as its holder"
+        )
+    if lease.state is not LeaseState.QUEUED:
+        raise _bad_state(lease, "it is granted already, release it")
+    cancel_waiter(core, lease, "its holder gave up")
+    core.reply(event.client, event.request, {"state": "cancelled"})
+
+
+def cancel_waiter(core: Core, lease: Lease, why: str) -> None:
+    """A revoke that was sent for it stands: the holder may be unloading by now."""
+    lease.move(LeaseState.CANCELLED, core.now, why)
+    core.dequeue(lease)
+    core.note("cancelled", lease, reason=why)
+    core.end(
+        lease, {"code": "cancelled", "message": f"{lease.id}: {why}", "hint": "acquire again", "details": {}}
+    )
+
+
+def on_wait_timeout(core: Core, lease_id: str) -> None:
+    lease = core.waiting[LeaseId(lease_id)]
+    why = explain.explain_lease(core, lease)
+    error = {
+        "code": "wait_timeout",
+        "message": f"{lease.spec.consumer} waited {core.now - lease.arrived_at:.1f} s: {why['text']}",
+        "hint": "wait longer, or make room",
+        "details": {"why": why},
+    }
+    eviction.deny(core, lease, error)
+
+
+# -- holding -----------------------------------------------------------------------------------------------------------
+def ready(core: Core, event: ReadyReported) -> None:
+    """Loaded: from now on the steady bytes are charged, or what the holder measured."""
+    lease = own_lease(core, event.client, event.lease, event.token)
+    if lease.state is LeaseState.HELD:  # a repeat
+        core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
+        return
+    if lease.state is not LeaseState.LOADING:
+        raise _bad_state(lease, "only a loading lease becomes ready")
+    become_held(core, lease, event.measured_bytes)
+    core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
+    core.learn(lease.spec.consumer, "load_s", core.now - lease.granted_at)
+    core.note(
+        "ready",
+        lease,
+        charge_bytes=core.gpu_of(lease).ledger.charge_bytes(lease.id),
+        declared_bytes=lease.steady_bytes,
+        measured_bytes=event.measured_bytes,
+        load_ms=(core.now - lease.granted_at) * 1e3,
+    )
+    core.note("switch", lease, **explain.switch_record(core, lease))
+
+
+def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
+    gpu = core.gpu_of(lease)
+    lease.move(LeaseState.HELD, core.now, "ready")
+    lease.ready_at = lease.last_used_at = core.now
+    lease.measured_bytes = measured_bytes
+    steady = lease.steady_bytes if measured_bytes is None else max(measured_bytes, lease.spec.residue_bytes)
+    gpu.ledger.recharge(lease.id, steady, core.now)
+    gpu.changed_at = core.now
+    core.record_lease(lease)
+    core.wake(gpu)
+
+
+def use_begin(core: Core, event: UseBegan) -> None:
+    """Mark a use. Anybody with the token may; nobody once the holder was asked to leave."""
+    client = client_of(core, event.client)
+    lease = lease_for(core, event.lease, event.token)
+    key = (client.process, event.use)
+    if key in lease.uses:
+        core.reply(event.client, event.request, {"uses": len(lease.uses)})
+        return
+    if lease.state in LEAVING:
+        raise Refused(
+            "lease_revoking",
+            f"{lease.spec.consumer} was asked to leave",
+            "wait until it is granted again",
+            state=str(lease.state),
+        )
+    if lease.state is not LeaseState.HELD:
+        raise _bad_state(lease, "only a held lease can be used")
+    if len(lease.uses) >= core.settings.uses_per_lease_max:
+        raise Refused(
+            "limit_exceeded", f"{lease.id} has too many uses", "end some", limit="uses_per_lease_max"
+        )
+    lease.uses[key] = Use(event.use, client.id, client.process, event.label, core.now)
+    lease.last_used_at = core.now
+    core.reply(event.client, event.request, {"uses": len(lease.uses)})
+    core.note("use_began", lease, use_id=event.use, label=event.label, uses=len(lease.uses))
+
+
+def use_end(core: Core, event: UseEnded) -> None:
+    """End a use; one that is not there (any more) is fine."""
+    client = client_of(core, event.client)
+    lease = lease_for(core, event.lease, event.token)
+    if (client.process, event.use) in lease.uses:
+        end_use(core, lease, lease.uses[client.process, event.use], "ended")
+    core.reply(event.client, event.request, {"uses": len(lease.uses)})
+
+
+def end_use(core: Core, lease: Lease, use: Use, why: str) -> None:
+    del lease.uses[use.process, use.id]
+    lease.last_used_at = core.now
+    core.note(
+        "use_ended", lease, use_id=use.id, label=use.label, ms=(core.now - use.began_at) * 1e3, reason=why
+    )
+    if not lease.uses:
+        eviction.reached_safe_point(core, lease)
+        core.wake(core.gpu_of(lease))
+
+
+def renew(core: Core, event: Renewed) -> None:
+    """Keep leases alive. One that expired stays expired."""
+    client = client_of(core, event.client)
+    alive: list[str] = []
+    gone: list[dict[str, object]] = []
+    for lease_id, token in event.leases:
+        lease = core.leases.get(lease_id)
+        if lease is not None and lease.state is LeaseState.QUEUED and lease.process == client.process:
+            alive.append(lease_id)
+            continue
+        try:
+            own_lease(core, event.client, lease_id, token)
+            alive.append(lease_id)
+        except Refused as refused:
+            gone.append({"lease_id": lease_id, "error": refused.wire()})
+    core.reply(event.client, event.request, {"alive": alive, "gone": gone})
+
+
+# -- leaving -----------------------------------------------------------------------------------------------------------
+def revoke_ack(core: Core, event: RevokeAcknowledged) -> None:
+    lease = own_lease(core, event.client, event.lease, event.token)
+    eviction.acknowledge(core, lease, event.safe_point_eta_s)
+    core.reply(event.client, event.request, {"state": str(lease.state), "uses": len(lease.uses)})
+
+
+def unloading(core: Core, event: UnloadStarted) -> None:
+    """The holder is at its safe point and unloads. Refused while anybody uses the lease: this is the safe-point rule."""
+    lease = own_lease(core, event.client, event.lease, event.token)
+    if lease.state is LeaseState.UNLOADING:  # a repeat
+        core.reply(event.client, event.request, {"state": str(lease.state)})
+        return
+    if lease.state not in (LeaseState.HELD, LeaseState.REVOKING):
+        raise _bad_state(lease, "only a held lease is unloaded; a loading one is released")
+    if lease.uses:
+        raise _bad_state(lease, f"{len(lease.uses)} uses still run; wait for the `revoke` that says 0 uses")
+    gpu = core.gpu_of(lease)
+    lease.move(LeaseState.UNLOADING, core.now, "at its safe point")
+    lease.baseline = gpu.sample
+    if lease.eviction is not None:
+        lease.eviction.unloading_at = core.now
+        core.learn(lease.spec.consumer, "drain_s", core.now - lease.eviction.asked_at)
+    core.reply(event.client, event.request, {"state": str(lease.state)})
+    core.note("unloading", lease, asked=lease.eviction is not None)
+    core.wake(gpu)
+
+
+def release(core: Core, event: ReleaseReported) -> None:
+    """The holder let go. Its bytes stay charged until they are measured gone."""
+    process = client_of(core, event.client).process
+    ended = core.ended.get(event.lease)
+    same = ended is not None and (ended.token, ended.process) == (event.token, process)
+    if ended is not None and same and ended.state is LeaseState.RELEASED:  # a repeat
+        core.reply(event.client, event.request, {"state": str(ended.state)})
+        return
+    lease = own_lease(core, event.client, event.lease, event.token)
+    if lease.state is not LeaseState.VERIFYING:
+        let_go(core, lease, exiting=event.exiting, why="exits" if event.exiting else "let go")
+    core.reply(event.client, event.request, {"state": str(lease.state)})
+
+
+def let_go(core: Core, lease: Lease, *, exiting: bool, why: str) -> None:
+    """From any resident state to verification. Uses that others left on it end with it."""
+    gpu = core.gpu_of(lease)
+    for use in list(lease.uses.values()):
+        del lease.uses[use.process, use.id]
+        core.note(
+            "use_ended", lease, use_id=use.id, label=use.label, ms=(core.now - use.began_at) * 1e3, reason=why
+        )
+    before = lease.state
+    lease.exiting = exiting
+    lease.move(LeaseState.VERIFYING, core.now, why)
+    core.timers.clear(("ttl", lease.id))
+    if lease.eviction is not None:
+        lease.eviction.unloading_at = lease.eviction.unloading_at or core.now
+        lease.eviction.released_at = core.now
+        core.learn(lease.spec.consumer, "unload_s", core.now - lease.eviction.unloading_at)
+    begin_for_lease(core, gpu, lease, alive=True)
+    core.record_lease(lease)
+    core.note("released", lease, exiting=exiting, was=str(before), reason=why)
+    core.wake(gpu)
+
+
+def oom(core: Core, event: OomReported) -> None:
+    """An allocation failed. If the holder asked for more than it was granted, its footprint was wrong: learn it."""
+    lease = own_lease(core, event.client, event.lease, event.token)
+    gpu = core.gpu_of(lease)
+    charge = gpu.ledger.charge_bytes(lease.id)
+    allocated = charge if event.allocated_bytes is None else event.allocated_bytes
+    wanted = min(allocated + event.requested_bytes, gpu.ledger.budget_bytes)
+    learnt = wanted > charge
+    if learnt:
+        key = peak_key(lease.spec)
+        core.learnt_peaks[key] = max(core.learnt_peaks.get(key, 0), wanted)
+    core.want_sample(gpu, core.now)
+    core.reply(event.client, event.request, {"learnt_load_peak_bytes": wanted if learnt else None})
+    core.note(
+        "oom",
+        lease,
+        requested_bytes=event.requested_bytes,
+        allocated_bytes=event.allocated_bytes,
+        charge_bytes=charge,
+        learnt_load_peak_bytes=wanted if learnt else None,
+        reason="it needs more than it declared" if learnt else "somebody else holds what was granted to it",
+    )

@@ -1,0 +1,103 @@
+"""Connections and processes that come and go, and a journal that fails.
+
+Leases belong to processes: a connection that drops loses nothing that is resident (its process re-attaches or the ttl runs
+out); `bye` gives everything back; death ends everything, and what was held is measured away before anyone else gets it.
+"""
+
+from arbiter.core.events import BYE, ClientConnected, ClientLeft, JournalFailed
+from arbiter.core.lease import EXPIRING, Lease, LeaseState
+from arbiter.core.measure import begin_for_residue, lose
+from arbiter.core.recovery import account_for
+from arbiter.core.requests import cancel_waiter, end_use, let_go
+from arbiter.core.state import Client, Core, Refused
+from schemas.ids import LeaseId, ProcessKey
+
+
+def on_connected(core: Core, event: ClientConnected) -> None:
+    """A hello. The same instance on a new connection takes over what is still queued for it."""
+    core.clients[event.client] = Client(event.client, event.process, event.name, event.instance)
+    core.last_client_at = core.now
+    for gpu in core.gpus.values():
+        if gpu.sample is None or core.now - gpu.sample.taken_at > core.settings.sample_max_age_s:
+            core.want_sample(gpu, core.now - core.settings.sample_max_age_s)
+
+
+def on_left(core: Core, event: ClientLeft) -> None:
+    """Queued leases and uses of the connection end. Resident leases end with a `bye` only."""
+    client = core.clients.pop(event.client, None)
+    if client is None:
+        return
+    core.last_client_at = core.now
+    for lease in list(core.leases.values()):
+        for use in [use for use in lease.uses.values() if use.client == event.client]:
+            end_use(core, lease, use, f"its client left: {event.reason}")
+        if lease.client != event.client or lease.process != client.process:
+            continue
+        if lease.state is LeaseState.QUEUED:
+            cancel_waiter(core, lease, f"its client left: {event.reason}")
+        elif lease.state in EXPIRING and event.reason == BYE:
+            let_go(core, lease, exiting=False, why="its client said bye")
+
+
+def on_died(core: Core, process: ProcessKey) -> None:
+    """Everything of a process ends. Its bytes become debts, measured gone before they count as free."""
+    gone = [client for client, known in core.clients.items() if known.process == process]
+    for client in gone:
+        del core.clients[client]
+    if gone:
+        core.last_client_at = core.now
+    for gpu in core.gpus.values():
+        account = gpu.ledger.accounts.get(process)
+        if account is None:
+            continue
+        gpu.ledger.bury(process)
+        for verification in gpu.verifications.values():
+            if verification.process == process:
+                verification.alive = False
+                verification.not_before = min(verification.not_before, core.now)
+        if not account.charges and f"residue:{process}" not in gpu.verifications:
+            begin_for_residue(core, gpu, process)
+    for lease in list(core.leases.values()):
+        for use in [use for use in lease.uses.values() if use.process == process]:
+            end_use(core, lease, use, "its process died")
+        if lease.process == process:
+            _bereave(core, lease)
+
+
+def _bereave(core: Core, lease: Lease) -> None:
+    account_for(core, lease.id)
+    if lease.state is LeaseState.QUEUED:
+        cancel_waiter(core, lease, "its process died")
+    elif lease.state in EXPIRING:
+        message = f"{lease.id}: process {lease.process.pid} died"
+        core.note("lost", lease, reason=message)
+        error = {"code": "lease_lost", "message": message, "hint": "acquire again", "details": {}}
+        lose(core, lease, LeaseState.LOST, error, alive=False, grace_s=0.0)
+    # a lease under verification goes on: only its residue is no longer expected
+
+
+def on_journal_failed(core: Core, event: JournalFailed) -> None:
+    """A grant that could not be written was not sent: it is taken back, and its asker is told.
+
+    Other records only make a later recovery more careful; they are worth a note.
+    """
+    core.note("journal_failed", key=event.key, reason=event.reason)
+    lease = core.leases.get(LeaseId(event.key.removeprefix("lease:")))
+    if lease is None or lease.state is not LeaseState.LOADING:
+        return
+    gpu = core.gpu_of(lease)
+    gpu.ledger.drop(lease.id, 0, 0, core.now)
+    core.forget(event.key)
+    refused = Refused(
+        "journal_unavailable",
+        f"the grant of {lease.id} could not be written: {event.reason}",
+        "look at the daemon's log and its disk",
+        key=event.key,
+    )
+    lease.move(LeaseState.DENIED, core.now, refused.message)
+    if lease.request is not None:  # the reply was held back with the record
+        core.refuse(lease.client, lease.request, refused)
+    else:
+        core.push(lease, {"push": "denied", "lease_id": lease.id, "error": refused.wire()})
+    core.note("denied", lease, code=refused.code, reason=refused.message)
+    core.end(lease, refused.wire())

@@ -1,0 +1,227 @@
+"""Client of the runner: goals with feedback and result, frames, state. Speaks `schemas.goals`; knows no robot and no GPU."""
+
+import asyncio
+import itertools
+import os
+import uuid
+from collections.abc import AsyncIterator, Mapping
+from typing import Any, Self, cast
+
+from clients.transport import Transport
+from schemas.endpoints import program_endpoint
+from schemas.errors import GoalRejected, RunnerUnreachable, VramError, from_wire
+from schemas.goals import FeedbackPush, FrameReply, ResultPush
+
+Message = dict[str, Any]
+
+CALL_TIMEOUT_S = 10.0
+CONNECT_TIMEOUT_S = 10.0
+RESULT_POLL_S = 1.0  # while waiting for a result push: ask, in case contact was lost meanwhile
+ENDED = ("succeeded", "failed", "canceled", "deadline")
+FEEDBACK_MAX = 1000  # kept for a reader that is late; the oldest go first
+
+
+class Goal:
+    """An accepted goal. Its result comes exactly once and stays."""
+
+    def __init__(self, client: "RunnerClient", goal_id: str) -> None:
+        self.goal_id = goal_id
+        self._client = client
+        self._feedback: asyncio.Queue[FeedbackPush | None] = asyncio.Queue()
+        self._result: asyncio.Future[ResultPush] = asyncio.get_running_loop().create_future()
+
+    @property
+    def done(self) -> bool:
+        return self._result.done()
+
+    async def feedback(self) -> AsyncIterator[FeedbackPush]:
+        """Progress until the result is there. One reader."""
+        while (item := await self._feedback.get()) is not None:
+            yield item
+        self._feedback.put_nowait(None)  # a second reader ends too
+
+    async def result(self, timeout_s: float | None = None) -> ResultPush:
+        """Raises TimeoutError (the goal goes on), RunnerUnreachable when the runner is gone."""
+        async with asyncio.timeout(timeout_s):
+            while not self._result.done():
+                await asyncio.wait({self._result}, timeout=RESULT_POLL_S)
+                if not self._result.done():
+                    await self._client.check_result(self)
+        return self._result.result()
+
+    async def cancel(self) -> None:
+        """Ask for the end; the result (status `canceled`) still comes."""
+        await self._client.call("cancel", {"goal_id": self.goal_id})
+
+    def fed(self, push: FeedbackPush) -> None:
+        if self._feedback.qsize() >= FEEDBACK_MAX:
+            self._feedback.get_nowait()
+        self._feedback.put_nowait(push)
+
+    def ended(self, result: ResultPush) -> None:
+        if not self._result.done():
+            self._result.set_result(result)
+            self._feedback.put_nowait(None)
+
+
+class RunnerClient:
+    """`async with RunnerClient() as runner`. Connects at the first call; replaces its socket after a loss of contact."""
+
+    def __init__(
+        self,
+        endpoint: str | None = None,
+        *,
+        timeout_s: float = CALL_TIMEOUT_S,
+        connect_timeout_s: float = CONNECT_TIMEOUT_S,
+    ) -> None:
+        self.endpoint = endpoint or program_endpoint("runner", os.environ, os.getuid())
+        self._timeout_s = timeout_s
+        self._connect_timeout_s = connect_timeout_s
+        self._transport: Transport | None = None
+        self._proven = False
+        self._ids = itertools.count(1)
+        self._waiting: dict[int, asyncio.Future[Message]] = {}
+        self._goals: dict[str, Goal] = {}
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Goals go on without us."""
+        self._drop("the client was closed")
+
+    # -- goals -------------------------------------------------------------------------------------------------------
+    async def send_goal(
+        self,
+        rskill_id: str,
+        *,
+        revision: str = "",
+        prompt: str = "",
+        goal_params: Mapping[str, Any] | None = None,
+        deadline_s: float = 0.0,
+        goal_id: str | None = None,
+        traceparent: str | None = None,
+    ) -> Goal:
+        """Start a skill; returns once it is accepted. `deadline_s` 0 takes the manifest's.
+
+        Raises GoalRejected (another goal runs), UnknownSkill, RunnerUnreachable.
+        """
+        name = goal_id or f"goal-{uuid.uuid4().hex[:12]}"
+        if name in self._goals:
+            raise GoalRejected(f"goal {name} runs already", hint="choose another goal_id")
+        goal = self._goals[name] = Goal(self, name)  # before the answer: pushes may come right behind it
+        fields: Message = {
+            "goal_id": name,
+            "rskill_id": rskill_id,
+            "revision": revision,
+            "prompt": prompt,
+            "goal_params": dict(goal_params or {}),
+            "deadline_s": deadline_s,
+        }
+        if traceparent:
+            fields["traceparent"] = traceparent
+        try:
+            await self.call("goal", fields)
+        except BaseException:
+            del self._goals[name]
+            raise
+        return goal
+
+    async def check_result(self, goal: Goal) -> None:
+        """Ask for a result that may have passed us by while contact was lost."""
+        try:
+            reply = await self.call("result", {"goal_id": goal.goal_id})
+        except RunnerUnreachable:
+            raise
+        except VramError:
+            return  # it has none yet
+        if reply.get("status") in ENDED:
+            self._end(cast(ResultPush, reply))
+
+    # -- reads -------------------------------------------------------------------------------------------------------
+    async def frame(self, camera: str = "", max_age_ms: float = 500.0) -> FrameReply:
+        """Latest frame ("" takes the first camera). Raises FrameStale when none is young enough."""
+        return cast(FrameReply, await self.call("frame", {"camera": camera, "max_age_ms": max_age_ms}))
+
+    async def state(self) -> Message:
+        return await self.call("state")
+
+    async def ground_truth(self) -> Message:
+        """Simulator only: what is really there. For judges, never for planners."""
+        return await self.call("ground_truth")
+
+    async def skills(self) -> Message:
+        return await self.call("skills")
+
+    async def ping(self, *, timeout_s: float = 1.0) -> Message:
+        return await self._exchange("ping", {}, timeout_s)
+
+    async def shutdown(self) -> None:
+        await self._exchange("shutdown", {}, self._timeout_s)
+
+    async def call(
+        self, op: str, fields: Mapping[str, Any] | None = None, *, timeout_s: float | None = None
+    ) -> Message:
+        """Any op of `schemas.goals`. Raises its typed error, or RunnerUnreachable."""
+        if not self._proven:
+            await self._exchange("ping", {}, self._connect_timeout_s)
+        return await self._exchange(op, fields or {}, self._timeout_s if timeout_s is None else timeout_s)
+
+    # -- steps -------------------------------------------------------------------------------------------------------
+    async def _exchange(self, op: str, fields: Mapping[str, Any], timeout_s: float) -> Message:
+        if self._transport is None:
+            loop = asyncio.get_running_loop()
+            self._transport = Transport(self.endpoint, loop, self._received, lambda: self._drop("it hung up"))
+        request_id = next(self._ids)
+        answer: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
+        self._waiting[request_id] = answer
+        try:
+            if not self._transport.send({"op": op, "id": request_id, **fields}):
+                raise RunnerUnreachable(
+                    f"{self.endpoint} takes no more requests", hint="it hangs; restart it"
+                )
+            return await asyncio.wait_for(answer, timeout_s)
+        except TimeoutError:
+            raise RunnerUnreachable(
+                f"no runner answers {op} at {self.endpoint} within {timeout_s:g} s",
+                hint="start `vram-runner`, or see its log",
+            ) from None
+        finally:
+            self._waiting.pop(request_id, None)
+
+    def _received(self, message: Message) -> None:
+        self._proven = True
+        match message.get("push"):
+            case "feedback":
+                if goal := self._goals.get(message["goal_id"]):
+                    goal.fed(cast(FeedbackPush, message))
+            case "result":
+                self._end(cast(ResultPush, message))
+            case _:
+                answer = self._waiting.get(message.get("re", -1))
+                if answer is None or answer.done():
+                    return
+                if message.get("ok"):
+                    answer.set_result(message)
+                else:
+                    answer.set_exception(from_wire(message.get("error") or {}))
+
+    def _end(self, result: ResultPush) -> None:
+        if goal := self._goals.pop(result["goal_id"], None):
+            goal.ended(result)
+
+    def _drop(self, reason: str) -> None:
+        if self._transport is not None:
+            self._transport.close()
+        self._transport = None
+        self._proven = False
+        for answer in self._waiting.values():
+            if not answer.done():
+                answer.set_exception(
+                    RunnerUnreachable(
+                        f"contact to {self.endpoint} lost: {reason}", hint="is the runner alive?"
+                    )
+                )

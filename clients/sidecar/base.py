@@ -1,0 +1,263 @@
+"""Talk to one sidecar: lazy connection, replies matched by id, typed errors, a child of our own where nobody serves.
+
+Rules. The first call connects; a socket that timed out or was hung up on is replaced before the next call; a child of ours that
+died is started again by the next call; a sidecar that somebody else started is used and left running. No failure here reads
+as an answer: *evicted* or *unavailable* is never "not found". It knows nothing of images or actions.
+"""
+
+import asyncio
+import contextlib
+import itertools
+import socket
+from collections.abc import Mapping, Sequence
+from typing import Any, Self, cast
+
+from clients.sidecar.spawn import Child, SpawnSpec
+from clients.transport import Transport
+from schemas.errors import ModelError, SidecarUnavailable, VramError, from_wire
+from schemas.sidecar import LoadResult, PingResult
+
+Message = dict[str, Any]
+
+CALL_TIMEOUT_S = 180.0  # a cold load of a large model; the field's clients wait as long
+CONNECT_TIMEOUT_S = 10.0  # for a sidecar that somebody else starts
+PROBE_S = 1.0  # one ping
+REBIRTH_S = 0.2  # between a broken connection and the kernel's word on its process
+SHUTDOWN_S = 5.0  # from the op's answer to the exit
+
+
+class SidecarClient:
+    """Base of the sidecars' clients. `family` says how requests are tagged: `op` (perception) or `endpoint` (policy).
+
+    `spawn` starts the sidecar when nobody answers at `endpoint`. Several calls may be under way. One loop, one process.
+    """
+
+    family = "op"
+
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        spawn: SpawnSpec | None = None,
+        timeout_s: float = CALL_TIMEOUT_S,
+        connect_timeout_s: float = CONNECT_TIMEOUT_S,
+    ) -> None:
+        self.endpoint = endpoint
+        self.child: Child | None = None
+        """The process that we started, if we did."""
+        self.identity: PingResult | None = None
+        """The last answer to `ping`."""
+        self._spawn = spawn
+        self._timeout_s = timeout_s
+        self._connect_timeout_s = connect_timeout_s
+        self._transport: Transport | None = None
+        self._ids = itertools.count(1)
+        self._waiting: dict[int, asyncio.Future[Message]] = {}
+        self._connecting = asyncio.Lock()
+        self._proven = False  # the present socket was answered once
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    # -- ops of both families ------------------------------------------------------------------------------------------
+    async def ping(self, *, timeout_s: float = PROBE_S) -> PingResult:
+        """Identity and state. Does not start anything. Raises SidecarUnavailable."""
+        answer = cast(PingResult, await self._exchange("ping", {}, timeout_s))
+        self.identity = answer
+        return answer
+
+    async def load(self, timeout_s: float | None = None) -> LoadResult:
+        """Make the model resident (the sidecar acquires its lease). `timeout_s` bounds the wait for the lease: WaitTimeout, OutOfMemory …"""
+        fields = {"timeout_s": timeout_s} if self.family == "op" else {"data": {"timeout_s": timeout_s}}
+        limit_s = self._timeout_s if timeout_s is None else max(self._timeout_s, timeout_s)
+        return cast(LoadResult, await self.call("load", fields, timeout_s=limit_s))
+
+    async def unload(self) -> None:
+        """Ask it to let go of the model at its next safe point."""
+        await self.call("unload")
+
+    async def shutdown(self) -> None:
+        """Ask the process to end, whoever started it."""
+        await self._exchange("shutdown", {}, PROBE_S * 2)
+
+    async def call(
+        self,
+        op: str,
+        fields: Mapping[str, Any] | None = None,
+        *,
+        token: Sequence[int] | None = None,
+        timeout_s: float | None = None,
+    ) -> Any:
+        """One request, connecting and starting the sidecar first where needed.
+
+        Raises the type of the reply's code (Evicted, NotResident, Loading, OutOfMemory, ModelError, …) or SidecarUnavailable.
+        """
+        await self._ensure()
+        message = dict(fields or {})
+        if token is not None:
+            message["token"] = [int(token[0]), int(token[1])]
+        return await self._exchange(op, message, self._timeout_s if timeout_s is None else timeout_s)
+
+    async def close(self) -> None:
+        """End the child that we started (shutdown, SIGTERM, SIGKILL); leave an adopted one alone. Idempotent."""
+        async with self._connecting:
+            child, self.child = self.child, None
+            try:
+                if child is not None:
+                    if child.alive:
+                        with contextlib.suppress(VramError):
+                            await self.shutdown()
+                    await child.end(SHUTDOWN_S)
+            finally:
+                self._drop("the client was closed")
+
+    # -- steps: connection ---------------------------------------------------------------------------------------------
+    async def _ensure(self) -> None:
+        """1. Proven already, child alive. 2. Somebody answers: adopt. 3. Start a child, or wait for somebody else's start."""
+        async with self._connecting:
+            if self.child is not None and not self.child.alive:
+                self._drop("the sidecar ended")
+                await self._bury()
+            if self._proven:  # 1
+                return
+            if self._spawn is not None:
+                if self._somebody_listens() and await self._answers():  # 2
+                    return
+                await self._boot(self._spawn)  # 3
+            elif not await self._answers(self._connect_timeout_s):
+                raise SidecarUnavailable(
+                    f"no sidecar answers at {self.endpoint} within {self._connect_timeout_s:g} s",
+                    hint="start it with `vram-sidecar`, or give this client a spawn spec",
+                    details={"endpoint": self.endpoint},
+                )
+
+    def _somebody_listens(self) -> bool:
+        """Quick no for an ipc path that is not there or whose owner died; otherwise a ping has to tell."""
+        if not self.endpoint.startswith("ipc://"):
+            return True
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as knock:
+            knock.settimeout(PROBE_S)
+            try:
+                knock.connect(self.endpoint.removeprefix("ipc://"))
+            except (ConnectionRefusedError, FileNotFoundError):
+                return False
+            except OSError:
+                return True
+        return True
+
+    async def _answers(self, timeout_s: float = PROBE_S) -> bool:
+        try:
+            await self.ping(timeout_s=timeout_s)
+        except SidecarUnavailable:
+            return False
+        return True
+
+    async def _boot(self, spec: SpawnSpec) -> None:
+        """Start it and wait for its first answer or its end, whichever comes first."""
+        child = self.child if self.child is not None and self.child.alive else Child(spec)
+        self.child = child
+        exited = asyncio.create_task(child.exited.wait())
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + spec.boot_timeout_s
+        try:
+            while loop.time() < deadline:
+                answered = asyncio.create_task(self._answers(deadline - loop.time()))
+                await asyncio.wait({exited, answered}, return_when=asyncio.FIRST_COMPLETED)
+                if not answered.done():
+                    answered.cancel()
+                elif answered.result():
+                    if self.identity and self.identity.get("pid") != child.pid and await child.wait(PROBE_S):
+                        await self._bury()  # somebody else was faster: use theirs
+                    return
+                if await child.wait(REBIRTH_S):
+                    await self._bury_or_raise()
+                    return
+            raise SidecarUnavailable(
+                f"the sidecar did not answer within {spec.boot_timeout_s:g} s of its start",
+                hint="see its log",
+                details={"exit_code": None, "log": child.log_tail(), "argv": list(spec.argv)},
+            )
+        finally:
+            exited.cancel()
+
+    async def _bury_or_raise(self) -> None:
+        """Our child ended at once: if another process serves the endpoint by now, that is why, and good enough."""
+        assert self.child is not None
+        failure = self.child.failure()
+        await self._bury()
+        self._drop("the sidecar ended")
+        if not await self._answers():
+            raise failure
+
+    async def _bury(self) -> None:
+        child, self.child = self.child, None
+        if child is not None:
+            await child.end(0.0)
+
+    # -- steps: one exchange -------------------------------------------------------------------------------------------
+    async def _exchange(self, op: str, fields: Mapping[str, Any], timeout_s: float) -> Any:
+        transport = self._transport
+        if transport is None:
+            loop = asyncio.get_running_loop()
+            transport = self._transport = Transport(self.endpoint, loop, self._received, self._hung_up)
+        request_id = next(self._ids)
+        answer: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
+        self._waiting[request_id] = answer
+        try:
+            if not transport.send({self.family: op, "id": request_id, **fields}):
+                raise SidecarUnavailable(
+                    f"{self.endpoint} takes no more requests", hint="it hangs; restart it"
+                )
+            reply = await asyncio.wait_for(answer, timeout_s)
+        except TimeoutError:
+            if transport is self._transport and op != "ping":
+                self._drop(f"{op} was not answered")  # a fresh socket never sees the late answer
+            raise SidecarUnavailable(
+                f"no answer to {op} within {timeout_s:g} s from {self.endpoint}",
+                hint="is it running? it may be loading a model or hang",
+                details={"endpoint": self.endpoint, "op": op},
+            ) from None
+        finally:
+            self._waiting.pop(request_id, None)
+        return _result(reply)
+
+    def _received(self, message: Message) -> None:
+        self._proven = True
+        answer = self._waiting.get(message.get("re", -1))
+        if answer is not None and not answer.done():
+            answer.set_result(message)
+
+    def _hung_up(self) -> None:
+        """The process ended or was ended. Whoever waits hears it now, not after minutes."""
+        self._drop("it hung up")
+
+    def _drop(self, reason: str) -> None:
+        if self._transport is not None:
+            self._transport.close()
+        self._transport = None
+        self._proven = False
+        for answer in self._waiting.values():
+            if not answer.done():
+                answer.set_exception(
+                    SidecarUnavailable(
+                        f"contact to {self.endpoint} lost: {reason}", hint="the next call tries again"
+                    )
+                )
+
+
+def _result(reply: Message) -> Any:
+    """The result without the envelope. Raises the typed error of a failure; one without a code is a foreign server's ModelError."""
+    if reply.get("ok") is False or ("error" in reply and "ok" not in reply):
+        error = reply.get("error", "")
+        wire = {**error} if isinstance(error, dict) else {"message": str(error)}
+        for key in ("code", "hint", "details"):
+            if key in reply:
+                wire.setdefault(key, reply[key])
+        if "code" not in wire:
+            raise ModelError(str(wire.get("message", "")), hint="see the sidecar's log")
+        raise from_wire(wire)
+    body = {key: value for key, value in reply.items() if key != "re"}
+    return body["result"] if body.keys() == {"result"} else body

@@ -1,0 +1,88 @@
+"""Clients of the two perception sidecars: open-vocabulary detector and scene VLM. They know images as PNG bytes only."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from clients.sidecar.base import SidecarClient
+from schemas.errors import ModelError
+
+MAX_SIDE = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """`box` is x0, y0, x1, y1 in pixels of the image that was sent; `score` is 0..1."""
+
+    label: str
+    score: float
+    box: tuple[float, float, float, float]
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        return (self.box[0] + self.box[2]) / 2, (self.box[1] + self.box[3]) / 2
+
+
+class DetectorClient(SidecarClient):
+    """`await detector.detect(png, "red cube")`."""
+
+    async def detect(
+        self,
+        image_png: bytes,
+        query: str,
+        *,
+        max_side: int = MAX_SIDE,
+        score_threshold: float | None = None,
+        token: Sequence[int] | None = None,
+        timeout_s: float | None = None,
+    ) -> list[Detection]:
+        """Everything that matches, best first. An empty list means: the detector looked and found nothing.
+
+        Raises Evicted, NotResident, WaitTimeout, OutOfMemory, ModelError, SidecarUnavailable: it did not look.
+        """
+        fields = {
+            "image": image_png,
+            "query": query,
+            "max_side": max_side,
+            "score_threshold": score_threshold,
+        }
+        reply = await self.call("detect", fields, token=token, timeout_s=timeout_s)
+        try:
+            found = [_detection(entry) for entry in reply["detections"]]
+        except (KeyError, TypeError, ValueError) as error:
+            raise ModelError(f"the detector's answer has a wrong shape: {error!r}") from error
+        return sorted(found, key=lambda detection: -detection.score)
+
+
+class SceneVlmClient(SidecarClient):
+    """`await vlm.query(png, "Is the red cube held?")`."""
+
+    async def query(
+        self,
+        image_png: bytes,
+        question: str,
+        *,
+        max_side: int = MAX_SIDE,
+        max_new_tokens: int = 256,
+        token: Sequence[int] | None = None,
+        timeout_s: float | None = None,
+    ) -> str:
+        """The model's answer, as it wrote it. Raises as `DetectorClient.detect`."""
+        fields = {
+            "image": image_png,
+            "question": question,
+            "max_side": max_side,
+            "max_new_tokens": max_new_tokens,
+        }
+        reply = await self.call("query", fields, token=token, timeout_s=timeout_s)
+        answer = reply.get("answer") if isinstance(reply, dict) else None
+        if not isinstance(answer, str):
+            raise ModelError("the scene VLM's reply has no answer")
+        return answer
+
+
+def _detection(entry: dict[str, object]) -> Detection:
+    box = entry["box"]
+    if not isinstance(box, list) or len(box) != 4:
+        raise ValueError(f"a box has four numbers, not {box!r}")
+    x0, y0, x1, y1 = (float(side) for side in box)
+    return Detection(str(entry["label"]), float(str(entry["score"])), (x0, y0, x1, y1))

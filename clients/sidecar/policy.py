@@ -1,0 +1,50 @@
+"""Client of a policy sidecar (endpoint family): load, reset, get_action. Arrays travel as .npy (`clients.sidecar.npy`)."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from clients.sidecar import npy
+from clients.sidecar.base import SidecarClient
+from schemas.errors import ModelError
+
+
+class PolicyClient(SidecarClient):
+    """`load` gives lease id and token; a goal marks a use with them at the arbiter and sends the token with every call."""
+
+    family = "endpoint"
+
+    async def reset(
+        self,
+        data: Mapping[str, Any] | None = None,
+        *,
+        token: Sequence[int] | None = None,
+        timeout_s: float | None = None,
+    ) -> dict[str, Any]:
+        """Forget the episode so far. Raises Evicted, NotResident, SidecarUnavailable."""
+        fields = {"data": npy.pack(dict(data or {}))}
+        result = await self.call("reset", fields, token=token, timeout_s=timeout_s)
+        return result if isinstance(result, dict) else {}
+
+    async def get_action(
+        self,
+        observation: Mapping[str, Any],
+        *,
+        options: Mapping[str, Any] | None = None,
+        token: Sequence[int] | None = None,
+        timeout_s: float | None = None,
+    ) -> dict[str, Any]:
+        """The next actions by name, e.g. `{"action": array of shape (steps, joints)}`.
+
+        Raises Evicted when the sidecar holds another lease than `token`'s, ModelError, OutOfMemory, SidecarUnavailable.
+        """
+        data = {
+            "observation": npy.pack(dict(observation)),
+            "options": npy.pack(dict(options)) if options else None,
+        }
+        result = npy.unpack(await self.call("get_action", {"data": data}, token=token, timeout_s=timeout_s))
+        if isinstance(result, list) and result:  # the field's servers answer [actions, info]
+            result = result[0]
+        if not isinstance(result, dict):
+            raise ModelError(f"get_action answered a {type(result).__name__}, not a map of actions")
+        result.pop("ok", None)
+        return result

@@ -1,0 +1,378 @@
+"""`SimRunner`: the control loop on the simulator. One environment step per tick, a reset tick before each episode.
+
+Everything here runs on the control thread (MuJoCo's rendering contexts belong to it). It gives the arm to at most one skill,
+holds the pose when there is none, and knows no sockets, goals' clients or arbiter.
+
+A run of n episodes has n reset ticks: the last episode ends the run by itself, nothing is reset for an episode that nobody plays.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from pydantic import ValidationError
+
+from runner.clock import Clock
+from runner.control import Mailbox
+from runner.frames import Snapshot
+from runner.loop import Applied, Decision, RunnerBase
+from runner.protocols import Act, DeadlinePolicy, Done, Goal, Hold, Progress, Skill, SkillEnded
+from runner.recorder import Recorder
+from runner.safety import Envelope
+from schemas.control import ControlMode
+from schemas.errors import InternalError, ModelError, VramError
+from schemas.world import Action, CameraModel, FrameEncoding, JointState, Pose, SensorFrame, WorldState
+
+log = logging.getLogger(__name__)
+
+VIOLATIONS_KEPT = 256
+WITHHELD_IN_A_ROW_MAX = 15  # half a second of refused actions: the policy is lost, the goal fails
+STILL_AFTER_TICKS = 20  # without a skill nothing moves: the video repeats its last picture
+FRAME_REUSE_S = 0.1  # observation cameras are rendered on demand, at most at 10 Hz
+
+
+class Environment(Protocol):
+    """What the loop needs of a simulator (`runner.sim.env.SimEnv`)."""
+
+    def reset(self, seed: int) -> None: ...
+
+    def step(
+        self, arm_target: Mapping[str, float] | None, base_velocity: tuple[float, float, float] | None = None
+    ) -> None: ...
+
+    @property
+    def time_s(self) -> float: ...
+
+    def joint_state(self) -> dict[str, float]: ...
+
+    def joint_velocity(self) -> dict[str, float]: ...
+
+    def joint_limits(self) -> dict[str, tuple[float, float]]: ...
+
+    def base_pose(self) -> tuple[float, float, float]: ...
+
+    def render(self, camera: str) -> Any: ...
+
+    def camera_model(self, camera: str) -> CameraModel: ...
+
+    def close(self) -> None: ...
+
+
+@dataclass(slots=True)
+class Episode:
+    """One finished episode of a batch run."""
+
+    index: int
+    steps: int
+    success: bool | None
+    truncated: bool
+
+
+@dataclass(slots=True)
+class _Active:
+    skill: Skill
+    goal: Goal
+    on_end: Callable[[SkillEnded], None]
+    began_tick: int
+    withheld: int = 0
+    withheld_in_a_row: int = 0
+    clamped: int = 0
+    detail: str = ""
+
+
+class SimRunner(RunnerBase):
+    """`seed + i` seeds episode i. `episodes` None plays one endless episode (the live runner). `judge` ends an episode when it
+    returns True; `max_steps` truncates it."""
+
+    def __init__(
+        self,
+        make_env: Callable[[], Environment],
+        *,
+        cameras: tuple[str, ...],
+        seed: int = 0,
+        rate_hz: float = 30.0,
+        deadline_policy: DeadlinePolicy = DeadlinePolicy.WARN,
+        clock: Clock | None = None,
+        episodes: int | None = None,
+        max_steps: int | None = None,
+        judge: Callable[[Environment], bool] | None = None,
+        object_centre_m: float = 0.0,
+        recorder: Recorder | None = None,
+        video_camera: str = "overview",
+        video_every: int = 3,
+    ) -> None:
+        super().__init__(rate_hz=rate_hz, deadline_policy=deadline_policy, clock=clock)
+        self._make_env = make_env
+        self._cameras = cameras
+        self._seed = seed
+        self._episodes_wanted = episodes
+        self._max_steps = max_steps
+        self._judge = judge
+        self._object_centre_m = object_centre_m
+        self._recorder = recorder
+        self._video_camera = video_camera
+        self._video_every = video_every
+        self._video_picture: Any = None
+        self._mailbox = Mailbox()
+        self._env: Environment | None = None
+        self._envelope: Envelope | None = None
+        self._active: _Active | None = None
+        self._idle_ticks = 0
+        self._stopping = False
+        self._reset_due = True
+        self._episode_idx = 0
+        self._step_idx = 0
+        self._snapshots: dict[str, Snapshot] = {}
+        self.world: WorldState | None = None  # the newest; replaced, never changed
+        self.episodes: list[Episode] = []
+        self.violations: deque[str] = deque(maxlen=VIOLATIONS_KEPT)
+        self.progress = Progress(0.0, "idle")  # replaced whole: the event loop may read it any time
+        self.caption: tuple[str, ...] = ()
+
+    # -- life --------------------------------------------------------------------------------------------------------
+    def activate(self) -> None:
+        if self._env is None:
+            self._env = self._make_env()
+
+    def deactivate(self) -> None:
+        self._end(SkillEnded({}, InternalError("the runner is stopping")))
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+    def request_stop(self) -> None:
+        """Any thread: the run ends before its next tick."""
+        self._stopping = True
+
+    @property
+    def mailbox(self) -> Mailbox:
+        return self._mailbox
+
+    @property
+    def env(self) -> Environment:
+        if self._env is None:
+            raise InternalError("the simulator is not active")
+        return self._env
+
+    # -- the skill that has the arm --------------------------------------------------------------------------------------
+    def begin_skill(self, skill: Skill, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
+        """Control thread. Raises InternalError when another skill has the arm."""
+        if self._active is not None:
+            raise InternalError("another skill has the arm")
+        self._active = _Active(skill, goal, on_end, self.tick_idx)
+        self.progress = Progress(0.0, "running")
+
+    def end_skill(self) -> None:
+        """Control thread: take the arm back without a word to anybody; it holds. Repeatable."""
+        self._active = None
+        self.progress = Progress(0.0, "idle")
+
+    def _end(self, ended: SkillEnded) -> None:
+        if (active := self._active) is None:
+            return
+        self._active = None
+        self.progress = Progress(1.0 if ended.error is None else self.progress.fraction, "ended")
+        ticks = {"ticks": self.tick_idx - active.began_tick, "withheld": active.withheld, "clamped": active.clamped}
+        active.on_end(SkillEnded({**ticks, **ended.data}, ended.error))
+
+    # -- pictures -----------------------------------------------------------------------------------------------------
+    def camera_names(self) -> tuple[str, ...]:
+        """Observation cameras, the default one first."""
+        return self._cameras
+
+    def snapshot(self, camera: str, max_age_s: float) -> Snapshot:
+        """Control thread: a picture no older than `max_age_s`, rendered now unless a recent one is at hand."""
+        known = self._snapshots.get(camera)
+        newest_ns = self.clock.now_ns() - int(min(max_age_s, FRAME_REUSE_S) * 1e9)
+        if known is not None and known.stamp_ns >= newest_ns:
+            return known
+        return self._render(camera)
+
+    def _render(self, camera: str) -> Snapshot:
+        rgb = self.env.render(camera)
+        model = self.env.camera_model(camera)
+        if self._object_centre_m:
+            # what a detector's box centres on is the middle of a thing, not the table below it
+            model = model.model_copy(
+                update={"support_plane_z": model.support_plane_z + self._object_centre_m}
+            )
+        snapshot = Snapshot(camera, rgb, self.clock.now_ns(), model)
+        self._snapshots[camera] = snapshot
+        return snapshot
+
+    # -- one tick -----------------------------------------------------------------------------------------------------
+    def _finished(self) -> bool:
+        return self._stopping or (
+            self._episodes_wanted is not None and len(self.episodes) >= self._episodes_wanted
+        )
+
+    def _success(self) -> bool | None:
+        judged = [episode.success for episode in self.episodes if episode.success is not None]
+        return all(judged) if judged else None
+
+    def _decide(self, tick_idx: int) -> Decision:
+        """1. reset tick? 2. posted work 3. cameras 4. world state 5. the skill 6. safety."""
+        if self._reset_due:  # 1
+            return Decision(reset=True)
+        self._mailbox.run_pending()  # 2
+        started_s = self.clock.now_s()
+        active = self._active
+        frames: dict[str, SensorFrame] | None = None
+        if active is not None and active.skill.wants_frames():  # 3
+            frames = {camera: self._sensor_frame(self._render(camera)) for camera in active.skill.cameras}
+        sensed_s = self.clock.now_s()
+        try:
+            world = self._world(frames)  # 4
+        except ValidationError as error:  # a state that is not finite: nobody may act on it
+            self.world = None
+            self._end(SkillEnded({}, InternalError(f"the robot's state is invalid: {error.errors()[0]['msg']}")))
+            return Decision(safety_violations=("the robot's state is invalid",))
+        self.world = world
+        decision = Decision(
+            sensors_ms=(sensed_s - started_s) * 1e3, world_state_ms=(self.clock.now_s() - sensed_s) * 1e3
+        )
+        if active is not None:
+            self._ask_skill(active, world, decision)  # 5, 6
+        return decision
+
+    def _ask_skill(self, active: _Active, world: WorldState, decision: Decision) -> None:
+        asked_s = self.clock.now_s()
+        try:
+            outcome = active.skill.step(world)
+        except VramError as error:
+            decision.safety_violations = (f"{error.code}: {error.message}",)
+            self.violations.append(decision.safety_violations[0])
+            self._end(SkillEnded({}, error))
+            return
+        except Exception as error:  # noqa: BLE001 — a defect of a skill must not take the arm's control loop with it
+            log.exception("skill %s failed", active.goal.rskill_id)
+            self._end(SkillEnded({}, InternalError(f"the skill failed: {type(error).__name__}: {error}")))
+            return
+        decision.inference_ms = (self.clock.now_s() - asked_s) * 1e3
+        match outcome:
+            case Act(action=action, chunk_index=chunk_index):
+                decision.chunk_index = chunk_index
+                self._check(active, action, world, decision)
+            case Hold(reason=reason):
+                active.detail = reason
+            case Done(data=data):
+                self._end(SkillEnded(dict(data)))
+                return
+        if self._active is active:
+            self.progress = Progress(
+                min(max(active.skill.fraction, 0.0), 1.0), "running", self.tick_idx - active.began_tick, active.detail
+            )
+
+    def _check(self, active: _Active, action: Action, world: WorldState, decision: Decision) -> None:
+        checked_s = self.clock.now_s()
+        if self._envelope is None:
+            self._envelope = Envelope(self.env.joint_limits())
+        allowed, problems = self._envelope.check(action, world)
+        decision.safety_ms = (self.clock.now_s() - checked_s) * 1e3
+        decision.safety_violations = problems
+        decision.action = allowed
+        self.violations.extend(problems)
+        if allowed is not None:
+            active.withheld_in_a_row = 0
+            active.clamped += bool(problems)
+            active.detail = ""
+            return
+        active.withheld += 1
+        active.withheld_in_a_row += 1
+        active.detail = f"withheld: {problems[0]}"
+        if active.withheld_in_a_row >= WITHHELD_IN_A_ROW_MAX:
+            self._end(
+                SkillEnded(
+                    {},
+                    ModelError(
+                        f"{active.withheld_in_a_row} actions in a row were withheld: {problems[0]}",
+                        hint="the skill commands what this robot's envelope forbids",
+                    ),
+                )
+            )
+
+    def _apply(self, decision: Decision) -> Applied:
+        if decision.reset:
+            self._reset_due = False
+            self._step_idx = 0
+            self._snapshots.clear()
+            self.env.reset(self._seed + self._episode_idx)
+            self._envelope = Envelope(self.env.joint_limits())
+            return Applied(action_applied=False, episode_idx=self._episode_idx)
+        arm, base = _commands(decision.action)
+        self.env.step(arm, base)
+        self._step_idx += 1
+        self._idle_ticks = 0 if self._active is not None else self._idle_ticks + 1
+        terminated = self._judge is not None and self._judge(self.env)
+        truncated = not terminated and self._max_steps is not None and self._step_idx >= self._max_steps
+        applied = Applied(
+            action_applied=decision.action is not None,
+            step_idx=self._step_idx,
+            episode_idx=self._episode_idx,
+            terminated=terminated,
+            truncated=truncated,
+        )
+        self._record(closing=terminated or truncated)
+        if terminated or truncated:
+            self.episodes.append(
+                Episode(self._episode_idx, self._step_idx, terminated if self._judge else None, truncated)
+            )
+            self._episode_idx += 1
+            self._reset_due = True
+        return applied
+
+    def _record(self, *, closing: bool) -> None:
+        if self._recorder is None or (self.tick_idx % self._video_every and not closing):
+            return
+        if self._video_picture is None or self._idle_ticks < STILL_AFTER_TICKS:
+            self._video_picture = self.env.render(self._video_camera)
+        self._recorder.submit(self._video_picture, (*self.caption, f"t = {self.env.time_s:.1f} s"))
+
+    # -- observation ----------------------------------------------------------------------------------------------------
+    def _world(self, frames: dict[str, SensorFrame] | None) -> WorldState:
+        stamp_ns = self.clock.now_ns()
+        positions, velocities = self.env.joint_state(), self.env.joint_velocity()
+        x, y, yaw = self.env.base_pose()
+        return WorldState(
+            stamp_ns=stamp_ns,
+            joint_state=JointState(
+                name=tuple(positions),
+                position=tuple(positions.values()),
+                velocity=tuple(velocities[name] for name in positions),
+                stamp_ns=stamp_ns,
+            ),
+            base_pose=Pose(
+                xyz=(x, y, 0.0), quat_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)), frame_id="map"
+            ),
+            image_frames=frames,
+        )
+
+    def _sensor_frame(self, taken: Snapshot) -> SensorFrame:
+        height, width = taken.rgb.shape[:2]
+        return SensorFrame(
+            sensor_id=taken.camera,
+            stamp_monotonic_ns=taken.stamp_ns,
+            stamp_wall_ns=self.clock.wall_ns(),
+            encoding=FrameEncoding.RGB8,
+            width=int(width),
+            height=int(height),
+            data=taken.rgb.tobytes(),
+        )
+
+
+def _commands(action: Action | None) -> tuple[dict[str, float] | None, tuple[float, float, float] | None]:
+    """Arm target by joint name and base velocity of an action; (None, None) holds."""
+    if action is None:
+        return None, None
+    if action.control_mode is ControlMode.BODY_TWIST:
+        twist = action.rows[0]
+        return None, (twist[0], twist[1], twist[5])
+    names = action.joint_names
+    if names is None:
+        raise InternalError("a joint action reached the simulator without joint names")
+    return dict(zip(names, action.rows[0], strict=True)), None

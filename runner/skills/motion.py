@@ -1,0 +1,59 @@
+"""Bounded joint motion to a known pose: how the arm folds before it drives or before a policy takes over.
+
+Pure: joint names and radians in, targets out, one per control step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from schemas.errors import ModelError
+from schemas.world import WorldState
+
+SPEED_RAD_S = 1.6
+REACHED_RAD = 0.06  # servos under load stop a little short
+SETTLE_STEPS_MAX = 45  # after the target stands still the arm gets 1.5 s to arrive
+
+
+def joint_positions(world: WorldState, names: tuple[str, ...]) -> dict[str, float]:
+    """Measured positions of the named joints. Raises ModelError when one is missing or the state is stale: never made up."""
+    if "joint_state" in world.stale:
+        raise ModelError("the joint state is stale", hint="nothing moves on an old state")
+    known = dict(zip(world.joint_state.name, world.joint_state.position, strict=True))
+    missing = [name for name in names if name not in known]
+    if missing:
+        raise ModelError(f"the joint state lacks {', '.join(missing)}")
+    return {name: known[name] for name in names}
+
+
+class JointRamp:
+    """From where the joints are to `goal` (rad, by name) at a bounded speed. `done` when they arrived, or cannot go further."""
+
+    def __init__(
+        self, start: Mapping[str, float], goal: Mapping[str, float], *, period_s: float, speed_rad_s: float = SPEED_RAD_S
+    ) -> None:
+        self._target = {name: start[name] for name in goal}
+        self._goal = dict(goal)
+        self._stride = speed_rad_s * period_s
+        self._settling = 0
+
+    def next_target(self) -> dict[str, float]:
+        """The next joint targets; the goal itself once they are there."""
+        self._target = {
+            name: here + min(max(self._goal[name] - here, -self._stride), self._stride)
+            for name, here in self._target.items()
+        }
+        return dict(self._target)
+
+    def done(self, measured: Mapping[str, float]) -> bool:
+        """Whether the motion is over, given where the joints are."""
+        if self._target != self._goal:
+            return False
+        self._settling += 1
+        arrived = all(abs(measured[name] - goal) <= REACHED_RAD for name, goal in self._goal.items())
+        return arrived or self._settling > SETTLE_STEPS_MAX
+
+
+def is_at(measured: Mapping[str, float], goal: Mapping[str, float]) -> bool:
+    """Whether every joint of `goal` is where it should be."""
+    return all(abs(measured[name] - value) <= REACHED_RAD for name, value in goal.items())

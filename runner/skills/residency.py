@@ -1,0 +1,65 @@
+"""Which skill is resident: one GPU-holding skill at a time, by (rskill_id, revision); the prompt is no part of the key.
+
+The same key is reused (and reset by its `start`), another key makes the old one leave first. GPU-free skills live beside it, take no
+slot and make nobody leave. Holds no lock over a goal: callers run one goal at a time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+
+from runner.protocols import Skill, SkillKey
+from schemas.errors import VramError
+
+log = logging.getLogger(__name__)
+
+
+class Residency:
+    """`acquire(key, make)` returns the resident skill of a key, making it if need be."""
+
+    def __init__(self) -> None:
+        self._lock = asyncio.Lock()
+        self._resident: Skill | None = None
+        self._free: dict[SkillKey, Skill] = {}
+
+    @property
+    def resident(self) -> SkillKey | None:
+        """Key of the GPU-holding skill, if any."""
+        return self._resident.key if self._resident is not None else None
+
+    async def acquire(self, key: SkillKey, make: Callable[[], Skill]) -> Skill:
+        """Reuse or make. Raises what `make` raises; then nothing is resident that was not before."""
+        async with self._lock:
+            if key in self._free:
+                return self._free[key]
+            if self._resident is not None and self._resident.key == key:
+                return self._resident
+            skill = make()
+            if not skill.holds_gpu:
+                self._free[key] = skill
+                return skill
+            await self._evict()
+            self._resident = skill
+            return skill
+
+    async def _evict(self) -> None:
+        if (leaving := self._resident) is not None:
+            self._resident = None
+            await _release(leaving)
+
+    async def close(self) -> None:
+        """Release everything."""
+        async with self._lock:
+            await self._evict()
+            for skill in self._free.values():
+                await _release(skill)
+            self._free.clear()
+
+
+async def _release(skill: Skill) -> None:
+    try:
+        await skill.release()
+    except VramError as error:  # its process may be gone; whoever measures the card decides what is free
+        log.warning("%s did not release cleanly: %s", skill.key, error)

@@ -1,0 +1,187 @@
+"""`vram-sidecar`: serve one model. Reads the flags, puts a host together, runs it.
+
+Exit codes: 0 ended in order; 1 could not start or failed; 2 the flags are wrong.
+"""
+
+import argparse
+import asyncio
+import logging
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from schemas import defaults as d
+from schemas.endpoints import arbiter_endpoint, program_endpoint
+from schemas.errors import ConfigError, VramError
+from schemas.fakegpu import CARD_FILE, FOLDER_VARIABLE, parse_config
+from schemas.manifest import ManifestError
+from sidecars.adapters.choose import make_adapter
+from sidecars.device.memory import DeviceMemory, NoDevice
+from sidecars.settings import (
+    WAIT_TIMEOUT_S,
+    Settings,
+    footprint_for,
+    parse_footprint,
+    read_footprints,
+    read_model,
+)
+from sidecars.weights import configs_folder
+
+FOOTPRINTS = "models/footprints.yaml"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point of `vram-sidecar` and `python -m sidecars`."""
+    flags = _parser().parse_args(arguments)
+    logging.basicConfig(
+        level=flags.log_level.upper(),
+        stream=sys.stderr,
+        format=f"%(asctime)s {flags.name} %(levelname)s %(message)s",
+    )
+    try:
+        settings = settings_from(flags)
+        adapter = make_adapter(settings.manifest, settings.weights)
+        if flags.check:
+            print(f"ok: {settings.manifest.name} from {settings.weights.source} as {adapter.kind}")
+            return 0
+        from sidecars.host import SidecarHost
+
+        asyncio.run(SidecarHost(settings, adapter, open_memory(settings)).serve())
+    except (VramError, ManifestError) as error:
+        print(f"vram-sidecar: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def settings_from(flags: argparse.Namespace) -> Settings:
+    """Flags, files and environment as settings. Raises ConfigError or ManifestError."""
+    configs = flags.configs or configs_folder(os.environ)
+    manifest, weights = read_model(flags.rskill, configs)
+    if flags.footprint:
+        entry = parse_footprint(flags.footprint)
+    else:
+        path = flags.footprints or configs / FOOTPRINTS
+        entry = footprint_for(manifest, read_footprints(path) if path.exists() or flags.footprints else {})
+    device = _device(flags.device)
+    return Settings(
+        name=flags.name,
+        manifest=manifest,
+        weights=weights,
+        footprint=entry.on_wire(),
+        endpoint=flags.endpoint or program_endpoint(flags.name, os.environ, os.getuid()),
+        device=device,
+        arbiter=None if flags.no_arbiter else flags.arbiter or arbiter_endpoint(os.environ, os.getuid()),
+        stands_for=entry.stands_for,
+        throttle_bytes_per_s=entry.throttle,
+        gpu=flags.gpu or _gpu_of(device),
+        priority=flags.priority,
+        evictable=not flags.pinned,
+        min_residency_s=flags.min_residency_s,
+        wait_timeout_s=flags.wait_timeout_s,
+        idle_release_s=flags.idle_release_s,
+    )
+
+
+def open_memory(settings: Settings) -> DeviceMemory:
+    """The device of the settings. Raises NoGpu or ConfigError."""
+    if settings.device == "none":
+        return NoDevice()
+    if settings.device.startswith("fake:"):
+        from sidecars.device.fake import FakeMemory
+
+        folder = Path(settings.device.removeprefix("fake:"))
+        return FakeMemory(folder, settings.name, settings.footprint.residue_bytes)
+    from sidecars.device.cuda import CudaMemory
+
+    return CudaMemory(int(settings.device.partition(":")[2] or 0), settings.footprint.residue_bytes)
+
+
+def _device(text: str | None) -> str:
+    """`--device`, else the simulated card that the environment names, else the first CUDA card. Raises ConfigError."""
+    if text is None:
+        folder = os.environ.get(FOLDER_VARIABLE)
+        return f"fake:{folder}" if folder else "cuda"
+    kind, colon, rest = text.partition(":")
+    if (
+        text in ("none", "cuda")
+        or (kind == "fake" and rest)
+        or (kind == "cuda" and colon and rest.isdecimal())
+    ):
+        return text
+    raise ConfigError(f"--device {text} is not known", hint="write fake:FOLDER, cuda, cuda:1 or none")
+
+
+def _gpu_of(device: str) -> str:
+    """Which card to lease: on a simulated one its own, so that lease and bytes cannot differ. Raises ConfigError."""
+    if not device.startswith("fake:"):
+        return "any"
+    path = Path(device.removeprefix("fake:")) / CARD_FILE
+    try:
+        return parse_config(path.read_text()).uuid
+    except OSError as error:
+        raise ConfigError(
+            f"{path} cannot be read: {error.strerror}", hint="start the arbiter with --gpu fake:8GiB"
+        ) from error
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="vram-sidecar", description="Serve one model, under a lease of the VRAM arbiter."
+    )
+    add = parser.add_argument
+    add("--name", required=True, help="consumer name and socket name, e.g. detector")
+    add("--rskill", required=True, type=Path, metavar="FILE", help="the skill's rskill.yaml")
+    add(
+        "--device",
+        metavar="fake:FOLDER|cuda[:N]|none",
+        help=f"default: fake:${FOLDER_VARIABLE} if set, else cuda",
+    )
+    add("--endpoint", metavar="EP", help="where to serve; default: <runtime folder>/<name>.sock")
+    add("--arbiter", metavar="EP", help="default: the arbiter's usual place")
+    add("--no-arbiter", action="store_true", help="load at once, stay resident, ask nobody")
+    add("--configs", type=Path, metavar="DIR", help="folder that local:// weights are looked up in")
+    add("--footprints", type=Path, metavar="FILE", help=f"default: {FOOTPRINTS} in the configs folder")
+    add("--footprint", metavar="PEAK[,STEADY[,RESIDUE]]", help="instead of the file, e.g. 5.3GB,5.3GB,450MiB")
+    add("--gpu", metavar="UUID|INDEX|any", help="which card to lease; default: the simulated one, else any")
+    add(
+        "--priority",
+        type=_number(int, 0, d.PRIORITY_MAX),
+        default=d.PRIORITY,
+        help="0..100, default %(default)s",
+    )
+    add("--pinned", action="store_true", help="never evicted")
+    add(
+        "--min-residency-s",
+        type=_number(float, 0, 86_400),
+        default=d.MIN_RESIDENCY_S,
+        help="default %(default)s",
+    )
+    add(
+        "--wait-timeout-s",
+        type=_number(float, 0.1, 86_400),
+        default=WAIT_TIMEOUT_S,
+        help="of a request for the lease; default %(default)s",
+    )
+    add(
+        "--idle-release-s",
+        type=_number(float, 0.1, 86_400),
+        help="let go of an idle model after so long; default: never",
+    )
+    add("--log-level", choices=("debug", "info", "warning", "error"), default="info")
+    add("--check", action="store_true", help="check manifest, footprint and flags, then end")
+    return parser
+
+
+def _number[T: (int, float)](kind: type[T], low: float, high: float) -> Callable[[str], T]:
+    def read(text: str) -> T:
+        value = kind(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"must be {low:g} to {high:g}")
+        return value
+
+    return read
+
+
+if __name__ == "__main__":
+    sys.exit(main())

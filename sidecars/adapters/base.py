@@ -1,0 +1,30 @@
+"""What the host asks of a model: prepare, load, run, unload. An adapter knows its model and nothing of leases, sockets or bytes."""
+
+from typing import Any, Literal, Protocol
+
+from schemas.sidecar import DetectOp, EndpointCall, QueryOp
+
+ModelCall = DetectOp | QueryOp | EndpointCall
+
+
+class ModelAdapter(Protocol):
+    """One model. All methods block and are called from one worker thread, never two at a time.
+
+    `ops` are the ops or endpoints that `run` answers. `prepare` does what needs no device (imports, processors). `load` puts
+    the weights onto `device` (`cpu`, `cuda:0`) and `unload` drops every reference to them; both may be repeated.
+    `run` raises a `schemas.errors` type for what the caller did wrong; anything else that it raises is the model's own failure.
+    """
+
+    @property
+    def kind(self) -> Literal["detector", "vlm", "vla"]: ...
+
+    @property
+    def ops(self) -> frozenset[str]: ...
+
+    def prepare(self) -> None: ...
+
+    def load(self, device: str) -> None: ...
+
+    def unload(self) -> None: ...
+
+    def run(self, call: ModelCall) -> dict[str, Any]: ...

@@ -1,0 +1,62 @@
+"""Questions about a picture through transformers' image-text-to-text classes (Qwen3.5 and its like)."""
+
+from typing import Any, Literal
+
+from schemas.manifest import RSkillManifest
+from schemas.sidecar import QueryOp
+from sidecars.adapters.base import ModelCall
+from sidecars.images import decode, within
+from sidecars.weights import Weights, from_pretrained, model_options
+
+
+class SceneVlmAdapter:
+    """`query`: a picture and a question in, the answer out. Greedy, so the same question gets the same answer."""
+
+    kind: Literal["vlm"] = "vlm"
+    ops = frozenset({"query"})
+
+    def __init__(self, manifest: RSkillManifest, weights: Weights) -> None:
+        self._manifest = manifest
+        self._weights = weights
+        self._processor: Any = None
+        self._model: Any = None
+
+    def prepare(self) -> None:
+        from transformers import AutoModelForImageTextToText, AutoProcessor  # noqa: F401  the import is the work
+
+        self._processor = from_pretrained(AutoProcessor, self._weights)
+
+    def load(self, device: str) -> None:
+        from transformers import AutoModelForImageTextToText
+
+        options = model_options(self._manifest, self._weights, device)
+        self._model = from_pretrained(AutoModelForImageTextToText, self._weights, **options).eval()
+
+    def unload(self) -> None:
+        self._model = None
+
+    def run(self, call: ModelCall) -> dict[str, Any]:
+        assert isinstance(call, QueryOp)
+        picture = within(decode(call.image), call.max_side)
+        return {"ok": True, "answer": self._answer(picture, call.question, call.max_new_tokens)}
+
+    def _answer(self, picture: Any, question: str, max_new_tokens: int) -> str:
+        import torch
+
+        content = [{"type": "image"}, {"type": "text", "text": question}]
+        prompt = self._processor.apply_chat_template(
+            [{"role": "user", "content": content}],
+            add_generation_prompt=True,
+            tokenize=False,
+            enable_thinking=False,  # of templates that know it; it would eat the tokens of the answer
+        )
+        inputs = self._processor(text=[prompt], images=[picture], return_tensors="pt").to(self._model.device)
+        with torch.inference_mode():
+            output = self._model.generate(**inputs, max_new_tokens=max_new_tokens, do_sample=False)
+        answer = output[0, inputs["input_ids"].shape[1] :]
+        return after_thinking(self._processor.decode(answer, skip_special_tokens=True))
+
+
+def after_thinking(text: str) -> str:
+    """The answer proper: what follows the last `</think>`, if the model thought aloud."""
+    return text.rpartition("</think>")[2].strip()

@@ -1,0 +1,107 @@
+"""Memory of a real NVIDIA card through torch. Blocks are ballast: they make a small model weigh what the one it stands for weighs."""
+
+import os
+from typing import Any
+
+from schemas.defaults import RESIDUE_BYTES
+from schemas.errors import NoGpu, OutOfMemory
+from sidecars.device.memory import Block
+
+_ALLOCATOR_VARIABLE = "PYTORCH_CUDA_ALLOC_CONF"
+
+
+class CudaMemory:
+    """`DeviceMemory` on card `index`. Raises NoGpu if torch sees no such card.
+
+    `context_bytes` is the guess for what the process's context costs where the driver does not list it.
+    """
+
+    def __init__(self, index: int = 0, context_bytes: int = RESIDUE_BYTES) -> None:
+        # segments that can grow and shrink: without them a fragmented cache keeps far more than is in use
+        os.environ.setdefault(_ALLOCATOR_VARIABLE, "expandable_segments:True")
+        import torch
+
+        if not torch.cuda.is_available() or index >= torch.cuda.device_count():
+            raise NoGpu(
+                f"torch sees no CUDA card {index}",
+                hint="use --device fake:FOLDER, or install a CUDA build of torch",
+            )
+        self._torch = torch
+        self._index = index
+        self._context_guess_bytes = context_bytes
+        self._ballast: dict[int, Any] = {}
+        self._number = 0
+        self._touched = False
+
+    @property
+    def torch_device(self) -> str:
+        return f"cuda:{self._index}"
+
+    def touch(self) -> None:
+        self._torch.cuda.init()
+        self._torch.zeros(1, device=self.torch_device)
+        self._touched = True
+
+    def allocate(self, label: str, size_bytes: int) -> Block:
+        self._touched = True
+        self._number += 1
+        try:
+            tensor = self._torch.empty(size_bytes, dtype=self._torch.uint8, device=self.torch_device)
+        except self._torch.OutOfMemoryError as error:
+            raise self.out_of_memory(error, size_bytes) from error
+        self._ballast[self._number] = tensor
+        return Block(label, size_bytes, self._number)
+
+    def free(self, block: Block) -> None:
+        del self._ballast[block.number]
+
+    def empty_cache(self) -> None:
+        if self._touched:
+            self._torch.cuda.synchronize(self._index)
+            self._torch.cuda.empty_cache()
+
+    def used_bytes(self) -> int | None:
+        """What the driver lists for this process, else the allocator's segments plus the guess for the context."""
+        if not self._touched:
+            return 0
+        listed = self._listed_bytes()
+        if listed is not None:
+            return listed
+        return int(self._torch.cuda.memory_reserved(self._index)) + self._context_guess_bytes
+
+    def throttle_bytes_per_s(self) -> int | None:
+        return None
+
+    def close(self) -> None:
+        """A CUDA context goes with its process; what can go before, goes."""
+        self._ballast.clear()
+        self.empty_cache()
+
+    def out_of_memory(self, error: BaseException, requested_bytes: int = 0) -> OutOfMemory:
+        """torch's error as ours, with the numbers that the arbiter learns from."""
+        free_bytes, capacity_bytes = self._torch.cuda.mem_get_info(self._index)
+        return OutOfMemory(
+            str(error),
+            details={
+                "requested_bytes": requested_bytes,
+                "free_bytes": int(free_bytes),
+                "capacity_bytes": int(capacity_bytes),
+                "allocated_bytes": self.used_bytes() or 0,
+            },
+        )
+
+    def _listed_bytes(self) -> int | None:
+        """This process in NVML's list; None where it is not listed (another pid namespace, no permission)."""
+        import pynvml
+
+        try:
+            pynvml.nvmlInit()
+            uuid = str(self._torch.cuda.get_device_properties(self._index).uuid)
+            handle = pynvml.nvmlDeviceGetHandleByUUID(uuid if uuid.startswith("GPU-") else f"GPU-{uuid}")
+            listed = {
+                process.pid: process.usedGpuMemory
+                for process in pynvml.nvmlDeviceGetComputeRunningProcesses(handle)
+            }
+        except (pynvml.NVMLError, AttributeError):
+            return None
+        return listed.get(os.getpid())

@@ -1,0 +1,136 @@
+"""One sidecar: a socket, a model, a lease. Puts the real parts together and takes them down in order.
+
+`prepare` runs from the start; `load` waits for the first request (or runs at once without an arbiter); everything that blocks runs in
+the worker's thread, so `ping` and `revoke` are answered meanwhile.
+"""
+
+import asyncio
+import contextlib
+import logging
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+from clients.aio import ArbiterClient
+from clients.serve import RouterServer
+from schemas.errors import VramError
+from schemas.sidecar import DetectOp, EndpointCall, QueryOp
+from sidecars.adapters.base import ModelAdapter
+from sidecars.device.memory import DeviceMemory
+from sidecars.residency import Residency
+from sidecars.settings import Settings
+from sidecars.wires import Wire, error_reply
+from sidecars.worker import Worker
+
+_log = logging.getLogger("sidecars")
+
+
+class SidecarHost:
+    """Serves until `stop`, SIGTERM or SIGINT; then finishes the op that runs, unloads, releases and returns."""
+
+    def __init__(self, settings: Settings, adapter: ModelAdapter, memory: DeviceMemory) -> None:
+        self._settings = settings
+        self._adapter = adapter
+        self._memory = memory
+        self._stopping = asyncio.Event()
+        self._residency: Residency | None = None
+        self._boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+
+    async def serve(self) -> None:
+        """Raises AlreadyRunning, ConfigError, ArbiterUnreachable at the start; later trouble is answered on the wire."""
+        settings, worker = self._settings, Worker()
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self.stop)
+        async with contextlib.AsyncExitStack() as stack:
+            stack.callback(worker.close)
+            client = None
+            if settings.arbiter is not None:
+                client = await stack.enter_async_context(ArbiterClient(settings.arbiter, name=settings.name))
+            server = await stack.enter_async_context(RouterServer(settings.endpoint, error_reply))
+            residency = self._residency = Residency(settings, self._adapter, self._memory, worker, client)
+            background = [asyncio.create_task(server.serve(Wire(self, server.send).handle), name="serve")]
+            residency.prepare()
+            if client is None:
+                background.append(asyncio.create_task(self._load_at_start(residency), name="load"))
+            elif settings.idle_release_s is not None:
+                background.append(
+                    asyncio.create_task(residency.release_when_idle(settings.idle_release_s), name="idle")
+                )
+            _log.info("%s serves %s on %s", settings.name, settings.manifest.name, settings.endpoint)
+            stopped = asyncio.create_task(self._stopping.wait(), name="stopped")
+            try:
+                await asyncio.wait([stopped, background[0]], return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                stopped.cancel()
+                await residency.leave()
+                for task in background:
+                    task.cancel()
+                outcomes = await asyncio.gather(*background, return_exceptions=True)
+            if isinstance(outcomes[0], Exception):
+                raise outcomes[0]
+        _log.info("%s has ended", settings.name)
+
+    @staticmethod
+    async def _load_at_start(residency: Residency) -> None:
+        with contextlib.suppress(
+            VramError
+        ):  # logged, kept as last_error, and tried again by the next request
+            await residency.load()
+
+    # -- what the wire asks (`wires.Host`) ----------------------------------------------------------------------------
+    @property
+    def model_ops(self) -> frozenset[str]:
+        return self._adapter.ops
+
+    def stop(self) -> None:
+        self._stopping.set()
+
+    def identity(self) -> dict[str, Any]:
+        residency, settings = self._here, self._settings
+        token = residency.token()
+        found = {
+            "ok": True,
+            "model": settings.weights.source
+            if not settings.weights.local
+            else str(settings.manifest.weights_uri),
+            "revision": settings.revision,
+            "kind": self._adapter.kind,
+            "rskill": settings.manifest.name,
+            "pid": os.getpid(),
+            "boot_id": self._boot_id,
+            "state": residency.state,
+            "lease_id": residency.lease.lease_id
+            if token is not None and residency.lease is not None
+            else None,
+            "token": list(token) if token is not None else None,
+        }
+        if residency.last_error is not None:
+            found["last_error"] = f"{residency.last_error.code}: {residency.last_error.message}"
+        return found
+
+    async def load(self, timeout_s: float | None, traceparent: str | None) -> dict[str, Any]:
+        residency = self._here
+        loaded = await residency.load(timeout_s, traceparent)
+        lease = residency.lease
+        return {
+            "ok": True,
+            "lease_id": lease.lease_id if lease else None,
+            "token": list(lease.token) if lease else None,
+            "loaded": loaded,
+        }
+
+    async def unload(self) -> None:
+        await self._here.unload()
+
+    async def run(self, name: str, call: DetectOp | QueryOp | EndpointCall) -> dict[str, Any]:
+        residency = self._here
+        if name == "reset" and call.token is None and residency.state != "resident":
+            return {"ok": True}  # a model that is not there has nothing to forget, and no reason to load
+        return await residency.run(name, call.token, lambda: self._adapter.run(call), call.traceparent)
+
+    @property
+    def _here(self) -> Residency:
+        assert self._residency is not None, "the wire is served inside serve()"
+        return self._residency

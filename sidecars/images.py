@@ -1,0 +1,39 @@
+"""Pictures from the wire: PNG or JPEG bytes from strangers to a bounded RGB picture."""
+
+import io
+from typing import TYPE_CHECKING
+
+from schemas.errors import BadRequest
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+PIXELS_MAX = 4096 * 4096  # 50 MB as RGB; a robot's cameras have a tenth
+FORMATS = ("PNG", "JPEG")
+
+
+def decode(data: bytes) -> "Image.Image":
+    """Decode one picture. Raises BadRequest for anything that is no PNG or JPEG of at most `PIXELS_MAX` pixels."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        picture = Image.open(io.BytesIO(data), formats=FORMATS)  # reads the header only
+        width, height = picture.size
+        if width * height > PIXELS_MAX:
+            raise BadRequest(f"an image of {width} x {height} pixels", hint=f"at most {PIXELS_MAX} pixels")
+        return picture.convert("RGB")
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise BadRequest(
+            f"the image cannot be decoded: {error}", hint="send PNG (or JPEG) bytes of an RGB picture"
+        ) from None
+
+
+def within(picture: "Image.Image", max_side: int) -> "Image.Image":
+    """The picture with its longest side at most `max_side` pixels, shrunk if it has to be."""
+    from PIL import Image
+
+    scale = max_side / max(picture.size)
+    if scale >= 1:
+        return picture
+    size = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))
+    return picture.resize(size, Image.Resampling.BILINEAR)

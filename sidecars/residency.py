@@ -1,0 +1,299 @@
+"""Whether the model is on the card: acquire, load, use, unload, in step with the lease.
+
+States: unloaded → waiting (for the lease) → loading → resident → unloading → unloaded. One model, one lease at a time. The
+lease's own protocol (revoke, drain, release, fencing) is the client library's, which calls `_unload` when the bytes must go. Knows no
+sockets and no wire.
+"""
+
+import asyncio
+import contextlib
+import gc
+import logging
+import time
+from collections.abc import AsyncIterator, Callable
+from typing import Any, Literal
+
+from clients.aio import ArbiterClient
+from clients.lease import Lease
+from schemas.errors import (
+    Evicted,
+    LeaseExpired,
+    LeaseLost,
+    LeaseRevoking,
+    Loading,
+    OutOfMemory,
+    SidecarUnavailable,
+    StaleToken,
+    UnknownLease,
+    VramError,
+    WaitTimeout,
+)
+from sidecars.adapters.base import ModelAdapter
+from sidecars.device.memory import Block, DeviceMemory, fill
+from sidecars.settings import Settings
+from sidecars.worker import Worker
+
+State = Literal["unloaded", "waiting", "loading", "resident", "unloading"]
+Token = tuple[int, int]
+_GONE = (LeaseRevoking, LeaseLost, LeaseExpired, StaleToken, UnknownLease, Evicted)
+_log = logging.getLogger("sidecars")
+
+
+class Residency:
+    """Keeps one model on or off one card. `client` None: no arbiter, so the model is loaded without a lease and stays."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        adapter: ModelAdapter,
+        memory: DeviceMemory,
+        worker: Worker,
+        client: ArbiterClient | None,
+    ) -> None:
+        self._settings = settings
+        self._adapter = adapter
+        self._memory = memory
+        self._worker = worker
+        self._client = client
+        self._turn = asyncio.Lock()  # one attempt to become resident at a time
+        self._prepared: asyncio.Task[None] | None = None
+        self._blocks: list[Block] = []
+        self._loads = 0  # counts loads and unloads, in the worker: an op that was queued before an unload must not run after it
+        self._running = 0
+        self._last_use_s = time.monotonic()
+        self.lease: Lease | None = None
+        self.state: State = "unloaded"
+        self.last_error: VramError | None = None
+
+    # -- what the wire asks -------------------------------------------------------------------------------------------
+    def prepare(self) -> None:
+        """Begin the host work (imports, processors) that needs no lease. Repeats only after a failure."""
+        if self._prepared is None or (self._prepared.done() and self._prepared.exception() is not None):
+            self._prepared = asyncio.create_task(self._worker.run(self._adapter.prepare))
+
+    async def load(self, timeout_s: float | None = None, traceparent: str | None = None) -> bool:
+        """Make the model resident; False if it was. `timeout_s` bounds the wait for the lease, not the loading.
+
+        Raises what the arbiter denies with (WaitTimeout, VramInsufficient …), OutOfMemory, ModelError.
+        """
+        if self._worker.stopping.is_set():
+            raise SidecarUnavailable(f"{self._settings.name} is ending", hint="start it again")
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        try:
+            async with asyncio.timeout(timeout_s):
+                await self._turn.acquire()
+        except TimeoutError:
+            raise Loading(
+                f"{self._settings.name} is still {self.state}", hint="ask again, or wait longer"
+            ) from None
+        try:
+            return await self._load_in_turn(deadline, traceparent)
+        except VramError as error:
+            self.last_error = error
+            raise
+        finally:
+            self._turn.release()
+
+    async def unload(self) -> None:
+        """Give the lease up at the next safe point. Nothing happens if the model is not resident."""
+        if self.lease is not None:
+            await self.lease.give_up()
+        elif self.state == "resident":
+            async with self._turn:
+                await self._unload()
+
+    async def run(
+        self, label: str, token: Token | None, work: Callable[[], dict[str, Any]], traceparent: str | None
+    ) -> dict[str, Any]:
+        """Run one op of the model as a use of the lease.
+
+        With a `token` the caller holds the lease by a use of its own: anything but the current one raises Evicted. Without, the model is made
+        resident first, also if it was evicted a moment ago.
+        """
+        deadline = time.monotonic() + self._settings.wait_timeout_s
+        while True:
+            if token is None:
+                await self.load(max(0.0, deadline - time.monotonic()), traceparent)
+            else:
+                self._check(token)
+            lease, loads = self.lease, self._loads
+            try:
+                async with self._use(lease, label, handed=token is not None):
+                    return await self._worker.run(lambda: self._guarded(loads, work))  # noqa: B023  awaited in this very pass
+            except _GONE as error:
+                if token is not None:
+                    raise self._evicted() from error
+                if lease is not None:
+                    await self._until_gone(lease, deadline)  # then there is a lease to ask for again
+
+    def token(self) -> Token | None:
+        """Token of the lease under which the model is resident now."""
+        return self.lease.token if self.lease is not None and self.state == "resident" else None
+
+    async def leave(self) -> None:
+        """End of the process: after the op that runs, everything goes, the context included."""
+        self._worker.stopping.set()
+        lease = self.lease
+        await self._unload()
+        await self._worker.run(self._memory.close)
+        if lease is not None:
+            await lease.release(exiting=True)
+
+    async def release_when_idle(self, idle_s: float) -> None:
+        """Runs beside the host: lets go of a model that nobody used for `idle_s`."""
+        while True:
+            left = self._last_use_s + idle_s - time.monotonic()
+            if self.state == "resident" and not self._running and left <= 0:
+                _log.info("idle for %.0f s: releasing", idle_s)
+                await self.unload()
+            await asyncio.sleep(max(left, 0.05, idle_s / 10))
+
+    # -- loading ------------------------------------------------------------------------------------------------------
+    async def _load_in_turn(self, deadline: float | None, traceparent: str | None) -> bool:
+        if self.state == "resident" and (self.lease is None or self.lease.state == "held"):
+            return False
+        if self.lease is not None:
+            await self._until_gone(self.lease, deadline)
+        self.prepare()
+        assert self._prepared is not None
+        self.state = "waiting"
+        try:
+            await asyncio.shield(self._prepared)
+            lease = await self._acquire(deadline, traceparent)
+            self.state, self.lease = "loading", lease
+            await self._load(lease)
+        except BaseException:
+            self.state = "unloaded"
+            raise
+        self.last_error = None
+        return True
+
+    async def _until_gone(self, lease: Lease, deadline: float | None) -> None:
+        """Wait until a lease that is leaving has left, its bytes unloaded. Raises Loading when the time is over."""
+        try:
+            async with asyncio.timeout(None if deadline is None else max(0.0, deadline - time.monotonic())):
+                await lease.wait_gone()
+        except TimeoutError:
+            raise Loading(
+                f"{self._settings.name} is still {self.state}", hint="ask again, or wait longer"
+            ) from None
+
+    async def _acquire(self, deadline: float | None, traceparent: str | None) -> Lease | None:
+        if self._client is None:
+            return None
+        wait_s = None if deadline is None else max(0.0, deadline - time.monotonic())
+        if wait_s == 0.0:
+            raise WaitTimeout(
+                f"{self._settings.name}: no time left to wait for the lease", hint="wait longer"
+            )
+        return await self._client.acquire(
+            self._settings.lease_spec(),
+            wait_s,
+            unload=self._unload,
+            on_lost=self._on_lost,
+            traceparent=traceparent,
+        )
+
+    async def _load(self, lease: Lease | None) -> None:
+        """Put the model on the card; on failure everything is taken back before the lease is."""
+        began = time.monotonic()
+        try:
+            await self._worker.run(self._load_blocking)
+            measured = await self._worker.run(self._memory.used_bytes)
+            if lease is not None:
+                await lease.ready(measured)
+        except BaseException as error:
+            await self._worker.run(self._unload_blocking)
+            if lease is not None:
+                if isinstance(error, OutOfMemory):
+                    requested = int(
+                        error.details.get("requested_bytes") or self._settings.footprint.load_peak_bytes
+                    )
+                    await lease.oom(requested, error.details.get("allocated_bytes"))
+                await lease.release()
+            _log.error("loading failed: %s", error)
+            raise
+        self._last_use_s = time.monotonic()
+        self.state = "resident"
+        _log.info("resident after %.2f s: %s bytes on the card", time.monotonic() - began, measured)
+
+    def _load_blocking(self) -> None:
+        """In the worker: real weights first, then what is missing to the footprint that they stand for, at the pace of a real load."""
+        self._loads += 1
+        settings, memory = self._settings, self._memory
+        footprint = settings.footprint
+        memory.touch()
+        self._adapter.load(memory.torch_device)
+        used = memory.used_bytes()
+        if used is None or not (settings.device.startswith("fake:") or settings.stands_for):
+            return  # a real model weighs what it weighs
+        paces = [pace for pace in (settings.throttle_bytes_per_s, memory.throttle_bytes_per_s()) if pace]
+        pace = min(paces, default=None)
+        self._blocks = fill(
+            memory,
+            "weights",
+            footprint.steady_bytes - used,
+            bytes_per_s=pace,
+            wait=self._worker.stopping.wait,
+        )
+        if footprint.load_peak_bytes > footprint.steady_bytes:
+            memory.free(memory.allocate("load peak", footprint.load_peak_bytes - footprint.steady_bytes))
+            memory.empty_cache()
+
+    # -- unloading ----------------------------------------------------------------------------------------------------
+    async def _unload(self) -> None:
+        """Called when the bytes must go: by the lease (revoked, lost, given up) or at the end of the process."""
+        began, self.state = time.monotonic(), "unloading"
+        try:
+            await self._worker.run(self._unload_blocking)
+        finally:
+            self.state = "unloaded"
+        _log.info("unloaded in %.2f s", time.monotonic() - began)
+
+    def _unload_blocking(self) -> None:
+        self._loads += 1
+        self._adapter.unload()
+        gc.collect()  # models are full of reference cycles, and each keeps its tensors
+        blocks, self._blocks = self._blocks, []
+        for block in blocks:
+            self._memory.free(block)
+        self._memory.empty_cache()
+
+    def _on_lost(self, lease: Lease, error: VramError) -> None:
+        self.last_error = error
+        _log.warning("lease %s is lost: %s", lease.lease_id, error)
+
+    # -- uses -------------------------------------------------------------------------------------------------------------
+    def _check(self, token: Token) -> None:
+        if self.token() != tuple(token):
+            raise self._evicted()
+
+    def _evicted(self) -> Evicted:
+        return Evicted(
+            f"{self._settings.name} is not resident under this token (it is {self.state})",
+            hint="load again and use the new token, or leave the token out",
+            details={"state": self.state},
+        )
+
+    @contextlib.asynccontextmanager
+    async def _use(self, lease: Lease | None, label: str, *, handed: bool) -> AsyncIterator[None]:
+        """Mark a use. Under a handed-over token the caller's own use protects the model, also while it is asked to leave."""
+        self._running += 1
+        try:
+            async with contextlib.AsyncExitStack() as stack:
+                if lease is not None:
+                    try:
+                        await stack.enter_async_context(lease.use(label))
+                    except LeaseRevoking:
+                        if not handed:
+                            raise
+                yield
+        finally:
+            self._running -= 1
+            self._last_use_s = time.monotonic()
+
+    def _guarded(self, loads: int, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """In the worker: an unload may have come between the check and this moment."""
+        if loads != self._loads:
+            raise self._evicted()
+        return work()

@@ -1,0 +1,142 @@
+"""What one sidecar is: its model, its bytes, its place. Put together from a manifest, the footprint file and flags."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from schemas import defaults as d
+from schemas.errors import ConfigError
+from schemas.manifest import RSkillManifest, load_manifest
+from schemas.units import ByteSize, parse_bytes
+from schemas.wire import Footprint, LeaseSpec
+from schemas.yamltext import parse_yaml
+from sidecars.weights import Weights, resolve
+
+WAIT_TIMEOUT_S = 120.0  # how long a request without a time limit of its own waits for the lease
+GB = 10**9  # manifests count in 1000s
+
+
+class FootprintEntry(BaseModel):
+    """One entry of `configs/models/footprints.yaml`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    stands_for: str = ""
+    load_peak: ByteSize
+    steady: ByteSize
+    residue: ByteSize = d.RESIDUE_BYTES
+    throttle: Annotated[ByteSize, Field(gt=0)] | None = None
+    source: str = ""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if not self.residue <= self.steady <= self.load_peak:
+            raise ValueError("must be residue ≤ steady ≤ load_peak: each includes the context")
+        return self
+
+    def on_wire(self) -> Footprint:
+        return Footprint(load_peak_bytes=self.load_peak, steady_bytes=self.steady, residue_bytes=self.residue)
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """All that a sidecar's host has to know. `arbiter` None: without one, resident from the start."""
+
+    name: str
+    manifest: RSkillManifest
+    weights: Weights
+    footprint: Footprint
+    endpoint: str
+    device: str  # fake:FOLDER | cuda[:N] | none
+    arbiter: str | None
+    stands_for: str = ""  # the model whose weight is simulated by filling up to the footprint
+    throttle_bytes_per_s: int | None = None
+    gpu: str = "any"
+    priority: int = d.PRIORITY
+    evictable: bool = True
+    min_residency_s: float = d.MIN_RESIDENCY_S
+    wait_timeout_s: float = WAIT_TIMEOUT_S
+    idle_release_s: float | None = None  # None: resident until somebody else needs the room
+
+    @property
+    def revision(self) -> str:
+        return self.manifest.weights_revision or self.manifest.version
+
+    def lease_spec(self) -> LeaseSpec:
+        return LeaseSpec(
+            consumer=self.name,
+            model_id=self.manifest.name,
+            revision=self.revision,
+            gpu=self.gpu,
+            footprint=self.footprint,
+            priority=self.priority,
+            evictable=self.evictable,
+            min_residency_s=self.min_residency_s,
+        )
+
+
+def read_model(rskill: Path, configs: Path) -> tuple[RSkillManifest, Weights]:
+    """The manifest and its weights. Raises ManifestError or ConfigError."""
+    manifest = load_manifest(rskill)
+    if manifest.weights_uri is None:
+        raise ConfigError(
+            f"{rskill}: {manifest.name} has no weights", hint="sidecars serve detector, vlm and vla skills"
+        )
+    return manifest, resolve(manifest.weights_uri, configs)
+
+
+def read_footprints(path: Path) -> dict[str, FootprintEntry]:
+    """All entries of a footprint file. Raises ConfigError naming file, line and problem."""
+    try:
+        document = parse_yaml(path.read_text(), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}") from error
+    if not isinstance(document.data, Mapping):
+        raise ConfigError(f"{path}: must be a map from manifest names to footprints")
+    entries = {}
+    for name, value in document.data.items():
+        try:
+            entries[str(name)] = FootprintEntry.model_validate(value)
+        except ValidationError as error:
+            problem = error.errors()[0]
+            where = (name, *problem["loc"])
+            raise ConfigError(
+                f"{path}:{document.line(where)}: {'.'.join(str(part) for part in where)}: {problem['msg']}"
+            ) from None
+    return entries
+
+
+def parse_footprint(text: str) -> FootprintEntry:
+    """`PEAK[,STEADY[,RESIDUE]]`, each a size: the flag `--footprint`. Raises ConfigError."""
+    hint = "write PEAK,STEADY,RESIDUE, e.g. 5.3GB,5.3GB,450MiB"
+    try:
+        peak, *rest = [parse_bytes(part) for part in text.split(",")]
+        if len(rest) > 2:
+            raise ValueError("at most three sizes")
+        steady = rest[0] if rest else peak
+        return FootprintEntry(
+            load_peak=peak, steady=steady, residue=rest[1] if len(rest) == 2 else d.RESIDUE_BYTES
+        )
+    except ValueError as error:
+        raise ConfigError(f"--footprint {text}: {_reason(error)}", hint=hint) from None
+
+
+def footprint_for(manifest: RSkillManifest, entries: Mapping[str, FootprintEntry]) -> FootprintEntry:
+    """The entry of a manifest, else what it declares for its number format. Raises ConfigError if nobody says anything."""
+    if entry := entries.get(manifest.name):
+        return entry
+    if manifest.declared_vram_gb is None:
+        raise ConfigError(
+            f"nobody says how many bytes {manifest.name} needs",
+            hint="add it to configs/models/footprints.yaml, declare min_vram_gb for its dtype, or pass --footprint",
+        )
+    declared = round(manifest.declared_vram_gb * GB)
+    return FootprintEntry(
+        load_peak=declared, steady=declared, residue=min(declared, d.RESIDUE_BYTES), source="min_vram_gb"
+    )
+
+
+def _reason(error: ValueError) -> str:
+    return error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)

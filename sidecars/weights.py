@@ -1,0 +1,107 @@
+"""Where weights come from, and the one call that loads them: a hub id and a local folder take the same path.
+
+`local://models/x` is CONFIGS/models/x; `hf://owner/repo[@revision]` is a repository of the hub. Knows nothing of devices' bytes or leases.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from schemas.errors import ConfigError, ModelError
+from schemas.manifest import RSkillManifest
+from schemas.manifest.vocabulary import Dtype
+
+CONFIGS_VARIABLE = "VRAM_ARBITER_CONFIGS"
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """`source` is what `from_pretrained` takes: a folder or `owner/repo`."""
+
+    source: str
+    revision: str | None = None
+    local: bool = False
+
+
+def configs_folder(environ: Mapping[str, str]) -> Path:
+    """Folder of skills, models and scenes: named by the environment, inside the installed package, or in the source tree."""
+    if explicit := environ.get(CONFIGS_VARIABLE):
+        return Path(explicit)
+    import schemas
+
+    package = Path(schemas.__file__).parent
+    installed = package / "_configs"
+    return installed if installed.is_dir() else package.parent / "configs"
+
+
+def resolve(uri: str, configs: Path) -> Weights:
+    """Read a manifest's `weights_uri`. Raises ConfigError if it leads nowhere or out of the configs folder."""
+    scheme, _, rest = uri.partition("://")
+    if scheme == "hf":
+        source, _, revision = rest.partition("@")
+        return Weights(source, revision or None)
+    folder = (configs / rest).resolve()
+    if scheme != "local" or not folder.is_relative_to(configs.resolve()):
+        raise ConfigError(
+            f"weights_uri {uri!r} is not a place for weights",
+            hint="write hf://OWNER/REPO or local://models/NAME",
+        )
+    if not folder.is_dir():
+        raise ConfigError(
+            f"no weights in {folder}", hint=f"{uri} is looked up below {configs}; see {CONFIGS_VARIABLE}"
+        )
+    return Weights(str(folder), local=True)
+
+
+def from_pretrained(cls: Any, weights: Weights, **options: Any) -> Any:
+    """`cls.from_pretrained` for any class of transformers or lerobot. Raises ModelError if the checkpoint does not fit the class."""
+    if weights.local:
+        options["local_files_only"] = True
+    elif weights.revision:
+        options["revision"] = weights.revision
+    try:
+        return cls.from_pretrained(weights.source, **options)
+    except (OSError, ValueError, KeyError, TypeError, ImportError) as error:
+        raise ModelError(
+            f"{cls.__name__} cannot load {weights.source}: {type(error).__name__}: {error}",
+            hint="is it complete, and of the kind that the manifest says?",
+        ) from error
+
+
+def model_options(manifest: RSkillManifest, weights: Weights, device: str) -> dict[str, Any]:
+    """Options for loading a transformers model onto `device` as in production.
+
+    On the CPU: nothing, float32 as saved. On CUDA: shards go straight to the card, one after the other (never the whole model twice), in the
+    manifest's number format; `int4` is NF4 through bitsandbytes, unless the checkpoint is quantized already and says so itself.
+    """
+    os.environ.setdefault(
+        "HF_DEACTIVATE_ASYNC_LOAD", "1"
+    )  # transformers then loads shard by shard: a lower peak
+    if not device.startswith("cuda"):
+        return {}
+    import torch
+
+    dtype = manifest.quantization.dtype
+    options: dict[str, Any] = {"device_map": {"": device}, "low_cpu_mem_usage": True}
+    options["dtype"] = {Dtype.FP32: torch.float32, Dtype.FP16: torch.float16}.get(dtype, torch.bfloat16)
+    if dtype is Dtype.INT4 and not is_quantized(weights):
+        from transformers import BitsAndBytesConfig
+
+        options["quantization_config"] = BitsAndBytesConfig(
+            load_in_4bit=True,
+            bnb_4bit_quant_type="nf4",
+            bnb_4bit_compute_dtype=torch.bfloat16,
+            llm_int8_skip_modules=list(
+                manifest.quantization.extra.get("skip_modules", ("lm_head", "visual"))
+            ),
+        )
+    return options
+
+
+def is_quantized(weights: Weights) -> bool:
+    """Whether the checkpoint's own configuration says how it is quantized."""
+    from transformers import AutoConfig
+
+    return getattr(from_pretrained(AutoConfig, weights), "quantization_config", None) is not None

@@ -1,0 +1,156 @@
+"""The sidecars' two wire families: messages in, replies out. Shapes are in `schemas.sidecar`; what they do is the host's.
+
+Every bad message gets a typed error; none ends the sidecar. Both families can be spoken at once: `op` or `endpoint` decides.
+"""
+
+import logging
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any, Protocol
+
+from pydantic import ValidationError
+
+from clients.serve import Message, Peer
+from clients.sidecar import npy
+from schemas.errors import BadRequest, InternalError, LimitExceeded, UnknownOp, VramError
+from schemas.sidecar import ENDPOINT_REQUEST, OP_REQUEST, DetectOp, EndpointCall, LoadOp, OpRequest, QueryOp
+
+PENDING_MAX = 32  # model requests that wait or run; beyond this, `ping` would have to wait too
+Call = OpRequest | EndpointCall
+Send = Callable[[Peer, Message], Awaitable[None]]
+_log = logging.getLogger("sidecars")
+
+
+class Host(Protocol):
+    """What the wire needs of its host."""
+
+    @property
+    def model_ops(self) -> frozenset[str]: ...
+
+    def identity(self) -> dict[str, Any]: ...
+
+    async def load(self, timeout_s: float | None, traceparent: str | None) -> dict[str, Any]: ...
+
+    async def unload(self) -> None: ...
+
+    async def run(self, name: str, call: DetectOp | QueryOp | EndpointCall) -> dict[str, Any]: ...
+
+    def stop(self) -> None: ...
+
+
+class Wire:
+    """Answers messages for one host: give `handle` to `RouterServer.serve`."""
+
+    def __init__(self, host: Host, send: Send) -> None:
+        self._host = host
+        self._send = send
+        self._pending = 0
+
+    async def handle(self, peer: Peer, message: Message) -> None:
+        try:
+            call = parse(message, self._host.model_ops)
+            reply = npy.pack(await self._answer(call))
+        except VramError as error:
+            reply = error_reply(error)
+        except Exception as error:  # noqa: BLE001  the outermost loop of a server: a defect of ours must not end it
+            _log.exception("internal error while answering")
+            reply = error_reply(
+                InternalError(f"{type(error).__name__}: {error}", hint="this is a defect; see the log")
+            )
+        if isinstance(number := message.get("id"), int):
+            reply = {**reply, "re": number}
+        await self._send(peer, reply)
+
+    async def _answer(self, call: Call) -> dict[str, Any]:
+        name = name_of(call)
+        if name == "ping":
+            return self._host.identity()
+        if name == "shutdown":
+            self._host.stop()
+            return {"ok": True}
+        if name == "unload":
+            await self._host.unload()
+            return {"ok": True}
+        if self._pending >= PENDING_MAX:
+            raise LimitExceeded(
+                f"{PENDING_MAX} requests wait already",
+                hint="wait for answers",
+                details={"limit": "pending requests"},
+            )
+        self._pending += 1
+        try:
+            if name == "load":
+                return await self._host.load(_timeout_s(call), call.traceparent)
+            assert isinstance(call, DetectOp | QueryOp | EndpointCall), "what is left is for the model"
+            return await self._host.run(name, call)
+        finally:
+            self._pending -= 1
+
+
+def parse(message: Message, model_ops: frozenset[str]) -> Call:
+    """A request from a decoded message. Raises UnknownOp (details.known) or BadRequest (details.fields)."""
+    known = sorted({"ping", "load", "unload", "shutdown"} | model_ops)
+    family = "endpoint" if "endpoint" in message else "op"
+    name = message.get(family)
+    if not isinstance(name, str):
+        raise BadRequest(
+            "a message names its op or endpoint", hint='e.g. {"op": "ping"}', details={"known": known}
+        )
+    if name not in known:
+        raise UnknownOp(
+            f"unknown {family} {name[:40]!r}", hint=f"known: {', '.join(known)}", details={"known": known}
+        )
+    try:
+        if family == "op":
+            return OP_REQUEST.validate_python(message)
+        call = ENDPOINT_REQUEST.validate_python({**message, "data": _unpack(message.get("data"))})
+    except ValidationError as error:
+        fields = [_field(problem) for problem in error.errors(include_input=False, include_url=False)]
+        raise BadRequest(
+            f"{name}: {fields[0]}", hint="see schemas/sidecar.py", details={"fields": fields}
+        ) from None
+    _timeout_s(call)
+    return call
+
+
+def name_of(call: Call) -> str:
+    return call.endpoint if isinstance(call, EndpointCall) else call.op
+
+
+def error_reply(error: VramError) -> Message:
+    """The field's `{"ok": false, "error": "Type: message"}`, with our code, hint and numbers beside it."""
+    wire = error.to_wire()
+    return {"ok": False, **wire, "error": f"{type(error).__name__}: {error.message}"}
+
+
+def _unpack(data: Any) -> Any:
+    try:
+        return npy.unpack(data)
+    except (ValueError, TypeError, KeyError, RecursionError, MemoryError) as error:
+        raise BadRequest(
+            f"data: {error}", hint="arrays are {'__ndarray_class__': true, 'as_npy': bytes}"
+        ) from None
+
+
+def _timeout_s(call: Call) -> float | None:
+    """Of `load`, in either family. Raises BadRequest."""
+    if isinstance(call, LoadOp):
+        return call.timeout_s
+    if isinstance(call, EndpointCall) and call.endpoint == "load" and call.data:
+        value = call.data.get("timeout_s")
+        if value is not None and (
+            isinstance(value, bool) or not isinstance(value, int | float) or not value >= 0
+        ):
+            raise BadRequest(
+                "load: data.timeout_s must be seconds, 0 or more", details={"fields": ["data.timeout_s"]}
+            )
+        return value
+    return None
+
+
+def _field(problem: Mapping[str, Any]) -> str:
+    where = ".".join(
+        str(part)
+        for part in problem["loc"]
+        if part not in ("ping", "load", "unload", "shutdown", "detect", "query")
+    )
+    return f"{where or 'the message'}: {problem['msg']}"

@@ -1,0 +1,50 @@
+"""The one thread that touches model and device. The event loop hands it work and stays free for `ping` and `revoke`."""
+
+import asyncio
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+from schemas.errors import ModelError, OutOfMemory, VramError
+
+
+class Worker:
+    """Runs one piece of work after the other, in the order given. `stopping` ends waits inside the work (throttled loads)."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="model")
+        self.stopping = threading.Event()
+
+    async def run[T](self, work: Callable[[], T]) -> T:
+        """Do the work and wait for it, also if the caller is cancelled meanwhile: a model is never left half loaded.
+
+        Raises the work's own typed error; any other failure comes as ModelError, a full card as OutOfMemory.
+        """
+        future = asyncio.get_running_loop().run_in_executor(self._pool, self._guarded, work)
+        try:
+            return await asyncio.shield(future)
+        except asyncio.CancelledError:
+            await asyncio.wait([future])
+            if not future.cancelled():
+                future.exception()  # was seen: asyncio need not complain
+            raise
+
+    def close(self) -> None:
+        """Refuse further work; what runs now ends by itself."""
+        self.stopping.set()
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    @staticmethod
+    def _guarded[T](work: Callable[[], T]) -> T:
+        try:
+            return work()
+        except VramError:
+            raise
+        except (
+            Exception
+        ) as error:  # any failure inside a model is an answer to the caller, not the end of the sidecar
+            if (
+                type(error).__name__ == "OutOfMemoryError"
+            ):  # torch's; importing torch to say so would cost seconds
+                raise OutOfMemory(str(error)) from error
+            raise ModelError(f"{type(error).__name__}: {error}", hint="see the sidecar's log") from error

@@ -1,0 +1,161 @@
+"""No bytes make the codec raise anything but a typed, answerable error."""
+
+from typing import Any
+
+import msgpack
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from arbiter.rpc import codec
+from schemas.errors import BadFrame, BadRequest, MessageTooLarge, UnknownOp
+from schemas.wire import Acquire, Ping
+
+LIMIT = 1 << 20
+
+
+def undecodable(payload: bytes) -> codec.Undecodable:
+    with pytest.raises(codec.Undecodable) as raised:
+        codec.decode(payload, LIMIT)
+    return raised.value
+
+
+def pack(**message: Any) -> bytes:
+    packed: bytes = msgpack.packb(message)
+    return packed
+
+
+def test_a_request_is_read() -> None:
+    assert codec.decode(pack(op="ping", id=7), LIMIT) == Ping(op="ping", id=7)
+
+
+def test_a_nested_request_is_read() -> None:
+    spec = {"consumer": "c", "model_id": "m", "footprint": {"load_peak_bytes": 5, "steady_bytes": 4}}
+    request = codec.decode(pack(op="acquire", id=1, nonce="n", spec=spec), LIMIT)
+    assert isinstance(request, Acquire)
+    assert request.spec.footprint.load_peak_bytes == 5
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xc1",  # never used by msgpack
+        b"not msgpack at all",
+        msgpack.packb([1, 2]),
+        msgpack.packb(None),
+        msgpack.packb({"op": "ping", "id": 1}) + b"\x00",  # something behind the message
+        msgpack.packb({"op": "ping", "id": 1})[:-1],  # torn
+        b"\x91" * 2000,  # nested deeper than any stack
+        b"\x81\x01\x02",  # a key that is no text
+        b"\xa2\xff\xfe",  # text that is no UTF-8
+        b"\xdd\xff\xff\xff\xff",  # a list that claims four billion items
+    ],
+)
+def test_what_is_no_map_is_a_bad_frame(payload: bytes) -> None:
+    bad = undecodable(payload)
+    assert isinstance(bad.error, BadFrame)
+    assert bad.request_id is None
+
+
+def test_an_oversized_message_names_the_limit() -> None:
+    bad = undecodable(b"\x00" * (LIMIT + 1))
+    assert isinstance(bad.error, MessageTooLarge)
+    assert bad.error.details == {"size_bytes": LIMIT + 1, "limit_bytes": LIMIT}
+
+
+def test_an_unknown_op_lists_the_known_ones() -> None:
+    bad = undecodable(pack(op="explode", id=3))
+    assert isinstance(bad.error, UnknownOp)
+    assert "acquire" in bad.error.details["known"]
+    assert bad.request_id == 3
+
+
+def test_a_long_unknown_op_is_not_echoed_at_length() -> None:
+    assert len(undecodable(pack(op="x" * 100_000, id=3)).error.message) < 200
+
+
+def test_wrong_fields_are_listed_by_name() -> None:
+    spec = {"consumer": "", "model_id": "m", "footprint": {"load_peak_bytes": -1}, "colour": "red"}
+    bad = undecodable(pack(op="acquire", id=9, nonce="n", spec=spec))
+    assert isinstance(bad.error, BadRequest)
+    assert bad.request_id == 9
+    fields = {field["field"] for field in bad.error.details["fields"]}
+    assert fields == {
+        "spec.consumer",
+        "spec.footprint.load_peak_bytes",
+        "spec.footprint.steady_bytes",
+        "spec.colour",
+    }
+
+
+def test_thousands_of_wrong_fields_make_a_short_reply() -> None:
+    bad = undecodable(pack(op="ping", id=1, **{f"extra{n}": n for n in range(5000)}))
+    assert isinstance(bad.error, BadRequest)
+    assert len(bad.error.details["fields"]) == codec.FIELDS_MAX
+    assert "4999 more" in bad.error.message
+
+
+@pytest.mark.parametrize("request_id", [-1, 1 << 53, "one", None, 1.5])
+def test_an_unusable_id_is_answered_with_null(request_id: object) -> None:
+    bad = undecodable(pack(op="ping", id=request_id))
+    assert isinstance(bad.error, BadRequest)
+    assert bad.request_id is None
+
+
+def test_a_request_without_op_is_a_bad_request() -> None:
+    assert isinstance(undecodable(pack(id=1)).error, BadRequest)
+
+
+def outcome(payload: bytes) -> codec.Undecodable | None:
+    """None for a request. Anything else than a request or Undecodable fails the test by itself."""
+    try:
+        codec.decode(payload, LIMIT)
+    except codec.Undecodable as bad:
+        return bad
+    return None
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=400))
+def test_any_bytes_are_a_request_or_a_typed_error(payload: bytes) -> None:
+    bad = outcome(payload)
+    assert bad is None or codec.refusal(bad.request_id, 1, bad.error.to_wire())
+
+
+_VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(1 << 63), (1 << 64) - 1)
+    | st.floats()
+    | st.text()
+    | st.binary(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=10,
+)
+_OPS = st.sampled_from(["hello", "acquire", "renew", "history", "release", "reattach", "oom", "use_begin"])
+_FIELDS = st.dictionaries(
+    st.sampled_from(["spec", "nonce", "lease_id", "token", "leases", "use_id", "after", "version", "name"]),
+    _VALUES,
+)
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(_OPS, st.integers(0, 100), _FIELDS)
+def test_any_fields_are_a_request_or_a_typed_error(op: str, request_id: int, fields: dict[str, Any]) -> None:
+    bad = outcome(pack(**{**fields, "op": op, "id": request_id}))
+    if bad is not None:
+        assert bad.request_id == request_id
+        assert codec.refusal(bad.request_id, 1, bad.error.to_wire())
+
+
+def test_replies_have_the_shape_of_the_wire() -> None:
+    assert msgpack.unpackb(codec.reply(4, 2, {"a": 1})) == {"re": 4, "epoch": 2, "ok": True, "a": 1}
+    error = {"code": "bad_frame", "message": "m", "hint": "", "details": {}}
+    assert msgpack.unpackb(codec.refusal(None, 2, error)) == {
+        "re": None,
+        "epoch": 2,
+        "ok": False,
+        "error": error,
+    }
+    assert msgpack.unpackb(codec.push(8, 2, {"push": "lost"})) == {"push": "lost", "seq": 8, "epoch": 2}

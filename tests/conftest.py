@@ -1,0 +1,44 @@
+"""Fixtures for every test of the product: a real arbiter daemon in a folder of its own."""
+
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from arbiter.testing.wire import WireClient
+
+
+@pytest.fixture
+def make_arbiter() -> Iterator[Callable[..., ArbiterProcess]]:
+    """`make_arbiter(gpu="fake:8GiB", arguments=(), config=None)` prepares a daemon; call `.start()` on it. Ended at teardown."""
+    made: list[ArbiterProcess] = []
+
+    def make(
+        gpu: str = "fake:8GiB", arguments: tuple[str, ...] = (), config: str | None = None
+    ) -> ArbiterProcess:
+        made.append(ArbiterProcess(gpu, arguments, config))
+        return made[-1]
+
+    yield make
+    for arbiter in made:
+        arbiter.close()
+
+
+@pytest.fixture
+def arbiter_daemon(make_arbiter: Callable[..., ArbiterProcess]) -> ArbiterProcess:
+    """A running daemon with one simulated card of 8 GiB."""
+    return make_arbiter().start()
+
+
+@pytest.fixture
+def connect(arbiter_daemon: ArbiterProcess) -> Iterator[Callable[..., WireClient]]:
+    """`connect()` makes a bare connection to `arbiter_daemon` (no hello yet)."""
+    made: list[WireClient] = []
+
+    def make(**options: object) -> WireClient:
+        made.append(WireClient(arbiter_daemon.endpoint, **options))  # type: ignore[arg-type]  # handed on as they are
+        return made[-1]
+
+    yield make
+    for client in made:
+        client.close()
