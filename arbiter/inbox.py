@@ -109,7 +109,7 @@ class Inbox:
     def _state(self) -> str:
         try:
             return json.dumps(self.status(), default=str)
-        except Exception as error:  # the state may be what is broken
+        except Exception as error:  # noqa: BLE001 - the state may be what is broken; this is its last word
             return f"unreadable: {error!r}"
 
     def _arm(self) -> None:

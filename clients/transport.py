@@ -47,6 +47,7 @@ class Transport:
         loop.add_reader(self._monitor.fileno(), self._drain_monitor)
         self._socket.connect(endpoint)
         self._schedule_drain()
+        loop.call_soon(self._drain_monitor)  # libzmq only signals a reader that found nothing once
 
     def send(self, message: dict[str, Any]) -> bool:
         """Queue one message. False: the queue is full, the other side does not read."""

@@ -19,7 +19,9 @@ from schemas.world import CameraModel
 Encoding = Literal["jpeg", "png"]
 JPEG_QUALITY = 90
 PNG_COMPRESSION = 1  # local sockets are fast, cores are few
-FIRST_FRAME_GRACE_S = 1.0  # a tick may be long once (scene set-up); a hung loop is refused after this at the latest
+FIRST_FRAME_GRACE_S = (
+    1.0  # a tick may be long once (scene set-up); a hung loop is refused after this at the latest
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,7 +52,9 @@ class Envelope:
                 low, high = self.joint_limits[name]
                 excess = max(low - value, value - high, 0.0)
                 if excess > 0:
-                    problems.append(f"{name}: {value:.3f} rad is {excess:.3f} outside [{low:.3f}, {high:.3f}]")
+                    problems.append(
+                        f"{name}: {value:.3f} rad is {excess:.3f} outside [{low:.3f}, {high:.3f}]"
+                    )
                     withheld |= excess > self.clamp_tolerance_rad
                 values.append(min(max(value, low), high))
             rows.append(tuple(values))

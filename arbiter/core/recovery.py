@@ -153,6 +153,7 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
     lease.attached = True
     if lease.state is LeaseState.LOADING and item.held:  # its `ready` was lost
         become_held(core, lease, item.measured_bytes)
+        core.record_lease(lease)
     _restore_uses(core, lease, client, item)
     touch(core, lease)
     account_for(core, lease.id)

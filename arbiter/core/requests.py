@@ -268,6 +268,7 @@ def ready(core: Core, event: ReadyReported) -> None:
         raise _bad_state(lease, "only a loading lease becomes ready")
     become_held(core, lease, event.measured_bytes)
     core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
+    core.record_lease(lease)  # after the reply: a record that fails here only makes a recovery more careful
     core.learn(lease.spec.consumer, "load_s", core.now - lease.granted_at)
     core.note(
         "ready",
@@ -288,7 +289,6 @@ def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     steady = lease.steady_bytes if measured_bytes is None else max(measured_bytes, lease.spec.residue_bytes)
     gpu.ledger.recharge(lease.id, steady, core.now)
     gpu.changed_at = core.now
-    core.record_lease(lease)
     core.wake(gpu)
 
 

@@ -77,7 +77,8 @@ def _bereave(core: Core, lease: Lease) -> None:
 
 
 def on_journal_failed(core: Core, event: JournalFailed) -> None:
-    """A grant that could not be written was not sent: it is taken back, and its asker is told.
+    """A grant that could not be written was not sent: it is taken back. The executor refuses the request whose
+    reply it held back; a waiter that was to hear by push is denied here.
 
     Other records only make a later recovery more careful; they are worth a note.
     """
@@ -95,9 +96,7 @@ def on_journal_failed(core: Core, event: JournalFailed) -> None:
         key=event.key,
     )
     lease.move(LeaseState.DENIED, core.now, refused.message)
-    if lease.request is not None:  # the reply was held back with the record
-        core.refuse(lease.client, lease.request, refused)
-    else:
+    if lease.request is None:  # else: whoever held the reply back has refused the request
         core.push(lease, {"push": "denied", "lease_id": lease.id, "error": refused.wire()})
     core.note("denied", lease, code=refused.code, reason=refused.message)
     core.end(lease, refused.wire())

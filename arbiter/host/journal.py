@@ -112,7 +112,7 @@ class Journal:
 
 
 def _connect(path: Path) -> sqlite3.Connection:
-    connection = sqlite3.connect(path, isolation_level=None, timeout=1.0)
+    connection = sqlite3.connect(path, isolation_level=None, timeout=0.1)
     try:
         path.chmod(0o600)
         connection.execute("PRAGMA journal_mode=WAL")

@@ -150,7 +150,12 @@ class CoreDriver:
         performed: list[Effect] = []
         for effect in effects:
             if failed and _names(effect, failed[0].key.removeprefix("lease:")):
-                continue  # held back with its record
+                if isinstance(effect, Reply):
+                    details = {"key": failed[0].key}
+                    performed.append(
+                        Refuse(effect.client, effect.request, "journal_unavailable", self.journal_failing, "", details)
+                    )
+                continue  # held back with its record, as the executor does
             performed.append(effect)
             match effect:
                 case JournalPut():

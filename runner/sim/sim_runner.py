@@ -101,7 +101,6 @@ class SimRunner(RunnerBase):
         episodes: int | None = None,
         max_steps: int | None = None,
         judge: Callable[[Environment], bool] | None = None,
-        object_centre_m: float = 0.0,
         recorder: Recorder | None = None,
         video_camera: str = "overview",
         video_every: int = 3,
@@ -113,7 +112,6 @@ class SimRunner(RunnerBase):
         self._episodes_wanted = episodes
         self._max_steps = max_steps
         self._judge = judge
-        self._object_centre_m = object_centre_m
         self._recorder = recorder
         self._video_camera = video_camera
         self._video_every = video_every
@@ -177,7 +175,11 @@ class SimRunner(RunnerBase):
             return
         self._active = None
         self.progress = Progress(1.0 if ended.error is None else self.progress.fraction, "ended")
-        ticks = {"ticks": self.tick_idx - active.began_tick, "withheld": active.withheld, "clamped": active.clamped}
+        ticks = {
+            "ticks": self.tick_idx - active.began_tick,
+            "withheld": active.withheld,
+            "clamped": active.clamped,
+        }
         active.on_end(SkillEnded({**ticks, **ended.data}, ended.error))
 
     # -- pictures -----------------------------------------------------------------------------------------------------
@@ -195,13 +197,7 @@ class SimRunner(RunnerBase):
 
     def _render(self, camera: str) -> Snapshot:
         rgb = self.env.render(camera)
-        model = self.env.camera_model(camera)
-        if self._object_centre_m:
-            # what a detector's box centres on is the middle of a thing, not the table below it
-            model = model.model_copy(
-                update={"support_plane_z": model.support_plane_z + self._object_centre_m}
-            )
-        snapshot = Snapshot(camera, rgb, self.clock.now_ns(), model)
+        snapshot = Snapshot(camera, rgb, self.clock.now_ns(), self.env.camera_model(camera))
         self._snapshots[camera] = snapshot
         return snapshot
 
@@ -230,7 +226,9 @@ class SimRunner(RunnerBase):
             world = self._world(frames)  # 4
         except ValidationError as error:  # a state that is not finite: nobody may act on it
             self.world = None
-            self._end(SkillEnded({}, InternalError(f"the robot's state is invalid: {error.errors()[0]['msg']}")))
+            self._end(
+                SkillEnded({}, InternalError(f"the robot's state is invalid: {error.errors()[0]['msg']}"))
+            )
             return Decision(safety_violations=("the robot's state is invalid",))
         self.world = world
         decision = Decision(
@@ -265,7 +263,10 @@ class SimRunner(RunnerBase):
                 return
         if self._active is active:
             self.progress = Progress(
-                min(max(active.skill.fraction, 0.0), 1.0), "running", self.tick_idx - active.began_tick, active.detail
+                min(max(active.skill.fraction, 0.0), 1.0),
+                "running",
+                self.tick_idx - active.began_tick,
+                active.detail,
             )
 
     def _check(self, active: _Active, action: Action, world: WorldState, decision: Decision) -> None:

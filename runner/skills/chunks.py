@@ -47,7 +47,9 @@ class ChunkPlayer:
         """(index of the chunk, row) to play now, or None while the next chunk is awaited. Raises what the fetch raised."""
         if self.wants_observation():
             if observation is None:
-                raise ModelError("no observation for the next chunk", hint="the world state came without frames")
+                raise ModelError(
+                    "no observation for the next chunk", hint="the world state came without frames"
+                )
             self._under_way = self._fetch(observation)
         if not self._rows:
             self._collect(self._wait_s)

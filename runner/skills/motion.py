@@ -30,7 +30,12 @@ class JointRamp:
     """From where the joints are to `goal` (rad, by name) at a bounded speed. `done` when they arrived, or cannot go further."""
 
     def __init__(
-        self, start: Mapping[str, float], goal: Mapping[str, float], *, period_s: float, speed_rad_s: float = SPEED_RAD_S
+        self,
+        start: Mapping[str, float],
+        goal: Mapping[str, float],
+        *,
+        period_s: float,
+        speed_rad_s: float = SPEED_RAD_S,
     ) -> None:
         self._target = {name: start[name] for name in goal}
         self._goal = dict(goal)

@@ -27,7 +27,7 @@ class CompactActConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
         }
     )
     views: dict[str, list[list[float]]] = field(default_factory=dict)
-    channels: list[int] = field(default_factory=lambda: [16, 32, 40, 48])
+    channels: list[int] = field(default_factory=lambda: [16, 24, 24, 32])
     keypoints: int = 32
     hidden_dim: int = 256
     aux_point_dim: int = 3

@@ -192,8 +192,7 @@ def train(
         for group in optimizer.param_groups:
             group["lr"] = config.optimizer_lr * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * progress)))
         policy.train()
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            loss, parts = policy(batches.draw(batch_size))
+        loss, parts = policy(batches.draw(batch_size))
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
@@ -218,8 +217,8 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m sidecars.training.policy", description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder written by runner.sim.dataset grab")
     parser.add_argument("--out", type=Path, required=True, help="checkpoint folder")
-    parser.add_argument("--steps", type=int, default=6000)
-    parser.add_argument("--batch-size", type=int, default=64)
+    parser.add_argument("--steps", type=int, default=7000)
+    parser.add_argument("--batch-size", type=int, default=32)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--action-steps", type=int, default=6, help="how many of a chunk's targets are executed")
     parser.add_argument("--threads", type=int, default=min(2, os.cpu_count() or 1))

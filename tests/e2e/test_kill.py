@@ -120,7 +120,7 @@ class Box:
 
     def check(self) -> None:
         report = check_log(self.log())
-        assert report.problems == ()
+        assert not report.problems
         assert report.oom_events == 0
         assert report.peak_bytes <= CAPACITY
 

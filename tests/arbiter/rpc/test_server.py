@@ -203,17 +203,15 @@ def test_many_clients_at_once(serving: Serving) -> None:
 
 def test_a_second_connection_under_a_living_routing_id_gets_nothing(serving: Serving) -> None:
     """Whoever copies a routing id must not receive its pushes."""
-    with (
-        WireClient(f"ipc://{serving.path}", routing_id=b"me") as mine,
-        WireClient(f"ipc://{serving.path}", routing_id=b"me") as thief,
-    ):
+    with WireClient(f"ipc://{serving.path}", routing_id=b"me") as mine:
         mine.send_raw(b"x")
         assert mine.receive() is not None
-        thief.send_raw(b"xx")
-        assert thief.receive(0.2) is None
-        serving.call(lambda: serving.server.send(b"me", False, msgpack.packb({"push": "secret"})))
-        assert mine.receive() == {"push": "secret"}
-        assert thief.receive(0.2) is None
+        with WireClient(f"ipc://{serving.path}", routing_id=b"me") as thief:
+            thief.send_raw(b"xx")
+            assert thief.receive(0.2) is None
+            serving.call(lambda: serving.server.send(b"me", False, msgpack.packb({"push": "secret"})))
+            assert mine.receive() == {"push": "secret"}
+            assert thief.receive(0.2) is None
 
 
 def test_a_stale_socket_is_replaced_and_close_removes_it(folder: Path) -> None:

@@ -1,0 +1,77 @@
+"""The installed skills: manifests by name, which of them a goal may execute, and who makes them.
+
+Only kinds that move something can be executed: a detector, a scene VLM or a reward model never, whoever asks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from runner.protocols import Skill, SkillKey
+from schemas.errors import ManifestInvalid, UnknownSkill
+from schemas.manifest import Kind, ManifestError, RSkillManifest, load_manifest
+
+EXECUTABLE = frozenset({Kind.VLA, Kind.ROS_ACTION, Kind.ROS_SERVICE})
+DEADLINE_S = 45.0  # of a goal when neither it nor its manifest says one
+FILE_NAME = "rskill.yaml"
+
+Maker = Callable[[RSkillManifest], Skill]
+
+
+def read_manifests(paths: Iterable[Path]) -> list[RSkillManifest]:
+    """Manifests of files, or of folders that hold `rskill.yaml` files at any depth. Raises ManifestInvalid for a wrong one, or none."""
+    files: list[Path] = []
+    for path in paths:
+        files += sorted(path.rglob(FILE_NAME)) if path.is_dir() else [path]
+    manifests: dict[str, RSkillManifest] = {}
+    for file in files:
+        try:
+            manifest = load_manifest(file)
+        except ManifestError as error:
+            raise ManifestInvalid(
+                str(error), hint="`python -m schemas check FILE` shows every finding"
+            ) from error
+        if manifest.name in manifests:
+            raise ManifestInvalid(f"{manifest.name} is installed twice, again by {file}")
+        manifests[manifest.name] = manifest
+    if not manifests:
+        raise ManifestInvalid("no skill is installed", hint=f"--skills takes folders with {FILE_NAME} files")
+    return list(manifests.values())
+
+
+class Catalogue:
+    """`makers` says how a skill of a kind is made; kinds without a maker are listed but not executed."""
+
+    def __init__(self, manifests: Iterable[RSkillManifest], makers: Mapping[Kind, Maker]) -> None:
+        self._manifests = {manifest.name: manifest for manifest in manifests}
+        self._makers = {kind: maker for kind, maker in makers.items() if kind in EXECUTABLE}
+
+    def find(
+        self, rskill_id: str, revision: str = ""
+    ) -> tuple[SkillKey, Callable[[], Skill], RSkillManifest]:
+        """Key, maker and manifest of an executable skill. Raises UnknownSkill, which says what there is."""
+        manifest = self._manifests.get(rskill_id)
+        runnable = [m.name for m in self._manifests.values() if m.kind in self._makers]
+        if manifest is None:
+            raise UnknownSkill(
+                f"no skill {rskill_id!r} is installed", hint=f"choose from {', '.join(runnable)}"
+            )
+        maker = self._makers.get(manifest.kind)
+        if maker is None:
+            raise UnknownSkill(
+                f"{rskill_id} is a {manifest.kind} and cannot be executed",
+                hint=f"choose from {', '.join(runnable)}",
+            )
+        if revision not in ("", manifest.version):
+            raise UnknownSkill(f"{rskill_id} is installed as {manifest.version}, not {revision}")
+        return SkillKey(manifest.name, manifest.version), lambda: maker(manifest), manifest
+
+    def deadline_s(self, manifest: RSkillManifest, asked_s: float) -> float:
+        """Seconds a goal may take in all: as asked, else the manifest's, else 45."""
+        return asked_s or manifest.latency_budget.max_execution_s or DEADLINE_S
+
+    def as_wire(self) -> list[dict[str, Any]]:
+        """All manifests as plain maps, for a reasoner's palette."""
+        return [manifest.model_dump(mode="json") for manifest in self._manifests.values()]

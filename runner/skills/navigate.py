@@ -1,0 +1,244 @@
+"""`navigate`: drive the base to a pose, square up to a point on the table, or turn in place. Needs no GPU and takes no lease.
+
+Goal parameters as Nav2's NavigateToPose (`pose` with `header.frame_id` map, odom or base_link), or `target_point` (x, y, z in base_link:
+stand so that this point lies where the arm grasps), or `turn_rad`. The arm folds first, its gripper stays as it is. Places in
+`base_link` mean the base as it stands when the first step is taken; the planar simulator's odometry is its map.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from runner.protocols import Act, Done, Goal, Hold, StepOutcome
+from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
+from runner.sim.navigate import PlanarController, Pose2D, standoff_pose, to_map
+from runner.skills.base import SkillBase
+from runner.skills.motion import JointRamp, is_at, joint_positions
+from schemas.control import ControlMode
+from schemas.errors import BadRequest, GoalRejected, ModelError
+from schemas.manifest import RSkillManifest
+from schemas.world import Action, Finite, WorldState
+
+SETTLE_STEPS = 8  # standing still at the goal, so that the next picture is sharp and the pose is final
+STUCK_STEPS = 120  # four seconds at 30 Hz without coming closer
+CLOSER_M, CLOSER_RAD = 0.002, 0.005  # what counts as closer
+FOLDED_JOINTS = ARM_JOINTS[:-1]  # the gripper may hold something
+
+Distance = Annotated[Finite, Field(ge=-100, le=100)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Position(_Part):
+    x: Distance
+    y: Distance
+    z: Distance = 0.0
+
+
+class Orientation(_Part):
+    """Quaternion; only its turn about the vertical counts."""
+
+    x: Finite = 0.0
+    y: Finite = 0.0
+    z: Finite = 0.0
+    w: Finite = 1.0
+
+    @model_validator(mode="after")
+    def _check(self) -> Orientation:
+        if math.hypot(self.x, self.y, self.z, self.w) < 1e-6:
+            raise ValueError("a quaternion has length 1, this one is zero")
+        return self
+
+    @property
+    def yaw_rad(self) -> float:
+        return math.atan2(
+            2 * (self.w * self.z + self.x * self.y), self.w**2 + self.x**2 - self.y**2 - self.z**2
+        )
+
+
+class Header(BaseModel):
+    """As ROS writes it; stamps and the like are ignored."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+    frame_id: Literal["map", "odom", "base_link"]
+
+
+class PlainPose(_Part):
+    position: Position
+    orientation: Orientation = Orientation()
+
+
+class StampedPose(_Part):
+    header: Header
+    pose: PlainPose
+
+
+class NavigateParams(_Part):
+    """What a goal may ask for: `target_point` and `turn_rad` go before `pose`, which the manifest's default always gives."""
+
+    pose: StampedPose | None = None
+    target_point: Position | None = None
+    turn_rad: Annotated[Finite, Field(ge=-2 * math.pi, le=2 * math.pi)] | None = None
+    behavior_tree: str = ""
+
+    @model_validator(mode="after")
+    def _check(self) -> NavigateParams:
+        if self.target_point is not None and self.turn_rad is not None:
+            raise ValueError("give target_point or turn_rad, not both")
+        if self.pose is None and self.target_point is None and self.turn_rad is None:
+            raise ValueError("give pose, target_point or turn_rad")
+        return self
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Deep merge: maps are merged, everything else of `over` replaces."""
+    merged = dict(base)
+    for key, value in over.items():
+        known = merged.get(key)
+        merged[key] = (
+            merge(known, value) if isinstance(known, Mapping) and isinstance(value, Mapping) else value
+        )
+    return merged
+
+
+def parse_params(manifest: RSkillManifest, params: Mapping[str, Any]) -> NavigateParams:
+    """The goal's parameters over the manifest's defaults. Raises BadRequest, field by field."""
+    defaults = json.loads(manifest.ros_integration.default_goal_json) if manifest.ros_integration else {}
+    try:
+        return NavigateParams.model_validate(merge(defaults, params))
+    except ValidationError as error:
+        fields = [
+            {"path": ".".join(map(str, item["loc"])) or "goal_params", "problem": item["msg"]}
+            for item in error.errors(include_url=False, include_input=False)
+        ]
+        text = "; ".join(f"{field['path']}: {field['problem']}" for field in fields)
+        raise BadRequest(f"goal_params: {text}", details={"fields": fields}) from error
+
+
+def base_pose(world: WorldState) -> Pose2D:
+    """Where the base stands on the map. Raises ModelError when that is unknown or stale: never assumed."""
+    if world.base_pose is None or "base_pose" in world.stale:
+        raise ModelError("the base's pose is not known", hint="nothing drives without odometry")
+    x, y, _ = world.base_pose.xyz
+    qx, qy, qz, qw = world.base_pose.quat_xyzw
+    return Pose2D(x, y, math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)))
+
+
+def goal_pose(params: NavigateParams, here: Pose2D, config: SceneConfig) -> Pose2D:
+    """Where to stand, on the map."""
+    if params.target_point is not None:
+        point = to_map(here, params.target_point.x, params.target_point.y)
+        return standoff_pose(point, config)
+    if params.turn_rad is not None:
+        return Pose2D(here.x_m, here.y_m, here.yaw_rad + params.turn_rad)
+    if params.pose is None:  # the validator refuses this
+        raise BadRequest("goal_params: give pose, target_point or turn_rad")
+    position, yaw = params.pose.pose.position, params.pose.pose.orientation.yaw_rad
+    if params.pose.header.frame_id == "base_link":
+        x, y = to_map(here, position.x, position.y)
+        return Pose2D(x, y, here.yaw_rad + yaw)
+    return Pose2D(position.x, position.y, yaw)
+
+
+class Navigate(SkillBase):
+    """Fold, drive, stand still. Fails with `goal_rejected` when the base stops coming closer (a table is in the way)."""
+
+    def __init__(self, manifest: RSkillManifest, config: SceneConfig, *, period_s: float) -> None:
+        super().__init__(manifest)
+        self._config = config
+        self._period_s = period_s
+        self._params: NavigateParams | None = None
+        self._reset()
+
+    def _reset(self) -> None:
+        self._fold: JointRamp | None = None
+        self._folded = False
+        self._controller: PlanarController | None = None
+        self._start_m = 0.0
+        self._settling = 0
+        self._best = (math.inf, math.inf)
+        self._since_closer = 0
+
+    async def _start(self, goal: Goal) -> None:
+        self._reset()
+        self._params = parse_params(self.manifest, goal.params)
+
+    def _step(self, world: WorldState) -> StepOutcome:
+        if self._params is None:
+            raise BadRequest("navigate was stepped without a goal")
+        if not self._folded and (action := self._fold_arm(world)) is not None:
+            return Act(action)
+        here = base_pose(world)
+        if self._controller is None:
+            goal = goal_pose(self._params, here, self._config)
+            self._controller = PlanarController(goal, self._config, control_dt_s=self._period_s)
+            self._start_m = max(self._controller.distance_m(here), 1e-3)
+        gap_m = self._controller.distance_m(here)
+        turn_rad = abs(_wrap(self._controller.goal.yaw_rad - here.yaw_rad))
+        self.fraction = min(max(1.0 - gap_m / self._start_m, 0.0), 0.99)
+        if self._controller.reached(here) or self._settling:
+            self._settling += 1
+            if self._settling > SETTLE_STEPS:
+                return Done(
+                    {
+                        "base_pose": [here.x_m, here.y_m, here.yaw_rad],
+                        "error_m": round(gap_m, 4),
+                        "error_rad": round(turn_rad, 4),
+                    }
+                )
+            return Hold("standing still")
+        self._watch(gap_m, turn_rad)
+        vx, vy, wz = self._controller.command(here)
+        return Act(
+            Action(
+                control_mode=ControlMode.BODY_TWIST,
+                body_twist=((vx, vy, 0.0, 0.0, 0.0, wz),),
+                stamp_ns=world.stamp_ns,
+            )
+        )
+
+    def _fold_arm(self, world: WorldState) -> Action | None:
+        """The next step towards the folded pose, or None once the arm is there."""
+        rest = {
+            name: value for name, value in zip(ARM_JOINTS, REST_POSE, strict=True) if name in FOLDED_JOINTS
+        }
+        measured = joint_positions(world, FOLDED_JOINTS)
+        if self._fold is None:
+            if is_at(measured, rest):
+                self._folded = True
+                return None
+            self._fold = JointRamp(measured, rest, period_s=self._period_s)
+        if self._fold.done(measured):
+            self._folded = True
+            return None
+        target = self._fold.next_target()
+        return Action(
+            control_mode=ControlMode.JOINT_POSITION,
+            joint_targets=(tuple(target.values()),),
+            joint_names=tuple(target),
+            stamp_ns=world.stamp_ns,
+        )
+
+    def _watch(self, gap_m: float, turn_rad: float) -> None:
+        best_m, best_rad = self._best
+        if gap_m < best_m - CLOSER_M or turn_rad < best_rad - CLOSER_RAD:
+            self._since_closer = 0
+            self._best = (min(gap_m, best_m), min(turn_rad, best_rad))
+            return
+        self._since_closer += 1
+        if self._since_closer > STUCK_STEPS:
+            raise GoalRejected(
+                f"the base stays {gap_m:.3f} m and {turn_rad:.3f} rad from its goal",
+                hint="the goal lies on or behind the table",
+            )
+
+
+def _wrap(angle_rad: float) -> float:
+    return math.atan2(math.sin(angle_rad), math.cos(angle_rad))

@@ -1,0 +1,332 @@
+"""A learnt policy (`vla`) that lives in its own sidecar process: this is the runner's end of it.
+
+A goal: `load` (the sidecar acquires its lease and says lease and token) → mark one use on that lease for the whole goal, so that
+nobody is evicted mid-step → arm to the start pose → `reset` → chunks, played in order → use ended. If the lease is lost in between, the
+goal fails with that error and the arm holds. Knows no robot model: joints, cameras and limits come from manifest and world state.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import logging
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from clients.sidecar.policy import PolicyClient
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from runner.protocols import Act, Done, Goal, Hold, StepOutcome
+from runner.skills.base import SkillBase
+from runner.skills.chunks import ChunkPlayer, Row
+from runner.skills.motion import JointRamp, is_at, joint_positions
+from schemas.control import ControlMode
+from schemas.errors import (
+    BadState,
+    Evicted,
+    FrameStale,
+    LeaseExpired,
+    LeaseLost,
+    LeaseRevoking,
+    ManifestInvalid,
+    ModelError,
+    NotResident,
+    StaleToken,
+    UnknownLease,
+    VramError,
+)
+from schemas.manifest import RSkillManifest
+from schemas.world import Action, SensorFrame, WorldState
+
+log = logging.getLogger(__name__)
+
+LOAD_TRIES_MAX = 20
+RETRY_S = 0.2
+CHUNK_TIMEOUT_S = 30.0  # a policy that needs longer for one chunk is gone
+LOCKSTEP_WAIT_S = 2.0  # how long one tick of a simulator waits with its world
+ROLLOUT_STEPS = 150  # unless the manifest's policy_extras say otherwise
+STILL_WINDOW = 20  # steps over which targets that move less than STILL_RAD mean that the policy has ended
+STILL_RAD = 0.01
+STILL_FROM = 0.5  # share of the rollout before which standing still is just waiting
+STATE_KEY, TASK_KEY, IMAGES_PREFIX = "observation.state", "task", "observation.images."
+ACTION_KEY = "action"
+
+# The lease went between `load` and the use: load again. Anything else is the goal's failure.
+_AGAIN = (LeaseRevoking, StaleToken, UnknownLease, LeaseLost, LeaseExpired, Evicted, NotResident, BadState)
+
+
+class Use(Protocol):
+    """A busy interval on the sidecar's lease (`clients.lease.ForeignUse`)."""
+
+    lost: VramError | None
+
+    async def end(self) -> None: ...
+
+
+class Arbiter(Protocol):
+    """What is needed of `clients.aio.ArbiterClient`."""
+
+    async def begin_use(self, lease_id: str, token: Sequence[int], label: str = "") -> Use: ...
+
+
+class View(BaseModel):
+    """A crop in fractions of the picture (x0, y0, x1, y1) and the size it is averaged down to (width, height)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    crop: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    size_px: tuple[int, int] | None = None
+
+
+class Rollout(BaseModel):
+    """The part of `policy_extras` that the runner reads; other keys belong to the sidecar's adapter."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+    rollout_steps: int = Field(default=ROLLOUT_STEPS, ge=1, le=100_000)
+    stop_when_still: bool = True
+    views: dict[str, View] = Field(default_factory=dict)
+    prefetch_at: int = Field(default=0, ge=0, le=1000)
+
+
+@dataclass(frozen=True, slots=True)
+class Wiring:
+    """How a manifest's features map to this robot: camera → feature key, joint order, start pose (rad)."""
+
+    cameras: Mapping[str, str]
+    joints: tuple[str, ...]
+    start_pose: Mapping[str, float]
+    degrees: bool
+    steps_per_chunk: int | None
+    rollout: Rollout
+
+
+def wire_up(manifest: RSkillManifest, joints: tuple[str, ...], rest: Mapping[str, float]) -> Wiring:
+    """Read the manifest. Raises ManifestInvalid when it does not say what it looks at or does not fit the joints."""
+    aliases = manifest.image_preprocessing.aliases if manifest.image_preprocessing else {}
+    robot_name = {model: robot for robot, model in aliases.items()}
+    cameras: dict[str, str] = {}
+    for sensor in manifest.sensors_required:
+        key = sensor.vla_feature_key
+        if key and key.startswith(IMAGES_PREFIX):
+            name = key.removeprefix(IMAGES_PREFIX)
+            cameras[robot_name.get(name, name)] = key
+    if not cameras:
+        raise ManifestInvalid(
+            f"{manifest.name} names no camera",
+            hint=f"give sensors_required a vla_feature_key {IMAGES_PREFIX}…",
+        )
+    dim = manifest.action_contract.dim if manifest.action_contract else None
+    if dim is not None and dim != len(joints):
+        raise ManifestInvalid(f"{manifest.name} commands {dim} joints, the robot has {len(joints)}")
+    degrees = bool(manifest.action_contract and manifest.action_contract.joint_units == "degrees")
+    start = rest
+    if manifest.starting_pose is not None:
+        if len(manifest.starting_pose) != len(joints):
+            raise ManifestInvalid(f"{manifest.name}: starting_pose must give {len(joints)} joints")
+        start = dict(zip(joints, manifest.starting_pose, strict=True))
+    try:
+        rollout = Rollout.model_validate(manifest.policy_extras)
+    except ValidationError as error:
+        raise ManifestInvalid(f"{manifest.name}: policy_extras: {error.errors()[0]['msg']}") from error
+    return Wiring(cameras, joints, start, degrees, manifest.n_action_steps, rollout)
+
+
+class SidecarPolicy(SkillBase):
+    """`arbiter` None: nobody arbitrates, the sidecar loads at once. `wait_s` > 0 lets a simulated world wait for each chunk."""
+
+    holds_gpu = True
+
+    def __init__(
+        self,
+        manifest: RSkillManifest,
+        wiring: Wiring,
+        client: PolicyClient,
+        arbiter: Arbiter | None,
+        *,
+        period_s: float,
+        wait_s: float = 0.0,
+        revision: str = "",
+    ) -> None:
+        super().__init__(manifest, revision=revision)
+        self.cameras = tuple(wiring.cameras)
+        self._wiring = wiring
+        self._client = client
+        self._arbiter = arbiter
+        self._period_s = period_s
+        self._wait_s = wait_s
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._use: Use | None = None
+        self._token: tuple[int, ...] | None = None
+        self._task = ""
+        self._ramp: JointRamp | None = None
+        self._running = False
+        self._player: ChunkPlayer | None = None
+        self._recent: deque[Row] = deque(maxlen=STILL_WINDOW)
+        self._target: dict[str, float] = {}
+
+    # -- event loop ----------------------------------------------------------------------------------------------------
+    async def _start(self, goal: Goal) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._task = goal.prompt or self.manifest.default_prompt or ""
+        if not self._task:
+            raise ModelError(f"{self.key} needs a prompt", hint="say what to do, e.g. `grab the red cube`")
+        await self._occupy(goal)
+        await self._client.reset({TASK_KEY: self._task}, token=self._token)
+        self._ramp, self._running = None, False
+        self._recent.clear()
+        self._player = ChunkPlayer(
+            self._request, prefetch_at=self._wiring.rollout.prefetch_at, wait_s=self._wait_s
+        )
+
+    async def _occupy(self, goal: Goal) -> None:
+        """Resident and in use, both at once. The goal's deadline bounds how long this may take."""
+        for attempt in range(1, LOAD_TRIES_MAX + 1):
+            try:
+                loaded = await self._client.load(timeout_s=goal.deadline_s or None)
+                lease_id, token = loaded["lease_id"], loaded["token"]
+                self._token = tuple(token) if token is not None else None
+                if self._arbiter is not None and lease_id is not None and self._token is not None:
+                    self._use = await self._arbiter.begin_use(lease_id, self._token, goal.rskill_id)
+                return
+            except _AGAIN as error:
+                if attempt == LOAD_TRIES_MAX:
+                    raise
+                log.info(
+                    "%s was made to leave before the goal began (%s); loading again", self.key, error.code
+                )
+                await asyncio.sleep(RETRY_S)
+
+    async def _finish(self) -> None:
+        player, self._player = self._player, None
+        if player is not None:
+            player.close()
+        use, self._use = self._use, None
+        self._token = None
+        if use is not None:
+            await use.end()
+
+    async def _release(self) -> None:
+        """Another policy takes its place: the sidecar gives its memory back."""
+        try:
+            await self._client.unload()
+        finally:
+            await self._client.close()
+
+    async def _fetch(self, observation: Mapping[str, Any]) -> list[Row]:
+        answer = await self._client.get_action(observation, token=self._token, timeout_s=CHUNK_TIMEOUT_S)
+        return self._rows(answer)
+
+    # -- control thread ------------------------------------------------------------------------------------------------
+    def wants_frames(self) -> bool:
+        return self._running and self._player is not None and self._player.wants_observation()
+
+    def _step(self, world: WorldState) -> StepOutcome:
+        player = self._player
+        if player is None:
+            raise BadState(f"{self.key} was stepped without a goal")
+        if self._use is not None and self._use.lost is not None:
+            raise self._use.lost
+        measured = joint_positions(world, self._wiring.joints)
+        if not self._running:
+            if not self._at_start(measured):
+                return Act(self._action(tuple(self._target.values()), world))
+            self._running = True
+            return Hold("at the start pose")
+        if player.played >= self._wiring.rollout.rollout_steps or self._stands_still(player):
+            return Done({"steps": player.played, "chunks": player.chunks})
+        observation = self._observation(world, measured) if player.wants_observation() else None
+        popped = player.next_row(observation)
+        if popped is None:
+            return Hold("the policy thinks")
+        chunk, row = popped
+        self._recent.append(row)
+        self.fraction = player.played / self._wiring.rollout.rollout_steps
+        return Act(self._action(row, world), chunk_index=chunk)
+
+    def _at_start(self, measured: Mapping[str, float]) -> bool:
+        """Whether the arm is at the start pose; sets the next target when not."""
+        goal = {name: self._wiring.start_pose[name] for name in self._wiring.joints}
+        if self._ramp is None:
+            if is_at(measured, goal):
+                return True
+            self._ramp = JointRamp(measured, goal, period_s=self._period_s)
+        self._target = self._ramp.next_target()
+        return self._ramp.done(measured)
+
+    def _stands_still(self, player: ChunkPlayer) -> bool:
+        rollout = self._wiring.rollout
+        if not rollout.stop_when_still or player.played < STILL_FROM * rollout.rollout_steps:
+            return False
+        if len(self._recent) < STILL_WINDOW:
+            return False
+        return all(max(column) - min(column) < STILL_RAD for column in zip(*self._recent, strict=True))
+
+    def _observation(self, world: WorldState, measured: Mapping[str, float]) -> dict[str, Any]:
+        import numpy as np
+
+        values = [measured[name] for name in self._wiring.joints]
+        if self._wiring.degrees:
+            values = [math.degrees(value) for value in values]
+        observation: dict[str, Any] = {STATE_KEY: np.asarray(values, dtype=np.float32), TASK_KEY: self._task}
+        frames = world.image_frames or {}
+        for camera, key in self._wiring.cameras.items():
+            frame = frames.get(camera)
+            if frame is None or frame.data is None or camera in world.stale:
+                raise FrameStale(f"no frame of camera {camera}", hint="nothing moves without a picture")
+            observation[key] = _picture(frame, self._wiring.rollout.views.get(camera))
+        return observation
+
+    def _request(self, observation: Any) -> concurrent.futures.Future[Sequence[Row]]:
+        if self._loop is None:
+            raise BadState(f"{self.key} has no event loop")
+        return asyncio.run_coroutine_threadsafe(self._fetch(observation), self._loop)
+
+    def _rows(self, answer: Mapping[str, Any]) -> list[Row]:
+        """Rows of joint targets in rad. Raises ModelError for a wrong shape or a number that is not finite."""
+        import numpy as np
+
+        if ACTION_KEY not in answer:
+            raise ModelError(f"the policy answered {sorted(answer)}, no {ACTION_KEY!r}")
+        try:
+            actions = np.asarray(answer[ACTION_KEY], dtype=float)
+        except (TypeError, ValueError) as error:
+            raise ModelError(f"the policy's actions are no numbers: {error}") from error
+        if actions.ndim == 3 and actions.shape[0] == 1:
+            actions = actions[0]
+        if actions.ndim != 2 or actions.shape[1] != len(self._wiring.joints):
+            raise ModelError(
+                f"actions of shape {actions.shape}; (steps, {len(self._wiring.joints)}) is expected"
+            )
+        if not np.isfinite(actions).all():
+            raise ModelError("the policy commands numbers that are not finite", hint="its weights are broken")
+        if self._wiring.degrees:
+            actions = np.radians(actions)
+        return [tuple(map(float, row)) for row in actions[: self._wiring.steps_per_chunk]]
+
+    def _action(self, row: Row, world: WorldState) -> Action:
+        return Action(
+            control_mode=ControlMode.JOINT_POSITION,
+            joint_targets=(row,),
+            joint_names=self._wiring.joints,
+            stamp_ns=world.stamp_ns,
+        )
+
+
+def _picture(frame: SensorFrame, view: View | None) -> Any:
+    """RGB uint8, height × width × 3, cropped and averaged down as the policy was trained."""
+    import numpy as np
+
+    picture = np.frombuffer(frame.data or b"", dtype=np.uint8).reshape(frame.height, frame.width, 3)
+    if view is None:
+        return picture
+    x0, y0, x1, y1 = view.crop
+    picture = picture[
+        round(y0 * frame.height) : round(y1 * frame.height), round(x0 * frame.width) : round(x1 * frame.width)
+    ]
+    if view.size_px is not None:
+        import cv2
+
+        picture = cv2.resize(picture, view.size_px, interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(picture)

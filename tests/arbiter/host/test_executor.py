@@ -1,0 +1,107 @@
+"""Effects are performed in order, and nothing is said about a grant that could not be written down."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from arbiter.core import effects as fx
+from arbiter.core import events as ev
+from arbiter.host.executor import Executor
+from schemas.errors import JournalUnavailable
+from schemas.ids import ClientId, GpuId, RequestId
+
+A, ONE, GPU = ClientId("aa"), RequestId(1), GpuId("GPU-1")
+LEASE = {"lease_id": "L1-1", "state": "loading"}
+
+
+class Recorder:
+    """Writes down, in order, whatever is done."""
+
+    def __init__(self) -> None:
+        self.done: list[tuple[Any, ...]] = []
+        self.disk_full = False
+        self.executor = Executor(self, self, self, self.sample, self.post, self.log_event)
+
+    def reply(self, client: ClientId, request: RequestId, body: Mapping[str, Any]) -> None:
+        self.done.append(("reply", client, request, body))
+
+    def refuse(self, client: ClientId, request: RequestId, error: Mapping[str, Any]) -> None:
+        self.done.append(("refuse", client, request, error["code"]))
+
+    def push(self, client: ClientId, body: Mapping[str, Any]) -> None:
+        self.done.append(("push", client, body))
+
+    def broadcast(self, event: Mapping[str, Any]) -> None:
+        self.done.append(("broadcast", event["kind"]))
+
+    def apply(self, changes: Sequence[tuple[str, Mapping[str, Any] | None]]) -> None:
+        if self.disk_full:
+            raise JournalUnavailable("disk full")
+        self.done.append(("journal", *changes))
+
+    def append(self, kind: str, data: Mapping[str, Any]) -> Mapping[str, Any]:
+        self.done.append(("history", kind))
+        return {"kind": kind, **data}
+
+    def sample(self, gpu: GpuId) -> None:
+        self.done.append(("sample", gpu))
+
+    def post(self, event: ev.Event) -> None:
+        self.done.append(("post", event))
+
+    def log_event(self, event: Mapping[str, Any]) -> None:
+        self.done.append(("log", event["kind"]))
+
+
+def test_every_effect_is_performed_in_order() -> None:
+    recorder = Recorder()
+    recorder.executor.perform(
+        [
+            fx.JournalPut("lease:L1-1", {"a": 1}),
+            fx.JournalDelete("lease:L1-0"),
+            fx.Reply(A, ONE, {"lease": LEASE}),
+            fx.Push(A, {"push": "revoke"}),
+            fx.Sample(GPU),
+            fx.Note("granted", {"lease_id": "L1-1"}),
+            fx.Refuse(A, ONE, "bad_state", "m", "h", {}),
+            fx.JournalDelete("lease:L1-1"),
+        ]
+    )
+    assert recorder.done == [
+        ("journal", ("lease:L1-1", {"a": 1}), ("lease:L1-0", None)),
+        ("reply", A, ONE, {"lease": LEASE}),
+        ("push", A, {"push": "revoke"}),
+        ("sample", GPU),
+        ("history", "granted"),
+        ("log", "granted"),
+        ("broadcast", "granted"),
+        ("refuse", A, ONE, "bad_state"),
+        ("journal", ("lease:L1-1", None)),
+    ]
+
+
+def test_a_grant_that_cannot_be_written_is_not_sent() -> None:
+    recorder = Recorder()
+    recorder.disk_full = True
+    recorder.executor.perform(
+        [
+            fx.JournalPut("lease:L1-1", {"a": 1}),
+            fx.Reply(A, ONE, {"state": "loading", "lease": LEASE}),
+            fx.Note("granted", {"lease_id": "L1-1"}),
+            fx.Push(A, {"push": "granted", "lease": LEASE}),
+            fx.Push(A, {"push": "revoke", "lease_id": "L1-9"}),
+            fx.Sample(GPU),
+        ]
+    )
+    assert recorder.done == [
+        ("post", ev.JournalFailed("lease:L1-1", "disk full")),
+        ("refuse", A, ONE, "journal_unavailable"),
+        ("push", A, {"push": "revoke", "lease_id": "L1-9"}),
+        ("sample", GPU),
+    ]
+
+
+def test_a_record_that_cannot_be_deleted_stops_nobody() -> None:
+    recorder = Recorder()
+    recorder.disk_full = True
+    recorder.executor.perform([fx.JournalDelete("lease:L1-1"), fx.Reply(A, ONE, {"lease": LEASE})])
+    assert recorder.done == [("reply", A, ONE, {"lease": LEASE})]

@@ -1,0 +1,135 @@
+"""Events are numbered for ever, found in memory or on disk, and bounded by number and age."""
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from arbiter.host import history as module
+from arbiter.host.history import CLEAN_END, RING_EVENTS, SKIPPED_AFTER_CRASH, History
+
+PATIENCE_S = 20.0
+
+
+def with_history(
+    folder: Path, test: Callable[[History], Awaitable[None]], max_events: int = 100_000, days: float = 7.0
+) -> None:
+    async def run() -> None:
+        history = History.open(folder, max_events, days)
+        history.start(asyncio.get_running_loop())
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                await test(history)
+        finally:
+            history.close()
+
+    asyncio.run(run())
+
+
+async def read(
+    history: History, after: int = 0, limit: int = 500, kinds: tuple[str, ...] = ()
+) -> Mapping[str, Any]:
+    answer: asyncio.Future[Mapping[str, Any]] = asyncio.get_running_loop().create_future()
+    history.read(after, limit, kinds, answer.set_result)
+    return await answer
+
+
+def test_events_are_numbered_and_read_back(tmp_path: Path) -> None:
+    async def test(history: History) -> None:
+        event = history.append("granted", {"lease_id": "L1-1"})
+        assert event["seq"] == 1
+        assert abs(event["at_wall_s"] - time.time()) < PATIENCE_S
+        history.append("ready", {})
+        history.append("granted", {"lease_id": "L1-2"})
+        assert [e["seq"] for e in (await read(history))["events"]] == [1, 2, 3]
+        assert [e["seq"] for e in (await read(history, after=1))["events"]] == [2, 3]
+        assert [e["seq"] for e in (await read(history, limit=1))["events"]] == [1]
+        assert [e["lease_id"] for e in (await read(history, kinds=("granted",)))["events"]] == [
+            "L1-1",
+            "L1-2",
+        ]
+        assert (await read(history, after=99)) == {"events": [], "last_seq": 3}
+
+    with_history(tmp_path, test)
+
+
+def test_numbering_goes_on_after_an_orderly_stop(tmp_path: Path) -> None:
+    async def first(history: History) -> None:
+        history.append("granted", {"lease_id": "L1-1"})
+        history.append(CLEAN_END, {})
+
+    async def second(history: History) -> None:
+        assert history.append("ready", {})["seq"] == 3
+        events = (await read(history))["events"]
+        assert [(e["seq"], e["kind"]) for e in events] == [(1, "granted"), (2, CLEAN_END), (3, "ready")]
+        assert events[0]["lease_id"] == "L1-1"
+        assert [e["seq"] for e in (await read(history, kinds=("granted", "nonsense")))["events"]] == [1]
+
+    with_history(tmp_path, first)
+    with_history(tmp_path, second)
+
+
+def test_after_a_crash_no_number_is_given_twice(tmp_path: Path) -> None:
+    async def crash(history: History) -> None:
+        history.append("granted", {})
+
+    async def after(history: History) -> None:
+        assert history.append("ready", {})["seq"] == 2 + SKIPPED_AFTER_CRASH
+
+    with_history(tmp_path, crash)
+    with_history(tmp_path, after)
+
+
+def test_what_memory_no_longer_holds_is_found_on_disk(tmp_path: Path) -> None:
+    async def test(history: History) -> None:
+        for number in range(RING_EVENTS + 50):
+            history.append("odd" if number % 2 else "even", {"number": number})
+        old = (await read(history, after=10, limit=3))["events"]
+        assert [e["seq"] for e in old] == [11, 12, 13]
+        assert [e["number"] for e in (await read(history, kinds=("odd",), limit=2))["events"]] == [1, 3]
+        assert len((await read(history, limit=5000))["events"]) == RING_EVENTS + 50
+
+    with_history(tmp_path, test)
+
+
+def test_number_and_age_are_bounded(tmp_path: Path) -> None:
+    async def many(history: History) -> None:
+        for _ in range(module.PRUNE_EVERY_EVENTS + 10):
+            history.append("x", {})
+
+    async def look(history: History) -> None:
+        assert (await read(history))["events"][0]["seq"] > module.PRUNE_EVERY_EVENTS - 200
+
+    with_history(tmp_path, many, max_events=100)
+    with_history(tmp_path, look, max_events=100)
+    store = module._Store(tmp_path / "history.sqlite", 100, 1.0)
+    store.prune(time.time() + 2 * 86_400)
+    assert store.find(0, 10, ()) == []
+    store.close()
+
+
+def test_a_broken_database_is_put_aside(tmp_path: Path) -> None:
+    (tmp_path / "history.sqlite").write_bytes(b"junk" * 1000)
+
+    async def test(history: History) -> None:
+        assert history.append("x", {})["seq"] == 1
+
+    with_history(tmp_path, test)
+    assert list(tmp_path.glob("history.sqlite.corrupt-*"))
+
+    async def again(history: History) -> None:
+        assert len((await read(history))["events"]) == 1
+
+    with_history(tmp_path, again)
+
+
+def test_without_a_disk_it_lives_in_memory(tmp_path: Path) -> None:
+    (tmp_path / "history.sqlite").mkdir()
+
+    async def test(history: History) -> None:
+        for _ in range(RING_EVENTS + 5):
+            history.append("x", {})
+        assert (await read(history))["events"][0]["seq"] == 6
+
+    with_history(tmp_path, test)

@@ -1,0 +1,156 @@
+"""The journal survives the daemon; what cannot be trusted is put aside and reported."""
+
+import os
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from arbiter.host.journal import Journal
+from schemas.errors import ConfigError, JournalUnavailable
+
+RECORDS = {"lease:L1-1": {"token": [1, 2], "state": "held"}, "residue:7@9:GPU-1": {"residue_bytes": 5}}
+
+
+def filled(folder: Path, boot_id: str = "boot-1") -> None:
+    journal = Journal.open(folder, boot_id)
+    journal.apply(list(RECORDS.items()))
+    journal.close()
+
+
+def test_records_come_back_and_the_epoch_grows(tmp_path: Path) -> None:
+    filled(tmp_path)
+    journal = Journal.open(tmp_path, "boot-1")
+    assert journal.opened.records == RECORDS
+    assert journal.opened.epoch == 2
+    journal.apply([("lease:L1-1", None), ("lease:L2-1", {"a": 1})])
+    journal.close()
+    again = Journal.open(tmp_path, "boot-1").opened
+    assert set(again.records) == {"residue:7@9:GPU-1", "lease:L2-1"}
+    assert again.epoch == 3
+
+
+def test_another_boot_voids_every_record(tmp_path: Path) -> None:
+    filled(tmp_path)
+    opened = Journal.open(tmp_path, "boot-2").opened
+    assert (opened.records, opened.voided, opened.epoch) == ({}, 2, 2)
+    assert Journal.open(tmp_path, "boot-1").opened.records == {}, "they do not come back"
+
+
+def test_a_commit_survives_kill_9(tmp_path: Path) -> None:
+    script = (
+        "import sys, os, signal; from pathlib import Path; from arbiter.host.journal import Journal\n"
+        "j = Journal.open(Path(sys.argv[1]), 'boot-1'); j.apply([('lease:L1-1', {'state': 'held'})])\n"
+        "os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    root = str(Path(__file__).parents[3])
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path)],
+        env={**os.environ, "PYTHONPATH": root},
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == -9
+    assert Journal.open(tmp_path, "boot-1").opened.records == {"lease:L1-1": {"state": "held"}}
+
+
+@pytest.mark.parametrize("damage", ["garbage", "torn", "json", "not a map", "schema", "table"])
+def test_a_corrupt_journal_is_put_aside_and_the_epoch_still_grows(tmp_path: Path, damage: str) -> None:
+    filled(tmp_path)
+    path = tmp_path / "journal.sqlite"
+    match damage:
+        case "garbage":
+            path.write_bytes(os.urandom(8192))
+        case "torn":
+            with path.open("r+b") as file:
+                file.truncate(path.stat().st_size // 2)
+        case "table":
+            edit(path, "DROP TABLE records", "CREATE TABLE records (other TEXT)")
+        case "json":
+            edit(path, "UPDATE records SET json = '{\"half'")
+        case "not a map":
+            edit(path, "UPDATE records SET json = '[1]'")
+        case _:
+            edit(path, "UPDATE meta SET value = '99' WHERE name = 'schema'")
+    journal = Journal.open(tmp_path, "boot-1")
+    assert journal.opened.put_aside == tmp_path / "journal.sqlite.corrupt-1"
+    assert journal.opened.put_aside.exists()
+    assert journal.opened.problem
+    assert journal.opened.records == {}
+    assert journal.opened.epoch == 2
+    journal.apply([("lease:L2-1", {"a": 1})])
+    journal.close()
+    assert Journal.open(tmp_path, "boot-1").opened.records == {"lease:L2-1": {"a": 1}}
+
+
+def edit(path: Path, *statements: str) -> None:
+    database = sqlite3.connect(path)
+    with database:
+        for statement in statements:
+            database.execute(statement)
+    database.close()
+
+
+def test_several_corrupt_files_are_all_kept(tmp_path: Path) -> None:
+    for _ in range(3):
+        Journal.open(tmp_path, "boot-1").close()
+        (tmp_path / "journal.sqlite").write_bytes(b"junk" * 1000)
+    Journal.open(tmp_path, "boot-1")
+    assert sorted(p.name for p in tmp_path.glob("*.corrupt-?")) == [
+        f"journal.sqlite.corrupt-{n}" for n in (1, 2, 3)
+    ]
+
+
+def test_the_epoch_grows_even_if_both_of_its_places_are_lost(tmp_path: Path) -> None:
+    filled(tmp_path)
+    (tmp_path / "journal.sqlite").write_bytes(b"junk" * 1000)
+    (tmp_path / "epoch").unlink()
+    assert Journal.open(tmp_path, "boot-1", wall_s=6_000_000.0).opened.epoch == 100_001
+
+
+def test_the_epoch_grows_if_the_database_is_deleted(tmp_path: Path) -> None:
+    filled(tmp_path)
+    (tmp_path / "journal.sqlite").unlink()
+    assert Journal.open(tmp_path, "boot-1").opened.epoch == 2
+
+
+def test_records_that_nobody_understands_are_put_aside_in_the_same_epoch(tmp_path: Path) -> None:
+    filled(tmp_path)
+    journal = Journal.open(tmp_path, "boot-1")
+    journal.put_aside("KeyError: 'spec'")
+    assert (journal.opened.records, journal.opened.epoch) == ({}, 2)
+    assert journal.opened.put_aside is not None
+    journal.apply([("lease:L2-1", {})])
+    journal.close()
+    assert Journal.open(tmp_path, "boot-1").opened.epoch == 3
+
+
+def test_a_write_that_fails_is_typed_and_writes_nothing(tmp_path: Path) -> None:
+    journal = Journal.open(tmp_path, "boot-1")
+    blocker = sqlite3.connect(tmp_path / "journal.sqlite", isolation_level=None)
+    blocker.execute("BEGIN IMMEDIATE")
+    with pytest.raises(JournalUnavailable, match="locked"):
+        journal.apply([("lease:L1-1", {"a": 1})])
+    blocker.execute("ROLLBACK")
+    blocker.close()
+    journal.apply([("lease:L1-2", {"a": 1})])
+    journal.close()
+    assert set(Journal.open(tmp_path, "boot-1").opened.records) == {"lease:L1-2"}
+
+
+def test_one_failing_change_of_a_batch_undoes_all(tmp_path: Path) -> None:
+    journal = Journal.open(tmp_path, "boot-1")
+    with pytest.raises(TypeError):
+        journal.apply([("lease:L1-1", {"a": 1}), ("lease:L1-2", {"a": object()})])
+    assert Journal.open(tmp_path, "boot-1").opened.records == {}
+
+
+def test_a_folder_that_cannot_be_used_is_a_config_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="state folder"):
+        Journal.open(tmp_path / "file", "boot-1")
+    (tmp_path / "journal.sqlite").mkdir()
+    with pytest.raises(ConfigError, match="state folder"):
+        Journal.open(tmp_path, "boot-1")

@@ -1,0 +1,134 @@
+"""Deaths are reported once, at once, and for the right process. Real processes, real pidfds."""
+
+import asyncio
+import os
+import subprocess
+import sys
+from collections.abc import Awaitable, Callable, Iterator
+
+import pytest
+
+from arbiter.host.watch import ProcessWatch
+from arbiter.rpc.peer import start_ticks
+from schemas.ids import ProcessKey
+
+PATIENCE_S = 20.0
+
+
+@pytest.fixture
+def children() -> Iterator[Callable[[], "subprocess.Popen[bytes]"]]:
+    """Makes processes that wait for their stdin to close."""
+    made: list[subprocess.Popen[bytes]] = []
+
+    def make() -> "subprocess.Popen[bytes]":
+        made.append(
+            subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE)
+        )
+        return made[-1]
+
+    yield make
+    for child in made:
+        if child.poll() is None:
+            child.kill()
+        child.communicate()
+
+
+def key_of(child: "subprocess.Popen[bytes]") -> ProcessKey:
+    ticks = start_ticks(child.pid)
+    assert ticks is not None
+    return ProcessKey(child.pid, ticks)
+
+
+def watching(test: Callable[[ProcessWatch, "asyncio.Queue[ProcessKey]"], Awaitable[None]]) -> None:
+    async def run() -> None:
+        died: asyncio.Queue[ProcessKey] = asyncio.Queue()
+        watch = ProcessWatch(asyncio.get_running_loop(), start_ticks, died.put_nowait)
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                await test(watch, died)
+        finally:
+            watch.close()
+
+    asyncio.run(run())
+
+
+def open_files() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+def test_a_killed_process_is_reported_once_before_it_is_reaped(
+    children: Callable[[], "subprocess.Popen[bytes]"],
+) -> None:
+    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+        child, other = children(), children()
+        watch.add(key_of(child))
+        watch.add(key_of(child))
+        watch.add(key_of(other))
+        key = key_of(child)
+        child.kill()
+        assert await died.get() == key
+        await asyncio.sleep(0)
+        assert died.empty()
+        assert len(watch) == 1
+
+    watching(test)
+
+
+def test_a_process_that_is_dead_already_is_reported_but_not_from_inside_add(
+    children: Callable[[], "subprocess.Popen[bytes]"],
+) -> None:
+    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+        child = children()
+        key = key_of(child)
+        child.kill()
+        child.communicate()
+        watch.add(key)
+        watch.add(key)
+        assert died.empty()
+        assert await died.get() == key
+        assert len(watch) == 0
+
+    watching(test)
+
+
+def test_a_reused_pid_is_the_death_of_the_one_that_was_meant(
+    children: Callable[[], "subprocess.Popen[bytes]"],
+) -> None:
+    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+        child = children()
+        earlier = ProcessKey(child.pid, key_of(child).start_ticks - 100)
+        watch.add(earlier)
+        assert await died.get() == earlier
+        assert child.poll() is None
+
+    watching(test)
+
+
+def test_an_unknown_start_time_is_watched_by_pid(children: Callable[[], "subprocess.Popen[bytes]"]) -> None:
+    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+        child = children()
+        watch.add(ProcessKey(child.pid, 0))
+        child.kill()
+        assert await died.get() == ProcessKey(child.pid, 0)
+
+    watching(test)
+
+
+def test_no_descriptor_is_left_behind(children: Callable[[], "subprocess.Popen[bytes]"]) -> None:
+    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+        made = [children() for _ in range(5)]
+        keys = [key_of(child) for child in made]
+        before = open_files()
+        for key in keys:
+            watch.add(key)
+        assert open_files() == before + 5
+        for child in made[:3]:
+            child.kill()
+        assert {await died.get() for _ in range(3)} == set(keys[:3])
+        assert open_files() == before + 2
+        watch.add(ProcessKey(keys[3].pid, 1))  # another start time
+        assert open_files() == before + 2
+        watch.close()
+        assert open_files() == before
+
+    watching(test)

@@ -1,0 +1,141 @@
+"""The inbox: one event after the other, one timer, and an end when the core fails. The core is scripted, the loop is real."""
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any
+
+from arbiter.core.effects import Effect, Note
+from arbiter.core.events import ClientLeft, Event, Tick
+from arbiter.inbox import Inbox
+from schemas.ids import ClientId
+
+PATIENCE_S = 20.0
+
+
+def left(name: str) -> ClientLeft:
+    return ClientLeft(ClientId(name), "bye")
+
+
+class ScriptedCore:
+    """Answers every event with a note of its number; its deadline is whatever the test says."""
+
+    def __init__(self) -> None:
+        self.seen: list[Event] = []
+        self.times: list[float] = []
+        self.deadline: float | None = None
+        self.ticked = asyncio.Event()
+        self.broken = False
+
+    def handle(self, event: Event, now: float) -> list[Effect]:
+        if self.broken:
+            raise RuntimeError("invariant 1")
+        self.seen.append(event)
+        self.times.append(now)
+        if isinstance(event, Tick):
+            self.deadline = None
+            self.ticked.set()
+        return [Note("seen", {"number": len(self.seen)})]
+
+    def next_deadline(self) -> float | None:
+        return self.deadline
+
+    def status(self, now: float) -> dict[str, Any]:
+        if self.broken:
+            raise KeyError("state")
+        return {"now": now}
+
+    def why(self, consumer: str, now: float) -> dict[str, Any]:
+        return {"consumer": consumer, "now": now}
+
+
+def with_inbox(test: Callable[[Inbox, ScriptedCore, list[Any]], Awaitable[None]]) -> None:
+    async def run() -> None:
+        core, done = ScriptedCore(), list[Any]()
+
+        def perform(effects: Sequence[Effect]) -> None:
+            done.append(effects)
+            if len(core.seen) == 1:  # an effect that posts: handled afterwards, not inside
+                inbox.post(left("second"))
+                done.append("first performed")
+
+        inbox = Inbox(core, perform, done.append)
+        async with asyncio.timeout(PATIENCE_S):
+            await test(inbox, core, done)
+        inbox.close()
+
+    asyncio.run(run())
+
+
+def test_an_event_that_an_effect_posts_is_handled_after_it() -> None:
+    async def test(inbox: Inbox, core: ScriptedCore, done: list[Any]) -> None:
+        inbox.post(left("first"))
+        assert core.seen == [left("first"), left("second")]
+        assert done[1] == "first performed"
+        assert inbox.handled == 2
+
+    with_inbox(test)
+
+
+def test_the_clock_is_monotonic_time() -> None:
+    async def test(inbox: Inbox, core: ScriptedCore, done: list[Any]) -> None:
+        before = time.monotonic()
+        inbox.post(left("a"))
+        assert before <= core.times[0] <= time.monotonic()
+        assert inbox.status()["now"] >= core.times[0]
+        assert inbox.why("c")["consumer"] == "c"
+
+    with_inbox(test)
+
+
+def test_a_tick_comes_at_the_deadline_and_not_before() -> None:
+    async def test(inbox: Inbox, core: ScriptedCore, done: list[Any]) -> None:
+        deadline = time.monotonic() + 0.05
+        core.deadline = deadline
+        inbox.post(left("a"))
+        await core.ticked.wait()
+        assert core.times[-1] >= deadline - 0.001
+
+    with_inbox(test)
+
+
+def test_an_earlier_deadline_replaces_a_later_one() -> None:
+    async def test(inbox: Inbox, core: ScriptedCore, done: list[Any]) -> None:
+        core.deadline = time.monotonic() + 1000
+        inbox.post(left("a"))
+        core.deadline = time.monotonic() + 0.01
+        inbox.post(left("b"))
+        await core.ticked.wait()
+        core.ticked.clear()
+        core.deadline = time.monotonic() - 5  # passed already
+        inbox.post(left("c"))
+        await core.ticked.wait()
+
+    with_inbox(test)
+
+
+def test_the_same_deadline_twice_in_a_row_still_ticks() -> None:
+    """After a tick the core may name the deadline again that has just come: it must not be taken for armed."""
+
+    async def test(inbox: Inbox, core: ScriptedCore, done: list[Any]) -> None:
+        deadline = time.monotonic() + 0.01
+        for _ in range(3):
+            core.deadline = deadline
+            inbox.post(left("a"))
+            await core.ticked.wait()
+            core.ticked.clear()
+
+    with_inbox(test)
+
+
+def test_a_core_that_raises_ends_everything_once() -> None:
+    async def test(inbox: Inbox, core: ScriptedCore, done: list[Any]) -> None:
+        inbox.post(left("a"))
+        done.clear()
+        core.broken = True
+        inbox.post(left("b"))
+        inbox.post(left("c"))
+        assert inbox.closed
+        assert [str(error) for error in done] == ["invariant 1"]
+
+    with_inbox(test)

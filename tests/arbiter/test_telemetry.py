@@ -1,0 +1,57 @@
+"""The log says every event once, for people and for programs."""
+
+import json
+import logging
+from collections.abc import Iterator
+
+import pytest
+
+from arbiter import telemetry
+
+EVENT = {"seq": 4, "at_wall_s": 1.0, "kind": "granted", "lease_id": "L1-4", "consumer": "detector",
+         "charge_bytes": 5 << 30, "waited_s": 1.25, "reason": "fits"}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _root_logger() -> Iterator[None]:
+    root = logging.getLogger()
+    before, level = list(root.handlers), root.level
+    yield
+    for handler in list(root.handlers):
+        root.removeHandler(handler)
+    for handler in before:
+        root.addHandler(handler)
+    root.setLevel(level)
+
+
+def test_an_event_for_people(capsys: pytest.CaptureFixture[str]) -> None:
+    telemetry.set_up_logging("human", "info")
+    telemetry.log_event(EVENT)
+    line = capsys.readouterr().err
+    assert line.endswith('info     granted L1-4 (detector): charge=5 GiB, waited_s=1.25, reason="fits"\n')
+
+
+def test_an_event_for_programs(capsys: pytest.CaptureFixture[str]) -> None:
+    telemetry.set_up_logging("json", "info")
+    telemetry.log_event(EVENT)
+    line = json.loads(capsys.readouterr().err)
+    assert line["event"] == EVENT
+    assert line["level"] == "info"
+
+
+def test_frequent_events_are_quiet_and_trouble_is_loud(capsys: pytest.CaptureFixture[str]) -> None:
+    telemetry.set_up_logging("human", "info")
+    telemetry.log_event({**EVENT, "kind": "use_began"})
+    assert capsys.readouterr().err == ""
+    telemetry.log_event({**EVENT, "kind": "lost"})
+    assert " warning  lost L1-4" in capsys.readouterr().err
+
+
+def test_an_exception_is_part_of_the_line(capsys: pytest.CaptureFixture[str]) -> None:
+    for form in ("human", "json"):
+        telemetry.set_up_logging(form, "error")  # type: ignore[arg-type]  # both are forms
+        try:
+            raise ValueError("why")
+        except ValueError:
+            logging.getLogger("x").exception("it failed")
+        assert "ValueError: why" in capsys.readouterr().err
