@@ -68,6 +68,7 @@ def main(argv: list[str] | None = None) -> int:
     logging.basicConfig(
         level=args.log_level.upper(), stream=sys.stderr, format="%(asctime)s runner %(levelname)s %(message)s"
     )
+    logging.getLogger("OpenGL").setLevel(logging.WARNING)  # it announces an accelerator that nobody needs
     try:
         return asyncio.run(run_sim(args))
     except VramError as error:
@@ -92,9 +93,9 @@ def sidecars_given(flags: list[str]) -> dict[str, str]:
 
 async def run_sim(args: argparse.Namespace) -> int:
     """Build everything, serve until a signal, `shutdown` or `--max-seconds`, end in order."""
-    from clients.sidecar.policy import PolicyClient
     from pydantic import ValidationError
 
+    from clients.sidecar.policy import PolicyClient
     from runner.catalogue import Catalogue, Maker, read_manifests
     from runner.clock import SystemClock
     from runner.control import ControlThread
@@ -138,12 +139,13 @@ async def run_sim(args: argparse.Namespace) -> int:
             return Navigate(manifest, scene, period_s=period_s)
 
         makers: dict[Kind, Maker] = {Kind.VLA: make_policy, Kind.ROS_ACTION: make_navigate}
+        env = SimEnv(scene)  # renders only on the control thread, from its first reset on
         recorder = None
         if args.video is not None:
             recorder = Recorder(args.video, fps=1.0 / period_s / VIDEO_EVERY)
             stack.callback(recorder.close)
         runner = SimRunner(
-            lambda: SimEnv(scene),
+            lambda: env,
             cameras=tuple(name for name in OBSERVATION_CAMERAS if name in scene.cameras),
             seed=args.seed,
             rate_hz=args.rate,
@@ -154,13 +156,14 @@ async def run_sim(args: argparse.Namespace) -> int:
             video_every=VIDEO_EVERY,
         )
         control = await stack.enter_async_context(ControlThread(runner))
+        await control.call(lambda: None)  # the scene stands and the cameras have rendered: ready means ready
         server = GoalServer(
             args.endpoint or program_endpoint("runner", os.environ, os.getuid()),
             control,
             runner,
             Catalogue(manifests, makers),
             clock,
-            ground_truth=lambda: truth_as_wire(runner.env),
+            ground_truth=lambda: truth_as_wire(env),
             identity={
                 "robot": "so101-mobile",
                 "simulated": True,

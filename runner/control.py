@@ -123,7 +123,7 @@ class ControlThread:
         failure: BaseException | None = None
         try:
             result = self.runner.run(self._max_ticks)
-        except BaseException as error:  # noqa: BLE001 — the thread's outermost frame
+        except BaseException as error:
             log.exception("the control loop failed")
             failure = error
         finally:
@@ -158,7 +158,8 @@ class ControlThread:
             await self.call(
                 lambda: self.runner.begin_skill(skill, goal, lambda end: self._settle(ended, end, None))
             )
-            await asyncio.wait([ended, self.ended], return_when=asyncio.FIRST_COMPLETED)
+            futures: list[asyncio.Future[Any]] = [ended, self.ended]
+            await asyncio.wait(futures, return_when=asyncio.FIRST_COMPLETED)
             if not ended.done():
                 raise InternalError("the control loop ended during the goal", hint="see the runner's log")
             return ended.result()

@@ -17,9 +17,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-from clients.serve import Message, Peer, RouterServer
 from pydantic import ValidationError
 
+from clients.serve import Message, Peer, RouterServer
 from runner import frames, telemetry
 from runner.catalogue import Catalogue
 from runner.clock import Clock
@@ -133,7 +133,7 @@ class GoalServer:
             reply = await self._answer(peer, _parse(message))
         except VramError as error:
             await self._send(peer, _refusal(request_id, error))
-        except Exception as error:  # noqa: BLE001 — a defect in one answer must not end the server
+        except Exception as error:
             log.exception("request failed")
             await self._send(
                 peer,
@@ -272,7 +272,7 @@ class GoalServer:
             error = raised
         except asyncio.CancelledError:  # our own cancel, or the server's end: the result still goes out
             status = "canceled"
-        except Exception as raised:  # noqa: BLE001 — whatever a skill does, its goal gets exactly one result
+        except Exception as raised:
             log.exception("goal %s failed", goal.goal_id)
             error = InternalError(f"{type(raised).__name__}: {raised}", hint="see the runner's log")
         running.phase = "finishing"

@@ -65,7 +65,7 @@ class Recorder:
                 writer.close()
 
     def _open(self, width: int, height: int) -> Any:
-        import imageio_ffmpeg
+        import imageio_ffmpeg  # type: ignore[import-untyped]
 
         writer = imageio_ffmpeg.write_frames(
             str(self.path),

@@ -21,9 +21,10 @@ EVENT_ACTION_WITHHELD = "vram.event.action_withheld"
 def goal_span(traceparent: str | None, rskill_id: str) -> AbstractContextManager[Any]:
     """A span for a whole goal, as a child of the caller's when it sent a W3C traceparent."""
     context = propagate.extract({"traceparent": traceparent}) if traceparent else None
-    return trace.get_tracer("runner").start_as_current_span(
+    span: AbstractContextManager[Any] = trace.get_tracer("runner").start_as_current_span(
         SPAN_GOAL, context=context, attributes={"rskill.id": rskill_id}
     )
+    return span
 
 
 def current_traceparent() -> str | None:

@@ -35,6 +35,7 @@ class ArbiterProcess:
             self.arguments += ["--config", str(self.runtime / "arbiter.yaml")]
         self.process: subprocess.Popen[bytes] | None = None
         self.messages: list[str] = []
+        self.program = [sys.executable, "-m", "arbiter"]
         self._notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._notify.bind(str(self.runtime / "notify.sock"))
 
@@ -74,17 +75,8 @@ class ArbiterProcess:
         return environ
 
     def command(self, *more: str) -> list[str]:
-        return [
-            sys.executable,
-            "-m",
-            "arbiter",
-            "--gpu",
-            self.gpu,
-            "--state-dir",
-            str(self.state),
-            *self.arguments,
-            *more,
-        ]
+        given = ["--gpu", self.gpu, "--state-dir", str(self.state)]
+        return [*self.program, *given, *self.arguments, *more]
 
     def spawn(self, extra_environ: Mapping[str, str] | None = None) -> "subprocess.Popen[bytes]":
         """Start the daemon without waiting for it."""
@@ -110,7 +102,10 @@ class ArbiterProcess:
         """Wait for a notification that holds `word`. Raises RuntimeError."""
         assert self.process is not None
         deadline = time.monotonic() + timeout_s
-        died = os.pidfd_open(self.process.pid)
+        if self.process.poll() is not None:
+            died = os.open("/dev/null", os.O_RDONLY)  # readable at once, as the pidfd of a dead process
+        else:
+            died = os.pidfd_open(self.process.pid)
         try:
             while True:
                 readable, _, _ = select.select(

@@ -247,7 +247,7 @@ class SimRunner(RunnerBase):
             self.violations.append(decision.safety_violations[0])
             self._end(SkillEnded({}, error))
             return
-        except Exception as error:  # noqa: BLE001 — a defect of a skill must not take the arm's control loop with it
+        except Exception as error:
             log.exception("skill %s failed", active.goal.rskill_id)
             self._end(SkillEnded({}, InternalError(f"the skill failed: {type(error).__name__}: {error}")))
             return
@@ -304,6 +304,8 @@ class SimRunner(RunnerBase):
             self._snapshots.clear()
             self.env.reset(self._seed + self._episode_idx)
             self._envelope = Envelope(self.env.joint_limits())
+            for camera in self._cameras:  # a first picture takes a second: rendering contexts, shaders
+                self._render(camera)
             return Applied(action_applied=False, episode_idx=self._episode_idx)
         arm, base = _commands(decision.action)
         self.env.step(arm, base)

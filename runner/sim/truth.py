@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
+
+from runner.sim.env import SimEnv
 
 
-class Knowing(Protocol):
-    """An environment that knows what is really there (`runner.sim.env.SimEnv`)."""
-
-    def ground_truth(self) -> Any: ...
-
-
-def truth_as_wire(env: Any) -> dict[str, Any]:
-    """Target, objects with their place (metres, map and base frame), what is held. Raises TypeError for a real robot."""
-    if not hasattr(env, "ground_truth"):
-        raise TypeError("this environment knows no ground truth")
+def truth_as_wire(env: SimEnv) -> dict[str, Any]:
+    """Target, objects with their place (metres, map and base frame), what is held."""
     truth = env.ground_truth()
     return {
         "target": truth.target,

@@ -16,9 +16,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from clients.sidecar.policy import PolicyClient
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from clients.sidecar.policy import PolicyClient
 from runner.protocols import Act, Done, Goal, Hold, StepOutcome
 from runner.skills.base import SkillBase
 from runner.skills.chunks import ChunkPlayer, Row

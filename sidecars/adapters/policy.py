@@ -127,7 +127,7 @@ class PolicyAdapter:
             pixels = pixels[::-1, ::-1]
         if rules is not None and rules.flip_vertical:
             pixels = pixels[::-1]
-        image = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1).to(torch.float32) / 255
+        image = torch.tensor(np.ascontiguousarray(pixels)).permute(2, 0, 1).to(torch.float32) / 255
         if rules is not None and rules.resize_width and rules.resize_height:
             size = (rules.resize_height, rules.resize_width)
             image = torch.nn.functional.interpolate(image[None], size=size, mode="bilinear", antialias=True)[

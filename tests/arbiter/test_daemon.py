@@ -1,0 +1,225 @@
+"""The daemon as an operator meets it: flags, exit codes, start, stop, notifications. Real processes."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from arbiter.testing.wire import WireClient
+
+pytestmark = pytest.mark.e2e
+PATIENCE_S = 60
+GIB = 1 << 30
+
+Make = Callable[..., ArbiterProcess]
+
+
+def run(arbiter: ArbiterProcess, *arguments: str, **environ: str) -> "subprocess.CompletedProcess[str]":
+    """`python -m arbiter` with exactly these flags, to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "arbiter", *arguments],
+        env={**arbiter.environ, **environ},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+
+
+def test_help_documents_the_exit_codes(make_arbiter: Make) -> None:
+    done = run(make_arbiter(), "--help")
+    assert done.returncode == 0
+    for code in ("0", "2", "3", "4", "70"):
+        assert re.search(rf"^  {code} +\w", done.stdout, re.MULTILINE), f"exit code {code} is not documented"
+
+
+def test_version_and_check_config(make_arbiter: Make) -> None:
+    arbiter = make_arbiter()
+    assert run(arbiter, "--version").stdout.startswith("vram-arbiter ")
+    example = Path(__file__).parents[2] / "configs" / "arbiter.yaml"
+    done = run(arbiter, "--check-config", "--config", str(example))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"ok (would serve {arbiter.endpoint}" in done.stdout
+
+
+def test_a_typo_in_the_configuration_is_named_with_its_line(make_arbiter: Make) -> None:
+    arbiter = make_arbiter(config="verify:\n  tiemout_s: 3\n")
+    done = run(arbiter, *arbiter.arguments)
+    assert done.returncode == 2
+    assert "arbiter.yaml:2: verify.tiemout_s: unknown key; did you mean timeout_s?" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--gpu", "cuda"], "write nvml, fake:8GiB or fake:FOLDER"),
+        (["--gpu", "fake:lots"], "not a size"),
+        (["--gpu", "fake:100MiB"], "leaves nothing of"),
+        (["--endpoint", "tcp://127.0.0.1:5555"], "without CURVE keys"),
+        (["--config", "/nonexistent/arbiter.yaml"], "readable YAML file"),
+        (["--state-dir", "/proc/nonexistent", "--gpu", "fake:8GiB"], "the daemon may write"),
+        (["--nonsense"], "unrecognized arguments"),
+    ],
+)
+def test_wrong_flags_end_with_2_and_say_what_to_do(
+    make_arbiter: Make, arguments: list[str], words: str
+) -> None:
+    done = run(make_arbiter(), *arguments)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_cap_on_a_card_that_is_not_there(make_arbiter: Make) -> None:
+    arbiter = make_arbiter(config="gpu:\n  capacity_bytes: {'7': 4GiB}\n")
+    done = run(arbiter, *arbiter.arguments, "--gpu", "fake:8GiB")
+    assert done.returncode == 2
+    assert "names no card of this machine: 7" in done.stderr
+
+
+@pytest.mark.skipif(os.path.exists("/dev/nvidiactl"), reason="this machine has an NVIDIA driver")
+def test_without_a_driver_nothing_is_simulated_unasked(make_arbiter: Make) -> None:
+    arbiter = make_arbiter()
+    done = run(arbiter, "--state-dir", str(arbiter.state))
+    assert done.returncode == 4
+    assert "--gpu fake:8GiB" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not arbiter.card.exists()
+    assert not (arbiter.runtime / "arbiter.sock").exists()
+
+
+def test_a_second_daemon_on_the_socket_is_refused_and_the_first_serves_on(
+    arbiter_daemon: ArbiterProcess, connect: Callable[..., WireClient]
+) -> None:
+    client = connect().hello()
+    lease = client.acquire("holder", GIB)["lease"]
+    done = run(arbiter_daemon, "--gpu", "fake:8GiB", "--state-dir", str(arbiter_daemon.runtime / "other"))
+    assert done.returncode == 3
+    assert f"pid {arbiter_daemon.pid}" in done.stderr
+    assert [found["lease_id"] for found in client.ask("status")["leases"]] == [lease["lease_id"]]
+    assert connect().hello().ask("ping")["ok"], "new connections still reach the first"
+
+
+def test_a_second_daemon_on_the_state_folder_is_refused(arbiter_daemon: ArbiterProcess) -> None:
+    endpoint = f"ipc://{arbiter_daemon.runtime}/other.sock"
+    done = run(
+        arbiter_daemon, "--gpu", "fake:8GiB", "--endpoint", endpoint, "--state-dir", str(arbiter_daemon.state)
+    )
+    assert done.returncode == 3
+    assert f"pid {arbiter_daemon.pid}" in done.stderr
+
+
+def test_the_environment_names_the_endpoint_and_the_flag_wins(make_arbiter: Make) -> None:
+    arbiter = make_arbiter()
+    other = f"ipc://{arbiter.runtime}/by-variable.sock"
+    flag = f"ipc://{arbiter.runtime}/by-flag.sock"
+    arguments = ["--check-config", "--gpu", "fake:8GiB"]
+    assert other in run(arbiter, *arguments, VRAM_ARBITER_ENDPOINT=other).stdout
+    assert flag in run(arbiter, *arguments, "--endpoint", flag, VRAM_ARBITER_ENDPOINT=other).stdout
+
+
+@pytest.mark.parametrize("number", ["TERM", "INT"])
+def test_an_orderly_stop(make_arbiter: Make, number: str) -> None:
+    arbiter = make_arbiter().start()
+    assert (arbiter.runtime / "arbiter.sock").exists()
+    assert arbiter.process is not None
+    arbiter.process.send_signal(getattr(signal, f"SIG{number}"))
+    assert arbiter.process.wait(PATIENCE_S) == 0
+    assert not (arbiter.runtime / "arbiter.sock").exists()
+    arbiter.wait_for("STOPPING=1", PATIENCE_S)
+    assert "Traceback" not in arbiter.log
+
+
+def test_the_stale_socket_of_a_killed_daemon_is_replaced(make_arbiter: Make) -> None:
+    arbiter = make_arbiter().start()
+    arbiter.kill()
+    assert (arbiter.runtime / "arbiter.sock").exists()
+    arbiter.start()
+    with WireClient(arbiter.endpoint) as client:
+        assert client.hello().ask("ping")["ok"]
+
+
+def test_the_watchdog_is_fed_and_the_status_tells(make_arbiter: Make) -> None:
+    arbiter = make_arbiter().start({"WATCHDOG_USEC": "300000"})
+    for _ in range(3):
+        arbiter.wait_for("WATCHDOG=1", PATIENCE_S)
+    with WireClient(arbiter.endpoint) as client:
+        client.hello()
+        assert "Simulated GPU (8 GiB); 1 clients" in arbiter.wait_for("1 clients", PATIENCE_S)
+
+
+def test_a_cap_and_a_reserve_from_the_file_are_the_budget(make_arbiter: Make) -> None:
+    config = "gpu:\n  reserve_bytes: 1GiB\n  capacity_bytes: {'0': 4GiB}\n"
+    arbiter = make_arbiter(config=config).start()
+    with WireClient(arbiter.endpoint) as client:
+        gpu = client.hello().ask("status")["gpus"][0]
+        assert (gpu["capacity_bytes"], gpu["reserve_bytes"]) == (4 * GIB, GIB)
+        refused = client.acquire("big", 3 * GIB + 1)
+        assert refused["error"]["code"] == "vram_insufficient"
+        assert refused["error"]["details"]["capacity_bytes"] == 4 * GIB
+        assert client.acquire("fits", 3 * GIB)["ok"]
+
+
+def test_the_log_as_json(make_arbiter: Make) -> None:
+    arbiter = make_arbiter(arguments=("--log-format", "json")).start()
+    arbiter.stop()
+    lines = [json.loads(line) for line in arbiter.log.splitlines()]
+    assert next(line["event"]["kind"] for line in lines if "event" in line) == "started"
+    assert lines[-1]["event"]["kind"] == "stopped"
+
+
+def test_a_core_that_fails_ends_the_daemon_with_70(make_arbiter: Make) -> None:
+    """A real daemon around a core with a defect: it says so, and decides nothing more."""
+    arbiter = make_arbiter()
+    script = """
+        import sys
+        import arbiter.daemon as daemon
+        from arbiter.__main__ import main
+        from arbiter.core.events import ClientConnected
+        from arbiter.core.invariants import InvariantViolation
+
+        class Defective(daemon.Arbiter):
+            def handle(self, event, now):
+                if isinstance(event, ClientConnected):
+                    raise InvariantViolation(1, "planted")
+                return super().handle(event, now)
+
+        daemon.Arbiter = Defective
+        sys.exit(main())
+    """
+    path = arbiter.runtime / "defective.py"
+    path.write_text(textwrap.dedent(script))
+    arbiter.program = [sys.executable, str(path)]
+    arbiter.start()
+    with WireClient(arbiter.endpoint) as client:
+        client.send("hello", version=1, name="n", instance="i")
+        assert arbiter.process is not None
+        assert arbiter.process.wait(PATIENCE_S) == 70
+    assert "invariant 1: planted" in arbiter.log
+    assert "state of the core: {" in arbiter.log
+
+
+def notes(reply: Mapping[str, object]) -> list[str]:
+    events = reply["events"]
+    assert isinstance(events, list)
+    return [event["kind"] for event in events]
+
+
+def test_history_and_subscription_over_the_wire(connect: Callable[..., WireClient]) -> None:
+    watcher, client = connect().hello("watcher", role="observer"), connect().hello()
+    assert watcher.ask("subscribe")["ok"]
+    lease = client.acquire("detector", GIB)["lease"]
+    event = watcher.push("event", where=lambda push: push["event"]["kind"] == "granted")["event"]
+    assert event["lease_id"] == lease["lease_id"]
+    history = client.ask("history", kinds=["started", "granted"])
+    assert notes(history) == ["started", "granted"]
+    assert client.ask("history", after=history["events"][0]["seq"], kinds=["started"])["events"] == []

@@ -1,0 +1,176 @@
+"""Crashes of the daemon, corrupt and unwritable journals, hanging probes: leases survive, and nothing is granted on a guess."""
+
+import json
+import os
+import sqlite3
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from arbiter.rpc.peer import start_ticks
+from arbiter.testing.process import ArbiterProcess
+from arbiter.testing.wire import WireClient
+from schemas import fakegpu
+from schemas.ids import ProcessKey
+
+pytestmark = pytest.mark.e2e
+GIB = 1 << 30
+
+Make = Callable[..., ArbiterProcess]
+
+
+def occupy(arbiter: ArbiterProcess, size: int) -> None:
+    """Put bytes of this very process on the simulated card."""
+    ticks = start_ticks(os.getpid())
+    assert ticks is not None
+    key = ProcessKey(os.getpid(), ticks)
+    process = fakegpu.ProcessFile(pid=key.pid, start_ticks=key.start_ticks, name="test", allocated_bytes=size)
+    path = arbiter.card / fakegpu.file_name(key)
+    temporary = path.with_name(".new")
+    temporary.write_text(process.model_dump_json())
+    temporary.rename(path)
+
+
+def hold(client: WireClient, arbiter: ArbiterProcess, name: str, size: int) -> dict[str, Any]:
+    """Acquire, load, ready: the lease's id and token."""
+    reply = client.acquire(name, size, ttl_s=60.0)
+    lease = reply["lease"] if reply["state"] == "loading" else client.push("granted")["lease"]
+    occupy(arbiter, size)
+    on = {"lease_id": lease["lease_id"], "token": lease["token"]}
+    assert client.ask("ready", **on, measured_bytes=size)["ok"]
+    client.ask("ping")  # answered after the record of `ready` is written
+    return on
+
+
+def reattach(client: WireClient, on: dict[str, Any], name: str, size: int) -> dict[str, Any]:
+    spec = {"consumer": name, "model_id": name, "ttl_s": 60.0,
+            "footprint": {"load_peak_bytes": size, "steady_bytes": size, "residue_bytes": 0}}  # fmt: skip
+    reply = client.ask("reattach", leases=[{**on, "spec": spec, "state": "held", "measured_bytes": size}])
+    assert reply["ok"], reply
+    answer = reply["leases"][0]
+    assert isinstance(answer, dict)
+    return answer
+
+
+def leases(client: WireClient) -> list[tuple[str, str, list[int] | None]]:
+    return [(lease["consumer"], lease["state"], lease["token"]) for lease in client.ask("status")["leases"]]
+
+
+def test_leases_survive_kill_9_of_the_daemon(make_arbiter: Make) -> None:
+    arbiter = make_arbiter().start()
+    with WireClient(arbiter.endpoint) as client:
+        on = hold(client.hello(), arbiter, "holder", 5 * GIB)
+    arbiter.kill()
+    arbiter.start()
+    with WireClient(arbiter.endpoint) as client:
+        client.hello()
+        status = client.ask("status")
+        assert (status["phase"], status["epoch"]) == ("recovering", 2)
+        assert leases(client) == [("holder", "held", on["token"])]
+        waiting = client.acquire("waiter", 5 * GIB)
+        assert waiting["state"] == "queued", "nothing is granted before the holder is accounted for"
+        assert reattach(client, on, "holder", 5 * GIB)["kept"]
+        assert client.ask("status")["phase"] == "serving"
+        revoke = client.push("revoke")
+        assert (revoke["lease_id"], revoke["token"]) == (on["lease_id"], on["token"])
+        assert client.ask("unloading", **on)["ok"]
+        occupy(arbiter, 0)
+        assert client.ask("release", **on)["ok"]
+        granted = client.push("granted")["lease"]
+        assert granted["lease_id"] == waiting["lease"]["lease_id"]
+        assert granted["token"] > on["token"], "tokens grow across restarts"
+
+
+def test_leases_survive_an_orderly_restart_and_go_with_their_dead_holder(make_arbiter: Make) -> None:
+    arbiter = make_arbiter().start()
+    with WireClient(arbiter.endpoint) as client:
+        client.hello()
+        hold(client, arbiter, "holder", 5 * GIB)
+    assert arbiter.stop() == 0
+    path = arbiter.state / "journal.sqlite"
+    with sqlite3.connect(path) as database:  # its holder dies while nobody looks
+        (key, text), *_ = database.execute("SELECT key, json FROM records").fetchall()
+        record = {**json.loads(text), "start_ticks": 1}
+        database.execute("UPDATE records SET json = ? WHERE key = ?", (json.dumps(record), key))
+    database.close()
+    for file in arbiter.card.glob(f"{os.getpid()}-*.json"):
+        file.unlink()
+    arbiter.start()
+    with WireClient(arbiter.endpoint) as client:
+        client.hello()
+        assert client.acquire("next", 7 * GIB)["ok"]
+        lease = client.ask("status")["leases"][-1]
+        if lease["state"] == "queued":
+            lease = client.push("granted")["lease"]
+        assert lease["consumer"] == "next"
+
+
+@pytest.mark.parametrize("damage", ["garbage", "records"])
+def test_a_corrupt_journal_is_reported_and_the_holder_is_believed(make_arbiter: Make, damage: str) -> None:
+    arbiter = make_arbiter().start()
+    with WireClient(arbiter.endpoint) as client:
+        on = hold(client.hello(), arbiter, "holder", 5 * GIB)
+    arbiter.kill()
+    path = arbiter.state / "journal.sqlite"
+    if damage == "garbage":
+        path.write_bytes(os.urandom(20_000))
+        for suffix in ("-wal", "-shm"):
+            path.with_name(path.name + suffix).unlink(missing_ok=True)
+    else:
+        database = sqlite3.connect(path)
+        with database:
+            database.execute("UPDATE records SET json = '{}'")
+        database.close()
+    arbiter.start()
+    assert (arbiter.state / "journal.sqlite.corrupt-1").exists()
+    assert "journal_put_aside" in arbiter.log
+    with WireClient(arbiter.endpoint) as client:
+        client.hello()
+        status = client.ask("status")
+        assert (status["phase"], status["epoch"]) == ("recovering", 2)
+        kinds = [event["kind"] for event in client.ask("history")["events"]]
+        assert "journal_put_aside" in kinds
+        assert client.acquire("waiter", GIB)["state"] == "queued", "somebody may hold what nobody remembers"
+        assert reattach(client, on, "holder", 5 * GIB)["kept"]
+        assert ("holder", "held", on["token"]) in leases(client)
+
+
+def test_a_grant_that_cannot_be_written_is_refused_and_not_charged(make_arbiter: Make) -> None:
+    arbiter = make_arbiter().start()
+    with WireClient(arbiter.endpoint) as client:
+        client.hello()
+        blocker = sqlite3.connect(arbiter.state / "journal.sqlite", isolation_level=None)
+        blocker.execute("BEGIN IMMEDIATE")
+        refused = client.acquire("first", 5 * GIB)
+        assert refused["error"]["code"] == "journal_unavailable"
+        blocker.execute("ROLLBACK")
+        blocker.close()
+        assert client.ask("status")["gpus"][0]["charged_bytes"] == 0
+        assert client.acquire("second", 5 * GIB)["ok"]
+
+
+def set_fault(arbiter: ArbiterProcess, probe: str) -> None:
+    path = arbiter.card / fakegpu.CARD_FILE
+    config = json.loads(path.read_text())
+    config["faults"]["probe"] = probe
+    temporary = path.with_name(".new")
+    temporary.write_text(json.dumps(config))
+    temporary.rename(path)
+
+
+@pytest.mark.parametrize("fault", ["fail", "hang"])
+def test_a_card_that_cannot_be_read_blocks_and_comes_back(make_arbiter: Make, fault: str) -> None:
+    arbiter = make_arbiter(
+        config="probe:\n  deadline_s: 0.2\n  period_s: 0.1\n  sample_max_age_s: 0.1\n"
+    ).start()
+    with WireClient(arbiter.endpoint) as watcher, WireClient(arbiter.endpoint) as client:
+        watcher.hello("watcher").ask("subscribe")
+        set_fault(arbiter, fault)
+        client.hello()
+        watcher.push("event", where=lambda push: push["event"]["kind"] == "probe_failed")
+        waiting = client.acquire("waiter", GIB)
+        assert waiting["state"] == "queued", "unknown never counts as free"
+        assert client.ask("status")["gpus"][0]["blocked"]
+        set_fault(arbiter, "ok")
+        assert client.push("granted")["lease"]["consumer"] == "waiter"

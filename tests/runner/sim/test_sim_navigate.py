@@ -1,0 +1,71 @@
+"""Navigation reaches its pose and never drives into the table."""
+
+import math
+from collections.abc import Iterator
+
+import pytest
+
+pytest.importorskip("mujoco")
+
+from runner.sim.config import SceneConfig
+from runner.sim.env import SimEnv
+from runner.sim.navigate import PlanarController, Pose2D, front_reach_m, standoff_pose, to_map
+
+pytestmark = pytest.mark.heavy
+
+
+@pytest.fixture
+def env() -> Iterator[SimEnv]:
+    with SimEnv() as one:
+        yield one
+
+
+def drive(env: SimEnv, controller: PlanarController, limit: int = 300) -> int:
+    for step in range(limit):
+        pose = Pose2D(*env.base_pose())
+        if controller.reached(pose):
+            return step
+        env.step(None, controller.command(pose))
+        assert pose.x_m + front_reach_m(env.config, pose.yaw_rad) < env.config.table_edge_x_m
+    return limit
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_reaches_the_standoff_of_every_object(env: SimEnv, seed: int) -> None:
+    env.reset(seed)
+    for truth in env.ground_truth().objects.values():
+        goal = standoff_pose(truth.position_map[:2], env.config)
+        assert drive(env, PlanarController(goal, env.config)) < 200
+        for _ in range(6):
+            env.step(None)
+        x, y, yaw = env.base_pose()
+        assert math.dist((x, y), (goal.x_m, goal.y_m)) < 0.01
+        assert abs(yaw) < 0.02
+        spot = env.ground_truth().objects[truth.name].position_base
+        assert math.dist(spot[:2], env.config.grasp_spot_in_base_m) < 0.02
+
+
+def test_a_target_deep_on_the_table_stops_before_the_edge(env: SimEnv) -> None:
+    env.reset(0)
+    goal = standoff_pose((5.0, 0.0), env.config)
+    drive(env, PlanarController(goal, env.config))
+    assert env.base_pose()[0] + front_reach_m(env.config, 0.0) < env.config.table_edge_x_m
+
+
+def test_a_goal_inside_the_table_is_never_driven_to(env: SimEnv) -> None:
+    env.reset(0)
+    assert drive(env, PlanarController(Pose2D(1.0, 0.0, 0.0), env.config), limit=150) == 150
+
+
+def test_a_goal_that_turns_is_reached(env: SimEnv) -> None:
+    env.reset(0)
+    assert drive(env, PlanarController(Pose2D(-0.2, 0.3, 1.2), env.config)) < 200
+
+
+def test_to_map_turns_and_shifts() -> None:
+    assert to_map(Pose2D(1.0, 2.0, math.pi / 2), 0.5, 0.25) == pytest.approx((0.75, 2.5))
+
+
+def test_the_front_reach_grows_with_the_turn() -> None:
+    config = SceneConfig()
+    assert front_reach_m(config, 0.3) > front_reach_m(config, 0.0)

@@ -1,0 +1,138 @@
+"""The simulated scene: compiles, follows its seed, tells the truth, and its cameras measure."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mujoco")
+import numpy as np
+
+from runner.sim.config import ARM_JOINTS, COLOURS, REST_POSE, SHAPES, SceneConfig, vocabulary
+from runner.sim.env import SimEnv
+from runner.sim.layout import make_layout
+from runner.sim.navigate import standoff_pose
+
+pytestmark = pytest.mark.heavy
+
+SCENE_FILE = Path(__file__).parents[3] / "configs" / "scenes" / "tabletop.yaml"
+
+
+@pytest.fixture
+def env() -> Iterator[SimEnv]:
+    with SimEnv() as one:
+        one.reset(3)
+        yield one
+
+
+def test_scene_file_says_the_defaults() -> None:
+    written, built_in = SceneConfig.load(SCENE_FILE).model_dump(), SceneConfig().model_dump()
+    assert written.pop("timestep_s") == pytest.approx(built_in.pop("timestep_s"))
+    assert written == built_in
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_layout_has_distractors_of_the_targets_colour_and_shape(seed: int) -> None:
+    config = SceneConfig()
+    layout = make_layout(seed, config)
+    names = [o.name for o in layout.objects]
+    assert layout == make_layout(seed, config)
+    assert len(set(names)) == config.object_count
+    assert set(names) <= set(vocabulary())
+    colour, shape = layout.target.split()
+    assert any(o.colour == colour and o.shape != shape for o in layout.objects)
+    assert any(o.shape == shape and o.colour != colour for o in layout.objects)
+    for i, a in enumerate(layout.objects):
+        for b in layout.objects[i + 1 :]:
+            assert math.dist((a.x_m, a.y_m), (b.x_m, b.y_m)) >= config.object_spacing_m
+
+
+def test_layout_refuses_what_it_does_not_know() -> None:
+    with pytest.raises(ValueError, match="colour"):
+        make_layout(0, SceneConfig(), names=("pink cube",))
+    with pytest.raises(ValueError, match="differ"):
+        make_layout(0, SceneConfig(), names=("red cube", "red cube"))
+
+
+def test_vocabulary_is_colours_times_shapes() -> None:
+    assert len(vocabulary()) == len(COLOURS) * len(SHAPES)
+
+
+def test_same_seed_same_pixels_and_same_motion(env: SimEnv) -> None:
+    def play(one: SimEnv) -> tuple[np.ndarray, list[float]]:
+        one.reset(5)
+        for index in range(10):
+            one.step([a + 0.02 * index for a in REST_POSE], (0.1, 0.05, 0.1))
+        return one.render("front"), list(one.joint_state().values())
+
+    image, joints = play(env)
+    again, joints_again = play(env)
+    assert np.array_equal(image, again)
+    assert joints == joints_again
+    assert image.shape == (360, 480, 3)
+    assert image.dtype == np.uint8
+    assert image.std() > 10
+
+
+def test_all_objects_show_from_the_start(env: SimEnv) -> None:
+    for seed in range(6):
+        env.reset(seed)
+        seen = env.seen_objects("front")
+        assert set(seen) == {o.name for o in env.layout.objects}
+        assert all(s.pixels > 80 for s in seen.values())
+
+
+def test_middle_of_a_box_lands_on_the_object(env: SimEnv) -> None:
+    for seed in range(6):
+        env.reset(seed)
+        model = env.camera_model("front")
+        for name, seen in env.seen_objects("front").items():
+            x0, y0, x1, y1 = seen.box
+            point = model.ground_point((x0 + x1) / 2, (y0 + y1) / 2)
+            assert point is not None
+            assert math.dist(point[:2], env.ground_truth().objects[name].position_base[:2]) < 0.015
+
+
+def test_standing_still_holds_nothing_and_moves_nothing(env: SimEnv) -> None:
+    before = env.ground_truth()
+    for _ in range(30):
+        env.step(None)
+    after = env.ground_truth()
+    assert after.held is None
+    assert not env.is_held_above_table(env.target)
+    for name, truth in before.objects.items():
+        assert math.dist(truth.position_map, after.objects[name].position_map) < 0.001
+    assert list(env.joint_state()) == list(ARM_JOINTS)
+
+
+def test_arm_at_rest_clears_the_objects_when_the_base_stands_before_them(env: SimEnv) -> None:
+    for name, truth in env.ground_truth().objects.items():
+        pose = standoff_pose(truth.position_map[:2], env.config)
+        env.place((pose.x_m, pose.y_m, pose.yaw_rad), REST_POSE)
+        env.step(None)
+        assert env.ground_truth().objects[name].touching_fingers == 0
+
+
+@pytest.mark.parametrize("bad", [[0.0] * 5, [math.nan] * 6, [math.inf] * 6])
+def test_bad_arm_targets_move_nothing(env: SimEnv, bad: list[float]) -> None:
+    before = env.time_s
+    with pytest.raises(ValueError, match="finite"):
+        env.step(bad)
+    with pytest.raises(KeyError):
+        env.step({"shoulder_pan": 0.0})
+    with pytest.raises(ValueError, match="base velocity"):
+        env.step(None, (0.0, math.nan, 0.0))
+    assert env.time_s == before
+
+
+def test_targets_are_clipped_to_the_servos_range(env: SimEnv) -> None:
+    limits = env.joint_limits()
+    for _ in range(60):
+        env.step([9.0, *REST_POSE[1:]])
+    assert env.joint_state()["shoulder_pan"] <= limits["shoulder_pan"][1] + 0.02
+
+
+def test_an_env_without_reset_says_so() -> None:
+    with pytest.raises(RuntimeError, match="reset"):
+        _ = SimEnv().target

@@ -1,0 +1,65 @@
+"""A whole sidecar process around a model without weights, for the tests of the host: `python echo_sidecar.py FOLDER [flags of vram-sidecar]`.
+
+FOLDER tells it what to do: a file `fail_prepare` or `fail_load` makes that step fail. The query tells `run`: `hold NAME` waits until the
+file NAME appears there, `fail` raises; anything else is echoed.
+"""
+
+import sys
+import threading
+from pathlib import Path
+
+from schemas.errors import BadRequest
+from sidecars import __main__ as program
+from sidecars.settings import Settings
+
+
+class EchoAdapter:
+    kind = "detector"
+    ops = frozenset({"detect", "get_action", "reset"})
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._model: str | None = None
+
+    def _fail(self, step: str) -> None:
+        if (self._folder / f"fail_{step}").exists():
+            raise RuntimeError(f"{step} fails as told")
+
+    def prepare(self) -> None:
+        self._fail("prepare")
+
+    def load(self, device: str) -> None:
+        self._fail("load")
+        self._model = device
+
+    def unload(self) -> None:
+        self._model = None
+
+    def run(self, call) -> dict[str, object]:
+        if self._model is None:
+            raise RuntimeError("run without a model")
+        query = getattr(call, "query", "get_action")
+        if query == "fail":
+            raise RuntimeError("the model fails as told")
+        if query == "refuse":
+            raise BadRequest("not like that")
+        if query.startswith("hold "):
+            (self._folder / "holding").touch()
+            while not (self._folder / query.removeprefix("hold ")).exists():
+                threading.Event().wait(0.005)
+            (self._folder / "holding").unlink()
+        return {"ok": True, "answer": query, "norm": 1000, "detections": []}
+
+
+def make_adapter(manifest: object, weights: object) -> EchoAdapter:
+    return EchoAdapter(FOLDER)
+
+
+def test_settings(flags) -> Settings:
+    return program.settings_from(flags)
+
+
+if __name__ == "__main__":
+    FOLDER = Path(sys.argv.pop(1))
+    program.make_adapter = make_adapter
+    sys.exit(program.main())
