@@ -49,6 +49,7 @@ PROBE_START_S = 30.0
 """Without persistence mode the NVIDIA driver needs seconds to initialise its cards."""
 OPEN_FILES = 65_536
 STATUS_EVERY_S = 5.0
+KEEP_LEARNT_EVERY_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,10 +106,13 @@ def budget(cards: Sequence[Card], config: ArbiterConfig) -> tuple[GpuInfo, ...]:
     return tuple(found)
 
 
-def core_settings(config: ArbiterConfig, epoch: int, gpus: tuple[GpuInfo, ...]) -> Settings:
+def core_settings(
+    config: ArbiterConfig, epoch: int, gpus: tuple[GpuInfo, ...], learnt: Mapping[str, dict[str, float]]
+) -> Settings:
     return Settings(
         epoch=epoch,
         gpus=gpus,
+        learnt=dict(learnt),
         ageing_s_per_point=config.scheduling.ageing_s_per_point,
         revoke_resend_s=config.revoke.resend_s,
         revoke_remind_s=config.revoke.remind_s,
@@ -124,6 +128,17 @@ def core_settings(config: ArbiterConfig, epoch: int, gpus: tuple[GpuInfo, ...]) 
         leases_per_client_max=config.limits.leases_per_client_max,
         uses_per_lease_max=config.limits.uses_per_lease_max,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """What runs between start and stop."""
+
+    gpus: tuple[GpuInfo, ...]
+    inbox: Inbox
+    sessions: SessionTable
+    history: History
+    journal: Journal
 
 
 class Daemon:
@@ -143,22 +158,21 @@ class Daemon:
         notifier = Notifier(self._environ)
         raise_open_files()
         with contextlib.ExitStack() as undo:
-            gpus, inbox, sessions, history = await self._start(undo)
+            parts = await self._start(undo)
             for number in (signal.SIGTERM, signal.SIGINT):
                 asyncio.get_running_loop().add_signal_handler(number, self._stop.set)
-            notifier.ready(status_text(gpus))
-            beat = asyncio.get_running_loop().create_task(self._beat(inbox, sessions, notifier, gpus))
+            notifier.ready(status_text(parts.gpus))
+            beat = asyncio.get_running_loop().create_task(self._beat(parts, notifier))
             undo.callback(beat.cancel)
             await self._stop.wait()
             notifier.stopping("stopping" if self._exit_code == EXIT_OK else "the core failed")
-            telemetry.log_event(
-                history.append(CLEAN_END, {"exit_code": self._exit_code, "leases_kept": True})
-            )
+            if self._exit_code == EXIT_OK:
+                parts.journal.keep_learnt(parts.inbox.learnt())
+            facts = {"exit_code": self._exit_code, "leases_kept": True}
+            telemetry.log_event(parts.history.append(CLEAN_END, facts))
         return self._exit_code
 
-    async def _start(
-        self, undo: contextlib.ExitStack
-    ) -> tuple[tuple[GpuInfo, ...], Inbox, SessionTable, History]:
+    async def _start(self, undo: contextlib.ExitStack) -> Parts:
         """1. Folders and locks. 2. Journal and history. 3. Cards. 4. Core and the parts around it. 5. The past. 6. The socket."""
         config, loop = self._config, asyncio.get_running_loop()
         places = find_places(config, self._environ, os.getuid())
@@ -172,7 +186,7 @@ class Daemon:
         undo.callback(history.close)
         probe, gpus = await self._open_cards(places)  # 3
 
-        settings = core_settings(config, journal.opened.epoch, gpus)
+        settings = core_settings(config, journal.opened.epoch, gpus, journal.opened.learnt)
         try_records(journal, settings)
         core = Arbiter(settings, time.monotonic())  # 4
         inbox = Inbox(core, lambda effects: executor.perform(effects), self._core_failed)
@@ -202,7 +216,7 @@ class Daemon:
         server.bind()  # 6
         server.start(loop, sessions.receive)
         undo.callback(server.stop_receiving)
-        return gpus, inbox, sessions, history
+        return Parts(gpus, inbox, sessions, history, journal)
 
     def _take_folders(self, places: Places, group: int | None, undo: contextlib.ExitStack) -> None:
         make_private_folder(places.socket.parent, group)
@@ -274,23 +288,22 @@ class Daemon:
         self._exit_code = EXIT_DEFECT
         self._stop.set()
 
-    async def _beat(
-        self, inbox: Inbox, sessions: SessionTable, notifier: Notifier, gpus: Sequence[GpuInfo]
-    ) -> None:
+    async def _beat(self, parts: Parts, notifier: Notifier) -> None:
         """Feeds the watchdog only if the core handled an event just now, on this very thread: a stuck core starves it."""
         period_s = min(STATUS_EVERY_S, (notifier.watchdog_s or 3 * STATUS_EVERY_S) / 3)
-        last = ""
+        text, kept_at = "", time.monotonic()
         while True:
             await asyncio.sleep(period_s)
             if notifier.watchdog_s is not None:
-                before = inbox.handled
-                inbox.post(Tick())
-                if inbox.handled > before:
+                before = parts.inbox.handled
+                parts.inbox.post(Tick())
+                if parts.inbox.handled > before:
                     notifier.watchdog()
-            text = f"{status_text(gpus)}; {len(sessions)} clients"
-            if text != last:
+            if text != (text := f"{status_text(parts.gpus)}; {len(parts.sessions)} clients"):
                 notifier.status(text)
-                last = text
+            if time.monotonic() - kept_at >= KEEP_LEARNT_EVERY_S and not parts.inbox.closed:
+                parts.journal.keep_learnt(parts.inbox.learnt())
+                kept_at = time.monotonic()
 
 
 def status_text(gpus: Sequence[GpuInfo]) -> str:

@@ -33,6 +33,8 @@ class Core(Protocol):
 
     def why(self, consumer: str, now: float) -> dict[str, Any]: ...
 
+    def learnt(self) -> dict[str, dict[str, float]]: ...
+
 
 class Inbox:
     """Owns the core.
@@ -77,6 +79,9 @@ class Inbox:
 
     def why(self, consumer: str) -> dict[str, Any]:
         return self._core.why(consumer, self._clock())
+
+    def learnt(self) -> dict[str, dict[str, float]]:
+        return self._core.learnt()
 
     @property
     def handled(self) -> int:

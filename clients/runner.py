@@ -5,7 +5,7 @@ import itertools
 import os
 import uuid
 from collections.abc import AsyncIterator, Mapping
-from typing import Any, Self, cast
+from typing import Any, Literal, Self, cast
 
 from clients.transport import Transport
 from schemas.endpoints import program_endpoint
@@ -142,9 +142,12 @@ class RunnerClient:
             self._end(cast(ResultPush, reply))
 
     # -- reads -------------------------------------------------------------------------------------------------------
-    async def frame(self, camera: str = "", max_age_ms: float = 500.0) -> FrameReply:
+    async def frame(
+        self, camera: str = "", max_age_ms: float = 500.0, *, encoding: Literal["jpeg", "png"] = "jpeg"
+    ) -> FrameReply:
         """Latest frame ("" takes the first camera). Raises FrameStale when none is young enough."""
-        return cast(FrameReply, await self.call("frame", {"camera": camera, "max_age_ms": max_age_ms}))
+        fields = {"camera": camera, "max_age_ms": max_age_ms, "encoding": encoding}
+        return cast(FrameReply, await self.call("frame", fields))
 
     async def state(self) -> Message:
         return await self.call("state")

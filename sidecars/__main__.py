@@ -15,7 +15,8 @@ from schemas import defaults as d
 from schemas.endpoints import arbiter_endpoint, program_endpoint
 from schemas.errors import ConfigError, VramError
 from schemas.fakegpu import CARD_FILE, FOLDER_VARIABLE, parse_config
-from schemas.manifest import ManifestError
+from schemas.manifest import ManifestError, RSkillManifest
+from sidecars.adapters.base import ModelAdapter
 from sidecars.adapters.choose import make_adapter
 from sidecars.device.memory import DeviceMemory, NoDevice
 from sidecars.settings import (
@@ -26,13 +27,16 @@ from sidecars.settings import (
     read_footprints,
     read_model,
 )
-from sidecars.weights import configs_folder
+from sidecars.weights import Weights, configs_folder
 
 FOOTPRINTS = "models/footprints.yaml"
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point of `vram-sidecar` and `python -m sidecars`."""
+AdapterFor = Callable[[RSkillManifest, Weights], ModelAdapter]
+
+
+def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adapter) -> int:
+    """Entry point of `vram-sidecar` and `python -m sidecars`. `adapter_for` lets a program serve a model of its own."""
     flags = _parser().parse_args(arguments)
     logging.basicConfig(
         level=flags.log_level.upper(),
@@ -41,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     try:
         settings = settings_from(flags)
-        adapter = make_adapter(settings.manifest, settings.weights)
+        adapter = adapter_for(settings.manifest, settings.weights)
         if flags.check:
             print(f"ok: {settings.manifest.name} from {settings.weights.source} as {adapter.kind}")
             return 0

@@ -179,7 +179,7 @@ def _blockers(core: Core, gpu: Gpu, waiter: Lease, deficit: int) -> list[dict[st
     alone = waiter.spec.exclusive or any(lease.spec.exclusive for lease in gpu.residents.values())
     if not deficit and not alone and not any(gpu.in_state(LeaseState.LOADING)):
         return []
-    return [
+    holders = [
         {
             "lease_id": lease.id,
             "consumer": lease.spec.consumer,
@@ -189,6 +189,26 @@ def _blockers(core: Core, gpu: Gpu, waiter: Lease, deficit: int) -> list[dict[st
             "condition": _holder_condition(core, waiter, lease),
         }
         for lease in gpu.residents.values()
+    ]
+    return holders + _keepers(core, gpu, waiter)
+
+
+def _keepers(core: Core, gpu: Gpu, waiter: Lease) -> list[dict[str, Any]]:
+    """Processes without a resident lease that hold bytes all the same: contexts of live processes, debts, stowaways."""
+    names = {client.process: client.name for client in core.clients.values()}
+    kept = [
+        (names.get(a.process, f"pid {a.process.pid}"), a.booked_bytes(), "residue", "keeps its context until it exits")
+        for a in gpu.ledger.accounts.values()
+        if a.process != waiter.process and not any(lease in gpu.residents for lease in a.charges)
+    ]
+    kept += [
+        (s.name or f"pid {s.process.pid}", s.used_bytes, "stowaway", "holds bytes without a lease")
+        for s in gpu.ledger.strangers.values()
+        if s.process.pid != waiter.process.pid
+    ]
+    return [
+        {"lease_id": None, "consumer": name, "bytes": count, "state": state, "uses": 0, "condition": condition}
+        for name, count, state, condition in kept
     ]
 
 

@@ -12,7 +12,7 @@ import os
 import sqlite3
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
@@ -29,13 +29,15 @@ CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, json TEXT NOT NULL) WI
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """What a start found. `put_aside` names the corrupt file that was moved away; `voided` counts records of an earlier boot."""
+    """What a start found. `put_aside` names the corrupt file that was moved away; `voided` counts records of an earlier boot.
+    `learnt` is what `keep_learnt` wrote last, whatever the boot."""
 
     epoch: int
     records: Mapping[str, Mapping[str, Any]]
     put_aside: Path | None = None
     problem: str = ""
     voided: int = 0
+    learnt: Mapping[str, dict[str, float]] = field(default_factory=dict)
 
 
 class Journal:
@@ -80,7 +82,9 @@ class Journal:
                 f"the state folder {folder} cannot be used: {error}",
                 hint="make it writable, or choose another --state-dir",
             ) from error
-        return cls(path, boot_id, connection, Opened(epoch, records, put_aside, problem, voided))
+        return cls(
+            path, boot_id, connection, Opened(epoch, records, put_aside, problem, voided, _learnt(meta))
+        )
 
     def put_aside(self, problem: str) -> None:
         """The database is sound but nobody understands its records: start with an empty one, in the same epoch."""
@@ -106,6 +110,14 @@ class Journal:
             raise JournalUnavailable(
                 f"the journal cannot be written: {error}", hint="see the disk of the daemon's state folder"
             ) from error
+
+    def keep_learnt(self, learnt: Mapping[str, Mapping[str, float]]) -> None:
+        """Keep durations for the next start's estimates. Losing them costs estimates only: a failure is logged."""
+        try:
+            text = json.dumps(learnt, separators=(",", ":"))
+            self._connection.execute("INSERT OR REPLACE INTO meta VALUES ('learnt', ?)", (text,))
+        except sqlite3.Error as error:
+            log.warning("what was learnt cannot be kept: %s", error)
 
     def close(self) -> None:
         self._connection.close()
@@ -152,6 +164,15 @@ def _read(connection: sqlite3.Connection) -> tuple[dict[str, str], dict[str, dic
         connection.close()
         raise
     return meta, records
+
+
+def _learnt(meta: Mapping[str, str]) -> dict[str, dict[str, float]]:
+    """What `keep_learnt` wrote; anything else counts as nothing learnt."""
+    try:
+        found = json.loads(meta.get("learnt", "{}"))
+        return {str(who): {str(what): float(s) for what, s in each.items()} for who, each in found.items()}
+    except (ValueError, TypeError, AttributeError):
+        return {}
 
 
 def _is_corruption(error: sqlite3.OperationalError) -> bool:

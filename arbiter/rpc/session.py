@@ -76,7 +76,6 @@ class Session:
     budget: float  # requests that may still come at once
     heard_at: float
     seq: int = 0
-    subscribed: bool = False
     leased: bool = False  # it asked for a lease at least once: never dropped for being silent
     undelivered: int = 0
 
@@ -100,6 +99,8 @@ class SessionTable:
         self._watch = watch
         self._clock = clock
         self._sessions: dict[ClientId, Session] = {}
+        self._of_process: dict[ProcessKey, dict[ClientId, Session]] = {}
+        self._subscribers: dict[ClientId, Session] = {}
         self._instances: dict[tuple[ProcessKey, str], ClientId] = {}
         self._moved: dict[
             ClientId, ClientId
@@ -146,7 +147,7 @@ class SessionTable:
 
     def process_died(self, process: ProcessKey) -> None:
         """The kernel said so: forget its connections. The core hears it from whoever watches."""
-        for session in [s for s in self._sessions.values() if s.peer.process == process]:
+        for session in list(self._of_process.get(process, {}).values()):
             self._drop(session)
 
     def __len__(self) -> int:
@@ -168,8 +169,8 @@ class SessionTable:
 
     def broadcast(self, event: Mapping[str, Any]) -> None:
         """One history event to every subscriber. One that does not read loses events and can fetch them by `history`."""
-        for session in [s for s in self._sessions.values() if s.subscribed]:
-            self.push(session.client, {"push": "event", "event": event})
+        for client in list(self._subscribers):
+            self.push(client, {"push": "event", "event": event})
 
     # -- steps -------------------------------------------------------------------------------------------------
     def _charge_rate(self, session: Session | None, now: float) -> bool:
@@ -231,6 +232,7 @@ class SessionTable:
         )
         self._replace_earlier(session)
         self._sessions[session.client] = session
+        self._of_process.setdefault(peer.process, {})[session.client] = session
         self._connect(session)
         self._welcome(session, hello)
 
@@ -240,7 +242,7 @@ class SessionTable:
         key = (session.peer.process, session.instance)
         earlier = self._instances.get(key)
         if earlier is not None and earlier in self._sessions:
-            del self._sessions[earlier]
+            self._forget(self._sessions[earlier])
             for old, new in self._moved.items():
                 if new == earlier:
                     self._moved[old] = session.client
@@ -297,9 +299,17 @@ class SessionTable:
         for client in (*self._drop(session), session.client):
             self._decisions.post(ev.ClientLeft(client, reason))
 
+    def _forget(self, session: Session) -> None:
+        del self._sessions[session.client]
+        self._subscribers.pop(session.client, None)
+        siblings = self._of_process[session.peer.process]
+        del siblings[session.client]
+        if not siblings:
+            del self._of_process[session.peer.process]
+
     def _drop(self, session: Session) -> list[ClientId]:
         """Forget a connection; returns the earlier connections that it stood for."""
-        del self._sessions[session.client]
+        self._forget(session)
         self._instances.pop((session.peer.process, session.instance), None)
         earlier = [old for old, new in self._moved.items() if new == session.client]
         for old in earlier:
@@ -380,14 +390,14 @@ class SessionTable:
                 )
 
     def _subscribe(self, session: Session, request: RequestId) -> None:
-        subscribers = sum(s.subscribed for s in self._sessions.values())
-        if not session.subscribed and subscribers >= self._settings.subscribers_max:
+        subscribers = len(self._subscribers)
+        if session.client not in self._subscribers and subscribers >= self._settings.subscribers_max:
             raise LimitExceeded(
                 f"{subscribers} connections are subscribed",
                 hint="poll history instead, or raise limits.subscribers_max",
                 details={"limit": "subscribers_max", "value": self._settings.subscribers_max},
             )
-        session.subscribed = True
+        self._subscribers[session.client] = session
         self.reply(session.client, request, {})
 
 

@@ -53,9 +53,7 @@ def policy_view(image: Any, camera: str) -> Any:
     return cv2.resize(crop, size, interpolation=cv2.INTER_AREA)
 
 
-def stand_before(
-    env: SimEnv, name: str, rng: random.Random, *, error_m: float = NAVIGATION_ERROR_M
-) -> None:
+def stand_before(env: SimEnv, name: str, rng: random.Random, *, error_m: float = NAVIGATION_ERROR_M) -> None:
     """Put the base where an imperfect navigation would have left it in front of an object."""
     x, y, _ = env.ground_truth().objects[name].position_map
     goal = standoff_pose((x, y), env.config)
@@ -182,7 +180,7 @@ class Demonstration:
     """One recorded grab: per step both views (uint8), the measured joints and the expert's target (float32, rad).
 
     `point` is where the object really is in the base frame (m): a second thing to learn from, no input.
-   """
+    """
 
     front: list[Any] = dataclasses.field(default_factory=list)
     wrist: list[Any] = dataclasses.field(default_factory=list)
@@ -245,11 +243,15 @@ def write_grab(out: Path, episodes: int, seed: int) -> dict[str, int]:
             else:
                 failed += 1
                 if failed > 20 + episodes:
-                    raise RuntimeError("the expert fails too often: the scene and the expert do not fit together")
+                    raise RuntimeError(
+                        "the expert fails too often: the scene and the expert do not fit together"
+                    )
     for key in ("front", "wrist"):
         np.save(out / f"{key}.npy", np.stack([image for demo in kept for image in getattr(demo, key)]))
     for key in ("state", "action", "point"):
-        np.save(out / f"{key}.npy", np.asarray([row for d in kept for row in getattr(d, key)], dtype=np.float32))
+        np.save(
+            out / f"{key}.npy", np.asarray([row for d in kept for row in getattr(d, key)], dtype=np.float32)
+        )
     lengths = [len(demo.action) for demo in kept]
     np.save(out / "episode_length.npy", np.asarray(lengths, dtype=np.int64))
     cameras = SceneConfig().cameras

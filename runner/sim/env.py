@@ -14,7 +14,14 @@ from typing import Any, Self
 
 from runner.sim.config import ARM_JOINTS, BASE_JOINTS, CONTROL_DT_S, REST_POSE, SceneConfig, wrap_angle
 from runner.sim.layout import Layout, make_layout
-from runner.sim.scene import ARM_PREFIX, FIXED_FINGER_GEOM, GRASP_SITE, MOVING_FINGER_GEOM, build_model, load_mujoco
+from runner.sim.scene import (
+    ARM_PREFIX,
+    FIXED_FINGER_GEOM,
+    GRASP_SITE,
+    MOVING_FINGER_GEOM,
+    build_model,
+    load_mujoco,
+)
 from schemas.world import CameraModel
 
 HELD_LIFT_M = 0.03  # a thing is held when its centre is this far above where it would rest on the table
@@ -143,7 +150,9 @@ class SimEnv:
                 else [float(v) for v in arm_target]
             )
             if len(values) != len(ARM_JOINTS) or not all(map(math.isfinite, values)):
-                raise ValueError(f"an arm target is {len(ARM_JOINTS)} finite joint angles in rad, not {values}")
+                raise ValueError(
+                    f"an arm target is {len(ARM_JOINTS)} finite joint angles in rad, not {values}"
+                )
         twist = [float(v) for v in base_velocity] if base_velocity is not None else [0.0, 0.0, 0.0]
         if len(twist) != 3 or not all(map(math.isfinite, twist)):
             raise ValueError(f"a base velocity is three finite numbers (vx, vy, wz), not {twist}")

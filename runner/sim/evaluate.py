@@ -62,7 +62,8 @@ class LoadedPolicy:
         import torch
 
         observation: dict[str, Any] = {
-            f"observation.images.{camera}": torch.from_numpy(env.render(camera)).permute(2, 0, 1).float() / 255
+            f"observation.images.{camera}": torch.from_numpy(env.render(camera)).permute(2, 0, 1).float()
+            / 255
             for camera in self._cameras
         }
         observation["observation.state"] = torch.tensor(list(env.joint_state().values()))
@@ -92,7 +93,7 @@ def attempt(env: SimEnv, policy: LoadedPolicy, seed: int, *, tries: int, error_m
             rest = RestController(env.joint_state())
             while not rest.done:
                 env.step(rest.act())
-            x, y, _ = env.ground_truth().objects[env.target].position_map
+            x, _, _ = env.ground_truth().objects[env.target].position_map
             if not 0 <= x - env.config.table_edge_x_m <= env.config.table_depth_m:
                 break  # pushed off the table: no retry will find it
             stand_before(env, env.target, random.Random(f"evaluation-{seed}-{number}"), error_m=error_m)
@@ -103,12 +104,18 @@ def main(argv: list[str] | None = None) -> int:
     """Command line of the evaluation."""
     parser = argparse.ArgumentParser(prog="python -m runner.sim.evaluate", description=__doc__)
     parser.add_argument("--policy", type=Path, required=True)
-    parser.add_argument("--plugin", default="sidecars.compact_act", help="module that registers the policy type")
+    parser.add_argument(
+        "--plugin", default="sidecars.compact_act", help="module that registers the policy type"
+    )
     parser.add_argument("--episodes", type=int, default=40)
     parser.add_argument("--seed", type=int, default=900_000, help="first scene seed")
     parser.add_argument("--tries", type=int, default=1)
-    parser.add_argument("--execute", type=int, help="targets of a chunk to execute (default: the checkpoint's)")
-    parser.add_argument("--error-m", type=float, default=NAVIGATION_ERROR_M, help="navigation error, each axis")
+    parser.add_argument(
+        "--execute", type=int, help="targets of a chunk to execute (default: the checkpoint's)"
+    )
+    parser.add_argument(
+        "--error-m", type=float, default=NAVIGATION_ERROR_M, help="navigation error, each axis"
+    )
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args(argv)
     import torch

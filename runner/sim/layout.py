@@ -77,7 +77,9 @@ def make_layout(seed: int, config: SceneConfig, *, names: tuple[str, ...] | None
 def _parse(name: str) -> tuple[str, str]:
     colour, _, shape = name.partition(" ")
     if colour not in COLOURS or shape not in SHAPES:
-        raise ValueError(f"unknown object {name!r}: say a colour of {list(COLOURS)} and a shape of {list(SHAPES)}")
+        raise ValueError(
+            f"unknown object {name!r}: say a colour of {list(COLOURS)} and a shape of {list(SHAPES)}"
+        )
     return colour, shape
 
 

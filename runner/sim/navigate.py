@@ -84,7 +84,12 @@ class PlanarController:
         if gap > 1e-6:
             vx_map = self._speed * (self.goal.x_m - pose.x_m) / gap
             vy_map = self._speed * (self.goal.y_m - pose.y_m) / gap
-        room = self._config.table_edge_x_m - EDGE_CLEARANCE_M / 2 - pose.x_m - front_reach_m(self._config, pose.yaw_rad)
+        room = (
+            self._config.table_edge_x_m
+            - EDGE_CLEARANCE_M / 2
+            - pose.x_m
+            - front_reach_m(self._config, pose.yaw_rad)
+        )
         vx_map = min(vx_map, max(0.0, room) * self._gain)
         turn = self._gain * wrap_angle(self.goal.yaw_rad - pose.yaw_rad)
         cos, sin = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)

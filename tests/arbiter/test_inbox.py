@@ -48,6 +48,9 @@ class ScriptedCore:
     def why(self, consumer: str, now: float) -> dict[str, Any]:
         return {"consumer": consumer, "now": now}
 
+    def learnt(self) -> dict[str, dict[str, float]]:
+        return {"detector": {"load_s": 2.0}}
+
 
 def with_inbox(test: Callable[[Inbox, ScriptedCore, list[Any]], Awaitable[None]]) -> None:
     async def run() -> None:
@@ -84,6 +87,7 @@ def test_the_clock_is_monotonic_time() -> None:
         assert before <= core.times[0] <= time.monotonic()
         assert inbox.status()["now"] >= core.times[0]
         assert inbox.why("c")["consumer"] == "c"
+        assert inbox.learnt() == {"detector": {"load_s": 2.0}}
 
     with_inbox(test)
 

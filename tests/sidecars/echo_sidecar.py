@@ -1,4 +1,4 @@
-"""A whole sidecar process around a model without weights, for the tests of the host: `python echo_sidecar.py FOLDER [flags of vram-sidecar]`.
+"""A whole sidecar process around a model without weights: `python echo_sidecar.py FOLDER [flags of vram-sidecar]`.
 
 FOLDER tells it what to do: a file `fail_prepare` or `fail_load` makes that step fail. The query tells `run`: `hold NAME` waits until the
 file NAME appears there, `fail` raises; anything else is echoed.
@@ -9,8 +9,7 @@ import threading
 from pathlib import Path
 
 from schemas.errors import BadRequest
-from sidecars import __main__ as program
-from sidecars.settings import Settings
+from sidecars.__main__ import main
 
 
 class EchoAdapter:
@@ -51,15 +50,6 @@ class EchoAdapter:
         return {"ok": True, "answer": query, "norm": 1000, "detections": []}
 
 
-def make_adapter(manifest: object, weights: object) -> EchoAdapter:
-    return EchoAdapter(FOLDER)
-
-
-def test_settings(flags) -> Settings:
-    return program.settings_from(flags)
-
-
 if __name__ == "__main__":
-    FOLDER = Path(sys.argv.pop(1))
-    program.make_adapter = make_adapter
-    sys.exit(program.main())
+    folder = Path(sys.argv.pop(1))
+    sys.exit(main(adapter_for=lambda manifest, weights: EchoAdapter(folder)))

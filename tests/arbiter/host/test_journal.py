@@ -127,6 +127,18 @@ def test_records_that_nobody_understands_are_put_aside_in_the_same_epoch(tmp_pat
     assert Journal.open(tmp_path, "boot-1").opened.epoch == 3
 
 
+def test_what_was_learnt_survives_a_boot_and_nonsense_is_nothing(tmp_path: Path) -> None:
+    journal = Journal.open(tmp_path, "boot-1")
+    assert journal.opened.learnt == {}
+    journal.keep_learnt({"detector": {"load_s": 2.5}})
+    journal.close()
+    assert Journal.open(tmp_path, "boot-2").opened.learnt == {"detector": {"load_s": 2.5}}
+    for nonsense in ("[1]", "{", '{"a": {"b": "c"}}', '{"a": 1}'):
+        edit(tmp_path / "journal.sqlite", f"UPDATE meta SET value = '{nonsense}' WHERE name = 'learnt'")
+        opened = Journal.open(tmp_path, "boot-2").opened
+        assert (opened.learnt, opened.put_aside) == ({}, None)
+
+
 def test_a_write_that_fails_is_typed_and_writes_nothing(tmp_path: Path) -> None:
     journal = Journal.open(tmp_path, "boot-1")
     blocker = sqlite3.connect(tmp_path / "journal.sqlite", isolation_level=None)

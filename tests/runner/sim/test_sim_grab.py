@@ -84,7 +84,9 @@ def test_inverse_kinematics_reaches_the_grasp_zone(kinematics: ArmKinematics) ->
             assert math.dist(kinematics.grasp_point(joints), point) == pytest.approx(error, abs=1e-4)
 
 
-def test_scene_data_set_labels_what_the_pictures_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scene_data_set_labels_what_the_pictures_show(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["scenes", "--count", "20", "--out", str(tmp_path), "--seed", "4"]) == 0
     lines = [json.loads(line) for line in (tmp_path / "labels.jsonl").read_text().splitlines()]
     assert len(lines) == 20

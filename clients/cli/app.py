@@ -1,0 +1,158 @@
+"""The command line of `vramctl`: parse, call, print. What a command does is in the module that it imports when it runs."""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from typing import Annotated
+
+import typer
+
+from clients.cli import quick
+from schemas.errors import ArbiterUnreachable, VramError
+
+_EPILOG = (
+    "Exit codes: 0 done · 1 the answer is no, or an error · 2 wrong usage · 3 the arbiter cannot be reached. "
+    "Sizes are printed in GiB/MiB (1024-based); written ones may be 8GiB, 5.3GB, 450MiB. "
+    "VRAM_ARBITER_ENDPOINT or VRAM_ARBITER_RUNTIME say where the arbiter serves."
+)
+
+app = typer.Typer(
+    name="vramctl",
+    help="See and use the VRAM arbiter: who holds which bytes, why somebody waits, and leases for any program.",
+    epilog=_EPILOG,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+Endpoint = Annotated[
+    str | None, typer.Option(help="Where the arbiter serves.", envvar="VRAM_ARBITER_ENDPOINT")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the reply as JSON (the shapes of schemas.wire).")]
+
+
+def run_app(arguments: Sequence[str]) -> int:
+    """Run one command and return its exit code."""
+    try:
+        result = app(args=list(arguments), prog_name="vramctl", standalone_mode=False)
+    except typer.Abort:
+        return 130
+    except SystemExit as end:
+        return int(end.code or 0)
+    except ArbiterUnreachable as error:
+        quick.complain(error.to_wire(), as_json=False)
+        return quick.UNREACHABLE
+    except VramError as error:
+        quick.complain(error.to_wire(), as_json=False)
+        return quick.NO
+    except Exception as error:
+        # click's own usage errors know how to show themselves; anything else is a defect and keeps its traceback
+        show: Callable[[], None] | None = getattr(error, "show", None)
+        if show is None:
+            raise
+        show()
+        return int(getattr(error, "exit_code", quick.USAGE))
+    return int(result or 0)
+
+
+@app.command()
+def status(as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+    """Cards, leases and the queue."""
+    raise typer.Exit(quick.status(as_json=as_json, endpoint=endpoint))
+
+
+@app.command()
+def why(
+    consumer: Annotated[str, typer.Argument(help="Name of the consumer, as `status` shows it.")],
+    as_json: AsJson = False,
+    endpoint: Endpoint = None,
+) -> None:
+    """Why CONSUMER is not running: who blocks it, how many bytes, on which condition, what happens next, when.
+
+    Exits 1 if it neither holds nor waits for a lease.
+    """
+    raise typer.Exit(quick.why(consumer, as_json=as_json, endpoint=endpoint))
+
+
+@app.command()
+def history(
+    as_json: AsJson = False,
+    endpoint: Endpoint = None,
+    limit: Annotated[
+        int, typer.Option("--limit", "-n", min=1, max=5000, help="At most so many events.")
+    ] = 50,
+    after: Annotated[
+        int | None, typer.Option(min=0, help="Events after this number (default: the newest).")
+    ] = None,
+    kind: Annotated[
+        list[str] | None, typer.Option(help="Only this kind; may be given several times.")
+    ] = None,
+) -> None:
+    """What happened: grants, evictions, verdicts, with their reasons."""
+    code = quick.history(as_json=as_json, endpoint=endpoint, after=after, limit=limit, kinds=kind or ())
+    raise typer.Exit(code)
+
+
+@app.command()
+def watch(
+    endpoint: Endpoint = None,
+    events: Annotated[int, typer.Option(min=0, max=200, help="Events shown below the table.")] = 12,
+) -> None:
+    """Live view of leases and events; plain lines of events where the output is no terminal. Ctrl-C ends it."""
+    from clients.cli.watch import watch as live
+
+    raise typer.Exit(asyncio.run(live(endpoint, events)))
+
+
+@app.command(context_settings={"allow_interspersed_args": False})
+def run(
+    command: Annotated[list[str], typer.Argument(help="The program and its arguments, after `--`.")],
+    vram: Annotated[str, typer.Option(help="Bytes that the program needs, e.g. 5GiB.")],
+    name: Annotated[str | None, typer.Option(help="Consumer's name (default: the program's).")] = None,
+    gpu: Annotated[str, typer.Option(help="uuid, index or any.")] = "any",
+    priority: Annotated[int, typer.Option(min=0, max=100)] = 50,
+    wait: Annotated[
+        float | None, typer.Option(min=0, help="Give up after so many seconds (default: never).")
+    ] = None,
+    exclusive: Annotated[bool, typer.Option("--exclusive", help="Nobody else's model on that card.")] = False,
+    on_revoke: Annotated[
+        str, typer.Option(help="pin: nobody makes it leave. term: SIGTERM when its room is wanted.")
+    ] = "pin",
+    endpoint: Endpoint = None,
+) -> None:
+    """Run a program that knows nothing of the arbiter under a lease: `vramctl run --vram 5GiB -- python train.py`.
+
+    The program sees VRAM_LEASE_ID, VRAM_LEASE_TOKEN and VRAM_LEASE_GPU; signals are passed on. Exits with the program's code
+    (128+n if signal n ended it), 1 if no lease was granted, 3 without an arbiter, 126/127 if it cannot be started.
+    """
+    from clients.cli.run import RunSpec, run_leased
+    from schemas.sizes import parse_bytes
+
+    if on_revoke not in ("pin", "term"):
+        raise typer.BadParameter(f"--on-revoke is pin or term, not {on_revoke!r}")
+    try:
+        size = parse_bytes(vram)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    spec = RunSpec(command, name, size, gpu, priority, wait, exclusive, on_revoke == "term")
+    raise typer.Exit(asyncio.run(run_leased(spec, endpoint)))
+
+
+@app.command()
+def doctor(as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+    """Check this installation: where the six packages come from, the endpoint, the arbiter, its probe. Exits 1 on a finding."""
+    from clients.cli.doctor import doctor as examine
+
+    raise typer.Exit(examine(as_json=as_json, endpoint=endpoint))
+
+
+@app.command(
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []},
+)
+def demo(context: typer.Context) -> None:
+    """Run find → navigate → grab on a simulated arm inside 8 GiB (needs the full install); see `vramctl demo --help`."""
+    from clients.cli.demo import demo as show
+
+    inner = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    inner.command()(show)
+    raise typer.Exit(int(inner(args=context.args, prog_name="vramctl demo", standalone_mode=False) or 0))

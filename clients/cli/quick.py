@@ -1,0 +1,161 @@
+"""`vramctl status`, `why` and `history` on the shortest way: one blocking DEALER, two messages, two answers.
+
+An operator types these a hundred times, scripts poll them: the path imports zmq and msgpack and nothing heavier (no pydantic, asyncio,
+typer, rich, OpenTelemetry; a test holds it to that). Output and exit codes are the same as through `clients.cli.app`.
+"""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from clients.cli import text
+from schemas.defaults import WIRE_VERSION
+from schemas.endpoints import arbiter_endpoint
+
+OK, NO, USAGE, UNREACHABLE = 0, 1, 2, 3
+"""Exit codes of `vramctl`: done; the answer is no, or an error; wrong usage; the arbiter cannot be reached."""
+
+TIMEOUT_S = 3.0
+ENVELOPE = frozenset({"re", "ok"})
+HISTORY_LIMIT = 50
+
+Message = dict[str, Any]
+
+
+class Unreachable(Exception):
+    """Nobody answers; the text says where."""
+
+
+def ask(
+    op: str, fields: Mapping[str, Any], endpoint: str | None = None, timeout_s: float = TIMEOUT_S
+) -> Message:
+    """Hello as an observer, then one request. Returns its reply, error replies too. Raises Unreachable."""
+    import msgpack
+    import zmq
+
+    where = endpoint or arbiter_endpoint(os.environ, os.getuid())
+    if where.startswith("ipc://") and not os.path.exists(where.removeprefix("ipc://")):
+        raise Unreachable(f"no arbiter at {where}: there is no such socket")
+    context = zmq.Context()
+    socket = context.socket(zmq.DEALER)
+    try:
+        socket.setsockopt(zmq.LINGER, 0)
+        try:
+            socket.connect(where)
+        except zmq.ZMQError as error:
+            raise Unreachable(f"{where} is no endpoint: {error.strerror}") from error
+        hello = {
+            "op": "hello",
+            "id": 1,
+            "version": WIRE_VERSION,
+            "name": "vramctl",
+            "instance": f"vramctl-{os.getpid()}",
+        }
+        for message in (hello | {"role": "observer"}, {"op": op, "id": 2, **fields}):
+            socket.send(msgpack.packb(message))
+        deadline = time.monotonic() + timeout_s
+        while socket.poll(max(0, int(1000 * (deadline - time.monotonic())))):
+            reply: Message = msgpack.unpackb(socket.recv(), strict_map_key=False)
+            if reply.get("re") == 2 or (reply.get("re") == 1 and not reply.get("ok")):
+                return reply
+        raise Unreachable(f"no arbiter answers at {where} within {timeout_s:g} s")
+    finally:
+        socket.close()
+        context.term()
+
+
+def answer(
+    op: str,
+    fields: Mapping[str, Any],
+    *,
+    endpoint: str | None,
+    as_json: bool,
+    lines: Callable[[Message], Sequence[str]],
+    hidden: frozenset[str] = ENVELOPE,
+) -> tuple[int, Message]:
+    """Ask, print, and say with which code to exit. `--json` prints the reply of `schemas.wire` without its envelope."""
+    try:
+        reply = ask(op, fields, endpoint)
+    except Unreachable as error:
+        problem = {
+            "code": "arbiter_unreachable",
+            "message": str(error),
+            "hint": "start `vram-arbiter`, or set VRAM_ARBITER_ENDPOINT",
+        }
+        complain(problem, as_json=as_json)
+        return UNREACHABLE, {}
+    if not reply.get("ok"):
+        complain(reply["error"], as_json=as_json)
+        return NO, {}
+    if as_json:
+        print(json.dumps({key: value for key, value in reply.items() if key not in hidden}, indent=2))
+    else:
+        print("\n".join(lines(reply)))
+    return OK, reply
+
+
+def complain(error: Mapping[str, Any], *, as_json: bool) -> None:
+    """An error for programs on stdout, for people on stderr."""
+    if as_json:
+        print(json.dumps({"error": dict(error)}, indent=2))
+    else:
+        print(text.error_line(error), file=sys.stderr)
+
+
+# -- commands ----------------------------------------------------------------------------------------------------------
+def status(*, as_json: bool = False, endpoint: str | None = None) -> int:
+    return answer("status", {}, endpoint=endpoint, as_json=as_json, lines=text.status_lines)[0]
+
+
+def why(consumer: str, *, as_json: bool = False, endpoint: str | None = None) -> int:
+    """1 for a consumer that neither has a lease nor waits for one."""
+    code, reply = answer(
+        "why",
+        {"consumer": consumer},
+        endpoint=endpoint,
+        as_json=as_json,
+        lines=text.why_lines,
+        hidden=ENVELOPE | {"epoch"},
+    )
+    return NO if code == OK and not reply["leases"] else code
+
+
+def history(
+    *,
+    as_json: bool = False,
+    endpoint: str | None = None,
+    after: int | None = None,
+    limit: int = HISTORY_LIMIT,
+    kinds: Sequence[str] = (),
+) -> int:
+    """The newest `limit` events, or those after a sequence number."""
+    if after is None:
+        try:
+            newest = ask("history", {"after": (1 << 62), "limit": 1}, endpoint)
+        except Unreachable:
+            newest = {}
+        after = max(0, int(newest.get("last_seq", 0)) - limit) if not kinds else 0
+    fields = {"after": after, "limit": limit, "kinds": list(kinds)}
+    return answer(
+        "history",
+        fields,
+        endpoint=endpoint,
+        as_json=as_json,
+        lines=lambda reply: [text.event_line(event) for event in reply["events"]],
+        hidden=ENVELOPE | {"epoch"},
+    )[0]
+
+
+def try_run(arguments: Sequence[str]) -> int | None:
+    """Serve `status [--json]` and `why NAME [--json]` without an argument parser; None leaves everything else to it."""
+    if not arguments or arguments[0] not in ("status", "why"):
+        return None
+    command, *rest = arguments
+    as_json = "--json" in rest
+    names = [item for item in rest if item != "--json"]
+    if any(name.startswith("-") for name in names) or len(names) != (command == "why"):
+        return None
+    return status(as_json=as_json) if command == "status" else why(names[0], as_json=as_json)

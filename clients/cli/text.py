@@ -1,0 +1,183 @@
+"""How `vramctl` says things: replies of the arbiter as lines of text. Pure; sizes in GiB/MiB, times in seconds.
+
+It stands on the fast path: no pydantic, no rich, no typer here.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from schemas.sizes import format_bytes
+
+Message = Mapping[str, Any]
+_COLUMNS = ("LEASE", "CONSUMER", "MODEL", "STATE", "CHARGE", "USES", "PRIO", "PID", "SINCE")
+_RIGHT = frozenset({"CHARGE", "USES", "PRIO", "PID", "SINCE"})
+_NOT_SHOWN = frozenset(
+    {"seq", "at_wall_s", "kind", "lease_id", "consumer", "reason", "gpu", "token", "traceparent"}
+)
+
+
+def duration(seconds: float) -> str:
+    """`0.4 s`, `12 s`, `3 min`, `5 h`, `2 d`."""
+    for limit, factor, unit in (
+        (10.0, 1.0, ""),
+        (120.0, 1.0, "s"),
+        (7200.0, 60.0, "min"),
+        (172_800.0, 3600.0, "h"),
+    ):
+        if seconds < limit:
+            return f"{seconds:.1f} s" if not unit else f"{seconds / factor:.0f} {unit}"
+    return f"{seconds / 86_400:.0f} d"
+
+
+def plural(count: int, word: str) -> str:
+    return f"{count} {word}" if count == 1 else f"{count} {word}s"
+
+
+# -- status ------------------------------------------------------------------------------------------------------------
+def status_lines(status: Message) -> list[str]:
+    """The arbiter, each card, who else is on it, and all leases (residents first, then the queue in order)."""
+    lines = [
+        f"arbiter {status['phase']} · epoch {status['epoch']} · up {duration(status['uptime_s'])} · "
+        + plural(status["clients"], "client")
+    ]
+    if status["phase"] == "recovering":
+        lines.append("  after a restart nothing is granted until every lease is accounted for")
+    for gpu in status["gpus"]:
+        lines += ["", *_gpu_lines(gpu)]
+    lines.append("")
+    if not status["leases"]:
+        return [*lines, "no leases"]
+    return lines + table(_COLUMNS, [_lease_row(lease) for lease in status["leases"]])
+
+
+def _gpu_lines(gpu: Message) -> list[str]:
+    size = format_bytes
+    room = gpu["capacity_bytes"] - gpu["reserve_bytes"] - gpu["charged_bytes"] - gpu["stowaway_bytes"]
+    lines = [
+        f"GPU {gpu['index']} {gpu['name']} ({gpu['gpu']})",
+        f"  capacity {size(gpu['capacity_bytes'])} = reserve {size(gpu['reserve_bytes'])} + charged {size(gpu['charged_bytes'])}"
+        + (f" + stowaways {size(gpu['stowaway_bytes'])}" if gpu["stowaway_bytes"] else "")
+        + f" + free {size(max(0, room))}",
+    ]
+    if gpu["measured_used_bytes"] is None:
+        lines.append("  measured: unknown (the probe fails), so nothing is granted")
+    else:
+        lines.append(
+            f"  measured {size(gpu['measured_used_bytes'])} in use, {duration(gpu['sample_age_s'] or 0.0)} ago"
+        )
+    if gpu["pressure_bytes"]:
+        lines.append(f"  pressure: {size(gpu['pressure_bytes'])} more than was granted")
+    if gpu["blocked"]:
+        lines.append(f"  no grants now: {gpu['blocked']}")
+    for process in gpu["processes"]:
+        used = "?" if process.get("used_bytes") is None else size(process["used_bytes"])
+        who = f"pid {process['pid']} {process.get('name') or ''}".rstrip()
+        if process["stowaway"]:
+            lines.append(f"  stowaway {who}: {used} without a lease")
+        elif process.get("residue_bytes"):
+            lines.append(f"  residue of {who}: {size(process['residue_bytes'])}")
+    return lines
+
+
+def _lease_row(lease: Message) -> tuple[str, ...]:
+    state = lease["state"]
+    if "position" in lease:
+        state = f"{state} #{lease['position']}"
+    elif state == "held":
+        state = "held, in use" if lease["uses"] else "held, idle"
+    if not lease["evictable"]:
+        state += ", pinned"
+    return (
+        lease["lease_id"],
+        lease["consumer"],
+        lease["model"],
+        state,
+        format_bytes(lease["charge_bytes"]),
+        str(lease["uses"]),
+        str(lease["priority"]),
+        str(lease["pid"]),
+        duration(lease["since_s"]),
+    )
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Columns as wide as their longest cell, numbers to the right."""
+    widths = [max(len(row[i]) for row in [columns, *rows]) for i in range(len(columns))]
+
+    def line(cells: Sequence[str]) -> str:
+        padded = (
+            cell.rjust(width) if column in _RIGHT else cell.ljust(width)
+            for cell, width, column in zip(cells, widths, columns, strict=True)
+        )
+        return "  ".join(padded).rstrip()
+
+    return [line(columns), *(line(row) for row in rows)]
+
+
+# -- why ---------------------------------------------------------------------------------------------------------------
+def why_lines(why: Message) -> list[str]:
+    """Who blocks a consumer, how many bytes, on which condition, what happens next, and when."""
+    if not why["leases"]:
+        return [f"{why['consumer']} has no lease and waits for none"]
+    lines: list[str] = []
+    for lease in why["leases"]:
+        lines += [lease["text"], *_why_details(lease)]
+    return lines
+
+
+def _why_details(lease: Message) -> list[str]:
+    size = format_bytes
+    lines = [f"  lease     {lease['lease_id']}, {lease['state']}"]
+    if lease["state"] != "queued":
+        return lines
+    lines.append(
+        f"  bytes     needs {size(lease['needed_bytes'])}, free {size(lease['free_bytes'])}, "
+        f"missing {size(lease['deficit_bytes'])}"
+    )
+    for blocker in lease["blockers"]:
+        lines.append(
+            f"  blocked   by {blocker['consumer']} ({blocker['lease_id']}): {size(blocker['bytes'])}, "
+            f"{blocker['state']}, {blocker['condition']}"
+        )
+    lines.append(f"  next      {lease['next']}")
+    eta = lease["eta_s"]
+    lines.append(
+        f"  expected  {'unknown, never seen before' if eta is None else f'in {duration(eta)} ({lease["eta_source"]})'}"
+    )
+    return lines
+
+
+# -- events ------------------------------------------------------------------------------------------------------------
+def event_line(event: Message) -> str:
+    """One history event: local time, kind, who, why, and its other plain fields."""
+    at = event["at_wall_s"]
+    clock = time.strftime("%H:%M:%S", time.localtime(at)) + f".{int(at * 1000) % 1000:03d}"
+    who = " ".join(str(event[key]) for key in ("consumer", "lease_id") if event.get(key))
+    more = [
+        f"{key}={_value(key, value)}"
+        for key, value in event.items()
+        if key not in _NOT_SHOWN and _plain(value)
+    ]
+    parts = [clock, f"{event['kind']:<14}", who, str(event.get("reason") or ""), " ".join(more)]
+    return "  ".join(part for part in parts if part)
+
+
+def _plain(value: object) -> bool:
+    return value is not None and not isinstance(value, dict | list | tuple)
+
+
+def _value(key: str, value: Any) -> str:
+    if key.endswith("_bytes") and isinstance(value, int):
+        return format_bytes(value).replace(" ", "")
+    if key.endswith("_ms") and isinstance(value, int | float):
+        return f"{value:.1f}"
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return str(value)
+
+
+def error_line(error: Message) -> str:
+    """`message (hint)` of a typed error."""
+    hint = f" ({error['hint']})" if error.get("hint") else ""
+    return f"vramctl: {error['message']}{hint}"

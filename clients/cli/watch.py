@@ -1,0 +1,63 @@
+"""`vramctl watch`: the status, live, with the newest events below; plain event lines where the output is no terminal."""
+
+import asyncio
+import contextlib
+import sys
+from collections import deque
+from typing import Any
+
+from clients.aio import ArbiterClient
+from clients.cli import quick, text
+
+REFRESH_S = 0.5
+"""Between two readings of the status; every event refreshes at once as well."""
+
+
+async def watch(endpoint: str | None, events_shown: int) -> int:
+    """Until Ctrl-C. Raises ArbiterUnreachable if nobody answers at first; later it waits for the arbiter to come back."""
+    async with ArbiterClient(endpoint, name="vramctl watch", role="observer") as client:
+        with contextlib.suppress(asyncio.CancelledError):
+            if sys.stdout.isatty():
+                await _live(client, events_shown)
+            else:
+                async for event in client.subscribe():
+                    print(text.event_line(event), flush=True)
+    return quick.OK
+
+
+async def _live(client: ArbiterClient, events_shown: int) -> None:
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
+
+    newest: deque[dict[str, Any]] = deque(maxlen=max(1, events_shown))
+    changed = asyncio.Event()
+
+    async def follow() -> None:
+        async for event in client.subscribe():
+            newest.append(event)
+            changed.set()
+
+    following = asyncio.create_task(follow())
+    try:
+        with Live(console=Console(), auto_refresh=False, screen=True) as live:
+            lines: list[str] = ["…"]
+            while not following.done():
+                if client.connected:
+                    lines = text.status_lines(await client.status())
+                else:
+                    lines = [
+                        f"no contact to the arbiter at {client.endpoint}; what it said last:",
+                        "",
+                        *lines[-40:],
+                    ]
+                shown = [text.event_line(event) for event in newest][-events_shown or len(newest) :]
+                live.update(
+                    Text("\n".join([*lines, "", *shown]), no_wrap=True, overflow="ellipsis"), refresh=True
+                )
+                changed.clear()
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(changed.wait(), REFRESH_S)
+        await following
+    finally:
+        following.cancel()

@@ -1,0 +1,143 @@
+"""Small real parts for the runner's tests: a clock that moves only when told, a robot without physics."""
+
+import asyncio
+import math
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from runner.protocols import DeadlinePolicy
+from runner.sim.sim_runner import SimRunner
+from schemas.world import CameraModel
+
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+
+
+class ManualClock:
+    """Time passes by `advance` and by sleeping, never by itself."""
+
+    def __init__(self) -> None:
+        self.time_s = 100.0
+        self.slept: list[float] = []
+
+    def now_s(self) -> float:
+        return self.time_s
+
+    def now_ns(self) -> int:
+        return round(self.time_s * 1e9)
+
+    def wall_ns(self) -> int:
+        return round(self.time_s * 1e9)
+
+    def sleep_s(self, duration_s: float) -> None:
+        self.slept.append(duration_s)
+        self.time_s += max(0.0, duration_s)
+
+    def advance(self, duration_s: float) -> None:
+        self.time_s += duration_s
+
+
+class KinematicEnv:
+    """Joints go where they are told at once, the base integrates its velocity, cameras see nothing but know their size."""
+
+    def __init__(self) -> None:
+        self.joints = dict.fromkeys(JOINTS, 0.0)
+        self.base = (0.0, 0.0, 0.0)
+        self.resets: list[int] = []
+        self.steps: list[tuple[Any, Any]] = []
+        self.closed = 0
+
+    def reset(self, seed: int) -> None:
+        self.resets.append(seed)
+        self.joints = dict(zip(JOINTS, (0.0, -1.20, 1.05, 1.35, 0.0, 0.60), strict=True))
+        self.base = (0.0, 0.0, 0.0)
+
+    def step(
+        self, arm_target: Mapping[str, float] | None, base_velocity: tuple[float, float, float] | None = None
+    ) -> None:
+        self.steps.append((arm_target, base_velocity))
+        self.joints.update(arm_target or {})
+        vx, vy, wz = base_velocity or (0.0, 0.0, 0.0)
+        x, y, yaw = self.base
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        self.base = (x + (cos * vx - sin * vy) / 30, y + (sin * vx + cos * vy) / 30, yaw + wz / 30)
+
+    @property
+    def time_s(self) -> float:
+        return len(self.steps) / 30
+
+    def joint_state(self) -> dict[str, float]:
+        return dict(self.joints)
+
+    def joint_velocity(self) -> dict[str, float]:
+        return dict.fromkeys(JOINTS, 0.0)
+
+    def joint_limits(self) -> dict[str, tuple[float, float]]:
+        return dict.fromkeys(JOINTS, (-2.0, 2.0))
+
+    def base_pose(self) -> tuple[float, float, float]:
+        return self.base
+
+    def render(self, camera: str) -> Any:
+        import numpy as np
+
+        return np.zeros((24, 32, 3), dtype=np.uint8)
+
+    def camera_model(self, camera: str) -> CameraModel:
+        return CameraModel(
+            K=((30.0, 0.0, 16.0), (0.0, 30.0, 12.0), (0.0, 0.0, 1.0)),
+            T_base_camera=(
+                (1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.0), (0.0, 0.0, -1.0, 1.0), (0.0, 0.0, 0.0, 1.0),
+            ),
+        )  # fmt: skip
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+@pytest.fixture
+def clock() -> ManualClock:
+    return ManualClock()
+
+
+@pytest.fixture
+def env() -> KinematicEnv:
+    return KinematicEnv()
+
+
+@pytest.fixture
+def make_runner(env: KinematicEnv) -> Callable[..., SimRunner]:
+    """A SimRunner on the kinematic robot; no cameras unless asked for, so that no picture library is needed."""
+
+    def make(**options: Any) -> SimRunner:
+        options.setdefault("cameras", ())
+        options.setdefault("deadline_policy", DeadlinePolicy.WARN)
+        return SimRunner(lambda: env, **options)
+
+    return make
+
+
+@pytest.fixture
+def navigate_manifest() -> Path:
+    return Path(__file__).parents[2] / "configs/rskills/so101-navigate/rskill.yaml"
+
+
+@pytest.fixture
+def endpoint(tmp_path: Path) -> str:
+    return f"ipc://{tmp_path}/runner.sock"
+
+
+@pytest.fixture
+def run_async() -> Iterator[Callable[[Any], Any]]:
+    """Runs a coroutine to its end, at most 20 s."""
+
+    def run(coroutine: Any) -> Any:
+        async def bounded() -> Any:
+            async with asyncio.timeout(20):
+                return await coroutine
+
+        return asyncio.run(bounded())
+
+    yield run

@@ -1,0 +1,74 @@
+"""The gate before the motors."""
+
+from typing import Any
+
+import pytest
+
+from runner.safety import CLAMP_TOLERANCE_RAD, Envelope
+from schemas.control import ControlMode
+from schemas.world import Action, JointState, WorldState
+
+LIMITS = {"a": (-1.0, 1.0), "b": (0.0, 2.0)}
+WORLD = WorldState(stamp_ns=1, joint_state=JointState(name=("a", "b"), position=(0.0, 0.0), stamp_ns=1))
+
+
+def joints(*row: float, names: tuple[str, ...] | None = ("a", "b")) -> Action:
+    return Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), joint_names=names)
+
+
+def twist(vx: float, vy: float, wz: float) -> Action:
+    return Action(control_mode=ControlMode.BODY_TWIST, body_twist=((vx, vy, 0.0, 0.0, 0.0, wz),))
+
+
+@pytest.mark.parametrize("action", [joints(0.5, 1.0), joints(-1.0, 2.0, names=None), twist(0.3, 0.4, 1.2)])
+def test_what_is_inside_passes_unchanged(action: Action) -> None:
+    assert Envelope(LIMITS).check(action, WORLD) == (action, ())
+
+
+def test_a_small_excess_is_clamped_and_said() -> None:
+    allowed, problems = Envelope(LIMITS).check(joints(1.0 + CLAMP_TOLERANCE_RAD / 2, 1.0), WORLD)
+    assert allowed is not None
+    assert allowed.joint_targets == ((1.0, 1.0),)
+    assert "a: 1.075 rad" in problems[0]
+
+
+@pytest.mark.parametrize(
+    ("action", "said"),
+    [
+        (joints(1.5, 1.0), "outside"),
+        (joints(0.0, -0.4), "outside"),
+        (joints(0.0, names=("a",)), ""),
+        (joints(0.0, 0.0, names=("a", "z")), "no joint z"),
+        (joints(0.0, 0.0, 0.0, names=None), "3 joint targets for 2"),
+        (twist(0.5, 0.5, 0.0), "base speed"),
+        (twist(0.0, 0.0, -1.5), "base speed"),
+        (Action(control_mode=ControlMode.GRIPPER_POSITION, gripper=(0.5,)), "not supported"),
+    ],
+)
+def test_what_is_outside_is_withheld(action: Action, said: str) -> None:
+    allowed, problems = Envelope(LIMITS).check(action, WORLD)
+    if not said:
+        assert allowed == action  # a subset of the joints is fine
+        return
+    assert allowed is None
+    assert said in problems[0]
+
+
+def test_nothing_moves_on_a_stale_state() -> None:
+    stale = WORLD.model_copy(update={"diagnostics": {"joint_state": "stale"}})
+    allowed, problems = Envelope(LIMITS).check(joints(0.0, 0.0), stale)
+    assert allowed is None
+    assert "stale" in problems[0]
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_numbers_that_are_none_cannot_even_become_an_action(value: float) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        joints(value, 0.0)
+
+
+def test_a_chunk_is_checked_row_by_row() -> None:
+    chunk: Any = Action(
+        control_mode=ControlMode.JOINT_POSITION, horizon=2, joint_targets=((0.0, 0.0), (5.0, 0.0)), joint_names=("a", "b")
+    )
+    assert Envelope(LIMITS).check(chunk, WORLD)[0] is None

@@ -1,0 +1,148 @@
+"""Real sidecar processes around a model without weights, beside the real daemon."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from arbiter.host.gpu.fake import FakeProbe, make_card
+from arbiter.testing.fakegpu_check import check_log
+from arbiter.testing.wire import WireClient
+
+PNG = b"\x89PNG\r\n\x1a\n"  # the echo does not look at it
+PATIENCE_S = 20.0
+MANIFEST = """
+name: test/{name}
+version: 0.1.0
+kind: detector
+embodiment_tags: [any]
+chunk_size: 1
+weights_uri: hf://test/{name}
+description: an echo
+latency_budget: {{per_chunk_ms: 100}}
+actions: [detect]
+detector: {{labels: [cube]}}
+"""
+
+
+def until(condition, deadline_s=PATIENCE_S):
+    """Wait for something that only shows from outside; returns what the condition returned."""
+    began, pause = time.monotonic(), threading.Event()
+    while not (found := condition()):
+        assert time.monotonic() < began + deadline_s, "it did not happen in time"
+        pause.wait(0.01)
+    return found
+
+
+class Sidecar:
+    """One process. `ask` speaks the wire; `folder` tells the model what to do."""
+
+    def __init__(self, process, endpoint, folder):
+        self.process = process
+        self.folder = folder
+        self.client = WireClient(endpoint)
+
+    def ask(self, op, **fields):
+        return self.client.reply(self.client.send(op, **fields), PATIENCE_S)
+
+    def send_detect(self, query="red cube", **fields):
+        return self.client.send("detect", image=PNG, query=query, **fields)
+
+    def detect(self, query="red cube", **fields):
+        return self.client.reply(self.send_detect(query, **fields), PATIENCE_S)
+
+    def state(self):
+        return self.ask("ping")["state"]
+
+    def hold(self):
+        """Start an op that runs until `let_go`; returns its id once the model is in it."""
+        request = self.send_detect("hold go")
+        until(lambda: (self.folder / "holding").exists())
+        return request
+
+    def let_go(self):
+        (self.folder / "go").touch()
+
+    def terminate(self):
+        self.process.terminate()
+        return self.process.wait(PATIENCE_S)
+
+    @property
+    def log(self):
+        return (self.folder / "log").read_text()
+
+
+class Box:
+    """A runtime folder with a card; `start` starts sidecars in it."""
+
+    def __init__(self, runtime, card, environ):
+        self.runtime = runtime
+        self.card = card
+        self.environ = environ
+        self.sidecars = []
+
+    def spawn(self, name, *flags, footprint="1GB,1GB,100MB", device=None):
+        folder = self.runtime / f"{name}-model"
+        folder.mkdir(exist_ok=True)
+        (folder / "rskill.yaml").write_text(MANIFEST.format(name=name))
+        command = [
+            sys.executable, str(Path(__file__).with_name("echo_sidecar.py")), str(folder), "--name", name,
+            "--rskill", str(folder / "rskill.yaml"), "--device", device or f"fake:{self.card}", "--footprint", footprint, *flags,
+        ]  # fmt: skip
+        with (folder / "log").open("ab") as log:
+            process = subprocess.Popen(
+                command, env=self.environ, stdout=log, stderr=log, stdin=subprocess.DEVNULL
+            )
+        sidecar = Sidecar(process, f"ipc://{self.runtime}/{name}.sock", folder)
+        self.sidecars.append(sidecar)
+        return sidecar
+
+    def start(self, name, *flags, **options):
+        sidecar = self.spawn(name, *flags, **options)
+        assert sidecar.ask("ping")["ok"]
+        return sidecar
+
+    def used(self):
+        probe = FakeProbe([self.card])
+        return probe.sample(probe.cards()[0].id).used_bytes
+
+    def close(self):
+        for sidecar in self.sidecars:
+            sidecar.client.close()
+            if sidecar.process.poll() is None:
+                sidecar.process.kill()
+                sidecar.process.wait(PATIENCE_S)
+        report = (
+            check_log((self.card / "log.jsonl").read_text()) if (self.card / "log.jsonl").exists() else None
+        )
+        assert report is None or report.problems == [], report
+
+
+@pytest.fixture
+def box(arbiter_daemon):
+    """Sidecars beside a real daemon."""
+    box = Box(arbiter_daemon.runtime, arbiter_daemon.card, arbiter_daemon.environ)
+    yield box
+    box.close()
+
+
+@pytest.fixture
+def lone_box():
+    """Sidecars without an arbiter."""
+    runtime = Path(tempfile.mkdtemp(prefix="vs"))
+    make_card(runtime / "fakegpu", 8 * 2**30, release_lag_s=0.1)
+    root = str(Path(__file__).parents[2])
+    box = Box(
+        runtime, runtime / "fakegpu", {**os.environ, "VRAM_ARBITER_RUNTIME": str(runtime), "PYTHONPATH": root}
+    )
+    yield box
+    try:
+        box.close()
+    finally:
+        shutil.rmtree(runtime, ignore_errors=True)

@@ -1,0 +1,268 @@
+"""One sidecar's life, in real processes: on demand, under a token, evicted, out of memory, ended."""
+
+import json
+import os
+from threading import Event
+from time import monotonic
+
+import pytest
+
+from arbiter.testing.wire import WireClient
+
+pytestmark = pytest.mark.e2e
+
+GB = 10**9
+MB = 10**6
+PATIENCE_S = 20.0
+
+
+@pytest.fixture
+def arbiter(arbiter_daemon):
+    with WireClient(arbiter_daemon.endpoint) as client:
+        yield client.hello("looker")
+
+
+def leases(arbiter):
+    return {lease["consumer"]: lease for lease in arbiter.ask("status")["leases"]}
+
+
+def test_it_loads_on_the_first_request_and_not_before(box, arbiter):
+    sidecar = box.start("detector")
+    identity = sidecar.ask("ping")
+    assert (identity["state"], identity["kind"], identity["rskill"]) == (
+        "unloaded",
+        "detector",
+        "test/detector",
+    )
+    assert (identity["pid"], identity["token"], identity["model"]) == (
+        sidecar.process.pid,
+        None,
+        "test/detector",
+    )
+    assert leases(arbiter) == {}
+    assert sidecar.detect("red cube")["answer"] == "red cube"
+    identity = sidecar.ask("ping")
+    assert identity["state"] == "resident"
+    lease = leases(arbiter)["detector"]
+    assert (lease["state"], lease["lease_id"], lease["token"]) == (
+        "held",
+        identity["lease_id"],
+        identity["token"],
+    )
+    assert (lease["charge_bytes"], box.used(), lease["pid"]) == (GB, GB, sidecar.process.pid)
+    assert sidecar.ask("load") == {
+        "ok": True, "lease_id": lease["lease_id"], "token": lease["token"], "loaded": False, "re": sidecar.client._id
+    }  # fmt: skip
+
+
+def test_unload_leaves_the_context_and_the_next_request_loads_again(box, arbiter):
+    sidecar = box.start("detector")
+    sidecar.detect()
+    assert sidecar.ask("unload")["ok"]
+    assert sidecar.state() == "unloaded"
+    assert leases(arbiter) == {}
+    from_outside(lambda: box.used() == 100 * MB)
+    assert sidecar.ask("unload")["ok"], "twice is once"
+    assert sidecar.detect()["ok"]
+
+
+def test_an_evicted_sidecar_is_loaded_again_by_the_next_request(box, arbiter):
+    detector = box.start("detector", "--min-residency-s", "0", footprint="5GB,5GB,100MB")
+    grab = box.start("grab", "--min-residency-s", "0", footprint="4GB,4GB,100MB")
+    assert detector.detect()["ok"]
+    assert grab.detect()["ok"]
+    assert detector.state() == "unloaded"
+    assert box.used() == 4 * GB + 100 * MB
+    assert detector.detect()["ok"], "evicted is never an answer to a request that brings no token"
+    assert (grab.state(), detector.state()) == ("unloaded", "resident")
+
+
+def test_a_token_is_checked_before_every_op(box):
+    sidecar = box.start("detector", "--min-residency-s", "0", footprint="5GB,5GB,100MB")
+    token = sidecar.ask("load")["token"]
+    assert sidecar.detect(token=token)["ok"]
+    stranger = sidecar.detect(token=[token[0], token[1] + 1])
+    assert (stranger["ok"], stranger["code"]) == (False, "evicted")
+    assert stranger["error"].startswith("Evicted: detector is not resident under this token")
+    other = box.start("grab", footprint="5GB,5GB,100MB")
+    other.detect()
+    late = sidecar.detect(token=token)
+    assert (late["code"], late["details"]["state"]) == ("evicted", "unloaded")
+    assert sidecar.state() == "unloaded", "a stale token loads nothing"
+
+
+def test_ping_is_answered_and_a_revoke_acknowledged_while_an_op_runs_which_is_not_cut_short(box, arbiter):
+    detector = box.start("detector", "--min-residency-s", "0", footprint="5GB,5GB,100MB")
+    grab = box.start("grab", footprint="5GB,5GB,100MB")
+    running = detector.hold()
+    waiting = grab.send_detect()
+    from_outside(lambda: leases(arbiter)["detector"]["state"] == "revoking")
+    assert detector.state() == "resident"
+    assert grab.state() == "waiting"
+    detector.let_go()
+    assert detector.client.reply(running)["answer"] == "hold go"
+    assert grab.client.reply(waiting, PATIENCE_S)["ok"]
+    assert detector.state() == "unloaded"
+
+
+def test_a_callers_use_on_the_lease_keeps_the_model_until_it_ends(box, arbiter):
+    policy = box.start("policy", "--min-residency-s", "0", footprint="5GB,5GB,100MB")
+    other = box.start("other", footprint="5GB,5GB,100MB")
+    held = policy.ask("load")
+    goal = {"lease_id": held["lease_id"], "token": held["token"], "use_id": "goal-1"}
+    assert arbiter.ask("use_begin", **goal)["ok"]
+    waiting = other.send_detect()
+    from_outside(lambda: leases(arbiter)["policy"]["state"] == "revoking")
+    for _ in range(3):
+        assert policy.detect("step", token=held["token"])["ok"], (
+            "the goal goes on while its holder is asked to leave"
+        )
+    arbiter.ask("use_end", **goal)
+    assert other.client.reply(waiting, PATIENCE_S)["ok"]
+    assert policy.detect("step", token=held["token"])["code"] == "evicted"
+
+
+def test_a_failing_model_is_an_answer_and_the_sidecar_goes_on(box):
+    sidecar = box.start("detector")
+    failed = sidecar.detect("fail")
+    assert (failed["ok"], failed["code"]) == (False, "model_error")
+    assert failed["error"] == "ModelError: RuntimeError: the model fails as told"
+    assert sidecar.detect("refuse")["code"] == "bad_request"
+    assert sidecar.detect()["ok"]
+
+
+@pytest.mark.parametrize("step", ["prepare", "load"])
+def test_a_failed_start_takes_everything_back_and_can_be_tried_again(box, arbiter, step):
+    (box.runtime / "detector-model").mkdir()
+    switch = box.runtime / "detector-model" / f"fail_{step}"
+    switch.touch()
+    sidecar = box.start("detector")
+    failed = sidecar.detect()
+    assert (failed["code"], failed["error"]) == (
+        "model_error",
+        f"ModelError: RuntimeError: {step} fails as told",
+    )
+    assert leases(arbiter) == {}
+    assert "fails as told" in sidecar.ask("ping")["last_error"]
+    switch.unlink()
+    assert sidecar.detect()["ok"]
+    assert "last_error" not in sidecar.ask("ping")
+
+
+def test_an_out_of_memory_while_loading_rolls_back_and_is_reported(box, arbiter):
+    edit(box.card, throttle_bytes_per_s=2 * GB)
+    sidecar = box.start("detector", footprint="4GB,4GB,100MB")
+    request = sidecar.send_detect()
+    from_outside(lambda: box.used() > GB)
+    stowaway = {"pid": os.getpid(), "name": "browser", "allocated_bytes": 6 * GB}
+    (box.card / "browser.json").write_text(json.dumps(stowaway))
+    failed = sidecar.client.reply(request, PATIENCE_S)
+    assert failed["code"] == "oom"
+    assert failed["error"].startswith(
+        "SimulatedOutOfMemory: CUDA out of memory (simulated). Tried to allocate"
+    )
+    assert failed["details"]["capacity_bytes"] == 8 * 2**30
+    assert sidecar.state() == "unloaded"
+    assert "oom" in {event["kind"] for event in arbiter.ask("history")["events"]}
+    (box.card / "browser.json").unlink()
+    assert sidecar.detect()["ok"]
+
+
+def test_the_end_of_the_process_waits_for_the_op_and_gives_everything_back(box, arbiter):
+    sidecar = box.start("detector")
+    running = sidecar.hold()
+    sidecar.process.terminate()
+    refused = sidecar.detect()
+    assert refused["code"] == "sidecar_unavailable", "nothing is loaded by a process that ends"
+    sidecar.let_go()
+    assert sidecar.client.reply(running, PATIENCE_S)["ok"]
+    assert sidecar.process.wait(PATIENCE_S) == 0
+    assert leases(arbiter) == {}
+    from_outside(lambda: box.used() == 0)
+
+
+def test_shutdown_on_the_wire(box):
+    sidecar = box.start("detector")
+    sidecar.detect()
+    assert sidecar.ask("shutdown")["ok"]
+    assert sidecar.process.wait(PATIENCE_S) == 0
+
+
+def test_an_idle_model_lets_go_by_itself(box, arbiter):
+    sidecar = box.start("detector", "--idle-release-s", "0.3")
+    sidecar.detect()
+    from_outside(lambda: sidecar.state() == "unloaded")
+    assert leases(arbiter) == {}
+
+
+def test_a_wait_for_the_lease_is_bounded(box):
+    holder = box.start("holder", footprint="5GB,5GB,100MB")
+    holder.hold()
+    sidecar = box.start("detector", footprint="5GB,5GB,100MB")
+    reply = sidecar.ask("load", timeout_s=0.3)
+    assert (reply["ok"], reply["code"]) == (False, "wait_timeout")
+    holder.let_go()
+
+
+def test_what_can_never_fit_is_said_at_once(box):
+    sidecar = box.start("huge", footprint="80GB")
+    assert sidecar.detect()["code"] == "vram_insufficient"
+
+
+def test_the_arbiter_may_be_killed_between_two_requests(box, arbiter_daemon, arbiter):
+    sidecar = box.start("detector")
+    token = sidecar.ask("load")["token"]
+    arbiter_daemon.kill()
+    assert sidecar.state() == "resident"
+    arbiter_daemon.start()
+    assert sidecar.detect(token=token)["ok"], "what it had it keeps"
+    assert sidecar.ask("ping")["token"] == token
+
+
+def test_without_an_arbiter_models_stay_and_the_last_one_does_not_fit(lone_box):
+    detector = lone_box.start("detector", "--no-arbiter", footprint="5GB,5GB,100MB")
+    from_outside(lambda: detector.state() == "resident")
+    grab = lone_box.start("grab", "--no-arbiter", footprint="4GB,4GB,100MB")
+    failed = grab.detect()
+    assert failed["code"] == "oom"
+    assert grab.ask("ping")["last_error"].startswith("oom: CUDA out of memory (simulated)")
+    assert detector.ask("load") == {
+        "ok": True,
+        "lease_id": None,
+        "token": None,
+        "loaded": False,
+        "re": detector.client._id,
+    }
+    assert detector.terminate() == 0
+    from_outside(lambda: lone_box.used() <= 100 * MB)
+    assert grab.detect()["ok"]
+
+
+def test_a_process_without_a_device_needs_no_card(lone_box):
+    sidecar = lone_box.start("detector", "--no-arbiter", device="none")
+    assert sidecar.detect()["ok"]
+
+
+def test_two_sidecars_cannot_serve_one_socket(lone_box):
+    lone_box.start("detector", "--no-arbiter", device="none")
+    second = lone_box.spawn("detector", "--no-arbiter", device="none")
+    assert second.process.wait(PATIENCE_S) == 1
+    assert "is served by process" in second.log
+
+
+def test_without_the_arbiter_that_it_needs_it_says_so_and_ends(lone_box):
+    sidecar = lone_box.spawn("detector")
+    assert sidecar.process.wait(PATIENCE_S) == 1
+    assert "no arbiter answers at" in sidecar.log
+
+
+def edit(card, **changes):
+    path = card / "gpu.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def from_outside(condition):
+    deadline = monotonic() + PATIENCE_S
+    while not condition():
+        assert monotonic() < deadline, "it did not happen in time"
+        Event().wait(0.01)
