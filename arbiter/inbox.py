@@ -63,8 +63,10 @@ class Inbox:
 
     def post(self, event: Event) -> None:
         """Handle an event now, or right after the one that is being handled."""
+        if self._closed:
+            return
         self._queue.append(event)
-        if self._busy or self._closed:
+        if self._busy:
             return
         self._busy = True
         try:

@@ -112,8 +112,12 @@ class Tools:
             return Outcome(
                 "failed", f"no result within {limit_s:.0f} s; the goal was cancelled", "wait_timeout"
             )
-        status = "succeeded" if result["success"] else "failed"
-        return Outcome(status, result["message"] or result["status"], result["code"], dict(result["data"]))
+        return Outcome(
+            "succeeded" if result["success"] else "failed",
+            result["message"] or result["status"],
+            result["code"],
+            dict(result["data"]),
+        )
 
     async def _frame(self, camera: str) -> FrameReply:
         return await self._runner.frame(camera, max_age_ms=FRAME_MAX_AGE_MS, encoding="png")

@@ -79,7 +79,7 @@ class LogLine(TypedDict):
     """One line of the log. `delta` is what it changed on the card; the sum of all deltas is `used_after`.
 
     ops: context, alloc, cache (freed into the process's cache), free (let go of: still on the card), leak, returned (free again),
-    oom (refused: delta 0), died (noticed: delta 0).
+    oom (refused: delta 0), died (noticed: delta 0), edited (pid 0: somebody wrote or removed process files by hand).
     """
 
     seq: int
@@ -141,6 +141,9 @@ class Card:
     config: CardConfig
     processes: Mapping[str, ProcessFile]
     seq: int = 0
+    logged_bytes: int = (
+        0  # used bytes by the log; differs from `used_bytes` only after somebody edited a file by hand
+    )
 
     @property
     def used_bytes(self) -> int:
@@ -216,7 +219,8 @@ def read_card(texts: Mapping[str, str], log_tail: str) -> Change:
                 raise ConfigError(
                     f"{name} of a simulated card is wrong: {_first(error)}", hint=hint
                 ) from None
-    logged = _last_seq(log_tail)
+    newest = _last_line(log_tail)
+    logged = int(newest.get("seq", 0))
     missing = [
         p.last for p in processes.values() if p.last is not None and int(p.last.get("seq", 0)) > logged
     ]
@@ -226,17 +230,22 @@ def read_card(texts: Mapping[str, str], log_tail: str) -> Change:
         missing.sort(key=lambda line: int(line["seq"]))
         lines = "".join(_dump(line) for line in missing)
         steps = (Step("", None, ("\n" if torn else "") + lines),)
-    seq = max([logged, *(int(line["seq"]) for line in missing)])
-    return Change(Card(parse_config(texts[CARD_FILE]), processes, seq), steps)
+    newest = missing[-1] if missing else newest
+    card = Card(
+        parse_config(texts[CARD_FILE]), processes, int(newest.get("seq", 0)), int(newest.get("used_after", 0))
+    )
+    return Change(card, steps)
 
 
-def _last_seq(log_tail: str) -> int:
-    for line in reversed(log_tail.split("\n")[:-1]):  # what follows the last newline is torn
+def _last_line(log_tail: str) -> Mapping[str, Any]:
+    for text in reversed(log_tail.split("\n")[:-1]):  # what follows the last newline is torn
         try:
-            return int(json.loads(line)["seq"])
-        except (ValueError, TypeError, KeyError):
+            line = json.loads(text)
+        except ValueError:
             continue  # torn once, and ended since
-    return 0
+        if isinstance(line, dict) and "seq" in line:
+            return line
+    return {}
 
 
 def _dump(line: Mapping[str, Any]) -> str:
@@ -256,8 +265,8 @@ def parse_stat(text: str) -> tuple[bool, int]:
 
 # -- transitions -----------------------------------------------------------------------------------------------------
 def settle(card: Card, now: float, alive: Alive) -> Change:
-    """Let time pass: notice deaths, and let what is due come back."""
-    change = Change(card)
+    """Let time pass: notice edits by hand and deaths, and let what is due come back. Comes before every other transition."""
+    change = _notice_edits(card, now)
     for name, process in card.processes.items():
         if process.died_at_s is None and not alive(process.key):
             process = process.model_copy(update={"died_at_s": now})
@@ -272,6 +281,19 @@ def settle(card: Card, now: float, alive: Alive) -> Change:
             rest = tuple(part for part in process.returning if part.due_s > now)
             change = change.then(_return(name, process, now, due, {"returning": rest}))
     return change
+
+
+def _notice_edits(card: Card, now: float) -> Change:
+    delta = card.used_bytes - card.logged_bytes
+    if not delta:
+        return Change(card)
+    line: LogLine = {
+        "seq": card.seq + 1, "t": now, "pid": 0, "start": 0, "name": "edited by hand", "op": "edited", "label": "",
+        "bytes": abs(delta), "delta": delta, "process_bytes": 0, "used_after": card.used_bytes,
+        "capacity": card.config.capacity_bytes,
+    }  # fmt: skip
+    after = replace(card, seq=card.seq + 1, logged_bytes=card.used_bytes)
+    return Change(after, (Step("", None, _dump(line)),))
 
 
 def touch(card: Card, key: ProcessKey, name: str, context_bytes: int, now: float) -> Change:
@@ -388,10 +410,10 @@ def _step(
         line: LogLine = {
             "seq": card.seq + 1, "t": now, "pid": process.pid, "start": process.start_ticks, "name": process.name, "op": op,
             "label": label, "bytes": size, "delta": delta, "process_bytes": process.on_card_bytes,
-            "used_after": card.used_bytes + delta, "capacity": card.config.capacity_bytes,
+            "used_after": card.logged_bytes + delta, "capacity": card.config.capacity_bytes,
         }  # fmt: skip
         written = process.model_copy(update={"last": dict(line)})
-        after = Card(card.config, {**card.processes, name: written}, card.seq + 1)
+        after = Card(card.config, {**card.processes, name: written}, card.seq + 1, card.logged_bytes + delta)
         return Change(after, (Step(name, written.model_dump_json(exclude_defaults=True), _dump(line)),))
 
     return transition

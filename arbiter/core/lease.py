@@ -50,8 +50,6 @@ TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
 """State → states that may follow. Everything else is illegal."""
 
 TERMINAL = frozenset(state for state, following in TRANSITIONS.items() if not following)
-RESIDENT = frozenset({_S.LOADING, _S.HELD, _S.REVOKING, _S.UNLOADING, _S.VERIFYING})
-"""States in which the lease has a card and is charged there."""
 LEAVING = frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING})
 EXPIRING = frozenset({_S.LOADING, _S.HELD, _S.REVOKING, _S.UNLOADING})
 """States that a holder must renew."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from arbiter.core.effects import Effect, JournalDelete, JournalPut, Note, Push, Refuse, Reply, Sample
 from arbiter.core.events import MemorySampled
-from arbiter.core.lease import LEAVING, RESIDENT, Eviction, Lease, LeaseState
+from arbiter.core.lease import LEAVING, Eviction, Lease, LeaseState
 from arbiter.core.ledger import GpuLedger
 from arbiter.core.queue import WaitQueue
 from arbiter.core.settings import GpuInfo, Settings
@@ -277,7 +277,3 @@ class Core:
             or self.recovering
             or self.now - self.last_client_at <= IDLE_PROBE_S
         )
-
-
-def resident(lease: Lease) -> bool:
-    return lease.state in RESIDENT

@@ -139,6 +139,7 @@ class History:
 
     # -- the thread ----------------------------------------------------------------------------------------------
     def _run(self, store: "_Store") -> None:
+        failing = False
         while (work := self._work.get()) is not None:
             try:
                 if isinstance(work, _Question):
@@ -149,8 +150,11 @@ class History:
                     self._answer(work.done, body)
                 else:
                     store.add(work)
+                    failing = False
             except sqlite3.Error as error:
-                log.error("history: %s", error)
+                if not failing:  # a full disk is worth one line, not five a second
+                    log.error("history: %s; events are kept in memory only until that ends", error)
+                failing = True
                 if isinstance(work, _Question):
                     self._answer(work.done, {"events": [], "last_seq": self._last_seq, "problem": str(error)})
         store.close()

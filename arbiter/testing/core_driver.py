@@ -153,7 +153,14 @@ class CoreDriver:
                 if isinstance(effect, Reply):
                     details = {"key": failed[0].key}
                     performed.append(
-                        Refuse(effect.client, effect.request, "journal_unavailable", self.journal_failing, "", details)
+                        Refuse(
+                            effect.client,
+                            effect.request,
+                            "journal_unavailable",
+                            self.journal_failing,
+                            "",
+                            details,
+                        )
                     )
                 continue  # held back with its record, as the executor does
             performed.append(effect)
@@ -455,6 +462,22 @@ class Consumer:
         self.driver.advance(unload_s)
         self.hold(self.specs[lease].residue_bytes, gpu=GpuId(str(view["gpu"])))
         return self.release(lease)
+
+
+def refusal(effects: Sequence[Effect]) -> Refuse:
+    """The one refusal among effects. Raises AssertionError if there is none."""
+    found = [effect for effect in effects if isinstance(effect, Refuse)]
+    if len(found) != 1:
+        raise AssertionError(f"{len(found)} refusals in {list(effects)}")
+    return found[0]
+
+
+def answer(effects: Sequence[Effect]) -> Mapping[str, Any]:
+    """The body of the one reply among effects. Raises AssertionError if there is none."""
+    found = [effect for effect in effects if isinstance(effect, Reply)]
+    if len(found) != 1:
+        raise AssertionError(f"{len(found)} replies in {list(effects)}")
+    return found[0].body
 
 
 def _names(effect: Effect, lease: str) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-_OPS = {"context", "alloc", "cache", "free", "leak", "returned", "oom", "died"}
+_OPS = {"context", "alloc", "cache", "free", "leak", "returned", "oom", "died", "edited"}
 
 
 @dataclass(slots=True)
@@ -30,12 +30,13 @@ def check_log(text: str) -> Report:
     """Replay a log line by line.
 
     Rules: numbers rise by one, time never runs back; the sum of all deltas is what each line says is used; it stays within
-    the capacity; no process goes below zero, grows after its death, or is refused what would have fitted.
+    the capacity; no process goes below zero, grows after its death, or is refused what would have fitted. What somebody wrote
+    into the folder by hand (`edited`: a test's stowaway) counts for the card, and cannot be told apart from a process's own bytes.
     """
     report = Report()
     held: dict[tuple[int, int], int] = {}
     dead: set[tuple[int, int]] = set()
-    used, seq, clock = 0, 0, float("-inf")
+    used, seq, clock, by_hand = 0, 0, float("-inf"), 0
     pieces = text.split("\n")
     if pieces[-1]:
         report.torn_lines += 1  # nobody came after the process that was killed while it wrote
@@ -65,12 +66,13 @@ def check_log(text: str) -> Report:
             bad(f"{used} bytes on a card of {line['capacity']}")
         if used != line["used_after"]:
             bad(f"the deltas sum up to {used}, not to {line['used_after']}")
-        if held[key] != line["process_bytes"] or held[key] < 0:
+        by_hand += abs(delta) if op == "edited" else 0
+        if op != "edited" and (abs(held[key] - line["process_bytes"]) > by_hand or line["process_bytes"] < 0):
             bad(f"the process has {held[key]} bytes")
         if op in ("context", "alloc") and key in dead:
             bad("a dead process grows")
-        if (delta > 0) is not (op == "context" or (op == "alloc" and delta != 0)) or (
-            delta < 0 and op != "returned"
+        if (delta > 0 and op not in ("context", "alloc", "edited")) or (
+            delta < 0 and op not in ("returned", "edited")
         ):
             bad(f"{op} must not change the card by {delta}")
         if op == "died":

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Self
 
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.panel import Panel
 from rich.table import Table
@@ -85,7 +85,10 @@ class Display:
         """Redraw from the arbiter's status (None: there is no arbiter)."""
         if self._live is None:
             return
-        parts = [Text(f"task: {self._task}", style="bold"), Text(f"robot: {self._robot}")]
+        parts: list[RenderableType] = [
+            Text(f"task: {self._task}", style="bold"),
+            Text(f"robot: {self._robot}"),
+        ]
         if status is not None:
             parts += [_bar(gpu, status["leases"]) for gpu in status["gpus"]]
             parts.append(_table(status["leases"]))

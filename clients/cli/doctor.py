@@ -77,11 +77,11 @@ def _arbiter(endpoint: str) -> tuple[bool, list[Finding]]:
     try:
         status = quick.ask("status", {}, endpoint)
     except quick.Unreachable as error:
-        return False, [Finding("arbiter", False, f"{error}; start `vram-arbiter`")]
+        return False, [Finding("daemon", False, f"{error}; start `vram-arbiter`")]
     if not status.get("ok"):
-        return True, [Finding("arbiter", False, str(status["error"]["message"]))]
+        return True, [Finding("daemon", False, str(status["error"]["message"]))]
     about = [
-        Finding("arbiter", True, f"{status['phase']}, epoch {status['epoch']}, {status['clients']} clients")
+        Finding("daemon", True, f"{status['phase']}, epoch {status['epoch']}, {status['clients']} clients")
     ]
     return True, about + [_card(gpu) for gpu in status["gpus"]]
 

@@ -21,6 +21,9 @@ OK, NO, USAGE, UNREACHABLE = 0, 1, 2, 3
 TIMEOUT_S = 3.0
 ENVELOPE = frozenset({"re", "ok"})
 HISTORY_LIMIT = 50
+PAGE = 2000  # events in one reply; more would not fit a message
+GAP_MAX = 4000  # numbers that the daemon may leave out after a crash
+NEVER = 1 << 62  # no event has a number beyond it
 
 Message = dict[str, Any]
 
@@ -75,10 +78,11 @@ def answer(
     as_json: bool,
     lines: Callable[[Message], Sequence[str]],
     hidden: frozenset[str] = ENVELOPE,
+    question: Callable[..., Message] = ask,
 ) -> tuple[int, Message]:
     """Ask, print, and say with which code to exit. `--json` prints the reply of `schemas.wire` without its envelope."""
     try:
-        reply = ask(op, fields, endpoint)
+        reply = question(op, fields, endpoint)
     except Unreachable as error:
         problem = {
             "code": "arbiter_unreachable",
@@ -131,22 +135,33 @@ def history(
     limit: int = HISTORY_LIMIT,
     kinds: Sequence[str] = (),
 ) -> int:
-    """The newest `limit` events, or those after a sequence number."""
-    if after is None:
-        try:
-            newest = ask("history", {"after": (1 << 62), "limit": 1}, endpoint)
-        except Unreachable:
-            newest = {}
-        after = max(0, int(newest.get("last_seq", 0)) - limit) if not kinds else 0
-    fields = {"after": after, "limit": limit, "kinds": list(kinds)}
+    """The newest `limit` events (of some kinds), or the first `limit` after a sequence number."""
+
+    def shown(reply: Message) -> list[str]:
+        return [text.event_line(event) for event in reply["events"]]
+
+    fields = {"after": after or 0, "limit": limit, "kinds": list(kinds)}
+    question = ask if after is not None else _newest
+    hidden = ENVELOPE | {"epoch"}
     return answer(
-        "history",
-        fields,
-        endpoint=endpoint,
-        as_json=as_json,
-        lines=lambda reply: [text.event_line(event) for event in reply["events"]],
-        hidden=ENVELOPE | {"epoch"},
+        "history", fields, endpoint=endpoint, as_json=as_json, lines=shown, hidden=hidden, question=question
     )[0]
+
+
+def _newest(op: str, fields: Mapping[str, Any], endpoint: str | None = None) -> Message:
+    """Page forward to the end and keep the tail: numbers have gaps, so the start of the tail cannot be computed."""
+    reply = ask(op, {**fields, "after": NEVER, "limit": 1}, endpoint)
+    limit = int(fields["limit"])
+    after = 0 if fields["kinds"] else max(0, int(reply.get("last_seq", 0)) - limit - GAP_MAX)
+    tail: list[Any] = []
+    while reply.get("ok"):
+        reply = ask(op, {**fields, "after": after, "limit": PAGE}, endpoint)
+        events = reply.get("events", [])
+        tail = [*tail, *events][-limit:]
+        if len(events) < PAGE:
+            return {**reply, "events": tail} if reply.get("ok") else reply
+        after = events[-1]["seq"]
+    return reply
 
 
 def try_run(arguments: Sequence[str]) -> int | None:

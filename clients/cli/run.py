@@ -17,6 +17,7 @@ from clients.lease import Lease
 from schemas.errors import VramError
 from schemas.wire import Footprint, LeaseSpec
 
+PATIENCE_S = 1.0
 NOT_FOUND, NOT_STARTED = 127, 126  # as shells have it
 FORWARDED = (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGCONT, signal.SIGWINCH)
 
@@ -68,12 +69,13 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
         def lost(lease: Lease, error: VramError) -> None:
             print(f"vramctl run: {lease.lease_id} was lost: {error}", file=sys.stderr)
 
-        lease = await client.acquire(
+        acquiring = client.acquire(
             lease_spec(spec),
             spec.wait_timeout_s,
             unload=ended if spec.term_on_revoke else None,
             on_lost=lost,
         )
+        lease = await _tell_why(client, asyncio.ensure_future(acquiring), lease_spec(spec).consumer)
         try:
             child = await asyncio.create_subprocess_exec(program, *spec.command[1:], env=_environ(lease))
         except OSError as error:
@@ -84,6 +86,19 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
         code = await _wait(child)
         await lease.release(exiting=True)
     return code if code >= 0 else 128 - code
+
+
+async def _tell_why(client: ArbiterClient, acquiring: asyncio.Future[Lease], consumer: str) -> Lease:
+    """The lease; a person who waits for it is told once whom for."""
+    try:
+        done, _ = await asyncio.wait({acquiring}, timeout=PATIENCE_S)
+        if not done:
+            for entry in (await client.why(consumer))["leases"]:
+                if entry["state"] == "queued":
+                    print(f"vramctl run: waiting: {entry['text']}", file=sys.stderr)
+        return await acquiring
+    finally:
+        acquiring.cancel()
 
 
 async def _wait(child: asyncio.subprocess.Process) -> int:

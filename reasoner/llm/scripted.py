@@ -17,8 +17,8 @@ from schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall
 ATTEMPTS_MAX = 3
 LOOKS_MAX = 3  # repeats of a locate that gave no answer about the scene
 TURNS_RAD = (0.35, -0.70, 0.35)  # look left, look right, back to the middle
-NAVIGATE_DEADLINE_S = 30.0
-GRAB_DEADLINE_S = 40.0
+NAVIGATE_DEADLINE_S = 60.0
+GRAB_DEADLINE_S = 60.0
 
 _TASK = re.compile(
     r"\s*(?:grab|grasp|pick up|pick|fetch|take|lift)\s+(?:the\s+|a\s+|an\s+)?(.+?)\s*\.?\s*", re.IGNORECASE

@@ -23,6 +23,7 @@ from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
 from runner.sim.env import SimEnv
 from runner.sim.expert import CLOSED_RAD, GrabExpert
 from runner.sim.kinematics import ArmKinematics
+from runner.sim.learned import LoadedPolicy
 from runner.sim.navigate import standoff_pose
 
 # What the grab policy looks at: crops as fractions of the image (x0, y0, x1, y1), and the size they are averaged down to.
@@ -33,6 +34,7 @@ VIEWS: Final[dict[str, tuple[tuple[float, float, float, float], tuple[int, int]]
 NAVIGATION_ERROR_M: Final = 0.035
 NAVIGATION_ERROR_RAD: Final = 0.10
 MIN_VISIBLE_PIXELS: Final = 20
+MAX_STEPS: Final = 120
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -188,12 +190,19 @@ class Demonstration:
     action: list[list[float]] = dataclasses.field(default_factory=list)
     point: list[tuple[float, float, float]] = dataclasses.field(default_factory=list)
 
+    def in_reach(self) -> bool:
+        """Whether the object stayed where the arm can grab it."""
+        return all(0.24 < x < 0.41 and abs(y) < 0.09 and z > 0.2 for x, y, z in self.point)
 
-def demonstrate(env: SimEnv, kinematics: ArmKinematics, seed: int) -> tuple[Demonstration, bool]:
+
+def demonstrate(
+    env: SimEnv, kinematics: ArmKinematics, seed: int, policy: LoadedPolicy | None = None
+) -> tuple[Demonstration, bool]:
     """One perturbed demonstration and whether it ended with the object held.
 
     Bursts of noise push the arm off its way (as in DART); what is recorded is always what the expert would do from where the
-    arm really is, so the policy learns to come back.
+    arm really is, so the policy learns to come back. With a `policy` it is the policy that drives for most of the time (as in
+    DAgger), so that what is recorded are the states it gets itself into.
     """
     rng = random.Random(f"demonstration-{seed}")
     env.reset(seed)
@@ -205,27 +214,34 @@ def demonstrate(env: SimEnv, kinematics: ArmKinematics, seed: int) -> tuple[Demo
     demo = Demonstration()
     push = [0.0] * len(ARM_JOINTS)
     burst = 0
+    planned: list[list[float]] = []
+    expert_from = rng.randint(0, 110) if policy is not None else 0
     after = 0
-    for _ in range(110):
-        demo.front.append(policy_view(env.render("front"), "front"))
-        demo.wrist.append(policy_view(env.render("wrist"), "wrist"))
+    for step in range(MAX_STEPS):
+        front, wrist = env.render("front"), env.render("wrist")
+        demo.front.append(policy_view(front, "front"))
+        demo.wrist.append(policy_view(wrist, "wrist"))
         demo.state.append(list(env.joint_state().values()))
         demo.point.append(env.ground_truth().objects[name].position_base)
         target = expert.act()
         demo.action.append(target)
-        if burst == 0 and not expert.lifting and rng.random() < 0.12:
-            burst = rng.randint(3, 8)
-            push = [rng.gauss(0.0, s) for s in (0.08, 0.07, 0.07, 0.07, 0.02, 0.10)]
-        shove = burst > 0 and not expert.lifting
-        env.step([t + p for t, p in zip(target, push, strict=True)] if shove else target)
-        burst = max(0, burst - 1)
+        if policy is not None and step < expert_from:
+            planned = planned or policy.chunk(env, {"front": front, "wrist": wrist})
+            env.step(planned.pop(0))
+        else:
+            if burst == 0 and not expert.lifting and rng.random() < 0.12:
+                burst = rng.randint(3, 8)
+                push = [rng.gauss(0.0, s) for s in (0.08, 0.07, 0.07, 0.07, 0.02, 0.10)]
+            shove = burst > 0 and not expert.lifting and policy is None
+            env.step([t + p for t, p in zip(target, push, strict=True)] if shove else target)
+            burst = max(0, burst - 1)
         after += expert.done
         if after >= 6:
             break
     return demo, env.held_object() == name
 
 
-def write_grab(out: Path, episodes: int, seed: int) -> dict[str, int]:
+def write_grab(out: Path, episodes: int, seed: int, policy: LoadedPolicy | None = None) -> dict[str, int]:
     """Record `episodes` successful demonstrations. Returns episodes, steps and discarded failures."""
     import numpy as np
 
@@ -236,9 +252,10 @@ def write_grab(out: Path, episodes: int, seed: int) -> dict[str, int]:
         kinematics = ArmKinematics(env.config)
         number = 0
         while len(kept) < episodes:
-            demo, held = demonstrate(env, kinematics, seed * 1_000_000 + 500_000 + number)
+            demo, held = demonstrate(env, kinematics, seed * 1_000_000 + 500_000 + number, policy)
             number += 1
-            if held:
+            # an object pushed out of reach teaches nothing; a try that only ran out of time does
+            if held or (policy is not None and demo.in_reach()):
                 kept.append(demo)
             else:
                 failed += 1
@@ -280,6 +297,9 @@ def main(argv: list[str] | None = None) -> int:
     kinds = parser.add_subparsers(dest="kind", required=True)
     grab = kinds.add_parser("grab", help="demonstrations of the scripted expert")
     grab.add_argument("--episodes", type=int, default=200)
+    grab.add_argument(
+        "--policy", type=Path, help="checkpoint that drives while the expert labels (second round)"
+    )
     scenes = kinds.add_parser("scenes", help="labelled frames for detector and scene VLM")
     scenes.add_argument("--count", type=int, default=2000)
     for one in (grab, scenes):
@@ -288,7 +308,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     began = time.monotonic()
     counts = (
-        write_grab(args.out, args.episodes, args.seed)
+        write_grab(args.out, args.episodes, args.seed, LoadedPolicy(args.policy) if args.policy else None)
         if args.kind == "grab"
         else write_scenes(args.out, args.count, args.seed)
     )

@@ -9,20 +9,18 @@ from __future__ import annotations
 import argparse
 import collections
 import dataclasses
-import importlib
 import json
 import random
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 from runner.sim.dataset import NAVIGATION_ERROR_M, stand_before
 from runner.sim.env import SimEnv
 from runner.sim.expert import RestController
+from runner.sim.learned import OWN_POLICIES, LoadedPolicy
 
-MAX_STEPS = 90
-RETRY_STEPS = 75
+MAX_STEPS = 120
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -35,43 +33,6 @@ class Attempt:
     tries: int
     steps: int
     held: str | None
-
-
-class LoadedPolicy:
-    """A checkpoint with its processors; predicts joint targets from the env's cameras and joints."""
-
-    def __init__(self, folder: Path, plugin: str | None, execute: int | None) -> None:
-        from lerobot.configs import PreTrainedConfig
-        from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-
-        if plugin:
-            importlib.import_module(plugin)
-        config = PreTrainedConfig.from_pretrained(folder)
-        config.device = "cpu"
-        self._policy = get_policy_class(config.type).from_pretrained(folder, config=config)
-        self._before, self._after = make_pre_post_processors(config, pretrained_path=str(folder))
-        self._cameras = [key.rsplit(".", 1)[1] for key in config.image_features]
-        self.execute = execute or config.n_action_steps
-
-    def reset(self) -> None:
-        """Forget the last episode."""
-        self._policy.reset()
-
-    def chunk(self, env: SimEnv) -> list[list[float]]:
-        """The joint targets (rad) to execute next."""
-        import torch
-
-        observation: dict[str, Any] = {
-            f"observation.images.{camera}": torch.from_numpy(env.render(camera)).permute(2, 0, 1).float()
-            / 255
-            for camera in self._cameras
-        }
-        observation["observation.state"] = torch.tensor(list(env.joint_state().values()))
-        with torch.inference_mode():
-            actions = self._policy.predict_action_chunk(self._before(observation))
-            targets = self._after(actions)
-        rows: list[list[float]] = targets[0, : self.execute].tolist()
-        return rows
 
 
 def attempt(env: SimEnv, policy: LoadedPolicy, seed: int, *, tries: int, error_m: float) -> Attempt:
@@ -104,9 +65,7 @@ def main(argv: list[str] | None = None) -> int:
     """Command line of the evaluation."""
     parser = argparse.ArgumentParser(prog="python -m runner.sim.evaluate", description=__doc__)
     parser.add_argument("--policy", type=Path, required=True)
-    parser.add_argument(
-        "--plugin", default="sidecars.compact_act", help="module that registers the policy type"
-    )
+    parser.add_argument("--plugin", default=OWN_POLICIES, help="module that registers the policy type")
     parser.add_argument("--episodes", type=int, default=40)
     parser.add_argument("--seed", type=int, default=900_000, help="first scene seed")
     parser.add_argument("--tries", type=int, default=1)

@@ -28,6 +28,7 @@ CARRY_REACHED_RAD = 0.06
 LEAD_M = 0.022
 LEAD_RAD = 0.13
 NARROWEST_HOLD_RAD = 0.12  # the gripper closes beyond this only when nothing is between the fingers
+GRIPPING_RAD = 0.62  # and beyond this it is open: the widest ball is held at about 0.4
 CLOSE_STEPS = (5, 14)
 STILL_RAD_S = 0.15
 
@@ -115,9 +116,9 @@ class GrabExpert:
             case Phase.CLOSE:
                 least, most = CLOSE_STEPS
                 still = abs(self._env.joint_velocity()["gripper"]) < STILL_RAD_S
-                if self._in_phase > most or (self._in_phase > least and still):
+                if grip < GRIPPING_RAD and (self._in_phase > most or (self._in_phase > least and still)):
                     self._enter(Phase.LIFT)
-            case Phase.LIFT | Phase.DONE if self._retry and grip < NARROWEST_HOLD_RAD:
+            case Phase.LIFT | Phase.DONE if self._retry and not NARROWEST_HOLD_RAD < grip < GRIPPING_RAD:
                 self._enter(Phase.APPROACH)
             case _:
                 pass

@@ -40,8 +40,24 @@ class Demonstrations:
     info: dict[str, Any]
 
 
-def load_demonstrations(folder: Path) -> Demonstrations:
-    """Read a data folder. Raises BadDemonstrations."""
+def load_demonstrations(*folders: Path) -> Demonstrations:
+    """Read data folders, one after another. Raises BadDemonstrations."""
+    import numpy as np
+
+    parts = [_load_folder(folder) for folder in folders]
+    joined = {key: np.concatenate([arrays[key] for _, arrays in parts]) for key in parts[0][1]}
+    lengths = joined["episode_length"]
+    return Demonstrations(
+        images={key: joined[key] for key in CAMERAS},
+        state=joined["state"],
+        action=joined["action"],
+        point=joined["point"],
+        episode_end=np.repeat(np.cumsum(lengths), lengths),
+        info=parts[0][0],
+    )
+
+
+def _load_folder(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     import numpy as np
 
     path = folder / "info.json"
@@ -56,21 +72,13 @@ def load_demonstrations(folder: Path) -> Demonstrations:
         key: np.load(folder / f"{key}.npy")
         for key in (*CAMERAS, "state", "action", "point", "episode_length")
     }
-    ends = np.cumsum(arrays["episode_length"])
-    steps = int(ends[-1])
+    steps = int(arrays["episode_length"].sum())
     for key in (*CAMERAS, "state", "action", "point"):
         if len(arrays[key]) != steps:
             raise BadDemonstrations(
                 f"{folder / key}.npy has {len(arrays[key])} steps, the episodes sum to {steps}"
             )
-    return Demonstrations(
-        images={key: arrays[key] for key in CAMERAS},
-        state=arrays["state"],
-        action=arrays["action"],
-        point=arrays["point"],
-        episode_end=np.repeat(ends, arrays["episode_length"]),
-        info=info,
-    )
+    return info, arrays
 
 
 def make_config(info: dict[str, Any], *, action_steps: int) -> Any:
@@ -107,6 +115,21 @@ def make_stats(data: Demonstrations) -> dict[str, dict[str, Any]]:
     for key, values in (("observation.state", data.state), ("action", data.action)):
         tensor = torch.from_numpy(values)
         stats[key] = {"mean": tensor.mean(0), "std": tensor.std(0).clamp_min(MIN_STD_RAD)}
+    return stats
+
+
+def load_stats(checkpoint: Path) -> dict[str, dict[str, Any]]:
+    """The normalisation that a checkpoint was trained with, from its preprocessor."""
+    from safetensors.torch import load_file
+
+    stats: dict[str, dict[str, Any]] = {}
+    for path in checkpoint.glob("policy_preprocessor_step_*_normalizer_processor.safetensors"):
+        for name, value in load_file(path).items():
+            key, _, which = name.rpartition(".")
+            if which in ("mean", "std"):
+                stats.setdefault(key, {})[which] = value
+    if not {"observation.state", "action"} <= set(stats):
+        raise BadDemonstrations(f"{checkpoint} has no normalisation of state and action")
     return stats
 
 
@@ -173,8 +196,13 @@ def train(
     seed: int,
     action_steps: int,
     time_limit_s: float = math.inf,
+    init: Path | None = None,
 ) -> dict[str, float]:
-    """Train, write the checkpoint, return the last running losses. Ends early (and well: the rate follows time) at the limit."""
+    """Train, write the checkpoint, return the last running losses.
+
+    Ends early (and well: the rate follows time) at the limit. `init` goes on from an earlier checkpoint, whose normalisation
+    is kept because its weights mean nothing without it.
+    """
     import torch
     from lerobot.policies.factory import make_pre_post_processors
 
@@ -182,9 +210,14 @@ def train(
 
     random.seed(seed)
     torch.manual_seed(seed)
-    config, stats = make_config(data.info, action_steps=action_steps), make_stats(data)
-    policy = CompactActPolicy(config)
-    policy.point_centre.copy_(torch.from_numpy(data.point).mean(0))
+    config = make_config(data.info, action_steps=action_steps)
+    if init is None:
+        stats = make_stats(data)
+        policy = CompactActPolicy(config)
+        policy.point_centre.copy_(torch.from_numpy(data.point).mean(0))
+    else:
+        stats = load_stats(init)
+        policy = CompactActPolicy.from_pretrained(init, config=config)
     batches = Batches(data, config, stats, seed)
     optimizer = torch.optim.AdamW(
         policy.get_optim_params(), lr=config.optimizer_lr, weight_decay=config.optimizer_weight_decay
@@ -228,7 +261,10 @@ def train(
 def main(argv: list[str] | None = None) -> int:
     """Command line of the policy trainer."""
     parser = argparse.ArgumentParser(prog="python -m sidecars.training.policy", description=__doc__)
-    parser.add_argument("--data", type=Path, required=True, help="folder written by runner.sim.dataset grab")
+    parser.add_argument(
+        "--data", type=Path, required=True, nargs="+", help="folders written by runner.sim.dataset grab"
+    )
+    parser.add_argument("--init", type=Path, help="checkpoint to go on from")
     parser.add_argument("--out", type=Path, required=True, help="checkpoint folder")
     parser.add_argument("--steps", type=int, default=7000)
     parser.add_argument("--batch-size", type=int, default=32)
@@ -246,7 +282,7 @@ def main(argv: list[str] | None = None) -> int:
 
     torch.set_num_threads(args.threads)
     try:
-        data = load_demonstrations(args.data)
+        data = load_demonstrations(*args.data)
     except BadDemonstrations as error:
         print(error, file=sys.stderr)
         return 2
@@ -258,6 +294,7 @@ def main(argv: list[str] | None = None) -> int:
         seed=args.seed,
         action_steps=args.action_steps,
         time_limit_s=20.0 if args.smoke else args.time_limit_s,
+        init=args.init,
     )
     print(json.dumps({"out": str(args.out)} | {k: round(v, 5) for k, v in result.items()}))
     return 0

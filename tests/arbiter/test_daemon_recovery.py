@@ -188,3 +188,12 @@ def test_a_card_that_cannot_be_read_blocks_and_comes_back(make_arbiter: Make, fa
         assert client.ask("status")["gpus"][0]["blocked"]
         set_fault(arbiter, "ok")
         assert client.push("granted")["lease"]["consumer"] == "waiter"
+
+
+def test_a_hanging_driver_does_not_hold_up_the_stop(make_arbiter: Make) -> None:
+    arbiter = make_arbiter(config="probe:\n  deadline_s: 0.2\n").start()
+    with WireClient(arbiter.endpoint) as watcher:
+        watcher.hello("watcher").ask("subscribe")
+        set_fault(arbiter, "hang")
+        watcher.push("event", where=lambda push: push["event"]["kind"] == "probe_failed")
+        assert arbiter.stop() == 0

@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -130,7 +130,7 @@ def endpoint(tmp_path: Path) -> str:
 
 
 @pytest.fixture
-def run_async() -> Iterator[Callable[[Any], Any]]:
+def run_async() -> Callable[[Any], Any]:
     """Runs a coroutine to its end, at most 20 s."""
 
     def run(coroutine: Any) -> Any:
@@ -140,4 +140,4 @@ def run_async() -> Iterator[Callable[[Any], Any]]:
 
         return asyncio.run(bounded())
 
-    yield run
+    return run

@@ -29,7 +29,9 @@ class Scripted(RunnerBase):
     def _decide(self, tick_idx: int) -> Decision:
         self.began_s.append(self.manual.time_s)
         self.manual.advance(self.decide_s[tick_idx] if tick_idx < len(self.decide_s) else 0.0)
-        return Decision(action=ACTION, inference_ms=1e3 * (self.decide_s[tick_idx : tick_idx + 1] or [0.0])[0])
+        return Decision(
+            action=ACTION, inference_ms=1e3 * (self.decide_s[tick_idx : tick_idx + 1] or [0.0])[0]
+        )
 
     def _apply(self, decision: Decision) -> Applied:
         self.applied.append(decision.action)

@@ -69,6 +69,9 @@ def test_numbers_that_are_none_cannot_even_become_an_action(value: float) -> Non
 
 def test_a_chunk_is_checked_row_by_row() -> None:
     chunk: Any = Action(
-        control_mode=ControlMode.JOINT_POSITION, horizon=2, joint_targets=((0.0, 0.0), (5.0, 0.0)), joint_names=("a", "b")
+        control_mode=ControlMode.JOINT_POSITION,
+        horizon=2,
+        joint_targets=((0.0, 0.0), (5.0, 0.0)),
+        joint_names=("a", "b"),
     )
     assert Envelope(LIMITS).check(chunk, WORLD)[0] is None

@@ -167,11 +167,19 @@ def test_a_stowaway_is_a_file_that_anybody_may_write():
     folder = Folder()
     folder.texts["browser.json"] = '{"pid": 1, "name": "browser", "allocated_bytes": "2GB"}'
     assert folder.card.used_bytes == 2 * GB
+    allocate(folder, A, GB)
+    assert check_log(folder.log).problems == []
+    assert check_log(folder.log).peak_bytes == 3 * GB
     folder.dead.add(ProcessKey(1, 0))
     folder.now = 1
     folder.card  # noqa: B018  its death is noticed
     folder.now = 2
-    assert "browser.json" not in (folder.card.processes)
+    assert "browser.json" not in folder.card.processes
+    folder.texts["browser.json"] = '{"pid": 1, "name": "browser", "allocated_bytes": "2GB"}'
+    del folder.texts["100-1.json"]
+    folder.dead.clear()
+    assert folder.card.used_bytes == 2 * GB
+    assert check_log(folder.log).problems == [], "files that come and go by hand are on the record"
 
 
 def test_a_card_survives_the_daemon_but_not_the_boot():

@@ -171,7 +171,12 @@ class Leases(RuleBasedStateMachine):
         self.driver.card.set(STRANGER, 0, self.driver.now)
         waiting: set[LeaseId] = set()
         for turn in range(400):
-            if turn in (100, 110, 120, 130):  # residues of live processes may be all that is in the way: exit, one by one
+            if turn in (
+                100,
+                110,
+                120,
+                130,
+            ):  # residues of live processes may be all that is in the way: exit, one by one
                 self.die((turn - 100) // 10)
             for lease in self.mine:
                 self.load(lease)
@@ -189,5 +194,9 @@ class Leases(RuleBasedStateMachine):
 
 TestLeases = Leases.TestCase
 TestLeases.settings = settings(
-    max_examples=60, stateful_step_count=40, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True
+    max_examples=60,
+    stateful_step_count=40,
+    deadline=None,
+    suppress_health_check=list(HealthCheck),
+    derandomize=True,
 )

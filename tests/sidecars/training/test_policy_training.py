@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 pytest.importorskip("lerobot")
 import numpy as np
+import torch
 
 from sidecars.training.policy import BadDemonstrations, load_demonstrations, main, train
 
@@ -53,9 +54,10 @@ def write_demonstrations(folder: Path, episodes: int = 4, length: int = 25) -> N
 
 def act(folder: Path, chunk_of: int) -> np.ndarray:
     """One chunk from a checkpoint, loaded as any lerobot checkpoint is."""
-    import sidecars.compact_act  # noqa: F401  # registers the policy type
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+    import sidecars.compact_act  # noqa: F401  # registers the policy type
 
     config = PreTrainedConfig.from_pretrained(folder)
     config.device = "cpu"

@@ -1,0 +1,136 @@
+"""The ladder: ask, ask again until heard, remind, deadline. Exact times, no sleep."""
+
+from arbiter.testing.core_driver import Consumer, CoreDriver
+from schemas import defaults as d
+from schemas.ids import LeaseId
+
+GIB = d.GIB
+
+
+def held(driver: CoreDriver, name: str = "det") -> tuple[Consumer, LeaseId]:
+    holder = driver.consumer(name)
+    lease = holder.acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "loading")
+    holder.load(lease)
+    return holder, lease
+
+
+def test_revoke_is_sent_again_until_acknowledged() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver)
+    det.use_begin(lease)
+    waiter = driver.consumer("vlm").acquire(5 * GIB)
+    (first,) = driver.pushes("revoke")
+    assert first == {
+        "push": "revoke",
+        "lease_id": lease,
+        "token": list((det.token(lease).epoch, det.token(lease).serial)),
+        "reason": "vlm needs the room",
+        "wanted_by": "vlm",
+        "deadline_in_s": 30.0,
+        "uses": 1,
+    }
+    driver.advance(1.01)
+    assert len(driver.pushes("revoke")) == 5, "every 250 ms"
+    det.ack(lease, 4.0)
+    det.ack(lease, 3.0)
+    assert len(driver.notes("revoke_acked")) == 1
+    driver.advance(1.5)
+    assert len(driver.pushes("revoke")) == 5, "heard"
+    assert [note["uses"] for note in driver.notes("reminded")] == [1]
+    det.use_end(lease)
+    assert driver.pushes("revoke")[-1]["uses"] == 0
+    driver.advance(0.6)
+    assert len(driver.pushes("revoke")) == 8, "at the safe point it is reminded until it unloads"
+    det.unloading(lease)
+    driver.advance(0.6)
+    assert len(driver.pushes("revoke")) == 8
+    assert driver.state(waiter) == "queued"
+
+
+def test_a_waiter_that_is_patient_waits_past_the_deadline() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver)
+    det.use_begin(lease)
+    waiter = driver.consumer("vlm").acquire(5 * GIB)
+    driver.advance(31.0)
+    assert len(driver.notes("deadline_passed")) == 1
+    assert driver.state(waiter) == "queued"
+    driver.advance(60.0)
+    assert len(driver.notes("deadline_passed")) == 1
+    det.use_end(lease)
+    det.unload(lease)
+    driver.until(lambda: driver.state(waiter) == "loading")
+
+
+def test_a_waiter_that_said_deny_is_denied_at_the_deadline() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver)
+    det.use_begin(lease)
+    det.ack(lease)
+    waiter = driver.consumer("vlm").acquire(5 * GIB, deny_on_deadline=True)
+    driver.advance(30.1)
+    (denied,) = driver.pushes("denied", waiter)
+    assert denied["error"]["code"] == "holder_busy"
+    assert denied["error"]["details"] == {"lease_id": lease, "consumer": "det", "uses": 1}
+    assert driver.state(lease) == "revoking", "the revoke stands"
+    det.ack(lease)
+    driver.advance(1.0)
+    det.use_end(lease)
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+
+
+def test_a_revoke_stands_when_its_waiter_is_gone_and_counts_for_the_next() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver)
+    det.use_begin(lease)
+    vlm = driver.consumer("vlm")
+    vlm.cancel(vlm.acquire(5 * GIB))
+    driver.advance(31.0)
+    assert driver.state(lease) == "revoking"
+    other = driver.consumer("other")
+    second = other.acquire(5 * GIB)
+    det.use_end(lease)
+    det.unload(lease)
+    driver.until(lambda: driver.state(second) == "loading")
+    other.load(second)
+    assert driver.notes("switch")[-1]["evicted"][0]["lease_id"] == lease
+
+
+def test_a_holder_that_does_not_answer_at_the_deadline_no_longer_counts_as_leaving() -> None:
+    """Another idle holder is asked instead, so that the waiter does not hang on a deaf one."""
+    driver = CoreDriver(8 * GIB)
+    deaf, deaf_lease = held(driver, "deaf")
+    idle = driver.consumer("idle")
+    idle_lease = idle.acquire(2 * GIB)
+    driver.until(lambda: driver.state(idle_lease) == "loading")
+    idle.load(idle_lease)
+    waiter = driver.consumer("w").acquire(2 * GIB, residue_bytes=0)
+    assert (driver.state(deaf_lease), driver.state(idle_lease)) == ("held", "revoking")
+    driver.advance(31.0)
+    assert driver.state(deaf_lease) == "revoking"
+    deaf.unload(deaf_lease)
+    driver.until(lambda: driver.state(waiter) == "loading")
+
+
+def test_a_voluntary_release_while_asked_is_as_good() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver)
+    waiter = driver.consumer("vlm").acquire(5 * GIB)
+    det.hold(0)
+    det.release(lease)
+    driver.until(lambda: driver.state(waiter) == "loading")
+
+
+def test_death_while_asked_counts_as_leaving() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver)
+    vlm = driver.consumer("vlm")
+    waiter = vlm.acquire(5 * GIB)
+    driver.advance(0.1)
+    det.die()
+    driver.until(lambda: driver.state(waiter) == "loading")
+    vlm.load(waiter)
+    (gone,) = driver.notes("switch")[-1]["evicted"]
+    assert (gone["lease_id"], gone["verdict"]) == (lease, "verified")

@@ -1,0 +1,53 @@
+"""Order of waiters: priority, arrival, and ageing that never reorders equals."""
+
+from arbiter.core.events import Spec
+from arbiter.core.lease import Lease
+from arbiter.core.queue import WaitQueue
+from schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey
+
+
+def waiter(arrival: int, at: float, priority: int = 50, need: int = 10) -> Lease:
+    spec = Spec("c", ModelKey("m"), "any", False, need, need, 0, priority, True, 10.0, 0.0, False)
+    return Lease(
+        LeaseId(f"L1-{arrival}"), "n", spec, ProcessKey(1, 1), ClientId("c"), at, arrival, need, need, ()
+    )
+
+
+def order(queue: WaitQueue) -> list[int]:
+    return [lease.arrival for lease in queue]
+
+
+def test_priority_then_arrival() -> None:
+    queue = WaitQueue(5.0)
+    for lease in (waiter(1, 0.0), waiter(2, 0.0), waiter(3, 0.1, priority=60), waiter(4, 0.2, priority=40)):
+        queue.add(lease)
+    assert order(queue) == [3, 1, 2, 4]
+    assert [lease.arrival for lease in queue.behind_head()] == [1, 2, 4]
+
+
+def test_ageing_bounds_the_wait_behind_higher_priorities() -> None:
+    queue = WaitQueue(5.0)
+    queue.add(old := waiter(1, 0.0, priority=50))
+    queue.add(waiter(2, 40.0, priority=60))
+    assert order(queue) == [2, 1], "ten points are worth 50 s"
+    queue.add(waiter(3, 60.0, priority=60))
+    assert order(queue) == [2, 1, 3]
+    assert queue.position(old) == 2
+    assert queue.ahead_of(old) == "L1-2"
+    head = queue.head()
+    assert head is not None
+    assert queue.ahead_of(head) is None
+
+
+def test_taking_out_and_the_smallest_need() -> None:
+    queue = WaitQueue(5.0)
+    assert queue.head() is None
+    a, b = waiter(1, 0.0, need=30), waiter(2, 0.0, need=20)
+    queue.add(a)
+    queue.add(b)
+    assert (len(queue), queue.smallest_need_bytes()) == (2, 20)
+    assert b in queue
+    queue.discard(b)
+    queue.discard(b)
+    assert b not in queue
+    assert (len(queue), queue.smallest_need_bytes()) == (1, 30)

@@ -1,0 +1,320 @@
+"""What clients ask for: exact effects, and every refusal with its code. A refused request changes nothing."""
+
+from typing import Any
+
+import pytest
+
+from arbiter.core.effects import JournalPut, Note, Push, Reply, Sample
+from arbiter.core.events import AcquireRequested
+from arbiter.testing.core_driver import CoreDriver, answer, refusal
+from schemas import defaults as d
+from schemas.ids import ClientId, LeaseId, RequestId, Token
+
+GIB = d.GIB
+
+
+@pytest.fixture
+def driver() -> CoreDriver:
+    return CoreDriver(8 * GIB)
+
+
+def kinds(effects: list[Any]) -> list[str]:
+    return [f"{type(e).__name__}:{e.kind}" if isinstance(e, Note) else type(e).__name__ for e in effects]
+
+
+# -- acquire -----------------------------------------------------------------------------------------------------------
+def test_a_grant_is_journalled_before_it_is_told(driver: CoreDriver) -> None:
+    det = driver.consumer("det")
+    effects = det.try_acquire(5 * GIB)
+    assert kinds(effects) == ["JournalPut", "Reply", "Note:granted"]
+    put, reply, note = effects
+    assert isinstance(put, JournalPut)
+    assert isinstance(reply, Reply)
+    assert isinstance(note, Note)
+    assert put.key == "lease:L1-1"
+    assert put.record["state"] == "loading"
+    assert put.record["token"] == [1, 2]
+    assert reply.body["state"] == "loading"
+    assert reply.body["lease"]["token"] == [1, 2]
+    assert reply.body["lease"]["charge_bytes"] == 5 * GIB
+    assert note.data["reason"] == "fits"
+
+
+def test_who_has_to_wait_is_told_why_and_hears_of_the_grant_by_push(driver: CoreDriver) -> None:
+    det, vlm = driver.consumer("det"), driver.consumer("vlm")
+    first = det.acquire(5 * GIB)
+    effects = vlm.try_acquire(3 * GIB)
+    assert kinds(effects) == ["Note:queued", "Reply"]
+    assert answer(effects)["state"] == "queued"
+    assert answer(effects)["lease"]["token"] is None
+    assert answer(effects)["lease"]["position"] == 1
+    assert isinstance(effects[0], Note)
+    assert "det is loading" in effects[0].data["reason"]
+    waiting = LeaseId(answer(effects)["lease"]["lease_id"])
+    assert kinds(det.release(first)) == ["JournalPut", "Note:released", "Reply"]
+    driver.until(lambda: driver.state(waiting) == "loading")
+    (granted,) = driver.pushes("granted")
+    assert granted["lease"]["lease_id"] == waiting
+    tail = kinds(driver.effects)
+    assert tail.index("JournalPut", tail.index("Note:queued")) < tail.index("Push"), "journal first"
+
+
+def test_the_same_nonce_is_the_same_lease(driver: CoreDriver) -> None:
+    det, vlm = driver.consumer("det"), driver.consumer("vlm")
+    first = det.acquire(5 * GIB, nonce="again")
+    assert det.acquire(5 * GIB, nonce="again") == first
+    assert det.acquire(1 * GIB, nonce="again") == first, "the spec of a repeat does not matter"
+    assert vlm.acquire(1 * GIB, nonce="again") != first, "another process, another lease"
+    second = det.acquire(1 * GIB, nonce="more")
+    assert answer(det.try_acquire(1 * GIB, nonce="more"))["state"] == "queued"
+    det.cancel(second)
+    assert refusal(det.try_acquire(1 * GIB, nonce="more")).code == "cancelled"
+    det.release(first)
+    driver.advance(1.0)
+    assert refusal(det.try_acquire(1 * GIB, nonce="again")).code == "bad_state"
+
+
+def test_what_can_never_fit_fails_at_once(driver: CoreDriver) -> None:
+    refused = refusal(driver.consumer("big").try_acquire(8 * GIB))
+    assert refused.code == "vram_insufficient"
+    assert refused.details == {
+        "needed_bytes": 8 * GIB,
+        "capacity_bytes": 8 * GIB,
+        "reserve_bytes": d.RESERVE_BYTES,
+        "pinned": [],
+    }
+
+
+def test_pinned_leases_count_as_gone_room(driver: CoreDriver) -> None:
+    pin = driver.consumer("pin")
+    lease = pin.acquire(4 * GIB, evictable=False)
+    pin.load(lease)
+    refused = refusal(driver.consumer("big").try_acquire(4 * GIB))
+    assert refused.details["pinned"] == [{"lease_id": lease, "consumer": "pin", "bytes": 4 * GIB}]
+    assert refusal(driver.consumer("alone").try_acquire(1 * GIB, exclusive=True)).code == "vram_insufficient"
+    assert driver.consumer("small").acquire(1 * GIB)
+
+
+def test_nothing_goes_beside_a_pinned_exclusive_lease(driver: CoreDriver) -> None:
+    driver.consumer("pin").acquire(1 * GIB, evictable=False, exclusive=True)
+    assert refusal(driver.consumer("small").try_acquire(1 * GIB)).code == "vram_insufficient"
+
+
+def test_an_unknown_card_is_named(driver: CoreDriver) -> None:
+    refused = refusal(driver.consumer("det").try_acquire(1 * GIB, gpu="7"))
+    assert (refused.code, refused.details["known"]) == ("unknown_gpu", ["GPU-0"])
+    assert driver.consumer("a").acquire(1 * GIB, gpu="0")
+    assert driver.consumer("b").acquire(1 * GIB, gpu="GPU-0")
+
+
+def test_a_connection_without_hello_is_refused(driver: CoreDriver) -> None:
+    spec = driver.consumer("det").spec(1 * GIB)
+    event = AcquireRequested(ClientId("nobody"), RequestId(1), "n", spec, None)
+    assert refusal(driver.post(event)).code == "unknown_session"
+
+
+def test_limits_have_names() -> None:
+    driver = CoreDriver(
+        8 * GIB, settings={"waiters_max": 1, "leases_per_client_max": 2, "uses_per_lease_max": 1}
+    )
+    a, b = driver.consumer("a"), driver.consumer("b")
+    lease = a.acquire(1 * GIB)
+    a.acquire(1 * GIB)
+    assert refusal(b.try_acquire(1 * GIB)).details["limit"] == "waiters_max"
+    a.load(lease)
+    assert refusal(a.try_acquire(1 * GIB)).details["limit"] == "leases_per_client_max"
+    a.use_begin(lease, "u1")
+    assert refusal(a.use_begin(lease, "u2")).details["limit"] == "uses_per_lease_max"
+
+
+def test_a_wait_has_a_bound_and_says_who_was_in_the_way(driver: CoreDriver) -> None:
+    det, vlm = driver.consumer("det"), driver.consumer("vlm")
+    held = det.acquire(5 * GIB, evictable=False)
+    det.load(held)
+    queued = vlm.acquire(1 * GIB, exclusive=False, wait_timeout_s=5.0) if False else None
+    assert queued is None
+    driver.card.failing = "probe died"
+    driver.advance(1.5)
+    lease = vlm.acquire(2 * GIB, wait_timeout_s=5.0)
+    driver.advance(4.9)
+    assert driver.state(lease) == "queued"
+    driver.advance(0.2)
+    assert driver.state(lease) == "over"
+    (denied,) = driver.pushes("denied", lease)
+    assert denied["error"]["code"] == "wait_timeout"
+    assert "probe died" in denied["error"]["details"]["why"]["text"]
+
+
+# -- cancel ------------------------------------------------------------------------------------------------------------
+def test_cancel_gives_up_a_wait_and_may_be_repeated(driver: CoreDriver) -> None:
+    det, vlm = driver.consumer("det"), driver.consumer("vlm")
+    held = det.acquire(5 * GIB)
+    queued = vlm.acquire(5 * GIB)
+    assert refusal(det.cancel(queued)).code == "not_permitted"
+    assert refusal(det.cancel(held)).code == "bad_state"
+    assert refusal(det.cancel(LeaseId("L9-9"))).code == "unknown_lease"
+    assert answer(vlm.cancel(queued)) == {"state": "cancelled"}
+    assert answer(vlm.cancel(queued)) == {"state": "cancelled"}
+    det.die()
+    assert refusal(vlm.cancel(held)).code == "lease_lost"
+
+
+# -- tokens and ownership ----------------------------------------------------------------------------------------------
+def test_only_the_holder_with_the_exact_token_is_heard(driver: CoreDriver) -> None:
+    det, vlm = driver.consumer("det"), driver.consumer("vlm")
+    lease = det.acquire(5 * GIB)
+    assert refusal(vlm.ready(lease)).code == "not_permitted"
+    assert refusal(det.release(lease, token=Token(1, 99))).code == "stale_token"
+    queued = vlm.acquire(5 * GIB)
+    assert refusal(vlm.release(queued, token=Token(1, 99))).code == "bad_state"
+    assert refusal(vlm.release(LeaseId("L7-7"), token=Token(7, 7))).code == "unknown_lease"
+    assert driver.state(lease) == "loading"
+
+
+def test_a_second_connection_of_the_same_process_speaks_for_it(driver: CoreDriver) -> None:
+    det = driver.consumer("det", pid=500)
+    lease = det.acquire(5 * GIB)
+    other = driver.consumer("det", pid=500)
+    other.client = ClientId("c500-2")
+    other.connect()
+    other.specs = det.specs
+    assert answer(other.load(lease))["lease"]["state"] == "held"
+
+
+# -- ready -------------------------------------------------------------------------------------------------------------
+def test_ready_charges_the_steady_bytes_or_what_was_measured(driver: CoreDriver) -> None:
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB, 4 * GIB)
+    effects = det.load(lease)
+    assert kinds(effects) == ["Reply", "JournalPut", "Note:ready", "Note:switch"]
+    assert answer(effects)["lease"]["charge_bytes"] == 4 * GIB
+    assert kinds(det.ready(lease)) == ["Reply"], "a repeat changes nothing"
+    vlm = driver.consumer("vlm")
+    second = vlm.acquire(2 * GIB)
+    driver.until(lambda: driver.state(second) == "loading")
+    assert answer(vlm.load(second, 1 * GIB))["lease"]["charge_bytes"] == 1 * GIB
+    vlm.unloading(second)
+    assert refusal(vlm.ready(second)).code == "bad_state"
+
+
+# -- uses --------------------------------------------------------------------------------------------------------------
+def test_uses_are_idempotent_and_counted_per_process(driver: CoreDriver) -> None:
+    det, runner = driver.consumer("det"), driver.consumer("runner")
+    lease = det.acquire(5 * GIB)
+    assert refusal(det.use_begin(lease)).code == "bad_state"
+    det.load(lease)
+    token = det.token(lease)
+    assert answer(det.use_begin(lease, "u")) == {"uses": 1}
+    assert kinds(det.use_begin(lease, "u")) == ["Reply"]
+    assert answer(runner.use_begin(lease, "u", token)) == {"uses": 2}, (
+        "same name, another process, another use"
+    )
+    assert answer(runner.use_end(lease, "u", token)) == {"uses": 1}
+    assert answer(runner.use_end(lease, "u", token)) == {"uses": 1}, "ended already"
+    assert refusal(runner.use_begin(lease, "v", Token(1, 99))).code == "stale_token"
+    assert driver.notes("use_ended")[0]["reason"] == "ended"
+
+
+def test_no_new_use_once_the_holder_was_asked(driver: CoreDriver) -> None:
+    det, vlm = driver.consumer("det"), driver.consumer("vlm")
+    lease = det.acquire(5 * GIB)
+    det.load(lease)
+    det.use_begin(lease, "old")
+    vlm.acquire(5 * GIB)
+    assert driver.state(lease) == "revoking"
+    assert refusal(det.use_begin(lease, "new")).code == "lease_revoking"
+    assert answer(det.use_begin(lease, "old")) == {"uses": 1}, "a repeat of what runs is fine"
+
+
+# -- renew -------------------------------------------------------------------------------------------------------------
+def test_renewing_keeps_alive_and_never_resurrects(driver: CoreDriver) -> None:
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB, ttl_s=10.0)
+    det.load(lease)
+    queued = det.acquire(5 * GIB)
+    token = det.token(lease)
+    driver.advance(9.0)
+    renewed = answer(det.renew((lease, token), (queued, Token(0, 0)), (LeaseId("L8-8"), Token(8, 8))))
+    assert renewed["alive"] == [lease, queued]
+    assert [(gone["lease_id"], gone["error"]["code"]) for gone in renewed["gone"]] == [
+        ("L8-8", "unknown_lease")
+    ]
+    driver.advance(9.0)
+    assert driver.state(lease) == "held"
+    driver.advance(1.1)
+    assert driver.state(lease) == "over"
+    (gone,) = answer(det.renew((lease, token)))["gone"]
+    assert gone["error"]["code"] == "lease_expired"
+    assert driver.pushes("lost", lease)[0]["error"]["code"] == "lease_expired"
+    assert driver.state(lease) == "over"
+
+
+# -- leaving -----------------------------------------------------------------------------------------------------------
+def test_unloading_waits_for_the_safe_point_whoever_marked_the_use(driver: CoreDriver) -> None:
+    det, runner = driver.consumer("det"), driver.consumer("runner")
+    lease = det.acquire(5 * GIB)
+    assert refusal(det.unloading(lease)).code == "bad_state"
+    det.load(lease)
+    runner.use_begin(lease, "goal", det.token(lease))
+    refused = refusal(det.unloading(lease))
+    assert (refused.code, refused.details["uses"]) == ("bad_state", 1)
+    assert driver.state(lease) == "held"
+    runner.use_end(lease, "goal", det.token(lease))
+    assert kinds(det.unloading(lease)) == ["Reply", "Note:unloading"]
+    assert kinds(det.unloading(lease)) == ["Reply"], "a repeat"
+
+
+def test_release_may_be_repeated_before_and_after_the_verdict(driver: CoreDriver) -> None:
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB)
+    token = det.token(lease)
+    assert answer(det.release(lease)) == {"state": "verifying"}
+    assert answer(det.release(lease)) == {"state": "verifying"}
+    driver.advance(1.0)
+    assert answer(det.release(lease, token=token)) == {"state": "released"}
+    assert refusal(det.release(lease, token=Token(1, 99))).code == "bad_state"
+
+
+def test_a_release_in_use_is_a_fact_and_ends_the_uses(driver: CoreDriver) -> None:
+    det, runner = driver.consumer("det"), driver.consumer("runner")
+    lease = det.acquire(5 * GIB)
+    det.load(lease)
+    runner.use_begin(lease, "goal", det.token(lease))
+    det.hold(0)
+    det.release(lease, exiting=True)
+    assert driver.notes("use_ended")[0]["reason"] == "exits"
+    driver.until(lambda: driver.state(lease) == "over")
+    assert driver.gpu()["charged_bytes"] == 0
+
+
+def test_an_acknowledgement_without_a_question_is_only_answered(driver: CoreDriver) -> None:
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB)
+    assert kinds(det.ack(lease)) == ["Reply"]
+
+
+# -- oom ---------------------------------------------------------------------------------------------------------------
+def test_an_out_of_memory_raises_the_learnt_peak_of_its_model(driver: CoreDriver) -> None:
+    det = driver.consumer("det")
+    lease = det.acquire(2 * GIB)
+    effects = det.oom(lease, 1 * GIB)
+    assert kinds(effects) == ["Sample", "Reply", "Note:oom"]
+    assert answer(effects)["learnt_load_peak_bytes"] == 3 * GIB
+    det.release(lease)
+    driver.advance(1.0)
+    again = det.acquire(2 * GIB)
+    view = driver.view(again)
+    assert view is not None
+    assert view["charge_bytes"] == 3 * GIB
+    assert answer(det.oom(again, 100 * GIB, 1 * GIB))["learnt_load_peak_bytes"] == 8 * GIB - d.RESERVE_BYTES
+    assert isinstance(det.oom(again, 1, 1)[0], Reply), "a reading is under way already"
+
+
+def test_an_out_of_memory_within_the_grant_is_somebody_elses_doing(driver: CoreDriver) -> None:
+    det = driver.consumer("det")
+    lease = det.acquire(4 * GIB)
+    effects = det.oom(lease, 1 * GIB, 2 * GIB)
+    assert answer(effects)["learnt_load_peak_bytes"] is None
+    assert "somebody else" in driver.notes("oom")[0]["reason"]
+    assert any(isinstance(effect, Sample) for effect in effects)
+    assert not any(isinstance(effect, Push) for effect in effects)

@@ -1,0 +1,168 @@
+"""Connections that come and go, deaths, and a journal that fails."""
+
+from arbiter.core.effects import Note, Push, Refuse
+from arbiter.core.events import ClientLeft, JournalFailed, ProcessDied
+from arbiter.testing.core_driver import CoreDriver, refusal
+from schemas import defaults as d
+from schemas.ids import ClientId, LeaseId, ProcessKey
+
+GIB = d.GIB
+
+
+def test_a_first_client_makes_the_card_be_read_if_the_reading_is_old() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.advance(60.0)
+    assert driver.arbiter.next_deadline() is None, "nobody is interested: the card is left alone"
+    det = driver.consumer("det")
+    assert [type(e).__name__ for e in det.connect()] == [], "the reading for its hello is under way"
+    driver.advance(0.01)
+    assert det.connect() == []
+
+
+def test_bye_gives_everything_back() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, runner = driver.consumer("det"), driver.consumer("runner")
+    held = det.acquire(2 * GIB)
+    det.load(held)
+    queued = det.acquire(7 * GIB)
+    runner.use_begin(held, "goal", det.token(held))
+    det.hold(0)
+    det.leave()
+    assert driver.state(held) == "verifying"
+    assert driver.state(queued) == "over"
+    driver.until(lambda: driver.state(held) == "over")
+    assert det.leave() == [], "twice is once"
+
+
+def test_a_dropped_connection_loses_its_waits_and_uses_but_nothing_resident() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, runner = driver.consumer("det"), driver.consumer("runner")
+    held = det.acquire(2 * GIB)
+    det.load(held)
+    queued = det.acquire(7 * GIB)
+    runner.use_begin(held, "goal", det.token(held))
+    det.leave("misconduct")
+    assert (driver.state(held), driver.state(queued)) == ("revoking", "over"), (
+        "it was asked for its own second lease"
+    )
+    runner.leave("misconduct")
+    assert driver.notes("use_ended")[-1]["reason"] == "its client left: misconduct"
+
+
+def test_pushes_go_to_another_living_connection_of_the_process() -> None:
+    driver = CoreDriver(8 * GIB)
+    first = driver.consumer("det", pid=500)
+    held = first.acquire(5 * GIB)
+    first.load(held)
+    second = driver.consumer("det", pid=500)
+    second.client = ClientId("c500-2")
+    second.connect()
+    first.leave("misconduct")
+    effects = driver.consumer("vlm").try_acquire(5 * GIB)
+    assert [e.client for e in effects if isinstance(e, Push)] == ["c500-2"]
+    second.leave("misconduct")
+    driver.advance(0.3)
+    assert [e for e in driver.effects if isinstance(e, Push)][-1].client == "c500", (
+        "nobody is there: the last known"
+    )
+
+
+def test_a_death_ends_leases_waits_and_uses_and_its_bytes_are_measured_away() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = 1.0
+    det, vlm = driver.consumer("det"), driver.consumer("vlm")
+    held = det.acquire(5 * GIB)
+    det.load(held)
+    own_wait = det.acquire(7 * GIB)
+    vlm_lease = vlm.acquire(2 * GIB)
+    det.die()
+    assert driver.state(held) == "over"
+    assert driver.state(own_wait) == "over"
+    assert driver.gpu()["charged_bytes"] == 5 * GIB, "a debt until measured gone"
+    driver.until(lambda: driver.state(vlm_lease) == "loading")
+    assert driver.notes("verified")[-1]["verdict"] == "verified"
+    took = driver.until(lambda: driver.gpu()["charged_bytes"] == 2 * GIB)
+    assert took <= 1.0
+    vlm.load(vlm_lease)
+    vlm.use_begin(vlm_lease)
+    runner = driver.consumer("runner")
+    runner.use_begin(vlm_lease, "goal", vlm.token(vlm_lease))
+    runner.die()
+    assert driver.notes("use_ended")[-1]["reason"] == "its process died"
+    assert refusal(det.connect() + det.release(held, token=vlm.token(vlm_lease))).code == "lease_lost"
+
+
+def test_a_death_during_verification_needs_no_residue_any_more() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    held = det.acquire(5 * GIB, residue_bytes=1 * GIB)
+    det.load(held)
+    det.unload(held)
+    det.die()
+    driver.until(lambda: driver.state(held) == "over")
+    assert driver.gpu()["charged_bytes"] == 0
+    assert driver.journal == {}
+
+
+def test_the_residue_of_a_dead_process_is_measured_away_too() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, big = driver.consumer("det"), driver.consumer("big")
+    held = det.acquire(5 * GIB, residue_bytes=1 * GIB)
+    det.load(held)
+    det.unload(held)
+    driver.until(lambda: driver.state(held) == "over")
+    assert driver.gpu()["charged_bytes"] == 1 * GIB
+    assert list(driver.journal) == [f"residue:{det.process}:GPU-0"]
+    waiting = big.acquire(7 * GIB)
+    assert driver.state(waiting) == "queued"
+    det.die()
+    driver.post(ProcessDied(det.process))
+    driver.until(lambda: driver.state(waiting) == "loading")
+    assert "lease:L1-1" not in driver.journal
+    assert driver.notes("verified")[-1]["lease_id"] is None
+
+
+def test_a_grant_that_cannot_be_written_is_taken_back() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, vlm = driver.consumer("det"), driver.consumer("vlm")
+    held = det.acquire(5 * GIB)
+    waiting = vlm.acquire(5 * GIB)
+    driver.journal_failing = "disk full"
+    other = driver.consumer("other")
+    other.try_acquire(1 * GIB)
+    det.release(held)
+    driver.advance(1.0)
+    (denied,) = driver.pushes("denied", waiting)
+    assert denied["error"]["code"] == "journal_unavailable"
+    assert not driver.pushes("granted")
+    assert driver.gpu()["charged_bytes"] == 0, "nothing stays charged for it"
+
+
+def test_a_grant_in_reply_that_cannot_be_written_is_refused_once() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    driver.journal_failing = "disk full"
+    det.try_acquire(5 * GIB)
+    refused = [effect for effect in driver.effects if isinstance(effect, Refuse)]
+    assert [refuse.code for refuse in refused] == ["journal_unavailable"]
+    assert driver.gpu()["charged_bytes"] == 0
+    notes = [effect.kind for effect in driver.effects if isinstance(effect, Note)]
+    assert notes[-2:] == ["journal_failed", "denied"]
+
+
+def test_other_records_that_fail_are_noted_and_nothing_else() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    held = det.acquire(5 * GIB)
+    driver.journal_failing = "disk full"
+    det.load(held)
+    assert driver.state(held) == "held"
+    effects = driver.post(JournalFailed("residue:1@2:GPU-0", "disk full"))
+    assert [type(effect) for effect in effects] == [Note]
+
+
+def test_strangers_to_the_core_die_unmourned() -> None:
+    driver = CoreDriver(8 * GIB)
+    assert driver.post(ProcessDied(ProcessKey(1, 1))) == []
+    assert driver.post(ClientLeft(ClientId("x"), "bye")) == []
+    assert driver.state(LeaseId("L1-1")) == "over"

@@ -1,0 +1,33 @@
+"""Deadlines by name."""
+
+from arbiter.core.timers import Timers
+
+
+def test_timers_come_in_their_order_and_once() -> None:
+    timers = Timers()
+    timers.set(("ttl", "b"), 2.0)
+    timers.set(("ttl", "a"), 1.0)
+    assert timers.next_at() == 1.0
+    assert timers.pop_due(0.5) is None
+    assert [timers.pop_due(3.0) for _ in range(3)] == [("ttl", "a"), ("ttl", "b"), None]
+    assert timers.next_at() is None
+
+
+def test_renewing_moves_a_deadline_and_earlier_ones_win() -> None:
+    timers = Timers()
+    timers.set(("ttl", "a"), 1.0)
+    timers.set(("ttl", "a"), 5.0)
+    assert timers.next_at() == 5.0
+    timers.set(("ttl", "a"), 3.0)
+    assert timers.next_at() == 3.0
+    assert timers.pop_due(4.0) == ("ttl", "a")
+    assert timers.next_at() is None
+
+
+def test_a_cleared_timer_never_fires() -> None:
+    timers = Timers()
+    timers.set(("ttl", "a"), 1.0)
+    timers.clear(("ttl", "a"))
+    timers.clear(("ttl", "a"))
+    assert ("ttl", "a") not in timers
+    assert timers.pop_due(9.0) is None

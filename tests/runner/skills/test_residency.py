@@ -1,0 +1,140 @@
+"""One GPU-holding skill is resident by (rskill_id, revision); GPU-free ones come and go beside it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from runner.protocols import Done, Goal, SkillKey, StepOutcome
+from runner.skills.base import SkillBase
+from runner.skills.residency import Residency
+from schemas.errors import BadState, ManifestInvalid, SidecarUnavailable
+from schemas.manifest import RSkillManifest, load_manifest
+from schemas.world import WorldState
+
+Run = Callable[[Any], Any]
+
+
+class Recording(SkillBase):
+    def __init__(self, manifest: RSkillManifest, revision: str, holds_gpu: bool, fails: str = "") -> None:
+        super().__init__(manifest, revision=revision)
+        self.holds_gpu = holds_gpu
+        self.fails = fails
+        self.story: list[str] = []
+
+    async def _start(self, goal: Goal) -> None:
+        self.story.append(f"start {goal.prompt}")
+        if self.fails == "start":
+            raise SidecarUnavailable("no")
+
+    def _step(self, world: WorldState) -> StepOutcome:
+        return Done()
+
+    async def _finish(self) -> None:
+        self.story.append("finish")
+
+    async def _release(self) -> None:
+        self.story.append("release")
+        if self.fails == "release":
+            raise SidecarUnavailable("gone")
+
+
+@pytest.fixture
+def skill(navigate_manifest: Path) -> Callable[..., Recording]:
+    manifest = load_manifest(navigate_manifest)
+
+    def make(revision: str = "1", holds_gpu: bool = True, fails: str = "") -> Recording:
+        return Recording(manifest, revision, holds_gpu, fails)
+
+    return make
+
+
+def test_the_same_key_is_reused_whatever_the_prompt(skill: Callable[..., Recording], run_async: Run) -> None:
+    async def scenario() -> None:
+        residency, made = Residency(), skill()
+        for prompt in ("red", "blue"):
+            got = await residency.acquire(made.key, lambda: made)
+            await got.start(Goal("g", "r", prompt=prompt))
+            await got.finish()
+        assert made.story == ["start red", "finish", "start blue", "finish"]
+
+    run_async(scenario())
+
+
+@pytest.mark.parametrize("fails", ["", "release"])
+def test_another_key_makes_the_old_one_leave_first(
+    skill: Callable[..., Recording], run_async: Run, fails: str
+) -> None:
+    async def scenario() -> None:
+        residency, old, new = Residency(), skill("1", fails=fails), skill("2")
+        await residency.acquire(old.key, lambda: old)
+        assert await residency.acquire(new.key, lambda: new) is new
+        assert old.story == ["release"]
+        assert residency.resident == new.key
+        await residency.close()
+        assert new.story == ["release"]
+        assert residency.resident is None
+
+    run_async(scenario())
+
+
+def test_a_gpu_free_skill_makes_nobody_leave(skill: Callable[..., Recording], run_async: Run) -> None:
+    async def scenario() -> None:
+        residency, policy, drive = Residency(), skill("1"), skill("drive", holds_gpu=False)
+        await residency.acquire(policy.key, lambda: policy)
+        assert await residency.acquire(drive.key, lambda: drive) is drive
+        assert await residency.acquire(drive.key, lambda: skill()) is drive
+        assert policy.story == []
+        assert residency.resident == policy.key
+
+    run_async(scenario())
+
+
+def test_a_skill_that_cannot_be_made_leaves_the_resident_one_alone(
+    skill: Callable[..., Recording], run_async: Run
+) -> None:
+    def broken() -> Recording:
+        raise ManifestInvalid("no")
+
+    async def scenario() -> None:
+        residency, old = Residency(), skill("1")
+        await residency.acquire(old.key, lambda: old)
+        with pytest.raises(ManifestInvalid):
+            await residency.acquire(SkillKey("x"), broken)
+        assert residency.resident == old.key
+        assert old.story == []
+
+    run_async(scenario())
+
+
+def test_a_failed_start_is_cleaned_up_and_can_be_tried_again(
+    skill: Callable[..., Recording], run_async: Run
+) -> None:
+    async def scenario() -> None:
+        made = skill(fails="start")
+        with pytest.raises(SidecarUnavailable):
+            await made.start(Goal("g", "r"))
+        assert made.story == ["start ", "finish"]
+        made.fails = ""
+        await made.start(Goal("g", "r"))
+        assert made.state == "active"
+
+    run_async(scenario())
+
+
+def test_steps_out_of_order_are_refused(skill: Callable[..., Recording], run_async: Run) -> None:
+    async def scenario() -> None:
+        made = skill()
+        with pytest.raises(BadState, match="idle, not active"):
+            made.step(None)  # type: ignore[arg-type]  # refused before it is looked at
+        await made.start(Goal("g", "r"))
+        with pytest.raises(BadState):
+            await made.start(Goal("g", "r"))
+        await made.release()
+        await made.release()
+        assert made.story.count("release") == 1
+        with pytest.raises(BadState, match="released"):
+            await made.start(Goal("g", "r"))
+
+    run_async(scenario())

@@ -1,0 +1,405 @@
+"""The runner's end of a policy sidecar: one use per goal, chunks in order, fails closed. A real socket, a small real server."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clients.serve import Message, Peer, RouterServer
+from clients.sidecar import npy
+from clients.sidecar.policy import PolicyClient
+from runner.protocols import Act, Done, Goal, Hold, StepOutcome
+from runner.skills.sidecar_policy import SidecarPolicy, Wiring, wire_up
+from schemas.errors import (
+    BadState,
+    Evicted,
+    FrameStale,
+    LeaseLost,
+    LeaseRevoking,
+    ManifestInvalid,
+    ModelError,
+    VramError,
+)
+from schemas.manifest import RSkillManifest, parse_manifest
+from schemas.world import FrameEncoding, JointState, SensorFrame, WorldState
+
+pytestmark = pytest.mark.heavy  # arrays: numpy
+
+Run = Callable[[Any], Any]
+JOINTS = ("a", "b")
+REST = {"a": 0.0, "b": 0.5}
+MANIFEST = """
+name: "test/arm-grab"
+version: "1.0.0"
+kind: vla
+model_family: act
+embodiment_tags: [custom]
+embodiment_extra:
+  sensors: [{modality: rgb, count: 1}]
+  actuators: [{kind: joint_position, n_dof: 2, control_mode_semantics: {mode: absolute}}]
+sensors_required:
+  - {modality: rgb, vla_feature_key: observation.images.front}
+actuators_required:
+  - {kind: joint_position, n_dof: 2, vla_action_key: action, control_mode_semantics: {mode: absolute}}
+weights_uri: "local://models/none"
+chunk_size: 3
+latency_budget: {per_chunk_ms: 100.0, max_execution_s: 20.0}
+min_vram_gb: {fp32: 1.0}
+description: "A policy of this test."
+actions: [grasp]
+action_contract: {dim: 2}
+policy_extras: {rollout_steps: 7, stop_when_still: false}
+"""
+
+
+@pytest.fixture
+def manifest() -> RSkillManifest:
+    return parse_manifest(MANIFEST)
+
+
+class Sidecar:
+    """Speaks the endpoint family. Chunk n is [(n, 0), (n, 1), (n, 2)] / 100."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+        self.tokens: list[Any] = []
+        self.observations: list[Any] = []
+        self.serial = 1
+        self.action: Any = None
+        self.error: VramError | None = None
+        self.load_error: VramError | None = None
+        self.arbitrated = True
+
+    @asynccontextmanager
+    async def served(self, endpoint: str) -> AsyncIterator[None]:
+        async with RouterServer(endpoint, lambda error: {"ok": False, "error": str(error)}) as server:
+            self.server = server
+            task = asyncio.create_task(server.serve(self.handle))
+            try:
+                yield
+            finally:
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+
+    async def handle(self, peer: Peer, message: Message) -> None:
+        import numpy as np
+
+        endpoint = message["endpoint"]
+        if endpoint != "ping":
+            self.calls.append(endpoint)
+            self.tokens.append(message.get("token"))
+        error = self.load_error if endpoint == "load" else self.error
+        if endpoint in ("load", "get_action") and error is not None:
+            reply: Message = {
+                "ok": False,
+                "error": str(error),
+                **{k: v for k, v in error.to_wire().items() if k == "code"},
+            }
+            self.load_error = None
+        elif endpoint == "load":
+            lease = f"L1-{self.serial}" if self.arbitrated else None
+            reply = {
+                "ok": True,
+                "lease_id": lease,
+                "token": [1, self.serial] if lease else None,
+                "loaded": True,
+            }
+        elif endpoint == "get_action":
+            self.observations.append(npy.unpack(message["data"]["observation"]))
+            number = len(self.observations) - 1
+            action = np.array([[number, i] for i in range(3)], dtype=np.float32) / 100
+            reply = {"action": npy.pack(self.action if self.action is not None else action)}
+        elif endpoint == "ping":
+            reply = {"ok": True, "model": "m", "revision": "", "kind": "vla", "rskill": "test/arm-grab", "pid": 1,
+                     "boot_id": "b", "state": "resident"}  # fmt: skip
+        else:
+            reply = {"ok": True}
+        if "id" in message:
+            reply["re"] = message["id"]
+        await self.server.send(peer, reply)
+
+
+class Use:
+    def __init__(self) -> None:
+        self.lost: VramError | None = None
+        self.ended = 0
+
+    async def end(self) -> None:
+        self.ended += 1
+
+
+class Arbiter:
+    """Gives uses, after the refusals it was told to give."""
+
+    def __init__(self, *refusals: VramError) -> None:
+        self.refusals = list(refusals)
+        self.asked: list[tuple[str, tuple[int, ...], str]] = []
+        self.uses: list[Use] = []
+
+    async def begin_use(self, lease_id: str, token: Sequence[int], label: str = "") -> Use:
+        self.asked.append((lease_id, tuple(token), label))
+        if self.refusals:
+            raise self.refusals.pop(0)
+        self.uses.append(Use())
+        return self.uses[-1]
+
+
+class Bench:
+    """A policy skill wired to the sidecar and the arbiter above."""
+
+    def __init__(
+        self, manifest: RSkillManifest, endpoint: str, arbiter: Arbiter | None, **options: Any
+    ) -> None:
+        self.sidecar, self.arbiter = Sidecar(), arbiter
+        self.client = PolicyClient(endpoint, timeout_s=5.0)
+        options.setdefault("wait_s", 5.0)
+        wiring: Wiring = wire_up(manifest, JOINTS, REST)
+        self.skill = SidecarPolicy(manifest, wiring, self.client, arbiter, period_s=1 / 30, **options)
+        self.position = dict(REST)
+
+    def world(self, frames: bool = True, **changes: Any) -> WorldState:
+        frame = SensorFrame(
+            sensor_id="front", stamp_monotonic_ns=1, stamp_wall_ns=1, encoding=FrameEncoding.RGB8, width=4, height=2,
+            data=bytes(range(24)),
+        )  # fmt: skip
+        fields: dict[str, Any] = {
+            "stamp_ns": 1,
+            "joint_state": JointState(
+                name=tuple(self.position), position=tuple(self.position.values()), stamp_ns=1
+            ),
+            "image_frames": {"front": frame} if frames else None,
+        }
+        return WorldState(**(fields | changes))
+
+    async def step(self, **changes: Any) -> StepOutcome:
+        """On another thread, as in the runner: the event loop must be free to fetch."""
+        frames = self.skill.wants_frames()
+        outcome = await asyncio.to_thread(self.skill.step, self.world(frames, **changes))
+        if isinstance(outcome, Act):
+            self.position.update(zip(JOINTS, outcome.action.rows[0], strict=True))
+        return outcome
+
+    async def play(self) -> tuple[list[tuple[float, ...]], Done]:
+        rows = []
+        for _ in range(300):
+            outcome = await self.step()
+            if isinstance(outcome, Done):
+                return rows, outcome
+            if isinstance(outcome, Act):
+                rows.append(outcome.action.rows[0])
+        raise AssertionError("the rollout did not end")
+
+
+@pytest.fixture
+def bench(manifest: RSkillManifest, tmp_path: Path) -> Callable[..., Bench]:
+    def make(arbiter: Arbiter | None = None, **options: Any) -> Bench:
+        return Bench(manifest, f"ipc://{tmp_path}/grab.sock", arbiter, **options)
+
+    return make
+
+
+def scenario(run_async: Run, bench: Bench, play: Callable[[Bench], Any]) -> None:
+    async def body() -> None:
+        async with bench.sidecar.served(bench.client.endpoint):
+            try:
+                await play(bench)
+            finally:
+                await bench.skill.finish()
+                await bench.client.close()
+
+    run_async(body())
+
+
+GOAL = Goal("g1", "test/arm-grab", prompt="grab the red cube", deadline_s=20.0)
+
+
+def test_a_goal_is_one_use_and_its_chunks_play_in_order(bench: Callable[..., Bench], run_async: Run) -> None:
+    async def play(b: Bench) -> None:
+        await b.skill.start(GOAL)
+        rows, done = await b.play()
+        assert rows == [
+            pytest.approx((n / 100, i / 100))
+            for n, i in [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 0)]
+        ]
+        assert done.data == {"steps": 7, "chunks": 3}
+        assert b.arbiter is not None
+        assert b.arbiter.asked == [("L1-1", (1, 1), "test/arm-grab")]
+        assert b.arbiter.uses[0].ended == 0
+        await b.skill.finish()
+        assert b.arbiter.uses[0].ended == 1
+        assert b.sidecar.calls == ["load", "reset", "get_action", "get_action", "get_action"]
+        assert b.sidecar.tokens[1:] == [[1, 1]] * 4
+        assert b.sidecar.observations[0]["task"] == "grab the red cube"
+        assert b.sidecar.observations[0]["observation.state"].tolist() == pytest.approx([0.0, 0.5])
+        assert b.sidecar.observations[0]["observation.images.front"].shape == (2, 4, 3)
+
+    scenario(run_async, bench(Arbiter()), play)
+
+
+def test_the_arm_goes_to_its_start_pose_before_the_policy_sees_anything(
+    bench: Callable[..., Bench], run_async: Run
+) -> None:
+    async def play(b: Bench) -> None:
+        b.position = {"a": 0.8, "b": -0.5}
+        await b.skill.start(GOAL)
+        first = await b.step()
+        assert isinstance(first, Act)
+        assert first.action.rows[0] == pytest.approx((0.8 - 1.6 / 30, -0.5 + 1.6 / 30))
+        while not b.sidecar.observations:
+            await b.step()
+        assert b.sidecar.observations[0]["observation.state"].tolist() == pytest.approx([0.0, 0.5])
+
+    scenario(run_async, bench(Arbiter()), play)
+
+
+def test_a_lease_that_goes_between_load_and_use_is_loaded_again(
+    bench: Callable[..., Bench], run_async: Run
+) -> None:
+    async def play(b: Bench) -> None:
+        b.sidecar.load_error = Evicted("just now")
+        await b.skill.start(GOAL)
+        assert b.sidecar.calls == ["load", "load", "load", "reset"]
+        assert b.arbiter is not None
+        assert len(b.arbiter.asked) == 2
+
+    scenario(run_async, bench(Arbiter(LeaseRevoking("asked to leave"))), play)
+
+
+def test_a_lost_use_fails_the_goal(bench: Callable[..., Bench], run_async: Run) -> None:
+    async def play(b: Bench) -> None:
+        await b.skill.start(GOAL)
+        await b.step()
+        assert b.arbiter is not None
+        b.arbiter.uses[0].lost = LeaseLost("the arbiter forgot it")
+        with pytest.raises(LeaseLost):
+            await b.step()
+
+    scenario(run_async, bench(Arbiter()), play)
+
+
+def test_eviction_in_the_middle_fails_the_goal(bench: Callable[..., Bench], run_async: Run) -> None:
+    async def play(b: Bench) -> None:
+        await b.skill.start(GOAL)
+        b.sidecar.error = Evicted("another model is there")
+        await b.step()
+        with pytest.raises(Evicted):
+            await b.step()
+
+    scenario(run_async, bench(Arbiter()), play)
+
+
+def test_without_an_arbiter_no_use_is_marked(bench: Callable[..., Bench], run_async: Run) -> None:
+    async def play(b: Bench) -> None:
+        b.sidecar.arbitrated = False
+        await b.skill.start(GOAL)
+        _, done = await b.play()
+        assert done.data["steps"] == 7
+        assert set(map(str, b.sidecar.tokens)) == {"None"}
+
+    scenario(run_async, bench(None), play)
+
+
+@pytest.mark.parametrize(
+    "action", [[[float("nan"), 0.0]], [[0.0, float("inf")]], [[0.0, 0.0, 0.0]], [0.0, 0.0], [], "left"]
+)
+def test_actions_that_are_none_never_reach_the_arm(
+    bench: Callable[..., Bench], run_async: Run, action: Any
+) -> None:
+    import numpy as np
+
+    async def play(b: Bench) -> None:
+        b.sidecar.action = np.array(action) if action != "left" else action
+        await b.skill.start(GOAL)
+        await b.step()
+        with pytest.raises(ModelError):
+            await b.step()
+
+    scenario(run_async, bench(Arbiter()), play)
+
+
+def test_no_frame_no_motion(bench: Callable[..., Bench], run_async: Run) -> None:
+    async def play(b: Bench) -> None:
+        await b.skill.start(GOAL)
+        assert isinstance(await b.step(), Hold)
+        with pytest.raises(FrameStale):
+            await b.step(image_frames=None)
+        with pytest.raises(FrameStale):
+            await b.step(diagnostics={"front": "stale"})
+        with pytest.raises(ModelError, match="lacks b"):
+            await b.step(joint_state=JointState(name=("a",), position=(0.0,), stamp_ns=1))
+
+    scenario(run_async, bench(Arbiter()), play)
+
+
+def test_a_goal_without_words_is_refused(bench: Callable[..., Bench], run_async: Run) -> None:
+    async def play(b: Bench) -> None:
+        with pytest.raises(ModelError, match="prompt"):
+            await b.skill.start(Goal("g", "test/arm-grab"))
+        with pytest.raises(BadState):
+            await b.step()
+
+    scenario(run_async, bench(Arbiter()), play)
+
+
+def test_losing_residency_unloads_the_sidecar(bench: Callable[..., Bench], run_async: Run) -> None:
+    async def play(b: Bench) -> None:
+        await b.skill.start(GOAL)
+        await b.skill.release()
+        assert b.arbiter is not None
+        assert b.arbiter.uses[0].ended == 1
+        assert b.sidecar.calls[-1] == "unload"
+
+    scenario(run_async, bench(Arbiter()), play)
+
+
+def test_a_policy_that_stands_still_has_ended(
+    manifest: RSkillManifest, tmp_path: Path, run_async: Run
+) -> None:
+    import numpy as np
+
+    patient = manifest.model_copy(update={"policy_extras": {"rollout_steps": 200}})
+
+    async def play(b: Bench) -> None:
+        b.sidecar.action = np.full((10, 2), 0.25)
+        await b.skill.start(GOAL)
+        _, done = await b.play()
+        assert 100 <= done.data["steps"] < 120
+
+    scenario(run_async, Bench(patient, f"ipc://{tmp_path}/grab.sock", Arbiter()), play)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"sensors_required": ()}, "names no camera"),
+        ({"starting_pose": (0.0,)}, "starting_pose"),
+        ({"policy_extras": {"rollout_steps": 0}}, "policy_extras"),
+    ],
+)
+def test_a_manifest_that_does_not_fit_the_robot_is_refused(
+    manifest: RSkillManifest, change: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ManifestInvalid, match=said):
+        wire_up(manifest.model_copy(update=change), JOINTS, REST)
+
+
+def test_a_manifest_for_another_arm_is_refused(manifest: RSkillManifest) -> None:
+    with pytest.raises(ManifestInvalid, match="commands 2 joints"):
+        wire_up(manifest, ("a", "b", "c"), REST)
+
+
+def test_views_are_cropped_and_averaged_as_trained(
+    manifest: RSkillManifest, tmp_path: Path, run_async: Run
+) -> None:
+    extras = {"rollout_steps": 3, "views": {"front": {"crop": [0.5, 0.0, 1.0, 1.0], "size_px": [1, 1]}}}
+
+    async def play(b: Bench) -> None:
+        await b.skill.start(GOAL)
+        await b.play()
+        assert b.sidecar.observations[0]["observation.images.front"].shape == (1, 1, 3)
+
+    viewing = manifest.model_copy(update={"policy_extras": extras})
+    scenario(run_async, Bench(viewing, f"ipc://{tmp_path}/grab.sock", Arbiter()), play)
