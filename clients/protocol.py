@@ -344,9 +344,9 @@ class ClientProtocol:
         self._phase_deadline = None
         assert self.epoch is not None
         self._events.append(Up(self.epoch))
-        if self._subscribed:
-            self.subscribe(now)
         again = list(self._pending.values())
+        if self._subscribed:
+            self._ask({"op": "subscribe"}, now, quiet=True)
         for waiter in self._waiters.values():
             if waiter.request_id not in self._pending:
                 self._send_acquire(waiter, now)

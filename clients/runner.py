@@ -9,7 +9,7 @@ from typing import Any, Literal, Self, cast
 
 from clients.transport import Transport
 from schemas.endpoints import program_endpoint
-from schemas.errors import GoalRejected, RunnerUnreachable, VramError, from_wire
+from schemas.errors import BadState, GoalRejected, RunnerUnreachable, from_wire
 from schemas.goals import FeedbackPush, FrameReply, ResultPush
 
 Message = dict[str, Any]
@@ -41,7 +41,7 @@ class Goal:
         self._feedback.put_nowait(None)  # a second reader ends too
 
     async def result(self, timeout_s: float | None = None) -> ResultPush:
-        """Raises TimeoutError (the goal goes on), RunnerUnreachable when the runner is gone."""
+        """Raises TimeoutError (the goal goes on), RunnerUnreachable when the runner is gone, BadRequest when it forgot the goal."""
         async with asyncio.timeout(timeout_s):
             while not self._result.done():
                 await asyncio.wait({self._result}, timeout=RESULT_POLL_S)
@@ -134,10 +134,8 @@ class RunnerClient:
         """Ask for a result that may have passed us by while contact was lost."""
         try:
             reply = await self.call("result", {"goal_id": goal.goal_id})
-        except RunnerUnreachable:
-            raise
-        except VramError:
-            return  # it has none yet
+        except BadState:
+            return  # it runs; a runner that does not know the goal (any more) is the caller's to hear
         if reply.get("status") in ENDED:
             self._end(cast(ResultPush, reply))
 

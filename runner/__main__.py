@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from runner import frames
 from schemas.endpoints import program_endpoint
 from schemas.errors import ArbiterUnreachable, ConfigError, VramError
 
@@ -156,6 +157,7 @@ async def run_sim(args: argparse.Namespace) -> int:
             video_every=VIDEO_EVERY,
         )
         control = await stack.enter_async_context(ControlThread(runner))
+        await asyncio.to_thread(warm_up)
         await control.call(lambda: None)  # the scene stands and the cameras have rendered: ready means ready
         server = GoalServer(
             args.endpoint or program_endpoint("runner", os.environ, os.getuid()),
@@ -180,6 +182,15 @@ async def run_sim(args: argparse.Namespace) -> int:
     result = runner.result()
     log.info("%d ticks, %d late, p99 %.1f ms", result.n_ticks, result.budget_violations, result.p99_tick_ms)
     return 1 if control.ended.exception() is not None else 0
+
+
+def warm_up() -> None:
+    """The first picture would otherwise wait for OpenCV's import."""
+    import cv2
+    import numpy as np
+
+    cv2.setNumThreads(1)
+    frames.encode(np.zeros((8, 8, 3), dtype=np.uint8), "png")
 
 
 async def connect_arbiter(endpoint: str | None, stack: contextlib.AsyncExitStack) -> Any:

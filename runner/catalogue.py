@@ -14,7 +14,8 @@ from schemas.errors import ManifestInvalid, UnknownSkill
 from schemas.manifest import Kind, ManifestError, RSkillManifest, load_manifest
 
 EXECUTABLE = frozenset({Kind.VLA, Kind.ROS_ACTION, Kind.ROS_SERVICE})
-DEADLINE_S = 45.0  # of a goal when neither it nor its manifest says one
+MOTION_S = 45.0  # of a goal when neither it nor its manifest says how long
+START_S = 90.0  # for what comes before the motion: others finish and leave, a model loads, the arm goes to its start
 FILE_NAME = "rskill.yaml"
 
 Maker = Callable[[RSkillManifest], Skill]
@@ -69,8 +70,8 @@ class Catalogue:
         return SkillKey(manifest.name, manifest.version), lambda: maker(manifest), manifest
 
     def deadline_s(self, manifest: RSkillManifest, asked_s: float) -> float:
-        """Seconds a goal may take in all: as asked, else the manifest's, else 45."""
-        return asked_s or manifest.latency_budget.max_execution_s or DEADLINE_S
+        """Seconds a goal may take in all, from acceptance: as asked, else the manifest's time of motion and 90 s to get there."""
+        return asked_s or (manifest.latency_budget.max_execution_s or MOTION_S) + START_S
 
     def as_wire(self) -> list[dict[str, Any]]:
         """All manifests as plain maps, for a reasoner's palette."""

@@ -99,7 +99,13 @@ class ControlThread:
         self._ready = self._loop.create_future()
         self.ended = self._loop.create_future()
         self._thread.start()
-        await self._ready
+        try:
+            await self._ready
+        except BaseException:
+            self.runner.request_stop()
+            await asyncio.wait([self.ended])
+            self.ended.exception()  # it says no more than what is raised here
+            raise
         return self
 
     async def __aexit__(self, *_: object) -> None:

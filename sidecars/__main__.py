@@ -51,7 +51,9 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
             return 0
         from sidecars.host import SidecarHost
 
-        asyncio.run(SidecarHost(settings, adapter, open_memory(settings)).serve())
+        if not asyncio.run(SidecarHost(settings, adapter, open_memory(settings)).serve()):
+            logging.shutdown()
+            os._exit(0)  # the interpreter would wait for an import of many seconds that nobody needs any more
     except (VramError, ManifestError) as error:
         print(f"vram-sidecar: {error}", file=sys.stderr)
         return 1

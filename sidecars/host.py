@@ -37,8 +37,10 @@ class SidecarHost:
         self._residency: Residency | None = None
         self._boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
-    async def serve(self) -> None:
-        """Raises AlreadyRunning, ConfigError, ArbiterUnreachable at the start; later trouble is answered on the wire."""
+    async def serve(self) -> bool:
+        """Serve until the end. False if the worker's thread is still importing: the process should not wait for that.
+
+        Raises AlreadyRunning, ConfigError, ArbiterUnreachable at the start; later trouble is answered on the wire."""
         settings, worker = self._settings, Worker()
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -64,13 +66,14 @@ class SidecarHost:
                 await asyncio.wait([stopped, background[0]], return_when=asyncio.FIRST_COMPLETED)
             finally:
                 stopped.cancel()
-                await residency.leave()
+                finished = await residency.leave()
                 for task in background:
                     task.cancel()
                 outcomes = await asyncio.gather(*background, return_exceptions=True)
             if isinstance(outcomes[0], Exception):
                 raise outcomes[0]
         _log.info("%s has ended", settings.name)
+        return finished
 
     @staticmethod
     async def _load_at_start(residency: Residency) -> None:

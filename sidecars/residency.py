@@ -69,7 +69,7 @@ class Residency:
     def prepare(self) -> None:
         """Begin the host work (imports, processors) that needs no lease. Repeats only after a failure."""
         if self._prepared is None or (self._prepared.done() and self._prepared.exception() is not None):
-            self._prepared = asyncio.create_task(self._worker.run(self._adapter.prepare))
+            self._prepared = asyncio.create_task(self._worker.run(self._adapter.prepare, abandon=True))
 
     async def load(self, timeout_s: float | None = None, traceparent: str | None = None) -> bool:
         """Make the model resident; False if it was. `timeout_s` bounds the wait for the lease, not the loading.
@@ -130,14 +130,24 @@ class Residency:
         """Token of the lease under which the model is resident now."""
         return self.lease.token if self.lease is not None and self.state == "resident" else None
 
-    async def leave(self) -> None:
-        """End of the process: after the op that runs, everything goes, the context included."""
+    async def leave(self) -> bool:
+        """End of the process: after the op that runs, everything goes, the context included.
+
+        False if imports still run in the worker's thread: nothing was loaded then, and nothing can stop them.
+        """
         self._worker.stopping.set()
+        if self._prepared is not None and not self._prepared.done():
+            self._prepared.cancel()
+            return False
         lease = self.lease
-        await self._unload()
-        await self._worker.run(self._memory.close)
+        try:
+            await self._unload()
+            await self._worker.run(self._memory.close)
+        except VramError as error:  # e.g. the card's folder is gone: there is nothing left to give back
+            _log.warning("leaving: %s", error)
         if lease is not None:
             await lease.release(exiting=True)
+        return True
 
     async def release_when_idle(self, idle_s: float) -> None:
         """Runs beside the host: lets go of a model that nobody used for `idle_s`."""

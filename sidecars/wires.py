@@ -48,7 +48,7 @@ class Wire:
     async def handle(self, peer: Peer, message: Message) -> None:
         try:
             call = parse(message, self._host.model_ops)
-            reply = npy.pack(await self._answer(call))
+            reply = await self._answer(call)
         except VramError as error:
             reply = error_reply(error)
         except Exception as error:  # noqa: BLE001  the outermost loop of a server: a defect of ours must not end it
@@ -81,7 +81,8 @@ class Wire:
             if name == "load":
                 return await self._host.load(_timeout_s(call), call.traceparent)
             assert isinstance(call, DetectOp | QueryOp | EndpointCall), "what is left is for the model"
-            return await self._host.run(name, call)
+            answer: dict[str, Any] = npy.pack(await self._host.run(name, call))
+            return answer
         finally:
             self._pending -= 1
 
@@ -104,7 +105,7 @@ def parse(message: Message, model_ops: frozenset[str]) -> Call:
             return OP_REQUEST.validate_python(message)
         call = ENDPOINT_REQUEST.validate_python({**message, "data": _unpack(message.get("data"))})
     except ValidationError as error:
-        fields = [_field(problem) for problem in error.errors(include_input=False, include_url=False)]
+        fields = [_field(problem, family) for problem in error.errors(include_input=False, include_url=False)]
         raise BadRequest(
             f"{name}: {fields[0]}", hint="see schemas/sidecar.py", details={"fields": fields}
         ) from None
@@ -147,10 +148,6 @@ def _timeout_s(call: Call) -> float | None:
     return None
 
 
-def _field(problem: Mapping[str, Any]) -> str:
-    where = ".".join(
-        str(part)
-        for part in problem["loc"]
-        if part not in ("ping", "load", "unload", "shutdown", "detect", "query")
-    )
-    return f"{where or 'the message'}: {problem['msg']}"
+def _field(problem: Mapping[str, Any], family: str) -> str:
+    where = problem["loc"][1:] if family == "op" else problem["loc"]  # a union puts its tag, the op, in front
+    return f"{'.'.join(str(part) for part in where) or 'the message'}: {problem['msg']}"

@@ -15,18 +15,20 @@ class Worker:
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="model")
         self.stopping = threading.Event()
 
-    async def run[T](self, work: Callable[[], T]) -> T:
+    async def run[T](self, work: Callable[[], T], *, abandon: bool = False) -> T:
         """Do the work and wait for it, also if the caller is cancelled meanwhile: a model is never left half loaded.
 
-        Raises the work's own typed error; any other failure comes as ModelError, a full card as OutOfMemory.
+        `abandon`: do not wait then, for work that holds nothing (imports). Raises the work's own typed error; any other failure
+        comes as ModelError, a full card as OutOfMemory.
         """
         future = asyncio.get_running_loop().run_in_executor(self._pool, self._guarded, work)
         try:
             return await asyncio.shield(future)
         except asyncio.CancelledError:
-            await asyncio.wait([future])
-            if not future.cancelled():
-                future.exception()  # was seen: asyncio need not complain
+            if not abandon:
+                await asyncio.wait([future])
+                if not future.cancelled():
+                    future.exception()  # was seen: asyncio need not complain
             raise
 
     def close(self) -> None:
@@ -47,4 +49,6 @@ class Worker:
                 type(error).__name__ == "OutOfMemoryError"
             ):  # torch's; importing torch to say so would cost seconds
                 raise OutOfMemory(str(error)) from error
+            if isinstance(error, ImportError):
+                raise ModelError(str(error), hint="pip install 'vram-arbiter[sidecars]'") from error
             raise ModelError(f"{type(error).__name__}: {error}", hint="see the sidecar's log") from error

@@ -151,7 +151,7 @@ class Arbiter:
                 requests.unloading(core, event)
             case ReleaseReported():
                 requests.release(core, event)
-            case Reattached():
+            case _:  # Reattached
                 recovery.on_reattached(core, event)
 
     def _run_due(self) -> None:

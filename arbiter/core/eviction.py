@@ -26,7 +26,7 @@ def ask(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: str) 
     gpu.evictions.append(holder.eviction)
     holder.move(LeaseState.REVOKING, core.now, reason)
     core.want_sample(gpu, core.now)
-    push_revoke(core, holder, holder.eviction)
+    _push_now(core, holder, holder.eviction)
     core.note(
         "revoke_asked",
         holder,
@@ -35,7 +35,6 @@ def ask(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: str) 
         uses=len(holder.uses),
         reason=reason,
     )
-    _set_timer(core, holder, holder.eviction)
 
 
 def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
@@ -69,9 +68,20 @@ def acknowledge(core: Core, holder: Lease, eta_s: float | None) -> None:
 def reached_safe_point(core: Core, holder: Lease) -> None:
     """The last use ended while the holder is asked to leave: tell it, it may not know of uses that others marked."""
     if holder.eviction is not None and holder.state is LeaseState.REVOKING:
-        push_revoke(core, holder, holder.eviction)
-        holder.eviction.next_push_at = core.now + core.settings.revoke_resend_s
-        _set_timer(core, holder, holder.eviction)
+        _push_now(core, holder, holder.eviction)
+
+
+def _push_now(core: Core, holder: Lease, eviction: Eviction) -> None:
+    push_revoke(core, holder, eviction)
+    eviction.next_push_at = core.now + core.settings.revoke_resend_s
+    _set_timer(core, holder, eviction)
+
+
+def ask_again(core: Core, holder: Lease) -> None:
+    """The holder came back on another connection: what it heard on the old one does not count."""
+    if holder.eviction is not None and holder.state is LeaseState.REVOKING:
+        holder.eviction.acked_at = None
+        _push_now(core, holder, holder.eviction)
 
 
 def on_ladder_due(core: Core, lease_id: str) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from arbiter.core.events import MemorySampled, ProbeFailed
-from arbiter.core.lease import EXPIRING, Lease, LeaseState
+from arbiter.core.lease import Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 from arbiter.core.verify import Judgement, Verdict, Verification, judge
 from schemas.ids import GpuId, LeaseId, ProcessKey
@@ -196,8 +196,6 @@ def _set_poll(core: Core, gpu: Gpu) -> None:
 
 
 def _weigh(core: Core, gpu: Gpu, verification: Verification, sample: MemorySampled) -> None:
-    if verification.key not in gpu.verifications:  # resolved together with an earlier one
-        return
     judgement = judge(
         verification,
         gpu.ledger,
@@ -274,10 +272,6 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
         core.record_residue(gpu, process, 0)
         return
     residue = gpu.ledger.drop(verification.lease, judgement.residue_bytes, verification.kept_bytes, core.now)
-    account = gpu.ledger.accounts.get(process)
-    if account is not None and not account.charges and not verification.alive:
-        gpu.ledger.set_residue(process, 0, core.now)
-        residue = 0
     core.record_residue(gpu, process, residue)
     core.forget(f"lease:{verification.lease}")
     _close_eviction(core, gpu, verification, judgement)
@@ -314,10 +308,8 @@ def lose(
 
 
 def on_expiry_due(core: Core, lease_id: str) -> None:
-    """A holder did not renew. It may still be loading until it fences itself, so no verdict before that."""
+    """A holder did not renew (who has let go has no such timer). It may still be loading until it fences itself, so no verdict before that."""
     lease = core.leases[LeaseId(lease_id)]
-    if lease.state not in EXPIRING:
-        return
     error = {
         "code": "lease_expired",
         "message": f"{lease.id} was not renewed for {lease.spec.ttl_s:g} s",

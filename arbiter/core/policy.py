@@ -249,21 +249,15 @@ def _search(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId
         for k in range(len(busy) + 1)
         if any(covers(_leave([*idle, *some])) for some in combinations(busy, k))
     )
-    for ceiling in sorted({lease.spec.priority for lease in candidates}):
-        calm = [lease for lease in idle if lease.spec.priority <= ceiling]
-        lively = [lease for lease in busy if lease.spec.priority <= ceiling]
-        for size in range(len(calm) + 1):
-            found = [
-                [*some, *others]
-                for some in combinations(lively, count)
-                for others in combinations(calm, size)
-                if covers(_leave([*some, *others]))
-            ]
-            if found:
-                return min(found, key=lambda plan: _fineness(plan, freed))
-    return list(
-        candidates
-    )  # pragma: no cover - the highest ceiling admits the set that `count` was found with
+    groups = (
+        [[*some, *others] for some in combinations(lively, count) for others in combinations(calm, size)]
+        for ceiling in sorted({lease.spec.priority for lease in candidates})
+        for calm in [[lease for lease in idle if lease.spec.priority <= ceiling]]
+        for lively in [[lease for lease in busy if lease.spec.priority <= ceiling]]
+        for size in range(len(calm) + 1)
+    )
+    found = next(found for group in groups if (found := [plan for plan in group if covers(_leave(plan))]))
+    return min(found, key=lambda plan: _fineness(plan, freed))
 
 
 def _fineness(plan: Sequence[Lease], freed: Mapping[LeaseId, int]) -> tuple[int, float, tuple[int, ...]]:
@@ -286,11 +280,8 @@ def _greedy(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId
             lease.arrival,
         ),
     )
-    plan: list[Lease] = []
-    for lease in order:
-        plan.append(lease)
-        if covers(_leave(plan)):
-            break
+    size = next(n for n in range(1, len(order) + 1) if covers(_leave(order[:n])))
+    plan = order[:size]
     for lease in reversed(list(plan)):
         without = [other for other in plan if other is not lease]
         if covers(_leave(without)):

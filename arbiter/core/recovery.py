@@ -7,7 +7,7 @@ at baseline) nothing is granted. Recovered bytes are charged from the first mome
 from collections.abc import Mapping
 from typing import Any
 
-from arbiter.core import explain
+from arbiter.core import eviction, explain
 from arbiter.core.events import MemorySampled, Reattached, ReattachedLease, Recovered, Spec
 from arbiter.core.lease import EXPIRING, Lease, LeaseState, Use
 from arbiter.core.measure import begin_for_lease
@@ -170,6 +170,7 @@ def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLeas
         for use_id in item.uses:
             began = Use(use_id, client.id, client.process, "", core.now)
             lease.uses.setdefault((client.process, use_id), began)
+    eviction.ask_again(core, lease)
     core.wake(core.gpu_of(lease))
 
 

@@ -289,6 +289,7 @@ def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     steady = lease.steady_bytes if measured_bytes is None else max(measured_bytes, lease.spec.residue_bytes)
     gpu.ledger.recharge(lease.id, steady, core.now)
     gpu.changed_at = core.now
+    core.want_sample(gpu, core.now)  # what it holds now is what has to come back one day
     core.wake(gpu)
 
 

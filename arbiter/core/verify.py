@@ -84,8 +84,9 @@ def judge(
     bound_b = _delta_bound(v, ledger, expected, grown_bytes)
     short_bytes = max(used - bound_a, 0 if bound_b is None else used - bound_b)
     evident = held is None or held <= expected + tolerance_bytes
-    if short_bytes <= tolerance_bytes and evident and stable and sample.taken_at > v.not_before:
-        return Judgement(Verdict.VERIFIED, True, v.kept_bytes)
+    if short_bytes <= tolerance_bytes and evident:
+        settled = stable and sample.taken_at > v.not_before
+        return Judgement(Verdict.VERIFIED, True, v.kept_bytes) if settled else None
     if not v.overdue:
         return None
     return _late(v, ledger, sample, expected, held, short_bytes, bound_a, bound_b, tolerance_bytes)

@@ -118,6 +118,8 @@ class SidecarClient:
     async def _ensure(self) -> None:
         """1. Proven already, child alive. 2. Somebody answers: adopt. 3. Start a child, or wait for somebody else's start."""
         async with self._connecting:
+            if self.child is not None and not self._proven:
+                await self.child.wait(REBIRTH_S)  # it may have hung up because it is dying
             if self.child is not None and not self.child.alive:
                 self._drop("the sidecar ended")
                 await self._bury()
@@ -160,18 +162,18 @@ class SidecarClient:
         child = self.child if self.child is not None and self.child.alive else Child(spec)
         self.child = child
         exited = asyncio.create_task(child.exited.wait())
+        answered: asyncio.Task[bool] | None = None
         loop = asyncio.get_running_loop()
         deadline = loop.time() + spec.boot_timeout_s
         try:
             while loop.time() < deadline:
                 answered = asyncio.create_task(self._answers(deadline - loop.time()))
                 await asyncio.wait({exited, answered}, return_when=asyncio.FIRST_COMPLETED)
-                if not answered.done():
-                    answered.cancel()
-                elif answered.result():
-                    if self.identity and self.identity.get("pid") != child.pid and await child.wait(PROBE_S):
-                        await self._bury()  # somebody else was faster: use theirs
+                if answered.done() and answered.result():
+                    if self.identity and self.identity.get("pid", child.pid) != child.pid:
+                        await self._bury()  # somebody else was faster: use theirs, end ours
                     return
+                answered.cancel()
                 if await child.wait(REBIRTH_S):
                     await self._bury_or_raise()
                     return
@@ -182,6 +184,8 @@ class SidecarClient:
             )
         finally:
             exited.cancel()
+            if answered is not None:
+                answered.cancel()
 
     async def _bury_or_raise(self) -> None:
         """Our child ended at once: if another process serves the endpoint by now, that is why, and good enough."""

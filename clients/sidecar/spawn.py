@@ -112,6 +112,8 @@ class Child:
 
     async def wait(self, timeout_s: float) -> bool:
         """Whether it has ended within that time."""
+        if self.exited.is_set():
+            return True
         try:
             await asyncio.wait_for(self.exited.wait(), timeout_s)
         except TimeoutError:

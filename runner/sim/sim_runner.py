@@ -120,6 +120,7 @@ class SimRunner(RunnerBase):
         self._env: Environment | None = None
         self._envelope: Envelope | None = None
         self._active: _Active | None = None
+        self._targets: dict[str, float] = {}  # last joint targets, rad
         self._idle_ticks = 0
         self._stopping = False
         self._reset_due = True
@@ -304,11 +305,16 @@ class SimRunner(RunnerBase):
             self._snapshots.clear()
             self.env.reset(self._seed + self._episode_idx)
             self._envelope = Envelope(self.env.joint_limits())
+            self._targets = self.env.joint_state()
             for camera in self._cameras:  # a first picture takes a second: rendering contexts, shaders
                 self._render(camera)
             return Applied(action_applied=False, episode_idx=self._episode_idx)
         arm, base = _commands(decision.action)
-        self.env.step(arm, base)
+        if (
+            arm is not None
+        ):  # joints that an action leaves out keep their last target: a closed gripper stays closed
+            self._targets.update(arm)
+        self.env.step(dict(self._targets) if arm is not None else None, base)
         self._step_idx += 1
         self._idle_ticks = 0 if self._active is not None else self._idle_ticks + 1
         terminated = self._judge is not None and self._judge(self.env)

@@ -47,7 +47,7 @@ LOAD_TRIES_MAX = 20
 RETRY_S = 0.2
 CHUNK_TIMEOUT_S = 30.0  # a policy that needs longer for one chunk is gone
 LOCKSTEP_WAIT_S = 2.0  # how long one tick of a simulator waits with its world
-ROLLOUT_STEPS = 150  # unless the manifest's policy_extras say otherwise
+ROLLOUT_S = 5.0  # of motion, unless the manifest says otherwise
 STILL_WINDOW = 20  # steps over which targets that move less than STILL_RAD mean that the policy has ended
 STILL_RAD = 0.01
 STILL_FROM = 0.5  # share of the rollout before which standing still is just waiting
@@ -84,7 +84,7 @@ class Rollout(BaseModel):
     """The part of `policy_extras` that the runner reads; other keys belong to the sidecar's adapter."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
-    rollout_steps: int = Field(default=ROLLOUT_STEPS, ge=1, le=100_000)
+    rollout_steps: int | None = Field(default=None, ge=1, le=100_000)  # None: latency_budget.max_execution_s
     stop_when_still: bool = True
     views: dict[str, View] = Field(default_factory=dict)
     prefetch_at: int = Field(default=0, ge=0, le=1000)
@@ -92,7 +92,7 @@ class Rollout(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """How a manifest's features map to this robot: camera → feature key, joint order, start pose (rad)."""
+    """How a manifest's features map to this robot: camera → key of the observation, joint order, start pose (rad)."""
 
     cameras: Mapping[str, str]
     joints: tuple[str, ...]
@@ -100,6 +100,7 @@ class Wiring:
     degrees: bool
     steps_per_chunk: int | None
     rollout: Rollout
+    rollout_s: float
 
 
 def wire_up(manifest: RSkillManifest, joints: tuple[str, ...], rest: Mapping[str, float]) -> Wiring:
@@ -108,14 +109,14 @@ def wire_up(manifest: RSkillManifest, joints: tuple[str, ...], rest: Mapping[str
     robot_name = {model: robot for robot, model in aliases.items()}
     cameras: dict[str, str] = {}
     for sensor in manifest.sensors_required:
-        key = sensor.vla_feature_key
-        if key and key.startswith(IMAGES_PREFIX):
-            name = key.removeprefix(IMAGES_PREFIX)
-            cameras[robot_name.get(name, name)] = key
+        if sensor.modality == "rgb" and sensor.vla_feature_key:
+            name = sensor.vla_feature_key.rpartition(".")[2]
+            camera = robot_name.get(name, name)
+            cameras[camera] = IMAGES_PREFIX + camera  # the sidecar renames it to what the checkpoint calls it
     if not cameras:
         raise ManifestInvalid(
             f"{manifest.name} names no camera",
-            hint=f"give sensors_required a vla_feature_key {IMAGES_PREFIX}…",
+            hint=f"give a sensor of modality rgb a vla_feature_key {IMAGES_PREFIX}…",
         )
     dim = manifest.action_contract.dim if manifest.action_contract else None
     if dim is not None and dim != len(joints):
@@ -130,7 +131,8 @@ def wire_up(manifest: RSkillManifest, joints: tuple[str, ...], rest: Mapping[str
         rollout = Rollout.model_validate(manifest.policy_extras)
     except ValidationError as error:
         raise ManifestInvalid(f"{manifest.name}: policy_extras: {error.errors()[0]['msg']}") from error
-    return Wiring(cameras, joints, start, degrees, manifest.n_action_steps, rollout)
+    rollout_s = manifest.latency_budget.max_execution_s or ROLLOUT_S
+    return Wiring(cameras, joints, start, degrees, manifest.n_action_steps, rollout, rollout_s)
 
 
 class SidecarPolicy(SkillBase):
@@ -156,6 +158,7 @@ class SidecarPolicy(SkillBase):
         self._arbiter = arbiter
         self._period_s = period_s
         self._wait_s = wait_s
+        self._steps = wiring.rollout.rollout_steps or max(1, round(wiring.rollout_s / period_s))
         self._loop: asyncio.AbstractEventLoop | None = None
         self._use: Use | None = None
         self._token: tuple[int, ...] | None = None
@@ -234,7 +237,7 @@ class SidecarPolicy(SkillBase):
                 return Act(self._action(tuple(self._target.values()), world))
             self._running = True
             return Hold("at the start pose")
-        if player.played >= self._wiring.rollout.rollout_steps or self._stands_still(player):
+        if player.played >= self._steps or self._stands_still(player):
             return Done({"steps": player.played, "chunks": player.chunks})
         observation = self._observation(world, measured) if player.wants_observation() else None
         popped = player.next_row(observation)
@@ -242,7 +245,7 @@ class SidecarPolicy(SkillBase):
             return Hold("the policy thinks")
         chunk, row = popped
         self._recent.append(row)
-        self.fraction = player.played / self._wiring.rollout.rollout_steps
+        self.fraction = player.played / self._steps
         return Act(self._action(row, world), chunk_index=chunk)
 
     def _at_start(self, measured: Mapping[str, float]) -> bool:
@@ -252,12 +255,13 @@ class SidecarPolicy(SkillBase):
             if is_at(measured, goal):
                 return True
             self._ramp = JointRamp(measured, goal, period_s=self._period_s)
+        if self._ramp.done(measured):
+            return True
         self._target = self._ramp.next_target()
-        return self._ramp.done(measured)
+        return False
 
     def _stands_still(self, player: ChunkPlayer) -> bool:
-        rollout = self._wiring.rollout
-        if not rollout.stop_when_still or player.played < STILL_FROM * rollout.rollout_steps:
+        if not self._wiring.rollout.stop_when_still or player.played < STILL_FROM * self._steps:
             return False
         if len(self._recent) < STILL_WINDOW:
             return False

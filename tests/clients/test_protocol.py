@@ -464,6 +464,7 @@ def test_reattachment_says_what_is_held_and_used(link: Wire) -> None:
     record = link.hold()
     link.protocol.use_begin(record, "u1", "x", link.now)
     link.reply(link.one("use_begin"))
+    link.told()
     loading = link.grant("n2", "L1-3", 4)
     link.told()
     reattach = link.reconnect()

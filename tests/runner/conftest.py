@@ -58,7 +58,10 @@ class KinematicEnv:
         self, arm_target: Mapping[str, float] | None, base_velocity: tuple[float, float, float] | None = None
     ) -> None:
         self.steps.append((arm_target, base_velocity))
-        self.joints.update(arm_target or {})
+        if arm_target is not None:
+            self.joints = {
+                name: arm_target[name] for name in JOINTS
+            }  # all of them, as the simulator wants it
         vx, vy, wz = base_velocity or (0.0, 0.0, 0.0)
         x, y, yaw = self.base
         cos, sin = math.cos(yaw), math.sin(yaw)

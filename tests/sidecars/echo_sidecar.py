@@ -1,6 +1,6 @@
 """A whole sidecar process around a model without weights: `python echo_sidecar.py FOLDER [flags of vram-sidecar]`.
 
-FOLDER tells it what to do: a file `fail_prepare` or `fail_load` makes that step fail. The query tells `run`: `hold NAME` waits until the
+FOLDER tells it what to do: a file `fail_prepare` or `fail_load` makes that step fail, `slow_prepare` makes it last. The query tells `run`: `hold NAME` waits until the
 file NAME appears there, `fail` raises; anything else is echoed.
 """
 
@@ -25,6 +25,8 @@ class EchoAdapter:
             raise RuntimeError(f"{step} fails as told")
 
     def prepare(self) -> None:
+        while (self._folder / "slow_prepare").exists():
+            threading.Event().wait(0.005)
         self._fail("prepare")
 
     def load(self, device: str) -> None:

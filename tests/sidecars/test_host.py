@@ -181,6 +181,15 @@ def test_the_end_of_the_process_waits_for_the_op_and_gives_everything_back(box, 
     from_outside(lambda: box.used() == 0)
 
 
+def test_the_end_does_not_wait_for_imports(box):
+    (box.runtime / "detector-model").mkdir()
+    (box.runtime / "detector-model" / "slow_prepare").touch()
+    sidecar = box.start("detector")
+    sidecar.send_detect()
+    from_outside(lambda: sidecar.state() == "waiting")
+    assert sidecar.terminate() == 0
+
+
 def test_shutdown_on_the_wire(box):
     sidecar = box.start("detector")
     sidecar.detect()

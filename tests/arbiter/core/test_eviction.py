@@ -2,7 +2,7 @@
 
 from arbiter.testing.core_driver import Consumer, CoreDriver
 from schemas import defaults as d
-from schemas.ids import LeaseId
+from schemas.ids import ClientId, LeaseId
 
 GIB = d.GIB
 
@@ -24,7 +24,7 @@ def test_revoke_is_sent_again_until_acknowledged() -> None:
     assert first == {
         "push": "revoke",
         "lease_id": lease,
-        "token": list((det.token(lease).epoch, det.token(lease).serial)),
+        "token": [det.token(lease).epoch, det.token(lease).serial],
         "reason": "vlm needs the room",
         "wanted_by": "vlm",
         "deadline_in_s": 30.0,
@@ -134,3 +134,31 @@ def test_death_while_asked_counts_as_leaving() -> None:
     vlm.load(waiter)
     (gone,) = driver.notes("switch")[-1]["evicted"]
     assert (gone["lease_id"], gone["verdict"]) == (lease, "verified")
+
+
+def test_a_reminder_between_two_pushes_pushes_nothing() -> None:
+    driver = CoreDriver(8 * GIB, settings={"revoke_resend_s": 0.3})
+    det, lease = held(driver)
+    det.use_begin(lease)
+    driver.consumer("vlm").acquire(5 * GIB)
+    driver.advance(2.05)
+    assert len(driver.pushes("revoke")) == 7
+    assert len(driver.notes("reminded")) == 1
+
+
+def test_a_holder_that_comes_back_is_asked_again_and_keeps_the_uses_of_others() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver)
+    runner = driver.consumer("runner")
+    runner.use_begin(lease, "goal", det.token(lease))
+    det.use_begin(lease, "own")
+    driver.consumer("vlm").acquire(5 * GIB)
+    det.ack(lease)
+    driver.advance(1.0)
+    assert len(driver.pushes("revoke")) == 1
+    det.client = ClientId("c-new")
+    det.connect()
+    det.reattach(lease, det.token(lease))
+    assert driver.pushes("revoke")[-1]["uses"] == 1
+    driver.advance(0.3)
+    assert len(driver.pushes("revoke")) == 3, "until this connection acknowledges"

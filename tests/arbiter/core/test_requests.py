@@ -131,8 +131,6 @@ def test_a_wait_has_a_bound_and_says_who_was_in_the_way(driver: CoreDriver) -> N
     det, vlm = driver.consumer("det"), driver.consumer("vlm")
     held = det.acquire(5 * GIB, evictable=False)
     det.load(held)
-    queued = vlm.acquire(1 * GIB, exclusive=False, wait_timeout_s=5.0) if False else None
-    assert queued is None
     driver.card.failing = "probe died"
     driver.advance(1.5)
     lease = vlm.acquire(2 * GIB, wait_timeout_s=5.0)
@@ -186,7 +184,7 @@ def test_ready_charges_the_steady_bytes_or_what_was_measured(driver: CoreDriver)
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB, 4 * GIB)
     effects = det.load(lease)
-    assert kinds(effects) == ["Reply", "JournalPut", "Note:ready", "Note:switch"]
+    assert kinds(effects) == ["Sample", "Reply", "JournalPut", "Note:ready", "Note:switch"]
     assert answer(effects)["lease"]["charge_bytes"] == 4 * GIB
     assert kinds(det.ready(lease)) == ["Reply"], "a repeat changes nothing"
     vlm = driver.consumer("vlm")
@@ -229,7 +227,7 @@ def test_no_new_use_once_the_holder_was_asked(driver: CoreDriver) -> None:
 # -- renew -------------------------------------------------------------------------------------------------------------
 def test_renewing_keeps_alive_and_never_resurrects(driver: CoreDriver) -> None:
     det = driver.consumer("det")
-    lease = det.acquire(5 * GIB, ttl_s=10.0)
+    lease = det.acquire(5 * GIB, ttl_s=10.0, min_residency_s=100.0)
     det.load(lease)
     queued = det.acquire(5 * GIB)
     token = det.token(lease)
@@ -318,3 +316,19 @@ def test_an_out_of_memory_within_the_grant_is_somebody_elses_doing(driver: CoreD
     assert "somebody else" in driver.notes("oom")[0]["reason"]
     assert any(isinstance(effect, Sample) for effect in effects)
     assert not any(isinstance(effect, Push) for effect in effects)
+
+
+# -- memory --------------------------------------------------------------------------------------------------------------
+def test_what_is_over_is_remembered_for_a_bounded_while(driver: CoreDriver) -> None:
+    det, vlm = driver.consumer("det"), driver.consumer("vlm")
+    det.acquire(5 * GIB)
+    first = vlm.acquire(5 * GIB, nonce="first")
+    vlm.cancel(first)
+    assert refusal(vlm.release(first, token=Token(1, 1))).code == "cancelled"
+    for _ in range(1024):
+        vlm.cancel(vlm.acquire(5 * GIB))
+    assert refusal(vlm.release(first, token=Token(1, 1))).code == "unknown_lease"
+    assert vlm.acquire(5 * GIB, nonce="first") != first
+    core = driver.arbiter._core
+    assert len(core.ended) == 1024
+    assert len(core.nonces) == 1024 + 2

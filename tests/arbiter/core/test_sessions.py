@@ -37,14 +37,12 @@ def test_bye_gives_everything_back() -> None:
 def test_a_dropped_connection_loses_its_waits_and_uses_but_nothing_resident() -> None:
     driver = CoreDriver(8 * GIB)
     det, runner = driver.consumer("det"), driver.consumer("runner")
-    held = det.acquire(2 * GIB)
+    held = det.acquire(2 * GIB, min_residency_s=60.0)
     det.load(held)
     queued = det.acquire(7 * GIB)
     runner.use_begin(held, "goal", det.token(held))
     det.leave("misconduct")
-    assert (driver.state(held), driver.state(queued)) == ("revoking", "over"), (
-        "it was asked for its own second lease"
-    )
+    assert (driver.state(held), driver.state(queued)) == ("held", "over")
     runner.leave("misconduct")
     assert driver.notes("use_ended")[-1]["reason"] == "its client left: misconduct"
 
@@ -74,14 +72,14 @@ def test_a_death_ends_leases_waits_and_uses_and_its_bytes_are_measured_away() ->
     held = det.acquire(5 * GIB)
     det.load(held)
     own_wait = det.acquire(7 * GIB)
-    vlm_lease = vlm.acquire(2 * GIB)
+    vlm_lease = vlm.acquire(3 * GIB)
     det.die()
     assert driver.state(held) == "over"
     assert driver.state(own_wait) == "over"
     assert driver.gpu()["charged_bytes"] == 5 * GIB, "a debt until measured gone"
     driver.until(lambda: driver.state(vlm_lease) == "loading")
     assert driver.notes("verified")[-1]["verdict"] == "verified"
-    took = driver.until(lambda: driver.gpu()["charged_bytes"] == 2 * GIB)
+    took = driver.until(lambda: driver.gpu()["charged_bytes"] == 3 * GIB)
     assert took <= 1.0
     vlm.load(vlm_lease)
     vlm.use_begin(vlm_lease)

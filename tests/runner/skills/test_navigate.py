@@ -47,7 +47,7 @@ def drive(skill: Navigate, env: Any, ticks: int = 600) -> tuple[StepOutcome, lis
             if outcome.action.control_mode is ControlMode.BODY_TWIST:
                 env.step(None, (row[0], row[1], row[5]))
             else:
-                env.step(dict(zip(outcome.action.joint_names or (), row, strict=True)))
+                env.step(env.joints | dict(zip(outcome.action.joint_names or (), row, strict=True)))
     raise AssertionError("navigate did not end")
 
 

@@ -10,7 +10,7 @@ pytest.importorskip("lerobot")
 import numpy as np
 import torch
 
-from sidecars.training.policy import BadDemonstrations, load_demonstrations, main, train
+from sidecars.training.policy import BadDemonstrations, load_demonstrations, load_stats, main, train
 
 pytestmark = pytest.mark.heavy
 
@@ -105,6 +105,21 @@ def test_the_loss_falls_and_the_seed_decides(tmp_path: Path) -> None:
     run(2, "again")
     weights = [(tmp_path / name / "model.safetensors").read_bytes() for name in ("few", "again")]
     assert weights[0] == weights[1]
+
+
+def test_going_on_from_a_checkpoint_keeps_its_normalisation(tmp_path: Path) -> None:
+    first, second, started, went_on = (tmp_path / name for name in ("first", "second", "started", "went_on"))
+    for folder in (first, second):
+        folder.mkdir()
+        write_demonstrations(folder)
+    np.save(second / "state.npy", np.load(second / "state.npy") * 3)
+    data = load_demonstrations(first, second)
+    assert len(data.state) == 200
+    assert data.episode_end.max() == 200
+    train(load_demonstrations(first), started, steps=2, batch_size=8, seed=0, action_steps=6)
+    train(data, went_on, steps=2, batch_size=8, seed=0, action_steps=6, init=started)
+    before, after = load_stats(started), load_stats(went_on)
+    assert all(torch.equal(before[k][w], after[k][w]) for k in before for w in ("mean", "std"))
 
 
 def test_a_folder_without_demonstrations_is_refused(

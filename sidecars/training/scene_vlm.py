@@ -1,0 +1,414 @@
+"""Trains the demo's scene VLM: a small Qwen3.5 from scratch, saved as any image-text-to-text hub checkpoint.
+
+`python -m sidecars.training.scene_vlm --data DIR --out DIR [--smoke]`. DIR holds `labels.jsonl` and PNGs. The result is read
+by `AutoProcessor` and `AutoModelForImageTextToText` like Qwen/Qwen3.5-4B: chat template, `generate`. This script must not know
+the simulator or the sidecar that will serve the model.
+
+Two stages. The vision tower first learns, through throw-away linear heads on its mean output token, what is held and what
+shows: language comes easily once the image tokens say it. Then tower and language model learn to answer questions together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import random
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from sidecars.training import common, questions
+from sidecars.training.common import Frame
+
+SPECIALS: Final = (
+    "<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>",
+)  # fmt: skip
+CHAT_TEMPLATE: Final = (
+    "{%- for message in messages -%}"
+    "{{- '<|im_start|>' + message['role'] + '\\n' -}}"
+    "{%- if message['content'] is string -%}{{- message['content'] -}}"
+    "{%- else -%}"
+    "{%- for part in message['content'] -%}"
+    "{%- if part['type'] == 'image' -%}{{- '<|vision_start|><|image_pad|><|vision_end|>' -}}"
+    "{%- elif part['type'] == 'text' -%}{{- part['text'] -}}"
+    "{%- endif -%}"
+    "{%- endfor -%}"
+    "{%- endif -%}"
+    "{{- '<|im_end|>\\n' -}}"
+    "{%- endfor -%}"
+    "{%- if add_generation_prompt -%}{{- '<|im_start|>assistant\\n' -}}{%- endif -%}"
+)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Recipe:
+    """Everything a run depends on beside its data."""
+
+    seed: int = 7
+    threads: int = 1
+    cameras: tuple[str, ...] = ("wrist",)
+    grid: tuple[int, int] = (14, 10)  # patches across and down; even, as 2 x 2 of them make one token
+    patch_px: int = 16
+    vision_width: int = 128
+    vision_layers: int = 3
+    width: int = 128
+    layer_types: tuple[str, ...] = ("linear_attention", "full_attention")
+    batch: int = 24
+    questions_per_image: int = 2
+    vision_steps: int = 1200
+    steps: int = 1000
+    learning_rate: float = 1.0e-3
+    held_out: float = 0.12
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height that the processor scales a 4:3 frame to."""
+        return self.grid[0] * self.patch_px, self.grid[1] * self.patch_px
+
+
+SMOKE: Final = Recipe(
+    grid=(6, 4), vision_width=32, vision_layers=1, width=32, batch=6, vision_steps=6, steps=6, held_out=0.25,
+)  # fmt: skip
+
+
+def build_processor(folder: Path, recipe: Recipe, names: Sequence[str]) -> Any:
+    """Tokenizer (byte-level BPE of Qwen's kind), image processor and chat template, as `AutoProcessor` reads them back."""
+    from transformers import (
+        Qwen2TokenizerFast,
+        Qwen2VLImageProcessor,
+        Qwen3VLProcessor,
+        Qwen3VLVideoProcessor,
+    )
+
+    blank = Qwen2TokenizerFast(vocab={"<|endoftext|>": 0}, merges=[])
+    split = blank.backend_tokenizer.pre_tokenizer
+    words = {piece for text in questions.corpus(names) for piece, _ in split.pre_tokenize_str(text)}
+    tokens, merges = common.learn_merges(words, suffix="")
+    vocab = dict.fromkeys([*common.byte_alphabet(), *tokens, *SPECIALS])
+    tokenizer = Qwen2TokenizerFast(
+        vocab={token: index for index, token in enumerate(vocab)},
+        merges=merges,
+        eos_token="<|im_end|>",
+        pad_token="<|endoftext|>",
+        additional_special_tokens=list(SPECIALS),
+        padding_side="left",
+        model_max_length=512,
+    )
+    # exactly one size fits these bounds for a 4:3 frame: that of the grid
+    pixels = recipe.size_px[0] * recipe.size_px[1]
+    options = {
+        "patch_size": recipe.patch_px,
+        "temporal_patch_size": 2,
+        "merge_size": 2,
+        "size": {"shortest_edge": pixels // 2, "longest_edge": round(pixels * 1.06)},
+        "image_mean": [0.5, 0.5, 0.5],
+        "image_std": [0.5, 0.5, 0.5],
+    }
+    processor = Qwen3VLProcessor(
+        image_processor=Qwen2VLImageProcessor(**options),
+        tokenizer=tokenizer,
+        video_processor=Qwen3VLVideoProcessor(**options),
+        chat_template=CHAT_TEMPLATE,
+    )
+    processor.save_pretrained(folder)
+    return processor
+
+
+def build_model(recipe: Recipe, processor: Any) -> Any:
+    """A fresh Qwen3.5 with this tokenizer's ids."""
+    import torch
+    from transformers import Qwen3_5Config, Qwen3_5ForConditionalGeneration
+
+    token = processor.tokenizer.convert_tokens_to_ids
+    config = Qwen3_5Config(
+        text_config={
+            "vocab_size": len(processor.tokenizer),
+            "hidden_size": recipe.width,
+            "intermediate_size": 2 * recipe.width,
+            "num_hidden_layers": len(recipe.layer_types),
+            "layer_types": list(recipe.layer_types),
+            "num_attention_heads": 4,
+            "num_key_value_heads": 2,
+            "head_dim": 32,
+            "linear_key_head_dim": 32,
+            "linear_value_head_dim": 32,
+            "linear_num_key_heads": 2,
+            "linear_num_value_heads": 4,
+            "max_position_embeddings": 512,
+            "rope_parameters": {
+                "rope_type": "default",
+                "rope_theta": 10000.0,
+                "partial_rotary_factor": 0.5,
+                "mrope_section": [4, 2, 2],
+                "mrope_interleaved": True,
+            },
+            "pad_token_id": token("<|endoftext|>"),
+            "eos_token_id": token("<|im_end|>"),
+            "tie_word_embeddings": True,
+        },
+        vision_config={
+            "depth": recipe.vision_layers,
+            "hidden_size": recipe.vision_width,
+            "intermediate_size": 3 * recipe.vision_width,
+            "num_heads": 2,
+            "patch_size": recipe.patch_px,
+            "temporal_patch_size": 2,
+            "spatial_merge_size": 2,
+            "out_hidden_size": recipe.width,
+            "num_position_embeddings": 12 * 12,
+        },
+        image_token_id=token("<|image_pad|>"),
+        video_token_id=token("<|video_pad|>"),
+        vision_start_token_id=token("<|vision_start|>"),
+        vision_end_token_id=token("<|vision_end|>"),
+        tie_word_embeddings=True,
+    )
+    model = Qwen3_5ForConditionalGeneration(config)
+    model.generation_config.eos_token_id = token("<|im_end|>")
+    model.generation_config.pad_token_id = token("<|endoftext|>")
+    model.generation_config.do_sample = False
+    with torch.no_grad():
+        tower = model.model.visual
+        for name, module in tower.named_modules():
+            if isinstance(module, torch.nn.Linear):
+                inner = name.endswith(("attn.proj", "mlp.linear_fc2"))
+                depth = (2 * recipe.vision_layers) ** -0.5 if inner else 1.0
+                module.weight.normal_(std=depth * module.in_features**-0.5)
+        tower.patch_embed.proj.weight.normal_(std=(6 * recipe.patch_px**2) ** -0.5)
+        tower.pos_embed.weight.normal_(std=0.3)
+    return model
+
+
+def to_patches(images: Any, recipe: Recipe) -> Any:
+    """Float images (n, 3, h, w) in 0..1 as the rows of patches that Qwen's image processor makes of them."""
+    count = images.shape[0]
+    across, down = recipe.grid
+    side = recipe.patch_px
+    x = ((images - 0.5) / 0.5)[:, None].expand(-1, 2, -1, -1, -1)
+    x = x.reshape(count, 1, 2, 3, down // 2, 2, side, across // 2, 2, side)
+    x = x.permute(0, 1, 4, 7, 5, 8, 3, 2, 6, 9)
+    return x.reshape(count * across * down, 3 * 2 * side * side)
+
+
+def augment(images: Any, generator: Any) -> Any:
+    """uint8 images under small random shifts, zooms and light; never mirrored, for the gripper is not symmetric."""
+    import torch
+
+    count = images.shape[0]
+    zoom = 1.0 - 0.08 * torch.rand(count, generator=generator)
+    shift = (2 * torch.rand(count, 2, generator=generator) - 1) * (1 - zoom)[:, None]
+    theta = torch.zeros(count, 2, 3)
+    theta[:, 0, 0] = theta[:, 1, 1] = zoom
+    theta[:, :, 2] = shift
+    grid = torch.nn.functional.affine_grid(theta, list(images.shape), align_corners=False)
+    moved = torch.nn.functional.grid_sample(
+        images.float() / 255.0, grid, mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return common.jitter_colours(moved, generator, 0.12)
+
+
+def visible_names(frame: Frame) -> list[str]:
+    """Names of what clearly shows, from left to right."""
+    return [o.name for o in sorted(frame.objects, key=lambda o: o.box[0] + o.box[2]) if o.clear]
+
+
+class Heads:
+    """Throw-away linear heads on the mean image token: what is held (or nothing), and what shows."""
+
+    def __init__(self, width: int, names: Sequence[str]) -> None:
+        import torch
+
+        self.names = list(names)
+        self.held = torch.nn.Linear(width, len(names) + 1)
+        self.shows = torch.nn.Linear(width, len(names))
+
+    def parameters(self) -> list[Any]:
+        """Of both heads."""
+        return [*self.held.parameters(), *self.shows.parameters()]
+
+    def loss(self, tokens: Any, frames: Sequence[Frame]) -> tuple[Any, float]:
+        """Summed losses, and the share of frames whose held object is right."""
+        import torch
+        from torch.nn import functional
+
+        mean = tokens.mean(dim=1)
+        held = torch.tensor([0 if f.held is None else 1 + self.names.index(f.held) for f in frames])
+        shows = torch.zeros(len(frames), len(self.names))
+        weight = torch.ones_like(shows)
+        for row, frame in enumerate(frames):
+            for seen in frame.objects:
+                shows[row, self.names.index(seen.name)] = 1.0
+                weight[row, self.names.index(seen.name)] = float(seen.clear)
+        logits = self.held(mean)
+        visible = functional.binary_cross_entropy_with_logits(self.shows(mean), shows, weight=weight)
+        right = float((logits.argmax(dim=1) == held).float().mean())
+        return functional.cross_entropy(logits, held) + 2.0 * visible, right
+
+
+def image_tokens(model: Any, patches: Any, recipe: Recipe) -> Any:
+    """(images, tokens, width) from the vision tower: its own forward pass, written for a batch of equal images.
+
+    The library's convolution over patches and its attention image by image cost three times as much on a CPU.
+    """
+    import torch
+    from torch.nn import functional
+    from transformers.models.qwen3_5.modeling_qwen3_5 import apply_rotary_pos_emb_vision
+
+    tower = model.model.visual
+    per_image = recipe.grid[0] * recipe.grid[1]
+    count = patches.shape[0] // per_image
+    grid = torch.tensor([[1, recipe.grid[1], recipe.grid[0]]])
+    conv = tower.patch_embed.proj
+    x = functional.linear(patches, conv.weight.flatten(1), conv.bias).view(count, per_image, -1)
+    x = x + tower.fast_pos_embed_interpolate(grid)
+    turn = tower.rot_pos_emb(grid)
+    turn = torch.cat([turn, turn], dim=-1)
+    cos, sin = turn.cos(), turn.sin()
+    for block in tower.blocks:
+        attention = block.attn
+        qkv = attention.qkv(block.norm1(x)).view(count, per_image, 3, attention.num_heads, -1)
+        query, key, value = qkv.unbind(dim=2)
+        query, key = apply_rotary_pos_emb_vision(query, key, cos, sin)
+        score = (query.transpose(1, 2) @ key.permute(0, 2, 3, 1)) * attention.scaling
+        mixed = (score.softmax(dim=-1) @ value.transpose(1, 2)).transpose(1, 2)
+        x = x + attention.proj(mixed.reshape(count, per_image, -1))
+        x = x + block.mlp(block.norm2(x))
+    tokens = tower.merger(x.reshape(count * per_image, -1))
+    return tokens.view(count, per_image // 4, -1)
+
+
+def ask_about(rng: random.Random, frame: Frame, names: Sequence[str]) -> tuple[str, str]:
+    """A question about a frame and its answer; every second one is whether something is grasped."""
+    kind = rng.random()
+    if kind < 0.55:
+        if frame.held is not None and rng.random() < 0.5:
+            name = frame.held
+        elif rng.random() < 0.6:
+            name = rng.choice(frame.present)
+        else:
+            name = rng.choice(list(names))
+        return questions.grasped(rng, name, frame.held)
+    if kind < 0.8:
+        return questions.holding(rng, frame.held)
+    seen = visible_names(frame)
+    if kind < 0.92:
+        half_hidden = {o.name for o in frame.objects if not o.clear}
+        likely = seen if seen and rng.random() < 0.5 else [n for n in names if n not in half_hidden]
+        return questions.present(rng, rng.choice(likely), seen)
+    return questions.listing(rng, seen)
+
+
+def encode(processor: Any, pairs: Sequence[tuple[str, str]], image_token_count: int) -> tuple[Any, Any, Any]:
+    """(ids, attention mask, labels) of chats, left-padded; labels only on the answers."""
+    import torch
+
+    rows, answers = [], []
+    for question, answer in pairs:
+        content = [{"type": "image"}, {"type": "text", "text": question}]
+        prompt = processor.apply_chat_template(
+            [{"role": "user", "content": content}], add_generation_prompt=True, tokenize=False
+        )
+        prompt = prompt.replace("<|image_pad|>", "<|image_pad|>" * image_token_count)
+        ids = processor.tokenizer(prompt)["input_ids"]
+        reply = processor.tokenizer(f"{answer}<|im_end|>")["input_ids"]
+        rows.append(ids + reply)
+        answers.append(len(reply))
+    longest = max(len(row) for row in rows)
+    ids = torch.full((len(rows), longest), processor.tokenizer.pad_token_id)
+    mask = torch.zeros(len(rows), longest, dtype=torch.long)
+    labels = torch.full((len(rows), longest), -100)
+    for index, row in enumerate(rows):
+        ids[index, longest - len(row) :] = torch.tensor(row)
+        mask[index, longest - len(row) :] = 1
+        labels[index, longest - answers[index] :] = ids[index, longest - answers[index] :]
+    return ids, mask, labels
+
+
+def answer_loss(model: Any, tokens: Any, owner: Any, encoded: tuple[Any, Any, Any], recipe: Recipe) -> Any:
+    """Cross-entropy of the answers; `owner[i]` is the image of chat i, whose tokens are reused by all its chats."""
+    import torch
+
+    ids, mask, labels = encoded
+    embeds = model.get_input_embeddings()(ids)
+    spot = (ids == model.config.image_token_id)[..., None].expand_as(embeds)
+    embeds = embeds.masked_scatter(spot, tokens[owner].to(embeds.dtype))
+    grid = torch.tensor([[1, recipe.grid[1], recipe.grid[0]]] * len(ids))
+    kinds = (ids == model.config.image_token_id).int()
+    positions, _ = model.model.get_rope_index(ids, kinds, image_grid_thw=grid, attention_mask=mask)
+    hidden = model.model.language_model(
+        inputs_embeds=embeds, attention_mask=mask, position_ids=positions, use_cache=False
+    ).last_hidden_state
+    asked = labels[:, 1:] != -100
+    logits = model.lm_head(hidden[:, :-1][asked])
+    return torch.nn.functional.cross_entropy(logits.float(), labels[:, 1:][asked])
+
+
+def train(recipe: Recipe, frames: Sequence[Frame], names: Sequence[str], out: Path) -> tuple[Any, dict[str, Any]]:
+    """Both stages on `frames`; saves the processor; returns (model, figures of the run)."""
+    import torch
+
+    common.seed_everything(recipe.seed, recipe.threads)
+    processor = build_processor(out, recipe, names)
+    model = build_model(recipe, processor)
+    model.train()
+    pixels = common.load_pixels(frames, recipe.size_px)
+    heads = Heads(recipe.width, names)
+    rng = random.Random(f"scene-vlm-{recipe.seed}")
+    generator = torch.Generator().manual_seed(recipe.seed)
+    started = time.monotonic()
+    image_token_count = recipe.grid[0] * recipe.grid[1] // 4
+
+    # Held and empty frames as often as each other: an empty gripper is the easy guess.
+    order = balanced([i for i, f in enumerate(frames) if f.held], [i for i, f in enumerate(frames) if not f.held])
+    batches = common.batches(len(order), recipe.batch, recipe.seed)
+    tower = list(model.model.visual.parameters())
+    language = [*model.model.language_model.parameters()]
+    shares = {"vision": (recipe.vision_steps, [*tower, *heads.parameters()])}
+    shares["both"] = (recipe.steps, [*tower, *heads.parameters(), *language])
+    figures: dict[str, Any] = {"train_frames": len(frames)}
+    for stage, (steps, parameters) in shares.items():
+        optimizer = torch.optim.AdamW(parameters, lr=recipe.learning_rate, betas=(0.9, 0.98), weight_decay=0.02)
+        seen: list[tuple[float, float]] = []
+        for step in range(steps):
+            for group in optimizer.param_groups:
+                group["lr"] = recipe.learning_rate * common.cosine_with_warmup(step, steps, min(50, steps))
+            chosen = [order[i] for i in next(batches)]
+            picked = [frames[i] for i in chosen]
+            patches = to_patches(augment(pixels[chosen], generator), recipe)
+            with torch.autocast("cpu", dtype=torch.bfloat16):
+                tokens = image_tokens(model, patches, recipe)
+            tokens = tokens.float()
+            loss, right = heads.loss(tokens, picked)
+            said = 0.0
+            if stage == "both":
+                owner = [i for i in range(len(picked)) for _ in range(recipe.questions_per_image)]
+                pairs = [ask_about(rng, picked[i], names) for i in owner]
+                answers = answer_loss(model, tokens, owner, encode(processor, pairs, image_token_count), recipe)
+                said = answers.item()
+                loss = 0.5 * loss + answers
+            optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(parameters, 1.0)
+            optimizer.step()
+            seen.append((right, said))
+            if step % max(1, steps // 20) == 0:
+                last = seen[-30:]
+                held_right = sum(r for r, _ in last) / len(last)
+                answer = sum(s for _, s in last) / len(last)
+                spent = time.monotonic() - started
+                print(f"{spent:6.0f} s  {stage} {step:5d}  held {held_right:.3f}  answers {answer:.4f}", flush=True)
+        figures[f"{stage}_steps"] = steps
+    figures["train_s"] = round(time.monotonic() - started, 1)
+    model.eval()
+    return model, figures
+
+
+def balanced(some: Sequence[int], others: Sequence[int]) -> list[int]:
+    """Both lists, the shorter one repeated to the longer one's length."""
+    if not some or not others:
+        return [*some, *others]
+    longest = max(len(some), len(others))
+    return [half[i % len(half)] for i in range(longest) for half in (some, others)]

@@ -1,0 +1,274 @@
+"""Views, `status`, `why` and the record of a switch."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from arbiter.core.effects import Note
+from arbiter.core.events import AcquireRequested
+from arbiter.core.explain import NOTE_KINDS
+from arbiter.testing.core_driver import Consumer, CoreDriver
+from schemas import defaults as d
+from schemas.ids import GpuId, LeaseId, ProcessKey
+
+GIB, MIB = d.GIB, d.MIB
+
+
+def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
+    person = driver.consumer(name)
+    lease = person.acquire(int(gib * GIB), **spec)
+    driver.until(lambda: driver.state(lease) == "loading")
+    person.load(lease)
+    driver.advance(0.01)
+    return person, lease
+
+
+def why(driver: CoreDriver, consumer: str) -> dict[str, Any]:
+    (lease,) = driver.arbiter.why(consumer, driver.now)["leases"]
+    found: dict[str, Any] = lease
+    return found
+
+
+def test_status_shows_holders_first_then_the_queue_in_order() -> None:
+    driver = CoreDriver(8 * GIB)
+    busy, lease = held(driver, "busy", 5)
+    busy.use_begin(lease)
+    driver.consumer("late").acquire(5 * GIB)
+    driver.consumer("urgent").acquire(5 * GIB, priority=90)
+    driver.card.names[ProcessKey(9, 9)] = "browser"
+    driver.card.set(ProcessKey(9, 9), 100 * MIB, driver.now)
+    driver.advance(1.5)
+    status = driver.arbiter.status(driver.now)
+    assert [view["consumer"] for view in status["leases"]] == ["busy", "urgent", "late"]
+    assert [view.get("position") for view in status["leases"]] == [None, 1, 2]
+    assert (status["epoch"], status["phase"], status["clients"]) == (1, "serving", 3)
+    (gpu,) = status["gpus"]
+    assert gpu["charged_bytes"] == 5 * GIB
+    assert gpu["stowaway_bytes"] == 100 * MIB
+    assert gpu["measured_used_bytes"] == 5 * GIB + 100 * MIB
+    assert [(p["name"], p["stowaway"], p["lease_ids"]) for p in gpu["processes"]] == [
+        ("busy", False, [lease]),
+        ("browser", True, []),
+    ]
+    busy.release(lease)
+    shown = driver.view(lease)
+    assert shown is not None
+    assert "ttl_left_s" not in shown
+
+
+def test_before_the_first_reading_nothing_is_known() -> None:
+    driver = CoreDriver(8 * GIB, start=False)
+    gpu = driver.gpu()
+    assert (gpu["measured_used_bytes"], gpu["sample_age_s"], gpu["processes"]) == (None, None, [])
+    assert gpu["blocked"] == "the card has not been read yet"
+
+
+def test_why_of_a_stranger_is_empty() -> None:
+    assert CoreDriver().arbiter.why("nobody", 0.0) == {"consumer": "nobody", "leases": []}
+
+
+def test_why_of_a_resident_lease_says_what_it_is_doing() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB)
+    says = [why(driver, "det")["text"]]
+    det.load(lease)
+    det.use_begin(lease)
+    says.append(why(driver, "det")["text"])
+    det.use_begin(lease, "u2")
+    driver.consumer("vlm").acquire(5 * GIB)
+    says.append(why(driver, "det")["text"])
+    det.use_end(lease)
+    det.use_end(lease, "u2")
+    det.unloading(lease)
+    says.append(why(driver, "det")["text"])
+    det.release(lease)
+    says.append(why(driver, "det")["text"])
+    assert says == [
+        "det: it was granted and is loading",
+        "det: it is resident, 1 use running",
+        "det: it was asked to leave for vlm, 2 uses running",
+        "det: it is unloading",
+        "det: it let go; its bytes are being measured",
+    ]
+
+
+def test_why_follows_the_way_of_the_holder() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = 0.5
+    det, lease = held(driver, "det", 5.3, min_residency_s=2.0)
+    det.use_begin(lease)
+    det.use_begin(lease, "u2")
+    driver.consumer("vlm").acquire(int(3.3 * GIB))
+    first = why(driver, "vlm")
+    assert first["condition"] == "no room"
+    assert first["blockers"] == [
+        {
+            "lease_id": lease,
+            "consumer": "det",
+            "bytes": int(5.3 * GIB),
+            "state": "held",
+            "uses": 2,
+            "condition": "may stay 2.0 s more (minimum residency)",
+        }
+    ]
+    assert first["deficit_bytes"] == int(3.3 * GIB) - (8 * GIB - 300 * MIB - int(5.3 * GIB))
+    driver.advance(2.1)
+    says = [why(driver, "vlm")["next"]]
+    det.use_end(lease)
+    says.append(why(driver, "vlm")["next"])
+    det.use_end(lease, "u2")
+    says.append(why(driver, "vlm")["next"])
+    assert why(driver, "vlm")["blockers"][0]["condition"].startswith("was asked to leave 0.1 s ago")
+    det.unloading(lease)
+    says.append(why(driver, "vlm")["next"])
+    assert [b["condition"] for b in why(driver, "vlm")["blockers"]] == ["is unloading"]
+    det.hold(0)
+    det.release(lease)
+    says.append(why(driver, "vlm")["next"])
+    assert says == [
+        "waits for det to finish 2 uses (asked 0.1 s ago), then it unloads and 5.69 GB are verified",
+        "waits for det to finish 1 use (asked 0.1 s ago), then it unloads and 5.69 GB are verified",
+        "waits for det to unload (asked 0.1 s ago), then 5.69 GB are verified",
+        "det unloads, then 5.69 GB are verified",
+        "5.69 GB of det are being verified",
+    ]
+
+
+def test_why_says_who_is_pinned_idle_or_of_higher_priority() -> None:
+    driver = CoreDriver(10 * GIB)
+    busy, busy_lease = held(driver, "busy", 3, priority=90)
+    busy.use_begin(busy_lease)
+    even, even_lease = held(driver, "even", 1)
+    even.use_begin(even_lease)
+    held(driver, "calm", 1)
+    driver.consumer("w").acquire(8 * GIB)
+    keeper, keeper_lease = held(driver, "keeper", 1, residue_bytes=450 * MIB, evictable=False)
+    conditions = {b["consumer"]: b["condition"] for b in why(driver, "w")["blockers"]}
+    assert conditions == {
+        "busy": "is in use and has priority 90, the waiter 50",
+        "even": "is in use",
+        "calm": "is idle and may be asked",
+        "keeper": "is pinned",
+    }
+    keeper.unload(keeper_lease)
+    driver.advance(1.0)
+    blockers = why(driver, "w")["blockers"]
+    assert {
+        "lease_id": None,
+        "consumer": "keeper",
+        "bytes": 450 * MIB,
+        "state": "residue",
+        "uses": 0,
+        "condition": "keeps its context until it exits",
+    } in blockers
+
+
+def test_why_behind_others_and_behind_a_load() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.consumer("det").acquire(5 * GIB)
+    driver.consumer("first").acquire(1 * GIB)
+    driver.consumer("second").acquire(1 * GIB)
+    assert why(driver, "first")["next"] == "waits: det is loading"
+    assert [b["condition"] for b in why(driver, "first")["blockers"]] == ["is loading"]
+    assert why(driver, "second")["next"] == "waits behind first as number 2"
+
+
+def test_why_when_only_measurements_are_missing() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    det.die()
+    driver.consumer("w").acquire(5 * GIB)
+    assert why(driver, "w")["next"] == "waits until the bytes of det are measured gone"
+    driver = CoreDriver(8 * GIB)
+    driver.advance(20.0)
+    driver.consumer("w").acquire(5 * GIB)
+    assert why(driver, "w")["next"] == "waits for a fresh reading of the card"
+    assert lease
+
+
+def test_why_names_relief_of_pressure_and_a_victim_of_somebody_else() -> None:
+    driver = CoreDriver(8 * GIB)
+    calm, lease = held(driver, "calm", 5)
+    driver.card.set(ProcessKey(9, 9), 3 * GIB, driver.now)
+    driver.until(lambda: driver.state(lease) == "revoking", limit_s=2.0)
+    assert why(driver, "calm")["text"] == "calm: it was asked to leave for relief of pressure, idle"
+    assert calm.name == "calm"
+
+
+def test_a_waiter_of_another_plan_sees_the_room_being_made() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    first = driver.consumer("first")
+    first.cancel(first.acquire(5 * GIB))
+    driver.consumer("w").acquire(5 * GIB)
+    assert why(driver, "w")["condition"] == "room is being made"
+    assert driver.state(lease) == "revoking"
+    assert det.name == "det"
+
+
+def test_the_eta_is_learnt_and_honest_about_not_knowing() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    vlm = driver.consumer("vlm")
+    waiter = vlm.acquire(5 * GIB)
+    assert (why(driver, "vlm")["eta_s"], why(driver, "vlm")["eta_source"]) == (None, "none")
+    driver.advance(1.0)
+    det.unload(lease, unload_s=0.5)
+    driver.until(lambda: driver.state(waiter) == "loading")
+    driver.advance(2.0)
+    vlm.load(waiter)
+    learnt = driver.arbiter.learnt()
+    assert learnt["det"]["drain_s"] == pytest.approx(1.0)
+    assert learnt["det"]["unload_s"] == pytest.approx(0.5)
+    assert learnt["vlm"]["load_s"] == pytest.approx(2.0, abs=0.01)
+
+    again = CoreDriver(8 * GIB, settings={"learnt": learnt})
+    det, lease = held(again, "det", 5)
+    det.use_begin(lease)
+    again.consumer("vlm").acquire(5 * GIB)
+    eta = why(again, "vlm")["eta_s"]
+    assert eta == pytest.approx(1.5 + learnt["det"]["verify_s"] + learnt["vlm"]["load_s"])
+    again.advance(0.4)
+    det.use_end(lease)
+    det.unloading(lease)
+    assert why(again, "vlm")["eta_s"] == pytest.approx(
+        0.5 + learnt["det"]["verify_s"] + learnt["vlm"]["load_s"]
+    )
+    det.release(lease)
+    assert why(again, "vlm")["eta_s"] == pytest.approx(learnt["det"]["verify_s"] + learnt["vlm"]["load_s"])
+
+
+def test_a_load_without_eviction_is_a_record_too() -> None:
+    driver = CoreDriver(8 * GIB)
+    held(driver, "det", 5)
+    (record,) = driver.notes("switch")
+    assert (record["switched"], record["evicted"], record["verified"]) == (False, [], True)
+    assert (record["wait_ms"], record["drain_ms"], record["unload_ms"], record["verify_ms"]) == (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    )
+    assert "kind" not in record
+
+
+def test_every_note_that_is_ever_said_is_listed() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    driver.consumer("vlm").acquire(5 * GIB)
+    det.unload(lease)
+    driver.advance(1.0)
+    assert {effect.kind for effect in driver.effects if isinstance(effect, Note)} <= set(NOTE_KINDS)
+    assert len(set(NOTE_KINDS)) == len(NOTE_KINDS)
+
+
+def test_a_trace_is_carried_from_the_acquire_to_every_note() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    event = AcquireRequested(det.client, driver.next_request(), "n", det.spec(1 * GIB), None)
+    effects = driver.post(replace(event, traceparent="00-abc-def-01"))
+    (note,) = [effect for effect in effects if isinstance(effect, Note)]
+    assert note.data["traceparent"] == "00-abc-def-01"
+    assert note.data["gpu"] == GpuId("GPU-0")

@@ -1,0 +1,268 @@
+"""Who gets the card next: serial loads, head and backfill, the measurement as second gate, pressure, several cards."""
+
+from typing import Any
+
+from arbiter.core.effects import Sample
+from arbiter.core.events import MemorySampled
+from arbiter.testing.core_driver import Consumer, CoreDriver, answer
+from schemas import defaults as d
+from schemas.ids import GpuId, LeaseId, ProcessKey
+
+GIB, MIB = d.GIB, d.MIB
+STRANGER = ProcessKey(9, 9)
+
+
+def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
+    person = driver.consumer(name)
+    lease = person.acquire(int(gib * GIB), **spec)
+    driver.until(lambda: driver.state(lease) == "loading")
+    person.load(lease)
+    driver.advance(0.01)
+    return person, lease
+
+
+# -- order and backfill --------------------------------------------------------------------------------------------------
+def test_a_higher_priority_passes_and_equals_keep_their_order() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = driver.consumer("det"), LeaseId("")
+    lease = det.acquire(6 * GIB)
+    low = driver.consumer("low").acquire(6 * GIB)
+    high = driver.consumer("high").acquire(6 * GIB, priority=60)
+    assert answer(driver.consumer("late").try_acquire(6 * GIB))["lease"]["position"] == 3
+    det.release(lease)
+    driver.until(lambda: driver.state(high) == "loading")
+    assert driver.state(low) == "queued"
+
+
+def test_a_small_one_passes_the_head_if_it_cannot_delay_it() -> None:
+    driver = CoreDriver(8 * GIB)
+    busy, busy_lease = held(driver, "busy", 4)
+    busy.use_begin(busy_lease)
+    head = driver.consumer("head").acquire(5 * GIB)
+    assert driver.state(busy_lease) == "revoking"
+    small = driver.consumer("small")
+    fits_beside = small.acquire(2 * GIB)
+    driver.advance(0.01)
+    assert driver.state(fits_beside) == "loading", "5 + 2 fit once the holder is gone"
+    small.load(fits_beside)
+    too_big = driver.consumer("big").acquire(1 * GIB)
+    assert driver.state(too_big) == "queued", "there is room now, but the head would not fit beside it"
+    busy.use_end(busy_lease)
+    busy.unload(busy_lease)
+    driver.until(lambda: driver.state(head) == "loading")
+
+
+def test_nobody_passes_an_exclusive_head_or_when_its_room_is_about_to_come() -> None:
+    driver = CoreDriver(8 * GIB)
+    busy, busy_lease = held(driver, "busy", 4)
+    busy.use_begin(busy_lease)
+    alone = driver.consumer("alone")
+    head = alone.acquire(1 * GIB, exclusive=True)
+    small = driver.consumer("small").acquire(1 * GIB)
+    driver.advance(0.5)
+    assert driver.state(small) == "queued"
+    alone.cancel(head)
+    head = alone.acquire(5 * GIB)
+    driver.advance(0.01)
+    assert driver.state(small) == "loading", "the newcomer came later, so the small one is the head now"
+
+
+def test_while_the_head_s_victim_unloads_nobody_starts_a_load_in_between() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    head = driver.consumer("head").acquire(5 * GIB)
+    det.unloading(lease)
+    small = driver.consumer("small").acquire(1 * GIB)
+    driver.advance(0.1)
+    assert (driver.state(head), driver.state(small)) == ("queued", "queued")
+    det.hold(0)
+    det.release(lease)
+    driver.until(lambda: driver.state(head) == "loading")
+
+
+def test_an_exclusive_waiter_never_passes() -> None:
+    driver = CoreDriver(8 * GIB)
+    busy, busy_lease = held(driver, "busy", 4, priority=90)
+    busy.use_begin(busy_lease)
+    head = driver.consumer("head").acquire(5 * GIB)
+    alone = driver.consumer("alone").acquire(1 * GIB, exclusive=True)
+    third = driver.consumer("third").acquire(2 * GIB)
+    driver.advance(0.1)
+    assert [driver.state(lease) for lease in (head, alone, third)] == ["queued", "queued", "loading"]
+
+
+# -- exclusive -------------------------------------------------------------------------------------------------------------
+def test_residues_may_stay_beside_an_exclusive_lease() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    alone = driver.consumer("alone").acquire(7 * GIB, exclusive=True)
+    driver.advance(0.01)
+    assert driver.state(alone) == "loading"
+
+
+# -- the second gate ---------------------------------------------------------------------------------------------------------
+def test_an_old_reading_carries_no_grant_a_fresh_one_is_asked_for() -> None:
+    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 100.0})
+    det = driver.consumer("det")
+    driver.advance(5.0)
+    effects = det.try_acquire(1 * GIB)
+    assert answer(effects)["state"] == "queued"
+    assert [e for e in effects if isinstance(e, Sample)] == [Sample(GpuId("GPU-0"))]
+    again = driver.consumer("vlm").try_acquire(1 * GIB)
+    assert not [e for e in again if isinstance(e, Sample)], "one is under way"
+    driver.advance(0.01)
+    assert [view["state"] for view in driver.arbiter.status(driver.now)["leases"]] == ["loading", "queued"]
+
+
+def test_the_card_may_say_no_where_the_ledger_says_yes() -> None:
+    """Total-only backend: bytes that appear while somebody loads cannot be explained, but they are not free either."""
+    driver = CoreDriver(8 * GIB)
+    driver.card.lists_processes = False
+    det, lease = held(driver, "det", 1)
+    driver.card.set(STRANGER, 4 * GIB, driver.now)
+    det.unloading(lease)
+    driver.advance(1.5)
+    waiter = driver.consumer("vlm").acquire(5 * GIB)
+    driver.advance(1.5)
+    assert driver.state(waiter) == "queued"
+    assert "measured memory is not free yet" in driver.gpu()["blocked"]
+    driver.card.set(STRANGER, 0, driver.now)
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)
+
+
+def test_a_reading_from_before_the_last_ready_is_not_believed_to_be_full() -> None:
+    """It may have seen the bytes of the newcomer or not: they are subtracted, and if that is too little a fresh one is read."""
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    first = det.acquire(4 * GIB)
+    det.hold(4 * GIB)
+    driver.advance(1.1)
+    det.ready(first)
+    vlm = driver.consumer("vlm").acquire(3 * GIB)
+    assert driver.state(vlm) == "queued", "4 used, 4 perhaps not seen: a fresh reading is needed"
+    driver.advance(0.01)
+    assert driver.state(vlm) == "loading"
+
+
+# -- pressure ----------------------------------------------------------------------------------------------------------------
+def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder() -> None:
+    driver = CoreDriver(8 * GIB)
+    calm, calm_lease = held(driver, "calm", 2)
+    _, other_lease = held(driver, "other", 4)
+    busy, busy_lease = held(driver, "busy", 1)
+    busy.use_begin(busy_lease)
+    driver.card.set(STRANGER, 2 * GIB, driver.now)
+    waiter = driver.consumer("w")
+    driver.until(lambda: bool(driver.notes("pressure")), limit_s=2.0)
+    assert driver.notes("stowaway")[-1]["used_bytes"] == 2 * GIB
+    assert "pressure" in driver.gpu()["blocked"]
+    assert [driver.state(lease) for lease in (calm_lease, other_lease, busy_lease)] == [
+        "revoking",
+        "held",
+        "held",
+    ]
+    assert driver.pushes("revoke", calm_lease)[0]["wanted_by"] == ""
+    queued = waiter.acquire(100 * MIB)
+    assert driver.state(queued) == "queued"
+    calm.unload(calm_lease)
+    driver.until(lambda: driver.state(queued) == "loading")
+    assert driver.notes("pressure")[-1]["pressure_bytes"] == 0
+
+
+def test_pressure_that_cannot_be_covered_asks_every_idle_holder() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, small = held(driver, "small", 1)
+    busy, busy_lease = held(driver, "busy", 6)
+    busy.use_begin(busy_lease)
+    driver.card.set(STRANGER, 3 * GIB, driver.now)
+    driver.until(lambda: driver.state(small) == "revoking", limit_s=2.0)
+    assert driver.state(busy_lease) == "held"
+    driver.card.total_bytes = 16 * GIB
+
+
+def test_a_holder_above_its_charge_is_pressure_not_a_stowaway() -> None:
+    driver = CoreDriver(8 * GIB)
+    liar, lease = held(driver, "liar", 3)
+    liar.use_begin(lease)
+    _, idle = held(driver, "idle", 4, min_residency_s=5.0)
+    liar.hold(5 * GIB)
+    driver.until(lambda: bool(driver.notes("pressure")), limit_s=2.0)
+    (note,) = driver.notes("pressure")
+    assert note["holders"] == [{"pid": liar.process.pid, "over_bytes": 2 * GIB}]
+    assert not driver.notes("stowaway")
+    assert driver.state(idle) == "held", "its residency is not over"
+    driver.until(lambda: driver.state(idle) == "revoking", limit_s=6.0)
+
+
+def test_ready_with_more_than_granted_is_pressure_and_no_violation() -> None:
+    driver = CoreDriver(8 * GIB)
+    a, first = held(driver, "a", 4)
+    a.use_begin(first)
+    b = driver.consumer("b")
+    second = b.acquire(3 * GIB)
+    driver.until(lambda: driver.state(second) == "loading")
+    b.use_begin(first, token=a.token(first))
+    b.load(second, 5 * GIB)
+    assert driver.gpu()["pressure_bytes"] > 0
+    assert driver.state(second) == "revoking", "it is idle, and the card is too full"
+
+
+# -- several cards -------------------------------------------------------------------------------------------------------------
+def test_any_takes_the_first_card_where_it_fits_without_asking() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    a, b = driver.consumer("a"), driver.consumer("b")
+    first = a.acquire(5 * GIB)
+    second = b.acquire(5 * GIB)
+    assert [view["gpu"] for view in (driver.view(first), driver.view(second)) if view] == ["GPU-0", "GPU-1"]
+
+
+def test_any_empties_the_cheaper_card_only() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    dear, dear_lease = held(driver, "dear", 5, priority=80, gpu="0")
+    cheap, cheap_lease = held(driver, "cheap", 5, priority=20, gpu="1")
+    person = driver.consumer("w")
+    waiter = person.acquire(5 * GIB)
+    assert (driver.state(dear_lease), driver.state(cheap_lease)) == ("held", "revoking")
+    driver.advance(5.0)
+    assert driver.state(dear_lease) == "held"
+    cheap.unload(cheap_lease)
+    driver.until(lambda: driver.state(waiter) == "loading")
+    view = driver.view(waiter)
+    assert view is not None
+    assert view["gpu"] == "GPU-1"
+    assert dear.driver is driver
+
+
+def test_any_waits_for_room_that_comes_on_another_card() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    _, stays = held(driver, "stays", 5, gpu="0", min_residency_s=1.0)
+    goes, going = held(driver, "goes", 5, gpu="1")
+    goes.unloading(going)
+    driver.advance(1.5)
+    waiter = driver.consumer("w").acquire(5 * GIB)
+    assert driver.state(stays) == "held"
+    goes.hold(0, gpu=GpuId("GPU-1"))
+    goes.release(going)
+    driver.until(lambda: driver.state(waiter) == "loading")
+    assert driver.state(stays) == "held"
+
+
+def test_the_dearer_card_is_emptied_if_the_cheaper_one_is_not_its_turn() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    _, dear = held(driver, "dear", 5, priority=80, gpu="0")
+    cheap, cheap_lease = held(driver, "cheap", 5, priority=20, gpu="1")
+    cheap.use_begin(cheap_lease)
+    driver.consumer("first").acquire(5 * GIB, gpu="1", priority=60)
+    waiter = driver.consumer("w").acquire(5 * GIB)
+    assert driver.state(dear) == "revoking"
+    assert driver.state(waiter) == "queued"
+
+
+def test_readings_of_unknown_cards_and_late_ones_are_dropped() -> None:
+    driver = CoreDriver(8 * GIB)
+    assert driver.post(MemorySampled(GpuId("GPU-9"), driver.now, 0, 1, None)) == []
+    driver.post(MemorySampled(GpuId("GPU-0"), driver.now, 123, 8 * GIB, ()))
+    driver.post(MemorySampled(GpuId("GPU-0"), driver.now - 5.0, 456, 8 * GIB, ()))
+    assert driver.gpu()["measured_used_bytes"] == 123

@@ -1,0 +1,130 @@
+"""Each invariant, broken by hand, is found by its number. A sound state is never complained about (the other tests)."""
+
+from collections.abc import Callable
+
+import pytest
+
+from arbiter.core import invariants
+from arbiter.core.invariants import InvariantViolation
+from arbiter.core.lease import Lease, LeaseState, Use
+from arbiter.core.state import Core, Gpu
+from arbiter.testing.core_driver import CoreDriver
+from schemas import defaults as d
+from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, Token, UseId
+
+GIB = d.GIB
+X = ProcessKey(5, 5)
+
+
+class Broken:
+    """One held lease, one queued lease (with a bound), and free access to the inside."""
+
+    def __init__(self) -> None:
+        self.driver = CoreDriver(8 * GIB)
+        holder = self.driver.consumer("a")
+        held = holder.acquire(5 * GIB, priority=90)
+        holder.load(held)
+        holder.use_begin(held)
+        self.driver.consumer("b").acquire(5 * GIB, wait_timeout_s=50.0)
+        self.core: Core = self.driver.arbiter._core
+        self.gpu: Gpu = self.core.gpus[GpuId("GPU-0")]
+        self.held: Lease = self.core.leases[held]
+        self.queued: Lease = next(iter(self.core.waiting.values()))
+        self.core.granted.clear()
+        invariants.check(self.core)
+
+
+def over_budget(b: Broken) -> None:
+    b.gpu.ledger.charge(LeaseId("x"), X, 5 * GIB, 5 * GIB, 0.0)
+
+
+def granted_under_pressure(b: Broken) -> None:
+    b.core.granted.append((Token(1, 99), b.gpu.info.id))
+    b.gpu.ledger.unnamed_bytes = 4 * GIB
+    b.gpu.ledger._total = None
+
+
+def beside_exclusive(b: Broken) -> None:
+    from dataclasses import replace
+
+    b.held.spec = replace(b.held.spec, exclusive=True)
+    b.gpu.residents[b.queued.id] = b.queued
+
+
+def two_loads(b: Broken) -> None:
+    b.held.uses.clear()
+    b.held.state = b.queued.state = LeaseState.LOADING
+    b.gpu.residents[b.queued.id] = b.queued
+    b.core.granted.append((Token(1, 99), b.gpu.info.id))
+
+
+def unloads_in_use(b: Broken) -> None:
+    b.held.uses[X, UseId("u")] = Use(UseId("u"), ClientId("c"), X, "", 0.0)
+    b.held.state = LeaseState.UNLOADING
+
+
+def resident_without_charge(b: Broken) -> None:
+    b.gpu.ledger.drop(b.held.id, 0, 0, 0.0)
+
+
+def verifying_without_verification(b: Broken) -> None:
+    b.held.uses.clear()
+    b.held.state = LeaseState.VERIFYING
+
+
+def charged_for_ever(b: Broken) -> None:
+    b.gpu.ledger.charge(LeaseId("x"), X, 1, 1, 0.0)
+
+
+def token_shrinks(b: Broken) -> None:
+    b.core.granted.append((Token(1, 1), GpuId("GPU-1")))
+
+
+def waiter_in_no_queue(b: Broken) -> None:
+    b.gpu.queue.discard(b.queued)
+
+
+def queue_without_waiter(b: Broken) -> None:
+    del b.core.waiting[b.queued.id]
+    b.core.waiting[LeaseId("other")] = b.queued
+
+
+def bound_without_timer(b: Broken) -> None:
+    b.core.timers.clear(("wait", b.queued.id))
+
+
+def no_next_reading(b: Broken) -> None:
+    b.core.timers.clear(("probe", b.gpu.info.id))
+
+
+@pytest.mark.parametrize(
+    ("number", "breaks", "says"),
+    [
+        (1, over_budget, "approved"),
+        (1, granted_under_pressure, "beyond the budget"),
+        (2, beside_exclusive, "is exclusive"),
+        (2, two_loads, "load at once"),
+        (3, unloads_in_use, "with 2 uses"),
+        (4, resident_without_charge, "not charged"),
+        (4, verifying_without_verification, "nobody works on"),
+        (4, charged_for_ever, "for ever"),
+        (5, token_shrinks, "token 1.1 after"),
+        (6, waiter_in_no_queue, "are in queues"),
+        (6, queue_without_waiter, "is the head"),
+        (6, bound_without_timer, "no timer"),
+        (6, no_next_reading, "nobody will read"),
+    ],
+)
+def test_a_broken_state_is_found(number: int, breaks: Callable[[Broken], None], says: str) -> None:
+    broken = Broken()
+    breaks(broken)
+    with pytest.raises(InvariantViolation, match=says) as caught:
+        invariants.check(broken.core)
+    assert caught.value.number == number
+
+
+def test_a_violation_stops_the_event() -> None:
+    broken = Broken()
+    over_budget(broken)
+    with pytest.raises(InvariantViolation):
+        broken.driver.consumer("c")

@@ -1,0 +1,250 @@
+"""A restart of the daemon alone: what the journal names stays charged, holders come back, and nobody is granted before."""
+
+from typing import Any
+
+from arbiter.core.effects import Note
+from arbiter.core.events import MemorySampled, Recovered
+from arbiter.testing.core_driver import Consumer, CoreDriver, answer
+from schemas import defaults as d
+from schemas.ids import ClientId, GpuId, LeaseId, Token
+
+GIB, MIB = d.GIB, d.MIB
+
+
+def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId, Token]:
+    person = driver.consumer(name)
+    lease = person.acquire(int(gib * GIB), **spec)
+    driver.until(lambda: driver.state(lease) == "loading")
+    token = person.token(lease)
+    person.load(lease)
+    driver.advance(0.01)
+    return person, lease, token
+
+
+def test_a_kept_lease_keeps_its_token_its_uses_and_its_charge() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, token = held(driver, "det", 5)
+    driver.restart()
+    assert driver.arbiter.status(driver.now)["phase"] == "recovering"
+    assert driver.gpu()["charged_bytes"] == 5 * GIB
+    assert "recovering" in driver.gpu()["blocked"]
+    vlm = driver.consumer("vlm")
+    waiter = vlm.acquire(1 * GIB)
+    assert driver.state(waiter) == "queued", "nothing is granted before everybody is accounted for"
+    det.connect()
+    (kept,) = answer(det.reattach(lease, token, uses=["goal"]))["leases"]
+    assert kept["kept"] is True
+    assert (kept["lease"]["state"], kept["lease"]["uses"], kept["lease"]["token"]) == ("held", 1, [1, 2])
+    driver.until(lambda: driver.state(waiter) == "loading")
+    assert driver.arbiter.status(driver.now)["phase"] == "serving"
+    assert vlm.token(waiter) > token, "tokens grow across restarts"
+    det.use_end(lease, "goal", token)
+    det.unload(lease)
+
+
+def test_re_attaching_to_a_daemon_that_did_not_restart_only_moves_the_connection() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, token = held(driver, "det", 5)
+    det.use_begin(lease, "over")
+    det.client = ClientId("c-new")
+    det.connect()
+    assert answer(det.reattach(lease, token, uses=["runs"]))["leases"][0]["lease"]["uses"] == 1
+    det.use_end(lease, "runs")
+    det.unloading(lease)
+    assert answer(det.reattach(lease, token, uses=["late"]))["leases"][0]["lease"]["uses"] == 0, "it unloads"
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    (gone,) = answer(det.reattach(lease, token))["leases"]
+    assert gone["error"]["code"] == "bad_state"
+
+
+def test_wrong_tokens_and_wrong_processes_are_not_kept() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, token = held(driver, "det", 5)
+    thief = driver.consumer("thief")
+    spec = det.specs[lease]
+    assert answer(thief.reattach(lease, token, spec=spec))["leases"][0]["error"]["code"] == "not_permitted"
+    assert answer(det.reattach(lease, Token(1, 99)))["leases"][0]["error"]["code"] == "stale_token"
+    unknown = answer(det.reattach(LeaseId("L0-5"), Token(0, 5), spec=spec))["leases"][0]
+    assert unknown["error"]["code"] == "lease_lost", "only while recovering is anybody believed"
+
+
+def test_a_ready_that_was_lost_with_the_daemon_is_made_up_for() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB, 4 * GIB)
+    token = det.token(lease)
+    det.hold(4 * GIB)
+    driver.restart()
+    assert driver.state(lease) == "loading"
+    det.connect()
+    det.reattach(lease, token, held=True, measured_bytes=4 * GIB)
+    assert (driver.state(lease), driver.gpu()["charged_bytes"]) == ("held", 4 * GIB)
+    assert driver.journal[f"lease:{lease}"]["state"] == "held"
+
+
+def test_a_holder_that_never_comes_back_expires_and_is_measured_away() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease, _ = held(driver, "det", 5, ttl_s=10.0)
+    driver.restart()
+    waiter = driver.consumer("vlm").acquire(5 * GIB)
+    driver.advance(14.9)
+    assert driver.state(lease) == "held"
+    driver.card.held.clear()
+    driver.card.set(driver.consumer("x").process, 1 * GIB, driver.now)
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=12.0)
+    assert driver.notes("serving")
+    assert driver.journal.keys() == {f"lease:{waiter}"}
+
+
+def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _ = held(driver, "det", 5)
+    driver.restart()
+    waiter = driver.consumer("vlm").acquire(5 * GIB)
+    driver.card.lag_s = 0.5
+    det.die()
+    assert driver.arbiter.status(driver.now)["phase"] == "serving"
+    assert driver.state(waiter) == "queued"
+    took = driver.until(lambda: driver.state(waiter) == "loading")
+    assert took >= 0.5
+    assert driver.state(lease) == "over"
+
+
+def test_an_empty_card_voids_what_was_resident_but_not_who_may_just_begin_to_load() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, token = held(driver, "det", 5)
+    tiny, small, _ = held(driver, "tiny", 0.25)
+    loader = driver.consumer("loader")
+    loading = loader.acquire(1 * GIB)
+    driver.until(lambda: driver.state(loading) == "loading")
+    load_token = loader.token(loading)
+    driver.card.held.clear()
+    driver.restart()
+    assert (driver.state(lease), driver.state(small), driver.state(loading)) == ("over", "held", "loading")
+    det.connect()
+    assert answer(det.reattach(lease, token))["leases"][0]["error"]["code"] == "lease_lost"
+    loader.connect()
+    loader.reattach(loading, load_token, held=False)
+    tiny.die()
+    assert driver.arbiter.status(driver.now)["phase"] == "serving"
+    assert driver.state(loading) == "loading"
+
+
+def test_verifications_and_debts_go_on_after_the_restart() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = 3.0
+    det, lease, token = held(driver, "det", 4, residue_bytes=450 * MIB)
+    vlm, other, _ = held(driver, "vlm", 2)
+    driver.card.set(driver.consumer("x").process, 200 * MIB, driver.now)
+    det.unload(lease)
+    vlm.die()
+    assert {record["state"] for record in driver.journal.values()} == {"verifying", "debt"}
+    driver.restart()
+    assert driver.gpu()["charged_bytes"] == 6 * GIB
+    assert driver.state(lease) == "verifying"
+    assert driver.arbiter.status(driver.now)["phase"] == "serving", "nobody has to come back for these"
+    (gone,) = answer(vlm.connect() + vlm.reattach(other, Token(1, 4)))["leases"]
+    assert gone["error"]["code"] == "lease_lost"
+    driver.until(lambda: driver.gpu()["charged_bytes"] == 450 * MIB, limit_s=5.0)
+    driver.restart(epoch=3)
+    assert driver.gpu()["charged_bytes"] == 450 * MIB, "residues are remembered"
+    assert det.process.pid in {process["pid"] for process in driver.gpu()["processes"]}
+    assert token.epoch == 1
+
+
+def test_a_lost_journal_believes_holders_for_a_while() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, token = held(driver, "det", 5)
+    loader = driver.consumer("loader")
+    loading = loader.acquire(2 * GIB)
+    driver.until(lambda: driver.state(loading) == "loading")
+    load_token = loader.token(loading)
+    driver.restart(keep_journal=False)
+    vlm = driver.consumer("vlm")
+    waiter = vlm.acquire(4 * GIB)
+    det.connect()
+    loader.connect()
+    assert answer(det.reattach(lease, token, measured_bytes=5 * GIB))["leases"][0]["kept"] is True
+    assert (
+        answer(loader.reattach(loading, load_token, held=False))["leases"][0]["lease"]["state"] == "loading"
+    )
+    spec = det.spec(1 * GIB, gpu="7")
+    lost = answer(det.reattach(LeaseId("L1-77"), Token(1, 77), spec=spec))["leases"][0]
+    assert lost["error"]["code"] == "unknown_gpu"
+    future = answer(det.reattach(LeaseId("L9-1"), Token(9, 1), spec=spec))["leases"][0]
+    assert future["error"]["code"] == "lease_lost"
+    driver.advance(14.0)
+    assert driver.arbiter.status(driver.now)["phase"] == "recovering"
+    driver.advance(1.1)
+    assert driver.arbiter.status(driver.now)["phase"] == "serving"
+    assert driver.gpu()["charged_bytes"] == 7 * GIB
+    loader.load(loading)
+    assert driver.state(lease) == "revoking"
+    assert driver.state(waiter) == "queued"
+    assert f"lease:{lease}" in driver.journal
+
+
+def test_adopting_more_than_the_card_has_is_pressure_not_a_crash() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, token = held(driver, "det", 5)
+    driver.restart(keep_journal=False)
+    liar = driver.consumer("liar")
+    det.connect()
+    det.reattach(lease, token)
+    liar.reattach(LeaseId("L1-50"), Token(1, 50), spec=liar.spec(6 * GIB))
+    assert driver.gpu()["pressure_bytes"] > 0
+    driver.advance(16.0)
+    assert "revoking" in {driver.state(lease), driver.state(LeaseId("L1-50"))}
+
+
+def test_a_lost_journal_and_an_empty_card_serve_at_once() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.restart(keep_journal=False)
+    assert driver.arbiter.status(driver.now)["phase"] == "serving"
+    assert driver.consumer("det").acquire(5 * GIB)
+
+
+def test_one_empty_card_of_two_is_not_enough() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    driver.cards[GpuId("GPU-1")].set(driver.consumer("x").process, 1 * GIB, driver.now)
+    driver.restart(keep_journal=False)
+    assert driver.arbiter.status(driver.now)["phase"] == "recovering"
+
+
+def test_records_of_a_card_that_is_gone_are_dropped() -> None:
+    driver = CoreDriver(8 * GIB)
+    record = {"gpu": "GPU-old", "pid": 1, "start_ticks": 1, "residue_bytes": 5}
+    effects = driver.post(Recovered({"residue:1@1:GPU-old": record}))
+    assert type(effects[0]).__name__ == "JournalDelete"
+    assert isinstance(effects[-1], Note)
+    assert effects[-1].kind == "serving"
+
+
+def test_a_reading_from_before_the_restart_voids_nothing() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease, _ = held(driver, "det", 5)
+    records = dict(driver.journal)
+    driver = CoreDriver(8 * GIB, start=False)
+    driver.post(Recovered(records))
+    driver.post(MemorySampled(GpuId("GPU-0"), driver.now - 1.0, 0, 8 * GIB, ()))
+    assert driver.state(lease) == "held"
+    driver.post(MemorySampled(GpuId("GPU-9"), driver.now, 0, 8 * GIB, ()))
+
+
+def test_the_first_verdict_after_a_restart_needs_no_reading_from_before() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _ = held(driver, "det", 5)
+    other = driver.consumer("other")
+    driver.card.set(other.process, 1 * GIB, driver.now)
+    driver.advance(1.5)
+    det.hold(4 * GIB)
+    det.release(lease)
+    records = dict(driver.journal)
+    again = CoreDriver(8 * GIB, start=False)
+    again.card.names[other.process] = "other"
+    again.card.set(other.process, 6 * GIB, again.now)
+    again.post(Recovered(records))
+    again.advance(11.0)
+    (note,) = again.notes("verified")
+    assert (note["verdict"], note["before_bytes"]) == ("verified", None), "the stowaway explains the card"

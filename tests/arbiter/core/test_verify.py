@@ -1,0 +1,324 @@
+"""Verdicts. The bytes of a lease stay charged until a reading says that they came back, or whose they are."""
+
+from typing import Any
+
+import pytest
+
+from arbiter.core.events import ProbeFailed, Tick
+from arbiter.testing.core_driver import Consumer, CoreDriver
+from schemas import defaults as d
+from schemas.ids import GpuId, LeaseId, ProcessKey
+
+GIB, MIB = d.GIB, d.MIB
+STRANGER = ProcessKey(9, 9)
+GPU = GpuId("GPU-0")
+
+
+def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
+    person = driver.consumer(name)
+    lease = person.acquire(int(gib * GIB), **spec)
+    driver.until(lambda: driver.state(lease) == "loading")
+    person.load(lease)
+    driver.advance(0.01)
+    return person, lease
+
+
+def verdicts(driver: CoreDriver) -> list[tuple[str, bool]]:
+    return [(note["verdict"], note["resolved"]) for note in driver.notes("verified")]
+
+
+def total_only(driver: CoreDriver) -> None:
+    driver.card.lists_processes = False
+    driver.advance(1.5)
+
+
+# -- verified ------------------------------------------------------------------------------------------------------------
+def test_two_equal_readings_after_the_release_are_enough() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
+    det.unload(lease)
+    took = driver.until(lambda: driver.state(lease) == "over", step_s=0.001)
+    assert took == pytest.approx(0.026, abs=0.0015), "polled after 5 and 25 ms"
+    (note,) = driver.notes("verified")
+    assert (note["verdict"], note["before_bytes"], note["after_bytes"]) == ("verified", 5 * GIB, 450 * MIB)
+    assert driver.gpu()["charged_bytes"] == 450 * MIB
+
+
+def test_polling_gets_slower_and_no_reading_from_before_the_release_counts() -> None:
+    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
+    driver.card.lag_s = 0.25
+    det, lease = held(driver, "det", 5)
+    det.unload(lease)
+    began = driver.now
+    driver.until(lambda: driver.state(lease) == "over")
+    polls = [round(at - began, 3) for at, event in driver.events if isinstance(event, Tick) and at > began]
+    assert polls == [0.005, 0.025, 0.075, 0.125, 0.175, 0.225, 0.275, 0.325]
+
+
+def test_a_process_that_exits_has_to_give_back_even_its_context() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
+    det.unloading(lease)
+    det.hold(450 * MIB)
+    det.release(lease, exiting=True)
+    driver.advance(1.0)
+    assert driver.state(lease) == "verifying"
+    det.die()
+    driver.until(lambda: driver.state(lease) == "over", limit_s=1.0)
+    assert driver.gpu()["charged_bytes"] == 0
+
+
+def test_another_holder_may_grow_up_to_its_charge_meanwhile() -> None:
+    driver = CoreDriver(8 * GIB)
+    a, first = held(driver, "a", 2)
+    a.hold(1 * GIB)
+    b, second = held(driver, "b", 4)
+    b.unloading(second)
+    a.hold(2 * GIB)
+    b.hold(0)
+    b.release(second)
+    driver.until(lambda: driver.state(second) == "over", limit_s=1.0)
+    assert verdicts(driver) == [("verified", True)]
+    assert driver.state(first) == "held"
+
+
+def test_totals_alone_verify_by_what_the_lease_was_charged() -> None:
+    driver = CoreDriver(8 * GIB)
+    total_only(driver)
+    a, first = held(driver, "a", 2)
+    b, second = held(driver, "b", 4)
+    driver.advance(1.0)
+    b.unloading(second)
+    c = driver.consumer("c")
+    third = c.acquire(1 * GIB)  # loads while b is measured: what it may take is allowed for
+    assert driver.state(third) == "loading"
+    c.hold(1 * GIB)
+    b.hold(0)
+    b.release(second)
+    driver.until(lambda: driver.state(second) == "over", limit_s=1.0)
+    assert verdicts(driver) == [("verified", True)]
+    assert a.driver.state(first) == "held"
+
+
+def test_without_a_comparable_reading_the_ledger_bound_decides() -> None:
+    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
+    driver.card.lists_processes = False
+    det = driver.consumer("det")
+    driver.advance(2.5)
+    lease = det.acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "loading")
+    det.hold(1 * GIB)
+    det.release(lease)
+    driver.advance(11.0)
+    assert verdicts(driver) == [("unverifiable", False)]
+    assert driver.state(lease) == "verifying", "nothing dropped"
+    det.hold(0)
+    driver.until(lambda: driver.state(lease) == "over", limit_s=2.0)
+    assert verdicts(driver)[-1] == ("verified", True)
+
+
+# -- residue ---------------------------------------------------------------------------------------------------------------
+def test_a_living_process_that_keeps_too_much_is_charged_for_it() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
+    waiter = driver.consumer("w").acquire(6 * GIB)
+    small = driver.consumer("small").acquire(4 * GIB)
+    det.unloading(lease)
+    det.hold(2 * GIB)
+    det.release(lease)
+    driver.advance(11.0)
+    assert verdicts(driver) == [("residue", True)]
+    (culprit,) = driver.notes("verified")[0]["culprits"]
+    assert culprit == {"pid": det.process.pid, "name": "det", "bytes": 2 * GIB}
+    assert driver.gpu()["charged_bytes"] == 2 * GIB
+    assert driver.journal[f"residue:{det.process}:GPU-0"]["residue_bytes"] == 2 * GIB
+    assert driver.state(waiter) == "queued", "only what fits now is granted"
+    assert driver.state(small) == "queued", "and it would delay the head"
+    det.hold(450 * MIB)
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
+    assert driver.gpu()["charged_bytes"] == 6 * GIB + 450 * MIB, "it came back later: noticed"
+
+
+def test_totals_alone_charge_the_shortfall_to_the_process_that_let_go() -> None:
+    driver = CoreDriver(8 * GIB)
+    total_only(driver)
+    det, lease = held(driver, "det", 5)
+    driver.advance(1.0)
+    det.unloading(lease)
+    det.hold(2 * GIB)
+    det.release(lease)
+    driver.advance(11.0)
+    assert verdicts(driver) == [("residue", True)]
+    assert driver.gpu()["charged_bytes"] == 2 * GIB
+
+
+# -- contested -------------------------------------------------------------------------------------------------------------
+def test_others_that_grew_are_named_and_charged_as_stowaways() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, residue_bytes=100 * MIB)
+    waiter = driver.consumer("w").acquire(7 * GIB)
+    det.unloading(lease)
+    driver.card.names[STRANGER] = "browser"
+    driver.card.set(STRANGER, 1 * GIB, driver.now)
+    det.hold(100 * MIB)
+    det.release(lease)
+    driver.advance(11.0)
+    assert verdicts(driver) == [("contested", True)]
+    assert driver.notes("verified")[0]["culprits"] == [{"pid": 9, "name": "browser", "bytes": 1 * GIB}]
+    assert driver.state(waiter) == "queued"
+    assert driver.gpu()["stowaway_bytes"] == 1 * GIB
+    assert "browser (holds bytes without a lease)" in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
+    driver.card.set(STRANGER, 0, driver.now)
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
+
+
+def test_a_dead_process_that_the_driver_still_lists_stays_charged() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = 15.0
+    det, lease = held(driver, "det", 5)
+    waiter = driver.consumer("w").acquire(5 * GIB)
+    det.die()
+    driver.advance(14.0)
+    assert verdicts(driver) == [("contested", False)]
+    assert driver.gpu()["charged_bytes"] == 5 * GIB
+    assert driver.state(waiter) == "queued"
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
+    assert verdicts(driver)[-1] == ("verified", True)
+    assert driver.state(lease) == "over"
+
+
+def test_totals_alone_and_a_dead_process_end_contested_if_the_ledger_explains_the_card() -> None:
+    driver = CoreDriver(8 * GIB)
+    total_only(driver)
+    a, first = held(driver, "a", 2)
+    a.hold(1 * GIB)
+    driver.advance(1.0)
+    b, _ = held(driver, "b", 4)
+    driver.advance(1.0)
+    a.hold(2 * GIB)
+    b.die()
+    driver.advance(11.0)
+    assert verdicts(driver) == [("contested", True)], "a took what it is charged for; b cannot hold anything"
+    assert driver.gpu()["charged_bytes"] == 2 * GIB
+    assert driver.state(first) == "held"
+
+
+# -- stale and unverifiable --------------------------------------------------------------------------------------------------
+def test_no_reading_means_unknown_and_frees_nothing() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    waiter = driver.consumer("w").acquire(5 * GIB)
+    det.unloading(lease)
+    driver.card.failing = "driver hangs"
+    det.hold(0)
+    det.release(lease)
+    driver.advance(20.0)
+    assert verdicts(driver) == [("stale", False)]
+    assert len(driver.notes("probe_failed")) == 1
+    assert (driver.state(lease), driver.state(waiter)) == ("verifying", "queued")
+    assert driver.gpu()["measured_used_bytes"] is None
+    driver.card.failing = ""
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
+    assert len(driver.notes("probe_ok")) == 1
+
+
+def test_a_probe_that_never_answers_is_asked_again_and_again() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.silent = True
+    driver.advance(3.0)
+    waiter = driver.consumer("w").acquire(5 * GIB)
+    driver.advance(5.0)
+    assert driver.state(waiter) == "queued"
+    driver.card.silent = False
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
+
+
+def test_a_list_without_byte_counts_is_no_evidence() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.knows_bytes = False
+    det, lease = held(driver, "det", 5)
+    driver.advance(1.0)
+    det.unloading(lease)
+    det.hold(1 * GIB)
+    det.release(lease)
+    driver.advance(11.0)
+    assert verdicts(driver) == [("residue", True)]
+
+
+def test_a_failed_reading_of_an_unknown_card_is_ignored() -> None:
+    driver = CoreDriver(8 * GIB)
+    assert driver.post(ProbeFailed(GpuId("GPU-9"), driver.now, "no")) == []
+
+
+# -- expiry ------------------------------------------------------------------------------------------------------------------
+def test_expired_bytes_stay_charged_until_measured_gone_and_not_before_the_holder_fences_itself() -> None:
+    driver = CoreDriver(8 * GIB)
+    hung, lease = held(driver, "hung", 5, ttl_s=10.0, residue_bytes=450 * MIB)
+    waiter = driver.consumer("w").acquire(5 * GIB)
+    driver.advance(10.1)
+    assert driver.state(lease) == "over"
+    assert driver.notes("expired")[0]["consumer"] == "hung"
+    hung.hold(450 * MIB)
+    driver.advance(4.5)
+    assert driver.state(waiter) == "queued", "it may still be loading until it fences itself"
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
+    assert driver.gpu()["charged_bytes"] == 5 * GIB + 450 * MIB
+
+
+def test_a_lease_that_expires_while_it_loads_was_never_seen_complete() -> None:
+    driver = CoreDriver(8 * GIB)
+    hung = driver.consumer("hung")
+    hung.acquire(5 * GIB, ttl_s=1.0)
+    waiter = driver.consumer("w").acquire(5 * GIB)
+    driver.advance(1.1)
+    hung.hold(5 * GIB)
+    driver.advance(30.0)
+    assert driver.state(waiter) == "queued"
+    assert driver.gpu()["charged_bytes"] == 5 * GIB
+    hung.die()
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=12.0)
+
+
+# -- residues and their processes ----------------------------------------------------------------------------------------------
+def test_the_residue_of_a_process_that_left_unseen_is_forgotten() -> None:
+    """A process that said bye and is neither connected nor on the card any more keeps nothing."""
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    det.hold(0)
+    driver.advance(2.0)
+    assert driver.gpu()["charged_bytes"] == 450 * MIB, "connected: it may use its context again"
+    driver.consumer("other")
+    det.leave()
+    driver.advance(2.0)
+    assert driver.gpu()["charged_bytes"] == 0
+
+
+def test_two_debts_of_one_dead_process_are_measured_together() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    first = det.acquire(2 * GIB)
+    det.load(first)
+    driver.advance(0.01)
+    second = det.acquire(3 * GIB)
+    det.hold(5 * GIB)
+    det.ready(second)
+    driver.advance(1.0)
+    det.die()
+    driver.until(lambda: driver.gpu()["charged_bytes"] == 0, limit_s=1.0)
+    assert verdicts(driver) == [("verified", True), ("verified", True)]
+
+
+def test_two_releases_at_different_times_are_polled_each_at_its_own_pace() -> None:
+    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
+    driver.card.lag_s = 0.2
+    a, first = held(driver, "a", 2)
+    b, second = held(driver, "b", 3)
+    a.unload(first)
+    driver.advance(0.03)
+    b.unload(second)
+    driver.until(lambda: driver.state(first) == "over", limit_s=1.0)
+    assert driver.state(second) == "verifying"
+    driver.until(lambda: driver.state(second) == "over", limit_s=1.0)
+    assert verdicts(driver) == [("verified", True), ("verified", True)]

@@ -1,0 +1,163 @@
+"""What `vramctl` prints, to the letter."""
+
+import pytest
+
+from clients.cli import text
+from schemas.defaults import GIB, MIB
+
+GPU = {
+    "gpu": "GPU-1",
+    "index": 0,
+    "name": "Simulated GPU",
+    "capacity_bytes": 8 * GIB,
+    "reserve_bytes": 300 * MIB,
+    "charged_bytes": 5 * GIB,
+    "stowaway_bytes": 0,
+    "measured_used_bytes": 5 * GIB + 100 * MIB,
+    "sample_age_s": 0.42,
+    "pressure_bytes": 0,
+    "blocked": "",
+    "processes": [],
+}
+LEASE = {
+    "lease_id": "L1-1",
+    "token": [1, 2],
+    "state": "held",
+    "consumer": "detector",
+    "model": "m@r1",
+    "gpu": "GPU-1",
+    "mode": "shared",
+    "priority": 50,
+    "evictable": True,
+    "charge_bytes": 5 * GIB,
+    "uses": 1,
+    "pid": 7,
+    "since_s": 61.0,
+}
+STATUS = {"epoch": 3, "phase": "serving", "uptime_s": 720.0, "gpus": [GPU], "leases": [LEASE], "clients": 1}
+
+
+def test_status() -> None:
+    queued = LEASE | {"lease_id": "L1-12", "consumer": "grab", "state": "queued", "uses": 0, "position": 1}
+    pinned = LEASE | {
+        "lease_id": "L1-3",
+        "consumer": "job",
+        "uses": 0,
+        "evictable": False,
+        "charge_bytes": 450 * MIB,
+    }
+    assert text.status_lines(STATUS | {"leases": [LEASE, pinned, queued]}) == [
+        "arbiter serving · epoch 3 · up 12 min · 1 client",
+        "",
+        "GPU 0 Simulated GPU (GPU-1)",
+        "  capacity 8 GiB = reserve 300 MiB + charged 5 GiB + free 2.71 GiB",
+        "  measured 5.1 GiB in use, 0.4 s ago",
+        "",
+        "LEASE  CONSUMER  MODEL  STATE                CHARGE  USES  PRIO  PID  SINCE",
+        "L1-1   detector  m@r1   held, in use          5 GiB     1    50    7   61 s",
+        "L1-3   job       m@r1   held, idle, pinned  450 MiB     0    50    7   61 s",
+        "L1-12  grab      m@r1   queued #1             5 GiB     0    50    7   61 s",
+    ]
+
+
+def test_status_of_a_card_in_trouble() -> None:
+    processes = [
+        {"pid": 8, "name": "Xorg", "used_bytes": 200 * MIB, "residue_bytes": 0, "stowaway": True},
+        {"pid": 7, "name": "python", "used_bytes": None, "residue_bytes": 450 * MIB, "stowaway": False},
+        {"pid": 9, "name": "python", "used_bytes": 1, "residue_bytes": 0, "stowaway": False},
+    ]
+    gpu = GPU | {
+        "measured_used_bytes": None,
+        "sample_age_s": None,
+        "stowaway_bytes": 200 * MIB,
+        "pressure_bytes": GIB,
+        "blocked": "the probe failed",
+        "processes": processes,
+    }
+    assert text.status_lines(STATUS | {"phase": "recovering", "gpus": [gpu], "leases": [], "clients": 2}) == [
+        "arbiter recovering · epoch 3 · up 12 min · 2 clients",
+        "  after a restart nothing is granted until every lease is accounted for",
+        "",
+        "GPU 0 Simulated GPU (GPU-1)",
+        "  capacity 8 GiB = reserve 300 MiB + charged 5 GiB + stowaways 200 MiB + free 2.51 GiB",
+        "  measured: unknown (the probe fails), so nothing is granted",
+        "  pressure: 1 GiB more than was granted",
+        "  no grants now: the probe failed",
+        "  stowaway pid 8 Xorg: 200 MiB without a lease",
+        "  residue of pid 7 python: 450 MiB",
+        "",
+        "no leases",
+    ]
+
+
+def test_why_somebody_waits() -> None:
+    blocker = {
+        "lease_id": "L1-1",
+        "consumer": "detector",
+        "bytes": 5 * GIB,
+        "state": "revoking",
+        "uses": 1,
+        "condition": "1 use running",
+    }
+    entry = {
+        "lease_id": "L1-3",
+        "state": "queued",
+        "needed_bytes": 4 * GIB,
+        "free_bytes": 3 * GIB,
+        "deficit_bytes": GIB,
+        "condition": "room is being made",
+        "blockers": [blocker],
+        "next": "it unloads",
+        "eta_s": 1.25,
+        "eta_source": "learnt",
+        "text": "grab needs room",
+    }
+    assert text.why_lines({"consumer": "grab", "leases": [entry]}) == [
+        "grab needs room",
+        "  lease     L1-3, queued",
+        "  bytes     needs 4 GiB, free 3 GiB, missing 1 GiB",
+        "  blocked   by detector (L1-1): 5 GiB, revoking, 1 use running",
+        "  next      it unloads",
+        "  expected  in 1.2 s (learnt)",
+    ]
+    unknown = text.why_lines({"consumer": "grab", "leases": [entry | {"eta_s": None, "eta_source": "none"}]})
+    assert unknown[-1] == "  expected  unknown, never seen before"
+
+
+def test_why_somebody_runs_or_is_not_there() -> None:
+    entry = {"lease_id": "L1-1", "state": "held", "text": "detector: it is resident, idle"}
+    assert text.why_lines({"consumer": "detector", "leases": [entry]}) == [
+        "detector: it is resident, idle",
+        "  lease     L1-1, held",
+    ]
+    assert text.why_lines({"consumer": "x", "leases": []}) == ["x has no lease and waits for none"]
+
+
+def test_an_event() -> None:
+    event = {
+        "seq": 4,
+        "at_wall_s": 0.0625,
+        "kind": "granted",
+        "lease_id": "L1-1",
+        "consumer": "a",
+        "gpu": "GPU-1",
+        "token": [1, 2],
+        "reason": "fits",
+        "charge_bytes": GIB,
+        "waited_ms": 12.345,
+        "evicted": ["b"],
+        "share": 0.123456,
+        "eta": None,
+    }
+    line = text.event_line(event)
+    assert line.partition(":")[2].partition(":")[2] == (
+        "00.062  granted         a L1-1  fits  charge_bytes=1GiB waited_ms=12.3 share=0.123"
+    )
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [(0.04, "0.0 s"), (9.96, "10.0 s"), (12, "12 s"), (180, "3 min"), (10_800, "3 h"), (200_000, "2 d")],
+)
+def test_durations(seconds: float, said: str) -> None:
+    assert text.duration(seconds) == said

@@ -1,0 +1,250 @@
+"""`vramctl` as a program: output, exit codes, and what its quick path imports."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from arbiter.testing.wire import WireClient
+from clients.sync import SyncArbiterClient
+from schemas.wire import LeaseSpec
+
+Spec = Callable[..., LeaseSpec]
+Finished = subprocess.CompletedProcess[str]
+PATIENCE_S = 30.0
+
+
+def vramctl(*arguments: str, environ: dict[str, str]) -> Finished:
+    return subprocess.run(
+        [sys.executable, "-m", "clients", *arguments],
+        env=environ,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+
+
+@pytest.fixture
+def nowhere(tmp_path: Path) -> dict[str, str]:
+    """An environment without an arbiter."""
+    root = str(Path(__file__).parents[3])
+    kept = {key: value for key, value in os.environ.items() if not key.startswith("VRAM_ARBITER_")}
+    return {**kept, "VRAM_ARBITER_RUNTIME": str(tmp_path), "PYTHONPATH": root}
+
+
+@pytest.fixture
+def client(arbiter_daemon: ArbiterProcess) -> Iterator[SyncArbiterClient]:
+    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        yield client
+
+
+# -- without a daemon ----------------------------------------------------------------------------------------------
+def test_the_path_of_status_imports_nothing_heavy(nowhere: dict[str, str]) -> None:
+    code = (
+        "import sys; sys.argv = ['vramctl', 'status']\n"
+        "from clients.cli.main import main\n"
+        "try: main()\n"
+        "except SystemExit as end: assert end.code == 3, end.code\n"
+        "import msgpack, zmq\n"
+        "heavy = {'pydantic', 'asyncio', 'opentelemetry', 'typer', 'rich', 'click', 'yaml', 'numpy'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=nowhere, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    "command", [["status"], ["why", "x"], ["history"], ["watch"], ["run", "--vram", "1GiB", "true"]]
+)
+def test_3_without_an_arbiter(command: list[str], nowhere: dict[str, str]) -> None:
+    done = vramctl(*command, environ=nowhere)
+    assert done.returncode == 3
+    assert "VRAM_ARBITER_ENDPOINT" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_errors_are_json_where_json_was_asked_for(nowhere: dict[str, str]) -> None:
+    done = vramctl("status", "--json", environ=nowhere)
+    assert (done.returncode, json.loads(done.stdout)["error"]["code"]) == (3, "arbiter_unreachable")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["bogus"],
+        ["why"],
+        ["status", "--bogus"],
+        ["status", "extra"],
+        ["run", "true"],
+        ["run", "--vram", "5XB", "true"],
+        ["run", "--vram", "1GiB", "--on-revoke", "kill", "true"],
+    ],
+)
+def test_2_for_wrong_usage(command: list[str], nowhere: dict[str, str]) -> None:
+    done = vramctl(*command, environ=nowhere)
+    assert done.returncode == 2
+    assert "Usage: vramctl" in done.stderr
+
+
+def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) -> None:
+    done = vramctl("--help", environ=nowhere)
+    assert done.returncode == 0
+    for word in ("status", "why", "history", "watch", "run", "doctor", "demo", "Exit codes: 0 done"):
+        assert word in done.stdout
+
+
+def test_doctor_says_where_the_packages_come_from(nowhere: dict[str, str]) -> None:
+    done = vramctl("doctor", "--json", environ=nowhere)
+    findings = {finding["what"]: finding for finding in json.loads(done.stdout)}
+    assert done.returncode == 3
+    root = Path(__file__).parents[3]
+    for name in ("arbiter", "clients", "sidecars", "runner", "reasoner", "schemas"):
+        assert (findings[name]["ok"], findings[name]["says"]) == (True, str(root / name))
+    assert findings["daemon"]["ok"] is False
+
+
+def test_a_socket_that_nobody_serves(nowhere: dict[str, str]) -> None:
+    import zmq
+
+    endpoint = f"ipc://{nowhere['VRAM_ARBITER_RUNTIME']}/s"
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as mute:
+        mute.bind(endpoint)
+        done = vramctl("status", environ={**nowhere, "VRAM_ARBITER_ENDPOINT": endpoint})
+    assert done.returncode == 3
+    assert "no arbiter answers" in done.stderr
+
+
+# -- with a daemon -------------------------------------------------------------------------------------------------
+@pytest.mark.e2e
+def test_status_why_history(client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    environ = arbiter_daemon.environ
+    lease = client.acquire(spec("detector", 5))
+    lease.ready()
+    shown = vramctl("status", environ=environ)
+    assert shown.returncode == 0
+    assert "L1-1   detector  detector  held, idle   5 GiB" in shown.stdout
+    status = json.loads(vramctl("status", "--json", environ=environ).stdout)
+    assert set(status) == {"epoch", "phase", "uptime_s", "gpus", "leases", "clients"}
+    assert status["leases"][0]["consumer"] == "detector"
+
+    why = vramctl("why", "detector", environ=environ)
+    assert (why.returncode, why.stdout.splitlines()[1]) == (0, "  lease     L1-1, held")
+    nobody = vramctl("why", "nobody", "--json", environ=environ)
+    assert (nobody.returncode, json.loads(nobody.stdout)) == (1, {"consumer": "nobody", "leases": []})
+
+    kinds = [line.split()[1] for line in vramctl("history", environ=environ).stdout.splitlines()]
+    assert kinds[-3:] == ["granted", "ready", "switch"]
+    newest = json.loads(vramctl("history", "-n", "1", "--json", environ=environ).stdout)
+    assert [event["kind"] for event in newest["events"]] == ["switch"]
+    granted = json.loads(vramctl("history", "--kind", "granted", "--json", environ=environ).stdout)
+    assert [event["consumer"] for event in granted["events"]] == ["detector"]
+
+
+@pytest.mark.e2e
+def test_doctor_with_a_daemon(arbiter_daemon: ArbiterProcess) -> None:
+    done = vramctl("doctor", environ=arbiter_daemon.environ)
+    assert done.returncode == 0, done.stdout
+    assert "ok   gpu 0" in done.stdout
+
+
+@pytest.mark.e2e
+def test_run_leases_for_a_program(arbiter_daemon: ArbiterProcess) -> None:
+    environ = arbiter_daemon.environ
+    script = "import os, sys; print(os.environ['VRAM_LEASE_ID'], os.environ['VRAM_LEASE_TOKEN']); sys.exit(7)"
+    done = vramctl(
+        "run", "--vram", "1GiB", "--name", "job", "--", sys.executable, "-c", script, environ=environ
+    )
+    assert (done.returncode, done.stdout) == (7, "L1-1 1.2\n")
+    history = json.loads(vramctl("history", "--json", environ=environ).stdout)["events"]
+    story = [(event["kind"], event.get("exiting")) for event in history if event.get("consumer") == "job"]
+    assert ("granted", None) in story
+    assert ("released", True) in story
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize(
+    ("command", "code", "said"),
+    [
+        (["--vram", "9GiB", "true"], 1, "needs 9"),
+        (["--vram", "1GiB", "/nonexistent/program"], 127, "not found"),
+        (["--vram", "1GiB", sys.executable, "-c", "import os; os.kill(os.getpid(), 15)"], 128 + 15, ""),
+    ],
+)
+def test_codes_of_run(command: list[str], code: int, said: str, arbiter_daemon: ArbiterProcess) -> None:
+    done = vramctl("run", *command, environ=arbiter_daemon.environ)
+    assert done.returncode == code
+    assert said in done.stderr
+
+
+SLEEPER = (
+    "import signal, sys; signal.signal(15, lambda *_: sys.exit(5)); print('up', flush=True); signal.pause()"
+)
+
+
+def start_run(environ: dict[str, str], *options: str) -> "subprocess.Popen[str]":
+    """A program under `vramctl run` that ends with 5 on SIGTERM; returns when it is up."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "clients", "run", "--vram", "5GiB", "--name", "job", *options, "--", sys.executable, "-c", SLEEPER],
+        env=environ,
+        stdout=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stdout.readline() == "up\n"
+    return process
+
+
+@pytest.mark.e2e
+def test_run_passes_signals_on(arbiter_daemon: ArbiterProcess) -> None:
+    with start_run(arbiter_daemon.environ) as process:
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(PATIENCE_S) == 5
+
+
+@pytest.mark.e2e
+def test_run_is_pinned_unless_told_otherwise(
+    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    with start_run(arbiter_daemon.environ) as process:
+        views: dict[str, Any] = {view["consumer"]: view for view in client.status()["leases"]}
+        assert views["job"]["evictable"] is False
+        process.send_signal(signal.SIGTERM)
+    with start_run(arbiter_daemon.environ, "--on-revoke", "term") as process:
+        lease = client.acquire(spec("b", 5), PATIENCE_S)
+        assert process.wait(PATIENCE_S) == 5
+    lease.release()
+
+
+@pytest.mark.e2e
+def test_watch_prints_plain_lines_where_there_is_no_terminal(
+    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "clients", "watch"],
+        env=arbiter_daemon.environ,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    with process:
+        with WireClient(arbiter_daemon.endpoint) as looker:
+            looker.hello("looker")
+            while looker.ask("status")["clients"] < 3:
+                pass
+        client.ping()
+        lease = client.acquire(spec("a", 1))
+        line = process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE_S) in (0, 130)
+    assert "a L1-" in line
+    lease.release()

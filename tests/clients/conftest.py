@@ -1,0 +1,49 @@
+"""What the tests of the clients share: a way to write specs, and waiting for a condition with a deadline."""
+
+import asyncio
+from collections.abc import Callable
+
+import pytest
+
+from schemas.defaults import GIB
+from schemas.wire import Footprint, LeaseSpec
+
+DEADLINE_S = 20.0
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    """The clients are asyncio programs."""
+    return "asyncio"
+
+
+@pytest.fixture
+def spec() -> Callable[..., LeaseSpec]:
+    """`spec("detector", 5)`: a lease of 5 GiB without residue or minimum residency."""
+
+    def make(consumer: str, gib: float, **fields: object) -> LeaseSpec:
+        size = int(gib * GIB)
+        footprint = Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=0)
+        return LeaseSpec.model_validate(
+            {
+                "consumer": consumer,
+                "model_id": consumer,
+                "footprint": footprint,
+                "min_residency_s": 0.0,
+                **fields,
+            }
+        )
+
+    return make
+
+
+@pytest.fixture
+def until() -> Callable[..., object]:
+    """`await until(lambda: …)`: poll on the loop until it is true; fails after 20 s."""
+
+    async def wait(condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(DEADLINE_S):
+            while not condition():
+                await asyncio.sleep(0.01)
+
+    return wait

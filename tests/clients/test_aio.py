@@ -1,0 +1,333 @@
+"""The asyncio client against a real daemon with a simulated card."""
+
+import asyncio
+import signal
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from clients.aio import ArbiterClient
+from schemas.errors import (
+    ArbiterUnreachable,
+    LeaseLost,
+    LeaseRevoking,
+    StaleToken,
+    UnknownGpu,
+    VramError,
+    VramInsufficient,
+    WaitTimeout,
+)
+from schemas.wire import LeaseSpec
+
+pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
+
+Spec = Callable[..., LeaseSpec]
+Until = Callable[[Callable[[], bool]], Awaitable[None]]
+
+
+async def states(client: ArbiterClient) -> dict[str, str]:
+    return {lease["consumer"]: lease["state"] for lease in (await client.status())["leases"]}
+
+
+async def test_acquire_ready_use_release(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        lease = await client.acquire(spec("a", 5))
+        assert (lease.state, lease.token[0]) == ("loading", client.epoch)
+        await lease.ready(5 << 30)
+        async with lease.use("detect"):
+            assert (await client.status())["leases"][0]["uses"] == 1
+        assert lease.state == "held"
+        await lease.release()
+        await lease.release()
+        assert lease.state == "gone"
+        assert lease.error is None
+        with pytest.raises(LeaseLost):
+            await lease.ready()
+
+
+async def test_a_block_unloads_and_releases_also_when_it_raises(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    unloaded: list[str] = []
+
+    async def unload() -> None:
+        unloaded.append("a")
+
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        with pytest.raises(ZeroDivisionError):
+            async with client.lease(spec("a", 5), unload=unload) as lease:  # fails while loading
+                raise ZeroDivisionError
+        assert (unloaded, lease.state) == (["a"], "gone")
+        async with client.lease(spec("a", 5), unload=unload) as lease:
+            await lease.ready()
+        assert unloaded == ["a", "a"]
+
+
+async def test_closing_the_client_gives_up_its_leases(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    unloaded = asyncio.Event()
+
+    async def unload() -> None:
+        unloaded.set()
+
+    async with ArbiterClient(arbiter_daemon.endpoint, name="other") as other:
+        async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+            lease = await client.acquire(spec("a", 5), unload=unload)
+            await lease.ready()
+        assert unloaded.is_set()
+        await (await other.acquire(spec("b", 7), 10.0)).release()
+
+
+async def test_revoked_at_the_safe_point_and_not_before(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    story: list[str] = []
+
+    async def unload() -> None:
+        story.append("unload")
+
+    def revoked(_: object, push: Any) -> None:
+        story.append(f"revoke for {push['wanted_by']}")
+
+    async with (
+        ArbiterClient(arbiter_daemon.endpoint, name="holder") as holder,
+        ArbiterClient(arbiter_daemon.endpoint, name="waiter") as waiter,
+    ):
+        lease = await holder.acquire(
+            spec("a", 5), unload=unload, on_revoke=revoked, safe_point_eta_s=lambda: 0.5
+        )
+        await lease.ready()
+        async with lease.use("first"):
+            wanted = asyncio.create_task(waiter.acquire(spec("b", 5)))
+            while not lease.revoking:
+                await asyncio.sleep(0.01)
+            with pytest.raises(LeaseRevoking):
+                async with lease.use("second"):
+                    pytest.fail("a use began on a lease that is asked to leave")
+            assert (await states(waiter))["a"] == "revoking"
+            story.append("use ends")
+        await lease.wait_gone()
+        second = await wanted
+        assert story == ["revoke for b", "use ends", "unload"]
+        assert second.state == "loading"
+        assert lease.state == "gone"
+        assert lease.error is None
+
+
+async def test_a_use_of_somebody_else_keeps_the_holder_in_place(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    unloaded = asyncio.Event()
+
+    async def unload() -> None:
+        unloaded.set()
+
+    async with (
+        ArbiterClient(arbiter_daemon.endpoint, name="sidecar") as sidecar,
+        ArbiterClient(arbiter_daemon.endpoint, name="runner") as runner,
+    ):
+        lease = await sidecar.acquire(spec("a", 5), unload=unload)
+        await lease.ready()
+        async with runner.use(lease.lease_id, lease.token, "goal"):
+            wanted = asyncio.create_task(runner.acquire(spec("b", 5)))
+            while not lease.revoking:
+                await asyncio.sleep(0.01)
+            while (await states(runner))["a"] != "revoking":
+                await asyncio.sleep(0.01)
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(unloaded.wait(), 0.6)  # longer than the holder's own retries
+            with pytest.raises(LeaseRevoking):
+                await runner.begin_use(lease.lease_id, lease.token, "another goal")
+        await wanted
+        assert unloaded.is_set()
+
+
+async def test_a_use_needs_the_right_token(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        lease = await client.acquire(spec("a", 1))
+        await lease.ready()
+        with pytest.raises(StaleToken):
+            async with client.use(lease.lease_id, (1, 999)):
+                pytest.fail("a use began with a wrong token")
+
+
+async def test_typed_refusals(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        with pytest.raises(VramInsufficient) as never:
+            await client.acquire(spec("a", 9))
+        assert never.value.details["capacity_bytes"] == 8 << 30
+        with pytest.raises(UnknownGpu):
+            await client.acquire(spec("a", 1, gpu="GPU-none"))
+        pinned = await client.acquire(spec("a", 5, evictable=False))
+        await pinned.ready()
+        with pytest.raises(VramError):
+            await client.acquire(spec("b", 5), 0.2)
+
+
+async def test_wait_timeout_says_who_blocked(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        lease = await client.acquire(spec("a", 5))
+        await lease.ready()
+        async with lease.use():
+            with pytest.raises(WaitTimeout) as late:
+                await client.acquire(spec("b", 5), 0.2)
+            assert late.value.details["why"]["blockers"][0]["consumer"] == "a"
+
+
+async def test_a_cancelled_acquire_leaves_the_queue(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        lease = await client.acquire(spec("a", 5))
+        await lease.ready()
+        async with lease.use():
+            waiting = asyncio.create_task(client.acquire(spec("b", 5)))
+            while "b" not in await states(client):
+                await asyncio.sleep(0.01)
+            waiting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await waiting
+            while "b" in await states(client):
+                await asyncio.sleep(0.01)
+
+
+async def test_an_acquire_cancelled_at_any_moment_leaks_nothing(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        for steps in range(12):  # of the loop, between asking and turning away
+            waiting = asyncio.create_task(client.acquire(spec(f"c{steps}", 5)))
+            for _ in range(steps * 3):
+                await asyncio.sleep(0)
+            waiting.cancel()
+            try:
+                await (await waiting).release()  # it was faster
+            except asyncio.CancelledError:
+                pass
+        async with asyncio.timeout(10):
+            while await states(client):
+                await asyncio.sleep(0.01)
+
+
+async def test_callbacks_that_raise_do_not_keep_the_lease(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    async def unload() -> None:
+        raise ValueError("a bug of the holder")
+
+    def revoked(*_: object) -> None:
+        raise ValueError("another")
+
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        lease = await client.acquire(spec("a", 5), unload=unload, on_revoke=revoked)
+        await lease.ready()
+        second = await client.acquire(spec("b", 5), 10.0)
+        assert (lease.state, second.state) == ("gone", "loading")
+
+
+async def test_nobody_at_the_endpoint(tmp_path: Path) -> None:
+    client = ArbiterClient(f"ipc://{tmp_path}/none.sock", name="t", connect_timeout_s=0.2)
+    with pytest.raises(ArbiterUnreachable) as unreachable:
+        await client.connect()
+    assert "VRAM_ARBITER_ENDPOINT" in unreachable.value.hint
+    with pytest.raises(ArbiterUnreachable):
+        await client.status()
+
+
+async def test_an_observer_may_look_but_not_acquire(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t", role="observer") as client:
+        assert (await client.status())["clients"] == 1
+        with pytest.raises(VramError, match="observer"):
+            await client.acquire(spec("a", 1))
+
+
+async def test_subscribers_see_events_in_order(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    kinds: list[str] = []
+
+    async def follow(client: ArbiterClient, started: asyncio.Event) -> None:
+        events = client.subscribe()
+        first = asyncio.ensure_future(anext(events))
+        await client.ping()
+        started.set()
+        kinds.append((await first)["kind"])
+        async for event in events:
+            kinds.append(event["kind"])
+            if event["kind"] == "released":
+                return
+
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        started = asyncio.Event()
+        following = asyncio.create_task(follow(client, started))
+        await started.wait()
+        lease = await client.acquire(spec("a", 5))
+        await lease.ready()
+        await lease.release()
+        await asyncio.wait_for(following, 10)
+        assert [kind for kind in kinds if kind != "use_began"] == ["granted", "ready", "switch", "released"]
+        assert [event["kind"] for event in (await client.history(kinds=["granted"]))["events"]] == ["granted"]
+
+
+async def test_a_restart_of_the_daemon_is_ridden_out(
+    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
+) -> None:
+    arbiter = make_arbiter().start()
+    async with ArbiterClient(arbiter.endpoint, name="t") as client:
+        pinned = await client.acquire(spec("a", 5))
+        waiting = asyncio.create_task(client.acquire(spec("b", 2), 30.0))
+        while "b" not in await states(client):
+            await asyncio.sleep(0.01)
+        process = arbiter.process
+        assert process is not None
+        process.kill()
+        process.wait()
+        await until(lambda: not client.connected)  # the socket's monitor says so, no heartbeat has to run out
+        asked = asyncio.create_task(client.status())
+        await asyncio.to_thread(arbiter.start)
+        await until(lambda: client.connected and client.epoch == 2)
+        assert (await asked)["epoch"] == 2
+        # the card is empty in this test: whatever the daemon decides about the old lease, the waiter's place was renewed
+        if pinned.state == "loading":
+            await pinned.ready()
+        lease = await waiting
+        assert lease.token[0] == 2
+        assert lease.token > pinned.token
+
+
+async def test_self_fencing(make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until) -> None:
+    lost: list[VramError] = []
+    unloaded = asyncio.Event()
+
+    async def unload() -> None:
+        unloaded.set()
+
+    arbiter = make_arbiter().start()
+    async with ArbiterClient(arbiter.endpoint, name="t") as client:
+        client.protocol.grace_s = 0.3
+        lease = await client.acquire(
+            spec("a", 5, ttl_s=0.5), unload=unload, on_lost=lambda _, error: lost.append(error)
+        )
+        await lease.ready()
+        process = arbiter.process
+        assert process is not None
+        process.kill()
+        process.wait()
+        async with asyncio.timeout(10):
+            await lease.wait_gone()
+        assert unloaded.is_set()
+        assert [type(error) for error in lost] == [LeaseLost]
+        assert "fenced" in str(lease.error)
+        with pytest.raises(LeaseLost):
+            async with lease.use():
+                pytest.fail("a use began on a fenced lease")
+
+
+async def test_a_hung_daemon_is_noticed_by_silence(
+    make_arbiter: Callable[..., ArbiterProcess], until: Until
+) -> None:
+    arbiter = make_arbiter().start()
+    async with ArbiterClient(arbiter.endpoint, name="t") as client:
+        client.protocol.heartbeat_s = 0.1
+        process = arbiter.process
+        assert process is not None
+        process.send_signal(signal.SIGSTOP)
+        try:
+            await until(lambda: not client.connected)
+        finally:
+            process.send_signal(signal.SIGCONT)
+        await until(lambda: client.connected)

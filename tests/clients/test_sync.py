@@ -1,0 +1,119 @@
+"""The blocking client against a real daemon: threads, callbacks, forks."""
+
+import os
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from clients.sync import SyncArbiterClient
+from schemas.errors import ArbiterUnreachable, BadState, LeaseLost, LeaseRevoking, VramInsufficient
+from schemas.wire import LeaseSpec
+
+pytestmark = pytest.mark.e2e
+
+Spec = Callable[..., LeaseSpec]
+PATIENCE_S = 20.0
+
+
+@pytest.fixture
+def client(arbiter_daemon: ArbiterProcess) -> Iterator[SyncArbiterClient]:
+    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        yield client
+
+
+def test_lease_use_release(client: SyncArbiterClient, spec: Spec) -> None:
+    with client.lease(spec("a", 5)) as lease:
+        lease.ready(5 << 30)
+        with lease.use("detect"):
+            assert client.status()["leases"][0]["uses"] == 1
+        assert lease.state == "held"
+        assert client.why("a")["leases"][0]["state"] == "held"
+    assert lease.state == "gone"
+    with pytest.raises(LeaseLost), lease.use():
+        pytest.fail("a use began on a released lease")
+
+
+def test_typed_errors_reach_the_thread(client: SyncArbiterClient, spec: Spec) -> None:
+    with pytest.raises(VramInsufficient):
+        client.acquire(spec("a", 9))
+
+
+def test_revoked_between_uses_in_a_worker_thread(client: SyncArbiterClient, spec: Spec) -> None:
+    loop_thread = threading.Event()
+    unloaded, asked = threading.Event(), threading.Event()
+
+    def unload() -> None:
+        if threading.current_thread().name == "vram-arbiter-client":
+            loop_thread.set()
+        unloaded.set()
+
+    lease = client.acquire(spec("a", 5), unload=unload, on_revoke=lambda *_: asked.set())
+    lease.ready()
+    granted: list[str] = []
+    with lease.use("goal"):
+        waiter = threading.Thread(target=lambda: granted.append(client.acquire(spec("b", 5)).lease_id))
+        waiter.start()
+        assert asked.wait(PATIENCE_S)
+        with pytest.raises(LeaseRevoking), lease.use():
+            pytest.fail("a use began on a lease that is asked to leave")
+        assert not unloaded.is_set()
+    waiter.join(PATIENCE_S)
+    assert granted
+    assert unloaded.is_set()
+    assert not loop_thread.is_set()
+
+
+def test_a_use_on_anothers_lease(
+    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    lease = client.acquire(spec("a", 5))
+    lease.ready()
+    with SyncArbiterClient(arbiter_daemon.endpoint, name="runner") as runner:
+        with runner.use(lease.lease_id, lease.token, "goal"):
+            assert runner.status()["leases"][0]["uses"] == 1
+        assert runner.status()["leases"][0]["uses"] == 0
+
+
+def test_events_can_be_iterated(client: SyncArbiterClient, spec: Spec) -> None:
+    kinds: list[str] = []
+    seen = threading.Event()
+
+    def follow() -> None:
+        for event in client.subscribe():
+            kinds.append(event["kind"])
+            if event["kind"] == "released":
+                break
+        seen.set()
+
+    threading.Thread(target=follow, daemon=True).start()
+    while not seen.is_set():  # the subscription may begin after the first of these leases
+        with client.lease(spec("a", 1)) as lease:
+            lease.ready()
+    assert "released" in kinds
+
+
+def test_not_across_a_fork(client: SyncArbiterClient, spec: Spec) -> None:
+    lease = client.acquire(spec("a", 1))
+    pid = os.fork()
+    if pid == 0:
+        try:
+            client.close()  # only forgets
+            lease.ready()
+        except BadState:
+            os._exit(0)
+        os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+    lease.ready()
+    assert client.status()["leases"][0]["state"] == "held"
+
+
+def test_closed_or_unreachable(tmp_path: Path) -> None:
+    client = SyncArbiterClient(f"ipc://{tmp_path}/none.sock", name="t", connect_timeout_s=0.2)
+    with pytest.raises(ArbiterUnreachable):
+        client.connect()
+    with pytest.raises(BadState):
+        client.status()
+    client.close()

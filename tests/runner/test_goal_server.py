@@ -1,0 +1,360 @@
+"""The goal server over real sockets with the real client: one goal at a time, exactly one result, whatever happens."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+import zmq
+import zmq.asyncio
+
+from clients.runner import RunnerClient
+from runner.catalogue import Catalogue, read_manifests
+from runner.clock import SystemClock
+from runner.control import ControlThread
+from runner.goals import GoalServer
+from runner.protocols import Act, Done, Goal, Hold, StepOutcome
+from runner.sim.sim_runner import SimRunner
+from runner.skills.base import SkillBase
+from schemas.control import ControlMode
+from schemas.errors import (
+    AlreadyRunning,
+    BadRequest,
+    BadState,
+    Evicted,
+    GoalRejected,
+    ManifestInvalid,
+    SidecarUnavailable,
+    UnknownSkill,
+)
+from schemas.manifest import Kind, RSkillManifest, load_manifest
+from schemas.world import Action, WorldState
+
+Run = Callable[[Any], Any]
+RSKILL = "vram-arbiter/so101-navigate"
+
+
+class Told(SkillBase):
+    """Does what the goal's prompt says: ends, waits, fails, or hangs in its start."""
+
+    def __init__(self, manifest: RSkillManifest) -> None:
+        super().__init__(manifest)
+        self.story: list[str] = []
+        self.begun = asyncio.Event()
+        self.loop = asyncio.get_running_loop()
+
+    async def _start(self, goal: Goal) -> None:
+        self.story.append(f"start {goal.prompt}")
+        self.todo = goal.prompt
+        self.steps = 0
+        self.begun.clear()
+        if goal.prompt == "hang":
+            self.begun.set()
+            await asyncio.Event().wait()
+        if goal.prompt == "unavailable":
+            raise SidecarUnavailable("no process", hint="start it")
+
+    def _step(self, world: WorldState) -> StepOutcome:
+        self.steps += 1
+        self.loop.call_soon_threadsafe(self.begun.set)
+        match self.todo:
+            case "end" if self.steps > 3:
+                return Done({"steps": self.steps})
+            case "evicted" if self.steps > 2:
+                raise Evicted("another model is there")
+            case "defect":
+                raise ZeroDivisionError("oops")
+        row = (0.01 * self.steps,) * 2
+        names = ("shoulder_pan", "wrist_roll")
+        if self.steps % 2:
+            return Hold("thinking")
+        return Act(Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), joint_names=names))
+
+    async def _finish(self) -> None:
+        self.story.append("finish")
+
+    async def _release(self) -> None:
+        self.story.append("release")
+
+
+class Bench:
+    def __init__(self, runner: SimRunner, server: GoalServer, env: Any, made: list[Told]) -> None:
+        self.runner, self.server, self.env, self.made = runner, server, env, made
+
+
+@pytest.fixture
+def bench(
+    make_runner: Callable[..., SimRunner], env: Any, endpoint: str, navigate_manifest: Path
+) -> Callable[..., Any]:
+    @asynccontextmanager
+    async def serving() -> AsyncIterator[Bench]:
+        made: list[Told] = []
+
+        def make(manifest: RSkillManifest) -> Told:
+            made.append(Told(manifest))
+            return made[-1]
+
+        runner = make_runner(rate_hz=200.0)
+        catalogue = Catalogue([load_manifest(navigate_manifest)], {Kind.ROS_ACTION: make})
+        async with ControlThread(runner) as control:
+            await control.call(lambda: None)
+            server = GoalServer(
+                endpoint,
+                control,
+                runner,
+                catalogue,
+                SystemClock(),
+                ground_truth=lambda: {"target": "red cube"},
+            )
+            task = asyncio.create_task(server.serve())
+            await server.bound.wait()
+            try:
+                yield Bench(runner, server, env, made)
+            finally:
+                server.stopping.set()
+                await task
+
+    return serving
+
+
+def play(
+    run_async: Run, bench: Callable[..., Any], endpoint: str, body: Callable[[Bench, RunnerClient], Any]
+) -> None:
+    async def scenario() -> None:
+        async with bench() as b, RunnerClient(endpoint) as client:
+            await body(b, client)
+
+    run_async(scenario())
+
+
+def test_a_goal_feeds_back_and_ends_with_one_result(bench: Any, endpoint: str, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="end")
+        states = [feedback["state"] async for feedback in goal.feedback()]
+        result = await goal.result(5)
+        assert (result["status"], result["success"], result["code"]) == ("succeeded", True, "")
+        assert result["data"]["steps"] == 4
+        assert states
+        assert b.made[0].story == ["start end", "finish"]
+        again = await client.call("result", {"goal_id": goal.goal_id})
+        assert again["status"] == "succeeded"
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_the_next_goal_of_the_same_skill_reuses_it(bench: Any, endpoint: str, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        for _ in range(3):
+            assert (await (await client.send_goal(RSKILL, prompt="end")).result(5))["success"]
+        assert len(b.made) == 1
+        assert b.made[0].story == ["start end", "finish"] * 3
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_second_goal_is_refused_and_the_first_goes_on(bench: Any, endpoint: str, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        first = await client.send_goal(RSKILL, prompt="forever", goal_id="one")
+        with pytest.raises(GoalRejected, match="goal one"):
+            await client.send_goal(RSKILL, prompt="end")
+        assert not first.done
+        await first.cancel()
+        assert (await first.result(5))["status"] == "canceled"
+        assert (await (await client.send_goal(RSKILL, prompt="end")).result(5))["success"]
+
+    play(run_async, bench, endpoint, body)
+
+
+@pytest.mark.parametrize("prompt", ["forever", "hang"])
+def test_cancel_takes_the_arm_back(bench: Any, endpoint: str, run_async: Run, prompt: str) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt=prompt)
+        while not b.made or not b.made[0].begun.is_set():
+            await asyncio.sleep(0.01)
+        await goal.cancel()
+        result = await goal.result(5)
+        assert (result["status"], result["success"]) == ("canceled", False)
+        assert b.made[0].story[-1] == "finish"
+        steps = b.made[0].steps
+        await goal.cancel()  # late and harmless
+        await client.state()
+        assert b.made[0].steps == steps
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_cancel_right_behind_the_goal_still_gives_a_result(bench: Any, endpoint: str, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        socket = zmq.asyncio.Context.instance().socket(zmq.DEALER)
+        try:
+            socket.connect(endpoint)
+            await socket.send(
+                msgpack.packb({"op": "goal", "id": 1, "goal_id": "g", "rskill_id": RSKILL, "prompt": "hang"})
+            )
+            await socket.send(msgpack.packb({"op": "cancel", "id": 2, "goal_id": "g"}))
+            results = []
+            while not results:
+                message = msgpack.unpackb(await socket.recv())
+                results += [message] if message.get("push") == "result" else []
+            assert results[0]["status"] == "canceled"
+        finally:
+            socket.close(0)
+
+    play(run_async, bench, endpoint, body)
+
+
+@pytest.mark.parametrize("prompt", ["forever", "hang"])
+def test_a_deadline_is_no_success(bench: Any, endpoint: str, run_async: Run, prompt: str) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt=prompt, deadline_s=0.3)
+        result = await goal.result(5)
+        assert (result["status"], result["success"]) == ("deadline", False)
+        assert b.made[0].story[-1] == "finish"
+
+    play(run_async, bench, endpoint, body)
+
+
+@pytest.mark.parametrize(
+    ("prompt", "code"),
+    [("evicted", "evicted"), ("unavailable", "sidecar_unavailable"), ("defect", "internal")],
+)
+def test_failures_are_typed(bench: Any, endpoint: str, run_async: Run, prompt: str, code: str) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        result = await (await client.send_goal(RSKILL, prompt=prompt)).result(5)
+        assert (result["status"], result["success"], result["code"]) == ("failed", False, code)
+        assert result["message"]
+        assert (await (await client.send_goal(RSKILL, prompt="end")).result(5))["success"]
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_client_that_vanished_finds_its_result(bench: Any, endpoint: str, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        async with RunnerClient(endpoint) as gone:
+            await gone.send_goal(RSKILL, prompt="end", goal_id="mine")
+        while True:
+            try:
+                result = await client.call("result", {"goal_id": "mine"})
+                break
+            except BadState:  # still running
+                await asyncio.sleep(0.02)
+        assert result["status"] == "succeeded"
+        with pytest.raises(GoalRejected, match="has ended"):
+            await client.send_goal(RSKILL, prompt="end", goal_id="mine")
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_the_same_goal_sent_again_is_the_same_goal(bench: Any, endpoint: str, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="forever", goal_id="same")
+        async with RunnerClient(endpoint) as other:
+            again = await other.send_goal(RSKILL, prompt="forever", goal_id="same")
+            await again.cancel()
+            assert (await again.result(5))["status"] == "canceled"
+        assert (await goal.result(5))["status"] == "canceled"
+        assert b.made[0].story == ["start forever", "finish"]
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_reads(bench: Any, endpoint: str, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        assert (await client.ping())["goal_id"] is None
+        assert (await client.ground_truth())["target"] == "red cube"
+        skills = (await client.skills())["skills"]
+        assert [(skill["name"], skill["kind"]) for skill in skills] == [(RSKILL, "ros_action")]
+        state = await client.state()
+        assert state["phase"] == "idle"
+        assert state["world"]["base_pose"]["frame_id"] == "map"
+        with pytest.raises(BadRequest, match="no camera 'rear'"):
+            await client.call("frame", {"camera": "rear"})
+
+    play(run_async, bench, endpoint, body)
+
+
+@pytest.mark.parametrize(
+    ("message", "code"),
+    [
+        (b"\xc1\xc1", "bad_frame"),
+        (msgpack.packb([1, 2]), "bad_frame"),
+        (msgpack.packb({"op": "dance", "id": 1}), "unknown_op"),
+        (msgpack.packb({"id": 1}), "unknown_op"),
+        (msgpack.packb({"op": "goal", "id": 1, "goal_id": "g"}), "bad_request"),
+        (
+            msgpack.packb({"op": "goal", "id": 1, "goal_id": "g", "rskill_id": "x", "deadline_s": -1}),
+            "bad_request",
+        ),
+        (msgpack.packb({"op": "goal", "id": 1, "goal_id": "g", "rskill_id": "a/b"}), "unknown_skill"),
+        (msgpack.packb({"op": "ping", "id": 1, "extra": 1}), "bad_request"),
+        (msgpack.packb({"op": "ping", "id": "one"}), "bad_request"),
+        (msgpack.packb({"op": "cancel", "id": 1, "goal_id": "none"}), "bad_request"),
+        (msgpack.packb({"op": "result", "id": 1, "goal_id": "none"}), "bad_request"),
+    ],
+)
+def test_bad_input_gets_an_answer_and_harms_nothing(
+    bench: Any, endpoint: str, run_async: Run, message: bytes, code: str
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        socket = zmq.asyncio.Context.instance().socket(zmq.DEALER)
+        try:
+            socket.connect(endpoint)
+            await socket.send(message)
+            reply = msgpack.unpackb(await socket.recv())
+            assert reply["error"]["code"] == code
+            assert reply["error"]["message"]
+        finally:
+            socket.close(0)
+        assert (await client.ping())["ok"]
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_shutdown_answers_cancels_and_ends(bench: Any, endpoint: str, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="forever")
+        await client.shutdown()
+        assert (await goal.result(5))["status"] == "canceled"
+        assert b.made[0].story == ["start forever", "finish", "release"]
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_second_runner_on_the_same_socket_is_refused(bench: Any, endpoint: str, run_async: Run) -> None:
+    async def scenario() -> None:
+        async with bench() as b, RunnerClient(endpoint) as client:
+            control = b.server._control
+            second = GoalServer(endpoint, control, b.runner, b.server._catalogue, SystemClock())
+            with pytest.raises(AlreadyRunning):
+                await second.serve()
+            assert (await client.ping())["ok"]
+
+    run_async(scenario())
+
+
+def test_only_skills_that_move_something_can_be_executed(navigate_manifest: Path) -> None:
+    manifest = load_manifest(navigate_manifest)
+    with pytest.raises(UnknownSkill, match="choose from"):
+        Catalogue([manifest], {Kind.ROS_ACTION: Told}).find("no/such")
+    with pytest.raises(UnknownSkill, match=r"installed as 0\.1\.0"):
+        Catalogue([manifest], {Kind.ROS_ACTION: Told}).find(RSKILL, "9.9.9")
+    detector = manifest.model_copy(update={"kind": Kind.DETECTOR})
+    with pytest.raises(UnknownSkill, match="is a detector"):
+        Catalogue([detector], {Kind.DETECTOR: Told}).find(RSKILL)
+
+
+def test_manifests_are_read_from_folders_and_checked(tmp_path: Path, navigate_manifest: Path) -> None:
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one/rskill.yaml").write_text(navigate_manifest.read_text())
+    assert [manifest.name for manifest in read_manifests([tmp_path])] == [RSKILL]
+    with pytest.raises(ManifestInvalid, match="installed twice"):
+        read_manifests([tmp_path, navigate_manifest])
+    (tmp_path / "one/rskill.yaml").write_text("name: x\n")
+    with pytest.raises(ManifestInvalid, match="rskill"):
+        read_manifests([tmp_path])
+    (tmp_path / "one/empty").mkdir()
+    with pytest.raises(ManifestInvalid, match="no skill"):
+        read_manifests([tmp_path / "one" / "empty"])

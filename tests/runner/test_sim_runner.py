@@ -1,0 +1,284 @@
+"""SimRunner: one environment step per tick, as many reset ticks as episodes, one skill at the arm, everything else holds."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from runner.protocols import Act, DeadlinePolicy, Done, Goal, Hold, SkillEnded, SkillKey, StepOutcome
+from runner.sim.sim_runner import WITHHELD_IN_A_ROW_MAX
+from schemas.control import ControlMode
+from schemas.errors import Evicted, InternalError, ModelError
+from schemas.world import Action, WorldState
+
+Make = Callable[..., Any]
+GOAL = Goal("g", "test/skill")
+
+
+def joints(*row: float) -> Action:
+    names = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")[: len(row)]
+    return Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), joint_names=names)
+
+
+class Scripted:
+    """Gives the outcomes of its script, then is done; raises the errors among them."""
+
+    manifest: Any = None
+    key = SkillKey("test/skill")
+    holds_gpu = False
+    cameras: tuple[str, ...] = ()
+    fraction = 0.5
+
+    def __init__(self, *script: StepOutcome | Exception) -> None:
+        self.script: list[StepOutcome | Exception] = list(script)
+        self.seen: list[WorldState] = []
+
+    def wants_frames(self) -> bool:
+        return bool(self.cameras)
+
+    def step(self, world: WorldState) -> StepOutcome:
+        self.seen.append(world)
+        outcome = self.script.pop(0) if self.script else Done({"played": True})
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    async def start(self, goal: Goal) -> None: ...
+
+    async def finish(self) -> None: ...
+
+    async def release(self) -> None: ...
+
+
+def play(
+    runner: Any, script: Sequence[StepOutcome | Exception], ticks: int
+) -> tuple[list[Any], list[SkillEnded]]:
+    """A reset tick, then the script; the results of the ticks after it and how the skill ended."""
+    ended: list[SkillEnded] = []
+    runner.activate()
+    runner.tick()
+    runner.begin_skill(Scripted(*script), GOAL, ended.append)
+    return [runner.tick() for _ in range(ticks)], ended
+
+
+# -- ticks and episodes ---------------------------------------------------------------------------------------------
+def test_the_first_tick_resets_and_every_other_one_steps(make_runner: Make, env: Any) -> None:
+    runner = make_runner(seed=7, rate_hz=0)
+    runner.activate()
+    first = runner.tick()
+    assert (env.resets, env.steps, first.step_idx, first.action_applied) == ([7], [], None, False)
+    second = runner.tick()
+    assert (env.resets, len(env.steps), second.step_idx, second.action_applied) == ([7], 1, 1, False)
+
+
+def test_n_episodes_are_n_resets_and_no_phantom_one(make_runner: Make, env: Any) -> None:
+    runner = make_runner(seed=3, rate_hz=0, episodes=2, max_steps=4)
+    runner.activate()
+    result = runner.run()
+    assert env.resets == [3, 4]
+    assert len(env.steps) == 8
+    assert result.n_ticks == 10
+    assert [(e.index, e.steps, e.truncated) for e in runner.episodes] == [(0, 4, True), (1, 4, True)]
+    assert result.success is None  # nobody judged
+
+
+def test_a_judge_ends_an_episode(make_runner: Make, env: Any) -> None:
+    runner = make_runner(rate_hz=0, episodes=2, max_steps=5, judge=lambda e: len(e.steps) == 3)
+    runner.activate()
+    result = runner.run()
+    assert [(e.steps, e.success) for e in runner.episodes] == [(3, True), (5, False)]
+    assert result.success is False
+
+
+def test_a_live_run_ends_when_asked(make_runner: Make, env: Any) -> None:
+    runner = make_runner(rate_hz=0)
+    runner.activate()
+    assert runner.run(max_ticks=5).n_ticks == 5
+    runner.request_stop()
+    assert runner.run(max_ticks=5).n_ticks == 5
+    runner.deactivate()
+    runner.deactivate()
+    assert env.closed == 1
+
+
+# -- the skill at the arm -------------------------------------------------------------------------------------------
+def test_actions_reach_the_robot_in_order_and_done_ends_the_skill(make_runner: Make, env: Any) -> None:
+    twist = Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.3, 0.0, 0.0, 0.0, 0.0, 0.1),))
+    script = [Act(joints(0.1), chunk_index=4), Hold("thinking"), Act(twist)]
+    ticks, ended = play(make_runner(rate_hz=0), script, 5)
+    first = dict(zip(env.joints, (0.1, -1.20, 1.05, 1.35, 0.0, 0.60), strict=True))
+    assert env.steps == [
+        (first, None),
+        (None, None),
+        (None, (0.3, 0.0, 0.1)),
+        (None, None),
+        (None, None),
+    ]
+    assert [t.action_applied for t in ticks] == [True, False, True, False, False]
+    assert ticks[0].chunk_index == 4
+    assert [(e.data["played"], e.data["ticks"], e.error) for e in ended] == [(True, 3, None)]
+
+
+def test_joints_that_an_action_leaves_out_keep_their_last_target(make_runner: Make, env: Any) -> None:
+    closed = joints(0.0, -1.0, 1.0, 1.0, 0.0, -0.1)
+    play(make_runner(rate_hz=0), [Act(closed), Hold("gripped"), Act(joints(0.3, -1.1))], 4)
+    assert list(env.steps[2][0].values()) == [0.3, -1.1, 1.0, 1.0, 0.0, -0.1]
+
+
+@pytest.mark.parametrize("error", [Evicted("gone"), ModelError("bad")])
+def test_a_typed_error_fails_the_goal_and_the_arm_holds(
+    make_runner: Make, env: Any, error: Exception
+) -> None:
+    runner = make_runner(rate_hz=0)
+    ticks, ended = play(runner, [Act(joints(0.1)), error], 4)
+    assert [e.error for e in ended] == [error]
+    assert env.steps[1:] == [(None, None)] * 3
+    assert ticks[1].safety_violations
+    assert runner.progress.state == "ended"
+
+
+def test_a_defect_of_a_skill_does_not_take_the_loop_with_it(make_runner: Make, env: Any) -> None:
+    _, ended = play(make_runner(rate_hz=0), [ZeroDivisionError("oops")], 3)
+    assert isinstance(ended[0].error, InternalError)
+    assert len(env.steps) == 3
+
+
+def test_an_action_outside_the_envelope_is_withheld_and_recorded(make_runner: Make, env: Any) -> None:
+    runner = make_runner(rate_hz=0)
+    ticks, ended = play(runner, [Act(joints(3.0)), Act(joints(2.1))], 3)
+    assert env.steps[0] == (None, None)
+    assert env.steps[1][0]["shoulder_pan"] == 2.0
+    assert [t.action_applied for t in ticks[:2]] == [False, True]
+    assert "outside" in ticks[0].safety_violations[0]
+    assert len(runner.violations) == 2
+    assert (ended[0].data["withheld"], ended[0].data["clamped"]) == (1, 1)
+
+
+def test_a_policy_that_is_lost_fails_its_goal(make_runner: Make) -> None:
+    _, ended = play(make_runner(rate_hz=0), [Act(joints(9.0))] * 40, 30)
+    assert isinstance(ended[0].error, ModelError)
+    assert ended[0].data["withheld"] == WITHHELD_IN_A_ROW_MAX
+
+
+def test_a_late_action_is_dropped_on_the_way_to_the_simulator(
+    make_runner: Make, env: Any, clock: Any
+) -> None:
+    class Slow(Scripted):
+        def step(self, world: WorldState) -> StepOutcome:
+            clock.advance(0.2)
+            return super().step(world)
+
+    runner = make_runner(rate_hz=10, clock=clock, deadline_policy=DeadlinePolicy.DROP)
+    runner.activate()
+    runner.run(max_ticks=1)
+    runner.begin_skill(Slow(Act(joints(0.1))), GOAL, lambda _: None)
+    assert not runner.tick().action_applied
+    assert env.steps == [(None, None)]
+
+
+def test_one_skill_at_a_time_and_taking_the_arm_back(make_runner: Make, env: Any) -> None:
+    runner, ended = make_runner(rate_hz=0), []
+    play(runner, [Act(joints(0.1))] * 10, 2)
+    with pytest.raises(InternalError, match="another skill"):
+        runner.begin_skill(Scripted(), GOAL, ended.append)
+    runner.end_skill()
+    runner.end_skill()
+    runner.tick()
+    assert env.steps[-1] == (None, None)
+    assert ended == []
+
+
+def test_a_state_that_is_not_finite_fails_closed(make_runner: Make, env: Any) -> None:
+    runner, ended = make_runner(rate_hz=0), []
+    runner.activate()
+    runner.tick()
+    runner.begin_skill(Scripted(Act(joints(0.1))), GOAL, ended.append)
+    env.joints["gripper"] = float("nan")
+    assert not runner.tick().action_applied
+    assert isinstance(ended[0].error, InternalError)
+    assert runner.world is None
+
+
+def test_stopping_ends_the_skill_with_an_error(make_runner: Make) -> None:
+    runner = make_runner(rate_hz=0)
+    _, ended = play(runner, [Act(joints(0.1))] * 10, 1)
+    runner.deactivate()
+    assert isinstance(ended[0].error, InternalError)
+
+
+# -- pictures -------------------------------------------------------------------------------------------------------
+@pytest.mark.heavy
+def test_frames_are_rendered_on_demand_and_reused_while_young(
+    make_runner: Make, env: Any, clock: Any
+) -> None:
+    runner = make_runner(rate_hz=0, clock=clock, cameras=("front",))
+    runner.activate()
+    runner.tick()
+    first = runner.snapshot("front", 0.5)
+    clock.advance(0.05)
+    assert runner.snapshot("front", 0.5) is first
+    assert runner.snapshot("front", 0.02) is not first
+    clock.advance(0.2)
+    assert runner.snapshot("front", 0.5).stamp_ns == clock.now_ns()
+
+
+@pytest.mark.heavy
+def test_a_skill_sees_the_cameras_it_wants(make_runner: Make) -> None:
+    runner, skill = make_runner(rate_hz=0, cameras=("front", "wrist")), Scripted(Hold("x"))
+    skill.cameras = ("wrist",)
+    runner.activate()
+    runner.tick()
+    runner.begin_skill(skill, GOAL, lambda _: None)
+    runner.tick()
+    frames = skill.seen[0].image_frames
+    assert frames is not None
+    assert set(frames) == {"wrist"}
+    assert (frames["wrist"].width, frames["wrist"].height) == (32, 24)
+
+
+# -- the real simulator ---------------------------------------------------------------------------------------------
+@pytest.mark.heavy
+def test_navigating_the_real_simulator_and_filming_it(
+    tmp_path: Path, navigate_manifest: Path, run_async: Any
+) -> None:
+    import imageio_ffmpeg
+
+    from runner.recorder import Recorder
+    from runner.sim.config import SceneConfig
+    from runner.sim.env import SimEnv
+    from runner.sim.sim_runner import SimRunner
+    from runner.skills.navigate import Navigate
+    from schemas.manifest import load_manifest
+
+    scene = SceneConfig()
+    env = SimEnv(scene)
+    recorder = Recorder(tmp_path / "episode.mp4", fps=10)
+    runner = SimRunner(lambda: env, cameras=("front",), seed=1, rate_hz=0, recorder=recorder)
+    skill = Navigate(load_manifest(navigate_manifest), scene, period_s=1 / 30)
+    ended: list[SkillEnded] = []
+    try:
+        runner.activate()
+        runner.tick()
+        x, y, z = env.ground_truth().objects[env.target].position_base
+        run_async(skill.start(Goal("g", "navigate", params={"target_point": {"x": x, "y": y, "z": z}})))
+        runner.begin_skill(skill, GOAL, ended.append)
+        while not ended:
+            runner.tick()
+            assert runner.tick_idx < 400
+        assert ended[0].error is None
+        x, y, _ = env.ground_truth().objects[env.target].position_base
+        assert (x, y) == pytest.approx(scene.grasp_spot_in_base_m, abs=0.03)
+        model = runner.snapshot("front", 0.5).model
+        assert model is not None
+        box = env.seen_objects("front")[env.target].box
+        seen = model.ground_point((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
+        assert seen is not None
+        assert seen[:2] == pytest.approx((x, y), abs=0.012)
+    finally:
+        runner.deactivate()
+        recorder.close()
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "episode.mp4"))
+    assert frames == recorder.written
+    assert frames >= 10
+    assert seconds == pytest.approx(frames / 10, abs=0.2)

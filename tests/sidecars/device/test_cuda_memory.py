@@ -1,0 +1,44 @@
+"""Memory of a real card. Where there is none, it says so."""
+
+import pytest
+
+from schemas.errors import NoGpu, OutOfMemory
+
+MIB = 2**20
+
+
+@pytest.mark.heavy
+def test_without_a_card_it_says_what_to_do():
+    torch = pytest.importorskip("torch")
+    from sidecars.device.cuda import CudaMemory
+
+    index = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    with pytest.raises(NoGpu, match="--device fake:FOLDER"):
+        CudaMemory(index)
+
+
+@pytest.mark.gpu
+@pytest.mark.heavy
+def test_ballast_fills_up_and_goes():
+    torch = pytest.importorskip("torch")
+    if not torch.cuda.is_available():
+        pytest.skip("needs an NVIDIA card")
+    from sidecars.device.cuda import CudaMemory
+    from sidecars.device.memory import fill
+
+    memory = CudaMemory()
+    assert memory.used_bytes() == 0
+    memory.touch()
+    context = memory.used_bytes()
+    assert context is not None
+    blocks = fill(memory, "weights", 512 * MIB, bytes_per_s=None, wait=lambda seconds: False)
+    grown = (memory.used_bytes() or 0) - context
+    assert 500 * MIB <= grown <= 600 * MIB
+    for block in blocks:
+        memory.free(block)
+    memory.empty_cache()
+    assert abs((memory.used_bytes() or 0) - context) <= 64 * MIB
+    with pytest.raises(OutOfMemory) as caught:
+        memory.allocate("too much", 1 << 50)
+    assert caught.value.details["requested_bytes"] == 1 << 50
+    memory.close()

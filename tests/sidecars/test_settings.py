@@ -1,0 +1,132 @@
+"""What a sidecar is told: flags, manifest, footprint file, environment."""
+
+from pathlib import Path
+
+import pytest
+
+from arbiter.host.gpu.fake import FakeProbe, make_card
+from schemas.errors import ConfigError
+from schemas.manifest import parse_manifest
+from sidecars.__main__ import _parser, main, settings_from
+from sidecars.adapters.choose import make_adapter
+from sidecars.settings import FootprintEntry, footprint_for, parse_footprint, read_footprints
+from sidecars.weights import Weights
+
+MIB = 2**20
+HEAD = "name: test/model\nversion: 1.2.3\nembodiment_tags: [any]\nchunk_size: 1\ndescription: d\nlatency_budget: {per_chunk_ms: 1}\n"
+DETECTOR = HEAD + "kind: detector\nweights_uri: hf://a/b@rev\nactions: [detect]\ndetector: {labels: [x]}\n"
+SHIPPED = Path(__file__).parents[2] / "configs/models/footprints.yaml"
+
+
+@pytest.fixture
+def rskill(tmp_path):
+    path = tmp_path / "rskill.yaml"
+    path.write_text(DETECTOR)
+    return path
+
+
+def settings(*flags):
+    return settings_from(_parser().parse_args([str(flag) for flag in flags]))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("5.3GB,5GB,450MiB", (5_300_000_000, 5_000_000_000, 450 * MIB)),
+        ("2GB,1GB", (2 * 10**9, 10**9, 450 * MIB)),
+        ("1GB", (10**9, 10**9, 450 * MIB)),
+    ],
+)
+def test_the_footprint_flag(text, expected):
+    entry = parse_footprint(text)
+    assert (entry.load_peak, entry.steady, entry.residue) == expected
+
+
+@pytest.mark.parametrize("text", ["much", "1GB,2GB", "1GB,1GB,1GB,1GB", "1GB,1GB,2GB", ""])
+def test_a_footprint_that_makes_no_sense(text):
+    with pytest.raises(ConfigError, match="write PEAK,STEADY,RESIDUE"):
+        parse_footprint(text)
+
+
+def test_the_shipped_footprints_are_the_measured_ones():
+    entries = read_footprints(SHIPPED)
+    peaks = {name: (entry.load_peak, entry.stands_for) for name, entry in entries.items()}
+    assert peaks["vram-arbiter/so101-detector"] == (5_300_000_000, "OpenRAL/rskill-locateanything-3b-nf4")
+    assert peaks["vram-arbiter/so101-scene-vlm"][0] == 3_300_000_000
+    assert peaks["vram-arbiter/so101-grab"][0] == 4_300_000_000
+    assert all(entry.source and entry.residue == 450 * MIB for entry in entries.values())
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("a/b: {load_peak: 1GB, steady: 1GB, residu: 1}", "footprints.yaml:1: a/b.residu"),
+        ("a/b:\n  load_peak: much\n  steady: 1GB\n", "footprints.yaml:2: a/b.load_peak"),
+        ("- 1", "must be a map"),
+        ("a/b: [", "not valid YAML"),
+    ],
+)
+def test_a_wrong_entry_is_named_with_its_line(tmp_path, text, told):
+    path = tmp_path / "footprints.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        read_footprints(path)
+    assert told in str(caught.value)
+
+
+def test_without_an_entry_the_manifest_counts_and_without_both_nobody_guesses():
+    declared = parse_manifest(DETECTOR + "min_vram_gb: {fp32: 2.5}\n")
+    assert footprint_for(declared, {}).on_wire().load_peak_bytes == 2_500_000_000
+    own = FootprintEntry(load_peak=5, steady=4, residue=3)
+    assert footprint_for(declared, {"test/model": own}) is own
+    with pytest.raises(ConfigError, match="nobody says how many bytes"):
+        footprint_for(parse_manifest(DETECTOR), {})
+
+
+def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
+    make_card(tmp_path / "card", 8 * 2**30)
+    monkeypatch.setenv("VRAM_ARBITER_RUNTIME", "/run/x")
+    monkeypatch.setenv("VRAM_FAKE_GPU", str(tmp_path / "card"))
+    found = settings(
+        "--name", "detector", "--rskill", rskill, "--footprint", "2GB", "--priority", "70", "--pinned"
+    )
+    assert (found.endpoint, found.arbiter) == ("ipc:///run/x/detector.sock", "ipc:///run/x/arbiter.sock")
+    assert found.device == f"fake:{tmp_path / 'card'}"
+    assert found.weights == Weights("a/b", "rev")
+    spec = found.lease_spec()
+    assert (spec.consumer, spec.model_id, spec.revision) == ("detector", "test/model", "rev")
+    assert (spec.priority, spec.evictable, spec.footprint.load_peak_bytes) == (70, False, 2 * 10**9)
+    assert spec.gpu == FakeProbe([tmp_path / "card"]).cards()[0].id, (
+        "the card that is charged is the card that is leased"
+    )
+    alone = settings(
+        "--name", "d", "--rskill", rskill, "--footprint", "2GB", "--no-arbiter", "--device", "cuda:1"
+    )
+    assert (alone.arbiter, alone.device, alone.gpu) == (None, "cuda:1", "any")
+    with pytest.raises(ConfigError, match="--device gpu"):
+        settings("--name", "d", "--rskill", rskill, "--footprint", "2GB", "--device", "gpu")
+
+
+def test_check_says_ok_or_what_is_wrong(rskill, tmp_path, capsys):
+    flags = ["--name", "d", "--rskill", str(rskill), "--footprint", "2GB", "--device", "none", "--check"]
+    assert main(flags) == 0
+    assert "ok: test/model from a/b as detector" in capsys.readouterr().out
+    rskill.write_text(DETECTOR.replace("labels", "lables"))
+    assert main(flags) == 1
+    assert "lables" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as caught:
+        main([*flags, "--priority", "101"])
+    assert caught.value.code == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (DETECTOR.replace("{labels: [x]}", "{labels: [x], engine: rtdetr_onnx}"), "engine"),
+        (DETECTOR + "runtime: onnx\n", "runtime 'onnx'"),
+        (HEAD + "kind: wam\nweights_uri: hf://a/b\nactions: [grasp]\n", "kind 'wam'"),
+    ],
+)
+def test_what_no_sidecar_serves_is_said(text, told):
+    with pytest.raises(ConfigError, match=told):
+        make_adapter(parse_manifest(text), Weights("a/b"))

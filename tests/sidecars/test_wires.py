@@ -1,0 +1,306 @@
+"""The sidecars' wires: both families, REQ and DEALER peers, and everything that strangers may send."""
+
+import asyncio
+import io
+
+import msgpack
+import pytest
+import zmq
+
+from clients.serve import Peer
+from schemas.errors import CODES, BadRequest, ModelError, OutOfMemory, UnknownOp
+from schemas.sidecar import DetectOp, EndpointCall
+from sidecars.images import decode, within
+from sidecars.wires import PENDING_MAX, Wire, error_reply, parse
+
+PNG = b"\x89PNG\r\n\x1a\n"
+OPS = frozenset({"detect", "get_action", "reset"})
+PEER = Peer(b"peer", False, None)
+
+
+class Host:
+    """Answers what it is asked; `gate` holds model calls back."""
+
+    model_ops = OPS
+
+    def __init__(self):
+        self.gate = asyncio.Event()
+        self.calls = []
+        self.answer: object = {"ok": True}
+
+    def identity(self):
+        return {"ok": True, "state": "unloaded"}
+
+    async def load(self, timeout_s, traceparent):
+        self.calls.append(("load", timeout_s, traceparent))
+        return {"ok": True, "lease_id": None, "token": None, "loaded": True}
+
+    async def unload(self):
+        self.calls.append(("unload",))
+
+    async def run(self, name, call):
+        self.calls.append((name, call))
+        await self.gate.wait()
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+    def stop(self):
+        self.calls.append(("stop",))
+
+
+def talk(*messages, answer=None):
+    """Handle messages one after the other; returns the replies and the host."""
+
+    async def run():
+        host, replies = Host(), []
+        host.gate.set()
+        if answer is not None:
+            host.answer = answer
+
+        async def send(peer, message):
+            replies.append(message)
+
+        wire = Wire(host, send)
+        for message in messages:
+            await wire.handle(PEER, message)
+        return replies, host
+
+    return asyncio.run(run())
+
+
+def test_both_families_reach_the_host():
+    replies, host = talk(
+        {"op": "ping", "id": 7},
+        {"endpoint": "ping"},
+        {"op": "load", "timeout_s": 2.0, "traceparent": "00-1-2-03"},
+        {"endpoint": "load", "data": {"timeout_s": 3}},
+        {"op": "detect", "image": PNG, "query": "cube", "mode": "fast", "token": [1, 2]},
+        {"endpoint": "get_action", "data": {"observation": {}, "options": None}, "api_token": None},
+        {"endpoint": "unload"},
+        {"op": "shutdown"},
+    )
+    assert replies[0] == {"ok": True, "state": "unloaded", "re": 7}
+    assert "re" not in replies[1], "REQ clients of the field send no id and expect none"
+    assert all(reply["ok"] for reply in replies)
+    names = [call[0] for call in host.calls]
+    assert names == ["load", "load", "detect", "get_action", "unload", "stop"]
+    assert host.calls[0][1:] == (2.0, "00-1-2-03")
+    assert host.calls[1][1] == 3
+    assert isinstance(host.calls[2][1], DetectOp)
+    assert host.calls[2][1].token == (1, 2)
+    assert isinstance(host.calls[3][1], EndpointCall)
+
+
+@pytest.mark.parametrize(
+    ("message", "code", "told"),
+    [
+        ({}, "bad_request", "names its op or endpoint"),
+        ({"op": 5}, "bad_request", "names its op or endpoint"),
+        ({"op": "dance"}, "unknown_op", "dance"),
+        ({"op": "query", "image": PNG, "question": "?"}, "unknown_op", "query"),
+        ({"endpoint": "detect", "data": {}}, "bad_request", "detect: endpoint"),
+        ({"op": "get_action"}, "bad_request", "get_action"),
+        ({"op": "detect"}, "bad_request", "image"),
+        ({"op": "detect", "image": "text", "query": "x", "colour": 1}, "bad_request", "colour"),
+        ({"op": "detect", "image": PNG, "query": ""}, "bad_request", "query"),
+        ({"op": "detect", "image": PNG, "query": "x", "max_side": 10**9}, "bad_request", "max_side"),
+        ({"op": "detect", "image": PNG, "query": "x", "token": [1]}, "bad_request", "token"),
+        (
+            {"op": "detect", "image": PNG, "query": "x", "score_threshold": float("nan")},
+            "bad_request",
+            "score_threshold",
+        ),
+        ({"op": "load", "timeout_s": -1}, "bad_request", "timeout_s"),
+        ({"op": "load", "timeout_s": float("inf")}, "bad_request", "timeout_s"),
+        ({"endpoint": "load", "data": {"timeout_s": "soon"}}, "bad_request", "timeout_s"),
+        ({"endpoint": "get_action", "data": [1]}, "bad_request", "data"),
+        ({"op": "ping", "id": "seven"}, "bad_request", "id"),
+    ],
+)
+def test_a_bad_message_gets_a_typed_error_that_names_the_field(message, code, told):
+    (reply,), host = talk(message)
+    assert (reply["ok"], reply["code"]) == (False, code)
+    assert told in reply["error"] + str(reply["details"])
+    assert host.calls == []
+
+
+def test_the_known_ops_are_told():
+    with pytest.raises(UnknownOp) as caught:
+        parse({"op": "dance"}, OPS)
+    assert caught.value.details["known"] == [
+        "detect",
+        "get_action",
+        "load",
+        "ping",
+        "reset",
+        "shutdown",
+        "unload",
+    ]
+
+
+def npy(array, **options):
+    import numpy as np
+
+    stream = io.BytesIO()
+    np.save(stream, array, **options)
+    return {"__ndarray_class__": True, "as_npy": stream.getvalue()}
+
+
+def test_arrays_go_both_ways_and_objects_never():
+    np = pytest.importorskip("numpy")
+    observation = {"state": npy(np.arange(3.0)), "task": "grab"}
+    (reply,), host = talk(
+        {"endpoint": "get_action", "data": {"observation": observation}},
+        answer={"action": np.zeros((2, 6), np.float32)},
+    )
+    assert (host.calls[0][1].data["observation"]["state"] == np.arange(3.0)).all()
+    assert reply["action"]["__ndarray_class__"] is True
+    assert msgpack.packb(reply), "nothing but plain values goes to the codec"
+    bomb = (
+        b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(
+            128, b" "
+        )
+    )
+    for bad in (
+        npy(np.array([{"a": 1}], dtype=object), allow_pickle=True),
+        {"__ndarray_class__": True, "as_npy": b"no array"},
+        {"__ndarray_class__": True, "as_npy": "text"},
+        {"__ndarray_class__": True, "as_npy": bomb},
+    ):
+        (reply,), host = talk({"endpoint": "get_action", "data": {"observation": {"state": bad}}})
+        assert reply["code"] == "bad_request"
+        assert host.calls == []
+
+
+@pytest.mark.parametrize(
+    "error", [ModelError("no"), OutOfMemory("full", details={"free_bytes": 1}), BadRequest("what")]
+)
+def test_errors_of_the_model_keep_their_type(error):
+    (reply,), _ = talk({"op": "detect", "image": PNG, "query": "x", "id": 3}, answer=error)
+    assert reply == {
+        "ok": False, "error": f"{type(error).__name__}: {error.message}", "code": error.code, "hint": "", "details": error.details,
+        "message": error.message, "re": 3,
+    }  # fmt: skip
+    assert CODES[reply["code"]] is type(error)
+
+
+def test_a_defect_of_ours_is_an_answer_too():
+    (reply,), _ = talk({"op": "detect", "image": PNG, "query": "x"}, answer=ZeroDivisionError("oops"))
+    assert (reply["code"], reply["error"]) == ("internal", "InternalError: ZeroDivisionError: oops")
+
+
+def test_too_many_waiting_requests_are_refused_and_ping_still_answers():
+    async def run():
+        host, replies = Host(), []
+
+        async def send(peer, message):
+            replies.append(message)
+
+        wire = Wire(host, send)
+        detect = {"op": "detect", "image": PNG, "query": "x"}
+        waiting = [asyncio.create_task(wire.handle(PEER, detect)) for _ in range(PENDING_MAX)]
+        await asyncio.sleep(0)
+        await wire.handle(PEER, detect)
+        await wire.handle(PEER, {"op": "ping"})
+        assert [reply.get("code") for reply in replies] == ["limit_exceeded", None]
+        host.gate.set()
+        await asyncio.gather(*waiting)
+        await wire.handle(PEER, detect)
+        assert replies[-1]["ok"]
+
+    asyncio.run(run())
+
+
+def test_error_replies_have_the_fields_form():
+    assert error_reply(ModelError("no", hint="try"))["error"] == "ModelError: no"
+
+
+# -- pictures --------------------------------------------------------------------------------------------------------
+def picture(kind, size=(8, 6), mode="RGB"):
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.new(mode, size).save(stream, kind)
+    return stream.getvalue()
+
+
+def test_pictures_of_any_mode_become_rgb():
+    pytest.importorskip("PIL")
+    for data in (
+        picture("PNG", mode="RGBA"),
+        picture("PNG", mode="L"),
+        picture("PNG", mode="I;16"),
+        picture("JPEG"),
+    ):
+        found = decode(data)
+        assert (found.mode, found.size) == ("RGB", (8, 6))
+
+
+def test_what_is_no_picture_or_too_large_is_refused():
+    pytest.importorskip("PIL")
+    whole = picture("PNG", size=(64, 64))
+    for data, told in (
+        (b"no picture", "cannot be decoded"), (whole[: len(whole) // 2], "cannot be decoded"),
+        (picture("GIF"), "cannot be decoded"), (picture("PNG", size=(4200, 4200), mode="1"), "4200 x 4200"),
+    ):  # fmt: skip
+        with pytest.raises(BadRequest, match=told):
+            decode(data)
+
+
+def test_pictures_are_shrunk_never_enlarged():
+    image = pytest.importorskip("PIL.Image")
+    assert within(image.new("RGB", (800, 600)), 400).size == (400, 300)
+    assert within(image.new("RGB", (3000, 1)), 30).size == (30, 1)
+    assert within(image.new("RGB", (80, 60)), 400).size == (80, 60)
+
+
+# -- on a real socket ------------------------------------------------------------------------------------------------
+@pytest.mark.e2e
+def test_a_real_sidecar_survives_what_strangers_send(lone_box):
+    sidecar = lone_box.start("detector", "--no-arbiter", device="none")
+    for payload in (
+        b"",
+        b"\xc1",
+        b"\x80" * 3,
+        msgpack.packb([1]),
+        msgpack.packb("x"),
+        msgpack.packb({1: 2}),
+        b"\xdf\xff\xff\xff\xff",
+    ):
+        sidecar.client.send_raw(payload)
+        reply = sidecar.client.receive()
+        assert reply is not None, payload
+        assert reply["ok"] is False, payload
+    sidecar.client.send_frames([b"one", b"two", b"three"])
+    sidecar.client.send_raw(msgpack.packb({"op": "detect", "image": bytes(17 * 2**20), "query": "x"}))
+    codes = {reply["code"] for reply in iter(lambda: sidecar.client.receive(2.0), None)}
+    assert "message_too_large" in codes
+    assert sidecar.detect()["ok"]
+
+
+@pytest.mark.e2e
+def test_req_clients_of_the_field_are_answered(lone_box):
+    lone_box.start("detector", "--no-arbiter", device="none")
+    socket = zmq.Context.instance().socket(zmq.REQ)
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.RCVTIMEO, 10_000)
+    try:
+        socket.connect(f"ipc://{lone_box.runtime}/detector.sock")
+        for message in (
+            {"op": "ping"},
+            {
+                "op": "detect",
+                "image": PNG,
+                "query": "cube",
+                "max_side": 512,
+                "mode": "hybrid",
+                "max_new_tokens": 1024,
+            },
+        ):
+            socket.send(msgpack.packb(message))
+            reply = msgpack.unpackb(socket.recv())
+            assert reply["ok"] is True
+            assert "re" not in reply
+    finally:
+        socket.close()
