@@ -66,6 +66,7 @@ class ArbiterClient:
         self._subscribers: set[asyncio.Queue[r.Message]] = set()
         self._tasks: set[asyncio.Task[None]] = set()
         self._closing = False
+        self._lost = False
 
     # -- connection ------------------------------------------------------------------------------------------------
     async def __aenter__(self) -> Self:
@@ -358,13 +359,16 @@ class ArbiterClient:
     def _tell(self, event: r.Event) -> None:
         match event:
             case r.Up():
+                self._lost = False
                 if self._greeted is not None and not self._greeted.done():
                     self._greeted.set_result(None)
                 else:
                     log.info("back in contact with the arbiter (epoch %s)", event.epoch)
             case r.ContactLost():
-                if not self._closing:
-                    log.warning("contact to the arbiter lost: %s", event.reason)
+                if not self._closing:  # said once, however often a reconnect fails
+                    level = logging.DEBUG if self._lost else logging.WARNING
+                    log.log(level, "contact to the arbiter lost: %s", event.reason)
+                self._lost = True
                 asyncio.get_running_loop().call_later(REOPEN_S, self._reopen)
             case r.Refused():
                 if self._greeted is not None and not self._greeted.done():

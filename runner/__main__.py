@@ -152,7 +152,6 @@ async def run_sim(args: argparse.Namespace) -> int:
             rate_hz=args.rate,
             deadline_policy=DeadlinePolicy(args.deadline_policy),
             clock=clock,
-            recorder=recorder,
             video_camera=VIDEO_CAMERA,
             video_every=VIDEO_EVERY,
         )
@@ -166,6 +165,9 @@ async def run_sim(args: argparse.Namespace) -> int:
             Catalogue(manifests, makers),
             clock,
             ground_truth=lambda: truth_as_wire(env),
+            on_bound=lambda: setattr(
+                runner, "recorder", recorder
+            ),  # not before: a second runner must not touch the first's video
             identity={
                 "robot": "so101-mobile",
                 "simulated": True,

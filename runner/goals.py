@@ -92,6 +92,7 @@ class GoalServer:
         *,
         ground_truth: Callable[[], dict[str, Any]] | None = None,
         identity: dict[str, Any] | None = None,
+        on_bound: Callable[[], None] | None = None,
     ) -> None:
         self._endpoint = endpoint
         self._control = control
@@ -100,6 +101,7 @@ class GoalServer:
         self._clock = clock
         self._ground_truth = ground_truth
         self._identity = identity or {}
+        self._on_bound = on_bound
         self._residency = Residency()
         self._running: _Running | None = None
         self._results: OrderedDict[str, ResultPush] = OrderedDict()
@@ -115,6 +117,8 @@ class GoalServer:
             stopping = asyncio.create_task(self.stopping.wait())
             ended = asyncio.ensure_future(asyncio.wait([self._control.ended]))
             self.bound.set()
+            if self._on_bound is not None:
+                self._on_bound()
             try:
                 await asyncio.wait([serving, stopping, ended], return_when=asyncio.FIRST_COMPLETED)
             finally:

@@ -30,6 +30,11 @@ from sidecars.settings import (
 from sidecars.weights import Weights, configs_folder
 
 FOOTPRINTS = "models/footprints.yaml"
+_ENVIRONMENT = {  # of the model libraries, before they are imported: what they write and whom they tell
+    "HF_HUB_DISABLE_PROGRESS_BARS": "1",
+    "HF_HUB_DISABLE_TELEMETRY": "1",
+    "TOKENIZERS_PARALLELISM": "false",
+}
 
 
 AdapterFor = Callable[[RSkillManifest, Weights], ModelAdapter]
@@ -43,6 +48,8 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
         stream=sys.stderr,
         format=f"%(asctime)s {flags.name} %(levelname)s %(message)s",
     )
+    for name, value in _ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
     try:
         settings = settings_from(flags)
         adapter = adapter_for(settings.manifest, settings.weights)

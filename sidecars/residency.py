@@ -69,7 +69,7 @@ class Residency:
     def prepare(self) -> None:
         """Begin the host work (imports, processors) that needs no lease. Repeats only after a failure."""
         if self._prepared is None or (self._prepared.done() and self._prepared.exception() is not None):
-            self._prepared = asyncio.create_task(self._worker.run(self._adapter.prepare, abandon=True))
+            self._prepared = asyncio.create_task(self._worker.run(self._prepare_blocking, abandon=True))
 
     async def load(self, timeout_s: float | None = None, traceparent: str | None = None) -> bool:
         """Make the model resident; False if it was. `timeout_s` bounds the wait for the lease, not the loading.
@@ -141,7 +141,8 @@ class Residency:
             return False
         lease = self.lease
         try:
-            await self._unload()
+            if self.state != "unloaded":
+                await self._unload()
             await self._worker.run(self._memory.close)
         except VramError as error:  # e.g. the card's folder is gone: there is nothing left to give back
             _log.warning("leaving: %s", error)
@@ -157,6 +158,11 @@ class Residency:
                 _log.info("idle for %.0f s: releasing", idle_s)
                 await self.unload()
             await asyncio.sleep(max(left, 0.05, idle_s / 10))
+
+    def _prepare_blocking(self) -> None:
+        self._adapter.prepare()
+        gc.collect()
+        gc.freeze()  # a million objects of imported code: every later collection, at each unload, would walk them
 
     # -- loading ------------------------------------------------------------------------------------------------------
     async def _load_in_turn(self, deadline: float | None, traceparent: str | None) -> bool:

@@ -150,6 +150,19 @@ def explain_lease(core: Core, lease: Lease) -> dict[str, Any]:
     }
 
 
+def wait_reason(core: Core, lease: Lease) -> str:
+    """Why a waiter waits, in words. Short for those who stand behind others: only the head has blockers of its own."""
+    position = _best_position(core, lease)
+    if position > 1:
+        return _behind(core, lease, position)
+    return str(explain_lease(core, lease)["text"])
+
+
+def _behind(core: Core, lease: Lease, position: int) -> str:
+    ahead = core.gpus[lease.planned_gpu or lease.gpus[0]].queue.ahead_of(lease)
+    return f"waits behind {core.waiting[ahead].spec.consumer if ahead else 'others'} as number {position}"
+
+
 def _explain_resident(core: Core, gpu: Gpu, lease: Lease, free: int) -> dict[str, Any]:
     says = {
         LeaseState.LOADING: "it was granted and is loading",
@@ -195,11 +208,15 @@ def _blockers(core: Core, gpu: Gpu, waiter: Lease, deficit: int) -> list[dict[st
 
 def _keepers(core: Core, gpu: Gpu, waiter: Lease) -> list[dict[str, Any]]:
     """Processes without a resident lease that hold bytes all the same: contexts of live processes, debts, stowaways."""
-    names = {client.process: client.name for client in core.clients.values()}
+    keepers = {
+        account.process: account.booked_bytes()
+        for account in gpu.ledger.accounts.values()
+        if account.process != waiter.process and gpu.residents.keys().isdisjoint(account.charges)
+    }
+    names = {client.process: client.name for client in core.clients.values()} if keepers else {}
     kept = [
-        (names.get(a.process, f"pid {a.process.pid}"), a.booked_bytes(), "residue", "keeps its context until it exits")
-        for a in gpu.ledger.accounts.values()
-        if a.process != waiter.process and not any(lease in gpu.residents for lease in a.charges)
+        (names.get(process, f"pid {process.pid}"), count, "residue", "keeps its context until it exits")
+        for process, count in keepers.items()
     ]
     kept += [
         (s.name or f"pid {s.process.pid}", s.used_bytes, "stowaway", "holds bytes without a lease")
@@ -207,7 +224,14 @@ def _keepers(core: Core, gpu: Gpu, waiter: Lease) -> list[dict[str, Any]]:
         if s.process.pid != waiter.process.pid
     ]
     return [
-        {"lease_id": None, "consumer": name, "bytes": count, "state": state, "uses": 0, "condition": condition}
+        {
+            "lease_id": None,
+            "consumer": name,
+            "bytes": count,
+            "state": state,
+            "uses": 0,
+            "condition": condition,
+        }
         for name, count, state, condition in kept
     ]
 
@@ -237,9 +261,7 @@ def _condition(
     """(short condition, what happens next in words)."""
     leaving = [other for other in gpu.residents.values() if other.state in LEAVING]
     if position > 1:
-        ahead = gpu.queue.ahead_of(lease)
-        name = core.waiting[ahead].spec.consumer if ahead is not None else "others"
-        return "queued", f"waits behind {name} as number {position}"
+        return "queued", _behind(core, lease, position)
     if leaving and lease.planned_gpu == gpu.info.id:
         return "room is being made", "; ".join(_leaving_next(core, gpu, other) for other in leaving)
     blocked = policy.blocked(core, gpu)

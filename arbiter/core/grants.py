@@ -43,12 +43,12 @@ def _serve(core: Core, gpu: Gpu) -> None:
         _grant_if_measured(core, gpu, head)
         return
     leaving = policy.leaving(gpu)
-    if not policy.fits(gpu, head, leaving):  # 5
-        if _ask_victims(core, gpu, head, leaving):
-            leaving = policy.leaving(gpu)
-    else:
+    planned = policy.fits(gpu, head, leaving)
+    if planned:
         head.reason = "room is being made"
-    _backfill(core, gpu, head, leaving)  # 6
+    elif _ask_victims(core, gpu, head, leaving):  # 5
+        leaving, planned = policy.leaving(gpu), True
+    _backfill(core, gpu, head, leaving, planned=planned)  # 6
 
 
 def _relieve(core: Core, gpu: Gpu) -> None:
@@ -97,13 +97,16 @@ def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, in
     return True
 
 
-def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int]) -> None:
+def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int], *, planned: bool) -> None:
     if len(gpu.queue) < 2 or head.spec.exclusive:
+        return
+    smallest = gpu.queue.smallest_need_bytes() - policy.largest_fold_bytes(gpu)
+    if smallest > gpu.ledger.budget_bytes - gpu.ledger.total_bytes():
         return
     if any(True for _ in gpu.in_state(LeaseState.UNLOADING, LeaseState.VERIFYING)):
         return  # the head's room is about to come; a load now would only be in its way
-    spare = policy.spare_beside_bytes(core, gpu, head, leaving)
-    if gpu.queue.smallest_need_bytes() > spare + policy.largest_fold_bytes(gpu):
+    spare = policy.spare_beside_bytes(gpu, head, leaving, planned=planned)
+    if smallest > spare:
         return
     for lease in gpu.queue.behind_head():
         if policy.added_bytes(gpu, lease) <= spare and policy.fits(gpu, lease):

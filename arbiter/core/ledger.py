@@ -65,7 +65,8 @@ class GpuLedger:
         self.unnamed_bytes = 0  # used, but in nobody's list, beyond the fixed reserve
         self.overhead_bytes: int | None = None  # the driver's own; None: never seen
         self._owner: dict[LeaseId, ProcessKey] = {}
-        self._total: int | None = None
+        self._total: int | None = None  # kept sums; None: to be counted again
+        self._approved: int | None = None
 
     # -- reading ---------------------------------------------------------------------------------------------------
     def total_bytes(self) -> int:
@@ -84,11 +85,15 @@ class GpuLedger:
         return sum(account.booked_bytes() for account in self.accounts.values())
 
     def approved_bytes(self) -> int:
-        return sum(account.approved_bytes() for account in self.accounts.values())
+        """Sum of what fitted when it was granted."""
+        if self._approved is None:
+            self._approved = sum(account.approved_bytes() for account in self.accounts.values())
+        return self._approved
 
     def pressure_bytes(self) -> int:
-        """By how much everything together exceeds the budget."""
-        return max(0, self.total_bytes() - self.budget_bytes)
+        """By how much everything together exceeds the budget; less than the tolerance is no pressure."""
+        over = self.total_bytes() - self.budget_bytes
+        return over if over > self._tolerance_bytes else 0
 
     def charge_bytes(self, lease: LeaseId) -> int:
         owner = self._owner.get(lease)
@@ -155,15 +160,12 @@ class GpuLedger:
             booked = max(
                 sum(c.booked_bytes for c in account.charges.values()) + more_bytes, account.residue_bytes
             )
-            return self._with_evidence(booked, account.measured_bytes)
+            return max(booked, account.measured_bytes)
         staying = sum(charge.booked_bytes for lease, charge in account.charges.items() if lease not in going)
         return max(staying + more_bytes, account.residue_floor_bytes, *going.values())
 
     def _occupied(self, account: Account) -> int:
-        return self._with_evidence(account.booked_bytes(), account.measured_bytes)
-
-    def _with_evidence(self, booked_bytes: int, measured_bytes: int) -> int:
-        return measured_bytes if measured_bytes > booked_bytes + self._tolerance_bytes else booked_bytes
+        return max(account.booked_bytes(), account.measured_bytes)
 
     def _stranger_of(self, process: ProcessKey) -> Stranger | None:
         return self.strangers.get(process) or self.strangers.get(ProcessKey(process.pid, 0))
@@ -273,7 +275,7 @@ class GpuLedger:
     def _changed(self, account: Account, now: float) -> None:
         account.changed_at = now
         account.measured_bytes = 0  # older evidence no longer says anything about this account
-        self._total = None
+        self._total = self._approved = None
 
 
 def process_bytes(sample: MemorySampled, process: ProcessKey) -> int | None:

@@ -66,7 +66,7 @@ def note_pressure(core: Core, gpu: Gpu) -> None:
     over = [
         {"pid": account.process.pid, "over_bytes": gpu.ledger.drift_bytes(account.process)}
         for account in gpu.ledger.accounts.values()
-        if gpu.ledger.drift_bytes(account.process)
+        if gpu.ledger.drift_bytes(account.process) > core.settings.verify_tolerance_bytes
     ]
     core.note(
         "pressure",

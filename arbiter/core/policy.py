@@ -289,10 +289,10 @@ def _greedy(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId
     return plan
 
 
-def spare_beside_bytes(core: Core, gpu: Gpu, head: Lease, going: Mapping[LeaseId, int]) -> int:
+def spare_beside_bytes(gpu: Gpu, head: Lease, going: Mapping[LeaseId, int], *, planned: bool) -> int:
     """How much a waiter behind the head may take and stay without delaying it.
 
-    Counts what the head's plan frees; while there is no plan, everything that could ever be freed.
+    Counts what the head's plan frees (`planned`: `going` is enough for it); without a plan, everything that could ever be freed.
     """
-    freed = going if fits(gpu, head, going) else {**_leave(list(gpu.residents.values())), **going}
+    freed = going if planned else {**_leave(list(gpu.residents.values())), **going}
     return gpu.ledger.budget_bytes - gpu.ledger.total_if(freed, (head.process, head.load_peak_bytes))

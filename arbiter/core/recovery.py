@@ -5,6 +5,7 @@ at baseline) nothing is granted. Recovered bytes are charged from the first mome
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from arbiter.core import eviction, explain
@@ -70,13 +71,14 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
         story=[(core.now, LeaseState.HELD, "recovered from the journal")],
     )
     _place(core, gpu, lease, int(record["charge_bytes"]))
+    core.nonces[process, lease.nonce] = lease_id
     if state == "debt":
         gpu.ledger.to_debt(lease_id)
         begin_for_lease(core, gpu, lease, alive=True)
         core.remember(Ended(lease_id, process, lease.nonce, token, LeaseState.LOST, lost_error(lease_id)))
         return
-    core.leases[lease_id] = gpu.residents[lease_id] = lease
-    core.nonces[process, lease.nonce] = lease_id
+    core.add(lease)
+    gpu.residents[lease_id] = lease
     if lease.state is LeaseState.VERIFYING:
         begin_for_lease(core, gpu, lease, alive=True)
         return
@@ -150,7 +152,11 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
             "not_permitted", f"{item.lease} belongs to process {lease.process.pid}", "ask as its holder"
         )
     lease.client = client.id
-    lease.attached = True
+    if not lease.attached:
+        lease.attached = True
+        lease.ready_at = (
+            core.now
+        )  # its residency begins anew: who marked uses on it may still be on the way back
     if lease.state is LeaseState.LOADING and item.held:  # its `ready` was lost
         become_held(core, lease, item.measured_bytes)
         core.record_lease(lease)
@@ -168,8 +174,10 @@ def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLeas
             del lease.uses[key]
     if lease.state in (LeaseState.HELD, LeaseState.REVOKING):
         for use_id in item.uses:
+            key = (client.process, use_id)
+            known = lease.uses.get(key)
             began = Use(use_id, client.id, client.process, "", core.now)
-            lease.uses.setdefault((client.process, use_id), began)
+            lease.uses[key] = began if known is None else replace(known, client=client.id)
     eviction.ask_again(core, lease)
     core.wake(core.gpu_of(lease))
 
@@ -213,7 +221,8 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
         story=[(core.now, LeaseState.HELD, "adopted: the journal did not know it")],
     )
     _place(core, gpu, lease, charge)
-    core.leases[lease.id] = gpu.residents[lease.id] = lease
+    core.add(lease)
+    gpu.residents[lease.id] = lease
     core.nonces[lease.process, lease.nonce] = lease.id
     core.record_lease(lease)
     return lease

@@ -4,6 +4,8 @@ Who may: leases belong to a process, so a request on a lease must come from a cl
 and ended by anyone who knows the exact token: that is how a runner marks a goal on its policy sidecar's lease.
 """
 
+from dataclasses import replace
+
 from arbiter.core import eviction, explain
 from arbiter.core.events import (
     AcquireRequested,
@@ -109,7 +111,7 @@ def acquire(core: Core, event: AcquireRequested) -> None:
     gpus = _places(core, spec, load_peak)
     if len(core.waiting) >= core.settings.waiters_max:
         raise Refused("limit_exceeded", "too many wait already", "try again later", limit="waiters_max")
-    owned = sum(1 for lease in core.leases.values() if lease.client == client.id)
+    owned = sum(1 for lease in core.leases_of(client.process) if lease.client == client.id)
     if owned >= core.settings.leases_per_client_max:
         raise Refused(
             "limit_exceeded",
@@ -134,7 +136,8 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         traceparent=event.traceparent,
         story=[(core.now, LeaseState.QUEUED, "acquired")],
     )
-    core.leases[lease.id] = core.waiting[lease.id] = lease
+    core.add(lease)
+    core.waiting[lease.id] = lease
     core.nonces[nonce] = lease.id
     for gpu_id in gpus:
         core.gpus[gpu_id].queue.add(lease)
@@ -149,9 +152,9 @@ def answer_queued(core: Core) -> None:
     for lease in core.unanswered:
         if lease.state is LeaseState.QUEUED and not lease.answered and lease.request is not None:
             lease.answered = True
-            explained = explain.explain_lease(core, lease)
-            core.note("queued", lease, position=explained["position"], reason=explained["text"])
-            core.reply(lease.client, lease.request, {"state": "queued", "lease": explain.view(core, lease)})
+            view = explain.view(core, lease)
+            core.note("queued", lease, position=view["position"], reason=explain.wait_reason(core, lease))
+            core.reply(lease.client, lease.request, {"state": "queued", "lease": view})
     core.unanswered.clear()
 
 
@@ -298,7 +301,8 @@ def use_begin(core: Core, event: UseBegan) -> None:
     client = client_of(core, event.client)
     lease = lease_for(core, event.lease, event.token)
     key = (client.process, event.use)
-    if key in lease.uses:
+    if key in lease.uses:  # a repeat, perhaps on a new connection: it ends with that one
+        lease.uses[key] = replace(lease.uses[key], client=client.id)
         core.reply(event.client, event.request, {"uses": len(lease.uses)})
         return
     if lease.state in LEAVING:

@@ -102,6 +102,7 @@ class Core:
             for info in sorted(settings.gpus, key=lambda info: info.index)
         }
         self.leases: dict[LeaseId, Lease] = {}
+        self._of_process: dict[ProcessKey, dict[LeaseId, Lease]] = {}
         self.waiting: dict[LeaseId, Lease] = {}
         self.nonces: dict[tuple[ProcessKey, str], LeaseId] = {}
         self.clients: dict[ClientId, Client] = {}
@@ -184,6 +185,15 @@ class Core:
         """Something changed that a waiter of this card may have waited for."""
         gpu.dirty = True
 
+    def add(self, lease: Lease) -> None:
+        """A lease begins to live."""
+        self.leases[lease.id] = lease
+        self._of_process.setdefault(lease.process, {})[lease.id] = lease
+
+    def leases_of(self, process: ProcessKey) -> list[Lease]:
+        """Live leases of a process, oldest first."""
+        return list(self._of_process.get(process, {}).values())
+
     def dequeue(self, lease: Lease) -> None:
         self.waiting.pop(lease.id, None)
         self.timers.clear(("wait", lease.id))
@@ -194,6 +204,10 @@ class Core:
     def end(self, lease: Lease, error: Mapping[str, Any] | None) -> None:
         """Drop a lease that reached a terminal state; a bounded memory of it stays."""
         del self.leases[lease.id]
+        siblings = self._of_process[lease.process]
+        del siblings[lease.id]
+        if not siblings:
+            del self._of_process[lease.process]
         for kind in ("ttl", "revoke"):
             self.timers.clear((kind, lease.id))
         if lease.gpu is not None:
@@ -206,8 +220,7 @@ class Core:
         self.ended[ended.lease] = ended
         while len(self.ended) > ENDED_REMEMBERED:
             _, oldest = self.ended.popitem(last=False)
-            if self.nonces.get((oldest.process, oldest.nonce)) == oldest.lease:
-                del self.nonces[oldest.process, oldest.nonce]
+            self.nonces.pop((oldest.process, oldest.nonce), None)
 
     def learn(self, consumer: str, phase: str, seconds: float) -> None:
         """Remember how long a phase (`drain_s`, `unload_s`, `verify_s`, `load_s`) took for a consumer."""

@@ -21,7 +21,7 @@ MAX_TOKENS = 512
 
 SYSTEM = """You control a mobile robot with one arm by calling tools, one at a time.
 Find the named object, drive to it (execute_rskill of the navigation skill with goal_params_json {"target_point": {"x", "y", "z"}} taken from locate_in_view),
-grab it, and ask the scene model whether it is grasped. After a failed grasp look again and retry, at most three attempts.
+grab it, and ask the scene model, camera "wrist", whether it is grasped. After a failed grasp look again and retry, at most three attempts.
 "evicted" or "error" means that nothing was looked at: it never means that the object is absent. Call `finish` when done."""
 
 NUDGE = "Answer with exactly one tool call."

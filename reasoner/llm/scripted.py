@@ -19,6 +19,7 @@ LOOKS_MAX = 3  # repeats of a locate that gave no answer about the scene
 TURNS_RAD = (0.35, -0.70, 0.35)  # look left, look right, back to the middle
 NAVIGATE_DEADLINE_S = 60.0
 GRAB_DEADLINE_S = 60.0
+GRASP_CAMERA = "wrist"  # looks at the fingers: what they hold cannot hide behind the arm
 
 _TASK = re.compile(
     r"\s*(?:grab|grasp|pick up|pick|fetch|take|lift)\s+(?:the\s+|a\s+|an\s+)?(.+?)\s*\.?\s*", re.IGNORECASE
@@ -69,19 +70,21 @@ class ScriptedPlanner:
 def _script(thing: str, navigate: str, grab: str, *, can_query: bool) -> Script:
     if can_query:
         yield QueryScene(
-            question="Which objects are on the table?", rationale="get an overview before moving"
+            question="What is the gripper holding?",
+            camera=GRASP_CAMERA,
+            rationale="know the hand before moving",
         )
     reason = ""
     for attempt in range(1, ATTEMPTS_MAX + 1):
-        point = yield from _find(thing, navigate)
-        if point is None:
-            return Finish(False, reason or f"the {thing} was not seen")
-        arrived = yield _drive(navigate, point, f"stand in front of the {thing}")
+        found = yield from _find(thing, navigate)
+        if isinstance(found, str):
+            return Finish(False, found)
+        arrived = yield _drive(navigate, found, f"stand in front of the {thing}")
         if arrived.status != "succeeded":
             reason = f"could not drive to the {thing}: {arrived.text}"
             continue
         closer = yield from _locate(thing)
-        if closer is not None:
+        if isinstance(closer, Point):
             yield _drive(navigate, closer, "correct what the view from afar got wrong")
         outcome = yield ExecuteRskill(
             rskill_id=grab,
@@ -101,32 +104,37 @@ def _script(thing: str, navigate: str, grab: str, *, can_query: bool) -> Script:
     return Finish(False, reason)
 
 
-def _find(thing: str, navigate: str) -> Generator[ToolCall, Outcome, Point | None]:
-    """Look; where it is not seen, turn and look again."""
+def _find(thing: str, navigate: str) -> Generator[ToolCall, Outcome, Point | str]:
+    """Look; where a detector that really looked does not see it, turn and look again. A text says why there is no point."""
     for turn in (*TURNS_RAD, None):
-        point = yield from _locate(thing)
-        if point is not None or turn is None:
-            return point
-        yield ExecuteRskill(
-            rskill_id=navigate, deadline_s=NAVIGATE_DEADLINE_S, rationale=f"the {thing} is not in view: look around",
-            goal_params_json=json.dumps({"turn_rad": turn}),
-        )  # fmt: skip
-    return None
+        looked = yield from _locate(thing)
+        if isinstance(looked, Point):
+            return looked
+        if looked.status != "not_seen":
+            return f"could not look for the {thing}: {looked.text}"
+        if turn is not None:
+            yield ExecuteRskill(
+                rskill_id=navigate, deadline_s=NAVIGATE_DEADLINE_S, rationale=f"the {thing} is not in view: look around",
+                goal_params_json=json.dumps({"turn_rad": turn}),
+            )  # fmt: skip
+    return f"the {thing} was not seen"
 
 
-def _locate(thing: str) -> Generator[ToolCall, Outcome, Point | None]:
+def _locate(thing: str) -> Generator[ToolCall, Outcome, Point | Outcome]:
+    """Where it stands, or the last outcome: only `not_seen` says something about the scene, everything else is tried again."""
+    outcome = Outcome("error", "never looked")
     for _ in range(LOOKS_MAX):
         outcome = yield LocateInView(query=thing, rationale=f"where is the {thing}?")
         if outcome.status == "found":
             return Point(*outcome.data["point_base_m"])
         if outcome.status == "not_seen":
-            return None
-    return None
+            break
+    return outcome
 
 
 def _ask(question: str) -> Generator[ToolCall, Outcome, str | None]:
     for _ in range(LOOKS_MAX):
-        outcome = yield QueryScene(question=question)
+        outcome = yield QueryScene(question=question, camera=GRASP_CAMERA)
         if outcome.status == "answered":
             return outcome.text
     return None

@@ -1,8 +1,8 @@
 """Writes the datasets that the training scripts read: `python -m runner.sim.dataset grab|scenes --out DIR`.
 
 `scenes`: PNG frames of the front and wrist cameras and `labels.jsonl`, one JSON object a frame (boxes, names, what is held).
-`grab`: demonstrations as `frames.npz`-style arrays, because a step is two tiny images and six numbers: random access by
-index is all the trainer needs, and a video codec would blur objects that are twelve pixels wide.
+`grab`: demonstrations as plain .npy arrays and `info.json`, because a step is two tiny images and six numbers: random
+access by index is all the trainer needs, and a video codec would blur objects that are twelve pixels wide.
 The programs meet on files only: trainers live in `sidecars/`, which never imports the runner.
 """
 

@@ -75,6 +75,7 @@ class SimEnv:
         self._layout: Layout | None = None
         self._model: Any = None
         self._data: Any = None
+        self.steps = 0  # control steps since the reset
 
     # -- life --------------------------------------------------------------------------------------------------
     def reset(self, seed: int, *, names: tuple[str, ...] | None = None) -> None:
@@ -171,7 +172,7 @@ class SimEnv:
             self._data.ctrl[uyaw] += dt * turn
             mujoco.mj_step(self._model, self._data)
         mujoco.mj_forward(self._model, self._data)
-        self.steps = getattr(self, "steps", 0) + 1
+        self.steps += 1
 
     # -- state the robot itself knows ----------------------------------------------------------------------------
     @property

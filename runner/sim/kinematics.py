@@ -48,32 +48,21 @@ class ArmKinematics:
         start: Sequence[float],
         *,
         roll_rad: float = 0.0,
-        pitch_rad: float = 0.0,
     ) -> tuple[list[float], float]:
-        """Joint angles (all six; the gripper's is `start`'s) and the position error left, in metres.
-
-        `pitch_rad` tips the fingers outward from straight down, towards the front.
-        """
+        """Joint angles (all six; the gripper's is `start`'s) and the position error left, in metres."""
         np, mujoco = self._np, self._mujoco
         goal = np.asarray(point_base_m, dtype=float) - self._mount
         joints = np.asarray(start, dtype=float).copy()
         joints[4] = roll_rad
         jac_p, jac_r = np.zeros((3, self._model.nv)), np.zeros((3, self._model.nv))
+        down = np.array([0.0, 0.0, -1.0])
         error = math.inf
         for _ in range(ITERATIONS):
             self._pose(joints)
             offset = goal - self._data.site_xpos[self._site]
             error = float(np.linalg.norm(offset))
             fingers = -self._data.body("gripper").xmat.reshape(3, 3)[:, 2]
-            heading = math.atan2(goal[1], goal[0] - 0.0388)
-            wanted = np.array(
-                [
-                    math.sin(pitch_rad) * math.cos(heading),
-                    math.sin(pitch_rad) * math.sin(heading),
-                    -math.cos(pitch_rad),
-                ]
-            )
-            tilt = np.cross(fingers, wanted)
+            tilt = np.cross(fingers, down)
             if error < TOLERANCE_M and float(np.linalg.norm(tilt)) < 0.01:
                 break
             mujoco.mj_jacSite(self._model, self._data, jac_p, jac_r, self._site)

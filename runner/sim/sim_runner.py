@@ -112,7 +112,7 @@ class SimRunner(RunnerBase):
         self._episodes_wanted = episodes
         self._max_steps = max_steps
         self._judge = judge
-        self._recorder = recorder
+        self.recorder = recorder  # may be set while running
         self._video_camera = video_camera
         self._video_every = video_every
         self._video_picture: Any = None
@@ -336,11 +336,12 @@ class SimRunner(RunnerBase):
         return applied
 
     def _record(self, *, closing: bool) -> None:
-        if self._recorder is None or (self.tick_idx % self._video_every and not closing):
+        recorder = self.recorder
+        if recorder is None or (self.tick_idx % self._video_every and not closing):
             return
         if self._video_picture is None or self._idle_ticks < STILL_AFTER_TICKS:
             self._video_picture = self.env.render(self._video_camera)
-        self._recorder.submit(self._video_picture, (*self.caption, f"t = {self.env.time_s:.1f} s"))
+        recorder.submit(self._video_picture, (*self.caption, f"t = {self.env.time_s:.1f} s"))
 
     # -- observation ----------------------------------------------------------------------------------------------------
     def _world(self, frames: dict[str, SensorFrame] | None) -> WorldState:

@@ -15,6 +15,11 @@ from schemas.errors import VramError
 
 log = logging.getLogger(__name__)
 
+EVICT_S = (
+    30.0  # a skill that needs longer to leave is left behind: whoever measures the card decides what is free
+)
+CLOSE_S = 3.0  # the runner ends: its sidecar may be ending too
+
 
 class Residency:
     """`acquire(key, make)` returns the resident skill of a key, making it if need be."""
@@ -40,26 +45,27 @@ class Residency:
             if not skill.holds_gpu:
                 self._free[key] = skill
                 return skill
-            await self._evict()
+            await self._evict(EVICT_S)
             self._resident = skill
             return skill
 
-    async def _evict(self) -> None:
+    async def _evict(self, timeout_s: float) -> None:
         if (leaving := self._resident) is not None:
             self._resident = None
-            await _release(leaving)
+            await _release(leaving, timeout_s)
 
     async def close(self) -> None:
         """Release everything."""
         async with self._lock:
-            await self._evict()
+            await self._evict(CLOSE_S)
             for skill in self._free.values():
-                await _release(skill)
+                await _release(skill, CLOSE_S)
             self._free.clear()
 
 
-async def _release(skill: Skill) -> None:
+async def _release(skill: Skill, timeout_s: float) -> None:
     try:
-        await skill.release()
-    except VramError as error:  # its process may be gone; whoever measures the card decides what is free
-        log.warning("%s did not release cleanly: %s", skill.key, error)
+        async with asyncio.timeout(timeout_s):
+            await skill.release()
+    except (VramError, TimeoutError) as error:  # its process may be gone
+        log.warning("%s did not release cleanly: %s", skill.key, error or f"not within {timeout_s:.0f} s")

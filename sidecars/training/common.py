@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import itertools
 import json
+import math
 import os
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -106,6 +108,11 @@ def _frame(folder: Path, raw: Mapping[str, Any]) -> Frame:
     )
 
 
+def visible_names(frame: Frame) -> list[str]:
+    """Names of what clearly shows, from left to right."""
+    return [o.name for o in sorted(frame.objects, key=lambda o: o.box[0] + o.box[2]) if o.clear]
+
+
 def split_by_scene(frames: Sequence[Frame], held_out: float, seed: int) -> tuple[list[Frame], list[Frame]]:
     """(training, held-out) frames; whole scenes go to one side, at least one scene to each."""
     scenes = sorted({frame.scene for frame in frames})
@@ -135,7 +142,7 @@ def load_pixels(frames: Sequence[Frame], size: tuple[int, int]) -> Any:
     import torch
     from PIL import Image
 
-    out = np.empty((len(frames), size[1], size[0], 3), dtype=np.uint8)
+    out: Any = np.empty((len(frames), size[1], size[0], 3), dtype=np.uint8)
     for index, frame in enumerate(frames):
         with Image.open(frame.image) as image:
             rgb = image.convert("RGB")
@@ -157,8 +164,6 @@ def jitter_colours(images: Any, generator: Any, strength: float) -> Any:
 
 def cosine_with_warmup(step: int, total: int, warmup: int) -> float:
     """Factor on the learning rate: linear to 1 over `warmup` steps, then a cosine down to 0.02."""
-    import math
-
     if step < warmup:
         return (step + 1) / warmup
     done = min(1.0, (step - warmup) / max(1, total - warmup))
@@ -184,7 +189,7 @@ def learn_merges(words: Iterable[str], *, suffix: str) -> tuple[list[str], list[
     while True:
         pairs: collections.Counter[tuple[str, str]] = collections.Counter()
         for parts in pieces.values():
-            pairs.update(zip(parts, parts[1:], strict=False))
+            pairs.update(itertools.pairwise(parts))
         if not pairs:
             return tokens, merges
         best = min(pairs, key=lambda pair: (-pairs[pair], pair))

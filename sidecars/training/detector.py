@@ -22,6 +22,16 @@ from typing import Any, Final
 
 from sidecars.training import common, queries
 from sidecars.training.common import Frame
+from sidecars.training.detector_report import (
+    CARD,
+    area,
+    card_rows,
+    choose_threshold,
+    corners,
+    inference_ms,
+    rates,
+    run_trials,
+)
 
 PAD, START, END = "<|pad|>", "<|startoftext|>", "<|endoftext|>"
 MAX_TOKENS: Final = 16
@@ -82,7 +92,9 @@ def build_processor(folder: Path, image_px: int, words: Sequence[str]) -> Any:
     build_tokenizer(folder, words)
     size = {"height": image_px, "width": image_px}
     image_processor = OwlViTImageProcessor(size=size, crop_size=size, do_center_crop=False)
-    processor = OwlViTProcessor(image_processor=image_processor, tokenizer=CLIPTokenizer.from_pretrained(folder))
+    processor = OwlViTProcessor(
+        image_processor=image_processor, tokenizer=CLIPTokenizer.from_pretrained(folder)
+    )
     processor.save_pretrained(folder)
     return processor
 
@@ -145,7 +157,9 @@ def _sine_table(side: int, width: int) -> Any:
     return torch.nn.functional.pad(grid.reshape(side * side, -1), (0, width - 4 * quarter))
 
 
-def teach_words(model: Any, tokenizer: Any, recipe: Recipe, colours: Sequence[str], shapes: Sequence[str]) -> float:
+def teach_words(
+    model: Any, tokenizer: Any, recipe: Recipe, colours: Sequence[str], shapes: Sequence[str]
+) -> float:
     """Fit the text tower alone: a query's vector is its colour's code plus its shape's, or the code of `nothing`.
 
     The codes are random orthogonal directions; the image side then has fixed targets from its first step, where
@@ -162,17 +176,26 @@ def teach_words(model: Any, tokenizer: Any, recipe: Recipe, colours: Sequence[st
     for step in range(recipe.word_steps):
         for group in optimizer.param_groups:
             group["lr"] = 2e-3 * common.cosine_with_warmup(step, recipe.word_steps, 30)
-        asked = [q for _ in range(4) for q in queries.sample_queries(rng, colours, shapes, 3 * recipe.strange_queries)]
+        asked = [
+            q
+            for _ in range(4)
+            for q in queries.sample_queries(rng, colours, shapes, 3 * recipe.strange_queries)
+        ]
         batch = tokenizer([q.text for q in asked], padding="max_length", truncation=True, return_tensors="pt")
         wanted = torch.stack(
             [
-                sum((code[part] for part in (q.colour, q.shape) if part is not None), torch.zeros(recipe.text_width))
+                sum(
+                    (code[part] for part in (q.colour, q.shape) if part is not None),
+                    torch.zeros(recipe.text_width),
+                )
                 if q.known
                 else code[""]
                 for q in asked
             ]
         )
-        got = project(text(input_ids=batch["input_ids"], attention_mask=batch["attention_mask"]).pooler_output)
+        got = project(
+            text(input_ids=batch["input_ids"], attention_mask=batch["attention_mask"]).pooler_output
+        )
         cosine = torch.nn.functional.cosine_similarity(got, wanted)
         loss = (1.0 - cosine).mean()
         optimizer.zero_grad()
@@ -205,7 +228,7 @@ def make_targets(things: Sequence[Sequence[tuple[str, Any, bool]]], side: int) -
     half = 0.5 / side
     for b, row in enumerate(things):
         # the smallest last: where two things share a patch, it goes to the smaller
-        for t, (_, box, clear) in sorted(enumerate(row), key=lambda item: -_area(item[1][1])):
+        for t, (_, box, clear) in sorted(enumerate(row), key=lambda item: -area(item[1][1])):
             x0, y0, x1, y1 = (float(v) for v in box)
             cx, cy, w, h = (x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0
             boxes[b, t] = torch.tensor([cx, cy, w, h])
@@ -217,11 +240,9 @@ def make_targets(things: Sequence[Sequence[tuple[str, Any, bool]]], side: int) -
     return Targets([[name for name, _, _ in row] for row in things], boxes, owner, touched)
 
 
-def _area(box: Any) -> float:
-    return float((box[2] - box[0]) * (box[3] - box[1]))
-
-
-def loss_of(model: Any, pixels: Any, targets: Targets, asked: Sequence[queries.Query], ids: Any, mask: Any) -> Any:
+def loss_of(
+    model: Any, pixels: Any, targets: Targets, asked: Sequence[queries.Query], ids: Any, mask: Any
+) -> Any:
     """Focal classification over (patch, query) plus box loss over owning patches."""
     import torch
     from torch.nn import functional
@@ -263,14 +284,8 @@ def loss_of(model: Any, pixels: Any, targets: Targets, asked: Sequence[queries.Q
     if len(truth) == 0:
         return class_loss
     box_loss = functional.l1_loss(mine, truth, reduction="sum") / len(truth)
-    iou_loss = generalized_box_iou_loss(_corners(mine), _corners(truth), reduction="mean")
+    iou_loss = generalized_box_iou_loss(corners(mine), corners(truth), reduction="mean")
     return class_loss + 3.0 * box_loss + 0.5 * iou_loss
-
-
-def _corners(boxes: Any) -> Any:
-    import torch
-
-    return torch.cat([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2], dim=1)
 
 
 def augment(
@@ -290,7 +305,9 @@ def augment(
         x, y = rng.uniform(0, width - w), rng.uniform(0, height - h)
         x0, y0, x1, y1 = round(x), round(y), round(x + w), round(y + h)
         crop = images[index : index + 1, :, y0:y1, x0:x1].float() / 255.0
-        crop = functional.interpolate(crop, (size_px, size_px), mode="bilinear", antialias=True, align_corners=False)
+        crop = functional.interpolate(
+            crop, (size_px, size_px), mode="bilinear", antialias=True, align_corners=False
+        )
         mirror = rng.random() < 0.5
         out[index] = crop[0].flip(-1) if mirror else crop[0]
         row: list[tuple[str, Any, bool]] = []
@@ -350,7 +367,9 @@ def train(recipe: Recipe, frames: Sequence[Frame], out: Path) -> tuple[Any, Any,
             [query.text for query in asked], padding="max_length", truncation=True, return_tensors="pt"
         )
         targets = make_targets(things, recipe.image_px // recipe.patch_px)
-        loss = loss_of(model, (images - mean) / std, targets, asked, text["input_ids"], text["attention_mask"])
+        loss = loss_of(
+            model, (images - mean) / std, targets, asked, text["input_ids"], text["attention_mask"]
+        )
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -362,166 +381,17 @@ def train(recipe: Recipe, frames: Sequence[Frame], out: Path) -> tuple[Any, Any,
             recent = sum(losses[-50:]) / len(losses[-50:])
             print(f"{time.monotonic() - started:6.0f} s  step {step:5d}  loss {recent:.3f}", flush=True)
     model.eval()
-    return processor, model, {
-        "steps": step,
-        "train_frames": len(frames),
-        "train_s": round(time.monotonic() - started, 1),
-        "loss_first": round(sum(losses[:10]) / len(losses[:10]), 3),
-        "loss_last": round(sum(losses[-10:]) / len(losses[-10:]), 3),
-    }
-
-
-@dataclasses.dataclass(slots=True)
-class Trial:
-    """One (frame, query): what should be found, and the best box with its score."""
-
-    stage: str
-    known: bool
-    truth: tuple[float, float, float, float] | None
-    score: float
-    box: tuple[float, float, float, float]
-
-    def right_place(self) -> bool:
-        """Whether the best box is on the thing: IoU of 0.4 or centres within 8 pixels."""
-        if self.truth is None:
-            return False
-        a, b = self.truth, self.box
-        wide = max(0.0, min(a[2], b[2]) - max(a[0], b[0]))
-        high = max(0.0, min(a[3], b[3]) - max(a[1], b[1]))
-        union = _area(a) + _area(b) - wide * high
-        return wide * high >= 0.4 * union or self.centre_error_px() <= 8.0
-
-    def centre_error_px(self) -> float:
-        """Distance of the box centres in pixels of the frame."""
-        assert self.truth is not None
-        a, b = self.truth, self.box
-        return float(((a[0] + a[2] - b[0] - b[2]) ** 2 + (a[1] + a[3] - b[1] - b[3]) ** 2) ** 0.5 / 2)
-
-
-def run_trials(processor: Any, model: Any, frames: Sequence[Frame], seed: int) -> list[Trial]:
-    """Ask every frame for all names there are, in random words, and for things that exist nowhere.
-
-    A query's scores do not depend on the queries beside it, so one call asks them all.
-    """
-    import torch
-    from PIL import Image
-
-    rng = random.Random(f"evaluate-{seed}")
-    colours = sorted({name.split(" ")[0] for frame in frames for name in frame.present})
-    shapes = sorted({name.split(" ")[1] for frame in frames for name in frame.present})
-    trials: list[Trial] = []
-    for frame in frames:
-        asked = [q for q in queries.sample_queries(rng, colours, shapes, 4) if q.known == (q.shape is not None)]
-        asked += [
-            queries.Query(f"{rng.choice(colours)} {thing}", None, None, known=False)
-            for thing in rng.sample(queries.UNTAUGHT_THINGS, 2)
-        ]
-        with Image.open(frame.image) as image:
-            rgb = image.convert("RGB")
-        inputs = processor(text=[[query.text for query in asked]], images=rgb, return_tensors="pt")
-        with torch.inference_mode():
-            outputs = model(**inputs)
-        scores, best = outputs.logits[0].sigmoid().max(dim=0)
-        scale = torch.tensor([rgb.width, rgb.height, rgb.width, rgb.height])
-        boxes = _corners(outputs.pred_boxes[0][best]) * scale
-        for query, score, box in zip(asked, scores.tolist(), boxes.tolist(), strict=True):
-            if query.known and query.colour is None:
-                continue
-            hits = [seen for seen in frame.objects if query.matches(seen.colour, seen.shape)]
-            if hits and not hits[0].clear:
-                continue
-            trials.append(Trial(frame.stage, query.known, hits[0].box if hits else None, score, tuple(box)))
-    return trials
-
-
-def choose_threshold(trials: Sequence[Trial]) -> float:
-    """The score that loses least: misses of what is there plus alarms for what is not, both as rates."""
-
-    def cost(threshold: float) -> float:
-        found = rates(trials, threshold)
-        return (1.0 - found["found"]) + found["false_alarm"]
-
-    steps = [round(0.05 * n, 2) for n in range(2, 17)]
-    least = min(cost(t) for t in steps)
-    good = [t for t in steps if cost(t) <= least + 0.001]
-    return good[len(good) // 2]
-
-
-def rates(trials: Sequence[Trial], threshold: float) -> dict[str, float]:
-    """Found and false-alarm rates at a threshold, with the counts they stand on."""
-    there = [t for t in trials if t.truth is not None]
-    absent = [t for t in trials if t.truth is None and t.known]
-    strange = [t for t in trials if not t.known]
-    found = [t for t in there if t.score > threshold and t.right_place()]
-    errors = sorted(t.centre_error_px() for t in found)
-    return {
-        "asked": len(there),
-        "found": round(len(found) / max(1, len(there)), 4),
-        "centre_error_px_p95": round(errors[int(0.95 * (len(errors) - 1))], 2) if errors else -1.0,
-        "absent": len(absent),
-        "false_alarm": round(sum(t.score > threshold for t in absent) / max(1, len(absent)), 4),
-        "strange": len(strange),
-        "strange_alarm": round(sum(t.score > threshold for t in strange) / max(1, len(strange)), 4),
-    }
-
-
-def inference_ms(processor: Any, model: Any, frame: Frame) -> float:
-    """Median milliseconds of one query on one image, pre- and post-processing included."""
-    import torch
-    from PIL import Image
-
-    with Image.open(frame.image) as image:
-        rgb = image.convert("RGB")
-    times: list[float] = []
-    for _ in range(15):
-        began = time.perf_counter()
-        inputs = processor(text=[["red cube"]], images=rgb, return_tensors="pt")
-        with torch.inference_mode():
-            outputs = model(**inputs)
-        processor.post_process_grounded_object_detection(
-            outputs, threshold=0.3, target_sizes=[(rgb.height, rgb.width)], text_labels=[["red cube"]]
-        )
-        times.append(1000 * (time.perf_counter() - began))
-    return round(sorted(times)[len(times) // 2], 1)
-
-
-CARD: Final = """---
-license: apache-2.0
-library_name: transformers
-pipeline_tag: zero-shot-object-detection
----
-# so101-detector
-
-The demo's open-vocabulary detector: an OwlViT of {parameters} parameters, trained from scratch on frames of the simulated
-tabletop by `python -m sidecars.training.detector` (no pretrained weights). It stands in for a production detector, is read by
-`AutoProcessor` / `AutoModelForZeroShotObjectDetection` like one, and knows coloured cubes, balls and cylinders only.
-
-- Camera `{camera}`; frames are scaled to {image_px} x {image_px} by the processor. Recommended `score_threshold`: {threshold}.
-- Query with free text (`red cube`, `a photo of a blue ball`, `green object`). Several boxes may lie on one thing: take the best.
-- Data: `python -m runner.sim.dataset scenes --count 8000 --seed 1`; {train_frames} frames to train, {test_frames} held out by scene.
-- Training: seed {seed}, {steps} steps of {batch}, {train_s} s on {threads} thread(s), bfloat16 autocast; checkpoint float32, {bytes} bytes.
-- One query on one image: {inference_ms} ms on one core, pre- and post-processing included.
-
-Held out, at the threshold (found: best box above it with IoU >= 0.4 or centre within 8 px; false alarm: any box above it for a
-(colour, shape) that the scene lacks; strange: the same for words that training never saw; things with fewer than
-{min_pixels} visible pixels are not asked for):
-
-| frames | asked | found | centre error p95 (px) | absent asked | false alarm | strange asked | strange alarm |
-| --- | --- | --- | --- | --- | --- | --- | --- |
-{rows}
-"""
-
-
-def card_rows(trials: Sequence[Trial], threshold: float) -> str:
-    """One table row over everything, then one per stage of the episode."""
-    rows = []
-    for stage in ("all", *sorted({t.stage for t in trials})):
-        r = rates([t for t in trials if stage in ("all", t.stage)], threshold)
-        rows.append(
-            f"| {stage} | {r['asked']} | {r['found']:.2%} | {r['centre_error_px_p95']} | {r['absent']} | "
-            f"{r['false_alarm']:.2%} | {r['strange']} | {r['strange_alarm']:.2%} |"
-        )
-    return "\n".join(rows)
+    return (
+        processor,
+        model,
+        {
+            "steps": step,
+            "train_frames": len(frames),
+            "train_s": round(time.monotonic() - started, 1),
+            "loss_first": round(sum(losses[:10]) / len(losses[:10]), 3),
+            "loss_last": round(sum(losses[-10:]) / len(losses[-10:]), 3),
+        },
+    )
 
 
 def run(recipe: Recipe, data: Path, out: Path) -> dict[str, Any]:
@@ -560,7 +430,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m sidecars.training.detector", description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder with labels.jsonl and images")
     parser.add_argument("--out", type=Path, required=True, help="folder for the checkpoint")
-    parser.add_argument("--smoke", action="store_true", help="a toy size, seconds, only to see that everything runs")
+    parser.add_argument(
+        "--smoke", action="store_true", help="a toy size, seconds, only to see that everything runs"
+    )
     parser.add_argument("--seed", type=int, default=Recipe().seed)
     parser.add_argument("--threads", type=int, default=Recipe().threads)
     args = parser.parse_args(argv)

@@ -227,12 +227,13 @@ def train(
     )
     running: dict[str, float] = {}
     began, done = time.monotonic(), 0
+    warm_steps = max(1, min(100, steps // 10))
     for step in range(steps):
         done = step + 1
         progress = max(step / steps, (time.monotonic() - began) / time_limit_s)
         if progress >= 1.0:
             break
-        warm = min(1.0, (step + 1) / 100)
+        warm = min(1.0, (step + 1) / warm_steps)
         for group in optimizer.param_groups:
             group["lr"] = (
                 config.optimizer_lr * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * progress)))
@@ -245,7 +246,7 @@ def train(
         optimizer.step()
         averaged.update_parameters(policy)
         for key, value in parts.items():
-            running[key] = value if key not in running else 0.98 * running[key] + 0.02 * value
+            running[key] = value if key not in running else 0.9 * running[key] + 0.1 * value
         if done % 200 == 0:
             line = {"step": done, "s": round(time.monotonic() - began, 1)}
             print(json.dumps(line | {k: round(v, 5) for k, v in running.items()}), flush=True)
@@ -289,7 +290,7 @@ def main(argv: list[str] | None = None) -> int:
     result = train(
         data,
         args.out,
-        steps=40 if args.smoke else args.steps,
+        steps=20 if args.smoke else args.steps,
         batch_size=16 if args.smoke else args.batch_size,
         seed=args.seed,
         action_steps=args.action_steps,

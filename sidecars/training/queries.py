@@ -42,13 +42,23 @@ class Query:
 
 def every_word(colours: Sequence[str], shapes: Sequence[str]) -> list[str]:
     """The words that a tokenizer should know as one piece, sorted."""
-    words = {*colours, *OTHER_COLOURS, *OTHER_THINGS, *THING_WORDS, *(s for s in shapes if s not in SHAPE_WORDS)}
-    words.update(word for shape in shapes for phrase in SHAPE_WORDS.get(shape, (shape,)) for word in phrase.split())
+    words = {
+        *colours,
+        *OTHER_COLOURS,
+        *OTHER_THINGS,
+        *THING_WORDS,
+        *(s for s in shapes if s not in SHAPE_WORDS),
+    }
+    words.update(
+        word for shape in shapes for phrase in SHAPE_WORDS.get(shape, (shape,)) for word in phrase.split()
+    )
     words.update(word for phrase in PHRASES for word in phrase.replace("{}", " ").replace(".", " ").split())
     return sorted(words)
 
 
-def sample_queries(rng: random.Random, colours: Sequence[str], shapes: Sequence[str], strange: int) -> list[Query]:
+def sample_queries(
+    rng: random.Random, colours: Sequence[str], shapes: Sequence[str], strange: int
+) -> list[Query]:
     """Every (colour, shape), every colour, every shape in random words, and `strange` that nothing can answer."""
     out: list[Query] = []
     for colour in colours:

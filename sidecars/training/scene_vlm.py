@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from sidecars.training import common, questions
-from sidecars.training.common import Frame
+from sidecars.training.common import Frame, visible_names
+from sidecars.training.scene_vlm_report import CARD, Asker, card_rows, evaluate, inference_ms, share
 
 SPECIALS: Final = (
     "<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>",
@@ -57,9 +58,9 @@ class Recipe:
     width: int = 128
     layer_types: tuple[str, ...] = ("linear_attention", "full_attention")
     batch: int = 24
-    questions_per_image: int = 2
+    questions_per_image: int = 1
     vision_steps: int = 1200
-    steps: int = 1000
+    steps: int = 800
     learning_rate: float = 1.0e-3
     held_out: float = 0.12
 
@@ -210,11 +211,6 @@ def augment(images: Any, generator: Any) -> Any:
     return common.jitter_colours(moved, generator, 0.12)
 
 
-def visible_names(frame: Frame) -> list[str]:
-    """Names of what clearly shows, from left to right."""
-    return [o.name for o in sorted(frame.objects, key=lambda o: o.box[0] + o.box[2]) if o.clear]
-
-
 class Heads:
     """Throw-away linear heads on the mean image token: what is held (or nothing), and what shows."""
 
@@ -346,7 +342,9 @@ def answer_loss(model: Any, tokens: Any, owner: Any, encoded: tuple[Any, Any, An
     return torch.nn.functional.cross_entropy(logits.float(), labels[:, 1:][asked])
 
 
-def train(recipe: Recipe, frames: Sequence[Frame], names: Sequence[str], out: Path) -> tuple[Any, dict[str, Any]]:
+def train(
+    recipe: Recipe, frames: Sequence[Frame], names: Sequence[str], out: Path
+) -> tuple[Any, dict[str, Any]]:
     """Both stages on `frames`; saves the processor; returns (model, figures of the run)."""
     import torch
 
@@ -362,7 +360,9 @@ def train(recipe: Recipe, frames: Sequence[Frame], names: Sequence[str], out: Pa
     image_token_count = recipe.grid[0] * recipe.grid[1] // 4
 
     # Held and empty frames as often as each other: an empty gripper is the easy guess.
-    order = balanced([i for i, f in enumerate(frames) if f.held], [i for i, f in enumerate(frames) if not f.held])
+    order = balanced(
+        [i for i, f in enumerate(frames) if f.held], [i for i, f in enumerate(frames) if not f.held]
+    )
     batches = common.batches(len(order), recipe.batch, recipe.seed)
     tower = list(model.model.visual.parameters())
     language = [*model.model.language_model.parameters()]
@@ -370,7 +370,9 @@ def train(recipe: Recipe, frames: Sequence[Frame], names: Sequence[str], out: Pa
     shares["both"] = (recipe.steps, [*tower, *heads.parameters(), *language])
     figures: dict[str, Any] = {"train_frames": len(frames)}
     for stage, (steps, parameters) in shares.items():
-        optimizer = torch.optim.AdamW(parameters, lr=recipe.learning_rate, betas=(0.9, 0.98), weight_decay=0.02)
+        optimizer = torch.optim.AdamW(
+            parameters, lr=recipe.learning_rate, betas=(0.9, 0.98), weight_decay=0.02
+        )
         seen: list[tuple[float, float]] = []
         for step in range(steps):
             for group in optimizer.param_groups:
@@ -386,7 +388,9 @@ def train(recipe: Recipe, frames: Sequence[Frame], names: Sequence[str], out: Pa
             if stage == "both":
                 owner = [i for i in range(len(picked)) for _ in range(recipe.questions_per_image)]
                 pairs = [ask_about(rng, picked[i], names) for i in owner]
-                answers = answer_loss(model, tokens, owner, encode(processor, pairs, image_token_count), recipe)
+                answers = answer_loss(
+                    model, tokens, owner, encode(processor, pairs, image_token_count), recipe
+                )
                 said = answers.item()
                 loss = 0.5 * loss + answers
             optimizer.zero_grad()
@@ -399,7 +403,10 @@ def train(recipe: Recipe, frames: Sequence[Frame], names: Sequence[str], out: Pa
                 held_right = sum(r for r, _ in last) / len(last)
                 answer = sum(s for _, s in last) / len(last)
                 spent = time.monotonic() - started
-                print(f"{spent:6.0f} s  {stage} {step:5d}  held {held_right:.3f}  answers {answer:.4f}", flush=True)
+                print(
+                    f"{spent:6.0f} s  {stage} {step:5d}  held {held_right:.3f}  answers {answer:.4f}",
+                    flush=True,
+                )
         figures[f"{stage}_steps"] = steps
     figures["train_s"] = round(time.monotonic() - started, 1)
     model.eval()
@@ -412,3 +419,76 @@ def balanced(some: Sequence[int], others: Sequence[int]) -> list[int]:
         return [*some, *others]
     longest = max(len(some), len(others))
     return [half[i % len(half)] for i in range(longest) for half in (some, others)]
+
+
+def run(recipe: Recipe, data: Path, out: Path) -> dict[str, Any]:
+    """Train, save, evaluate the saved checkpoint as a user would load it, write the model card. Returns the figures."""
+    frames = common.read_frames(data, recipe.cameras)
+    training, testing = common.split_by_scene(frames, recipe.held_out, recipe.seed)
+    names = sorted({name for frame in frames for name in frame.present})
+    out.mkdir(parents=True, exist_ok=True)
+    model, figures = train(recipe, training, names, out)
+    model.save_pretrained(out)
+    return figures | report(recipe, training, testing, names, out, figures)
+
+
+def report(
+    recipe: Recipe,
+    training: Sequence[Frame],
+    testing: Sequence[Frame],
+    names: Sequence[str],
+    out: Path,
+    figures: dict[str, Any],
+) -> dict[str, Any]:
+    """Evaluate the checkpoint in `out` and write its model card. Returns the figures."""
+    asker = Asker(out)
+    rows = evaluate(asker, testing, names, recipe.seed)
+    grasp = [r for r in rows if r["group"] in ("held", "holds another", "empty")]
+    found: dict[str, Any] = {
+        "train_frames": len(training),
+        "test_frames": len(testing),
+        "parameters": sum(p.numel() for p in asker.model.parameters()),
+        "inference_ms": inference_ms(asker, testing[0]),
+        "bytes": common.folder_bytes(out),
+        "grasp_asked": len(grasp),
+        "grasp_right": round(share(grasp, "right"), 4),
+        "all_exact": round(share(rows, "exact"), 4),
+    }
+    card = CARD.format(
+        **{**dataclasses.asdict(recipe), **figures, **found},
+        camera=", ".join(recipe.cameras),
+        size="{} x {}".format(*recipe.size_px),
+        rows=card_rows(rows),
+    )
+    (out / "README.md").write_text(card, encoding="utf-8")
+    for row in [r for r in grasp if not r["right"]][:12]:
+        print(
+            f"wrong: {row['image']} {row['question']!r}: {row['answer']!r}, truth {row['truth']!r}",
+            flush=True,
+        )
+    return found
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; 2 for a folder that is no data set."""
+    parser = argparse.ArgumentParser(prog="python -m sidecars.training.scene_vlm", description=__doc__)
+    parser.add_argument("--data", type=Path, required=True, help="folder with labels.jsonl and images")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the checkpoint")
+    parser.add_argument(
+        "--smoke", action="store_true", help="a toy size, seconds, only to see that everything runs"
+    )
+    parser.add_argument("--seed", type=int, default=Recipe().seed)
+    parser.add_argument("--threads", type=int, default=Recipe().threads)
+    args = parser.parse_args(argv)
+    recipe = dataclasses.replace(SMOKE if args.smoke else Recipe(), seed=args.seed, threads=args.threads)
+    try:
+        figures = run(recipe, args.data, args.out)
+    except common.BadDataset as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(json.dumps(figures, indent=2))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

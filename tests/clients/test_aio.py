@@ -21,6 +21,7 @@ from schemas.errors import (
     WaitTimeout,
 )
 from schemas.wire import LeaseSpec
+from sidecars.device.fake import FakeMemory
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
@@ -331,3 +332,44 @@ async def test_a_hung_daemon_is_noticed_by_silence(
         finally:
             process.send_signal(signal.SIGCONT)
         await until(lambda: client.connected)
+
+
+async def test_leases_and_uses_survive_a_kill_of_the_daemon(
+    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
+) -> None:
+    arbiter = make_arbiter().start()
+    memory = FakeMemory(arbiter.card, "a", 0)
+    unloaded = asyncio.Event()
+
+    async def unload() -> None:
+        memory.free(block)
+        memory.empty_cache()
+        unloaded.set()
+
+    async with (
+        ArbiterClient(arbiter.endpoint, name="sidecar") as sidecar,
+        ArbiterClient(arbiter.endpoint, name="runner") as runner,
+    ):
+        lease = await sidecar.acquire(spec("a", 5), unload=unload)
+        block = memory.allocate("a", 5 << 30)
+        await lease.ready(memory.used_bytes())
+        async with lease.use("request"), runner.use(lease.lease_id, lease.token, "goal") as goal:
+            process = arbiter.process
+            assert process is not None
+            process.kill()
+            process.wait()
+            await until(lambda: not sidecar.connected and not runner.connected)
+            await asyncio.to_thread(arbiter.start)
+            await until(lambda: sidecar.epoch == 2 and runner.epoch == 2)
+            async with asyncio.timeout(20):
+                while not (leases := (await runner.status())["leases"]) or leases[0]["uses"] != 2:
+                    await asyncio.sleep(0.01)
+            assert (leases[0]["lease_id"], leases[0]["state"]) == (lease.lease_id, "held")
+            wanted = asyncio.create_task(runner.acquire(spec("b", 5), 20.0))
+            await until(lambda: lease.revoking)
+            assert not unloaded.is_set()
+        assert goal.lost is None
+        second = await wanted
+        assert unloaded.is_set()
+        assert (lease.state, lease.error) == ("gone", None)
+        assert second.token > lease.token

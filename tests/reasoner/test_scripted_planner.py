@@ -108,6 +108,15 @@ def test_evicted_is_not_absent() -> None:
     assert result["status"] == "success"
 
 
+def test_a_detector_that_cannot_look_makes_nobody_turn_away() -> None:
+    def world(call: ToolCall, _: int) -> Outcome:
+        return Outcome("error", "CUDA out of memory", "oom") if isinstance(call, LocateInView) else YES
+
+    result, calls = play(world)
+    assert not any(isinstance(call, ExecuteRskill) for call in calls)
+    assert result["reason"] == "could not look for the red cube: CUDA out of memory"
+
+
 def test_a_failed_drive_or_grab_is_a_retry_with_its_reason() -> None:
     def world(call: ToolCall, before: int) -> Outcome:
         match call:

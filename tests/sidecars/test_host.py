@@ -172,6 +172,7 @@ def test_the_end_of_the_process_waits_for_the_op_and_gives_everything_back(box, 
     sidecar = box.start("detector")
     running = sidecar.hold()
     sidecar.process.terminate()
+    from_outside(lambda: sidecar.state() == "unloading")
     refused = sidecar.detect()
     assert refused["code"] == "sidecar_unavailable", "nothing is loaded by a process that ends"
     sidecar.let_go()

@@ -49,6 +49,7 @@ def beside_exclusive(b: Broken) -> None:
 
     b.held.spec = replace(b.held.spec, exclusive=True)
     b.gpu.residents[b.queued.id] = b.queued
+    b.core.granted.append((Token(1, 99), b.gpu.info.id))
 
 
 def two_loads(b: Broken) -> None:
@@ -101,7 +102,7 @@ def no_next_reading(b: Broken) -> None:
     ("number", "breaks", "says"),
     [
         (1, over_budget, "approved"),
-        (1, granted_under_pressure, "beyond the budget"),
+        (1, granted_under_pressure, "to bear"),
         (2, beside_exclusive, "is exclusive"),
         (2, two_loads, "load at once"),
         (3, unloads_in_use, "with 2 uses"),

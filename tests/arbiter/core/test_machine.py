@@ -121,6 +121,21 @@ class Leases(RuleBasedStateMachine):
     def probe(self, failing: str) -> None:
         self.driver.card.failing = failing
 
+    @rule()
+    def restart(self) -> None:
+        """kill -9 of the daemon: the journal survives, holders come back with their tokens, waiters have to ask again."""
+        held = {
+            lease: (view["state"], person.token(lease), view["uses"])
+            for lease, person in self.mine.items()
+            if (view := self.driver.view(lease)) is not None
+            and view["state"] in ("loading", "held", "revoking", "unloading")
+        }
+        self.driver.restart(epoch=self.driver.settings.epoch + 1)
+        for person in self.people:
+            person.connect()
+        for lease, (state, token, _) in held.items():
+            self.mine[lease].reattach(lease, token, held=state != "loading")
+
     # -- what must hold ------------------------------------------------------------------------------------------------
     @invariant()
     def card_never_overflows(self) -> None:

@@ -46,6 +46,7 @@ def test_re_attaching_to_a_daemon_that_did_not_restart_only_moves_the_connection
     driver = CoreDriver(8 * GIB)
     det, lease, token = held(driver, "det", 5)
     det.use_begin(lease, "over")
+    det.use_begin(lease, "runs")
     det.client = ClientId("c-new")
     det.connect()
     assert answer(det.reattach(lease, token, uses=["runs"]))["leases"][0]["lease"]["uses"] == 1

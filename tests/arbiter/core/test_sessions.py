@@ -47,6 +47,21 @@ def test_a_dropped_connection_loses_its_waits_and_uses_but_nothing_resident() ->
     assert driver.notes("use_ended")[-1]["reason"] == "its client left: misconduct"
 
 
+def test_a_use_that_was_repeated_on_a_new_connection_outlives_the_old_one() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, runner = driver.consumer("det"), driver.consumer("runner")
+    held = det.acquire(2 * GIB)
+    det.load(held)
+    runner.use_begin(held, "goal", det.token(held))
+    old, runner.client = runner.client, ClientId("new")
+    runner.connect()
+    runner.use_begin(held, "goal", det.token(held))
+    driver.post(ClientLeft(old, "silent"))
+    assert not driver.notes("use_ended")
+    runner.leave("bye")
+    assert driver.notes("use_ended")
+
+
 def test_pushes_go_to_another_living_connection_of_the_process() -> None:
     driver = CoreDriver(8 * GIB)
     first = driver.consumer("det", pid=500)

@@ -1,10 +1,14 @@
 """`vramctl` as a program: output, exit codes, and what its quick path imports."""
 
+import contextlib
 import json
 import os
+import queue
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +16,6 @@ from typing import Any
 import pytest
 
 from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
 from clients.sync import SyncArbiterClient
 from schemas.wire import LeaseSpec
 
@@ -191,22 +194,27 @@ SLEEPER = (
 )
 
 
-def start_run(environ: dict[str, str], *options: str) -> "subprocess.Popen[str]":
-    """A program under `vramctl run` that ends with 5 on SIGTERM; returns when it is up."""
+@contextlib.contextmanager
+def running(environ: dict[str, str], *options: str) -> Iterator["subprocess.Popen[str]"]:
+    """A program under `vramctl run` that ends with 5 on SIGTERM, once it is up."""
     process = subprocess.Popen(
         [sys.executable, "-m", "clients", "run", "--vram", "5GiB", "--name", "job", *options, "--", sys.executable, "-c", SLEEPER],
         env=environ,
         stdout=subprocess.PIPE,
         text=True,
     )  # fmt: skip
-    assert process.stdout is not None
-    assert process.stdout.readline() == "up\n"
-    return process
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        yield process
+    finally:
+        process.terminate()  # passed on to the program
+        process.wait(PATIENCE_S)
 
 
 @pytest.mark.e2e
 def test_run_passes_signals_on(arbiter_daemon: ArbiterProcess) -> None:
-    with start_run(arbiter_daemon.environ) as process:
+    with running(arbiter_daemon.environ) as process:
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE_S) == 5
 
@@ -215,11 +223,10 @@ def test_run_passes_signals_on(arbiter_daemon: ArbiterProcess) -> None:
 def test_run_is_pinned_unless_told_otherwise(
     client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    with start_run(arbiter_daemon.environ) as process:
+    with running(arbiter_daemon.environ):
         views: dict[str, Any] = {view["consumer"]: view for view in client.status()["leases"]}
         assert views["job"]["evictable"] is False
-        process.send_signal(signal.SIGTERM)
-    with start_run(arbiter_daemon.environ, "--on-revoke", "term") as process:
+    with running(arbiter_daemon.environ, "--on-revoke", "term") as process:
         lease = client.acquire(spec("b", 5), PATIENCE_S)
         assert process.wait(PATIENCE_S) == 5
     lease.release()
@@ -235,16 +242,18 @@ def test_watch_prints_plain_lines_where_there_is_no_terminal(
         stdout=subprocess.PIPE,
         text=True,
     )
-    assert process.stdout is not None
-    with process:
-        with WireClient(arbiter_daemon.endpoint) as looker:
-            looker.hello("looker")
-            while looker.ask("status")["clients"] < 3:
-                pass
-        client.ping()
-        lease = client.acquire(spec("a", 1))
-        line = process.stdout.readline()
+    try:
+        lines: queue.Queue[str] = queue.Queue()
+        output = process.stdout
+        assert output is not None
+        threading.Thread(target=lambda: lines.put(output.readline()), daemon=True).start()
+        deadline = time.monotonic() + PATIENCE_S
+        while lines.empty() and time.monotonic() < deadline:  # the subscription may begin after some of these
+            with client.lease(spec("a", 1)) as lease:
+                lease.ready()
+        assert "  a L1-" in lines.get_nowait()
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE_S) in (0, 130)
-    assert "a L1-" in line
-    lease.release()
+    finally:
+        process.kill()
+        process.wait()

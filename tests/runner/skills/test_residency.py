@@ -1,5 +1,6 @@
 """One GPU-holding skill is resident by (rskill_id, revision); GPU-free ones come and go beside it."""
 
+import asyncio
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import pytest
 
 from runner.protocols import Done, Goal, SkillKey, StepOutcome
+from runner.skills import residency as residency_module
 from runner.skills.base import SkillBase
 from runner.skills.residency import Residency
 from schemas.errors import BadState, ManifestInvalid, SidecarUnavailable
@@ -36,6 +38,8 @@ class Recording(SkillBase):
 
     async def _release(self) -> None:
         self.story.append("release")
+        if self.fails == "hang":
+            await asyncio.Event().wait()
         if self.fails == "release":
             raise SidecarUnavailable("gone")
 
@@ -136,5 +140,19 @@ def test_steps_out_of_order_are_refused(skill: Callable[..., Recording], run_asy
         assert made.story.count("release") == 1
         with pytest.raises(BadState, match="released"):
             await made.start(Goal("g", "r"))
+
+    run_async(scenario())
+
+
+def test_a_skill_that_does_not_let_go_holds_nobody_up(
+    skill: Callable[..., Recording], run_async: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(residency_module, "EVICT_S", 0.05)
+
+    async def scenario() -> None:
+        residency, old, new = Residency(), skill("1", fails="hang"), skill("2")
+        await residency.acquire(old.key, lambda: old)
+        assert await residency.acquire(new.key, lambda: new) is new
+        assert residency.resident == new.key
 
     run_async(scenario())
