@@ -34,6 +34,7 @@ log = logging.getLogger(__name__)
 
 CONNECT_TIMEOUT_S = 5.0
 BYE_TIMEOUT_S = 1.0
+LEAVE_TIMEOUT_S = 30.0  # as long as the arbiter's own ladder gives a holder
 REOPEN_S = 0.05  # between two sockets, so that a server that hangs up at once is not hammered
 SUBSCRIBER_QUEUE_MAX = 10_000  # events; a subscriber that does not read loses the oldest
 
@@ -110,16 +111,23 @@ class ArbiterClient:
             raise
 
     async def close(self) -> None:
-        """Give up every lease (at its safe point, running its `unload`), say bye, close the socket."""
+        """Give up every lease (at its safe point, running its `unload`), say bye, close the socket.
+
+        A lease that others still use after 30 s is left to the arbiter: it goes with the connection.
+        """
         if self._transport is None:
             return
         self._closing = True
+        leaving = [asyncio.ensure_future(lease.give_up()) for lease in self._leases.values()]
         try:
-            await asyncio.gather(*(lease.give_up() for lease in tuple(self._leases.values())))
+            if leaving and (await asyncio.wait(leaving, timeout=LEAVE_TIMEOUT_S))[1]:
+                log.warning("closing although leases are still in use: %s", self.leases)
             if self.connected:
                 with contextlib.suppress(VramError):
                     await self.reply(self.protocol.request("bye", {}, self.now(), timeout_s=BYE_TIMEOUT_S))
         finally:
+            for leave in leaving:
+                leave.cancel()
             self._shut()
 
     # -- leases ------------------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ SafePointEta = Callable[[], float | None]
 
 RETRY_UNLOADING_S = 0.25
 """Somebody else's use is still on the lease: the arbiter pushes when it ends; this only covers a lost push."""
+ANNOUNCE_TIMEOUT_S = 5.0
 RELEASE_TIMEOUT_S = 5.0
 """A release that the arbiter does not hear ends by ttl there; a holder does not wait longer for it."""
 
@@ -36,6 +37,9 @@ class Driver(Protocol):
     """What a lease needs of its client."""
 
     protocol: ClientProtocol
+
+    @property
+    def connected(self) -> bool: ...
 
     def now(self) -> float: ...
 
@@ -252,7 +256,9 @@ class Lease:
 
     async def _announced(self) -> bool:
         """Say `unloading`. False: not now; somebody else's use is on the lease, or there is no contact."""
-        request = self._driver.protocol.unloading(self._record, self._driver.now())
+        if self._own_will and not self._driver.connected:
+            return True  # nobody can refuse, nobody can be granted: whoever wants to go may go
+        request = self._driver.protocol.unloading(self._record, self._driver.now(), ANNOUNCE_TIMEOUT_S)
         try:
             await self._driver.reply(request)
         except BadState as error:
@@ -295,6 +301,9 @@ class Lease:
 
     async def _release(self, *, exiting: bool) -> None:
         request = self._driver.protocol.release(self._record, exiting, self._driver.now(), RELEASE_TIMEOUT_S)
+        if not self._driver.connected:
+            log.warning("%s is released without contact to the arbiter", self.lease_id)
+            return  # said when contact comes back soon, else its ttl ends it
         try:
             await self._driver.reply(request)
         except ArbiterUnreachable:

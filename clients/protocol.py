@@ -71,6 +71,10 @@ class _ForeignUse:
     token: TokenPair
     label: str
 
+    def begin(self, use_id: str) -> Message:
+        on = {"lease_id": self.lease_id, "token": list(self.token)}
+        return {"op": "use_begin", **on, "use_id": use_id, "label": self.label}
+
 
 class ClientProtocol:
     """One connection's state machine. `phase` is `down`, `greeting`, `reattaching` or `up`."""
@@ -181,7 +185,7 @@ class ClientProtocol:
             record.held, record.measured_bytes = True, measured_bytes
 
         return self._ask(
-            {"op": "ready", **_on(record), "measured_bytes": measured_bytes},
+            {"op": "ready", **record.ref(), "measured_bytes": measured_bytes},
             now,
             on_reply=held,
             record=record,
@@ -194,12 +198,12 @@ class ClientProtocol:
         def refused(_: VramError, __: float) -> None:
             record.uses.discard(use_id)
 
-        message = {"op": "use_begin", **_on(record), "use_id": use_id, "label": label}
+        message = {"op": "use_begin", **record.ref(), "use_id": use_id, "label": label}
         return self._ask(message, now, on_error=refused, record=record)
 
     def use_end(self, record: LeaseRecord, use_id: str, now: float) -> int:
         record.uses.discard(use_id)
-        return self._ask({"op": "use_end", **_on(record), "use_id": use_id}, now, quiet=True)
+        return self._ask({"op": "use_end", **record.ref(), "use_id": use_id}, now, quiet=True)
 
     def foreign_use_begin(
         self, lease_id: str, token: TokenPair, use_id: str, label: str, now: float, timeout_s: float
@@ -210,7 +214,7 @@ class ClientProtocol:
         def begun(_: Message, __: float) -> None:
             self._foreign[use_id] = use
 
-        return self._ask(_begin(use_id, use), now, timeout_s, on_reply=begun)
+        return self._ask(use.begin(use_id), now, timeout_s, on_reply=begun)
 
     def foreign_use_end(self, lease_id: str, token: TokenPair, use_id: str, now: float) -> int:
         """Also right while the begin is under way: the arbiter hears both in order."""
@@ -222,23 +226,23 @@ class ClientProtocol:
         return self._ask(message, now, quiet=True)
 
     def revoke_ack(self, record: LeaseRecord, eta_s: float | None, now: float) -> int:
-        message = {"op": "revoke_ack", **_on(record), "safe_point_eta_s": eta_s}
+        message = {"op": "revoke_ack", **record.ref(), "safe_point_eta_s": eta_s}
         return self._ask(message, now, quiet=True, record=record)
 
-    def unloading(self, record: LeaseRecord, now: float) -> int:
-        return self._ask({"op": "unloading", **_on(record)}, now, record=record)
+    def unloading(self, record: LeaseRecord, now: float, timeout_s: float = REQUEST_TIMEOUT_S) -> int:
+        return self._ask({"op": "unloading", **record.ref()}, now, timeout_s, record=record)
 
     def release(self, record: LeaseRecord, exiting: bool, now: float, timeout_s: float) -> int:
         """From here on the lease is not ours: no renewal, no re-attachment. A lease that is gone already counts as released."""
         record.released = True
         self.leases.pop(record.lease_id, None)
-        message = {"op": "release", **_on(record), "exiting": exiting}
+        message = {"op": "release", **record.ref(), "exiting": exiting}
         return self._ask(message, now, timeout_s)
 
     def oom(self, record: LeaseRecord, requested_bytes: int, allocated_bytes: int | None, now: float) -> int:
         message = {
             "op": "oom",
-            **_on(record),
+            **record.ref(),
             "requested_bytes": requested_bytes,
             "allocated_bytes": allocated_bytes,
         }
@@ -320,7 +324,7 @@ class ClientProtocol:
                 self.phase = "reattaching"
                 self._handshake_id, self._handshake_at = self._new_id(), now
                 self._phase_deadline = now + HELLO_TIMEOUT_S
-                leases = [_reattachment(record) for record in self.leases.values()]
+                leases = [record.reattachment() for record in self.leases.values()]
                 self._outgoing.append({"op": "reattach", "id": self._handshake_id, "leases": leases})
                 return
         else:
@@ -360,7 +364,7 @@ class ClientProtocol:
             if self._foreign.pop(use_id, None) is not None:
                 self._events.append(UseLost(use_id, error))
 
-        self._ask(_begin(use_id, use), now, on_error=lost, quiet=True)
+        self._ask(use.begin(use_id), now, on_error=lost, quiet=True)
 
     # -- steps: replies ------------------------------------------------------------------------------------------------
     def _reply(self, message: Message, now: float) -> None:
@@ -410,7 +414,7 @@ class ClientProtocol:
             renewed_at=now,
         )
         if waiter.abandoned:  # granted while we turned away: hand it back at once, nothing was loaded
-            self._ask({"op": "release", **_on(record), "exiting": False}, now, quiet=True)
+            self._ask({"op": "release", **record.ref(), "exiting": False}, now, quiet=True)
             return
         self.leases[record.lease_id] = record
         self._events.append(Granted(waiter.nonce, record))
@@ -495,7 +499,7 @@ class ClientProtocol:
                         self._gone(gone, from_wire(entry.get("error") or {"code": "lease_lost"}))
 
             self._ask(
-                {"op": "renew", "leases": [_on(record) for record in batch]},
+                {"op": "renew", "leases": [record.ref() for record in batch]},
                 now,
                 on_reply=renewed,
                 quiet=True,
@@ -575,30 +579,6 @@ class ClientProtocol:
     def _drop_unsent(self, matches: Callable[[Message], bool]) -> None:
         for request_id in [i for i, r in self._pending.items() if r.sent_at is None and matches(r.message)]:
             del self._pending[request_id]
-
-
-def _on(record: LeaseRecord) -> Message:
-    return {"lease_id": record.lease_id, "token": list(record.token)}
-
-
-def _begin(use_id: str, use: _ForeignUse) -> Message:
-    return {
-        "op": "use_begin",
-        "lease_id": use.lease_id,
-        "token": list(use.token),
-        "use_id": use_id,
-        "label": use.label,
-    }
-
-
-def _reattachment(record: LeaseRecord) -> Message:
-    return {
-        **_on(record),
-        "spec": record.spec,
-        "state": "held" if record.held else "loading",
-        "measured_bytes": record.measured_bytes,
-        "use_ids": sorted(record.uses),
-    }
 
 
 def _unreachable(op: str) -> ArbiterUnreachable:

@@ -124,3 +124,17 @@ class LeaseRecord:
     @property
     def ttl_s(self) -> float:
         return float(self.spec.get("ttl_s", d.LEASE_TTL_S))
+
+    def ref(self) -> Message:
+        """`schemas.wire.LeaseRef`."""
+        return {"lease_id": self.lease_id, "token": list(self.token)}
+
+    def reattachment(self) -> Message:
+        """`schemas.wire.ReattachLease`."""
+        return {
+            **self.ref(),
+            "spec": self.spec,
+            "state": "held" if self.held else "loading",
+            "measured_bytes": self.measured_bytes,
+            "use_ids": sorted(self.uses),
+        }

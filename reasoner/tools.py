@@ -8,7 +8,6 @@ from typing import Any, Protocol
 
 from clients.runner import RunnerClient
 from clients.sidecar.perception import DetectorClient, SceneVlmClient
-
 from reasoner.planner import Outcome
 from schemas.errors import (
     ArbiterUnreachable,

@@ -265,7 +265,7 @@ class GoalServer:
         try:
             if running.canceled:
                 raise asyncio.CancelledError
-            with telemetry.goal_span(goal.traceparent, goal.rskill_id):
+            with telemetry.span(telemetry.SPAN_GOAL, goal.traceparent, {"rskill.id": goal.rskill_id}):
                 async with asyncio.timeout(goal.deadline_s):
                     ended = await self._run(running, make)
             data, error = dict(ended.data), ended.error

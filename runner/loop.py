@@ -18,8 +18,6 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from opentelemetry import propagate, trace
-
 from runner import telemetry
 from runner.clock import Clock, SystemClock
 from runner.protocols import DeadlineMissed, DeadlinePolicy
@@ -82,7 +80,7 @@ class RunnerBase(ABC):
         self.clock: Clock = clock or SystemClock()
         self.tick_idx = 0
         self.deadline_misses = 0
-        self.last_error: str = ""
+        self.traceparent: str | None = None  # of the goal that the ticks are for; they join its trace
         self._due_s: float | None = None  # when the present tick should have begun
         self._tick_ms: deque[float] = deque(maxlen=TIMINGS_KEPT)
         self._inference_ms: deque[float] = deque(maxlen=TIMINGS_KEPT)
@@ -118,13 +116,11 @@ class RunnerBase(ABC):
 
     def tick(self) -> TickResult:
         """One turn. See the module's docstring for its steps."""
-        with trace.get_tracer("runner").start_as_current_span(telemetry.SPAN_TICK) as span:
-            carrier: dict[str, str] = {}
-            propagate.inject(carrier)
+        with telemetry.span(telemetry.SPAN_TICK, self.traceparent) as span:
             context = span.get_span_context()
             if context.is_valid and self._trace_id is None:
                 self._trace_id = f"{context.trace_id:032x}"
-            return self._tick(carrier or None)
+            return self._tick(telemetry.carrier())
 
     def _tick(self, trace_context: dict[str, str] | None) -> TickResult:
         started_s = self.clock.now_s()
@@ -135,7 +131,8 @@ class RunnerBase(ABC):
         if withheld and not decision.reset:
             decision.action = None
         apply_s = self.clock.now_s()
-        applied = self._apply(decision)  # 3
+        with telemetry.span(telemetry.SPAN_SEND):
+            applied = self._apply(decision)  # 3
         ended_s = self.clock.now_s()
         missed = ended_s > deadline_s
         result = TickResult(
@@ -164,7 +161,7 @@ class RunnerBase(ABC):
             self._inference_ms.append(result.inference_ms)
         if missed:  # 4
             self.deadline_misses += 1
-            trace.get_current_span().add_event(telemetry.EVENT_DEADLINE_MISSED, {"tick_ms": result.tick_ms})
+            telemetry.event(telemetry.EVENT_DEADLINE_MISSED, tick_ms=result.tick_ms)
             if self.deadline_policy is DeadlinePolicy.RAISE:
                 raise DeadlineMissed(
                     f"tick {result.tick_idx} took {result.tick_ms:.1f} ms of its {1e3 / self.rate_hz:.1f} ms",

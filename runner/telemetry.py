@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from typing import Any
 
 from opentelemetry import propagate, trace
 
@@ -18,17 +17,24 @@ EVENT_DEADLINE_MISSED = "vram.event.deadline_missed"
 EVENT_ACTION_WITHHELD = "vram.event.action_withheld"
 
 
-def goal_span(traceparent: str | None, rskill_id: str) -> AbstractContextManager[Any]:
-    """A span for a whole goal, as a child of the caller's when it sent a W3C traceparent."""
+def span(
+    name: str, traceparent: str | None = None, attributes: dict[str, str] | None = None
+) -> AbstractContextManager[trace.Span]:
+    """A span, the present one's child, or the caller's when it sent a W3C traceparent."""
     context = propagate.extract({"traceparent": traceparent}) if traceparent else None
-    span: AbstractContextManager[Any] = trace.get_tracer("runner").start_as_current_span(
-        SPAN_GOAL, context=context, attributes={"rskill.id": rskill_id}
+    made: AbstractContextManager[trace.Span] = trace.get_tracer("runner").start_as_current_span(
+        name, context=context, attributes=attributes
     )
-    return span
+    return made
 
 
-def current_traceparent() -> str | None:
-    """The W3C traceparent of the present span, to be sent along; None outside any trace."""
-    carrier: dict[str, str] = {}
-    propagate.inject(carrier)
-    return carrier.get("traceparent")
+def carrier() -> dict[str, str] | None:
+    """The present span as W3C headers, to be stored or sent along; None outside any trace."""
+    headers: dict[str, str] = {}
+    propagate.inject(headers)
+    return headers or None
+
+
+def event(name: str, **attributes: str | float) -> None:
+    """Add an event to the present span."""
+    trace.get_current_span().add_event(name, attributes)

@@ -48,8 +48,6 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
         stream=sys.stderr,
         format=f"%(asctime)s {flags.name} %(levelname)s %(message)s",
     )
-    for name, value in _ENVIRONMENT.items():
-        os.environ.setdefault(name, value)
     try:
         settings = settings_from(flags)
         adapter = adapter_for(settings.manifest, settings.weights)
@@ -58,6 +56,8 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
             return 0
         from sidecars.host import SidecarHost
 
+        for name, value in _ENVIRONMENT.items():
+            os.environ.setdefault(name, value)
         if not asyncio.run(SidecarHost(settings, adapter, open_memory(settings)).serve()):
             logging.shutdown()
             os._exit(0)  # the interpreter would wait for an import of many seconds that nobody needs any more

@@ -293,11 +293,15 @@ class Residency:
 
     @contextlib.asynccontextmanager
     async def _use(self, lease: Lease | None, label: str, *, handed: bool) -> AsyncIterator[None]:
-        """Mark a use. Under a handed-over token the caller's own use protects the model, also while it is asked to leave."""
+        """Mark a use. Under a handed-over token the caller's own use protects the model, also while it is asked to leave.
+
+        Without contact to the arbiter nothing is marked: nobody can be granted anything then, and an unload waits for the op
+        in the worker's queue in any case.
+        """
         self._running += 1
         try:
             async with contextlib.AsyncExitStack() as stack:
-                if lease is not None:
+                if lease is not None and self._client is not None and self._client.connected:
                     try:
                         await stack.enter_async_context(lease.use(label))
                     except LeaseRevoking:

@@ -15,7 +15,8 @@ REFRESH_S = 0.5
 
 async def watch(endpoint: str | None, events_shown: int) -> int:
     """Until Ctrl-C. Raises ArbiterUnreachable if nobody answers at first; later it waits for the arbiter to come back."""
-    async with ArbiterClient(endpoint, name="vramctl watch", role="observer") as client:
+    client = ArbiterClient(endpoint, name="vramctl watch", role="observer", connect_timeout_s=quick.TIMEOUT_S)
+    async with client:
         with contextlib.suppress(asyncio.CancelledError):
             if sys.stdout.isatty():
                 await _live(client, events_shown)

@@ -107,10 +107,11 @@ class SidecarClient:
             child, self.child = self.child, None
             try:
                 if child is not None:
-                    if child.alive:
+                    serves = self._proven and child.alive
+                    if serves:
                         with contextlib.suppress(VramError):
                             await self.shutdown()
-                    await child.end(SHUTDOWN_S)
+                    await child.end(SHUTDOWN_S if serves else 0.0)
             finally:
                 self._drop("the client was closed")
 

@@ -17,6 +17,7 @@ from typing import Any, Protocol
 
 from pydantic import ValidationError
 
+from runner import telemetry
 from runner.clock import Clock
 from runner.control import Mailbox
 from runner.frames import Snapshot
@@ -164,17 +165,20 @@ class SimRunner(RunnerBase):
         if self._active is not None:
             raise InternalError("another skill has the arm")
         self._active = _Active(skill, goal, on_end, self.tick_idx)
+        self.traceparent = goal.traceparent
         self.progress = Progress(0.0, "running")
 
     def end_skill(self) -> None:
         """Control thread: take the arm back without a word to anybody; it holds. Repeatable."""
         self._active = None
+        self.traceparent = None
         self.progress = Progress(0.0, "idle")
 
     def _end(self, ended: SkillEnded) -> None:
         if (active := self._active) is None:
             return
         self._active = None
+        self.traceparent = None
         self.progress = Progress(1.0 if ended.error is None else self.progress.fraction, "ended")
         ticks = {
             "ticks": self.tick_idx - active.began_tick,
@@ -221,10 +225,12 @@ class SimRunner(RunnerBase):
         active = self._active
         frames: dict[str, SensorFrame] | None = None
         if active is not None and active.skill.wants_frames():  # 3
-            frames = {camera: self._sensor_frame(self._render(camera)) for camera in active.skill.cameras}
+            with telemetry.span(telemetry.SPAN_SENSORS):
+                frames = {camera: self._sensor_frame(self._render(camera)) for camera in active.skill.cameras}
         sensed_s = self.clock.now_s()
         try:
-            world = self._world(frames)  # 4
+            with telemetry.span(telemetry.SPAN_WORLD):
+                world = self._world(frames)  # 4
         except ValidationError as error:  # a state that is not finite: nobody may act on it
             self.world = None
             self._end(
@@ -242,7 +248,8 @@ class SimRunner(RunnerBase):
     def _ask_skill(self, active: _Active, world: WorldState, decision: Decision) -> None:
         asked_s = self.clock.now_s()
         try:
-            outcome = active.skill.step(world)
+            with telemetry.span(telemetry.SPAN_INFERENCE):
+                outcome = active.skill.step(world)
         except VramError as error:
             decision.safety_violations = (f"{error.code}: {error.message}",)
             self.violations.append(decision.safety_violations[0])
@@ -274,7 +281,8 @@ class SimRunner(RunnerBase):
         checked_s = self.clock.now_s()
         if self._envelope is None:
             self._envelope = Envelope(self.env.joint_limits())
-        allowed, problems = self._envelope.check(action, world)
+        with telemetry.span(telemetry.SPAN_SAFETY):
+            allowed, problems = self._envelope.check(action, world)
         decision.safety_ms = (self.clock.now_s() - checked_s) * 1e3
         decision.safety_violations = problems
         decision.action = allowed
@@ -284,6 +292,7 @@ class SimRunner(RunnerBase):
             active.clamped += bool(problems)
             active.detail = ""
             return
+        telemetry.event(telemetry.EVENT_ACTION_WITHHELD, reason=problems[0])
         active.withheld += 1
         active.withheld_in_a_row += 1
         active.detail = f"withheld: {problems[0]}"

@@ -71,7 +71,7 @@ class Recipe:
 
 
 SMOKE: Final = Recipe(
-    grid=(6, 4), vision_width=32, vision_layers=1, width=32, batch=6, vision_steps=6, steps=6, held_out=0.25,
+    grid=(8, 6), vision_width=32, vision_layers=1, width=32, batch=6, vision_steps=6, steps=6, held_out=0.25,
 )  # fmt: skip
 
 

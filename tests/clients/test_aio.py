@@ -2,6 +2,8 @@
 
 import asyncio
 import signal
+import subprocess
+import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -79,6 +81,28 @@ async def test_closing_the_client_gives_up_its_leases(arbiter_daemon: ArbiterPro
             await lease.ready()
         assert unloaded.is_set()
         await (await other.acquire(spec("b", 7), 10.0)).release()
+
+
+async def test_leaving_does_not_wait_for_an_arbiter_that_is_away(
+    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
+) -> None:
+    unloaded = asyncio.Event()
+
+    async def unload() -> None:
+        unloaded.set()
+
+    arbiter = make_arbiter().start()
+    async with asyncio.timeout(20), ArbiterClient(arbiter.endpoint, name="t") as client:
+        lease = await client.acquire(spec("a", 5, ttl_s=3600), unload=unload)
+        await lease.ready()
+        process = arbiter.process
+        assert process is not None
+        process.kill()
+        process.wait()
+        await until(lambda: not client.connected)
+        async with asyncio.timeout(2):
+            await lease.give_up()
+        assert unloaded.is_set()
 
 
 async def test_revoked_at_the_safe_point_and_not_before(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
@@ -334,6 +358,16 @@ async def test_a_hung_daemon_is_noticed_by_silence(
         await until(lambda: client.connected)
 
 
+RUNNER = """
+import sys
+from clients.sync import SyncArbiterClient
+with SyncArbiterClient(name="runner") as client, client.use(sys.argv[1], (int(sys.argv[2]), int(sys.argv[3])), "goal") as use:
+    print("in use", flush=True)
+    sys.stdin.readline()
+    print(use.lost, flush=True)
+"""
+
+
 async def test_leases_and_uses_survive_a_kill_of_the_daemon(
     make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
 ) -> None:
@@ -346,30 +380,38 @@ async def test_leases_and_uses_survive_a_kill_of_the_daemon(
         memory.empty_cache()
         unloaded.set()
 
-    async with (
-        ArbiterClient(arbiter.endpoint, name="sidecar") as sidecar,
-        ArbiterClient(arbiter.endpoint, name="runner") as runner,
-    ):
-        lease = await sidecar.acquire(spec("a", 5), unload=unload)
+    async with ArbiterClient(arbiter.endpoint, name="sidecar") as client:
+        lease = await client.acquire(spec("a", 5), unload=unload)
         block = memory.allocate("a", 5 << 30)
         await lease.ready(memory.used_bytes())
-        async with lease.use("request"), runner.use(lease.lease_id, lease.token, "goal") as goal:
+        runner = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", RUNNER, lease.lease_id, *map(str, lease.token),
+            env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        )  # fmt: skip
+        assert runner.stdout is not None
+        try:
+            assert await runner.stdout.readline() == b"in use\n"
             process = arbiter.process
             assert process is not None
-            process.kill()
-            process.wait()
-            await until(lambda: not sidecar.connected and not runner.connected)
-            await asyncio.to_thread(arbiter.start)
-            await until(lambda: sidecar.epoch == 2 and runner.epoch == 2)
-            async with asyncio.timeout(20):
-                while not (leases := (await runner.status())["leases"]) or leases[0]["uses"] != 2:
-                    await asyncio.sleep(0.01)
-            assert (leases[0]["lease_id"], leases[0]["state"]) == (lease.lease_id, "held")
-            wanted = asyncio.create_task(runner.acquire(spec("b", 5), 20.0))
+            async with lease.use("request"):
+                process.kill()
+                process.wait()
+                await until(lambda: not client.connected)
+                await asyncio.to_thread(arbiter.start)
+                await until(lambda: client.connected)
+                async with asyncio.timeout(20):
+                    while (shown := (await client.status())["leases"][0])["uses"] != 2:
+                        await asyncio.sleep(0.01)
+            assert (shown["lease_id"], shown["state"], client.epoch) == (lease.lease_id, "held", 2)
+            wanted = asyncio.create_task(client.acquire(spec("b", 5), 20.0))
             await until(lambda: lease.revoking)
-            assert not unloaded.is_set()
-        assert goal.lost is None
-        second = await wanted
+            assert not unloaded.is_set()  # the runner's goal goes on
+            assert (await runner.communicate(b"end\n"))[0] == b"None\n"
+            second = await wanted
+        finally:
+            if runner.returncode is None:
+                runner.kill()
+                await runner.wait()
         assert unloaded.is_set()
         assert (lease.state, lease.error) == ("gone", None)
         assert second.token > lease.token

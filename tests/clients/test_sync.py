@@ -95,6 +95,7 @@ def test_events_can_be_iterated(client: SyncArbiterClient, spec: Spec) -> None:
     assert "released" in kinds
 
 
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_not_across_a_fork(client: SyncArbiterClient, spec: Spec) -> None:
     lease = client.acquire(spec("a", 1))
     pid = os.fork()

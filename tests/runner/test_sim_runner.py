@@ -207,6 +207,17 @@ def test_stopping_ends_the_skill_with_an_error(make_runner: Make) -> None:
     assert isinstance(ended[0].error, InternalError)
 
 
+def test_the_ticks_of_a_goal_join_its_trace(make_runner: Make) -> None:
+    parent = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
+    runner = make_runner(rate_hz=0)
+    runner.activate()
+    runner.tick()
+    runner.begin_skill(Scripted(Hold("x")), Goal("g", "r", traceparent=parent), lambda _: None)
+    ticks = [runner.tick() for _ in range(3)]
+    assert [tick.trace_context is not None for tick in ticks] == [True, True, False]
+    assert ticks[0].trace_context["traceparent"].split("-")[1] == parent.split("-")[1]
+
+
 # -- pictures -------------------------------------------------------------------------------------------------------
 @pytest.mark.heavy
 def test_frames_are_rendered_on_demand_and_reused_while_young(

@@ -224,6 +224,8 @@ def test_the_arbiter_may_be_killed_between_two_requests(box, arbiter_daemon, arb
     token = sidecar.ask("load")["token"]
     arbiter_daemon.kill()
     assert sidecar.state() == "resident"
+    assert sidecar.detect(token=token)["ok"], "a goal does not stall because the daemon is restarted"
+    assert sidecar.detect()["ok"]
     arbiter_daemon.start()
     assert sidecar.detect(token=token)["ok"], "what it had it keeps"
     assert sidecar.ask("ping")["token"] == token

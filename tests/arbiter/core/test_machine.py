@@ -30,8 +30,8 @@ class Leases(RuleBasedStateMachine):
         self.driver.card.lists_processes = lists
         self.people = [self.driver.consumer(f"p{n}") for n in range(4)]
         self.mine: dict[LeaseId, Consumer] = {}
-        self.bytes: dict[LeaseId, int] = {}
-        self.used: set[LeaseId] = set()
+        self.loaded: dict[ProcessKey, dict[LeaseId, int]] = {}  # what each process holds for which lease
+        self.context: dict[ProcessKey, int] = {}  # what it keeps once it has loaded anything
 
     # -- what people do --------------------------------------------------------------------------------------------
     @rule(
@@ -51,8 +51,11 @@ class Leases(RuleBasedStateMachine):
     )
     def acquire(self, who: int, size: int, shrink: bool, spec: dict[str, Any]) -> Any:
         person = self.people[who]
-        if any(self.driver.state(lease) != "over" for lease, owner in self.mine.items() if owner is person):
-            return multiple()  # one lease a process, so that its bytes are its lease's
+        if (
+            sum(self.driver.state(lease) != "over" for lease, owner in self.mine.items() if owner is person)
+            > 1
+        ):
+            return multiple()  # at most two leases a process
         steady = max(size // 2, spec["residue_bytes"]) if shrink else size
         effects = person.try_acquire(size, steady, **spec)
         reply = next((effect for effect in effects if isinstance(effect, Reply)), None)
@@ -66,7 +69,24 @@ class Leases(RuleBasedStateMachine):
     @rule(lease=leases)
     def load(self, lease: LeaseId) -> None:
         if self.driver.state(lease) == "loading":
-            self.mine[lease].load(lease)
+            spec = self.mine[lease].specs[lease]
+            process = self.mine[lease].process
+            self.loaded.setdefault(process, {})[lease] = max(spec.steady_bytes, spec.residue_bytes)
+            self.context[process] = max(self.context.get(process, 0), spec.residue_bytes)
+            self.show(process)
+            self.mine[lease].ready(lease)
+
+    def show(self, process: ProcessKey) -> None:
+        """Put on the card what the process holds."""
+        count = max(sum(self.loaded[process].values()), self.context[process])
+        self.driver.card.set(process, count, self.driver.now)
+
+    def unload(self, lease: LeaseId) -> None:
+        person = self.mine[lease]
+        person.unloading(lease)
+        del self.loaded[person.process][lease]
+        self.show(person.process)
+        person.release(lease)
 
     @rule(lease=leases, who=st.integers(0, 3))
     def use(self, lease: LeaseId, who: int) -> None:
@@ -85,13 +105,13 @@ class Leases(RuleBasedStateMachine):
         if view is not None and view["state"] == "revoking":
             self.mine[lease].ack(lease)
             if not view["uses"]:
-                self.mine[lease].unload(lease)
+                self.unload(lease)
 
     @rule(lease=leases)
     def give_back(self, lease: LeaseId) -> None:
         view = self.driver.view(lease)
         if view is not None and view["state"] == "held" and not view["uses"]:
-            self.mine[lease].unload(lease)
+            self.unload(lease)
 
     @rule(lease=leases)
     def fail_to_load(self, lease: LeaseId) -> None:
@@ -147,7 +167,10 @@ class Leases(RuleBasedStateMachine):
             if view["state"] == "loading":
                 person = self.mine[view["lease_id"]]
                 peak = person.specs[view["lease_id"]].load_peak_bytes
-                coming += max(0, peak - self.driver.card.held.get(person.process, 0))
+                if self.loaded.get(person.process):
+                    coming += peak
+                else:  # its context is part of the peak
+                    coming += max(0, peak - self.driver.card.held.get(person.process, 0))
         assert sum(shown.values()) + coming <= CAPACITY
 
     @invariant()
@@ -199,7 +222,7 @@ class Leases(RuleBasedStateMachine):
                 self.comply(lease)
                 view = self.driver.view(lease)
                 if view is not None and view["state"] == "held" and not view["evictable"]:
-                    self.mine[lease].unload(lease)
+                    self.unload(lease)
             waiting = {lease for lease in self.mine if self.driver.state(lease) == "queued"}
             if not waiting:
                 break

@@ -81,6 +81,7 @@ def test_errors_are_json_where_json_was_asked_for(nowhere: dict[str, str]) -> No
     assert (done.returncode, json.loads(done.stdout)["error"]["code"]) == (3, "arbiter_unreachable")
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(
     "command",
     [
@@ -106,6 +107,7 @@ def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) ->
         assert word in done.stdout
 
 
+@pytest.mark.e2e
 def test_doctor_says_where_the_packages_come_from(nowhere: dict[str, str]) -> None:
     done = vramctl("doctor", "--json", environ=nowhere)
     findings = {finding["what"]: finding for finding in json.loads(done.stdout)}
@@ -116,6 +118,7 @@ def test_doctor_says_where_the_packages_come_from(nowhere: dict[str, str]) -> No
     assert findings["daemon"]["ok"] is False
 
 
+@pytest.mark.e2e
 def test_a_socket_that_nobody_serves(nowhere: dict[str, str]) -> None:
     import zmq
 

@@ -17,7 +17,7 @@ from clients.sidecar.policy import PolicyClient
 from clients.sidecar.spawn import SpawnSpec
 from schemas.errors import Evicted, Loading, ModelError, NotResident, OutOfMemory, SidecarUnavailable
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
 SERVER = Path(__file__).with_name("server_process.py")
 PNG = b"\x89PNG\r\n\x1a\n"

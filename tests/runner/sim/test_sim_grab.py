@@ -13,12 +13,16 @@ import cv2
 import numpy as np
 
 from runner.sim.config import REST_POSE, SceneConfig
-from runner.sim.dataset import VIEWS, main, stand_before
+from runner.sim.dataset import VIEWS, main, stand_before, write_grab
 from runner.sim.env import SimEnv
+from runner.sim.evaluate import attempt
 from runner.sim.expert import CLOSED_RAD, GrabExpert, RestController, run_expert
 from runner.sim.kinematics import ArmKinematics
+from runner.sim.learned import LoadedPolicy
 
 pytestmark = pytest.mark.heavy
+
+CHECKPOINT = Path(__file__).parents[3] / "configs" / "models" / "so101-grab"
 
 
 @pytest.fixture
@@ -114,3 +118,15 @@ def test_grab_data_set_holds_whole_episodes(tmp_path: Path) -> None:
         assert np.load(tmp_path / f"{camera}.npy").shape == (lengths.sum(), height, width, 3)
     assert action[lengths[0] - 1, 5] == pytest.approx(CLOSED_RAD)
     assert json.loads((tmp_path / "info.json").read_text())["units"] == "rad"
+
+
+def test_the_shipped_policy_grabs_and_can_drive_a_second_round(tmp_path: Path) -> None:
+    pytest.importorskip("lerobot")
+    import torch
+
+    torch.set_num_threads(1)  # a second thread of so small a network only waits
+    policy = LoadedPolicy(CHECKPOINT)
+    with SimEnv() as env:
+        done = [attempt(env, policy, 700 + n, tries=2, error_m=0.015) for n in range(3)]
+    assert sum(one.held == one.name for one in done) >= 2
+    assert write_grab(tmp_path, 1, 5, policy)["episodes"] == 1
