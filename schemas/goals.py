@@ -73,7 +73,15 @@ class ShutdownRunner(_Call):
 
 
 RunnerRequest = Annotated[
-    SendGoal | CancelGoal | GetResult | GetFrame | GetState | GetSkills | GetGroundTruth | PingRunner | ShutdownRunner,
+    SendGoal
+    | CancelGoal
+    | GetResult
+    | GetFrame
+    | GetState
+    | GetSkills
+    | GetGroundTruth
+    | PingRunner
+    | ShutdownRunner,
     Field(discriminator="op"),
 ]
 RUNNER_REQUEST: TypeAdapter[RunnerRequest] = TypeAdapter(RunnerRequest)

@@ -50,7 +50,9 @@ class LeaseSpec(_Frozen):
     evictable: bool = True
     ttl_s: Annotated[float, Field(ge=0.5, le=3600)] = d.LEASE_TTL_S
     min_residency_s: Seconds = d.MIN_RESIDENCY_S
-    on_deadline: Literal["wait", "deny"] = "wait"  # what a waiter gets when a holder outstays the ladder's deadline
+    on_deadline: Literal["wait", "deny"] = (
+        "wait"  # what a waiter gets when a holder outstays the ladder's deadline
+    )
 
 
 class _Request(_Frozen):

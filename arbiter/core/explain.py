@@ -131,8 +131,8 @@ def explain_lease(core: Core, lease: Lease) -> dict[str, Any]:
     position = _best_position(core, lease)
     condition, then = _condition(core, gpu, lease, blockers, position)
     eta = _eta(core, gpu, lease)
-    head = f"{lease.spec.consumer} needs {_gb(added)}, {_gb(max(0, free))} are free" + (
-        f", {_gb(deficit)} are missing" if deficit else ""
+    head = f"{lease.spec.consumer} needs {_gib(added)}, {_gib(max(0, free))} are free" + (
+        f", {_gib(deficit)} are missing" if deficit else ""
     )
     return {
         "lease_id": lease.id,
@@ -278,7 +278,7 @@ def _condition(
 
 
 def _leaving_next(core: Core, gpu: Gpu, holder: Lease) -> str:
-    charge = _gb(gpu.ledger.charge_bytes(holder.id))
+    charge = _gib(gpu.ledger.charge_bytes(holder.id))
     name = holder.spec.consumer
     if holder.state is LeaseState.REVOKING and holder.uses:
         plural = "use" if len(holder.uses) == 1 else "uses"
@@ -341,8 +341,8 @@ def _ago(core: Core, holder: Lease) -> str:
     return f"{core.now - asked_at:.1f} s ago"
 
 
-def _gb(count: int) -> str:
-    return f"{count / 1e9:.2f} GB"
+def _gib(count: int) -> str:
+    return f"{count / 2**30:.2f} GiB"
 
 
 # -- switch --------------------------------------------------------------------------------------------------------------

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from clients.aio import ArbiterClient
 
 from arbiter.host.gpu.fake import make_card
 from arbiter.testing.fakegpu_check import check_log
+from clients.aio import ArbiterClient
 from schemas.endpoints import RUNTIME_VARIABLE
 from schemas.errors import ArbiterUnreachable
 

@@ -3,10 +3,13 @@
 import contextlib
 import json
 import os
+import pty
 import queue
+import select
 import signal
 import subprocess
 import sys
+import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -66,6 +69,7 @@ def test_the_path_of_status_imports_nothing_heavy(nowhere: dict[str, str]) -> No
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(
     "command", [["status"], ["why", "x"], ["history"], ["watch"], ["run", "--vram", "1GiB", "true"]]
 )
@@ -260,3 +264,42 @@ def test_watch_prints_plain_lines_where_there_is_no_terminal(
     finally:
         process.kill()
         process.wait()
+
+
+@pytest.mark.e2e
+def test_watch_draws_the_status_on_a_terminal(
+    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    lease = client.acquire(spec("detector", 5))
+    lease.ready()
+    master, terminal = pty.openpty()
+    termios.tcsetwinsize(terminal, (40, 140))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "clients", "watch"],
+        env={**arbiter_daemon.environ, "TERM": "xterm"},
+        stdin=terminal,
+        stdout=terminal,
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(terminal)
+    shown = b""
+    try:
+        deadline = time.monotonic() + PATIENCE_S
+        while b"held, idle" not in shown and time.monotonic() < deadline:
+            if select.select([master], [], [], 1.0)[0]:
+                shown += os.read(master, 65_536)
+        assert b"arbiter serving" in shown
+        assert b"held, idle" in shown
+        process.send_signal(signal.SIGINT)
+        while select.select([master], [], [], PATIENCE_S)[
+            0
+        ]:  # it restores the screen, and must not block on us
+            try:
+                os.read(master, 65_536)
+            except OSError:  # the other side is closed: it has ended
+                break
+        assert process.wait(PATIENCE_S) in (0, 130)
+    finally:
+        process.kill()
+        process.wait()
+        os.close(master)
