@@ -18,7 +18,7 @@ ATTEMPTS_MAX = 3
 LOOKS_MAX = 3  # repeats of a locate that gave no answer about the scene
 TURNS_RAD = (0.35, -0.70, 0.35)  # look left, look right, back to the middle
 NAVIGATE_DEADLINE_S = 60.0
-GRAB_DEADLINE_S = 60.0
+GRAB_DEADLINE_S = 120.0  # counts from acceptance: waiting for the card and loading are in it
 GRASP_CAMERA = "wrist"  # looks at the fingers: what they hold cannot hide behind the arm
 
 _TASK = re.compile(
@@ -76,6 +76,8 @@ def _script(thing: str, navigate: str, grab: str, *, can_query: bool) -> Script:
         )
     reason = ""
     for attempt in range(1, ATTEMPTS_MAX + 1):
+        if attempt > 1:
+            yield _turn(navigate, 0.0, "fold the arm, which hides the table after a grab")
         found = yield from _find(thing, navigate)
         if isinstance(found, str):
             return Finish(False, found)
@@ -113,10 +115,7 @@ def _find(thing: str, navigate: str) -> Generator[ToolCall, Outcome, Point | str
         if looked.status != "not_seen":
             return f"could not look for the {thing}: {looked.text}"
         if turn is not None:
-            yield ExecuteRskill(
-                rskill_id=navigate, deadline_s=NAVIGATE_DEADLINE_S, rationale=f"the {thing} is not in view: look around",
-                goal_params_json=json.dumps({"turn_rad": turn}),
-            )  # fmt: skip
+            yield _turn(navigate, turn, f"the {thing} is not in view: look around")
     return f"the {thing} was not seen"
 
 
@@ -138,6 +137,13 @@ def _ask(question: str) -> Generator[ToolCall, Outcome, str | None]:
         if outcome.status == "answered":
             return outcome.text
     return None
+
+
+def _turn(navigate: str, angle_rad: float, why: str) -> ExecuteRskill:
+    params = json.dumps({"turn_rad": angle_rad})
+    return ExecuteRskill(
+        rskill_id=navigate, deadline_s=NAVIGATE_DEADLINE_S, rationale=why, goal_params_json=params
+    )
 
 
 def _drive(navigate: str, point: Point, why: str) -> ExecuteRskill:

@@ -241,7 +241,7 @@ class Heads:
         logits = self.held(mean)
         visible = functional.binary_cross_entropy_with_logits(self.shows(mean), shows, weight=weight)
         right = float((logits.argmax(dim=1) == held).float().mean())
-        return functional.cross_entropy(logits, held) + 2.0 * visible, right
+        return functional.cross_entropy(logits, held) + visible, right
 
 
 def image_tokens(model: Any, patches: Any, recipe: Recipe) -> Any:
@@ -351,6 +351,8 @@ def train(
     common.seed_everything(recipe.seed, recipe.threads)
     processor = build_processor(out, recipe, names)
     model = build_model(recipe, processor)
+    if start is not None:
+        model = type(model).from_pretrained(start, local_files_only=True)
     model.train()
     pixels = common.load_pixels(frames, recipe.size_px)
     heads = Heads(recipe.width, names)
@@ -421,13 +423,13 @@ def balanced(some: Sequence[int], others: Sequence[int]) -> list[int]:
     return [half[i % len(half)] for i in range(longest) for half in (some, others)]
 
 
-def run(recipe: Recipe, data: Path, out: Path) -> dict[str, Any]:
+def run(recipe: Recipe, data: Path, out: Path, start: Path | None = None) -> dict[str, Any]:
     """Train, save, evaluate the saved checkpoint as a user would load it, write the model card. Returns the figures."""
     frames = common.read_frames(data, recipe.cameras)
     training, testing = common.split_by_scene(frames, recipe.held_out, recipe.seed)
     names = sorted({name for frame in frames for name in frame.present})
     out.mkdir(parents=True, exist_ok=True)
-    model, figures = train(recipe, training, names, out)
+    model, figures = train(recipe, training, names, out, start)
     model.save_pretrained(out)
     return figures | report(recipe, training, testing, names, out, figures)
 
@@ -481,8 +483,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--threads", type=int, default=Recipe().threads)
     args = parser.parse_args(argv)
     recipe = dataclasses.replace(SMOKE if args.smoke else Recipe(), seed=args.seed, threads=args.threads)
+    if args.vision_steps is not None:
+        recipe = dataclasses.replace(recipe, vision_steps=args.vision_steps)
+    if args.steps is not None:
+        recipe = dataclasses.replace(recipe, steps=args.steps)
     try:
-        figures = run(recipe, args.data, args.out)
+        figures = run(recipe, args.data, args.out, args.start_from)
     except common.BadDataset as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
