@@ -15,7 +15,6 @@ from pathlib import Path
 
 from clients.runner import RunnerClient
 from clients.sidecar.perception import DetectorClient, SceneVlmClient
-
 from reasoner.llm.openai import LlmConfig, OpenAiPlanner
 from reasoner.llm.scripted import ScriptedPlanner
 from reasoner.loop import Result, run_episode
@@ -23,7 +22,7 @@ from reasoner.palette import Palette, palette_of
 from reasoner.planner import Planner
 from reasoner.tools import Tools
 from schemas.endpoints import program_endpoint
-from schemas.errors import ArbiterUnreachable, SidecarUnavailable, VramError
+from schemas.errors import RunnerUnreachable, SidecarUnavailable, VramError
 from schemas.manifest import RSkillManifest
 
 EXIT_FAILED, EXIT_USAGE, EXIT_UNREACHABLE = 1, 2, 3
@@ -52,7 +51,7 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s", stream=sys.stderr)
     try:
         result = asyncio.run(_run(arguments))
-    except (ArbiterUnreachable, SidecarUnavailable) as error:
+    except (RunnerUnreachable, SidecarUnavailable) as error:
         sys.exit(_complain(error, EXIT_UNREACHABLE))
     except VramError as error:
         sys.exit(_complain(error, EXIT_USAGE))

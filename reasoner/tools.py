@@ -10,12 +10,12 @@ from clients.runner import RunnerClient
 from clients.sidecar.perception import DetectorClient, SceneVlmClient
 from reasoner.planner import Outcome
 from schemas.errors import (
-    ArbiterUnreachable,
     Evicted,
     FrameStale,
     GoalRejected,
     LeaseRevoking,
     NotResident,
+    RunnerUnreachable,
     VramError,
 )
 from schemas.goals import FrameReply
@@ -106,7 +106,7 @@ class Tools:
         limit_s = call.deadline_s + GOAL_GRACE_S if call.deadline_s else GOAL_MAX_S
         try:
             result = await goal.result(timeout_s=limit_s)
-        except (TimeoutError, ArbiterUnreachable):
+        except (TimeoutError, RunnerUnreachable):
             await goal.cancel()
             return Outcome(
                 "failed", f"no result within {limit_s:.0f} s; the goal was cancelled", "wait_timeout"

@@ -28,7 +28,7 @@ from clients.sidecar.perception import DetectorClient, SceneVlmClient
 from clients.sidecar.policy import PolicyClient
 from schemas import fakegpu
 from schemas.endpoints import RUNTIME_VARIABLE
-from schemas.errors import ArbiterUnreachable, SidecarUnavailable, VramError
+from schemas.errors import RunnerUnreachable, SidecarUnavailable, VramError
 from schemas.units import parse_bytes
 
 CONFIGS = Path(schemas.__file__).parents[1] / "configs"
@@ -220,7 +220,7 @@ async def _until_up(programs: Programs, ping: Any) -> None:
         programs.check()
         try:
             await ping()
-        except (SidecarUnavailable, ArbiterUnreachable):
+        except (SidecarUnavailable, RunnerUnreachable):
             await asyncio.sleep(POLL_S)
         else:
             return

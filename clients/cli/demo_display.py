@@ -38,7 +38,7 @@ def describe(event: Mapping[str, Any]) -> str:
             return f"{who} loaded beside the others in {event['load_ms']:.0f} ms, nobody evicted"
         case kind:
             reason = event.get("reason", "")
-            return f"{who}: {kind}" + (f" ({reason})" if reason else "")
+            return f"{who or 'arbiter'}: {kind}" + (f" ({reason})" if reason else "")
 
 
 class Display:

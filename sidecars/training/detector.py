@@ -44,8 +44,8 @@ class Recipe:
     seed: int = 7
     threads: int = 1
     camera: str = "front"
-    image_px: int = 320
-    patch_px: int = 16
+    image_px: int = 400
+    patch_px: int = 20
     width: int = 128
     layers: int = 4
     heads: int = 2
@@ -56,6 +56,7 @@ class Recipe:
     budget_s: float = 3600.0
     max_steps: int = 2400
     held_out: float = 0.12
+    split_seed: int = 7  # not the seed of the run: a run that goes on from another keeps its held-out scenes
     strange_queries: int = 10
     word_steps: int = 250
 
@@ -272,6 +273,8 @@ def loss_of(
     # a patch that touches a thing without owning it may say either to the thing's own queries
     unsure = torch.einsum("bpt,btq->bpq", targets.touched.float(), answers) > 0
     weight = 1.0 - (unsure & (wanted == 0)).float()
+    # right colour and wrong shape, or the reverse, is the mistake to unlearn: things weigh more than background
+    weight = weight * (1.0 + 2.0 * owned[..., None])
     chance = logits.sigmoid()
     raw = functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
     focus = torch.where(wanted > 0, 1 - chance, chance) ** 2
@@ -324,14 +327,29 @@ def augment(
     return common.jitter_colours(out, generator, 0.12), things
 
 
-def train(recipe: Recipe, frames: Sequence[Frame], out: Path) -> tuple[Any, Any, dict[str, Any]]:
-    """Train on `frames`; returns (processor, model, figures of the run)."""
+def take_over(model: Any, start: Path) -> None:
+    """Copy the weights of an earlier checkpoint; its patch filters are scaled if the patches have another size."""
+    import torch
+    from transformers import OwlViTForObjectDetection
+
+    weights = OwlViTForObjectDetection.from_pretrained(start, local_files_only=True).state_dict()
+    name = "owlvit.vision_model.embeddings.patch_embedding.weight"
+    old, new = weights[name], model.state_dict()[name]
+    scaled = torch.nn.functional.interpolate(old, new.shape[-2:], mode="bicubic", align_corners=False)
+    weights[name] = scaled * (old.shape[-1] / new.shape[-1]) ** 2
+    model.load_state_dict(weights)
+
+
+def train(
+    recipe: Recipe, frames: Sequence[Frame], words: Sequence[str], out: Path, start: Path | None = None
+) -> tuple[Any, Any, dict[str, Any]]:
+    """Train on `frames`, from the weights of `start` if given; returns (processor, model, figures of the run)."""
     import torch
 
     common.seed_everything(recipe.seed, recipe.threads)
     colours = sorted({thing.colour for frame in frames for thing in frame.objects})
     shapes = sorted({thing.shape for frame in frames for thing in frame.objects})
-    processor = build_processor(out, recipe.image_px, queries.every_word(colours, shapes))
+    processor = build_processor(out, recipe.image_px, words)
     model = build_model(recipe, processor.tokenizer)
     model.train()
     from PIL import Image
@@ -350,8 +368,11 @@ def train(recipe: Recipe, frames: Sequence[Frame], out: Path) -> tuple[Any, Any,
     rng = random.Random(f"detector-{recipe.seed}")
     generator = torch.Generator().manual_seed(recipe.seed)
     started, step, shown = time.monotonic(), 0, 0.0
-    cosine = teach_words(model, processor.tokenizer, recipe, colours, shapes)
-    print(f"{time.monotonic() - started:6.0f} s  words: mean cosine {cosine:.3f}", flush=True)
+    if start is None:
+        cosine = teach_words(model, processor.tokenizer, recipe, colours, shapes)
+        print(f"{time.monotonic() - started:6.0f} s  words: mean cosine {cosine:.3f}", flush=True)
+    else:
+        take_over(model, start)
     losses: list[float] = []
     for chosen in common.batches(len(frames), recipe.batch, recipe.seed):
         done = max((time.monotonic() - started) / recipe.budget_s, step / recipe.max_steps)
@@ -394,14 +415,16 @@ def train(recipe: Recipe, frames: Sequence[Frame], out: Path) -> tuple[Any, Any,
     )
 
 
-def run(recipe: Recipe, data: Path, out: Path) -> dict[str, Any]:
+def run(recipe: Recipe, data: Path, out: Path, start: Path | None = None) -> dict[str, Any]:
     """Train, save, evaluate the saved checkpoint as a user would load it, write the model card. Returns the figures."""
     from transformers import AutoModelForZeroShotObjectDetection, AutoProcessor
 
     frames = common.read_frames(data, [recipe.camera])
-    training, testing = common.split_by_scene(frames, recipe.held_out, recipe.seed)
+    training, testing = common.split_by_scene(frames, recipe.held_out, recipe.split_seed)
     out.mkdir(parents=True, exist_ok=True)
-    _, trained, figures = train(recipe, training, out)
+    names = sorted({name for frame in frames for name in frame.present})
+    words = queries.every_word(sorted({n.split()[0] for n in names}), sorted({n.split()[1] for n in names}))
+    _, trained, figures = train(recipe, training, words, out, start)
     trained.save_pretrained(out)
     processor = AutoProcessor.from_pretrained(out, local_files_only=True)
     model = AutoModelForZeroShotObjectDetection.from_pretrained(out, local_files_only=True)
@@ -437,8 +460,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--threads", type=int, default=Recipe().threads)
     args = parser.parse_args(argv)
     recipe = dataclasses.replace(SMOKE if args.smoke else Recipe(), seed=args.seed, threads=args.threads)
+    if args.steps is not None:
+        recipe = dataclasses.replace(recipe, max_steps=args.steps)
     try:
-        figures = run(recipe, args.data, args.out)
+        figures = run(recipe, args.data, args.out, args.start_from)
     except common.BadDataset as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

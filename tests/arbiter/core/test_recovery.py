@@ -3,10 +3,10 @@
 from typing import Any
 
 from arbiter.core.effects import Note
-from arbiter.core.events import MemorySampled, Recovered
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer
+from arbiter.core.events import ClientConnected, ClientLeft, MemorySampled, Recovered, UseBegan
+from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
 from schemas import defaults as d
-from schemas.ids import ClientId, GpuId, LeaseId, Token
+from schemas.ids import ClientId, GpuId, LeaseId, Token, UseId
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -47,8 +47,8 @@ def test_re_attaching_to_a_daemon_that_did_not_restart_only_moves_the_connection
     det, lease, token = held(driver, "det", 5)
     det.use_begin(lease, "over")
     det.use_begin(lease, "runs")
-    det.client = ClientId("c-new")
-    det.connect()
+    det.client = ClientId("c-new")  # the same instance: the server never says that its old connection is gone
+    driver.post(ClientConnected(det.client, det.process, 1000, det.name, "det-c101"))
     assert answer(det.reattach(lease, token, uses=["runs"]))["leases"][0]["lease"]["uses"] == 1
     det.use_end(lease, "runs")
     det.unloading(lease)
@@ -57,6 +57,29 @@ def test_re_attaching_to_a_daemon_that_did_not_restart_only_moves_the_connection
     driver.until(lambda: driver.state(lease) == "over")
     (gone,) = answer(det.reattach(lease, token))["leases"]
     assert gone["error"]["code"] == "bad_state"
+
+
+def test_a_re_attachment_keeps_the_uses_that_others_began_again_before_it() -> None:
+    """Regression: after a restart the users may be back before the holder, whose list knows only its own uses."""
+    driver = CoreDriver(8 * GIB)
+    det, lease, token = held(driver, "det", 5)
+    runner = driver.consumer("runner")
+    driver.restart()
+    second = ClientId("second")  # another connection of the holder's process
+    driver.post(ClientConnected(second, det.process, 1000, "det", "det-second"))
+    driver.post(UseBegan(second, driver.next_request(), lease, token, UseId("sibling"), ""))
+    runner.connect()
+    runner.use_begin(lease, "goal", token)
+    det.connect()
+    assert answer(det.reattach(lease, token, uses=["own"]))["leases"][0]["lease"]["uses"] == 3
+    assert answer(det.reattach(lease, token))["leases"][0]["lease"]["uses"] == 2, "its own it may take back"
+    vlm = driver.consumer("vlm").acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    assert refusal(det.unloading(lease)).code == "bad_state", "not at a safe point: others use it"
+    driver.post(ClientLeft(second, "gone"))
+    runner.use_end(lease, "goal", token)
+    det.unload(lease)
+    driver.until(lambda: driver.state(vlm) == "loading")
 
 
 def test_wrong_tokens_and_wrong_processes_are_not_kept() -> None:
