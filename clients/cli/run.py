@@ -1,6 +1,8 @@
 """`vramctl run`: a lease for a program that knows nothing of the arbiter. Acquire, start it, pass signals on, release when it ends.
 
-The lease belongs to `vramctl`, the bytes to its child: a consumer is a process tree. By default the lease is pinned, because a
+The lease belongs to `vramctl`, the bytes to its child: a consumer is a process tree, and the arbiter books a child's bytes on its nearest
+ancestor with a lease, so they are measured as this lease's, shown as "vramctl (python)". A program that leaves `vramctl`'s tree (it
+daemonises) or leases for itself is not covered by this lease. By default the lease is pinned, because a
 program that cannot unload can only be killed, and whether that is safe is for a person to say (`--on-revoke term`).
 """
 
