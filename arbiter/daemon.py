@@ -29,6 +29,7 @@ from arbiter.host.journal import Journal
 from arbiter.host.lockfile import LockFile
 from arbiter.host.probing import Prober, within
 from arbiter.host.systemd import Notifier
+from arbiter.host.tree import Known
 from arbiter.host.watch import ProcessWatch
 from arbiter.inbox import Inbox
 from arbiter.rpc.peer import group_id, start_ticks
@@ -190,7 +191,14 @@ class Daemon:
         try_records(journal, settings)
         core = Arbiter(settings, time.monotonic())  # 4
         inbox = Inbox(core, lambda effects: executor.perform(effects), self._core_failed)
-        prober = Prober(probe, [gpu.id for gpu in gpus], config.probe.deadline_s, loop, inbox.post)
+        prober = Prober(
+            probe,
+            [gpu.id for gpu in gpus],
+            config.probe.deadline_s,
+            loop,
+            inbox.post,
+            lambda gpu: Known(core.owners(gpu), core.clients()),
+        )
         undo.callback(prober.close)
         undo.callback(inbox.close)
         server = RouterServer(places.socket, config.limits.message_max_bytes, group)

@@ -1,7 +1,7 @@
 """The one place that owns the core: events in, one after the other, effects out to the executor, one timer for time.
 
 All of it runs on the thread of the event loop; other threads post through `loop.call_soon_threadsafe(inbox.post, event)`. Nothing
-else may touch the core, except the two reads that answer `status` and `why`. `now` is `time.monotonic()`: the clock of the event
+else may touch the core, except its reads: `status`, `why`, and who owns what when a probe's reading is handed on. `now` is `time.monotonic()`: the clock of the event
 loop's timers and of the probes' time stamps.
 """
 

@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from clients.configs import configs_folder
 from runner import frames
 from schemas.endpoints import program_endpoint
 from schemas.errors import ArbiterUnreachable, ConfigError, VramError
@@ -208,17 +209,13 @@ async def connect_arbiter(endpoint: str | None, stack: contextlib.AsyncExitStack
 
 
 def default_skills() -> Path:
-    """Folder of the shipped manifests: beside the sources, else in an installed wheel. Raises ConfigError."""
-    import schemas
-
-    configured = os.environ.get("VRAM_ARBITER_CONFIGS")
-    tops = [Path(top) for top in schemas.__path__]
-    candidates = [Path(configured)] if configured else []
-    candidates += [top / "_configs" for top in tops] + [top.parent / "configs" for top in tops]
-    for folder in candidates:
-        if (folder / "rskills").is_dir():
-            return folder / "rskills"
-    raise ConfigError("no skills are installed with this program", hint="name some with --skills")
+    """Folder of the shipped manifests. Raises ConfigError where there is none."""
+    folder = configs_folder(os.environ) / "rskills"
+    if not folder.is_dir():
+        raise ConfigError(
+            f"no skills in {folder}", hint="name some with --skills, or set VRAM_ARBITER_CONFIGS"
+        )
+    return folder
 
 
 def install_signals(stopping: asyncio.Event) -> None:

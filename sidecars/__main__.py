@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from clients.configs import configs_folder
 from schemas import defaults as d
 from schemas.endpoints import arbiter_endpoint, program_endpoint
 from schemas.errors import ConfigError, VramError
@@ -27,7 +28,7 @@ from sidecars.settings import (
     read_footprints,
     read_model,
 )
-from sidecars.weights import Weights, configs_folder
+from sidecars.weights import Weights
 
 FOOTPRINTS = "models/footprints.yaml"
 _ENVIRONMENT = {  # of the model libraries, before they are imported: what they write and whom they tell

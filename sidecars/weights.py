@@ -4,16 +4,14 @@
 """
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from clients.configs import CONFIGS_VARIABLE
 from schemas.errors import ConfigError, ModelError
 from schemas.manifest import RSkillManifest
 from schemas.manifest.vocabulary import Dtype
-
-CONFIGS_VARIABLE = "VRAM_ARBITER_CONFIGS"
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,17 +21,6 @@ class Weights:
     source: str
     revision: str | None = None
     local: bool = False
-
-
-def configs_folder(environ: Mapping[str, str]) -> Path:
-    """Folder of skills, models and scenes: named by the environment, inside the installed package, or in the source tree."""
-    if explicit := environ.get(CONFIGS_VARIABLE):
-        return Path(explicit)
-    import schemas
-
-    package = Path(schemas.__file__).parent
-    installed = package / "_configs"
-    return installed if installed.is_dir() else package.parent / "configs"
 
 
 def resolve(uri: str, configs: Path) -> Weights:

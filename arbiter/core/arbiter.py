@@ -42,7 +42,7 @@ from arbiter.core.events import (
 from arbiter.core.sessions import on_connected, on_died, on_journal_failed, on_left
 from arbiter.core.settings import Settings
 from arbiter.core.state import Core, Refused
-from schemas.ids import GpuId
+from schemas.ids import GpuId, ProcessKey
 
 
 class Arbiter:
@@ -84,6 +84,18 @@ class Arbiter:
     def learnt(self) -> dict[str, dict[str, float]]:
         """Medians of what was learnt, in the shape of `Settings.learnt`."""
         return explain.medians(self._core)
+
+    def owners(self, gpu: GpuId) -> frozenset[ProcessKey]:
+        """Processes with an account on a card: they hold a lease there, one of theirs is measured away, or they keep a residue.
+
+        Empty for an unknown card.
+        """
+        known = self._core.gpus.get(gpu)
+        return frozenset() if known is None else frozenset(known.ledger.accounts)
+
+    def clients(self) -> frozenset[ProcessKey]:
+        """Processes with a connection, observers too."""
+        return frozenset(client.process for client in self._core.clients.values())
 
     def _happened(self, event: Event) -> None:
         core = self._core

@@ -168,9 +168,14 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
 
 
 def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLease) -> None:
-    """What this client says runs is what runs, as far as it concerns this client's process."""
+    """What this client says runs is what runs, as far as its own uses go.
+
+    Other connections, of this process too, answer for theirs: after a restart they may have begun them again before this one
+    came. An earlier connection of the same instance is no other: ROUTER never says that it is gone.
+    """
+    others = {c.id for c in core.clients.values() if c.instance != client.instance}
     for key, use in list(lease.uses.items()):
-        if use.process == client.process and use.id not in item.uses:
+        if use.process == client.process and use.id not in item.uses and use.client not in others:
             del lease.uses[key]
     if lease.state in (LeaseState.HELD, LeaseState.REVOKING):
         for use_id in item.uses:

@@ -2,7 +2,8 @@
 
 A reading that fails or hangs is *unknown*. A thread that hangs cannot be ended, so the card stays unknown and no further reading is
 started until it returns. Requests are merged, except that one that comes after a reading began is answered by a fresh one: a
-verification must never be fed with a reading from before its question.
+verification must never be fed with a reading from before its question. Bytes of children are booked on the ancestor that holds the lease
+(`tree`): ancestors are read in the thread, who holds a lease is asked when the reading is handed on.
 """
 
 import asyncio
@@ -10,13 +11,14 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
 from arbiter.core import events as ev
 from arbiter.host.gpu.probe import GpuProbe, Reading
+from arbiter.host.tree import Known, Lineage, Lineages, on_owners
 from schemas.errors import ProbeFailed
-from schemas.ids import GpuId
+from schemas.ids import GpuId, ProcessKey
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +26,10 @@ CLOSE_S = 1.0
 
 
 class Prober:
-    """`sample(gpu)` ends by posting `MemorySampled` or `ProbeFailed`, exactly one for a request or for several merged ones."""
+    """`sample(gpu)` ends by posting `MemorySampled` or `ProbeFailed`, exactly one for a request or for several merged ones.
+
+    `known(gpu)` is called on the loop's thread.
+    """
 
     def __init__(
         self,
@@ -33,9 +38,10 @@ class Prober:
         deadline_s: float,
         loop: asyncio.AbstractEventLoop,
         post: Callable[[ev.Event], None],
+        known: Callable[[GpuId], Known],
     ) -> None:
         self._probe = probe
-        self._readers = {gpu: _Reader(probe, gpu, deadline_s, loop, post) for gpu in gpus}
+        self._readers = {gpu: _Reader(probe, gpu, deadline_s, loop, post, known) for gpu in gpus}
 
     def sample(self, gpu: GpuId) -> None:
         self._readers[gpu].request()
@@ -59,12 +65,15 @@ class _Reader:
         deadline_s: float,
         loop: asyncio.AbstractEventLoop,
         post: Callable[[ev.Event], None],
+        known: Callable[[GpuId], Known],
     ) -> None:
         self._probe = probe
         self._gpu = gpu
         self._deadline_s = deadline_s
         self._loop = loop
         self._post = post
+        self._known = known
+        self._lineages = Lineages()  # the thread's
         self._state: Literal["idle", "reading", "stuck", "closed"] = "idle"
         self._again = False
         self._timer: asyncio.TimerHandle | None = None
@@ -113,7 +122,7 @@ class _Reader:
     def _fail(self, reason: str) -> None:
         self._post(ev.ProbeFailed(self._gpu, time.monotonic(), reason))
 
-    def _done(self, taken_at: float, outcome: Reading | str) -> None:
+    def _done(self, taken_at: float, outcome: Reading | str, lineages: Mapping[ProcessKey, Lineage]) -> None:
         """Back on the loop's thread. A late answer is not used: it is as old as its question, and a fresh one costs nothing."""
         if self._state == "closed":
             return
@@ -127,10 +136,11 @@ class _Reader:
             self._begin()  # whether it answers is known from a fresh reading only
             return
         if isinstance(outcome, Reading):
+            processes = outcome.processes
+            if processes is not None:
+                processes = on_owners(processes, lineages, self._known(self._gpu))
             self._post(
-                ev.MemorySampled(
-                    self._gpu, taken_at, outcome.used_bytes, outcome.total_bytes, outcome.processes
-                )
+                ev.MemorySampled(self._gpu, taken_at, outcome.used_bytes, outcome.total_bytes, processes)
             )
         else:
             self._fail(outcome)
@@ -144,15 +154,17 @@ class _Reader:
         while self._work.get():
             taken_at = time.monotonic()
             outcome: Reading | str
+            lineages: Mapping[ProcessKey, Lineage] = {}
             try:
                 outcome = self._probe.sample(self._gpu)
+                lineages = self._lineages.trace(outcome.processes or ())
             except ProbeFailed as error:
                 outcome = error.message
             except Exception as error:  # outermost loop of a thread: a defect is an unknown card
                 log.exception("%s: the probe failed", self._gpu)
                 outcome = f"{type(error).__name__}: {error}"
             try:
-                self._loop.call_soon_threadsafe(self._done, taken_at, outcome)
+                self._loop.call_soon_threadsafe(self._done, taken_at, outcome, lineages)
             except RuntimeError:
                 return  # the loop closed meanwhile
 

@@ -7,6 +7,7 @@ own end. With `--arbiter off` the same programs run without the arbiter and show
 import asyncio
 import contextlib
 import json
+import os
 import shutil
 import tempfile
 import time
@@ -18,11 +19,11 @@ from typing import Annotated, Any
 
 import typer
 
-import schemas
 from clients.aio import ArbiterClient
 from clients.cli.demo_display import Display
 from clients.cli.demo_programs import Program, Programs
 from clients.cli.demo_report import CardStory, draw_timeline, read_log, read_samples, summarise
+from clients.configs import configs_folder
 from clients.runner import RunnerClient
 from clients.sidecar.perception import DetectorClient, SceneVlmClient
 from clients.sidecar.policy import PolicyClient
@@ -31,7 +32,6 @@ from schemas.endpoints import RUNTIME_VARIABLE
 from schemas.errors import RunnerUnreachable, SidecarUnavailable, VramError
 from schemas.units import parse_bytes
 
-CONFIGS = Path(schemas.__file__).parents[1] / "configs"
 SIDECARS = {"detector": "so101-detector", "scene-vlm": "so101-scene-vlm", "grab": "so101-grab"}
 BUDGET = "8GiB"
 LOAD_BYTES_PER_S = (
@@ -189,7 +189,7 @@ async def _boot(
         client = await stack.enter_async_context(_arbiter_client(runtime))
     device = "cuda" if gpu == "nvml" else f"fake:{runtime}/fakegpu"
     for name, rskill in SIDECARS.items():
-        manifest = str(CONFIGS / "rskills" / rskill / "rskill.yaml")
+        manifest = str(configs_folder(os.environ) / "rskills" / rskill / "rskill.yaml")
         await programs.start(
             name, "sidecars", "--name", name, "--rskill", manifest, "--device", device, *without
         )

@@ -252,6 +252,8 @@ def loss_of(
     batch = pixels.shape[0]
     with torch.autocast("cpu", dtype=torch.bfloat16):
         grid, _ = model.image_embedder(pixels)
+    # the text tower has been taught already and stays as it is: fixed targets, and a tenth less work
+    with torch.no_grad():
         words = model.owlvit.text_projection(
             model.owlvit.text_model(input_ids=ids, attention_mask=mask).pooler_output
         )
@@ -454,12 +456,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, required=True, help="folder with labels.jsonl and images")
     parser.add_argument("--out", type=Path, required=True, help="folder for the checkpoint")
     parser.add_argument(
-        "--smoke", action="store_true", help="a toy size, seconds, only to see that everything runs"
+        "--start-from", type=Path, help="checkpoint of this script whose training is to go on"
     )
+    parser.add_argument("--steps", type=int, help="steps, if not the recipe's")
+    parser.add_argument("--budget-s", type=float, help="seconds after which to end, learning rate and all")
+    parser.add_argument("--smoke", action="store_true", help="a toy size, seconds, only to see that all runs")
     parser.add_argument("--seed", type=int, default=Recipe().seed)
     parser.add_argument("--threads", type=int, default=Recipe().threads)
     args = parser.parse_args(argv)
     recipe = dataclasses.replace(SMOKE if args.smoke else Recipe(), seed=args.seed, threads=args.threads)
+    if args.budget_s is not None:
+        recipe = dataclasses.replace(recipe, budget_s=args.budget_s)
     if args.steps is not None:
         recipe = dataclasses.replace(recipe, max_steps=args.steps)
     try:

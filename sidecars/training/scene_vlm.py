@@ -4,8 +4,8 @@
 by `AutoProcessor` and `AutoModelForImageTextToText` like Qwen/Qwen3.5-4B: chat template, `generate`. This script must not know
 the simulator or the sidecar that will serve the model.
 
-Two stages. The vision tower first learns, through throw-away linear heads on its mean output token, what is held and what
-shows: language comes easily once the image tokens say it. Then tower and language model learn to answer questions together.
+Three stages. The vision tower first learns, through throw-away linear heads on its mean output token, what is held and what
+shows; then the language model learns to answer from the tower's tokens; at last both are fitted together for a while.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
 import random
 import sys
 import time
@@ -56,11 +57,13 @@ class Recipe:
     vision_width: int = 128
     vision_layers: int = 3
     width: int = 128
-    layer_types: tuple[str, ...] = ("linear_attention", "full_attention")
-    batch: int = 24
-    questions_per_image: int = 2
+    layer_types: tuple[str, ...] = ("linear_attention", "full_attention", "full_attention", "full_attention")
+    batch: int = 16
+    questions_per_image: int = 3
     vision_steps: int = 1200
-    steps: int = 800
+    language_steps: int = 900
+    steps: int = 150
+    language_budget_s: float = 3600.0
     learning_rate: float = 1.0e-3
     held_out: float = 0.12
     split_seed: int = 0  # not the seed of the run: a run that goes on from another keeps its held-out scenes
@@ -72,7 +75,8 @@ class Recipe:
 
 
 SMOKE: Final = Recipe(
-    grid=(8, 6), vision_width=32, vision_layers=1, width=32, batch=6, vision_steps=6, steps=6, held_out=0.25,
+    grid=(8, 6), vision_width=32, vision_layers=1, width=32, batch=6, vision_steps=6, language_steps=6,
+    steps=4, held_out=0.25,
 )  # fmt: skip
 
 
@@ -137,8 +141,8 @@ def build_model(recipe: Recipe, processor: Any) -> Any:
             "head_dim": 32,
             "linear_key_head_dim": 32,
             "linear_value_head_dim": 32,
-            "linear_num_key_heads": 2,
-            "linear_num_value_heads": 4,
+            "linear_num_key_heads": 1,
+            "linear_num_value_heads": 1,
             "max_position_embeddings": 512,
             "rope_parameters": {
                 "rope_type": "default",
@@ -361,17 +365,26 @@ def answer_loss(
     return (each * weight).sum() / weight.sum(), right
 
 
+def take_over(model: Any, start: Path) -> None:
+    """Copy the weights of an earlier checkpoint: its vision tower, and its language model if that has the same layers."""
+    earlier = type(model).from_pretrained(start, local_files_only=True)
+    weights = earlier.state_dict()
+    if earlier.config.text_config.layer_types != model.config.text_config.layer_types:
+        weights = {name: value for name, value in weights.items() if name.startswith("model.visual.")}
+    model.load_state_dict(weights, strict=False)
+
+
 def train(
     recipe: Recipe, frames: Sequence[Frame], names: Sequence[str], out: Path, start: Path | None = None
 ) -> tuple[Any, dict[str, Any]]:
-    """Both stages on `frames`, from the weights of `start` if given; saves the processor; returns (model, figures)."""
+    """All stages on `frames`, from the weights of `start` if given; saves the processor; returns (model, figures)."""
     import torch
 
     common.seed_everything(recipe.seed, recipe.threads)
     processor = build_processor(out, recipe, names)
     model = build_model(recipe, processor)
     if start is not None:
-        model = type(model).from_pretrained(start, local_files_only=True)
+        take_over(model, start)
     model.train()
     pixels = common.load_pixels(frames, recipe.size_px)
     heads = Heads(recipe.width, names)
@@ -387,47 +400,49 @@ def train(
     batches = common.batches(len(order), recipe.batch, recipe.seed)
     tower = list(model.model.visual.parameters())
     language = [*model.model.language_model.parameters()]
-    shares = {"vision": (recipe.vision_steps, [*tower, *heads.parameters()])}
-    shares["both"] = (recipe.steps, [*tower, *heads.parameters(), *language])
+    stages = {
+        "vision": (recipe.vision_steps, [*tower, *heads.parameters()]),
+        "language": (recipe.language_steps, language),
+        "both": (recipe.steps, [*tower, *language]),
+    }
     figures: dict[str, Any] = {"train_frames": len(frames)}
-    for stage, (steps, parameters) in shares.items():
+    for stage, (steps, parameters) in stages.items():
         optimizer = torch.optim.AdamW(
             parameters, lr=recipe.learning_rate, betas=(0.9, 0.98), weight_decay=0.02
         )
         seen: list[tuple[float, float]] = []
+        peak = recipe.learning_rate * (0.3 if stage == "both" else 1.0)
+        budget_s = recipe.language_budget_s if stage == "language" else math.inf
+        began = time.monotonic()
         for step in range(steps):
+            done = max(step / steps, (time.monotonic() - began) / budget_s)
+            if done >= 1.0:
+                break
             for group in optimizer.param_groups:
-                group["lr"] = recipe.learning_rate * common.cosine_with_warmup(step, steps, min(50, steps))
+                group["lr"] = peak * common.cosine_with_warmup(round(1000 * done), 1000, 40)
             chosen = [order[i] for i in next(batches)]
             picked = [frames[i] for i in chosen]
             patches = to_patches(augment(pixels[chosen], generator), recipe)
-            with torch.autocast("cpu", dtype=torch.bfloat16):
+            with torch.autocast("cpu", dtype=torch.bfloat16), torch.set_grad_enabled(stage != "language"):
                 tokens = image_tokens(model, patches, recipe)
             tokens = tokens.float()
-            loss, right = heads.loss(tokens, picked)
-            said = 0.0
-            if stage == "both":
+            if stage == "vision":
+                loss, right = heads.loss(tokens, picked)
+            else:
                 owner = [i for i in range(len(picked)) for _ in range(recipe.questions_per_image)]
                 pairs = [ask_about(rng, picked[i], names) for i in owner]
-                answers = answer_loss(
-                    model, tokens, owner, encode(processor, pairs, image_token_count), recipe
-                )
-                loss = 0.5 * loss + answers
+                encoded = encode(processor, pairs, image_token_count)
+                loss, right = answer_loss(model, tokens, owner, encoded, recipe)
             optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(parameters, 1.0)
             optimizer.step()
-            seen.append((right, said))
+            seen.append((right, loss.item()))
             if step % max(1, steps // 20) == 0:
                 last = seen[-30:]
-                held_right = sum(r for r, _ in last) / len(last)
-                answer = sum(s for _, s in last) / len(last)
-                spent = time.monotonic() - started
-                print(
-                    f"{spent:6.0f} s  {stage} {step:5d}  held {held_right:.3f}  first words {answer:.3f}",
-                    flush=True,
-                )
-        figures[f"{stage}_steps"] = steps
+                shown = f"right {sum(r for r, _ in last) / len(last):.3f}  loss {sum(v for _, v in last) / len(last):.3f}"
+                print(f"{time.monotonic() - started:6.0f} s  {stage} {step:5d}  {shown}", flush=True)
+        figures[f"{stage}_steps"] = len(seen)
     figures["train_s"] = round(time.monotonic() - started, 1)
     model.eval()
     return model, figures
@@ -498,7 +513,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--start-from", type=Path, help="checkpoint of this script whose training is to go on"
     )
     parser.add_argument("--vision-steps", type=int, help="steps of the first stage, if not the recipe's")
-    parser.add_argument("--steps", type=int, help="steps of the second stage, if not the recipe's")
+    parser.add_argument("--steps", type=int, help="steps of the language stage, if not the recipe's")
+    parser.add_argument("--budget-s", type=float, help="seconds after which the language stage ends")
     parser.add_argument("--smoke", action="store_true", help="a toy size, seconds, only to see that all runs")
     parser.add_argument("--seed", type=int, default=Recipe().seed)
     parser.add_argument("--threads", type=int, default=Recipe().threads)
@@ -506,8 +522,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     recipe = dataclasses.replace(SMOKE if args.smoke else Recipe(), seed=args.seed, threads=args.threads)
     if args.vision_steps is not None:
         recipe = dataclasses.replace(recipe, vision_steps=args.vision_steps)
+    if args.budget_s is not None:
+        recipe = dataclasses.replace(recipe, language_budget_s=args.budget_s)
     if args.steps is not None:
-        recipe = dataclasses.replace(recipe, steps=args.steps)
+        recipe = dataclasses.replace(recipe, language_steps=args.steps)
     try:
         figures = run(recipe, args.data, args.out, args.start_from)
     except common.BadDataset as error:

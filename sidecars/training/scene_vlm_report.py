@@ -113,8 +113,8 @@ the simulated tabletop by `python -m sidecars.training.scene_vlm` (no pretrained
   `No,` and say why: `Yes, the gripper holds the red cube.`, `No, the gripper is empty.`, `No, the gripper holds the blue ball.`
 - Data: `python -m runner.sim.dataset scenes --count 8000 --seed 1`; {train_frames} frames to train, {test_frames} held out by scene. A
   third of the grabs misses on purpose: closed gripper beside or above the thing, things knocked over.
-- Training: seed {seed}; {vision_steps} steps of {batch} for the vision tower through throw-away heads, then {both_steps} with the language
-  model; {train_s} s on {threads} thread(s), bfloat16 autocast; checkpoint float32, {bytes} bytes.
+- Training: seed {seed}; {vision_steps} steps of {batch} for the vision tower through throw-away heads, then {language_steps}
+  for the language model and {both_steps} for both; {train_s} s on {threads} thread(s), bfloat16 autocast; checkpoint float32, {bytes} bytes.
 - One question about one image: {inference_ms} ms on one core.
 
 Held out, through the chat template and greedy `generate` (right: the yes or no; for `what is held` and `list` the whole answer;

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from clients.configs import configs_folder
 from schemas.errors import ConfigError, ModelError
-from sidecars.weights import Weights, configs_folder, from_pretrained, resolve
+from sidecars.weights import Weights, from_pretrained, resolve
 
 
 def test_a_hub_id_keeps_its_revision(tmp_path):

@@ -1,5 +1,6 @@
 """The ladder: ask, ask again until heard, remind, deadline. Exact times, no sleep."""
 
+from arbiter.core.events import ClientConnected
 from arbiter.testing.core_driver import Consumer, CoreDriver
 from schemas import defaults as d
 from schemas.ids import ClientId, LeaseId
@@ -156,8 +157,8 @@ def test_a_holder_that_comes_back_is_asked_again_and_keeps_the_uses_of_others() 
     det.ack(lease)
     driver.advance(1.0)
     assert len(driver.pushes("revoke")) == 1
-    det.client = ClientId("c-new")
-    det.connect()
+    old, det.client = det.client, ClientId("c-new")
+    driver.post(ClientConnected(det.client, det.process, 1000, "det", f"det-{old}"))  # the same instance
     det.reattach(lease, det.token(lease))
     assert driver.pushes("revoke")[-1]["uses"] == 1
     driver.advance(0.3)

@@ -4,7 +4,7 @@ from arbiter.core.effects import Note, Push, Refuse
 from arbiter.core.events import ClientLeft, JournalFailed, ProcessDied
 from arbiter.testing.core_driver import CoreDriver, refusal
 from schemas import defaults as d
-from schemas.ids import ClientId, LeaseId, ProcessKey
+from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
 
 GIB = d.GIB
 
@@ -179,3 +179,19 @@ def test_strangers_to_the_core_die_unmourned() -> None:
     assert driver.post(ProcessDied(ProcessKey(1, 1))) == []
     assert driver.post(ClientLeft(ClientId("x"), "bye")) == []
     assert driver.state(LeaseId("L1-1")) == "over"
+
+
+def test_who_owns_bytes_of_a_card_and_who_is_connected() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    first, second = driver.cards
+    det, watcher = driver.consumer("det"), driver.consumer("watcher")
+    assert driver.arbiter.owners(first) == frozenset(), "nobody holds a lease"
+    assert driver.arbiter.clients() == {det.process, watcher.process}
+    lease = det.acquire(2 * GIB, gpu=first)
+    det.load(lease)
+    assert (driver.arbiter.owners(first), driver.arbiter.owners(second)) == ({det.process}, frozenset())
+    assert driver.arbiter.owners(GpuId("GPU-none")) == frozenset()
+    det.die()
+    assert driver.arbiter.clients() == {watcher.process}
+    assert driver.arbiter.owners(first) == {det.process}, "a debt is not measured gone yet"
+    driver.until(lambda: not driver.arbiter.owners(first))

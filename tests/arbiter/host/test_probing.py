@@ -1,6 +1,7 @@
 """Readings with deadlines: failing, hanging and late probes. Threads are real, the probe is scripted."""
 
 import asyncio
+import os
 import queue
 import threading
 import time
@@ -11,8 +12,9 @@ import pytest
 from arbiter.core import events as ev
 from arbiter.host.gpu.probe import Card, Reading
 from arbiter.host.probing import Prober, within
+from arbiter.host.tree import NOBODY, Known, read_kin
 from schemas.errors import NoGpu, ProbeFailed
-from schemas.ids import GpuId
+from schemas.ids import GpuId, ProcessKey
 
 GPU = GpuId("GPU-1")
 PATIENCE_S = 20.0
@@ -47,12 +49,14 @@ Posted = "asyncio.Queue[ev.Event]"
 
 
 def probing(
-    test: Callable[[Prober, ScriptedProbe, Posted], Awaitable[None]], deadline_s: float = PATIENCE_S
+    test: Callable[[Prober, ScriptedProbe, Posted], Awaitable[None]],
+    deadline_s: float = PATIENCE_S,
+    known: Callable[[GpuId], Known] = lambda _: NOBODY,
 ) -> None:
     async def run() -> None:
         probe = ScriptedProbe()
         posted: asyncio.Queue[ev.Event] = asyncio.Queue()
-        prober = Prober(probe, [GPU], deadline_s, asyncio.get_running_loop(), posted.put_nowait)
+        prober = Prober(probe, [GPU], deadline_s, asyncio.get_running_loop(), posted.put_nowait, known)
         async with asyncio.timeout(PATIENCE_S):
             await test(prober, probe, posted)
         prober.close()
@@ -143,6 +147,38 @@ def test_a_hanging_reading_is_unknown_until_a_fresh_one_answers() -> None:
         assert event.used_bytes == 2
 
     probing(test, deadline_s=0.1)
+
+
+def test_bytes_of_a_child_are_booked_on_who_holds_the_lease_when_the_reading_is_handed_on() -> None:
+    """This very process is the child, the test's parent holds the lease, and was granted it while the card was being read."""
+    me, parent = read_kin(os.getpid()), read_kin(os.getppid())
+    assert me is not None
+    assert parent is not None
+    owners: set[ProcessKey] = set()
+    asked_on: list[int] = []
+
+    def known(gpu: GpuId) -> Known:
+        asked_on.append(threading.get_ident())
+        return Known(frozenset(owners), frozenset())
+
+    async def test(prober: Prober, probe: ScriptedProbe, posted: Posted) -> None:
+        use = ev.ProcessUse(me.process, "child", 40)
+        prober.sample(GPU)
+        await began(probe)
+        owners.add(parent.process)
+        probe.answers.put(Reading(40, 100, (use,)))
+        event = await posted.get()
+        assert isinstance(event, ev.MemorySampled)
+        assert event.processes == (ev.ProcessUse(parent.process, f"{parent.name} (child)", 40),)
+        owners.clear()
+        prober.sample(GPU)
+        probe.answers.put(Reading(40, 100, (use,)))
+        event = await posted.get()
+        assert isinstance(event, ev.MemorySampled)
+        assert event.processes == (use,)
+        assert set(asked_on) == {threading.get_ident()}, "the core is asked on its own thread only"
+
+    probing(test, known=known)
 
 
 def test_closing_does_not_wait_for_a_hanging_driver() -> None:

@@ -1,0 +1,160 @@
+"""Bytes of children on the ancestor that holds the lease; /proc is a dict here, except where its real text is read."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from arbiter.core.events import ProcessUse
+from arbiter.host.tree import DEPTH_MAX, NAME_MAX, Kin, Known, Lineages, on_owners, read_kin
+from schemas.ids import ProcessKey
+
+
+def key(pid: int) -> ProcessKey:
+    """In these tests a process started at ten times its pid."""
+    return ProcessKey(pid, 10 * pid)
+
+
+def use(pid: int, count: int | None, name: str = "python") -> ProcessUse:
+    return ProcessUse(key(pid), name, count)
+
+
+def known(owners: tuple[int, ...] = (), clients: tuple[int, ...] = ()) -> Known:
+    return Known(frozenset(map(key, owners)), frozenset(map(key, clients)))
+
+
+class Proc:
+    """`/proc` as a dict: pid → (parent's pid, name). 1 init, 20 shell, 30 vramctl, 40 program, 50 its worker."""
+
+    def __init__(self) -> None:
+        self.kin = {1: Kin(key(1), 0, "init")}
+        for pid, parent, name in ((20, 1, "bash"), (30, 20, "vramctl"), (40, 30, "sh"), (50, 40, "python")):
+            self.add(pid, parent, name)
+
+    def add(self, pid: int, parent: int, name: str, start_ticks: int | None = None) -> None:
+        self.kin[pid] = Kin(ProcessKey(pid, 10 * pid if start_ticks is None else start_ticks), parent, name)
+
+    def book(self, who: Known, *uses: ProcessUse) -> tuple[ProcessUse, ...]:
+        return on_owners(uses, Lineages(self.kin.get).trace(uses), who)
+
+
+def test_a_child_s_bytes_are_its_owner_s_at_any_depth() -> None:
+    proc = Proc()
+    assert proc.book(known((30,)), use(40, 3)) == (use(30, 3, "vramctl (python)"),)
+    assert proc.book(known((30,)), use(50, 5)) == (use(30, 5, "vramctl (python)"),)
+
+
+def test_the_nearest_owner_gets_them() -> None:
+    assert Proc().book(known((20, 30)), use(50, 5)) == (use(30, 5, "vramctl (python)"),)
+
+
+def test_entries_of_one_owner_are_summed_and_named_whatever_their_order() -> None:
+    proc = Proc()
+    proc.add(60, 30, "worker")
+    own, child, worker = use(30, 1, "vramctl run"), use(40, 2, "sh"), use(60, 4, "worker")
+    assert proc.book(known((30,)), own, child, worker) == (use(30, 7, "vramctl run (sh, worker)"),)
+    assert proc.book(known((30,)), child, own, worker, use(50, 8, "sh")) == (
+        use(30, 15, "vramctl run (sh, worker)"),
+    )
+
+
+def test_a_child_without_a_name_adds_none() -> None:
+    assert Proc().book(known((30,)), use(40, 2, "")) == (use(30, 2, "vramctl"),)
+
+
+def test_bytes_that_the_driver_does_not_say_make_the_sum_unknown() -> None:
+    assert Proc().book(known((30,)), use(40, 2), use(50, None)) == (use(30, None, "vramctl (python)"),)
+
+
+def test_a_child_with_a_lease_or_a_connection_of_its_own_keeps_its_bytes() -> None:
+    proc = Proc()
+    for who in (known((30, 40)), known((30,), (40,))):
+        assert proc.book(who, use(40, 3)) == (use(40, 3),)
+    assert proc.book(known((30,), (40,)), use(40, 3), use(50, 4)) == (
+        use(40, 3),
+        use(30, 4, "vramctl (python)"),
+    )
+
+
+def test_a_dying_owner_that_is_listed_without_its_start_time_keeps_its_bytes() -> None:
+    proc = Proc()
+    lineages = Lineages(proc.kin.get)
+    lineages.trace([use(40, 3)])
+    del proc.kin[40]
+    left = ProcessUse(ProcessKey(40, 0), "", 3)
+    assert on_owners([left], lineages.trace([left]), known((30, 40))) == (left,)
+
+
+def test_children_of_a_mere_observer_are_not_hidden() -> None:
+    assert Proc().book(known((), (30,)), use(40, 3)) == (use(40, 3),)
+
+
+def test_a_reused_pid_is_no_ancestor() -> None:
+    proc = Proc()
+    proc.add(30, 20, "other", start_ticks=9_999)  # younger than its "child": the pid was used again
+    owner = ProcessKey(30, 9_999)
+    assert proc.book(Known(frozenset({owner}), frozenset()), use(40, 3)) == (use(40, 3),)
+    assert proc.book(known((30,)), use(40, 3)) == (use(40, 3),), "and the owner of that pid is dead"
+
+
+def test_an_orphan_is_a_stowaway() -> None:
+    proc = Proc()
+    lineages = Lineages(proc.kin.get)
+    assert on_owners([use(40, 3)], lineages.trace([use(40, 3)]), known((30,)))[0].process == key(30)
+    del proc.kin[30]
+    proc.add(40, 1, "sh")  # the kernel gave it to init
+    assert on_owners([use(40, 3)], lineages.trace([use(40, 3)]), known((30,))) == (use(40, 3),)
+
+
+@pytest.mark.parametrize("listed", [key(40), ProcessKey(40, 0)])
+def test_who_dies_between_the_reading_and_the_tracing_belongs_where_it_did(listed: ProcessKey) -> None:
+    proc = Proc()
+    lineages = Lineages(proc.kin.get)
+    lineages.trace([use(40, 3)])
+    del proc.kin[40]
+    left = ProcessUse(listed, "python", 3)
+    for _ in range(2):
+        assert on_owners([left], lineages.trace([left]), known((30,)))[0].process == key(30)
+    lineages.trace([])
+    assert on_owners([left], lineages.trace([left]), known((30,))) == (left,), "remembered for one reading"
+
+
+def test_somebody_else_with_the_pid_of_the_dead_inherits_nothing() -> None:
+    proc = Proc()
+    lineages = Lineages(proc.kin.get)
+    lineages.trace([use(40, 3)])
+    del proc.kin[40]
+    other = ProcessUse(ProcessKey(40, 77_777), "other", 3)
+    assert on_owners([other], lineages.trace([other]), known((30,))) == (other,)
+
+
+def test_lines_are_followed_so_far_and_names_are_bounded() -> None:
+    proc = Proc()
+    for pid in range(100, 100 + DEPTH_MAX + 2):
+        proc.add(pid, pid - 1 if pid > 100 else 30, "deep")
+    assert proc.book(known((30,)), use(100 + DEPTH_MAX - 1, 3))[0].process == key(30)
+    assert proc.book(known((30,)), use(100 + DEPTH_MAX, 3))[0].process == key(100 + DEPTH_MAX)
+    uses = [use(100 + n, 1, f"a rather long name {n}") for n in range(10)]
+    (booked,) = proc.book(known((30,)), *uses)
+    assert (len(booked.name), booked.used_bytes) == (NAME_MAX, 10)
+
+
+def test_a_driver_that_lists_nobody_leaves_nothing_to_book() -> None:
+    assert Proc().book(known((30,))) == ()
+
+
+def test_the_kernel_s_own_text() -> None:
+    mine = read_kin(os.getpid())
+    assert mine is not None
+    assert (mine.process.pid, mine.parent_pid) == (os.getpid(), os.getppid())
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        kin = read_kin(child.pid)
+        assert kin is not None
+        entry = ProcessUse(kin.process, "child", 1)
+        (booked,) = on_owners(
+            [entry], Lineages().trace([entry]), Known(frozenset({mine.process}), frozenset())
+        )
+        assert booked == ProcessUse(mine.process, f"{mine.name} (child)", 1)
+        child.communicate(b"\n")
+    assert read_kin(child.pid) is None

@@ -1,0 +1,134 @@
+"""A lease owns a process tree: a real daemon, the real `vramctl run`, and a child that puts its bytes on the simulated card."""
+
+import contextlib
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from arbiter.testing.wire import WireClient
+
+pytestmark = pytest.mark.e2e
+GIB = 1 << 30
+PATIENCE_S = 40.0
+
+CHILD = """
+import os, sys
+from pathlib import Path
+from sidecars.device.fake import FakeMemory
+memory = FakeMemory(Path(sys.argv[1]), "job")
+memory.allocate("weights", int(sys.argv[2]) - (450 << 20))
+print(os.getpid(), flush=True)
+sys.stdin.readline()
+"""
+
+
+@pytest.fixture
+def arbiter(make_arbiter: Callable[..., ArbiterProcess]) -> ArbiterProcess:
+    """Reads its card ten times a second, and gives its verdict after two seconds."""
+    return make_arbiter(config="probe:\n  period_s: 0.1\nverify:\n  timeout_s: 2\n").start()
+
+
+@pytest.fixture
+def observer(arbiter: ArbiterProcess) -> Iterator[WireClient]:
+    """A connected client: the card is read in the background while there is one."""
+    with WireClient(arbiter.endpoint) as client:
+        yield client.hello("watcher", role="observer")
+
+
+@contextlib.contextmanager
+def job(arbiter: ArbiterProcess, size: int, *extra: str) -> Iterator[tuple["subprocess.Popen[str]", int]]:
+    """`vramctl run` of a child that holds `size` until its stdin closes: (vramctl, the child's pid)."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "clients", "run", "--vram", "5GiB", "--name", "job", "--",
+         *extra, sys.executable, "-c", CHILD, str(arbiter.card), str(size)],
+        env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        yield process, int(process.stdout.readline())
+    finally:
+        process.stdin.close()  # the child ends, and vramctl with it
+        process.wait(PATIENCE_S)
+        process.stdout.close()
+
+
+def seen(observer: WireClient, when: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    """The card's view as soon as it is like that. Every answer of the daemon paces the questions; raises TimeoutError."""
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        gpu: dict[str, Any] = observer.ask("status")["gpus"][0]
+        if when(gpu):
+            return gpu
+        observer.receive(0.05)
+    raise TimeoutError(f"the card stays {gpu}")
+
+
+def told(observer: WireClient, *kinds: str) -> list[dict[str, Any]]:
+    events: list[dict[str, Any]] = observer.ask("history", kinds=list(kinds))["events"]
+    return events
+
+
+def wait_told(observer: WireClient, kind: str, where: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    event: dict[str, Any] = observer.push(
+        "event", PATIENCE_S, lambda push: push["event"]["kind"] == kind and where(push["event"])
+    )["event"]
+    return event
+
+
+@pytest.mark.parametrize("through", [[], ["sh", "-c", '"$@"; exit $?', "sh"]], ids=["child", "grandchild"])
+def test_the_bytes_of_a_child_are_those_of_the_lease(
+    arbiter: ArbiterProcess, observer: WireClient, through: list[str]
+) -> None:
+    assert observer.ask("subscribe")["ok"]
+    with job(arbiter, 4 * GIB, *through) as (vramctl, child):
+        gpu = seen(observer, lambda gpu: any(process["used_bytes"] for process in gpu["processes"]))
+        (process,) = gpu["processes"]
+        assert child != vramctl.pid
+        assert (process["pid"], process["used_bytes"], process["stowaway"]) == (vramctl.pid, 4 * GIB, False)
+        assert process["name"].endswith(" (job)")
+        assert (gpu["charged_bytes"], gpu["stowaway_bytes"], gpu["pressure_bytes"]) == (5 * GIB, 0, 0)
+    verified = wait_told(observer, "verified", lambda event: event["consumer"] == "job")
+    assert (verified["verdict"], verified["before_bytes"]) == ("verified", 4 * GIB)
+    gpu = seen(observer, lambda gpu: not gpu["charged_bytes"])
+    assert gpu["stowaway_bytes"] == 0
+    assert told(observer, "stowaway", "pressure", "lost") == []
+    assert vramctl.returncode == 0
+
+
+def test_the_child_of_a_killed_owner_is_a_stowaway_and_contests_its_debt(
+    arbiter: ArbiterProcess, observer: WireClient
+) -> None:
+    assert observer.ask("subscribe")["ok"]
+    with job(arbiter, 4 * GIB) as (vramctl, child):
+        seen(observer, lambda gpu: any(process["used_bytes"] for process in gpu["processes"]))
+        vramctl.send_signal(signal.SIGKILL)
+        stowaway = wait_told(observer, "stowaway", lambda event: event["pid"] == child)
+        assert (stowaway["name"], stowaway["used_bytes"]) == ("job", 4 * GIB)
+        verdict = wait_told(observer, "verified", lambda event: event["consumer"] == "job")
+        assert verdict["verdict"] == "contested"
+        assert verdict["culprits"] == [{"pid": child, "name": "job", "bytes": 4 * GIB}]
+        gpu = seen(observer, lambda gpu: not gpu["charged_bytes"])
+        assert gpu["stowaway_bytes"] == 4 * GIB, "charged once: the debt is over, the orphan is still there"
+    seen(observer, lambda gpu: not gpu["stowaway_bytes"])
+
+
+def test_what_the_child_of_an_observer_holds_is_not_hidden(
+    arbiter: ArbiterProcess, observer: WireClient
+) -> None:
+    """This very process is connected and the child's parent."""
+    with subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(arbiter.card), str(GIB)],
+        env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    ) as child:  # fmt: skip
+        assert child.stdout is not None
+        assert int(child.stdout.readline()) == child.pid
+        gpu = seen(observer, lambda gpu: bool(gpu["stowaway_bytes"]))
+        assert [process["pid"] for process in gpu["processes"]] == [child.pid]
+        child.communicate("\n", PATIENCE_S)
