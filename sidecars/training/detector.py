@@ -54,7 +54,7 @@ class Recipe:
     batch: int = 16
     learning_rate: float = 1.5e-3
     budget_s: float = 3600.0
-    max_steps: int = 2400
+    max_steps: int = 3000
     held_out: float = 0.12
     split_seed: int = 7  # not the seed of the run: a run that goes on from another keeps its held-out scenes
     strange_queries: int = 10

@@ -160,7 +160,7 @@ tabletop by `python -m sidecars.training.detector` (no pretrained weights). It s
 - Training: seed {seed}, {steps} steps of {batch}, {train_s} s on {threads} thread(s), bfloat16 autocast; checkpoint float32, {bytes} bytes.
 - One query on one image: {inference_ms} ms on one core, pre- and post-processing included.
 
-Held out, at the threshold (found: best box above it with IoU >= 0.4 or centre within 8 px; false alarm: any box above it for a
+Held out, at the threshold, which was chosen on these same frames (found: best box above it with IoU >= 0.4 or centre within 8 px; false alarm: any box above it for a
 (colour, shape) that the scene lacks; strange: the same for words that training never saw; things with fewer than
 {min_pixels} visible pixels are not asked for):
 

@@ -135,20 +135,28 @@ def test_the_shipped_checkpoint_tells_held_from_empty_and_from_another(tmp_path:
 
     asker = Asker(SHIPPED)
     image = tmp_path / "wrist.png"
+    wrong: list[str] = []
+
+    def expect(word: str, name: str, env: Any) -> None:
+        Image.fromarray(env.render("wrist")).save(image)
+        answer = asker.ask(image, f"Has the robot gripper grasped the {name}?")
+        if not answer.startswith(word):
+            wrong.append(f"{name}: {answer}")
+
     with SimEnv() as env:
         kinematics = ArmKinematics(env.config)
-        for seed in (900, 901, 902):
+        for seed in range(900, 906):
             env.reset(seed)
             target, other = env.layout.objects[0].name, env.layout.objects[1].name
             stand_before(env, target, random.Random(seed))
-            Image.fromarray(env.render("wrist")).save(image)
-            assert asker.ask(image, f"Has the robot gripper grasped the {target}?").startswith("No")
+            expect("No", target, env)
             expert = GrabExpert(env, kinematics, target)
             for _ in range(110):
                 env.step(expert.act())
                 if expert.done:
                     break
             assert env.held_object() == target, "the scripted expert failed: choose another seed"
-            Image.fromarray(env.render("wrist")).save(image)
-            assert asker.ask(image, f"Has the robot gripper grasped the {target}?").startswith("Yes")
-            assert asker.ask(image, f"Has the robot gripper grasped the {other}?").startswith("No")
+            expect("Yes", target, env)
+            expect("No", other, env)
+    # 18 questions; the model card gives 98 % over all and 95 % while another thing of the same colour is held
+    assert len(wrong) <= 2, wrong
