@@ -62,9 +62,10 @@ class Episode:
         )
 
     def confirmed(self, manipulation: frozenset[str]) -> bool:
-        """Whether the scene VLM's newest answer after the newest manipulation was a yes."""
+        """Whether the scene VLM's newest yes or no after the newest manipulation was a yes."""
         for step in reversed(self.steps):
-            if isinstance(step.call, QueryScene) and step.outcome.status == "answered":
+            asked = isinstance(step.call, QueryScene) and step.outcome.status == "answered"
+            if asked and step.outcome.text.strip().lower().startswith(("yes", "no")):
                 return says_yes(step.outcome.text)
             if isinstance(step.call, ExecuteRskill) and step.call.rskill_id in manipulation:
                 return False

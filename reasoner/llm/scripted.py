@@ -21,6 +21,8 @@ NAVIGATE_DEADLINE_S = 60.0
 GRAB_DEADLINE_S = 120.0  # counts from acceptance: waiting for the card and loading are in it
 GRASP_CAMERA = "wrist"  # looks at the fingers: what they hold cannot hide behind the arm
 
+NO_ANSWER = "the scene VLM gave no answer"
+
 _TASK = re.compile(
     r"\s*(?:grab|grasp|pick up|pick|fetch|take|lift)\s+(?:the\s+|a\s+|an\s+)?(.+?)\s*\.?\s*", re.IGNORECASE
 )
@@ -99,10 +101,10 @@ def _script(thing: str, navigate: str, grab: str, *, can_query: bool) -> Script:
             continue
         if not can_query:
             return Finish(True, "the grab ended; there is no scene VLM to confirm it")
-        grasped = yield from _ask(f"Has the robot gripper grasped the {thing}?")
-        if grasped is not None and says_yes(grasped):
-            return Finish(True, f"the scene VLM confirms: {grasped}")
-        reason = f"not grasped after attempt {attempt}: {grasped or 'the scene VLM gave no answer'}"
+        held, answer = yield from _confirm(thing)
+        if held:
+            return Finish(True, f"the scene VLM confirms: {answer}")
+        reason = f"not grasped after attempt {attempt}: {answer}"
     return Finish(False, reason)
 
 
@@ -129,6 +131,15 @@ def _locate(thing: str) -> Generator[ToolCall, Outcome, Point | Outcome]:
         if outcome.status == "not_seen":
             break
     return outcome
+
+
+def _confirm(thing: str) -> Generator[ToolCall, Outcome, tuple[bool, str]]:
+    """Whether the scene VLM says that the named thing is held, and its words. A yes that names something else, or nothing, is not enough."""
+    answer = yield from _ask(f"Has the robot gripper grasped the {thing}?")
+    if answer is not None and says_yes(answer) and thing not in answer.lower():
+        answer = yield from _ask("What is the gripper holding?")
+        return answer is not None and thing in answer.lower(), answer or NO_ANSWER
+    return answer is not None and says_yes(answer), answer or NO_ANSWER
 
 
 def _ask(question: str) -> Generator[ToolCall, Outcome, str | None]:

@@ -148,6 +148,28 @@ def test_an_unclear_answer_is_not_a_yes() -> None:
     assert play(world)[0]["status"] == "failure"
 
 
+def test_a_yes_that_names_something_else_is_asked_after() -> None:
+    def world(holding: str) -> Callable[[ToolCall, int], Outcome]:
+        def answer(call: ToolCall, _: int) -> Outcome:
+            match call:
+                case LocateInView():
+                    return FOUND
+                case QueryScene(question="What is the gripper holding?"):
+                    return Outcome("answered", holding)
+                case QueryScene():
+                    return Outcome("answered", "Yes, the gripper holds the red ball.")
+                case _:
+                    return DONE
+
+        return answer
+
+    refuted, _ = play(world("The gripper holds the red ball."))
+    assert (refuted["status"], refuted["attempts"]) == ("failure", 3)
+    confirmed, _ = play(world("A red cube."))
+    assert (confirmed["status"], confirmed["attempts"]) == ("success", 1)
+    assert confirmed["vlm_confirmed"]
+
+
 def test_task_and_skills_are_checked_before_anything_moves() -> None:
     assert object_of("Pick up the blue ball.") == "blue ball"
     with pytest.raises(BadRequest, match="cannot do"):
