@@ -12,7 +12,6 @@ import sys
 from pathlib import Path
 
 from clients.aio import ArbiterClient
-
 from clients.lease import Lease
 from schemas.wire import Footprint, LeaseSpec
 from sidecars.device.fake import FakeMemory
