@@ -89,6 +89,7 @@ def test_bad_labels_are_named_by_line(tmp_path: Path, text: str, message: str) -
         common.read_frames(tmp_path)
 
 
+@pytest.mark.heavy
 def test_a_folder_without_labels_ends_with_status_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
