@@ -114,6 +114,7 @@ def core_settings(
         epoch=epoch,
         gpus=gpus,
         learnt=dict(learnt),
+        policy=config.scheduling.policy,
         ageing_s_per_point=config.scheduling.ageing_s_per_point,
         revoke_resend_s=config.revoke.resend_s,
         revoke_remind_s=config.revoke.remind_s,

@@ -43,6 +43,8 @@ class SchedulingConfig(_Section):
 
     ageing_s_per_point: Seconds = d.AGEING_S_PER_POINT
     """A waiter gains one point of priority per so many seconds, so that nobody starves."""
+    policy: Literal["default", "fifo", "no_backfill", "lru", "one_model"] = "default"
+    """Who is next and who leaves; docs/policies.md compares them."""
 
 
 class RevokeConfig(_Section):

@@ -98,7 +98,7 @@ def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, in
 
 
 def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int], *, planned: bool) -> None:
-    if len(gpu.queue) < 2 or head.spec.exclusive:
+    if len(gpu.queue) < 2 or head.spec.exclusive or not core.settings.scheduling.backfill:
         return
     smallest = gpu.queue.smallest_need_bytes() - policy.largest_fold_bytes(gpu)
     if smallest > gpu.ledger.budget_bytes - gpu.ledger.total_bytes():

@@ -15,6 +15,7 @@ EXACT_SEARCH_MAX = 12  # candidates; beyond that the search is greedy
 _WAKE_SLACK_S = 0.001  # so that a wake-up for an ageing step does not come a rounding error too early
 
 type _Covers = Callable[[Mapping[LeaseId, int]], bool]
+type _Choice = Callable[[Sequence[Lease], _Covers, Mapping[LeaseId, int]], list[Lease]]
 
 
 # -- fits ------------------------------------------------------------------------------------------------------------
@@ -128,10 +129,12 @@ def choose_victims(core: Core, gpu: Gpu, waiter: Lease, going: Mapping[LeaseId, 
         for lease in gpu.in_state(LeaseState.HELD)
         if lease.spec.evictable and (not lease.uses or lease.spec.priority <= priority)
     ]
-    now = _cheapest(gpu, waiter, going, [lease for lease in willing if residency_ends_at(lease) <= core.now])
+    search = _oldest if core.settings.scheduling.least_recent else _search
+    ripe = [lease for lease in willing if residency_ends_at(lease) <= core.now]
+    now = _cheapest(gpu, waiter, going, ripe, search)
     if now is not None and not _in_use(now):
         return now
-    later = _cheapest(gpu, waiter, going, willing)
+    later = _cheapest(gpu, waiter, going, willing, search)
     if now is None or later is None or _in_use(later) < _in_use(now):
         return None
     return now
@@ -219,7 +222,7 @@ def _freed(gpu: Gpu, going: Mapping[LeaseId, int], candidates: Sequence[Lease]) 
 
 
 def _cheapest(
-    gpu: Gpu, waiter: Lease, going: Mapping[LeaseId, int], candidates: Sequence[Lease]
+    gpu: Gpu, waiter: Lease, going: Mapping[LeaseId, int], candidates: Sequence[Lease], search: _Choice
 ) -> list[Lease] | None:
     if waiter.spec.exclusive:
         must = list(candidates)
@@ -235,7 +238,7 @@ def _cheapest(
 
     if not rest or not covers(_leave(rest)):
         return None
-    return must + _search(rest, covers, _freed(gpu, base, rest))
+    return must + search(rest, covers, _freed(gpu, base, rest))
 
 
 def _search(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]) -> list[Lease]:
@@ -258,6 +261,15 @@ def _search(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId
     )
     found = next(found for group in groups if (found := [plan for plan in group if covers(_leave(plan))]))
     return min(found, key=lambda plan: _fineness(plan, freed))
+
+
+def _oldest(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]) -> list[Lease]:
+    """Idle ones first, then least recent use alone, until it is enough; all candidates together are."""
+    order = sorted(
+        candidates,
+        key=lambda lease: (bool(lease.uses), not freed[lease.id], lease.last_used_at, lease.arrival),
+    )
+    return order[: next(n for n in range(1, len(order) + 1) if covers(_leave(order[:n])))]
 
 
 def _fineness(plan: Sequence[Lease], freed: Mapping[LeaseId, int]) -> tuple[int, float, tuple[int, ...]]:

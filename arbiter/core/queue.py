@@ -2,7 +2,7 @@
 
 Effective priority is priority + waited/ageing. Both sides of any comparison age at the same rate, so the order of two
 waiters is fixed when they arrive: `arrival time − priority × ageing` (smaller first), then arrival. That makes the queue a
-sorted list that time never disturbs, bounds every wait, and never reorders equals.
+sorted list that time never disturbs, bounds every wait, and never reorders equals. Without ageing (0) it is the order of arrival.
 """
 
 from bisect import bisect_left, insort

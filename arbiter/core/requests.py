@@ -104,7 +104,7 @@ def acquire(core: Core, event: AcquireRequested) -> None:
     if nonce in core.nonces:
         _acquire_again(core, event, core.nonces[nonce])
         return
-    spec = event.spec
+    spec = replace(event.spec, exclusive=True) if core.settings.scheduling.alone else event.spec
     load_peak = max(
         spec.load_peak_bytes, spec.steady_bytes, spec.residue_bytes, core.learnt_peaks.get(peak_key(spec), 0)
     )

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from arbiter.core.scheduling import DEFAULT, SCHEDULING, Scheduling
 from schemas import defaults as d
 from schemas.ids import GpuId
 
@@ -37,5 +38,12 @@ class Settings:
     waiters_max: int = d.WAITERS_MAX
     leases_per_client_max: int = d.LEASES_PER_CLIENT_MAX
     uses_per_lease_max: int = d.USES_PER_LEASE_MAX
+    policy: str = DEFAULT
+    """A name of `core.scheduling.SCHEDULING`."""
     learnt: dict[str, dict[str, float]] = field(default_factory=dict)
     """Durations learnt by earlier runs, per consumer: {"drain_s", "unload_s", "verify_s", "load_s"}; basis of ETAs."""
+
+    @property
+    def scheduling(self) -> Scheduling:
+        """Raises KeyError for a name that the table does not have."""
+        return SCHEDULING[self.policy]

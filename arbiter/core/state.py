@@ -95,10 +95,9 @@ class Core:
         self.started_at = now
         self.now = now
         self.out: list[Effect] = []
+        ageing_s = settings.ageing_s_per_point if settings.scheduling.by_priority else 0.0
         self.gpus: dict[GpuId, Gpu] = {
-            info.id: Gpu(
-                info, GpuLedger(info, settings.verify_tolerance_bytes), WaitQueue(settings.ageing_s_per_point)
-            )
+            info.id: Gpu(info, GpuLedger(info, settings.verify_tolerance_bytes), WaitQueue(ageing_s))
             for info in sorted(settings.gpus, key=lambda info: info.index)
         }
         self.leases: dict[LeaseId, Lease] = {}
