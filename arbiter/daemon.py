@@ -121,6 +121,8 @@ def core_settings(
         revoke_deadline_s=config.revoke.deadline_s,
         verify_timeout_s=config.verify.timeout_s,
         verify_poll_s=config.verify.poll_s,
+        verify_poll_until_s=config.verify.poll_until_s,
+        verify_confirm_s=config.verify.confirm_s,
         verify_slow_poll_s=config.verify.slow_poll_s,
         verify_tolerance_bytes=config.verify.tolerance_bytes,
         sample_max_age_s=config.probe.sample_max_age_s,

@@ -304,20 +304,15 @@ def _eta(core: Core, gpu: Gpu, lease: Lease) -> float | None:
             LeaseState.UNLOADING: ("unload_s", "verify_s"),
             LeaseState.VERIFYING: ("verify_s",),
         }[holder.state]
-        times = [_median(core, holder.spec.consumer, phase) for phase in phases]
+        times = [core.learnt_s(holder.spec.consumer, phase) for phase in phases]
         known = [seconds for seconds in times if seconds is not None]
         if len(known) < len(times):
             return None
         slowest = max(slowest, sum(known) - (core.now - holder.since))
-    load = _median(core, lease.spec.consumer, "load_s")
+    load = core.learnt_s(lease.spec.consumer, "load_s")
     if load is None or (not slowest and not policy.fits(gpu, lease)):
         return None
     return max(0.0, slowest) + load
-
-
-def _median(core: Core, consumer: str, phase: str) -> float | None:
-    seen = core.durations.get(consumer, {}).get(phase)
-    return median(seen) if seen else None
 
 
 def medians(core: Core) -> dict[str, dict[str, float]]:

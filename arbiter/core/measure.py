@@ -10,6 +10,7 @@ from arbiter.core.events import MemorySampled, ProbeFailed
 from arbiter.core.lease import Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 from arbiter.core.verify import Judgement, Verdict, Verification, judge
+from schemas.defaults import VERIFY_READING_SHARE
 from schemas.ids import GpuId, LeaseId, ProcessKey
 
 
@@ -22,7 +23,7 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
     if gpu.asked_at is not None and sample.taken_at >= gpu.asked_at:
         gpu.asked_at = None
     gpu.sample = sample
-    gpu.sample_arrived_at = core.now
+    gpu.reading_s = max(0.0, core.now - sample.taken_at)
     if gpu.failed_at is not None:
         gpu.failed_at, gpu.failure = None, ""
         core.note("probe_ok", gpu=gpu.info.id)
@@ -128,7 +129,7 @@ def begin_for_lease(core: Core, gpu: Gpu, lease: Lease, *, alive: bool, grace_s:
         confirmed_at=core.now,
         not_before=core.now + grace_s,
         deadline_at=core.now + grace_s + core.settings.verify_timeout_s,
-        next_poll_at=0.0,
+        paced_from=core.now + grace_s,
         alive=alive,
         exiting=lease.exiting,
     )
@@ -149,7 +150,7 @@ def begin_for_residue(core: Core, gpu: Gpu, process: ProcessKey) -> None:
         confirmed_at=core.now,
         not_before=core.now,
         deadline_at=core.now + core.settings.verify_timeout_s,
-        next_poll_at=0.0,
+        paced_from=core.now,
         alive=False,
     )
     _begin(core, gpu, verification)
@@ -157,35 +158,56 @@ def begin_for_residue(core: Core, gpu: Gpu, process: ProcessKey) -> None:
 
 def _begin(core: Core, gpu: Gpu, verification: Verification) -> None:
     gpu.verifications[verification.key] = verification
-    verification.next_poll_at = core.now + core.settings.verify_poll_s[0]
+    _read_soon(core, gpu, verification)
+
+
+def bereave(core: Core, gpu: Gpu, verification: Verification) -> None:
+    """Its process died: nothing may stay any more, and it is from now on that the memory comes back."""
+    verification.alive = False
+    verification.not_before = min(verification.not_before, core.now)
+    verification.paced_from = core.now
+    _read_soon(core, gpu, verification)
+
+
+def _read_soon(core: Core, gpu: Gpu, verification: Verification) -> None:
+    """A reading at once, and the next one soon: most memory is back when its holder says so."""
+    core.want_sample(gpu, core.now)
+    soon = core.now + core.settings.verify_confirm_s
+    verification.next_poll_at = max(soon, verification.paced_from)
     _set_poll(core, gpu)
 
 
 def on_poll_due(core: Core, gpu_id: str) -> None:
     """Read the card for all verifications that are due, and say `stale` where no reading came in time."""
     gpu = core.gpus[GpuId(gpu_id)]
-    for verification in gpu.verifications.values():
-        if verification.next_poll_at > core.now:
-            continue
-        verification.polls += 1
+    due = [v for v in gpu.verifications.values() if v.next_poll_at <= core.now]
+    for verification in due:
         if core.now >= verification.deadline_at and not verification.overdue:
             verification.overdue = True
             core.wake(gpu)
             if verification.last_used_bytes is None:
                 _announce(core, gpu, verification, Judgement(Verdict.STALE, False, 0))
-        steps = core.settings.verify_poll_s
-        step = (
-            core.settings.verify_slow_poll_s
-            if verification.overdue
-            else steps[min(verification.polls, len(steps) - 1)]
-        )
-        verification.next_poll_at = core.now + step
-        if not verification.overdue:
-            verification.next_poll_at = min(
-                verification.next_poll_at, max(verification.deadline_at, core.now + steps[0])
-            )
-    core.want_sample(gpu, core.now)
+        verification.next_poll_at = _next_poll_at(core, gpu, verification)
+    if due:  # a reading that is under way and counts for all of them is not asked for twice
+        core.want_sample(gpu, max(verification.confirmed_at for verification in due))
     _set_poll(core, gpu)
+
+
+def _next_poll_at(core: Core, gpu: Gpu, verification: Verification) -> float:
+    """When to look again: dense as long as memory usually takes to come back, then rarer.
+
+    A consumer that is known to take longer is looked at densely for longer, and a card that is slow to read is read less often.
+    """
+    settings = core.settings
+    pauses = settings.verify_poll_s
+    if verification.overdue:
+        return core.now + settings.verify_slow_poll_s
+    waited_s = core.now - verification.paced_from
+    usual_s = 1.5 * (core.learnt_s(verification.consumer, "verify_s") or 0.0)
+    rungs = zip(pauses, settings.verify_poll_until_s, strict=False)
+    pause = next((pause for pause, until_s in rungs if waited_s < max(until_s, usual_s)), pauses[-1])
+    pause = max(pause, min(gpu.reading_s / VERIFY_READING_SHARE, settings.verify_slow_poll_s))
+    return min(core.now + pause, max(verification.deadline_at, core.now + pauses[0]))
 
 
 def _set_poll(core: Core, gpu: Gpu) -> None:
@@ -204,6 +226,9 @@ def _weigh(core: Core, gpu: Gpu, verification: Verification, sample: MemorySampl
         core.settings.verify_tolerance_bytes,
     )
     if judgement is None:
+        if verification.settling:
+            verification.next_poll_at = core.now + core.settings.verify_confirm_s
+            _set_poll(core, gpu)
         return
     _announce(core, gpu, verification, judgement, sample)
     if judgement.resolved:

@@ -6,7 +6,7 @@ out); `bye` gives everything back; death ends everything, and what was held is m
 
 from arbiter.core.events import BYE, ClientConnected, ClientLeft, JournalFailed
 from arbiter.core.lease import EXPIRING, Lease, LeaseState
-from arbiter.core.measure import begin_for_residue, lose
+from arbiter.core.measure import begin_for_residue, bereave, lose
 from arbiter.core.recovery import account_for
 from arbiter.core.requests import cancel_waiter, end_use, let_go
 from arbiter.core.state import Client, Core, Refused
@@ -53,8 +53,7 @@ def on_died(core: Core, process: ProcessKey) -> None:
         gpu.ledger.bury(process)
         for verification in gpu.verifications.values():
             if verification.process == process:
-                verification.alive = False
-                verification.not_before = min(verification.not_before, core.now)
+                bereave(core, gpu, verification)
         if not account.charges and f"residue:{process}" not in gpu.verifications:
             begin_for_residue(core, gpu, process)
     for lease in list(core.leases.values()):

@@ -30,6 +30,8 @@ class Settings:
     revoke_deadline_s: float = d.REVOKE_DEADLINE_S
     verify_timeout_s: float = d.VERIFY_TIMEOUT_S
     verify_poll_s: tuple[float, ...] = d.VERIFY_POLL_S
+    verify_poll_until_s: tuple[float, ...] = d.VERIFY_POLL_UNTIL_S
+    verify_confirm_s: float = d.VERIFY_CONFIRM_S
     verify_slow_poll_s: float = d.VERIFY_SLOW_POLL_S
     verify_tolerance_bytes: int = d.VERIFY_TOLERANCE_BYTES
     sample_max_age_s: float = d.SAMPLE_MAX_AGE_S

@@ -6,6 +6,7 @@ Data and bookkeeping only: no decision is taken here.
 from collections import OrderedDict, deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from statistics import median
 from typing import Any
 
 from arbiter.core.effects import Effect, JournalDelete, JournalPut, Note, Push, Refuse, Reply, Sample
@@ -68,7 +69,7 @@ class Gpu:
     verifications: dict[str, Verification] = field(default_factory=dict)
     evictions: list[Eviction] = field(default_factory=list)  # not yet counted to a grant
     sample: MemorySampled | None = None
-    sample_arrived_at: float = 0.0
+    reading_s: float = 0.0  # how long the newest reading took
     failed_at: float | None = None  # last failed reading, None after a good one
     failure: str = ""
     asked_at: float | None = None  # last Sample asked for, None if its answer is here
@@ -225,6 +226,11 @@ class Core:
         """Remember how long a phase (`drain_s`, `unload_s`, `verify_s`, `load_s`) took for a consumer."""
         phases = self.durations.setdefault(consumer, {})
         phases.setdefault(phase, deque(maxlen=LEARNT_REMEMBERED)).append(max(0.0, seconds))
+
+    def learnt_s(self, consumer: str, phase: str) -> float | None:
+        """Median of what was learnt; None: never seen."""
+        seen = self.durations.get(consumer, {}).get(phase)
+        return median(seen) if seen else None
 
     def record_lease(self, lease: Lease, *, debt: bool = False) -> None:
         """Write a resident lease (or its debt) to the journal."""

@@ -48,8 +48,9 @@ class Verification:
     confirmed_at: float  # only readings that began later count
     not_before: float  # no verdict earlier: a lost holder may still be loading until it fences itself
     deadline_at: float
-    next_poll_at: float
-    polls: int = 0
+    paced_from: float  # since when the memory may come back: the readings are dense first, then rarer
+    next_poll_at: float = 0.0
+    settling: bool = False  # the newest reading is on target: one more has to agree
     alive: bool = True
     exiting: bool = False
     last_used_bytes: int | None = None  # of the newest counting reading
@@ -84,9 +85,9 @@ def judge(
     bound_b = _delta_bound(v, ledger, expected, grown_bytes)
     short_bytes = max(used - bound_a, 0 if bound_b is None else used - bound_b)
     evident = held is None or held <= expected + tolerance_bytes
+    v.settling = short_bytes <= tolerance_bytes and evident and sample.taken_at >= v.not_before
     if short_bytes <= tolerance_bytes and evident:
-        settled = stable and sample.taken_at > v.not_before
-        return Judgement(Verdict.VERIFIED, True, v.kept_bytes) if settled else None
+        return Judgement(Verdict.VERIFIED, True, v.kept_bytes) if stable and v.settling else None
     if not v.overdue:
         return None
     return _late(v, ledger, sample, expected, held, short_bytes, bound_a, bound_b, tolerance_bytes)

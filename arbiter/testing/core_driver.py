@@ -61,6 +61,7 @@ class SimCard:
     knows_bytes: bool = True  # False: the driver lists processes without their bytes
     failing: str = ""  # not empty: readings fail with this reason
     silent: bool = False  # readings hang and never answer
+    reading_s: float = READING_S
     held: dict[ProcessKey, int] = field(default_factory=dict)
     names: dict[ProcessKey, str] = field(default_factory=dict)
     _late: list[tuple[float, ProcessKey, int]] = field(
@@ -175,7 +176,7 @@ class CoreDriver:
                 case Sample():
                     card = self.cards[effect.gpu]
                     if not card.silent:
-                        self._readings.append((self.now + READING_S, card.read(self.now)))
+                        self._readings.append((self.now + card.reading_s, card.read(self.now)))
                 case _:
                     pass
         self.effects += performed

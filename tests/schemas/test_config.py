@@ -93,6 +93,12 @@ def test_every_mistake_of_a_file_is_reported() -> None:
     assert "not a size: '12 parsecs'" in lines[2]
 
 
+@pytest.mark.parametrize("ends", ["[2]", "[2, 5, 9]", "[5, 2]"])
+def test_the_pauses_of_a_verification_and_their_ends_belong_together(ends: str) -> None:
+    assert "poll_until_s needs 2 rising times" in problem(f"verify:\n  poll_until_s: {ends}\n")
+    assert load_config("verify:\n  poll_s: [0.1]\n  poll_until_s: []\n", "x").verify.poll_until_s == ()
+
+
 def test_a_wrong_list_item_is_named_by_its_place() -> None:
     assert problem("verify:\n  poll_s:\n    - 0.1\n    - -2\n").startswith(
         "arbiter.yaml:4: verify.poll_s[1]: "

@@ -51,7 +51,7 @@ def test_who_has_to_wait_is_told_why_and_hears_of_the_grant_by_push(driver: Core
     assert isinstance(effects[0], Note)
     assert "det is loading" in effects[0].data["reason"]
     waiting = LeaseId(answer(effects)["lease"]["lease_id"])
-    assert kinds(det.release(first)) == ["JournalPut", "Note:released", "Reply"]
+    assert kinds(det.release(first)) == ["Sample", "JournalPut", "Note:released", "Reply"]
     driver.until(lambda: driver.state(waiting) == "loading")
     (granted,) = driver.pushes("granted")
     assert granted["lease"]["lease_id"] == waiting

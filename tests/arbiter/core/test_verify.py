@@ -1,11 +1,13 @@
 """Verdicts. The bytes of a lease stay charged until a reading says that they came back, or whose they are."""
 
+import itertools
 from typing import Any
 
 import pytest
 
-from arbiter.core.events import ProbeFailed, Tick
-from arbiter.testing.core_driver import Consumer, CoreDriver
+from arbiter.core.effects import Sample
+from arbiter.core.events import MemorySampled, ProbeFailed, Tick
+from arbiter.testing.core_driver import READING_S, Consumer, CoreDriver
 from schemas import defaults as d
 from schemas.ids import GpuId, LeaseId, ProcessKey
 
@@ -38,21 +40,113 @@ def test_two_equal_readings_after_the_release_are_enough() -> None:
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
     det.unload(lease)
     took = driver.until(lambda: driver.state(lease) == "over", step_s=0.001)
-    assert took == pytest.approx(0.026, abs=0.0015), "polled after 5 and 25 ms"
+    assert took == pytest.approx(0.007, abs=0.0015), "read after 2 ms, and 2 ms after that reading was good"
     (note,) = driver.notes("verified")
     assert (note["verdict"], note["before_bytes"], note["after_bytes"]) == ("verified", 5 * GIB, 450 * MIB)
     assert driver.gpu()["charged_bytes"] == 450 * MIB
 
 
-def test_polling_gets_slower_and_no_reading_from_before_the_release_counts() -> None:
+def pauses(driver: CoreDriver, began: float) -> list[float]:
+    """Milliseconds between the readings that were asked for by a timer since then."""
+    ticks = [at for at, event in driver.events if isinstance(event, Tick) and at >= began]
+    return [round(1e3 * (later - sooner), 3) for sooner, later in itertools.pairwise([began, *ticks])]
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.001, 0.25, 0.7, 1.5, 1.99])
+def test_memory_that_comes_back_is_noticed_within_ten_milliseconds(lag_s: float) -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = lag_s
+    det, lease = held(driver, "det", 5)
+    det.unload(lease)
+    took = driver.until(lambda: driver.state(lease) == "over", step_s=0.001)
+    assert lag_s < took <= lag_s + 0.010 + 2 * READING_S
+
+
+def test_readings_are_dense_while_memory_usually_comes_back_and_rarer_later() -> None:
     driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
-    driver.card.lag_s = 0.25
+    driver.card.lag_s = 7.0
     det, lease = held(driver, "det", 5)
     det.unload(lease)
     began = driver.now
     driver.until(lambda: driver.state(lease) == "over")
-    polls = [round(at - began, 3) for at, event in driver.events if isinstance(event, Tick) and at > began]
-    assert polls == [0.005, 0.025, 0.075, 0.125, 0.175, 0.225, 0.275, 0.325]
+    seen = pauses(driver, began)
+    assert (seen[0], set(seen[1:390])) == (2.0, {5.0}), "for 2 s"
+    assert set(seen[405:545]) == {20.0}, "for 3 s more"
+    assert set(seen[560:-1]) == {50.0}, "then until the verdict"
+    assert seen[-1] == pytest.approx(3.0), "but for the second reading that has to agree"
+    assert len(seen) < 620
+
+
+def test_a_consumer_that_is_known_to_take_longer_is_looked_at_densely_for_longer() -> None:
+    driver = CoreDriver(8 * GIB, settings={"learnt": {"det": {"verify_s": 4.0}}})
+    driver.card.lag_s = 4.2
+    det, lease = held(driver, "det", 5)
+    det.unload(lease)
+    took = driver.until(lambda: driver.state(lease) == "over", step_s=0.001)
+    assert 4.2 < took <= 4.212
+
+
+def test_a_card_that_is_slow_to_read_is_not_read_all_the_time() -> None:
+    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
+    driver.card.lag_s, driver.card.reading_s = 1.0, 0.025
+    det, lease = held(driver, "det", 5)
+    driver.advance(0.1)
+    det.unload(lease)
+    began = driver.now
+    driver.until(lambda: driver.state(lease) == "over")
+    assert set(pauses(driver, began)[2:-2]) == {100.0}, "a quarter of the time at most"
+
+
+def test_readings_do_not_pile_up_where_one_takes_longer_than_the_pause() -> None:
+    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
+    det, lease = held(driver, "det", 5)
+    driver.card.reading_s = 0.030
+    before = len(driver.effects)
+    det.unload(lease)
+    driver.advance(0.029)
+    asked = [effect for effect in driver.effects[before:] if isinstance(effect, Sample)]
+    assert len(asked) == 1, "that of the release is still under way, and counts"
+
+
+def test_one_good_reading_is_not_enough() -> None:
+    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
+    det, lease = held(driver, "det", 5)
+    det.unload(lease)
+    driver.advance(0.0031)
+    driver.card.set(STRANGER, GIB, driver.now)
+    driver.advance(0.1)
+    assert driver.state(lease) == "verifying", "the next one does not agree"
+
+
+def test_no_reading_from_before_the_release_counts() -> None:
+    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
+    det, lease = held(driver, "det", 5)
+    det.unloading(lease)
+    det.hold(0)
+    driver.post(MemorySampled(GPU, driver.now, 0, 8 * GIB, ()))
+    det.release(lease)
+    driver.card.silent = True
+    for _ in range(3):
+        driver.post(MemorySampled(GPU, driver.now, 0, 8 * GIB, ()))
+    assert driver.state(lease) == "verifying"
+    driver.advance(0.001)
+    driver.post(MemorySampled(GPU, driver.now, 0, 8 * GIB, ()))
+    assert driver.state(lease) == "verifying", "the first that counts"
+    driver.post(MemorySampled(GPU, driver.now, 0, 8 * GIB, ()))
+    assert driver.state(lease) == "over"
+
+
+def test_a_death_under_measurement_starts_the_dense_readings_anew() -> None:
+    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
+    driver.card.lag_s = 1.0
+    det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
+    det.unloading(lease)
+    det.hold(450 * MIB)
+    det.release(lease, exiting=True)
+    driver.advance(6.0)
+    det.die()
+    took = driver.until(lambda: driver.state(lease) == "over", step_s=0.001)
+    assert 1.0 < took <= 1.012
 
 
 def test_a_process_that_exits_has_to_give_back_even_its_context() -> None:
