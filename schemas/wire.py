@@ -22,6 +22,7 @@ Name = Annotated[str, Field(min_length=1, max_length=d.NAME_MAX_CHARS, pattern=r
 LeaseIdText = Annotated[str, Field(min_length=1, max_length=64)]
 TokenPair = Annotated[tuple[int, int], Field(description="[epoch, serial]")]
 Seconds = Annotated[float, Field(ge=0, le=86_400 * 365, allow_inf_nan=False)]
+Reason = Annotated[str, Field(max_length=d.REASON_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]*$")]
 Bytes = Annotated[int, Field(ge=0, le=1 << 50)]
 
 
@@ -187,6 +188,48 @@ class Subscribe(_Request):
     op: Literal["subscribe"]
 
 
+class _ByHand(_Request):
+    """An operator's action. `reason` is kept with the operator's name in history and, for pins and drains, in the journal."""
+
+    reason: Reason
+
+
+class _ByHandOn(_ByHand):
+    target: Name  # a lease id, or a consumer that has exactly one lease
+
+
+class Evict(_ByHandOn):
+    """Ask a holder to leave. In use it finishes first; a pinned one is refused."""
+
+    op: Literal["evict"]
+
+
+class Pin(_ByHandOn):
+    """Nobody makes this lease leave until it is unpinned."""
+
+    op: Literal["pin"]
+
+
+class Unpin(_ByHandOn):
+    op: Literal["unpin"]
+
+
+class ReleaseDead(_ByHandOn):
+    """Give up the lease of a holder that is not heard of, before its ttl is over. Refused in use, and for a holder that lives."""
+
+    op: Literal["release_dead"]
+
+
+class Drain(_ByHand):
+    """No new grants until `resume`; what is held is kept. Outlives the daemon, not the machine."""
+
+    op: Literal["drain"]
+
+
+class Resume(_ByHand):
+    op: Literal["resume"]
+
+
 class Ping(_Request):
     op: Literal["ping"]
 
@@ -199,13 +242,13 @@ class Bye(_Request):
 
 Request = Annotated[
     Hello | Acquire | Ready | UseBegin | UseEnd | Renew | RevokeAck | Unloading | Release | Cancel | Reattach | Oom
-    | Status | Why | History | Subscribe | Ping | Bye,
+    | Status | Why | History | Subscribe | Evict | Pin | Unpin | ReleaseDead | Drain | Resume | Ping | Bye,
     Field(discriminator="op"),
 ]  # fmt: skip
 REQUEST: TypeAdapter[Request] = TypeAdapter(Request)
 OPS: tuple[str, ...] = (
     "hello", "acquire", "ready", "use_begin", "use_end", "renew", "revoke_ack", "unloading", "release", "cancel",
-    "reattach", "oom", "status", "why", "history", "subscribe", "ping", "bye",
+    "reattach", "oom", "status", "why", "history", "subscribe", "evict", "pin", "unpin", "release_dead", "drain", "resume", "ping", "bye",
 )  # fmt: skip
 
 
@@ -228,6 +271,7 @@ class LeaseView(TypedDict):
     since_s: float  # seconds in this state
     waited_s: NotRequired[float]
     position: NotRequired[int]
+    pinned: NotRequired[str]  # which operator pinned it, and why
     ttl_left_s: NotRequired[float]
 
 
@@ -311,6 +355,7 @@ class StatusReply(TypedDict):
     gpus: list[GpuView]
     leases: list[LeaseView]  # live ones: held, loading, …, then the queue in order
     clients: int
+    drained: str  # who drained the arbiter and why; "" while it grants
 
 
 class WhyReply(TypedDict):

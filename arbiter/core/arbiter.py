@@ -3,7 +3,7 @@
 `handle` is one decision tree:
   1. what happened
      1.1 connections: hello, bye, death of a process
-     1.2 requests: acquire and cancel · ready, uses, renew, oom · revoke_ack, unloading, release · reattach
+     1.2 requests: acquire and cancel · ready, uses, renew, oom · revoke_ack, unloading, release · reattach · operators
      1.3 the machine: a reading, a failed reading, a failed journal write, a journal from before the restart
      1.4 time: every timer that is due
   2. recovery ends when everybody is accounted for
@@ -15,7 +15,7 @@ It must not know how effects are performed, nor that a wire exists.
 
 from typing import Any
 
-from arbiter.core import eviction, explain, grants, invariants, measure, recovery, requests
+from arbiter.core import eviction, explain, grants, invariants, measure, operators, recovery, requests
 from arbiter.core.effects import Effect
 from arbiter.core.events import (
     AcquireRequested,
@@ -26,6 +26,7 @@ from arbiter.core.events import (
     JournalFailed,
     MemorySampled,
     OomReported,
+    OperatorAsked,
     ProbeFailed,
     ProcessDied,
     ReadyReported,
@@ -139,7 +140,8 @@ class Arbiter:
         | RevokeAcknowledged
         | UnloadStarted
         | ReleaseReported
-        | Reattached,
+        | Reattached
+        | OperatorAsked,
     ) -> None:
         core = self._core
         match event:
@@ -163,8 +165,10 @@ class Arbiter:
                 requests.unloading(core, event)
             case ReleaseReported():
                 requests.release(core, event)
-            case _:  # Reattached
+            case Reattached():
                 recovery.on_reattached(core, event)
+            case _:  # OperatorAsked
+                operators.on_operator(core, event)
 
     def _run_due(self) -> None:
         core = self._core

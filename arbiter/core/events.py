@@ -3,7 +3,7 @@ and `inbox` (time). Frozen; plain values only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
 
@@ -164,6 +164,18 @@ class OomReported:
     allocated_bytes: int | None
 
 
+@dataclass(frozen=True, slots=True)
+class OperatorAsked:
+    """Somebody whose role allows it wants something done by hand. `target` is a lease or a consumer ("" for drain and resume)."""
+
+    client: ClientId
+    request: RequestId
+    action: Literal["evict", "pin", "unpin", "drain", "resume", "release_dead"]
+    target: str
+    by: str
+    reason: str
+
+
 # -- the machine ---------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class ProcessUse:
@@ -216,6 +228,6 @@ class Tick:
 
 Event = (
     ClientConnected | ClientLeft | ProcessDied | AcquireRequested | ReadyReported | UseBegan | UseEnded | Renewed
-    | RevokeAcknowledged | UnloadStarted | ReleaseReported | CancelRequested | Reattached | OomReported | MemorySampled
+    | RevokeAcknowledged | UnloadStarted | ReleaseReported | CancelRequested | Reattached | OomReported | OperatorAsked | MemorySampled
     | ProbeFailed | JournalFailed | Recovered | Tick
 )  # fmt: skip

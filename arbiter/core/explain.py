@@ -11,7 +11,7 @@ from arbiter.core.state import Core, Gpu
 NOTE_KINDS: tuple[str, ...] = (
     "queued", "granted", "ready", "switch", "use_began", "use_ended", "revoke_asked", "revoke_acked", "reminded",
     "deadline_passed", "unloading", "released", "verified", "denied", "cancelled", "expired", "lost", "reattached", "oom",
-    "pressure", "stowaway", "probe_failed", "probe_ok", "journal_failed", "recovered", "serving",
+    "pressure", "stowaway", "probe_failed", "probe_ok", "journal_failed", "recovered", "serving", "operator",
 )  # fmt: skip
 """Every kind of `effects.Note`. `switch` comes with each `ready`; its field `switched` says whether anybody had to leave."""
 
@@ -29,13 +29,15 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
         "gpu": lease.gpu,
         "mode": "exclusive" if lease.spec.exclusive else "shared",
         "priority": lease.spec.priority,
-        "evictable": lease.spec.evictable,
+        "evictable": lease.evictable,
         "charge_bytes": lease.load_peak_bytes if gpu is None else gpu.ledger.charge_bytes(lease.id),
         "uses": len(lease.uses),
         "pid": lease.process.pid,
         "since_s": core.now - lease.since,
         "waited_s": (core.now if lease.state is LeaseState.QUEUED else lease.granted_at) - lease.arrived_at,
     }
+    if lease.pinned is not None:
+        shown["pinned"] = str(lease.pinned)
     if lease.state is LeaseState.QUEUED:
         shown["position"] = min(core.gpus[gpu_id].queue.position(lease) for gpu_id in lease.gpus)
     elif lease.state is not LeaseState.VERIFYING:
@@ -105,6 +107,7 @@ def status(core: Core) -> dict[str, Any]:
         "gpus": [gpu_view(core, gpu) for gpu in core.gpus.values()],
         "leases": [view(core, lease) for lease in [*resident, *waiting]],
         "clients": len(core.clients),
+        "drained": "" if core.drain is None else str(core.drain),
     }
 
 
@@ -245,8 +248,8 @@ def _holder_condition(core: Core, waiter: Lease, holder: Lease) -> str:
             LeaseState.UNLOADING: "is unloading",
             LeaseState.VERIFYING: "let go, its bytes are being measured",
         }[holder.state]
-    if not holder.spec.evictable:
-        return "is pinned"
+    if not holder.evictable:
+        return f"is pinned by {holder.pinned}" if holder.pinned else "is pinned"
     if policy.residency_ends_at(holder) > core.now:
         return f"may stay {policy.residency_ends_at(holder) - core.now:.1f} s more (minimum residency)"
     priority = waiter.priority_at(core.now, core.settings.ageing_s_per_point)

@@ -74,6 +74,17 @@ class Use:
     began_at: float
 
 
+@dataclass(frozen=True, slots=True)
+class Order:
+    """An operator's word: who gave it (name, uid, pid) and why."""
+
+    by: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.by}: {self.reason}" if self.reason else self.by
+
+
 @dataclass(slots=True)
 class Eviction:
     """One holder's way out, from the first `revoke` to the verdict. Times are monotonic seconds."""
@@ -94,6 +105,7 @@ class Eviction:
     released_at: float | None = None
     verdict_at: float | None = None
     verdict: str = ""
+    order: Order | None = None  # an operator wanted it
 
 
 @dataclass(slots=True)
@@ -129,6 +141,7 @@ class Lease:
     baseline: MemorySampled | None = None  # the card as it was when the unloading began
     reason: str = ""  # why it waits, in words; for people
     planned_gpu: GpuId | None = None  # a card where somebody was asked to leave for it
+    pinned: Order | None = None  # by an operator
     eviction: Eviction | None = None
     evicted: list[Eviction] = field(default_factory=list)  # who left for it
     story: list[tuple[float, LeaseState, str]] = field(
@@ -150,6 +163,11 @@ class Lease:
     def priority_at(self, now: float, ageing_s_per_point: float) -> int:
         """Priority with one point for every `ageing_s_per_point` waited."""
         return self.spec.priority + int(max(0.0, now - self.arrived_at) / ageing_s_per_point)
+
+    @property
+    def evictable(self) -> bool:
+        """May it be asked to leave at all? Its holder and an operator can forbid it."""
+        return self.spec.evictable and self.pinned is None
 
     @property
     def residue_bytes(self) -> int:

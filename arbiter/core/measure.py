@@ -333,11 +333,16 @@ def lose(
 
 
 def on_expiry_due(core: Core, lease_id: str) -> None:
-    """A holder did not renew (who has let go has no such timer). It may still be loading until it fences itself, so no verdict before that."""
+    """A holder did not renew (who has let go has no such timer)."""
     lease = core.leases[LeaseId(lease_id)]
+    expire(core, lease, f"{lease.id} was not renewed for {lease.spec.ttl_s:g} s")
+
+
+def expire(core: Core, lease: Lease, why: str) -> None:
+    """The lease is over for good. Its holder may still be loading until it fences itself, so no verdict before that."""
     error = {
         "code": "lease_expired",
-        "message": f"{lease.id} was not renewed for {lease.spec.ttl_s:g} s",
+        "message": why,
         "hint": "unload, then acquire again",
         "details": {"ttl_s": lease.spec.ttl_s},
     }

@@ -23,6 +23,8 @@ def blocked(core: Core, gpu: Gpu) -> str:
     """Why nothing can be granted on this card now, whoever asks; "" if grants are possible."""
     if core.recovering is not None:
         return "recovering after a restart: holders have to come back first"
+    if core.drain is not None:
+        return f"drained by {core.drain}"
     if gpu.failed_at is not None:
         return f"the card cannot be read: {gpu.failure}"
     if gpu.sample is None:
@@ -127,7 +129,7 @@ def choose_victims(core: Core, gpu: Gpu, waiter: Lease, going: Mapping[LeaseId, 
     willing = [
         lease
         for lease in gpu.in_state(LeaseState.HELD)
-        if lease.spec.evictable and (not lease.uses or lease.spec.priority <= priority)
+        if lease.evictable and (not lease.uses or lease.spec.priority <= priority)
     ]
     search = _oldest if core.settings.scheduling.least_recent else _search
     ripe = [lease for lease in willing if residency_ends_at(lease) <= core.now]
@@ -145,7 +147,7 @@ def choose_relief(core: Core, gpu: Gpu, going: Mapping[LeaseId, int], over_bytes
     idle = [
         lease
         for lease in gpu.in_state(LeaseState.HELD)
-        if lease.spec.evictable and not lease.uses and residency_ends_at(lease) <= core.now
+        if lease.evictable and not lease.uses and residency_ends_at(lease) <= core.now
     ]
     ledger = gpu.ledger
     total = ledger.total_if(going)
@@ -165,7 +167,7 @@ def wake_when_evictable(core: Core, gpu: Gpu, waiter: Lease | None) -> None:
     ageing_s = core.settings.ageing_s_per_point
     times: list[float] = []
     for lease in gpu.in_state(LeaseState.HELD):
-        if not lease.spec.evictable:
+        if not lease.evictable:
             continue
         times.append(residency_ends_at(lease))
         if waiter is not None and lease.uses:

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from arbiter.core import eviction, explain
+from arbiter.core import eviction, explain, operators
 from arbiter.core.events import MemorySampled, Reattached, ReattachedLease, Recovered, Spec
-from arbiter.core.lease import EXPIRING, Lease, LeaseState, Use
+from arbiter.core.lease import EXPIRING, Lease, LeaseState, Order, Use
 from arbiter.core.measure import begin_for_lease
 from arbiter.core.requests import become_held, client_of, ended_error, peak_key, touch
 from arbiter.core.state import Client, Core, Ended, Gpu, Refused
@@ -24,7 +24,10 @@ EMPTY_JOURNAL = LeaseId("journal")
 def on_recovered(core: Core, event: Recovered) -> None:
     """Charge everything that the journal names, then wait for the holders. Records of a card that is gone are dropped."""
     core.recovering = set()
-    for key, record in sorted(event.records.items()):
+    held = {key: record for key, record in sorted(event.records.items()) if key != operators.DRAIN_KEY}
+    if len(held) < len(event.records):
+        operators.restore_drain(core, event.records[operators.DRAIN_KEY])
+    for key, record in held.items():
         gpu = core.gpus.get(GpuId(str(record["gpu"])))
         if gpu is None:
             core.forget(key)
@@ -33,11 +36,11 @@ def on_recovered(core: Core, event: Recovered) -> None:
             gpu.ledger.set_residue(process, int(record["residue_bytes"]), core.now)
         else:
             _restore(core, gpu, record)
-    if not event.records:
+    if not held:
         core.recovering.add(EMPTY_JOURNAL)
         grace_s = defaults.LEASE_TTL_S + core.settings.fence_grace_s
         core.timers.set(("recover", EMPTY_JOURNAL), core.now + grace_s)
-    core.note("recovered", leases=sorted(core.recovering), records=len(event.records))
+    core.note("recovered", leases=sorted(core.recovering), records=len(held))
 
 
 def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
@@ -67,6 +70,7 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
         last_used_at=core.now,
         answered=True,
         exiting=bool(record["exiting"]),
+        pinned=None if record.get("pinned") is None else Order(*record["pinned"]),
         attached=False,
         story=[(core.now, LeaseState.HELD, "recovered from the journal")],
     )

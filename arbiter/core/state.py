@@ -11,7 +11,7 @@ from typing import Any
 
 from arbiter.core.effects import Effect, JournalDelete, JournalPut, Note, Push, Refuse, Reply, Sample
 from arbiter.core.events import MemorySampled
-from arbiter.core.lease import LEAVING, Eviction, Lease, LeaseState
+from arbiter.core.lease import LEAVING, Eviction, Lease, LeaseState, Order
 from arbiter.core.ledger import GpuLedger
 from arbiter.core.queue import WaitQueue
 from arbiter.core.settings import GpuInfo, Settings
@@ -114,6 +114,7 @@ class Core:
         self.unanswered: list[Lease] = []  # acquires of the event being handled
         self.granted: list[tuple[Token, GpuId]] = []  # by the event being handled; invariants look at it
         self.last_client_at = now
+        self.drain: Order | None = None  # an operator wants no new grants
         self.recovering: set[LeaseId] | None = (
             None  # None: serving; else the leases still to be accounted for
         )
@@ -251,6 +252,7 @@ class Core:
                 "load_peak_bytes": lease.load_peak_bytes,
                 "measured_bytes": lease.measured_bytes,
                 "exiting": lease.exiting,
+                "pinned": None if lease.pinned is None else [lease.pinned.by, lease.pinned.reason],
                 "spec": {
                     "consumer": spec.consumer,
                     "model_id": spec.key.model_id,

@@ -23,6 +23,9 @@ SILENT_S = 10.0
 _READS = ("status", "why", "history", "subscribe", "ping", "bye")  # all that an observer may do
 
 
+_BY_HAND = ("evict", "pin", "unpin", "release_dead", "drain", "resume")  # operators only
+
+
 class Wire(Protocol):
     """The socket, as sessions need it."""
 
@@ -141,6 +144,8 @@ class SessionTable:
             session.delimiter = delimiter
             if session.role == "observer" and request.op not in _READS and request.op != "hello":  # 5
                 raise NotPermitted(f"an observer may not {request.op}", hint="say hello as a client")
+            if request.op in _BY_HAND and session.role != "operator":
+                raise NotPermitted(f"only an operator may {request.op}", hint="say hello as operator")
             self._dispatch(session, request)  # 6
         except VramError as error:
             self._refuse_raw(routing_id, delimiter, request.id, error)
@@ -383,6 +388,14 @@ class SessionTable:
             case w.Reattach():
                 session.leased = True
                 post(ev.Reattached(client, re, tuple(_reattached(lease) for lease in request.leases)))
+            case w.Evict() | w.Pin() | w.Unpin() | w.ReleaseDead():
+                post(
+                    ev.OperatorAsked(
+                        client, re, request.op, request.target, _operator(session), request.reason
+                    )
+                )
+            case w.Drain() | w.Resume():
+                post(ev.OperatorAsked(client, re, request.op, "", _operator(session), request.reason))
             case w.Oom():
                 lease, token = LeaseId(request.lease_id), Token(*request.token)
                 post(
@@ -417,6 +430,11 @@ def to_spec(spec: w.LeaseSpec) -> ev.Spec:
         min_residency_s=spec.min_residency_s,
         deny_on_deadline=spec.on_deadline == "deny",
     )
+
+
+def _operator(session: Session) -> str:
+    """Who it is by the kernel's word; the name is what the connection calls itself."""
+    return f"{session.name} (uid {session.peer.credentials.uid}, pid {session.peer.process.pid})"
 
 
 def _on_lease(

@@ -104,6 +104,59 @@ def watch(
     raise typer.Exit(asyncio.run(live(endpoint, events)))
 
 
+Target = Annotated[str, typer.Argument(help="A lease (L3-17), or a consumer that has exactly one.")]
+Because = Annotated[str, typer.Option("--reason", "-r", help="Why; kept in history with your name.")]
+
+
+@app.command()
+def evict(target: Target, reason: Because, as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+    """Ask a holder to leave. In use, it finishes first; a pinned one is refused. Operators only."""
+    raise typer.Exit(
+        quick.by_hand("evict", {"target": target, "reason": reason}, as_json=as_json, endpoint=endpoint)
+    )
+
+
+@app.command()
+def pin(target: Target, reason: Because, as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+    """Nobody makes this lease leave until it is unpinned. Operators only."""
+    raise typer.Exit(
+        quick.by_hand("pin", {"target": target, "reason": reason}, as_json=as_json, endpoint=endpoint)
+    )
+
+
+@app.command()
+def unpin(target: Target, reason: Because = "", as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+    """Undo an operator's pin. Operators only."""
+    raise typer.Exit(
+        quick.by_hand("unpin", {"target": target, "reason": reason}, as_json=as_json, endpoint=endpoint)
+    )
+
+
+@app.command()
+def drain(reason: Because, as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+    """No new grants until `vramctl resume`; what is held is kept. Outlives the daemon, not the machine. Operators only."""
+    raise typer.Exit(quick.by_hand("drain", {"reason": reason}, as_json=as_json, endpoint=endpoint))
+
+
+@app.command()
+def resume(reason: Because = "", as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+    """Grant again after a drain. Operators only."""
+    raise typer.Exit(quick.by_hand("resume", {"reason": reason}, as_json=as_json, endpoint=endpoint))
+
+
+@app.command(name="release-dead")
+def release_dead(target: Target, reason: Because, as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+    """Give up the lease of a holder that is not heard of, before its ttl is over; its bytes are measured gone as ever.
+
+    Refused in use, and for a holder that is heard of. Operators only.
+    """
+    raise typer.Exit(
+        quick.by_hand(
+            "release_dead", {"target": target, "reason": reason}, as_json=as_json, endpoint=endpoint
+        )
+    )
+
+
 @app.command(context_settings={"allow_interspersed_args": False})
 def run(
     command: Annotated[list[str], typer.Argument(help="The program and its arguments, after `--`.")],

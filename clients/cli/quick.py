@@ -9,6 +9,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from clients.cli import text
@@ -33,9 +34,13 @@ class Unreachable(Exception):
 
 
 def ask(
-    op: str, fields: Mapping[str, Any], endpoint: str | None = None, timeout_s: float = TIMEOUT_S
+    op: str,
+    fields: Mapping[str, Any],
+    endpoint: str | None = None,
+    timeout_s: float = TIMEOUT_S,
+    role: str = "observer",
 ) -> Message:
-    """Hello as an observer, then one request. Returns its reply, error replies too. Raises Unreachable."""
+    """Hello, then one request. Returns its reply, error replies too. Raises Unreachable."""
     import msgpack
     import zmq
 
@@ -57,7 +62,7 @@ def ask(
             "name": "vramctl",
             "instance": f"vramctl-{os.getpid()}",
         }
-        for message in (hello | {"role": "observer"}, {"op": op, "id": 2, **fields}):
+        for message in (hello | {"role": role}, {"op": op, "id": 2, **fields}):
             socket.send(msgpack.packb(message))
         deadline = time.monotonic() + timeout_s
         while socket.poll(max(0, int(1000 * (deadline - time.monotonic())))):
@@ -125,6 +130,20 @@ def why(consumer: str, *, as_json: bool = False, endpoint: str | None = None) ->
         hidden=ENVELOPE | {"epoch"},
     )
     return NO if code == OK and not reply["leases"] else code
+
+
+def by_hand(
+    action: str, fields: Mapping[str, Any], *, as_json: bool = False, endpoint: str | None = None
+) -> int:
+    """An operator's action: `evict`, `pin`, `unpin`, `release_dead` (fields target, reason), `drain`, `resume` (reason)."""
+    return answer(
+        action,
+        fields,
+        endpoint=endpoint,
+        as_json=as_json,
+        lines=lambda reply: text.by_hand_lines(action, reply),
+        question=partial(ask, role="operator"),
+    )[0]
 
 
 def history(

@@ -43,6 +43,8 @@ def status_lines(status: Message) -> list[str]:
     ]
     if status["phase"] == "recovering":
         lines.append("  after a restart nothing is granted until every lease is accounted for")
+    if status.get("drained"):
+        lines.append(f"  drained by {status['drained']}; nothing is granted until `vramctl resume`")
     for gpu in status["gpus"]:
         lines += ["", *_gpu_lines(gpu)]
     lines.append("")
@@ -146,6 +148,28 @@ def _why_details(lease: Message) -> list[str]:
         f"  expected  {'unknown, never seen before' if eta is None else f'in {duration(eta)} ({lease["eta_source"]})'}"
     )
     return lines
+
+
+# -- by hand -----------------------------------------------------------------------------------------------------------
+def by_hand_lines(action: str, reply: Message) -> list[str]:
+    """What an operator's action did, and what happens next."""
+    if "drained" in reply:
+        return [
+            f"drained by {reply['drained']}; what is held is kept"
+            if reply["drained"]
+            else "grants are made again"
+        ]
+    lease = reply.get("lease")
+    if lease is None:
+        return [f"given up: its bytes stay charged until they are measured gone ({reply['state']})"]
+    name = f"{lease['consumer']} ({lease['lease_id']})"
+    if action == "pin":
+        return [f"{name} is pinned: nobody makes it leave until `vramctl unpin {lease['lease_id']}`"]
+    if action == "unpin":
+        return [f"{name} is no longer pinned by an operator"]
+    uses = lease["uses"]
+    wait = f"finishes {plural(uses, 'use')}, then unloads" if uses else "unloads now"
+    return [f"{name} was asked to leave: it {wait}; follow it with `vramctl why {lease['consumer']}`"]
 
 
 # -- events ------------------------------------------------------------------------------------------------------------

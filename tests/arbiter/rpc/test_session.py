@@ -204,6 +204,29 @@ def test_every_request_on_leases_becomes_its_event(bench: Bench) -> None:
     ]
 
 
+def test_only_an_operator_acts_by_hand_and_is_named_by_the_kernel(bench: Bench) -> None:
+    bench.hello(routing=b"c")
+    bench.hello(routing=b"v", role="observer")
+    bench.hello(routing=b"o", role="operator", name="ops")
+    bench.events.clear()
+    for routing in (b"c", b"v"):
+        for op in ("evict", "pin", "unpin", "release_dead"):
+            assert code(bench.ask(op, routing, target="det", reason="r")) == "not_permitted"
+        for op in ("drain", "resume"):
+            assert code(bench.ask(op, routing, reason="r")) == "not_permitted"
+    assert bench.events == []
+    bench.ask("evict", b"o", target="det", reason="r")
+    bench.ask("drain", b"o", reason="new driver")
+    by = f"ops (uid {os.getuid()}, pid {os.getpid()})"
+    me, last = ClientId(b"o".hex()), bench.next_id
+    assert bench.events == [
+        ev.OperatorAsked(me, RequestId(last - 1), "evict", "det", by, "r"),
+        ev.OperatorAsked(me, RequestId(last), "drain", "", by, "new driver"),
+    ]
+    assert code(bench.ask("evict", b"o", target="det")) == "bad_request", "an action without a reason"
+    assert code(bench.ask("drain", b"o", reason="a\nb")) == "bad_request", "a reason is one line of history"
+
+
 def test_every_op_of_the_wire_is_dispatched(bench: Bench) -> None:
     """A new op without a case in `_dispatch` would be answered by nobody."""
     on = {"lease_id": "L3-1", "token": [3, 7]}

@@ -144,7 +144,7 @@ def test_status_why_history(client: SyncArbiterClient, arbiter_daemon: ArbiterPr
     assert shown.returncode == 0
     assert "L1-1   detector  detector  held, idle   5 GiB" in shown.stdout
     status = json.loads(vramctl("status", "--json", environ=environ).stdout)
-    assert set(status) == {"epoch", "phase", "uptime_s", "gpus", "leases", "clients"}
+    assert set(status) == {"epoch", "phase", "uptime_s", "gpus", "leases", "clients", "drained"}
     assert status["leases"][0]["consumer"] == "detector"
 
     why = vramctl("why", "detector", environ=environ)
@@ -158,6 +158,34 @@ def test_status_why_history(client: SyncArbiterClient, arbiter_daemon: ArbiterPr
     assert [event["kind"] for event in newest["events"]] == ["switch"]
     granted = json.loads(vramctl("history", "--kind", "granted", "--json", environ=environ).stdout)
     assert [event["consumer"] for event in granted["events"]] == ["detector"]
+
+
+@pytest.mark.e2e
+def test_an_operators_actions(client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    environ = arbiter_daemon.environ
+    lease = client.acquire(spec("detector", 5))
+    lease.ready()
+    pinned = vramctl("pin", "detector", "-r", "press demo", environ=environ)
+    assert (pinned.returncode, "is pinned" in pinned.stdout) == (0, True)
+    refused = vramctl("evict", "detector", "-r", "make room", "--json", environ=environ)
+    assert (refused.returncode, json.loads(refused.stdout)["error"]["code"]) == (1, "bad_state")
+    assert "press demo" in vramctl("status", "--json", environ=environ).stdout
+    assert vramctl("unpin", "L1-1", environ=environ).returncode == 0
+    evicted = vramctl("evict", "L1-1", "--reason", "make room", environ=environ)
+    assert evicted.stdout.startswith("detector (L1-1) was asked to leave: it unloads now")
+
+    drained = vramctl("drain", "-r", "new driver", environ=environ)
+    assert (drained.returncode, "new driver" in drained.stdout) == (0, True)
+    assert "nothing is granted until `vramctl resume`" in vramctl("status", environ=environ).stdout
+    arbiter_daemon.kill()
+    arbiter_daemon.start()
+    assert "new driver" in json.loads(vramctl("status", "--json", environ=environ).stdout)["drained"]
+    assert vramctl("resume", environ=environ).stdout == "grants are made again\n"
+    unknown = vramctl("release-dead", "nobody", "-r", "gone", environ=environ)
+    assert (unknown.returncode, "no lease or consumer" in unknown.stderr) == (1, True)
+    listed = json.loads(vramctl("history", "--kind", "operator", "--json", environ=environ).stdout)["events"]
+    assert [event["action"] for event in listed] == ["pin", "unpin", "evict", "drain", "resume"]
+    assert all("vramctl (uid" in event["by"] for event in listed)
 
 
 @pytest.mark.e2e

@@ -1,0 +1,249 @@
+"""What an operator does by hand: it is kept with who and why, and no rule for holders gets weaker."""
+
+from typing import Any
+
+import pytest
+
+from arbiter.core.effects import Effect, Note
+from arbiter.core.events import OperatorAsked
+from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
+from schemas import defaults as d
+from schemas.ids import LeaseId
+
+GIB = d.GIB
+BY = "ops (uid 0, pid 7)"
+
+
+@pytest.fixture
+def driver() -> CoreDriver:
+    return CoreDriver(8 * GIB)
+
+
+@pytest.fixture
+def ops(driver: CoreDriver) -> Consumer:
+    return driver.consumer("ops")
+
+
+def ask(ops: Consumer, action: Any, target: str = "", reason: str = "test") -> list[Effect]:
+    event = OperatorAsked(ops.client, ops.driver.next_request(), action, target, BY, reason)
+    return ops.driver.post(event)
+
+
+def held(driver: CoreDriver, name: str, count: int, **spec: Any) -> tuple[Consumer, LeaseId]:
+    consumer = driver.consumer(name)
+    lease = consumer.acquire(count, **spec)
+    driver.until(lambda: driver.state(lease) == "loading")
+    consumer.load(lease)
+    return consumer, lease
+
+
+def noted(effects: list[Effect]) -> dict[str, Any]:
+    (note,) = [e for e in effects if isinstance(e, Note) and e.kind == "operator"]
+    return dict(note.data)
+
+
+# -- evict -------------------------------------------------------------------------------------------------------------
+def test_an_evicted_holder_in_use_finishes_first(driver: CoreDriver, ops: Consumer) -> None:
+    det, lease = held(driver, "det", 5 * GIB)
+    det.use_begin(lease)
+    effects = ask(ops, "evict", "det", "maintenance")
+    assert answer(effects)["state"] == "revoking"
+    assert noted(effects) | {"action": "evict", "by": BY, "reason": "maintenance", "uses": 1} == noted(
+        effects
+    )
+    (revoke,) = driver.pushes("revoke", lease)
+    assert "maintenance" in revoke["reason"]
+    assert BY in revoke["reason"]
+    assert refusal(det.unloading(lease)).code == "bad_state"
+    det.use_end(lease)
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    assert driver.notes("verified")[-1]["verdict"] == "verified"
+
+
+def test_evicting_twice_asks_once(driver: CoreDriver, ops: Consumer) -> None:
+    _, lease = held(driver, "det", 5 * GIB)
+    ask(ops, "evict", lease)
+    effects = ask(ops, "evict", lease)
+    assert noted(effects)["repeated"] is True
+    assert len(driver.notes("revoke_asked")) == 1
+
+
+@pytest.mark.parametrize("spec", [{"evictable": False}, {}])
+def test_a_pinned_holder_is_not_evicted_even_by_an_operator(
+    driver: CoreDriver, ops: Consumer, spec: dict[str, Any]
+) -> None:
+    _, lease = held(driver, "det", 5 * GIB, **spec)
+    if not spec:
+        ask(ops, "pin", lease)
+    assert refusal(ask(ops, "evict", lease)).code == "bad_state"
+    assert driver.state(lease) == "held"
+
+
+def test_only_what_is_resident_can_be_evicted(driver: CoreDriver, ops: Consumer) -> None:
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB)
+    assert refusal(ask(ops, "evict", lease)).details["state"] == "loading"
+
+
+# -- who is meant --------------------------------------------------------------------------------------------------------
+def test_a_consumer_with_several_leases_has_to_be_named_by_lease(driver: CoreDriver, ops: Consumer) -> None:
+    det, first = held(driver, "det", 1 * GIB)
+    second = det.acquire(1 * GIB)
+    refused = refusal(ask(ops, "evict", "det"))
+    assert (refused.code, refused.details["leases"]) == ("bad_request", [first, second])
+
+
+def test_of_a_resident_and_a_waiting_lease_the_resident_is_meant(driver: CoreDriver, ops: Consumer) -> None:
+    det, first = held(driver, "det", 5 * GIB, min_residency_s=100.0)
+    det.acquire(5 * GIB)
+    assert answer(ask(ops, "pin", "det"))["lease"]["lease_id"] == first
+
+
+def test_nobody_and_the_dead_are_told_apart(driver: CoreDriver, ops: Consumer) -> None:
+    det, lease = held(driver, "det", 5 * GIB)
+    det.die()
+    assert refusal(ask(ops, "evict", "nobody")).code == "unknown_lease"
+    assert refusal(ask(ops, "evict", lease)).code == "lease_lost"
+
+
+# -- pins --------------------------------------------------------------------------------------------------------------
+def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consumer) -> None:
+    _, lease = held(driver, "det", 5 * GIB)
+    vlm = driver.consumer("vlm")
+    waiting = vlm.acquire(3 * GIB)
+    assert driver.state(lease) == "revoking"
+    assert refusal(ask(ops, "pin", lease)).code == "bad_state", "it was asked to leave before the pin"
+    vlm.cancel(waiting)
+
+    other = CoreDriver(8 * GIB)
+    operator = other.consumer("ops")
+    _, lease = held(other, "det", 5 * GIB, min_residency_s=1.0)
+    policy = other.consumer("policy")
+    waiting = policy.acquire(4 * GIB)
+    ask(operator, "pin", lease, "demo for the press")
+    other.advance(5.0)
+    assert other.state(lease) == "held"
+    assert other.state(waiting) == "queued"
+    why = other.arbiter.why("policy", other.now)["leases"][0]
+    assert why["blockers"][0]["condition"] == f"is pinned by {BY}: demo for the press"
+    view = other.view(lease)
+    assert view is not None
+    assert (view["evictable"], view["pinned"]) == (False, f"{BY}: demo for the press")
+    ask(operator, "unpin", lease, "")
+    assert other.state(lease) == "revoking"
+    assert other.notes("operator")[-1]["action"] == "unpin"
+
+
+def test_a_request_that_a_pin_makes_impossible_is_refused_at_once(driver: CoreDriver, ops: Consumer) -> None:
+    _, lease = held(driver, "det", 5 * GIB)
+    ask(ops, "pin", lease)
+    refused = refusal(driver.consumer("policy").try_acquire(4 * GIB))
+    assert refused.code == "vram_insufficient"
+    assert refused.details["pinned"][0]["consumer"] == "det"
+
+
+def test_a_waiter_can_be_pinned_for_when_it_holds(driver: CoreDriver, ops: Consumer) -> None:
+    det, _ = held(driver, "det", 5 * GIB, min_residency_s=100.0)
+    waiting = driver.consumer("policy").acquire(4 * GIB)
+    ask(ops, "pin", waiting)
+    view = driver.view(waiting)
+    assert view is not None
+    assert view["pinned"].startswith(BY)
+    del det
+
+
+def test_only_an_operators_pin_is_undone(driver: CoreDriver, ops: Consumer) -> None:
+    _, mine = held(driver, "det", 1 * GIB, evictable=False)
+    _, free = held(driver, "vlm", 1 * GIB)
+    assert "own to change" in refusal(ask(ops, "unpin", mine)).hint
+    assert refusal(ask(ops, "unpin", free)).hint == ""
+
+
+def test_a_pin_outlives_the_daemon(driver: CoreDriver, ops: Consumer) -> None:
+    det, lease = held(driver, "det", 5 * GIB)
+    ask(ops, "pin", lease, "why not")
+    token = det.token(lease)
+    driver.restart()
+    det.connect()
+    det.reattach(lease, token)
+    view = driver.view(lease)
+    assert view is not None
+    assert view["pinned"] == f"{BY}: why not"
+
+
+# -- drain -------------------------------------------------------------------------------------------------------------
+def test_a_drained_arbiter_grants_nothing_and_keeps_what_is_held(driver: CoreDriver, ops: Consumer) -> None:
+    _, lease = held(driver, "det", 3 * GIB)
+    assert answer(ask(ops, "drain", reason="new driver"))["drained"] == f"{BY}: new driver"
+    waiting = driver.consumer("vlm").acquire(1 * GIB)
+    driver.advance(20.0)
+    assert (driver.state(lease), driver.state(waiting)) == ("held", "queued")
+    assert driver.arbiter.status(driver.now)["drained"] == f"{BY}: new driver"
+    assert "drained by" in driver.arbiter.why("vlm", driver.now)["leases"][0]["next"]
+    assert answer(ask(ops, "resume", reason=""))["drained"] == ""
+    driver.until(lambda: driver.state(waiting) == "loading")
+    assert answer(ask(ops, "resume"))["drained"] == "", "resuming what is not drained is fine"
+
+
+@pytest.mark.parametrize("with_lease", [True, False])
+def test_a_drain_outlives_the_daemon(driver: CoreDriver, ops: Consumer, with_lease: bool) -> None:
+    if with_lease:
+        det, lease = held(driver, "det", 3 * GIB)
+        token = det.token(lease)
+    ask(ops, "drain", reason="new driver")
+    driver.restart()
+    assert driver.arbiter.status(driver.now)["drained"] == f"{BY}: new driver"
+    if with_lease:
+        det.connect()
+        det.reattach(lease, token)
+    ops.connect()
+    waiting = driver.consumer("vlm").acquire(1 * GIB)
+    driver.advance(20.0)
+    assert driver.state(waiting) == "queued"
+    ask(ops, "resume")
+    assert "drain" not in driver.journal
+    driver.until(lambda: driver.state(waiting) == "loading")
+
+
+# -- the dead ----------------------------------------------------------------------------------------------------------
+def test_the_lease_of_a_silent_holder_is_given_up_and_its_bytes_measured(
+    driver: CoreDriver, ops: Consumer
+) -> None:
+    det, lease = held(driver, "det", 5 * GIB, ttl_s=600.0)
+    refused = refusal(ask(ops, "release_dead", lease))
+    assert "not dead" in refused.message
+    driver.advance(450.0)
+    assert answer(ask(ops, "release_dead", lease, "hangs since noon"))["state"] == "expired"
+    (lost,) = driver.pushes("lost", lease)
+    assert lost["error"]["code"] == "lease_expired"
+    assert "hangs since noon" in lost["error"]["message"]
+    waiting = driver.consumer("policy").acquire(4 * GIB)
+    driver.advance(30.0)
+    assert driver.state(waiting) == "queued", "its bytes are still there"
+    det.hold(0)
+    driver.until(lambda: driver.state(waiting) == "loading")
+
+
+def test_a_lease_in_use_is_never_given_up(driver: CoreDriver, ops: Consumer) -> None:
+    det, lease = held(driver, "det", 5 * GIB, ttl_s=600.0)
+    det.use_begin(lease)
+    driver.advance(450.0)
+    assert "in use" in refusal(ask(ops, "release_dead", lease)).message
+
+
+def test_a_waiter_has_nothing_to_be_given_up(driver: CoreDriver, ops: Consumer) -> None:
+    held(driver, "det", 5 * GIB, min_residency_s=100.0)
+    waiting = driver.consumer("policy").acquire(4 * GIB)
+    assert refusal(ask(ops, "release_dead", waiting)).code == "bad_state"
+
+
+def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
+    driver: CoreDriver, ops: Consumer
+) -> None:
+    det, lease = held(driver, "det", 5 * GIB, ttl_s=600.0)
+    driver.restart()
+    ops.connect()
+    ask(ops, "release_dead", lease, "it was a crash")
+    det.hold(0)
+    driver.until(lambda: driver.arbiter.status(driver.now)["phase"] == "serving")
