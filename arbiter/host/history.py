@@ -28,6 +28,8 @@ BUFFER_MAX = 20_000
 """Events waiting for a disk that does not answer; beyond this the oldest are dropped and counted."""
 PRUNE_EVERY_EVENTS = 2000
 CLOSE_S = 5.0
+AT_ONCE = frozenset({"operator"})
+"""Kinds that do not wait for the next batch: who did what by hand is to survive a crash that follows at once."""
 CLEAN_END = "stopped"
 """Kind of the last event of an orderly stop."""
 
@@ -103,7 +105,9 @@ class History:
         self._ring.append(event)
         if self._store is not None:
             self._buffer.append(event)
-            if self._timer is None and self._loop is not None:
+            if kind in AT_ONCE:
+                self._flush()
+            elif self._timer is None and self._loop is not None:
                 self._timer = self._loop.call_later(FLUSH_S, self._flush)
         return event
 
