@@ -2,6 +2,7 @@
 
 import argparse
 import asyncio
+import faulthandler
 import os
 import sys
 from collections.abc import Sequence
@@ -116,6 +117,7 @@ def exit_code_of(error: VramError) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns the exit code; prints errors of the operator as one line without a traceback."""
     flags = parser().parse_args(argv)
+    faulthandler.enable()  # the manager's watchdog kills by SIGABRT: the log then says where the daemon was stuck
     try:
         config = effective_config(flags)
         from arbiter.daemon import Daemon, find_places  # late: --help and --version need none of it

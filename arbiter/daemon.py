@@ -28,6 +28,7 @@ from arbiter.host.history import CLEAN_END, History
 from arbiter.host.journal import Journal
 from arbiter.host.lockfile import LockFile
 from arbiter.host.probing import Prober, within
+from arbiter.host.suspend import SuspendWatch
 from arbiter.host.systemd import Notifier
 from arbiter.host.tree import Known
 from arbiter.host.watch import ProcessWatch
@@ -193,7 +194,12 @@ class Daemon:
         settings = core_settings(config, journal.opened.epoch, gpus, journal.opened.learnt)
         try_records(journal, settings)
         core = Arbiter(settings, time.monotonic())  # 4
-        inbox = Inbox(core, lambda effects: executor.perform(effects), self._core_failed)
+        inbox = Inbox(
+            core,
+            lambda effects: executor.perform(effects),
+            self._core_failed,
+            slept_s=SuspendWatch().slept_s,
+        )
         prober = Prober(
             probe,
             [gpu.id for gpu in gpus],
@@ -300,16 +306,14 @@ class Daemon:
         self._stop.set()
 
     async def _beat(self, parts: Parts, notifier: Notifier) -> None:
-        """Feeds the watchdog only if the core handled an event just now, on this very thread: a stuck core starves it."""
+        """Feeds the watchdog only with an event that has just passed through the core and the executor, on this very thread: whatever is
+        stuck there starves it."""
         period_s = min(STATUS_EVERY_S, (notifier.watchdog_s or 3 * STATUS_EVERY_S) / 3)
         text, kept_at = "", time.monotonic()
         while True:
             await asyncio.sleep(period_s)
-            if notifier.watchdog_s is not None:
-                before = parts.inbox.handled
-                parts.inbox.post(Tick())
-                if parts.inbox.handled > before:
-                    notifier.watchdog()
+            if notifier.watchdog_s is not None and parts.inbox.pulse():
+                notifier.watchdog()
             if text != (text := f"{status_text(parts.gpus)}; {len(parts.sessions)} clients"):
                 notifier.status(text)
             if time.monotonic() - kept_at >= KEEP_LEARNT_EVERY_S and not parts.inbox.closed:

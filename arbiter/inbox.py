@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from arbiter.core.effects import Effect
-from arbiter.core.events import Event, Tick
+from arbiter.core.events import Event, Resumed, Tick
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +40,8 @@ class Inbox:
     """Owns the core.
 
     `perform` runs the effects of one event; it may post events, which are handled after it returned. `failed` is called once with the
-    exception if the core raises: its state can no longer be trusted, so nothing is handled after that.
+    exception if the core raises: its state can no longer be trusted, so nothing is handled after that. `slept_s` tells for how long the
+    machine was suspended since it was last asked; the core hears of it before any other event.
     """
 
     def __init__(
@@ -49,11 +50,13 @@ class Inbox:
         perform: Callable[[Sequence[Effect]], None],
         failed: Callable[[BaseException], None],
         clock: Callable[[], float] = time.monotonic,
+        slept_s: Callable[[], float] = lambda: 0.0,
     ) -> None:
         self._core = core
         self._perform = perform
         self._failed = failed
         self._clock = clock
+        self._slept_s = slept_s
         self._queue: deque[Event] = deque()
         self._busy = False
         self._closed = False
@@ -71,6 +74,8 @@ class Inbox:
         self._busy = True
         try:
             while self._queue and not self._closed:
+                if slept_s := self._slept_s():  # before anything is decided on what was known yesterday
+                    self._queue.appendleft(Resumed(slept_s))
                 self._handle(self._queue.popleft())
         finally:
             self._busy = False
@@ -85,10 +90,12 @@ class Inbox:
     def learnt(self) -> dict[str, dict[str, float]]:
         return self._core.learnt()
 
-    @property
-    def handled(self) -> int:
-        """Events handled so far: the watchdog is fed as long as the core answers."""
-        return self._handled
+    def pulse(self) -> bool:
+        """Send an event through the core and have its effects performed: True only if both came back. What feeds the watchdog: a core, a
+        journal or a loop that is stuck never gets here, and one that failed answers False."""
+        before = self._handled
+        self.post(Tick())
+        return self._handled > before
 
     @property
     def closed(self) -> bool:
@@ -104,9 +111,8 @@ class Inbox:
 
     def _handle(self, event: Event) -> None:
         try:
-            effects = self._core.handle(event, self._clock())
+            self._perform(self._core.handle(event, self._clock()))
             self._handled += 1
-            self._perform(effects)
         except Exception as error:  # outermost: a core that raised has an unknown state
             log.critical("the core failed on %s: %s", event, error, exc_info=error)
             log.critical("state of the core: %s", self._state())

@@ -4,7 +4,7 @@
   1. what happened
      1.1 connections: hello, bye, death of a process
      1.2 requests: acquire and cancel · ready, uses, renew, oom · revoke_ack, unloading, release · reattach · operators
-     1.3 the machine: a reading, a failed reading, a failed journal write, a journal from before the restart
+     1.3 the machine: a reading, a failed reading, a failed journal write, a journal from before the restart, a resume from suspend
      1.4 time: every timer that is due
   2. recovery ends when everybody is accounted for
   3. who gets a card next (its own numbered tree: `grants`), and the answer to an acquire that has to wait
@@ -15,7 +15,7 @@ It must not know how effects are performed, nor that a wire exists.
 
 from typing import Any
 
-from arbiter.core import eviction, explain, grants, invariants, measure, operators, recovery, requests
+from arbiter.core import eviction, explain, grants, invariants, measure, operators, recovery, requests, resume
 from arbiter.core.effects import Effect
 from arbiter.core.events import (
     AcquireRequested,
@@ -34,6 +34,7 @@ from arbiter.core.events import (
     Recovered,
     ReleaseReported,
     Renewed,
+    Resumed,
     RevokeAcknowledged,
     Tick,
     UnloadStarted,
@@ -118,6 +119,8 @@ class Arbiter:
                 on_journal_failed(core, event)
             case Recovered():
                 recovery.on_recovered(core, event)
+            case Resumed():
+                resume.on_resumed(core, event)
             # 1.4 time
             case Tick():
                 self._run_due()

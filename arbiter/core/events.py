@@ -222,6 +222,13 @@ class Recovered:
 
 
 @dataclass(frozen=True, slots=True)
+class Resumed:
+    """The machine was suspended for `slept_s` in which the monotonic clock stood still. Comes before any other event of the new day."""
+
+    slept_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Tick:
     """`next_deadline()` has come."""
 
@@ -229,5 +236,5 @@ class Tick:
 Event = (
     ClientConnected | ClientLeft | ProcessDied | AcquireRequested | ReadyReported | UseBegan | UseEnded | Renewed
     | RevokeAcknowledged | UnloadStarted | ReleaseReported | CancelRequested | Reattached | OomReported | OperatorAsked | MemorySampled
-    | ProbeFailed | JournalFailed | Recovered | Tick
+    | ProbeFailed | JournalFailed | Recovered | Resumed | Tick
 )  # fmt: skip

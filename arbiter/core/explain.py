@@ -11,7 +11,7 @@ from arbiter.core.state import Core, Gpu
 NOTE_KINDS: tuple[str, ...] = (
     "queued", "granted", "ready", "switch", "use_began", "use_ended", "revoke_asked", "revoke_acked", "reminded",
     "deadline_passed", "unloading", "released", "verified", "denied", "cancelled", "expired", "lost", "reattached", "oom",
-    "pressure", "stowaway", "probe_failed", "probe_ok", "journal_failed", "recovered", "serving", "operator",
+    "pressure", "stowaway", "probe_failed", "probe_ok", "journal_failed", "recovered", "serving", "operator", "resumed",
 )  # fmt: skip
 """Every kind of `effects.Note`. `switch` comes with each `ready`; its field `switched` says whether anybody had to leave."""
 

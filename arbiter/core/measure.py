@@ -16,9 +16,11 @@ from schemas.ids import GpuId, LeaseId, ProcessKey
 
 # -- readings ------------------------------------------------------------------------------------------------------
 def on_sample(core: Core, sample: MemorySampled) -> None:
-    """A reading arrived. One older than the newest is dropped; one of an unknown card too."""
+    """A reading arrived. One older than the newest or from before a suspend is dropped; one of an unknown card too."""
     gpu = core.gpus.get(sample.gpu)
-    if gpu is None or (gpu.sample is not None and sample.taken_at < gpu.sample.taken_at):
+    if gpu is None or sample.taken_at < gpu.read_from:
+        return
+    if gpu.sample is not None and sample.taken_at < gpu.sample.taken_at:
         return
     if gpu.asked_at is not None and sample.taken_at >= gpu.asked_at:
         gpu.asked_at = None
@@ -166,6 +168,18 @@ def bereave(core: Core, gpu: Gpu, verification: Verification) -> None:
     verification.alive = False
     verification.not_before = min(verification.not_before, core.now)
     verification.paced_from = core.now
+    _read_soon(core, gpu, verification)
+
+
+def begin_again(core: Core, gpu: Gpu, verification: Verification) -> None:
+    """What was read so far tells nothing any more, and neither does the time that it took."""
+    verification.confirmed_at = core.now
+    verification.paced_from = max(core.now, verification.not_before)
+    verification.deadline_at = verification.paced_from + core.settings.verify_timeout_s
+    verification.settling = False
+    verification.last_used_bytes = None
+    verification.verdict = None
+    verification.overdue = False
     _read_soon(core, gpu, verification)
 
 

@@ -72,6 +72,7 @@ class Gpu:
     reading_s: float = 0.0  # how long the newest reading took
     failed_at: float | None = None  # last failed reading, None after a good one
     failure: str = ""
+    read_from: float = 0.0  # no reading that began earlier counts (resume from suspend)
     asked_at: float | None = None  # last Sample asked for, None if its answer is here
     changed_at: float = 0.0  # last grant, ready or verdict
     blocked: str = ""

@@ -123,6 +123,17 @@ class ArbiterProcess:
         finally:
             os.close(died)
 
+    def heard(self, seconds: float) -> list[str]:
+        """What the daemon tells its manager from now on, for so long; what it told before is put aside (`messages`)."""
+        while select.select([self._notify.fileno()], [], [], 0)[0]:
+            self.messages.append(self._notify.recv(4096).decode())
+        found: list[str] = []
+        deadline = time.monotonic() + seconds
+        while select.select([self._notify.fileno()], [], [], max(0.0, deadline - time.monotonic()))[0]:
+            found.append(self._notify.recv(4096).decode())
+        self.messages += found
+        return found
+
     def stop(self) -> int:
         """SIGTERM, and its exit code."""
         return self._end(signal.SIGTERM)

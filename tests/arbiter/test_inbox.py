@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
 from arbiter.core.effects import Effect, Note
-from arbiter.core.events import ClientLeft, Event, Tick
+from arbiter.core.events import ClientLeft, Event, Resumed, Tick
 from arbiter.inbox import Inbox
 from schemas.ids import ClientId
 
@@ -75,7 +75,6 @@ def test_an_event_that_an_effect_posts_is_handled_after_it() -> None:
         inbox.post(left("first"))
         assert core.seen == [left("first"), left("second")]
         assert done[1] == "first performed"
-        assert inbox.handled == 2
 
     with_inbox(test)
 
@@ -130,6 +129,69 @@ def test_the_same_deadline_twice_in_a_row_still_ticks() -> None:
             core.ticked.clear()
 
     with_inbox(test)
+
+
+def test_the_core_hears_of_a_suspend_before_anything_else() -> None:
+    async def run() -> None:
+        core, sleeps = ScriptedCore(), [0.0, 3600.0, 0.0, 7.0, 0.0]
+        inbox = Inbox(core, lambda effects: None, lambda error: None, slept_s=lambda: sleeps.pop(0))
+        for name in ("evening", "morning"):
+            inbox.post(left(name))
+        assert core.seen == [left("evening"), Resumed(3600.0), left("morning")]
+        inbox.post(left("noon"))
+        assert core.seen[3:] == [Resumed(7.0), left("noon")]
+        inbox.close()
+
+    asyncio.run(run())
+
+
+def test_a_pulse_has_passed_through_the_core_and_its_effects() -> None:
+    async def test(inbox: Inbox, core: ScriptedCore, done: list[Any]) -> None:
+        inbox.post(left("a"))
+        assert inbox.pulse()
+        assert core.seen[-1] == Tick()
+        assert done[-1] == [Note("seen", {"number": len(core.seen)})]
+
+    with_inbox(test)
+
+
+def test_there_is_no_pulse_while_an_event_is_being_handled() -> None:
+    """An effect that never ends is a stuck daemon, even if something inside it still asks."""
+
+    async def run() -> None:
+        pulses = list[bool]()
+
+        def perform(effects: Sequence[Effect]) -> None:
+            if not pulses:
+                pulses.append(inbox.pulse())
+
+        inbox = Inbox(ScriptedCore(), perform, lambda error: None)
+        inbox.post(left("a"))
+        assert pulses == [False]
+        assert inbox.pulse()
+        inbox.close()
+
+    asyncio.run(run())
+
+
+def test_a_failed_core_and_failed_effects_have_no_pulse() -> None:
+    async def test(inbox: Inbox, core: ScriptedCore, done: list[Any]) -> None:
+        core.broken = True
+        assert not inbox.pulse()
+        assert not inbox.pulse()
+
+    with_inbox(test)
+
+    async def run() -> None:
+        def perform(effects: Sequence[Effect]) -> None:
+            raise OSError("the socket is gone")
+
+        failed = list[BaseException]()
+        inbox = Inbox(ScriptedCore(), perform, failed.append)
+        assert not inbox.pulse()
+        assert [str(error) for error in failed] == ["the socket is gone"]
+
+    asyncio.run(run())
 
 
 def test_a_core_that_raises_ends_everything_once() -> None:

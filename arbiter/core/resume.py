@@ -1,0 +1,35 @@
+"""The machine slept and woke up (a laptop's lid). The monotonic clock stood still meanwhile, so no ttl ran and nobody expired; but what was
+measured before is of another day: drivers may have moved or dropped memory, and holders wake up in any order.
+
+So: every holder gets its full ttl anew, every card is unknown until it is read, and verifications begin again. Nothing is given up.
+"""
+
+from arbiter.core import measure
+from arbiter.core.events import Resumed
+from arbiter.core.lease import EXPIRING
+from arbiter.core.recovery import EMPTY_JOURNAL
+from arbiter.core.state import Core, Gpu
+from schemas import defaults
+
+
+def on_resumed(core: Core, event: Resumed) -> None:
+    """No reading that began before counts from here on."""
+    core.note("resumed", slept_s=event.slept_s)
+    grace_s = core.settings.fence_grace_s
+    for lease in core.leases.values():
+        if lease.state in EXPIRING:
+            lease.expires_at = core.now + lease.spec.ttl_s + (0.0 if lease.attached else grace_s)
+            core.timers.set(("ttl", lease.id), lease.expires_at)
+    if ("recover", EMPTY_JOURNAL) in core.timers:
+        core.timers.set(("recover", EMPTY_JOURNAL), core.now + defaults.LEASE_TTL_S + grace_s)
+    for gpu in core.gpus.values():
+        _measure_anew(core, gpu)
+
+
+def _measure_anew(core: Core, gpu: Gpu) -> None:
+    gpu.sample = None
+    gpu.read_from = core.now
+    core.want_sample(gpu, core.now)
+    for verification in gpu.verifications.values():
+        measure.begin_again(core, gpu, verification)
+    core.wake(gpu)

@@ -1,0 +1,124 @@
+"""A laptop's lid: the monotonic clock stood still, so nobody expires, but everything measured is of yesterday."""
+
+from arbiter.core.effects import Note, Sample
+from arbiter.core.events import MemorySampled, ProcessDied, Resumed
+from arbiter.testing.core_driver import Consumer, CoreDriver, answer
+from schemas import defaults as d
+from schemas.ids import LeaseId
+
+GIB = d.GIB
+NIGHT_S = 8 * 3600.0
+
+
+def held(driver: CoreDriver, name: str, gib: float, ttl_s: float = 10.0) -> tuple[Consumer, LeaseId]:
+    person = driver.consumer(name)
+    lease = person.acquire(int(gib * GIB), ttl_s=ttl_s)
+    driver.until(lambda: driver.state(lease) == "loading")
+    person.load(lease)
+    driver.advance(0.01)
+    return person, lease
+
+
+def test_every_holder_gets_its_full_ttl_anew_and_none_expires() -> None:
+    """They wake up in any order, behind a driver that takes its time: the first to be late must not lose its lease for it."""
+    driver = CoreDriver(8 * GIB)
+    holders = [held(driver, name, 1) for name in ("a", "b", "c")]
+    driver.advance(8.0)  # of ten
+    driver.post(Resumed(NIGHT_S))
+    assert [driver.notes("resumed")[0]["slept_s"]] == [NIGHT_S]
+    driver.advance(9.5)
+    assert [driver.state(lease) for _, lease in holders] == ["held"] * 3
+    driver.advance(1.0)
+    assert [driver.state(lease) for _, lease in holders] == ["over"] * 3, (
+        "who stays silent expires all the same"
+    )
+
+
+def test_nothing_is_granted_on_a_reading_from_before() -> None:
+    """Regression: by the monotonic clock yesterday's reading is a second old."""
+    driver = CoreDriver(8 * GIB)
+    person = driver.consumer("a")
+    driver.advance(0.01)
+    driver.card.failing = "the driver wakes up too"
+    effects = driver.post(Resumed(NIGHT_S))
+    assert Sample(driver.card.gpu) in effects
+    lease = person.acquire(2 * GIB)
+    assert driver.state(lease) == "queued"
+    assert driver.gpu()["blocked"]
+    driver.card.failing = ""
+    driver.until(lambda: driver.state(lease) == "loading")
+
+
+def test_a_reading_that_began_before_the_night_does_not_count() -> None:
+    driver = CoreDriver(8 * GIB)
+    began = driver.now
+    driver.advance(0.5)
+    driver.card.silent = True
+    driver.post(Resumed(NIGHT_S))
+    driver.post(MemorySampled(driver.card.gpu, began, 0, 8 * GIB, ()))
+    assert driver.gpu()["measured_used_bytes"] is None
+    waiter = driver.consumer("a").acquire(GIB)
+    assert driver.state(waiter) == "queued"
+    driver.post(MemorySampled(driver.card.gpu, driver.now, 0, 8 * GIB, ()))
+    assert driver.state(waiter) == "loading"
+
+
+def test_a_verification_begins_again() -> None:
+    """Its time is up by what it waited for before; the readings of a new day decide, with the whole time for them."""
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = 1000.0
+    person, lease = held(driver, "a", 5)
+    person.unload(lease)
+    driver.advance(driver.settings.verify_timeout_s + 1)
+    assert [note["verdict"] for note in driver.notes("verified")] == ["residue"]
+    other, second = held(driver, "b", 1)
+    driver.advance(1.0)
+    driver.post(ProcessDied(other.process))  # its bytes stay
+    driver.advance(driver.settings.verify_timeout_s + 1)
+    assert driver.notes("verified")[-1]["verdict"] == "contested"
+    driver.post(Resumed(NIGHT_S))
+    before = len(driver.notes("verified"))
+    driver.advance(driver.settings.verify_timeout_s - 1)
+    assert len(driver.notes("verified")) == before, "no verdict of yesterday is repeated"
+    driver.card.set(other.process, 0, driver.now)
+    driver.card.lag_s = 0.0
+    driver.until(lambda: driver.notes("verified")[-1]["resolved"], limit_s=2000.0)
+    assert driver.state(second) == "over"
+
+
+def test_a_recovery_that_was_under_way_waits_for_its_holders_anew() -> None:
+    driver = CoreDriver(8 * GIB)
+    person, lease = held(driver, "a", 5)
+    token = person.token(lease)
+    driver.restart()
+    driver.advance(14.0)  # of ttl and grace, fifteen
+    driver.post(Resumed(NIGHT_S))
+    driver.advance(14.0)
+    person.connect()
+    assert answer(person.reattach(lease, token))["leases"][0]["kept"]
+
+
+def test_a_recovery_without_a_journal_waits_anew_too() -> None:
+    driver = CoreDriver(8 * GIB)
+    held(driver, "a", 5)
+    driver.restart(keep_journal=False)
+    driver.advance(14.0)
+    driver.post(Resumed(NIGHT_S))
+    driver.advance(14.0)
+    assert driver.arbiter.status(driver.now)["phase"] == "recovering"
+    driver.advance(1.5)
+    assert driver.arbiter.status(driver.now)["phase"] == "serving"
+
+
+def test_waiters_and_leases_on_their_way_out_keep_their_place() -> None:
+    driver = CoreDriver(8 * GIB)
+    holder, lease = held(driver, "a", 5, ttl_s=3600.0)
+    holder.use_begin(lease)
+    waiter = driver.consumer("b").acquire(5 * GIB, wait_timeout_s=20.0)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    effects = driver.post(Resumed(NIGHT_S))
+    assert not [e for e in effects if isinstance(e, Note) and e.kind in ("denied", "expired", "cancelled")]
+    assert (driver.state(lease), driver.state(waiter)) == ("revoking", "queued")
+    holder.use_end(lease)
+    holder.unload(lease)
+    driver.until(lambda: driver.state(waiter) == "loading")

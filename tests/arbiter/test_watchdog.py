@@ -1,0 +1,140 @@
+"""The service manager's watchdog is fed by the decision loop itself: whatever is stuck in it starves the watchdog. Real processes.
+
+The defect is planted from outside: a script runs the real daemon around a part that reads from a pipe into which nobody writes.
+"""
+
+import os
+import signal
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from arbiter.testing.wire import WireClient
+
+pytestmark = pytest.mark.e2e
+PATIENCE_S = 60
+WATCHDOG_S = 0.6
+GIB = 1 << 30
+
+Make = Callable[..., ArbiterProcess]
+
+CORE = """
+    class Stuck(daemon.Arbiter):
+        def handle(self, event, now):
+            if isinstance(event, ClientConnected) and event.name == "trigger":
+                wait_for_ever()
+            return super().handle(event, now)
+
+    daemon.Arbiter = Stuck
+"""
+JOURNAL = """
+    class Stuck(daemon.Journal):
+        def apply(self, changes):
+            if any(record and record["spec"]["consumer"] == "trigger" for _, record in changes):
+                wait_for_ever()
+            super().apply(changes)
+
+    daemon.Journal = Stuck
+"""
+LOOP = """
+    class Stuck(daemon.SessionTable):
+        def receive(self, routing_id, delimiter, address, payload):
+            if b"trigger" in payload:
+                wait_for_ever()
+            super().receive(routing_id, delimiter, address, payload)
+
+    daemon.SessionTable = Stuck
+"""
+
+
+def planted(arbiter: ArbiterProcess, defect: str) -> Path:
+    """Make the daemon's program one with a defect; returns the pipe that it gets stuck on."""
+    pipe = arbiter.runtime / "pipe"
+    os.mkfifo(pipe)
+    script = f"""
+    import sys
+    import arbiter.daemon as daemon
+    from arbiter.__main__ import main
+    from arbiter.core.events import ClientConnected
+
+    def wait_for_ever():
+        with open({str(pipe)!r}, "rb") as file:
+            file.read(1)
+    {defect}
+    sys.exit(main())
+    """
+    path = arbiter.runtime / "planted.py"
+    path.write_text(textwrap.dedent(script))
+    arbiter.program = [sys.executable, str(path)]
+    return pipe
+
+
+def feed(messages: list[str]) -> list[str]:
+    return [message for message in messages if "WATCHDOG=1" in message]
+
+
+def test_a_daemon_that_decides_feeds_it(make_arbiter: Make) -> None:
+    arbiter = make_arbiter().start({"WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6))})
+    for _ in range(3):
+        arbiter.wait_for("WATCHDOG=1", PATIENCE_S)
+
+
+def test_without_a_watchdog_none_is_fed(make_arbiter: Make) -> None:
+    arbiter = make_arbiter().start()
+    with WireClient(arbiter.endpoint) as client:
+        client.hello()
+        arbiter.wait_for("1 clients", PATIENCE_S)  # a whole beat has passed
+    assert not feed(arbiter.messages)
+
+
+@pytest.mark.parametrize("defect", [CORE, JOURNAL, LOOP], ids=["core", "journal", "loop"])
+def test_a_stuck_part_stops_feeding_it_and_the_manager_learns_where(make_arbiter: Make, defect: str) -> None:
+    arbiter = make_arbiter()
+    pipe = planted(arbiter, defect)
+    arbiter.start({"WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6))})
+    arbiter.wait_for("WATCHDOG=1", PATIENCE_S)
+    with WireClient(arbiter.endpoint) as holder, WireClient(arbiter.endpoint) as trigger:
+        kept = holder.hello("holder").acquire("holder", GIB, ttl_s=60.0)["lease"]
+        trigger.send("hello", version=1, name="trigger", instance="t")
+        if defect is JOURNAL:
+            spec = {
+                "consumer": "trigger",
+                "model_id": "m",
+                "footprint": {"load_peak_bytes": GIB, "steady_bytes": GIB},
+            }
+            assert holder.ask("ready", lease_id=kept["lease_id"], token=kept["token"])["ok"]
+            trigger.send("acquire", nonce="n", spec=spec)
+        writer = os.open(
+            pipe, os.O_WRONLY
+        )  # returns once the daemon stands at the other end: it is stuck now
+        assert not feed(arbiter.heard(2 * WATCHDOG_S))
+        assert arbiter.process is not None
+        arbiter.process.send_signal(signal.SIGABRT)  # what systemd does after WatchdogSec
+        assert arbiter.process.wait(PATIENCE_S) == -signal.SIGABRT
+        os.close(writer)
+    assert "in wait_for_ever" in arbiter.log, "the log names the line that was stuck"
+
+    arbiter.program = [sys.executable, "-m", "arbiter"]
+    arbiter.start()
+    with WireClient(arbiter.endpoint) as client:
+        leases = client.hello().ask("status")["leases"]
+        assert [(lease["lease_id"], lease["token"]) for lease in leases if lease["consumer"] == "holder"] == [
+            (kept["lease_id"], kept["token"])
+        ]
+
+
+def test_what_was_stuck_for_a_while_feeds_it_again(make_arbiter: Make) -> None:
+    arbiter = make_arbiter()
+    pipe = planted(arbiter, CORE)
+    arbiter.start({"WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6))})
+    with WireClient(arbiter.endpoint) as trigger:
+        trigger.send("hello", version=1, name="trigger", instance="t")
+        writer = os.open(pipe, os.O_WRONLY)
+        assert not feed(arbiter.heard(WATCHDOG_S))
+        os.close(writer)
+        arbiter.wait_for("WATCHDOG=1", PATIENCE_S)
+        assert trigger.receive() is not None
