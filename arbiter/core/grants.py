@@ -103,7 +103,7 @@ def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int],
     smallest = gpu.queue.smallest_need_bytes() - policy.largest_fold_bytes(gpu)
     if smallest > gpu.ledger.budget_bytes - gpu.ledger.total_bytes():
         return
-    if any(True for _ in gpu.in_state(LeaseState.UNLOADING, LeaseState.VERIFYING)):
+    if gpu.residents.any_in((LeaseState.UNLOADING, LeaseState.VERIFYING)):
         return  # the head's room is about to come; a load now would only be in its way
     spare = policy.spare_beside_bytes(gpu, head, leaving, planned=planned)
     if smallest > spare:

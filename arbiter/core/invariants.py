@@ -1,5 +1,9 @@
 """What must always be true, checked after every event, also in production. A violation stops the daemon: it is not handled.
 
+`check` looks at what the event can have changed, by the tables that the ledger and the residents keep of themselves, so its cost does not
+grow with the number of leases. `check_all` looks at everybody and at those tables too; whatever it finds that `check` did not is a
+defect of the tables. Tests' drivers and the simulation run it after every event.
+
 Numbers are those of the design:
   1. approved bytes never exceed capacity − reserve, and a grant fits together with stowaways at its moment
   2. nobody is resident beside an exclusive lease
@@ -9,8 +13,11 @@ Numbers are those of the design:
   6. every waiter is in a queue, has a timer if it has a bound, and its card has a next reading scheduled
 """
 
-from arbiter.core.lease import LeaseState
+from arbiter.core.lease import Lease, LeaseState
 from arbiter.core.state import Core, Gpu
+
+_UNUSED = tuple(state for state in LeaseState if state not in (LeaseState.HELD, LeaseState.REVOKING))
+"""States in which nobody may use a lease."""
 
 
 class InvariantViolation(Exception):
@@ -22,13 +29,25 @@ class InvariantViolation(Exception):
 
 
 def check(core: Core) -> None:
-    """Raise InvariantViolation unless everything holds."""
+    """Raise InvariantViolation unless everything holds that the last event can have broken."""
     for gpu in core.gpus.values():
         _bytes(core, gpu)
         _residents(core, gpu)
         _charges(gpu)
     _tokens(core)
     _waiters(core)
+
+
+def check_all(core: Core) -> None:
+    """The same for everybody, whoever was touched, and for the tables that `check` stands on."""
+    for gpu in core.gpus.values():
+        problem = gpu.ledger.disagreement() or gpu.residents.disagreement()
+        if problem:
+            raise InvariantViolation(0, f"{gpu.info.id}: {problem}")
+        gpu.ledger.touched.update(gpu.ledger.leases(), gpu.residents, gpu.debts)
+        for lease in gpu.residents.values():
+            _unused(lease)
+    check(core)
 
 
 def _bytes(core: Core, gpu: Gpu) -> None:
@@ -49,30 +68,43 @@ def _granted_on(core: Core, gpu: Gpu) -> bool:
 
 
 def _residents(core: Core, gpu: Gpu) -> None:
+    residents = gpu.residents
     if _granted_on(core, gpu):
-        exclusive = [lease.id for lease in gpu.residents.values() if lease.spec.exclusive]
-        if exclusive and len(gpu.residents) > 1:
-            raise InvariantViolation(
-                2, f"{exclusive[0]} is exclusive, yet {sorted(gpu.residents)} are on {gpu.info.id}"
-            )
-        loading = [lease.id for lease in gpu.in_state(LeaseState.LOADING)]
+        if residents.exclusive and len(residents) > 1:
+            alone = next(iter(residents.exclusive))
+            raise InvariantViolation(2, f"{alone} is exclusive, yet {sorted(residents)} are on {gpu.info.id}")
+        loading = [lease.id for lease in residents.in_state(LeaseState.LOADING)]
         if len(loading) > 1:
             raise InvariantViolation(2, f"{loading} load at once on {gpu.info.id}")
-    for lease in gpu.residents.values():
-        if lease.uses and lease.state not in (LeaseState.HELD, LeaseState.REVOKING):
-            raise InvariantViolation(3, f"{lease.id} is {lease.state} with {len(lease.uses)} uses")
+    for lease in residents.in_state(*_UNUSED):
+        _unused(lease)
+
+
+def _unused(lease: Lease) -> None:
+    if lease.uses and lease.state in _UNUSED:
+        raise InvariantViolation(3, f"{lease.id} is {lease.state} with {len(lease.uses)} uses")
 
 
 def _charges(gpu: Gpu) -> None:
-    charged = set(gpu.ledger.leases())
-    for lease in gpu.residents.values():
-        if lease.id not in charged:
-            raise InvariantViolation(4, f"{lease.id} is {lease.state} and not charged")
-        if lease.state is LeaseState.VERIFYING and lease.id not in gpu.verifications:
-            raise InvariantViolation(4, f"{lease.id} waits for a verdict that nobody works on")
-    for lease_id in charged - gpu.residents.keys():
+    """Whoever came, went, was charged or was dropped since the last time is looked at; who stayed stays sound."""
+    ledger, residents = gpu.ledger, gpu.residents
+    touched = ledger.touched | residents.touched
+    for lease_id in sorted(touched):
+        if lease_id in residents and not ledger.charges(lease_id):
+            raise InvariantViolation(4, f"{lease_id} is {residents[lease_id].state} and not charged")
+    gpu.debts |= touched
+    for lease_id in [
+        lease_id for lease_id in gpu.debts if lease_id in residents or not ledger.charges(lease_id)
+    ]:
+        gpu.debts.discard(lease_id)
+    for lease_id in sorted(gpu.debts):
         if lease_id not in gpu.verifications:
             raise InvariantViolation(4, f"the bytes of {lease_id} are charged for ever")
+    for lease in residents.in_state(LeaseState.VERIFYING):
+        if lease.id not in gpu.verifications:
+            raise InvariantViolation(4, f"{lease.id} waits for a verdict that nobody works on")
+    ledger.touched.clear()
+    residents.touched.clear()
 
 
 def _tokens(core: Core) -> None:
@@ -80,6 +112,7 @@ def _tokens(core: Core) -> None:
         if token <= core.last_token:
             raise InvariantViolation(5, f"token {token} after {core.last_token}")
         core.last_token = token
+    core.granted.clear()
 
 
 def _waiters(core: Core) -> None:

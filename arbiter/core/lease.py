@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
+from typing import Protocol
 
 from arbiter.core.events import MemorySampled, Spec
 from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
@@ -14,6 +15,8 @@ from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, 
 
 class LeaseState(StrEnum):
     """Where a lease is. The words are those of the wire."""
+
+    __hash__ = str.__hash__  # Enum's own is written in Python, and states are looked up all the time
 
     QUEUED = "queued"
     LOADING = "loading"
@@ -108,6 +111,12 @@ class Eviction:
     order: Order | None = None  # an operator wanted it
 
 
+class Roster(Protocol):
+    """A table that is kept by state (`residents`)."""
+
+    def moved(self, lease: "Lease", before: LeaseState) -> None: ...
+
+
 @dataclass(slots=True)
 class Lease:
     """A live lease. `load_peak_bytes` is the spec's, raised by what was learnt; the spec itself is never changed."""
@@ -147,14 +156,17 @@ class Lease:
     story: list[tuple[float, LeaseState, str]] = field(
         default_factory=list
     )  # as long as the table's longest path
+    roster: Roster | None = field(default=None, repr=False, compare=False)  # of the card that it is on
 
     def move(self, to: LeaseState, now: float, why: str) -> None:
         """Go to another state. Raises IllegalTransition, and then nothing has changed."""
         if to not in TRANSITIONS[self.state]:
             raise IllegalTransition(self, to)
-        self.state = to
+        before, self.state = self.state, to
         self.since = now
         self.story.append((now, to, why))
+        if self.roster is not None:
+            self.roster.moved(self, before)
 
     def told(self) -> str:
         """The story in one line."""

@@ -5,6 +5,8 @@ top where somebody holds more than was booked. Knows nothing of states, order or
 
 One process shares one context among its leases, so an account counts max(its charges together, its residue): a residue is
 folded into the next lease of the same process and never charged twice.
+
+Sums are kept as accounts change, never counted again: a decision must not cost more because many have leases. `disagreement` counts.
 """
 
 from collections.abc import Iterable, Mapping
@@ -36,12 +38,20 @@ class Account:
     residue_bytes: int = 0
     residue_floor_bytes: int = 0  # declared; a larger residue was measured and may shrink down to this
     measured_bytes: int = 0  # evidence newer than the last change; 0: none
+    charged_bytes: int = 0  # kept sums over the charges
+    charged_approved_bytes: int = 0
+    counted_bytes: int = 0  # what the ledger's own sums hold of this account
+    counted_approved_bytes: int = 0
 
     def booked_bytes(self) -> int:
-        return max(sum(charge.booked_bytes for charge in self.charges.values()), self.residue_bytes)
+        return max(self.charged_bytes, self.residue_bytes)
 
     def approved_bytes(self) -> int:
-        return max(sum(charge.approved_bytes for charge in self.charges.values()), self.residue_bytes)
+        return max(self.charged_approved_bytes, self.residue_bytes)
+
+    def occupied_bytes(self) -> int:
+        """Booked, or more where more was measured."""
+        return max(self.charged_bytes, self.residue_bytes, self.measured_bytes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,21 +74,19 @@ class GpuLedger:
         self.strangers: dict[ProcessKey, Stranger] = {}
         self.unnamed_bytes = 0  # used, but in nobody's list, beyond the fixed reserve
         self.overhead_bytes: int | None = None  # the driver's own; None: never seen
+        self.touched: set[LeaseId] = set()  # charged or dropped since the invariants were checked last
         self._owner: dict[LeaseId, ProcessKey] = {}
-        self._total: int | None = None  # kept sums; None: to be counted again
-        self._approved: int | None = None
+        self._occupied_bytes = 0  # kept sums over accounts and strangers
+        self._approved_bytes = 0
+        self._strangers_bytes = 0
 
     # -- reading ---------------------------------------------------------------------------------------------------
     def total_bytes(self) -> int:
         """Booked bytes, evidence above them, and stowaways."""
-        if self._total is None:
-            self._total = (
-                sum(self._occupied(account) for account in self.accounts.values()) + self.stowaway_bytes()
-            )
-        return self._total
+        return self._occupied_bytes + self._strangers_bytes + self.unnamed_bytes
 
     def stowaway_bytes(self) -> int:
-        return sum(stranger.used_bytes for stranger in self.strangers.values()) + self.unnamed_bytes
+        return self._strangers_bytes + self.unnamed_bytes
 
     def booked_bytes(self) -> int:
         """Sum over processes of what was granted or is kept, without any evidence."""
@@ -86,9 +94,7 @@ class GpuLedger:
 
     def approved_bytes(self) -> int:
         """Sum of what fitted when it was granted."""
-        if self._approved is None:
-            self._approved = sum(account.approved_bytes() for account in self.accounts.values())
-        return self._approved
+        return self._approved_bytes
 
     def pressure_bytes(self) -> int:
         """By how much everything together exceeds the budget; less than the tolerance is no pressure."""
@@ -102,13 +108,17 @@ class GpuLedger:
     def leases(self) -> Iterable[LeaseId]:
         return self._owner.keys()
 
+    def charges(self, lease: LeaseId) -> bool:
+        """Is anything charged for this lease, be it nothing but a zero?"""
+        return lease in self._owner
+
     def is_debt(self, lease: LeaseId) -> bool:
         return self.accounts[self._owner[lease]].charges[lease].debt
 
     def drift_bytes(self, process: ProcessKey) -> int:
         """How far a process was seen above what is booked for it."""
         account = self.accounts[process]
-        return self._occupied(account) - account.booked_bytes()
+        return account.occupied_bytes() - account.booked_bytes()
 
     def total_if(
         self, leaving: Mapping[LeaseId, int] = NOTHING, joining: tuple[ProcessKey, int] | None = None
@@ -131,7 +141,7 @@ class GpuLedger:
                 stranger = self._stranger_of(process)
                 total += max(0, more_bytes - (stranger.used_bytes if stranger else 0))
                 continue
-            total += self._after(account, going, more_bytes) - self._occupied(account)
+            total += self._after(account, going, more_bytes) - account.occupied_bytes()
         return total
 
     def process_after_bytes(self, process: ProcessKey, going: Mapping[LeaseId, int], *, dead: bool) -> int:
@@ -139,9 +149,7 @@ class GpuLedger:
         account = self.accounts.get(process)
         if account is None:
             return 0
-        staying = sum(charge.booked_bytes for lease, charge in account.charges.items() if lease not in going)
-        if dead and not staying:
-            return 0
+        staying = self._staying(account, going)
         if dead:
             return staying
         return max(staying, account.residue_floor_bytes, *going.values())
@@ -152,20 +160,36 @@ class GpuLedger:
         if account is None:
             return self.total_bytes()
         return (
-            self.total_bytes() - self._occupied(account) + self.process_after_bytes(process, going, dead=dead)
+            self.total_bytes()
+            - account.occupied_bytes()
+            + self.process_after_bytes(process, going, dead=dead)
         )
 
     def _after(self, account: Account, going: Mapping[LeaseId, int], more_bytes: int) -> int:
         if not going:
-            booked = max(
-                sum(c.booked_bytes for c in account.charges.values()) + more_bytes, account.residue_bytes
-            )
-            return max(booked, account.measured_bytes)
-        staying = sum(charge.booked_bytes for lease, charge in account.charges.items() if lease not in going)
+            return max(account.charged_bytes + more_bytes, account.residue_bytes, account.measured_bytes)
+        staying = self._staying(account, going)
         return max(staying + more_bytes, account.residue_floor_bytes, *going.values())
 
-    def _occupied(self, account: Account) -> int:
-        return max(account.booked_bytes(), account.measured_bytes)
+    def _staying(self, account: Account, going: Mapping[LeaseId, int]) -> int:
+        """What is booked for a process's leases but for these."""
+        charges = account.charges
+        return account.charged_bytes - sum(charges[lease].booked_bytes for lease in going if lease in charges)
+
+    def disagreement(self) -> str:
+        """Where the kept sums and the accounts disagree; "" if nowhere. Counts everything: for tests."""
+        for process, account in self.accounts.items():
+            booked = sum(charge.booked_bytes for charge in account.charges.values())
+            approved = sum(charge.approved_bytes for charge in account.charges.values())
+            if (booked, approved) != (account.charged_bytes, account.charged_approved_bytes):
+                return f"{process} is charged {booked} ({approved}), kept as {account.charged_bytes} ({account.charged_approved_bytes})"
+        kept = (self._occupied_bytes, self._approved_bytes, self._strangers_bytes)
+        counted = (
+            sum(account.occupied_bytes() for account in self.accounts.values()),
+            sum(account.approved_bytes() for account in self.accounts.values()),
+            sum(stranger.used_bytes for stranger in self.strangers.values()),
+        )
+        return "" if kept == counted else f"the sums are {counted}, kept as {kept}"
 
     def _stranger_of(self, process: ProcessKey) -> Stranger | None:
         return self.strangers.get(process) or self.strangers.get(ProcessKey(process.pid, 0))
@@ -176,16 +200,17 @@ class GpuLedger:
     ) -> None:
         """Book a grant (or, after a restart, what somebody says he holds)."""
         account = self._open(process, now)
-        account.charges[lease] = Charge(booked_bytes, approved_bytes)
+        self._charge(account, lease, Charge(booked_bytes, approved_bytes))
         self._owner[lease] = process
+        self.touched.add(lease)
         self._changed(account, now)
 
     def recharge(self, lease: LeaseId, booked_bytes: int, now: float) -> None:
         """The holder is ready: book what it says it holds. What exceeds the grant was never approved."""
         account = self.accounts[self._owner[lease]]
-        charge = account.charges[lease]
-        charge.booked_bytes = booked_bytes
-        charge.approved_bytes = min(charge.approved_bytes, booked_bytes)
+        before = account.charges[lease]
+        after = Charge(booked_bytes, min(before.approved_bytes, booked_bytes), before.debt)
+        self._charge(account, lease, after)
         self._changed(account, now)
 
     def to_debt(self, lease: LeaseId) -> None:
@@ -199,7 +224,8 @@ class GpuLedger:
         """
         account = self.accounts[self._owner.pop(lease)]
         before_bytes = account.approved_bytes()
-        del account.charges[lease]
+        self._charge(account, lease, None)
+        self.touched.add(lease)
         floor_bytes = max(account.residue_floor_bytes, floor_bytes)
         account.residue_bytes = min(max(residue_bytes, floor_bytes), before_bytes)
         account.residue_floor_bytes = min(floor_bytes, account.residue_bytes)
@@ -221,10 +247,15 @@ class GpuLedger:
 
     def observe(self, sample: MemorySampled, *, quiet: bool) -> None:
         """Take evidence from a reading. `quiet`: nobody loads or unloads, so the unexplained rest means something."""
-        self._total = None
-        booked = self.booked_bytes()
+        self._observe(sample, quiet=quiet)
+        for account in self.accounts.values():
+            self._count(account)
+        self._count_strangers()
+
+    def _observe(self, sample: MemorySampled, *, quiet: bool) -> None:
         if sample.processes is None:
             if quiet:
+                booked = self.booked_bytes()
                 self.unnamed_bytes = max(0, sample.used_bytes - booked - self.info.reserve_bytes)
                 if not self.accounts:
                     self.overhead_bytes = min(sample.used_bytes, self.info.reserve_bytes)
@@ -266,6 +297,7 @@ class GpuLedger:
             account = self.accounts[process] = Account(process, now)
             self.strangers.pop(process, None)
             self.strangers.pop(ProcessKey(process.pid, 0), None)
+            self._count_strangers()
         return account
 
     def _close_if_empty(self, account: Account) -> None:
@@ -275,7 +307,29 @@ class GpuLedger:
     def _changed(self, account: Account, now: float) -> None:
         account.changed_at = now
         account.measured_bytes = 0  # older evidence no longer says anything about this account
-        self._total = self._approved = None
+        self._count(account)
+
+    # -- kept sums -------------------------------------------------------------------------------------------------
+    def _charge(self, account: Account, lease: LeaseId, charge: Charge | None) -> None:
+        """The one place where an account's charges change. None: the charge goes."""
+        before = account.charges.pop(lease, None) if charge is None else account.charges.get(lease)
+        if before is not None:
+            account.charged_bytes -= before.booked_bytes
+            account.charged_approved_bytes -= before.approved_bytes
+        if charge is not None:
+            account.charges[lease] = charge
+            account.charged_bytes += charge.booked_bytes
+            account.charged_approved_bytes += charge.approved_bytes
+
+    def _count(self, account: Account) -> None:
+        """Bring the ledger's sums up to date with one account."""
+        occupied, approved = account.occupied_bytes(), account.approved_bytes()
+        self._occupied_bytes += occupied - account.counted_bytes
+        self._approved_bytes += approved - account.counted_approved_bytes
+        account.counted_bytes, account.counted_approved_bytes = occupied, approved
+
+    def _count_strangers(self) -> None:
+        self._strangers_bytes = sum(stranger.used_bytes for stranger in self.strangers.values())
 
 
 def process_bytes(sample: MemorySampled, process: ProcessKey) -> int | None:

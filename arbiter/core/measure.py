@@ -25,6 +25,7 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
     if gpu.asked_at is not None and sample.taken_at >= gpu.asked_at:
         gpu.asked_at = None
     gpu.sample = sample
+    gpu.residents.seen(sample.taken_at)
     gpu.reading_s = max(0.0, core.now - sample.taken_at)
     if gpu.failed_at is not None:
         gpu.failed_at, gpu.failure = None, ""

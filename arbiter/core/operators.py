@@ -157,6 +157,7 @@ def drained(core: Core) -> str:
 def _pins_changed(core: Core, lease: Lease) -> None:
     if lease.gpu is None:
         return
+    core.gpu_of(lease).residents.refresh(lease)
     core.record_lease(lease)
     core.wake(core.gpu_of(lease))
 

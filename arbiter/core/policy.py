@@ -3,16 +3,19 @@
 Nothing here changes anything but one timer (`wake_when_evictable`).
 """
 
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 
-from arbiter.core.lease import LEAVING, Lease, LeaseState
+from arbiter.core.lease import Lease, LeaseState
 from arbiter.core.ledger import NOTHING, process_bytes
 from arbiter.core.state import Core, Gpu
 from schemas.ids import LeaseId
 
 EXACT_SEARCH_MAX = 12  # candidates; beyond that the search is greedy
 _WAKE_SLACK_S = 0.001  # so that a wake-up for an ageing step does not come a rounding error too early
+
+_LEAVING = (LeaseState.REVOKING, LeaseState.UNLOADING, LeaseState.VERIFYING)  # in a fixed order
 
 type _Covers = Callable[[Mapping[LeaseId, int]], bool]
 type _Choice = Callable[[Sequence[Lease], _Covers, Mapping[LeaseId, int]], list[Lease]]
@@ -29,9 +32,8 @@ def blocked(core: Core, gpu: Gpu) -> str:
         return f"the card cannot be read: {gpu.failure}"
     if gpu.sample is None:
         return "the card has not been read yet"
-    loading = next(gpu.in_state(LeaseState.LOADING), None)
-    if loading is not None:
-        return f"{loading.spec.consumer} is loading"
+    if loading := gpu.in_state(LeaseState.LOADING):
+        return f"{loading[0].spec.consumer} is loading"
     if gpu.pressed:
         return f"pressure: {gpu.ledger.pressure_bytes()} bytes more than the budget are held"
     return ""
@@ -40,9 +42,7 @@ def blocked(core: Core, gpu: Gpu) -> str:
 def leaving(gpu: Gpu) -> dict[LeaseId, int]:
     """Leases whose bytes are on their way back, with the residue each leaves. Those that outstayed a deadline do not count."""
     going: dict[LeaseId, int] = {}
-    for lease in gpu.residents.values():
-        if lease.state not in LEAVING:
-            continue
+    for lease in gpu.in_state(*_LEAVING):
         verification = gpu.verifications.get(lease.id)
         late = verification.overdue if verification else bool(lease.eviction and lease.eviction.overdue)
         if not late:
@@ -67,7 +67,7 @@ def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool
     if lease.spec.exclusive:
         if any(other not in going for other in gpu.ledger.leases()):
             return False
-    elif any(other.spec.exclusive and other.id not in going for other in gpu.residents.values()):
+    elif any(other not in going for other in gpu.residents.exclusive):
         return False
     return gpu.ledger.total_if(going, (lease.process, lease.load_peak_bytes)) <= gpu.ledger.budget_bytes
 
@@ -94,11 +94,7 @@ def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
         or core.now - sample.taken_at > core.settings.sample_max_age_s
     ):
         return None
-    unseen = sum(
-        gpu.ledger.charge_bytes(lease.id)
-        for lease in gpu.residents.values()
-        if max(lease.granted_at, lease.ready_at) > sample.taken_at
-    )
+    unseen = sum(gpu.ledger.charge_bytes(lease.id) for lease in gpu.residents.unseen(sample.taken_at))
     return min(gpu.info.capacity_bytes, sample.total_bytes) - sample.used_bytes - unseen
 
 
@@ -294,7 +290,7 @@ def _greedy(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId
             lease.arrival,
         ),
     )
-    size = next(n for n in range(1, len(order) + 1) if covers(_leave(order[:n])))
+    size = 1 + bisect_left(range(1, len(order)), True, key=lambda n: covers(_leave(order[:n])))
     plan = order[:size]
     for lease in reversed(list(plan)):
         without = [other for other in plan if other is not lease]

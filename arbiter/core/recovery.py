@@ -161,6 +161,7 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
         lease.ready_at = (
             core.now
         )  # its residency begins anew: who marked uses on it may still be on the way back
+        core.gpu_of(lease).residents.recent[lease.id] = lease
     if lease.state is LeaseState.LOADING and item.held:  # its `ready` was lost
         become_held(core, lease, item.measured_bytes)
         core.record_lease(lease)

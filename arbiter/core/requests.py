@@ -188,9 +188,7 @@ def _places(core: Core, spec: Spec, load_peak: int) -> tuple[GpuId, ...]:
     able: list[GpuId] = []
     pinned: dict[str, list[dict[str, object]]] = {}
     for gpu in gpus:
-        pins = [
-            lease for lease in gpu.residents.values() if not lease.evictable and lease.state not in LEAVING
-        ]
+        pins = [lease for lease in gpu.residents.pinned.values() if lease.state not in LEAVING]
         pinned[gpu.info.id] = [
             {"lease_id": p.id, "consumer": p.spec.consumer, "bytes": gpu.ledger.charge_bytes(p.id)}
             for p in pins

@@ -4,7 +4,7 @@ Data and bookkeeping only: no decision is taken here.
 """
 
 from collections import OrderedDict, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
@@ -14,6 +14,7 @@ from arbiter.core.events import MemorySampled
 from arbiter.core.lease import LEAVING, Eviction, Lease, LeaseState, Order
 from arbiter.core.ledger import GpuLedger
 from arbiter.core.queue import WaitQueue
+from arbiter.core.residents import Residents
 from arbiter.core.settings import GpuInfo, Settings
 from arbiter.core.timers import Timers
 from arbiter.core.verify import Verification
@@ -21,6 +22,7 @@ from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token
 
 ENDED_REMEMBERED = 1024
 LEARNT_REMEMBERED = 32
+_MOVING = LEAVING | {LeaseState.LOADING}
 IDLE_PROBE_S = 10.0  # how long after the last client a card is still read in the background
 
 
@@ -65,7 +67,7 @@ class Gpu:
     info: GpuInfo
     ledger: GpuLedger
     queue: WaitQueue
-    residents: dict[LeaseId, Lease] = field(default_factory=dict)
+    residents: Residents = field(default_factory=Residents)
     verifications: dict[str, Verification] = field(default_factory=dict)
     evictions: list[Eviction] = field(default_factory=list)  # not yet counted to a grant
     sample: MemorySampled | None = None
@@ -79,14 +81,14 @@ class Gpu:
     dirty: bool = True
     pressed: bool = False  # a pressure note is out
 
-    def in_state(self, *states: LeaseState) -> Iterator[Lease]:
-        return (lease for lease in self.residents.values() if lease.state in states)
+    debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
+
+    def in_state(self, *states: LeaseState) -> list[Lease]:
+        return self.residents.in_state(*states)
 
     def quiet(self) -> bool:
         """Nobody loads or unloads: an unexplained rest in a reading means something."""
-        return not self.verifications and not any(
-            lease.state in LEAVING or lease.state is LeaseState.LOADING for lease in self.residents.values()
-        )
+        return not self.verifications and not self.residents.any_in(_MOVING)
 
 
 class Core:

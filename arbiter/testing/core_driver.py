@@ -147,6 +147,7 @@ class CoreDriver:
         """Hand one event to the core at the present time and perform what it asks. Returns exactly those effects."""
         self.events.append((self.now, event))
         effects = self.arbiter.handle(event, self.now)
+        self.arbiter.check_all()
         failed: list[JournalPut] = []
         performed: list[Effect] = []
         for effect in effects:

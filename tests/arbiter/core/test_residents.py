@@ -1,0 +1,48 @@
+"""The sub-tables of a card's residents follow every change; the full invariant check compares them with the leases."""
+
+import pytest
+
+from arbiter.core.lease import Lease, LeaseState, Order
+from arbiter.core.residents import Residents
+from arbiter.testing.core_driver import CoreDriver
+from schemas import defaults as d
+from schemas.ids import GpuId, LeaseId
+
+
+def crowd(count: int) -> tuple[Residents, list[Lease]]:
+    """A card of small held leases of one process."""
+    driver = CoreDriver(8 * d.GIB)
+    holder = driver.consumer("a")
+    ids = []
+    for _ in range(count):
+        ids.append(holder.acquire(d.MIB))
+        holder.load(ids[-1])
+    core = driver.arbiter._core
+    return core.gpus[GpuId("GPU-0")].residents, [core.leases[lease_id] for lease_id in ids]
+
+
+def test_a_lease_that_goes_is_in_no_table() -> None:
+    residents, (one, two) = crowd(2)
+    two.pinned = Order("root", "")
+    residents.refresh(two)
+    del residents[two.id]
+    assert residents.in_state(*LeaseState) == [one]
+    assert not residents.pinned
+    assert two.roster is None
+    assert residents.disagreement() == ""
+
+
+def test_taking_away_who_is_not_there() -> None:
+    residents, _ = crowd(1)
+    with pytest.raises(KeyError, match="L9-9"):
+        del residents[LeaseId("L9-9")]
+    assert residents.pop(LeaseId("L9-9"), None) is None
+
+
+def test_a_reading_sees_what_happened_before_it_began() -> None:
+    residents, (one, two) = crowd(2)
+    one.granted_at = one.ready_at = 5.0
+    assert {lease.id for lease in residents.unseen(4.0)} == {one.id, two.id}
+    assert residents.unseen(5.0) == [two]
+    residents.seen(5.0)
+    assert list(residents.recent) == [two.id]
