@@ -14,7 +14,7 @@ events_log = logging.getLogger("arbiter.events")
 _WARNINGS = frozenset(
     {"probe_failed", "pressure", "stowaway", "oom", "lost", "expired", "deadline_passed", "journal_put_aside"}
 )
-_DETAILS = frozenset({"use_began", "use_ended", "reminded", "revoke_acked", "probe_ok"})
+_DETAILS = frozenset({"use_began", "use_ended", "use_yielded", "reminded", "revoke_acked", "probe_ok"})
 
 
 def set_up_logging(form: Literal["human", "json"], level: str) -> None:

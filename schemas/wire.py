@@ -105,6 +105,13 @@ class UseEnd(_OnLease):
     use_id: Name
 
 
+class Yield(_OnLease):
+    """The use pauses: it no longer keeps the lease from being evicted. `use_begin` with the same id resumes it, if it may."""
+
+    op: Literal["yield"]
+    use_id: Name
+
+
 class LeaseRef(_Frozen):
     lease_id: LeaseIdText
     token: TokenPair
@@ -241,13 +248,13 @@ class Bye(_Request):
 
 
 Request = Annotated[
-    Hello | Acquire | Ready | UseBegin | UseEnd | Renew | RevokeAck | Unloading | Release | Cancel | Reattach | Oom
+    Hello | Acquire | Ready | UseBegin | UseEnd | Yield | Renew | RevokeAck | Unloading | Release | Cancel | Reattach | Oom
     | Status | Why | History | Subscribe | Evict | Pin | Unpin | ReleaseDead | Drain | Resume | Ping | Bye,
     Field(discriminator="op"),
 ]  # fmt: skip
 REQUEST: TypeAdapter[Request] = TypeAdapter(Request)
 OPS: tuple[str, ...] = (
-    "hello", "acquire", "ready", "use_begin", "use_end", "renew", "revoke_ack", "unloading", "release", "cancel",
+    "hello", "acquire", "ready", "use_begin", "use_end", "yield", "renew", "revoke_ack", "unloading", "release", "cancel",
     "reattach", "oom", "status", "why", "history", "subscribe", "evict", "pin", "unpin", "release_dead", "drain", "resume", "ping", "bye",
 )  # fmt: skip
 
@@ -266,13 +273,14 @@ class LeaseView(TypedDict):
     priority: int
     evictable: bool
     charge_bytes: int
-    uses: int
+    uses: int  # busy ones
     pid: int
     since_s: float  # seconds in this state
     waited_s: NotRequired[float]
     position: NotRequired[int]
     pinned: NotRequired[str]  # which operator pinned it, and why
     ttl_left_s: NotRequired[float]
+    yielded: NotRequired[int]  # uses that pause
 
 
 class AcquireReply(TypedDict):

@@ -15,7 +15,18 @@ It must not know how effects are performed, nor that a wire exists.
 
 from typing import Any
 
-from arbiter.core import eviction, explain, grants, invariants, measure, operators, recovery, requests, resume
+from arbiter.core import (
+    eviction,
+    explain,
+    grants,
+    invariants,
+    measure,
+    operators,
+    recovery,
+    requests,
+    resume,
+    uses,
+)
 from arbiter.core.effects import Effect
 from arbiter.core.events import (
     AcquireRequested,
@@ -40,6 +51,7 @@ from arbiter.core.events import (
     UnloadStarted,
     UseBegan,
     UseEnded,
+    UseYielded,
 )
 from arbiter.core.sessions import on_connected, on_died, on_journal_failed, on_left
 from arbiter.core.settings import Settings
@@ -141,6 +153,7 @@ class Arbiter:
         | ReadyReported
         | UseBegan
         | UseEnded
+        | UseYielded
         | Renewed
         | OomReported
         | RevokeAcknowledged
@@ -158,9 +171,11 @@ class Arbiter:
             case ReadyReported():
                 requests.ready(core, event)
             case UseBegan():
-                requests.use_begin(core, event)
+                uses.begin(core, event)
             case UseEnded():
-                requests.use_end(core, event)
+                uses.end(core, event)
+            case UseYielded():
+                uses.yield_(core, event)
             case Renewed():
                 requests.renew(core, event)
             case OomReported():

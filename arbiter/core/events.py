@@ -96,6 +96,17 @@ class UseEnded:
 
 
 @dataclass(frozen=True, slots=True)
+class UseYielded:
+    """A use pauses: until it is begun again it keeps nobody from being evicted."""
+
+    client: ClientId
+    request: RequestId
+    lease: LeaseId
+    token: Token
+    use: UseId
+
+
+@dataclass(frozen=True, slots=True)
 class Renewed:
     client: ClientId
     request: RequestId
@@ -234,7 +245,7 @@ class Tick:
 
 
 Event = (
-    ClientConnected | ClientLeft | ProcessDied | AcquireRequested | ReadyReported | UseBegan | UseEnded | Renewed
-    | RevokeAcknowledged | UnloadStarted | ReleaseReported | CancelRequested | Reattached | OomReported | OperatorAsked | MemorySampled
-    | ProbeFailed | JournalFailed | Recovered | Resumed | Tick
+    ClientConnected | ClientLeft | ProcessDied | AcquireRequested | ReadyReported | UseBegan | UseEnded | UseYielded
+    | Renewed | RevokeAcknowledged | UnloadStarted | ReleaseReported | CancelRequested | Reattached | OomReported | OperatorAsked
+    | MemorySampled | ProbeFailed | JournalFailed | Recovered | Resumed | Tick
 )  # fmt: skip

@@ -9,7 +9,7 @@ from arbiter.core.lease import LEAVING, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 
 NOTE_KINDS: tuple[str, ...] = (
-    "queued", "granted", "ready", "switch", "use_began", "use_ended", "revoke_asked", "revoke_acked", "reminded",
+    "queued", "granted", "ready", "switch", "use_began", "use_ended", "use_yielded", "revoke_asked", "revoke_acked", "reminded",
     "deadline_passed", "unloading", "released", "verified", "denied", "cancelled", "expired", "lost", "reattached", "oom",
     "pressure", "stowaway", "probe_failed", "probe_ok", "journal_failed", "recovered", "serving", "operator", "resumed",
 )  # fmt: skip
@@ -38,6 +38,8 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
     }
     if lease.pinned is not None:
         shown["pinned"] = str(lease.pinned)
+    if lease.yielded:
+        shown["yielded"] = len(lease.yielded)
     if lease.state is LeaseState.QUEUED:
         shown["position"] = min(core.gpus[gpu_id].queue.position(lease) for gpu_id in lease.gpus)
     elif lease.state is not LeaseState.VERIFYING:
@@ -327,7 +329,9 @@ def medians(core: Core) -> dict[str, dict[str, float]]:
 
 
 def _uses(lease: Lease) -> str:
-    return f"{len(lease.uses)} use{'' if len(lease.uses) == 1 else 's'} running" if lease.uses else "idle"
+    paused = f", {len(lease.yielded)} paused" if lease.yielded else ""
+    running = f"{len(lease.uses)} use{'' if len(lease.uses) == 1 else 's'} running" if lease.uses else "idle"
+    return running + paused
 
 
 def _wanted_by(lease: Lease) -> str:

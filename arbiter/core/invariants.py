@@ -81,8 +81,8 @@ def _residents(core: Core, gpu: Gpu) -> None:
 
 
 def _unused(lease: Lease) -> None:
-    if lease.uses and lease.state in _UNUSED:
-        raise InvariantViolation(3, f"{lease.id} is {lease.state} with {len(lease.uses)} uses")
+    if (lease.uses or lease.yielded) and lease.state in _UNUSED:
+        raise InvariantViolation(3, f"{lease.id} is {lease.state} with {len(lease.all_uses())} uses")
 
 
 def _charges(gpu: Gpu) -> None:

@@ -136,7 +136,10 @@ class Lease:
     token: Token | None = None
     gpu: GpuId | None = None
     measured_bytes: int | None = None
-    uses: dict[tuple[ProcessKey, UseId], Use] = field(default_factory=dict)
+    uses: dict[tuple[ProcessKey, UseId], Use] = field(default_factory=dict)  # busy ones
+    yielded: dict[tuple[ProcessKey, UseId], Use] = field(
+        default_factory=dict
+    )  # pausing ones, nobody waits for them
     granted_at: float = 0.0
     ready_at: float = 0.0
     last_used_at: float = 0.0
@@ -175,6 +178,10 @@ class Lease:
     def priority_at(self, now: float, ageing_s_per_point: float) -> int:
         """Priority with one point for every `ageing_s_per_point` waited."""
         return self.spec.priority + int(max(0.0, now - self.arrived_at) / ageing_s_per_point)
+
+    def all_uses(self) -> list[Use]:
+        """Busy and pausing ones."""
+        return [*self.uses.values(), *self.yielded.values()]
 
     @property
     def evictable(self) -> bool:

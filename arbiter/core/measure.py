@@ -336,7 +336,9 @@ def lose(
 ) -> None:
     """A resident lease is over (expired or lost); its bytes become a debt and are measured away."""
     gpu = core.gpu_of(lease)
-    lease.uses.clear()
+    for use in list(lease.uses.values()):
+        core.unmark(lease, use)
+    lease.yielded.clear()
     gpu.ledger.to_debt(lease.id)
     core.record_lease(lease, debt=True)
     if lease.eviction is not None:

@@ -179,15 +179,15 @@ def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLeas
     came. An earlier connection of the same instance is no other: ROUTER never says that it is gone.
     """
     others = {c.id for c in core.clients.values() if c.instance != client.instance}
-    for key, use in list(lease.uses.items()):
+    for use in list(lease.uses.values()):
         if use.process == client.process and use.id not in item.uses and use.client not in others:
-            del lease.uses[key]
+            core.unmark(lease, use)
     if lease.state in (LeaseState.HELD, LeaseState.REVOKING):
         for use_id in item.uses:
             key = (client.process, use_id)
-            known = lease.uses.get(key)
+            known = lease.uses.get(key) or lease.yielded.get(key)
             began = Use(use_id, client.id, client.process, "", core.now)
-            lease.uses[key] = began if known is None else replace(known, client=client.id)
+            core.mark(lease, began if known is None else replace(known, client=client.id))
     eviction.ask_again(core, lease)
     core.wake(core.gpu_of(lease))
 

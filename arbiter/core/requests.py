@@ -1,7 +1,7 @@
 """What clients ask for, one function a request. Each checks everything first (raising Refused) and then changes things.
 
-Who may: leases belong to a process, so a request on a lease must come from a client of that process. Only uses may be begun
-and ended by anyone who knows the exact token: that is how a runner marks a goal on its policy sidecar's lease.
+Who may: leases belong to a process, so a request on a lease must come from a client of that process. Uses (`uses`) are open to
+anyone who knows the exact token.
 """
 
 from dataclasses import replace
@@ -17,8 +17,6 @@ from arbiter.core.events import (
     RevokeAcknowledged,
     Spec,
     UnloadStarted,
-    UseBegan,
-    UseEnded,
 )
 from arbiter.core.lease import EXPIRING, LEAVING, Lease, LeaseState, Use
 from arbiter.core.measure import begin_for_lease
@@ -55,7 +53,7 @@ def lease_for(core: Core, lease_id: LeaseId, token: Token) -> Lease:
             "unknown_lease", f"there is no lease {lease_id}", "acquire one; after a restart: re-attach"
         )
     if lease.token is None:
-        raise _bad_state(lease, "it is still queued")
+        raise bad_state(lease, "it is still queued")
     if lease.token != token:
         raise Refused(
             "stale_token",
@@ -85,7 +83,7 @@ def touch(core: Core, lease: Lease) -> None:
         core.timers.set(("ttl", lease.id), lease.expires_at)
 
 
-def _bad_state(lease: Lease, what: str) -> Refused:
+def bad_state(lease: Lease, what: str) -> Refused:
     return Refused(
         "bad_state",
         f"{lease.id} is {lease.state}: {what}",
@@ -229,7 +227,7 @@ def cancel(core: Core, event: CancelRequested) -> None:
             "not_permitted", f"{lease.id} belongs to process {lease.process.pid}", "ask as its holder"
         )
     if lease.state is not LeaseState.QUEUED:
-        raise _bad_state(lease, "it is granted already, release it")
+        raise bad_state(lease, "it is granted already, release it")
     cancel_waiter(core, lease, "its holder gave up")
     core.reply(event.client, event.request, {"state": "cancelled"})
 
@@ -264,7 +262,7 @@ def ready(core: Core, event: ReadyReported) -> None:
         core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
         return
     if lease.state is not LeaseState.LOADING:
-        raise _bad_state(lease, "only a loading lease becomes ready")
+        raise bad_state(lease, "only a loading lease becomes ready")
     become_held(core, lease, event.measured_bytes)
     core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
     core.record_lease(lease)  # after the reply: a record that fails here only makes a recovery more careful
@@ -290,54 +288,6 @@ def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     gpu.changed_at = core.now
     core.want_sample(gpu, core.now)  # what it holds now is what has to come back one day
     core.wake(gpu)
-
-
-def use_begin(core: Core, event: UseBegan) -> None:
-    """Mark a use. Anybody with the token may; nobody once the holder was asked to leave."""
-    client = client_of(core, event.client)
-    lease = lease_for(core, event.lease, event.token)
-    key = (client.process, event.use)
-    if key in lease.uses:  # a repeat, perhaps on a new connection: it ends with that one
-        lease.uses[key] = replace(lease.uses[key], client=client.id)
-        core.reply(event.client, event.request, {"uses": len(lease.uses)})
-        return
-    if lease.state in LEAVING:
-        raise Refused(
-            "lease_revoking",
-            f"{lease.spec.consumer} was asked to leave",
-            "wait until it is granted again",
-            state=str(lease.state),
-        )
-    if lease.state is not LeaseState.HELD:
-        raise _bad_state(lease, "only a held lease can be used")
-    if len(lease.uses) >= core.settings.uses_per_lease_max:
-        raise Refused(
-            "limit_exceeded", f"{lease.id} has too many uses", "end some", limit="uses_per_lease_max"
-        )
-    lease.uses[key] = Use(event.use, client.id, client.process, event.label, core.now)
-    lease.last_used_at = core.now
-    core.reply(event.client, event.request, {"uses": len(lease.uses)})
-    core.note("use_began", lease, use_id=event.use, label=event.label, uses=len(lease.uses))
-
-
-def use_end(core: Core, event: UseEnded) -> None:
-    """End a use; one that is not there (any more) is fine."""
-    client = client_of(core, event.client)
-    lease = lease_for(core, event.lease, event.token)
-    if (client.process, event.use) in lease.uses:
-        end_use(core, lease, lease.uses[client.process, event.use], "ended")
-    core.reply(event.client, event.request, {"uses": len(lease.uses)})
-
-
-def end_use(core: Core, lease: Lease, use: Use, why: str) -> None:
-    del lease.uses[use.process, use.id]
-    lease.last_used_at = core.now
-    core.note(
-        "use_ended", lease, use_id=use.id, label=use.label, ms=(core.now - use.began_at) * 1e3, reason=why
-    )
-    if not lease.uses:
-        eviction.reached_safe_point(core, lease)
-        core.wake(core.gpu_of(lease))
 
 
 def renew(core: Core, event: Renewed) -> None:
@@ -372,10 +322,11 @@ def unloading(core: Core, event: UnloadStarted) -> None:
         core.reply(event.client, event.request, {"state": str(lease.state)})
         return
     if lease.state not in (LeaseState.HELD, LeaseState.REVOKING):
-        raise _bad_state(lease, "only a held lease is unloaded; a loading one is released")
+        raise bad_state(lease, "only a held lease is unloaded; a loading one is released")
     if lease.uses:
-        raise _bad_state(lease, f"{len(lease.uses)} uses still run; wait for the `revoke` that says 0 uses")
+        raise bad_state(lease, f"{len(lease.uses)} uses still run; wait for the `revoke` that says 0 uses")
     gpu = core.gpu_of(lease)
+    end_uses(core, lease, "unloaded while it paused")
     lease.move(LeaseState.UNLOADING, core.now, "at its safe point")
     lease.baseline = gpu.sample
     if lease.eviction is not None:
@@ -400,14 +351,25 @@ def release(core: Core, event: ReleaseReported) -> None:
     core.reply(event.client, event.request, {"state": str(lease.state)})
 
 
+def end_uses(core: Core, lease: Lease, why: str) -> None:
+    """The bytes go: every use that is still on the lease ends with them, pausing ones too."""
+    for use in lease.all_uses():
+        if (use.process, use.id) in lease.uses:
+            core.unmark(lease, use)
+        note_ended(core, lease, use, why)
+    lease.yielded.clear()
+
+
+def note_ended(core: Core, lease: Lease, use: Use, why: str) -> None:
+    core.note(
+        "use_ended", lease, use_id=use.id, label=use.label, ms=(core.now - use.began_at) * 1e3, reason=why
+    )
+
+
 def let_go(core: Core, lease: Lease, *, exiting: bool, why: str) -> None:
     """From any resident state to verification. Uses that others left on it end with it."""
     gpu = core.gpu_of(lease)
-    for use in list(lease.uses.values()):
-        del lease.uses[use.process, use.id]
-        core.note(
-            "use_ended", lease, use_id=use.id, label=use.label, ms=(core.now - use.began_at) * 1e3, reason=why
-        )
+    end_uses(core, lease, why)
     before = lease.state
     lease.exiting = exiting
     lease.move(LeaseState.VERIFYING, core.now, why)

@@ -8,8 +8,9 @@ from arbiter.core.events import BYE, ClientConnected, ClientLeft, JournalFailed
 from arbiter.core.lease import EXPIRING, Lease, LeaseState
 from arbiter.core.measure import begin_for_residue, bereave, lose
 from arbiter.core.recovery import account_for
-from arbiter.core.requests import cancel_waiter, end_use, let_go
+from arbiter.core.requests import cancel_waiter, let_go
 from arbiter.core.state import Client, Core, Refused
+from arbiter.core.uses import end_use
 from schemas.ids import LeaseId, ProcessKey
 
 
@@ -29,7 +30,7 @@ def on_left(core: Core, event: ClientLeft) -> None:
         return
     core.last_client_at = core.now
     for lease in list(core.leases.values()):
-        for use in [use for use in lease.uses.values() if use.client == event.client]:
+        for use in [use for use in lease.all_uses() if use.client == event.client]:
             end_use(core, lease, use, f"its client left: {event.reason}")
         if lease.client != event.client or lease.process != client.process:
             continue
@@ -57,7 +58,7 @@ def on_died(core: Core, process: ProcessKey) -> None:
         if not account.charges and f"residue:{process}" not in gpu.verifications:
             begin_for_residue(core, gpu, process)
     for lease in list(core.leases.values()):
-        for use in [use for use in lease.uses.values() if use.process == process]:
+        for use in [use for use in lease.all_uses() if use.process == process]:
             end_use(core, lease, use, "its process died")
         if lease.process == process:
             _bereave(core, lease)

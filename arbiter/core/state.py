@@ -11,14 +11,14 @@ from typing import Any
 
 from arbiter.core.effects import Effect, JournalDelete, JournalPut, Note, Push, Refuse, Reply, Sample
 from arbiter.core.events import MemorySampled
-from arbiter.core.lease import LEAVING, Eviction, Lease, LeaseState, Order
+from arbiter.core.lease import LEAVING, Eviction, Lease, LeaseState, Order, Use
 from arbiter.core.ledger import GpuLedger
 from arbiter.core.queue import WaitQueue
 from arbiter.core.residents import Residents
 from arbiter.core.settings import GpuInfo, Settings
 from arbiter.core.timers import Timers
 from arbiter.core.verify import Verification
-from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token
+from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 
 ENDED_REMEMBERED = 1024
 LEARNT_REMEMBERED = 32
@@ -114,6 +114,7 @@ class Core:
         self.serial = 0
         self.arrivals = 0
         self.last_token = Token(settings.epoch, 0)
+        self.users: dict[ProcessKey, dict[tuple[LeaseId, UseId], Lease]] = {}  # whose busy uses are where
         self.unanswered: list[Lease] = []  # acquires of the event being handled
         self.granted: list[tuple[Token, GpuId]] = []  # by the event being handled; invariants look at it
         self.last_client_at = now
@@ -197,6 +198,20 @@ class Core:
     def leases_of(self, process: ProcessKey) -> list[Lease]:
         """Live leases of a process, oldest first."""
         return list(self._of_process.get(process, {}).values())
+
+    def mark(self, lease: Lease, use: Use) -> None:
+        """A use is busy from now on."""
+        lease.yielded.pop((use.process, use.id), None)
+        lease.uses[use.process, use.id] = use
+        self.users.setdefault(use.process, {})[lease.id, use.id] = lease
+
+    def unmark(self, lease: Lease, use: Use) -> None:
+        """A busy use ends or pauses."""
+        del lease.uses[use.process, use.id]
+        mine = self.users[use.process]
+        del mine[lease.id, use.id]
+        if not mine:
+            del self.users[use.process]
 
     def dequeue(self, lease: Lease) -> None:
         self.waiting.pop(lease.id, None)

@@ -371,6 +371,8 @@ class SessionTable:
                 post(ev.UseBegan(client, re, *_on_lease(request), UseId(request.use_id), request.label))
             case w.UseEnd():
                 post(ev.UseEnded(client, re, *_on_lease(request), UseId(request.use_id)))
+            case w.Yield():
+                post(ev.UseYielded(client, re, *_on_lease(request), UseId(request.use_id)))
             case w.Renew():
                 post(
                     ev.Renewed(
@@ -438,7 +440,7 @@ def _operator(session: Session) -> str:
 
 
 def _on_lease(
-    request: w.Ready | w.UseBegin | w.UseEnd | w.RevokeAck | w.Unloading | w.Release,
+    request: w.Ready | w.UseBegin | w.UseEnd | w.Yield | w.RevokeAck | w.Unloading | w.Release,
 ) -> tuple[LeaseId, Token]:
     return LeaseId(request.lease_id), Token(*request.token)
 

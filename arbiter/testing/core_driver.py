@@ -40,6 +40,7 @@ from arbiter.core.events import (
     UnloadStarted,
     UseBegan,
     UseEnded,
+    UseYielded,
 )
 from arbiter.core.settings import GpuInfo, Settings
 from schemas import defaults as d
@@ -388,6 +389,11 @@ class Consumer:
     def use_end(self, lease: LeaseId, use: str = "u1", token: Token | None = None) -> list[Effect]:
         return self.driver.post(
             UseEnded(self.client, self.driver.next_request(), lease, token or self.token(lease), UseId(use))
+        )
+
+    def use_yield(self, lease: LeaseId, use: str = "u1", token: Token | None = None) -> list[Effect]:
+        return self.driver.post(
+            UseYielded(self.client, self.driver.next_request(), lease, token or self.token(lease), UseId(use))
         )
 
     def renew(self, *leases: tuple[LeaseId, Token]) -> list[Effect]:

@@ -180,6 +180,7 @@ def test_every_request_on_leases_becomes_its_event(bench: Bench) -> None:
     bench.ask("ready", **on, measured_bytes=5)
     bench.ask("use_begin", **on, use_id="u", label="goal")
     bench.ask("use_end", **on, use_id="u")
+    bench.ask("yield", **on, use_id="u")
     bench.ask("renew", leases=[on])
     bench.ask("revoke_ack", **on, safe_point_eta_s=1.5)
     bench.ask("unloading", **on)
@@ -187,20 +188,21 @@ def test_every_request_on_leases_becomes_its_event(bench: Bench) -> None:
     bench.ask("cancel", lease_id="L3-1")
     bench.ask("reattach", leases=[{**on, "spec": wanted, "state": "held", "use_ids": ["u"]}])
     bench.ask("oom", **on, requested_bytes=11, allocated_bytes=12)
-    first = bench.next_id - 10
-    ids = [RequestId(first + n) for n in range(11)]
+    first = bench.next_id - 11
+    ids = iter([RequestId(first + n) for n in range(12)])
     assert bench.events == [
-        ev.AcquireRequested(me, ids[0], "n1", spec, 4.0, trace),
-        ev.ReadyReported(me, ids[1], LEASE, token, 5),
-        ev.UseBegan(me, ids[2], LEASE, token, USE, "goal"),
-        ev.UseEnded(me, ids[3], LEASE, token, USE),
-        ev.Renewed(me, ids[4], ((LEASE, token),)),
-        ev.RevokeAcknowledged(me, ids[5], LEASE, token, 1.5),
-        ev.UnloadStarted(me, ids[6], LEASE, token),
-        ev.ReleaseReported(me, ids[7], LEASE, token, True),
-        ev.CancelRequested(me, ids[8], LEASE),
-        ev.Reattached(me, ids[9], (ev.ReattachedLease(LEASE, token, spec, True, None, (USE,)),)),
-        ev.OomReported(me, ids[10], LEASE, token, 11, 12),
+        ev.AcquireRequested(me, next(ids), "n1", spec, 4.0, trace),
+        ev.ReadyReported(me, next(ids), LEASE, token, 5),
+        ev.UseBegan(me, next(ids), LEASE, token, USE, "goal"),
+        ev.UseEnded(me, next(ids), LEASE, token, USE),
+        ev.UseYielded(me, next(ids), LEASE, token, USE),
+        ev.Renewed(me, next(ids), ((LEASE, token),)),
+        ev.RevokeAcknowledged(me, next(ids), LEASE, token, 1.5),
+        ev.UnloadStarted(me, next(ids), LEASE, token),
+        ev.ReleaseReported(me, next(ids), LEASE, token, True),
+        ev.CancelRequested(me, next(ids), LEASE),
+        ev.Reattached(me, next(ids), (ev.ReattachedLease(LEASE, token, spec, True, None, (USE,)),)),
+        ev.OomReported(me, next(ids), LEASE, token, 11, 12),
     ]
 
 
