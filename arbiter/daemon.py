@@ -28,6 +28,7 @@ from arbiter.host.history import CLEAN_END, History
 from arbiter.host.journal import Journal
 from arbiter.host.lockfile import LockFile
 from arbiter.host.probing import Prober, within
+from arbiter.host.recorder import Recorder, freezer
 from arbiter.host.suspend import SuspendWatch
 from arbiter.host.systemd import Notifier
 from arbiter.host.tree import Known
@@ -193,12 +194,18 @@ class Daemon:
 
         settings = core_settings(config, journal.opened.epoch, gpus, journal.opened.learnt)
         try_records(journal, settings)
-        core = Arbiter(settings, time.monotonic())  # 4
+        made_at = time.monotonic()
+        core = Arbiter(settings, made_at)  # 4
+        recorder = self._open_recorder(places, settings, core, history)
+        if recorder is not None:
+            recorder.start(loop, made_at)
+            undo.callback(recorder.close)
         inbox = Inbox(
             core,
             lambda effects: executor.perform(effects),
             self._core_failed,
             slept_s=SuspendWatch().slept_s,
+            record=None if recorder is None else recorder.record,
         )
         prober = Prober(
             probe,
@@ -255,6 +262,21 @@ class Daemon:
         except BaseException:
             probe.close()
             raise
+
+    def _open_recorder(
+        self, places: Places, settings: Settings, core: Arbiter, history: History
+    ) -> Recorder | None:
+        if not self._config.record.enabled:
+            return None
+        return Recorder(
+            places.state,
+            settings,
+            self._server_name.partition(" ")[2],
+            max_bytes=self._config.record.max_bytes,
+            file_bytes=self._config.record.file_bytes,
+            freeze_engine=freezer(core),
+            told=lambda kind, facts: telemetry.log_event(history.append(kind, facts)),
+        )
 
     def _operators_group(self) -> int | None:
         name = self._config.wire.operators_group

@@ -41,7 +41,8 @@ class Inbox:
 
     `perform` runs the effects of one event; it may post events, which are handled after it returned. `failed` is called once with the
     exception if the core raises: its state can no longer be trusted, so nothing is handled after that. `slept_s` tells for how long the
-    machine was suspended since it was last asked; the core hears of it before any other event.
+    machine was suspended since it was last asked; the core hears of it before any other event. `record` is told of every event and what
+    came of it (None: the core raised), before anything is performed.
     """
 
     def __init__(
@@ -51,12 +52,14 @@ class Inbox:
         failed: Callable[[BaseException], None],
         clock: Callable[[], float] = time.monotonic,
         slept_s: Callable[[], float] = lambda: 0.0,
+        record: Callable[[float, Event, Sequence[Effect] | None], None] | None = None,
     ) -> None:
         self._core = core
         self._perform = perform
         self._failed = failed
         self._clock = clock
         self._slept_s = slept_s
+        self._record = record
         self._queue: deque[Event] = deque()
         self._busy = False
         self._closed = False
@@ -110,13 +113,19 @@ class Inbox:
             self._timer = None
 
     def _handle(self, event: Event) -> None:
+        now, effects = self._clock(), None
         try:
-            self._perform(self._core.handle(event, self._clock()))
+            effects = self._core.handle(event, now)
+            if self._record is not None:
+                self._record(now, event, effects)
+            self._perform(effects)
             self._handled += 1
         except Exception as error:  # outermost: a core that raised has an unknown state
             log.critical("the core failed on %s: %s", event, error, exc_info=error)
             log.critical("state of the core: %s", self._state())
             self.close()
+            if effects is None and self._record is not None:
+                self._record(now, event, None)
             self._failed(error)
 
     def _state(self) -> str:

@@ -12,7 +12,17 @@ from schemas.units import format_bytes
 events_log = logging.getLogger("arbiter.events")
 
 _WARNINGS = frozenset(
-    {"probe_failed", "pressure", "stowaway", "oom", "lost", "expired", "deadline_passed", "journal_put_aside"}
+    {
+        "probe_failed",
+        "pressure",
+        "stowaway",
+        "oom",
+        "lost",
+        "expired",
+        "deadline_passed",
+        "journal_put_aside",
+        "record_stopped",
+    }
 )
 _DETAILS = frozenset({"use_began", "use_ended", "use_yielded", "reminded", "revoke_acked", "probe_ok"})
 

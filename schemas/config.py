@@ -134,6 +134,17 @@ class HistoryConfig(_Section):
     """Older events are dropped after this many days."""
 
 
+class RecordConfig(_Section):
+    """The event log: what `vramctl replay` reads."""
+
+    enabled: bool = True
+    """Write what the engine was told, and a digest of what it decided, to the state folder."""
+    max_bytes: Annotated[ByteSize, Field(ge=128 * d.KIB)] = d.RECORD_MAX_BYTES
+    """All files together; the oldest go."""
+    file_bytes: Annotated[ByteSize, Field(ge=64 * d.KIB)] = d.RECORD_FILE_BYTES
+    """One file; the next one begins with the engine's whole state."""
+
+
 class WireConfig(_Section):
     """The socket."""
 
@@ -178,6 +189,7 @@ class ArbiterConfig(_Section):
     lease: LeaseConfig = LeaseConfig()
     limits: LimitsConfig = LimitsConfig()
     history: HistoryConfig = HistoryConfig()
+    record: RecordConfig = RecordConfig()
     wire: WireConfig = WireConfig()
     state: StateConfig = StateConfig()
     log: LogConfig = LogConfig()

@@ -199,9 +199,18 @@ def doctor(as_json: AsJson = False, endpoint: Endpoint = None) -> None:
     raise typer.Exit(examine(as_json=as_json, endpoint=endpoint))
 
 
-@app.command(
-    context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []},
-)
+_PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+
+
+@app.command(context_settings=_PASSED_ON)
+def replay(context: typer.Context) -> None:
+    """Run a recorded event log through the engine again: the same decisions, byte for byte? See `vramctl replay --help`."""
+    from clients.cli.engine import run as start
+
+    raise typer.Exit(start(["replay", *context.args]))
+
+
+@app.command(context_settings=_PASSED_ON)
 def demo(context: typer.Context) -> None:
     """Run find → navigate → grab on a simulated arm inside 8 GiB (needs the full install); see `vramctl demo --help`."""
     from clients.cli.demo import demo as show

@@ -205,3 +205,23 @@ def test_a_core_that_raises_ends_everything_once() -> None:
         assert [str(error) for error in done] == ["invariant 1"]
 
     with_inbox(test)
+
+
+def test_everything_that_is_handled_is_recorded_before_it_is_performed() -> None:
+    async def run() -> None:
+        core, told = ScriptedCore(), list[Any]()
+        inbox = Inbox(
+            core,
+            lambda effects: told.append("performed"),
+            told.append,
+            record=lambda now, event, effects: told.append((now, event, effects)),
+        )
+        inbox.post(left("a"))
+        assert told == [(core.times[0], left("a"), [Note("seen", {"number": 1})]), "performed"]
+        core.broken = True
+        inbox.post(left("b"))
+        now, event, effects = told[2]
+        assert (event, effects, str(told[3])) == (left("b"), None, "invariant 1")
+        assert now >= core.times[0]
+
+    asyncio.run(run())

@@ -1,0 +1,19 @@
+"""An event log of what a `CoreDriver` went through, written at once and without a daemon."""
+
+from pathlib import Path
+
+from arbiter.core.arbiter import Arbiter
+from arbiter.replay.logfile import Header, engine_id, entry_line, file_name, header_line
+from arbiter.testing.core_driver import START_S, CoreDriver
+
+
+def write_log(driver: CoreDriver, folder: Path, *, made_at: float = START_S) -> Path:
+    """Everything that the driver posted, as the daemon would have recorded it. Returns the file."""
+    header = Header("0", engine_id(), driver.settings.epoch, 0, "start", 0.0, made_at, driver.settings, None)
+    engine = Arbiter(driver.settings, made_at)
+    path = folder / file_name(0.0, driver.settings.epoch, 0)
+    with path.open("w") as file:
+        file.write(header_line(header))
+        for now, event in driver.events:
+            file.write(entry_line(now, event, engine.handle(event, now)))
+    return path

@@ -1,0 +1,12 @@
+"""Fixtures of the daemon's own tests."""
+
+import pytest
+
+from arbiter.testing.busy import busy_driver
+from arbiter.testing.core_driver import CoreDriver
+
+
+@pytest.fixture(scope="session")
+def busy() -> CoreDriver:
+    """A run of the engine with a bit of everything; read only."""
+    return busy_driver(7)

@@ -1,0 +1,106 @@
+"""Events to JSON and back by their hints alone, and a digest that sees every byte of the effects."""
+
+import json
+from dataclasses import fields, is_dataclass, replace
+from types import NoneType
+from typing import Any, NewType, get_args, get_origin, get_type_hints
+
+import pytest
+
+from arbiter.core.effects import JournalDelete, Note, Push, Reply, Sample
+from arbiter.core.events import AcquireRequested, Event, Tick
+from arbiter.core.settings import GpuInfo, Settings
+from arbiter.replay.codec import CodecError, decode, decode_event, digest, event_types, summary, to_json
+from arbiter.testing.core_driver import CoreDriver
+from schemas.ids import ClientId, GpuId, RequestId
+
+
+def example(hint: Any) -> Any:
+    """Some value of a type hint; raises KeyError for a hint that events never had so far."""
+    if isinstance(hint, NewType):
+        return example(hint.__supertype__)
+    if is_dataclass(hint) and isinstance(hint, type):
+        hints = get_type_hints(hint)
+        return hint(**{field.name: example(hints[field.name]) for field in fields(hint)})
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is tuple:
+        some = (arguments[0], arguments[0]) if Ellipsis in arguments else arguments
+        return tuple(example(argument) for argument in some)
+    if NoneType in arguments:
+        return example(next(argument for argument in arguments if argument is not NoneType))
+    if origin is not None and "Mapping" in str(origin):
+        return {"key": example(arguments[1])}
+    if "Literal" in str(origin):
+        return arguments[-1]
+    return {str: "tëxt", int: 2**40, float: 0.1 + 0.2, bool: True, Any: [1, None, "x"]}[hint]
+
+
+@pytest.mark.parametrize("name", sorted(cls.__name__ for cls in get_args(Event)))
+def test_every_event_survives_a_log(name: str) -> None:
+    event = example(event_types()[name])
+    line = to_json(event)
+    assert decode_event(name, json.loads(line)) == event
+    assert "\n" not in line
+
+
+def test_what_a_run_posts_survives_a_log(busy: CoreDriver) -> None:
+    assert len({type(event) for _, event in busy.events}) > 10
+    for _, event in busy.events:
+        assert decode_event(type(event).__name__, json.loads(to_json(event))) == event
+
+
+def test_settings_survive_a_log() -> None:
+    settings = Settings(3, (GpuInfo(GpuId("g"), 0, "card", 8),), policy="lru", learnt={"a": {"load_s": 0.1}})
+    assert decode(Settings, json.loads(to_json(settings))) == settings
+
+
+def test_a_field_that_came_later_takes_its_default(busy: CoreDriver) -> None:
+    event = next(event for _, event in busy.events if isinstance(event, AcquireRequested))
+    data = json.loads(to_json(event))
+    del data["traceparent"]
+    assert decode_event("AcquireRequested", data) == event
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "says"),
+    [
+        ("Vanished", {}, "no event is called Vanished"),
+        ("Tick", {"colour": 1}, "Tick has no field colour"),
+        ("ClientLeft", {"client": "c"}, "ClientLeft lacks reason"),
+        ("Tick", [], "a map was expected"),
+        ("Renewed", {"client": "c", "request": 1, "leases": [["L1"]]}, "a list was expected"),
+    ],
+)
+def test_a_log_of_another_version_says_what_is_strange(name: str, data: Any, says: str) -> None:
+    with pytest.raises(CodecError, match=says):
+        decode_event(name, data)
+
+
+def test_what_is_no_data_is_refused() -> None:
+    with pytest.raises(TypeError, match="no place in a log"):
+        to_json({"call": print})
+
+
+def test_the_digest_sees_order_kind_and_every_value() -> None:
+    reply = Reply(ClientId("c"), RequestId(1), {"lease": {"uses": 1}})
+    rest = [
+        Push(ClientId("c"), {"push": "revoke"}),
+        Note("granted", {"bytes": 1}),
+        Sample(GpuId("g")),
+        JournalDelete("g"),
+    ]
+    same = digest([reply, *rest])
+    assert same == digest([reply, *rest])
+    others = [
+        digest([*rest, reply]),
+        digest([reply, *rest[:-1]]),
+        digest([reply, *rest[:2], JournalDelete("g"), Sample(GpuId("g"))]),
+        digest([replace(reply, body={"lease": {"uses": 2}}), *rest]),
+        digest([]),
+    ]
+    assert len({same, *others}) == 6
+    assert summary([reply, *rest]) == "Reply Push:revoke Note:granted Sample JournalDelete"
+
+
+def test_an_event_without_fields_is_an_empty_map() -> None:
+    assert to_json(Tick()) == "{}"
