@@ -25,7 +25,7 @@ from arbiter.host.gpu.fake import open_cards
 from arbiter.host.gpu.nvml import NvmlProbe
 from arbiter.host.gpu.probe import Card, GpuProbe
 from arbiter.host.history import CLEAN_END, History
-from arbiter.host.journal import Journal
+from arbiter.host.journal import Journal, Opened
 from arbiter.host.lockfile import LockFile
 from arbiter.host.probing import Prober, within
 from arbiter.host.recorder import Recorder, freezer
@@ -52,7 +52,7 @@ PROBE_START_S = 30.0
 """Without persistence mode the NVIDIA driver needs seconds to initialise its cards."""
 OPEN_FILES = 65_536
 STATUS_EVERY_S = 5.0
-KEEP_LEARNT_EVERY_S = 60.0
+KEEP_LEARNT_EVERY_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,13 +109,12 @@ def budget(cards: Sequence[Card], config: ArbiterConfig) -> tuple[GpuInfo, ...]:
     return tuple(found)
 
 
-def core_settings(
-    config: ArbiterConfig, epoch: int, gpus: tuple[GpuInfo, ...], learnt: Mapping[str, dict[str, float]]
-) -> Settings:
+def core_settings(config: ArbiterConfig, gpus: tuple[GpuInfo, ...], opened: Opened) -> Settings:
     return Settings(
-        epoch=epoch,
+        epoch=opened.epoch,
         gpus=gpus,
-        learnt=dict(learnt),
+        learnt=dict(opened.learnt),
+        footprints=dict(opened.footprints),
         policy=config.scheduling.policy,
         ageing_s_per_point=config.scheduling.ageing_s_per_point,
         revoke_resend_s=config.revoke.resend_s,
@@ -129,6 +128,7 @@ def core_settings(
         verify_tolerance_bytes=config.verify.tolerance_bytes,
         sample_max_age_s=config.probe.sample_max_age_s,
         probe_period_s=config.probe.period_s,
+        load_probe_s=config.probe.load_s,
         fence_grace_s=config.lease.fence_grace_s,
         waiters_max=config.limits.waiters_max,
         leases_per_client_max=config.limits.leases_per_client_max,
@@ -173,7 +173,7 @@ class Daemon:
             await self._stop.wait()
             notifier.stopping("stopping" if self._exit_code == EXIT_OK else "the core failed")
             if self._exit_code == EXIT_OK:
-                parts.journal.keep_learnt(parts.inbox.learnt())
+                keep_learnt(parts)
             facts = {"exit_code": self._exit_code, "leases_kept": True}
             telemetry.log_event(parts.history.append(CLEAN_END, facts))
         return self._exit_code
@@ -192,7 +192,7 @@ class Daemon:
         undo.callback(history.close)
         probe, gpus = await self._open_cards(places)  # 3
 
-        settings = core_settings(config, journal.opened.epoch, gpus, journal.opened.learnt)
+        settings = core_settings(config, gpus, journal.opened)
         try_records(journal, settings)
         made_at = time.monotonic()
         core = Arbiter(settings, made_at)  # 4
@@ -339,8 +339,14 @@ class Daemon:
             if text != (text := f"{status_text(parts.gpus)}; {len(parts.sessions)} clients"):
                 notifier.status(text)
             if time.monotonic() - kept_at >= KEEP_LEARNT_EVERY_S and not parts.inbox.closed:
-                parts.journal.keep_learnt(parts.inbox.learnt())
+                keep_learnt(parts)
                 kept_at = time.monotonic()
+
+
+def keep_learnt(parts: Parts) -> None:
+    """So that a kill loses no more than the last few seconds of learning."""
+    parts.journal.keep("learnt", parts.inbox.learnt())
+    parts.journal.keep("footprints", parts.inbox.footprints())
 
 
 def status_text(gpus: Sequence[GpuInfo]) -> str:

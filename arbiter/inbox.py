@@ -35,6 +35,8 @@ class Core(Protocol):
 
     def learnt(self) -> dict[str, dict[str, float]]: ...
 
+    def footprints(self) -> dict[str, dict[str, list[int]]]: ...
+
 
 class Inbox:
     """Owns the core.
@@ -92,6 +94,9 @@ class Inbox:
 
     def learnt(self) -> dict[str, dict[str, float]]:
         return self._core.learnt()
+
+    def footprints(self) -> dict[str, dict[str, list[int]]]:
+        return self._core.footprints()
 
     def pulse(self) -> bool:
         """Send an event through the core and have its effects performed: True only if both came back. What feeds the watchdog: a core, a

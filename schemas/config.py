@@ -95,6 +95,8 @@ class ProbeConfig(_Section):
     """A reading that takes longer has failed: the card is unknown, which blocks grants."""
     period_s: Seconds = d.PROBE_PERIOD_S
     """Background readings while anybody holds or waits."""
+    load_s: Annotated[float, Field(ge=0.005, le=60, allow_inf_nan=False)] = d.LOAD_PROBE_S
+    """Readings while somebody loads: its load peak is learnt from them, and what falls between two is not seen."""
     sample_max_age_s: Seconds = d.SAMPLE_MAX_AGE_S
     """An older reading does not gate a grant; a fresh one is taken first."""
 

@@ -33,6 +33,7 @@ VERIFY_SLOW_POLL_S = 0.5  # after a verdict that does not allow a grant
 VERIFY_TOLERANCE_BYTES = 64 * MIB  # allocator granularity and driver bookkeeping
 PROBE_DEADLINE_S = 2.0
 PROBE_PERIOD_S = 1.0  # background samples while anybody holds or waits
+LOAD_PROBE_S = 0.05  # samples while somebody loads: its peak is learnt from them
 SAMPLE_MAX_AGE_S = 2.0  # an older sample does not gate a grant
 RESERVE_BYTES = 300 * MIB
 RESIDUE_BYTES = 450 * MIB  # a live CUDA process keeps its context

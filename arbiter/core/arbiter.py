@@ -3,7 +3,7 @@
 `handle` is one decision tree:
   1. what happened
      1.1 connections: hello, bye, death of a process
-     1.2 requests: acquire, reacquire and cancel · ready, uses, renew, oom · revoke_ack, unloading, release · reattach · operators
+     1.2 requests: acquire and cancel · ready, uses, renew, oom · revoke_ack, unloading, release · reattach · operators
      1.3 the machine: a reading, a failed reading, a failed journal write, a journal from before the restart, a resume from suspend
      1.4 time: every timer that is due
   2. recovery ends when everybody is accounted for
@@ -40,7 +40,6 @@ from arbiter.core.events import (
     OperatorAsked,
     ProbeFailed,
     ProcessDied,
-    Reacquired,
     ReadyReported,
     Reattached,
     Recovered,
@@ -103,6 +102,10 @@ class Arbiter:
         """Medians of what was learnt, in the shape of `Settings.learnt`."""
         return explain.medians(self._core)
 
+    def footprints(self) -> dict[str, dict[str, list[int]]]:
+        """What models really took, in the shape of `Settings.footprints`."""
+        return self._core.footprints.kept()
+
     def owners(self, gpu: GpuId) -> frozenset[ProcessKey]:
         """Processes with an account on a card: they hold a lease there, one of theirs is measured away, or they keep a residue.
 
@@ -160,7 +163,6 @@ class Arbiter:
         | RevokeAcknowledged
         | UnloadStarted
         | ReleaseReported
-        | Reacquired
         | Reattached
         | OperatorAsked,
     ) -> None:
@@ -188,8 +190,6 @@ class Arbiter:
                 requests.unloading(core, event)
             case ReleaseReported():
                 requests.release(core, event)
-            case Reacquired():
-                requests.reacquire(core, event)
             case Reattached():
                 recovery.on_reattached(core, event)
             case _:  # OperatorAsked
@@ -212,12 +212,15 @@ class Arbiter:
                     measure.on_probe_due(core, subject)
                 case "recover":
                     recovery.on_recover_due(core, subject)
-                case _:  # "plan": a residency ended, or somebody has aged; "return": the card has been quiet
+                case _:  # "plan": a residency ended, or somebody has aged
                     core.wake(core.gpus[GpuId(subject)])
 
     def _keep_reading(self) -> None:
         core = self._core
         for gpu in core.gpus.values():
             key = ("probe", gpu.info.id)
-            if key not in core.timers and core.active(gpu):
-                core.timers.set(key, core.now + core.settings.probe_period_s)
+            planned = core.timers.due(key)
+            peaks = gpu.sees_loads()
+            due = core.now + (core.settings.load_probe_s if peaks else core.settings.probe_period_s)
+            if (peaks and planned is not None and due < planned) or (planned is None and core.active(gpu)):
+                core.timers.set(key, due)

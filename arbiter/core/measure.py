@@ -6,9 +6,9 @@ Starts, polls and ends verifications; the judgement itself is in `verify`. A fai
 from collections.abc import Mapping
 from typing import Any
 
-from arbiter.core import standby
+from arbiter.core import drift
 from arbiter.core.events import MemorySampled, ProbeFailed
-from arbiter.core.lease import AWAY, Lease, LeaseState
+from arbiter.core.lease import Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 from arbiter.core.verify import Judgement, Verdict, Verification, judge
 from schemas.defaults import VERIFY_READING_SHARE
@@ -33,6 +33,7 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
         core.note("probe_ok", gpu=gpu.info.id)
     known = {stranger.process: stranger.used_bytes for stranger in gpu.ledger.strangers.values()}
     gpu.ledger.observe(sample, quiet=gpu.quiet() and sample.taken_at > gpu.changed_at)
+    drift.on_evidence(core, gpu)
     _note_stowaways(core, gpu, known)
     _shrink_residues(core, gpu, sample)
     for verification in list(gpu.verifications.values()):
@@ -121,12 +122,14 @@ def _shrink_residues(core: Core, gpu: Gpu, sample: MemorySampled) -> None:
 def begin_for_lease(core: Core, gpu: Gpu, lease: Lease, *, alive: bool, grace_s: float = 0.0) -> None:
     """Measure a lease's bytes away. Its charge is in the ledger and stays there until the verdict."""
     baseline = lease.baseline or gpu.sample
+    drift.on_leaving(core, lease)
     comparable = baseline is not None and 0.0 < lease.ready_at <= baseline.taken_at
     verification = Verification(
         key=lease.id,
         process=lease.process,
         lease=lease.id,
         consumer=lease.spec.consumer,
+        model=drift.model_name(lease.spec),
         residue_bytes=lease.spec.residue_bytes,
         baseline=baseline,
         baseline_comparable=comparable,
@@ -147,6 +150,7 @@ def begin_for_residue(core: Core, gpu: Gpu, process: ProcessKey) -> None:
         process=process,
         lease=None,
         consumer=str(process),
+        model="",
         residue_bytes=0,
         baseline=gpu.sample,
         baseline_comparable=gpu.sample is not None
@@ -204,8 +208,8 @@ def on_poll_due(core: Core, gpu_id: str) -> None:
             if verification.last_used_bytes is None:
                 _announce(core, gpu, verification, Judgement(Verdict.STALE, False, 0))
         verification.next_poll_at = _next_poll_at(core, gpu, verification)
-    if due:  # a reading that is under way and counts for all of them is not asked for twice
-        core.want_sample(gpu, max(verification.confirmed_at for verification in due))
+    # a reading that is under way and counts for all of them is not asked for twice
+    core.want_sample(gpu, max(verification.confirmed_at for verification in due))
     _set_poll(core, gpu)
 
 
@@ -312,13 +316,15 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
         gpu.ledger.set_residue(process, 0, core.now)
         core.record_residue(gpu, process, 0)
         return
+    drift.on_verdict(core, gpu, verification)
     residue = gpu.ledger.drop(verification.lease, judgement.residue_bytes, verification.kept_bytes, core.now)
     core.record_residue(gpu, process, residue)
     core.forget(f"lease:{verification.lease}")
     _close_eviction(core, gpu, verification, judgement)
     lease = core.leases.get(verification.lease)
     if lease is not None and lease.state is LeaseState.VERIFYING:
-        standby.settle(core, lease, str(judgement.verdict))
+        lease.move(LeaseState.RELEASED, core.now, str(judgement.verdict))
+        core.end(lease, None)
     if core.recovering is not None:
         core.recovering.discard(verification.lease)
 
@@ -352,9 +358,6 @@ def lose(
 def on_expiry_due(core: Core, lease_id: str) -> None:
     """A holder did not renew (who has let go has no such timer)."""
     lease = core.leases[LeaseId(lease_id)]
-    if lease.state in AWAY:
-        standby.give_up(core, lease, LeaseState.CANCELLED, "lease_lost", standby.NOT_BACK)
-        return
     expire(core, lease, f"{lease.id} was not renewed for {lease.spec.ttl_s:g} s")
 
 

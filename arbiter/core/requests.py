@@ -6,12 +6,11 @@ anyone who knows the exact token.
 
 from dataclasses import replace
 
-from arbiter.core import eviction, explain, standby
+from arbiter.core import drift, eviction, explain
 from arbiter.core.events import (
     AcquireRequested,
     CancelRequested,
     OomReported,
-    Reacquired,
     ReadyReported,
     ReleaseReported,
     Renewed,
@@ -19,10 +18,10 @@ from arbiter.core.events import (
     Spec,
     UnloadStarted,
 )
-from arbiter.core.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState, Recall, Use
+from arbiter.core.lease import EXPIRING, LEAVING, Lease, LeaseState, Use
 from arbiter.core.measure import begin_for_lease
 from arbiter.core.state import Client, Core, Ended, Refused
-from schemas.ids import ClientId, GpuId, LeaseId, RequestId, Token
+from schemas.ids import ClientId, GpuId, LeaseId, Token
 
 _HINT_ACQUIRE = "unload, then acquire again"
 
@@ -104,13 +103,10 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         _acquire_again(core, event, core.nonces[nonce])
         return
     spec = replace(event.spec, exclusive=True) if core.settings.scheduling.alone else event.spec
-    load_peak = load_peak_bytes(core, spec)
+    load_peak, steady = drift.expected_bytes(core, spec)
     gpus = _places(core, spec, load_peak)
-    _check_waiters(core)
-    away = standby.find(core, client.process, spec.consumer, spec.key)
-    if away is not None:
-        _take_over(core, event, away, spec, gpus)
-        return
+    if len(core.waiting) >= core.settings.waiters_max:
+        raise Refused("limit_exceeded", "too many wait already", "try again later", limit="waiters_max")
     owned = sum(1 for lease in core.leases_of(client.process) if lease.client == client.id)
     if owned >= core.settings.leases_per_client_max:
         raise Refused(
@@ -128,7 +124,7 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         arrived_at=core.now,
         arrival=core.next_arrival(),
         load_peak_bytes=load_peak,
-        steady_bytes=max(spec.steady_bytes, spec.residue_bytes),
+        steady_bytes=steady,
         gpus=gpus,
         since=core.now,
         wait_timeout_s=event.wait_timeout_s,
@@ -137,71 +133,14 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         story=[(core.now, LeaseState.QUEUED, "acquired")],
     )
     core.add(lease)
+    core.waiting[lease.id] = lease
     core.nonces[nonce] = lease.id
-    core.enqueue(lease)
+    for gpu_id in gpus:
+        core.gpus[gpu_id].queue.add(lease)
+        core.wake(core.gpus[gpu_id])
+    if event.wait_timeout_s is not None:
+        core.timers.set(("wait", lease.id), core.now + event.wait_timeout_s)
     core.unanswered.append(lease)
-
-
-def _check_waiters(core: Core) -> None:
-    if len(core.waiting) >= core.settings.waiters_max:
-        raise Refused("limit_exceeded", "too many wait already", "try again later", limit="waiters_max")
-
-
-def load_peak_bytes(core: Core, spec: Spec) -> int:
-    """What a grant has to have room for: the declared peak, raised by what was learnt."""
-    return max(
-        spec.load_peak_bytes, spec.steady_bytes, spec.residue_bytes, core.learnt_peaks.get(peak_key(spec), 0)
-    )
-
-
-def _take_over(
-    core: Core, event: AcquireRequested, lease: Lease, spec: Spec, gpus: tuple[GpuId, ...]
-) -> None:
-    """The process has a lease for this model, away: the acquire means that one, as it is asked for now."""
-    lease.earlier_nonces.append(lease.nonce)
-    lease.nonce = event.nonce
-    core.nonces[lease.process, event.nonce] = lease.id
-    lease.spec = spec
-    lease.steady_bytes = max(spec.steady_bytes, spec.residue_bytes)
-    lease.traceparent = event.traceparent
-    _call_back(core, lease, event.client, event.request, event.wait_timeout_s, gpus)
-
-
-def _call_back(
-    core: Core,
-    lease: Lease,
-    client: ClientId,
-    request: RequestId,
-    wait_timeout_s: float | None,
-    gpus: tuple[GpuId, ...],
-) -> None:
-    lease.gpus = gpus
-    lease.load_peak_bytes = load_peak_bytes(core, lease.spec)
-    standby.queue_again(core, lease, client, request, core.now, wait_timeout_s)
-    core.unanswered.append(lease)
-
-
-def reacquire(core: Core, event: Reacquired) -> None:
-    """A lease that is away, or on its way there, is wanted now. One that is wanted or back already is answered as it is."""
-    client = client_of(core, event.client)
-    lease = lease_for(core, event.lease, event.token)
-    if lease.process != client.process:
-        raise Refused(
-            "not_permitted", f"{lease.id} belongs to process {lease.process.pid}", "ask as its holder"
-        )
-    if lease.state in AWAY:
-        gpus = _places(core, lease.spec, load_peak_bytes(core, lease.spec))
-        _check_waiters(core)
-        _call_back(core, lease, event.client, event.request, event.wait_timeout_s, gpus)
-        return
-    if lease.state is LeaseState.VERIFYING and lease.comes_back:
-        lease.recalled = lease.recalled or Recall(core.now, event.wait_timeout_s)
-    elif lease.state is not LeaseState.QUEUED:
-        raise bad_state(
-            lease, "only a lease that is away, or being measured on its way there, is called back"
-        )
-    lease.client = client.id
-    core.reply(event.client, event.request, {"state": "queued", "lease": explain.view(core, lease)})
 
 
 def answer_queued(core: Core) -> None:
@@ -215,16 +154,12 @@ def answer_queued(core: Core) -> None:
     core.unanswered.clear()
 
 
-def peak_key(spec: Spec) -> str:
-    return f"{spec.consumer} {spec.key}"
-
-
 def _acquire_again(core: Core, event: AcquireRequested, lease_id: LeaseId) -> None:
     lease = core.leases.get(lease_id)
     if lease is None:
         raise ended_error(core.ended[lease_id])
     lease.client = event.client  # the newest connection of the process is the one that listens
-    state = str(lease.state) if lease.state in (LeaseState.QUEUED, *AWAY) else "loading"
+    state = "queued" if lease.state is LeaseState.QUEUED else "loading"
     core.reply(event.client, event.request, {"state": state, "lease": explain.view(core, lease)})
 
 
@@ -255,13 +190,16 @@ def _places(core: Core, spec: Spec, load_peak: int) -> tuple[GpuId, ...]:
         if alone and load_peak + fixed <= gpu.ledger.budget_bytes:
             able.append(gpu.info.id)
     if not able:
+        raised = load_peak > max(spec.load_peak_bytes, spec.steady_bytes, spec.residue_bytes)
+        learnt = f" ({spec.load_peak_bytes} declared, more was measured)" if raised else ""
         raise Refused(
             "vram_insufficient",
-            f"{spec.consumer} needs {load_peak} bytes; the card has {largest.info.capacity_bytes} "
+            f"{spec.consumer} needs {load_peak} bytes{learnt}; the card has {largest.info.capacity_bytes} "
             f"less a reserve of {largest.info.reserve_bytes}"
             + (", and pinned leases" if any(pinned.values()) else ""),
             "use a smaller model or a lower precision, or unpin what is resident",
             needed_bytes=load_peak,
+            declared_bytes=spec.load_peak_bytes,
             capacity_bytes=largest.info.capacity_bytes,
             reserve_bytes=largest.info.reserve_bytes,
             pinned=pinned[largest.info.id],
@@ -285,10 +223,6 @@ def cancel(core: Core, event: CancelRequested) -> None:
         raise Refused(
             "not_permitted", f"{lease.id} belongs to process {lease.process.pid}", "ask as its holder"
         )
-    if lease.state in AWAY:
-        standby.give_up(core, lease, LeaseState.CANCELLED, "cancelled", "its holder gave up")
-        core.reply(event.client, event.request, {"state": "cancelled"})
-        return
     if lease.state is not LeaseState.QUEUED:
         raise bad_state(lease, "it is granted already, release it")
     cancel_waiter(core, lease, "its holder gave up")
@@ -346,6 +280,7 @@ def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     lease.move(LeaseState.HELD, core.now, "ready")
     lease.ready_at = lease.last_used_at = core.now
     lease.measured_bytes = measured_bytes
+    drift.on_ready(core, lease, measured_bytes)
     steady = lease.steady_bytes if measured_bytes is None else max(measured_bytes, lease.spec.residue_bytes)
     gpu.ledger.recharge(lease.id, steady, core.now)
     gpu.changed_at = core.now
@@ -401,7 +336,7 @@ def unloading(core: Core, event: UnloadStarted) -> None:
 
 
 def release(core: Core, event: ReleaseReported) -> None:
-    """The holder let go. Its bytes stay charged until they are measured gone. A repeat never ends a lease that went on standby."""
+    """The holder let go. Its bytes stay charged until they are measured gone."""
     process = client_of(core, event.client).process
     ended = core.ended.get(event.lease)
     same = ended is not None and (ended.token, ended.process) == (event.token, process)
@@ -409,14 +344,8 @@ def release(core: Core, event: ReleaseReported) -> None:
         core.reply(event.client, event.request, {"state": str(ended.state)})
         return
     lease = own_lease(core, event.client, event.lease, event.token)
-    if lease.gpu is not None and lease.state is not LeaseState.VERIFYING:  # else: a repeat
-        let_go(
-            core,
-            lease,
-            exiting=event.exiting,
-            why="exits" if event.exiting else "let go",
-            comes_back=standby.stays_on(lease) and not event.exiting,
-        )
+    if lease.state is not LeaseState.VERIFYING:
+        let_go(core, lease, exiting=event.exiting, why="exits" if event.exiting else "let go")
     core.reply(event.client, event.request, {"state": str(lease.state)})
 
 
@@ -435,13 +364,12 @@ def note_ended(core: Core, lease: Lease, use: Use, why: str) -> None:
     )
 
 
-def let_go(core: Core, lease: Lease, *, exiting: bool, why: str, comes_back: bool = False) -> None:
+def let_go(core: Core, lease: Lease, *, exiting: bool, why: str) -> None:
     """From any resident state to verification. Uses that others left on it end with it."""
     gpu = core.gpu_of(lease)
     end_uses(core, lease, why)
     before = lease.state
     lease.exiting = exiting
-    lease.comes_back = comes_back
     lease.move(LeaseState.VERIFYING, core.now, why)
     core.timers.clear(("ttl", lease.id))
     if lease.eviction is not None:
@@ -457,16 +385,13 @@ def let_go(core: Core, lease: Lease, *, exiting: bool, why: str, comes_back: boo
 def oom(core: Core, event: OomReported) -> None:
     """An allocation failed. If the holder asked for more than it was granted, its footprint was wrong: learn it."""
     lease = own_lease(core, event.client, event.lease, event.token)
-    if lease.gpu is None:
-        raise bad_state(lease, "it holds nothing")
     gpu = core.gpu_of(lease)
     charge = gpu.ledger.charge_bytes(lease.id)
     allocated = charge if event.allocated_bytes is None else event.allocated_bytes
     wanted = min(allocated + event.requested_bytes, gpu.ledger.budget_bytes)
     learnt = wanted > charge
     if learnt:
-        key = peak_key(lease.spec)
-        core.learnt_peaks[key] = max(core.learnt_peaks.get(key, 0), wanted)
+        core.footprints.out_of_memory(drift.model_name(lease.spec), wanted)
     core.want_sample(gpu, core.now)
     core.reply(event.client, event.request, {"learnt_load_peak_bytes": wanted if learnt else None})
     core.note(

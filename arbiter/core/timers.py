@@ -16,6 +16,10 @@ class Timers:
     def __contains__(self, key: TimerKey) -> bool:
         return key in self._due
 
+    def due(self, key: TimerKey) -> float | None:
+        """When a timer comes up; None: it is not set."""
+        return self._due.get(key)
+
     def set(self, key: TimerKey, at: float) -> None:
         before = self._due.get(key)
         self._due[key] = at

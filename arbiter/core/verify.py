@@ -42,6 +42,7 @@ class Verification:
     process: ProcessKey
     lease: LeaseId | None  # None: only a residue of a dead process
     consumer: str
+    model: str  # under which name its footprint is learnt
     residue_bytes: int  # what may stay while the process lives
     baseline: MemorySampled | None  # newest reading in which the bytes were still there
     baseline_comparable: bool  # the lease was resident and ready when it was taken

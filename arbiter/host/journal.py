@@ -12,9 +12,9 @@ import os
 import sqlite3
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from schemas.errors import ConfigError, JournalUnavailable
 
@@ -30,7 +30,7 @@ CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, json TEXT NOT NULL) WI
 @dataclass(frozen=True, slots=True)
 class Opened:
     """What a start found. `put_aside` names the corrupt file that was moved away; `voided` counts records of an earlier boot.
-    `learnt` is what `keep_learnt` wrote last, whatever the boot."""
+    `learnt` is what `keep` wrote last under that name, whatever the boot, and so are `footprints`."""
 
     epoch: int
     records: Mapping[str, Mapping[str, Any]]
@@ -38,6 +38,7 @@ class Opened:
     problem: str = ""
     voided: int = 0
     learnt: Mapping[str, dict[str, float]] = field(default_factory=dict)
+    footprints: Mapping[str, dict[str, list[int]]] = field(default_factory=dict)
 
 
 class Journal:
@@ -48,6 +49,7 @@ class Journal:
         self._path = path
         self._boot_id = boot_id
         self._connection = connection
+        self._kept: dict[str, str] = {}  # what `keep` wrote last
         self.opened = opened
 
     @classmethod
@@ -83,7 +85,10 @@ class Journal:
                 hint="make it writable, or choose another --state-dir",
             ) from error
         return cls(
-            path, boot_id, connection, Opened(epoch, records, put_aside, problem, voided, _learnt(meta))
+            path,
+            boot_id,
+            connection,
+            Opened(epoch, records, put_aside, problem, voided, _learnt(meta), _footprints(meta)),
         )
 
     def put_aside(self, problem: str) -> None:
@@ -93,7 +98,7 @@ class Journal:
         log.error("journal not understood (%s): put aside as %s", problem, aside)
         self._connection = _connect(self._path)
         _write_meta(self._connection, self._boot_id, self.opened.epoch, drop_records=False)
-        self.opened = Opened(self.opened.epoch, {}, aside, problem)
+        self.opened = replace(self.opened, records={}, put_aside=aside, problem=problem)
 
     def apply(self, changes: Sequence[tuple[str, Mapping[str, Any] | None]]) -> None:
         """Write all changes in one transaction; None deletes. Raises JournalUnavailable (nothing is written then)."""
@@ -111,11 +116,14 @@ class Journal:
                 f"the journal cannot be written: {error}", hint="see the disk of the daemon's state folder"
             ) from error
 
-    def keep_learnt(self, learnt: Mapping[str, Mapping[str, float]]) -> None:
-        """Keep durations for the next start's estimates. Losing them costs estimates only: a failure is logged."""
+    def keep(self, name: Literal["learnt", "footprints"], learnt: Mapping[str, Mapping[str, Any]]) -> None:
+        """Keep what was learnt for the next start. Losing it costs estimates only: a failure is logged."""
+        text = json.dumps(learnt, separators=(",", ":"))
+        if text == self._kept.get(name):
+            return
+        self._kept[name] = text
         try:
-            text = json.dumps(learnt, separators=(",", ":"))
-            self._connection.execute("INSERT OR REPLACE INTO meta VALUES ('learnt', ?)", (text,))
+            self._connection.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (name, text))
         except sqlite3.Error as error:
             log.warning("what was learnt cannot be kept: %s", error)
 
@@ -167,10 +175,22 @@ def _read(connection: sqlite3.Connection) -> tuple[dict[str, str], dict[str, dic
 
 
 def _learnt(meta: Mapping[str, str]) -> dict[str, dict[str, float]]:
-    """What `keep_learnt` wrote; anything else counts as nothing learnt."""
+    """Durations that `keep` wrote; anything else counts as nothing learnt."""
     try:
         found = json.loads(meta.get("learnt", "{}"))
         return {str(who): {str(what): float(s) for what, s in each.items()} for who, each in found.items()}
+    except (ValueError, TypeError, AttributeError):
+        return {}
+
+
+def _footprints(meta: Mapping[str, str]) -> dict[str, dict[str, list[int]]]:
+    """Byte counts that `keep` wrote; anything else counts as nothing learnt."""
+    try:
+        found = json.loads(meta.get("footprints", "{}"))
+        return {
+            str(model): {str(part): [int(count) for count in counts] for part, counts in parts.items()}
+            for model, parts in found.items()
+        }
     except (ValueError, TypeError, AttributeError):
         return {}
 

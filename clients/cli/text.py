@@ -10,8 +10,8 @@ from typing import Any
 from schemas.sizes import format_bytes
 
 Message = Mapping[str, Any]
-_COLUMNS = ("LEASE", "CONSUMER", "MODEL", "STATE", "CHARGE", "USES", "PRIO", "PID", "SINCE")
-_RIGHT = frozenset({"CHARGE", "USES", "PRIO", "PID", "SINCE"})
+_COLUMNS = ("LEASE", "CONSUMER", "MODEL", "STATE", "CHARGE", "DRIFT", "USES", "PRIO", "PID", "SINCE")
+_RIGHT = frozenset({"CHARGE", "DRIFT", "USES", "PRIO", "PID", "SINCE"})
 _NOT_SHOWN = frozenset(
     {"seq", "at_wall_s", "kind", "lease_id", "consumer", "reason", "gpu", "token", "traceparent"}
 )
@@ -50,7 +50,11 @@ def status_lines(status: Message) -> list[str]:
     lines.append("")
     if not status["leases"]:
         return [*lines, "no leases"]
-    return lines + table(_COLUMNS, [_lease_row(lease) for lease in status["leases"]])
+    rows = [_lease_row(lease) for lease in status["leases"]]
+    at = _COLUMNS.index("DRIFT")
+    if any(row[at] for row in rows):
+        return lines + table(_COLUMNS, rows)
+    return lines + table(_without(_COLUMNS, at), [_without(row, at) for row in rows])
 
 
 def _gpu_lines(gpu: Message) -> list[str]:
@@ -96,11 +100,21 @@ def _lease_row(lease: Message) -> tuple[str, ...]:
         lease["model"],
         state,
         format_bytes(lease["charge_bytes"]),
+        _drift(lease.get("drift_bytes") or 0),
         str(lease["uses"]),
         str(lease["priority"]),
         str(lease["pid"]),
         duration(lease["since_s"]),
     )
+
+
+def _without(cells: Sequence[str], at: int) -> list[str]:
+    return [*cells[:at], *cells[at + 1 :]]
+
+
+def _drift(count: int) -> str:
+    """How far a lease is above or below what it declared; nothing where that is no news."""
+    return "" if not count else f"{'+' if count > 0 else '-'}{format_bytes(abs(count))}"
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
@@ -130,7 +144,7 @@ def why_lines(why: Message) -> list[str]:
 
 def _why_details(lease: Message) -> list[str]:
     size = format_bytes
-    lines = [f"  lease     {lease['lease_id']}, {lease['state']}"]
+    lines = [f"  lease     {lease['lease_id']}, {lease['state']}", *_footprint_lines(lease.get("footprint"))]
     if lease["state"] != "queued":
         return lines
     lines.append(
@@ -170,6 +184,19 @@ def by_hand_lines(action: str, reply: Message) -> list[str]:
     uses = lease["uses"]
     wait = f"finishes {plural(uses, 'use')}, then unloads" if uses else "unloads now"
     return [f"{name} was asked to leave: it {wait}; follow it with `vramctl why {lease['consumer']}`"]
+
+
+def _footprint_lines(footprint: Message | None) -> list[str]:
+    """Declared and measured bytes per part; nothing before anything was measured."""
+    if footprint is None or not any(footprint["learnt_bytes"].values()):
+        return []
+    parts = [
+        f"{part.replace('_', ' ')} {format_bytes(declared)} (measured {format_bytes(measured)})"
+        if (measured := footprint["learnt_bytes"][part])
+        else f"{part.replace('_', ' ')} {format_bytes(declared)}"
+        for part, declared in footprint["declared_bytes"].items()
+    ]
+    return [f"  footprint {', '.join(parts)}"]
 
 
 # -- events ------------------------------------------------------------------------------------------------------------

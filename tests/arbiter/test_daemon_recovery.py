@@ -164,6 +164,23 @@ def test_what_was_learnt_is_known_after_a_restart(make_arbiter: Make) -> None:
     assert arbiter.stop() == 0
 
 
+def test_a_measured_footprint_is_charged_after_a_restart_and_a_reboot(make_arbiter: Make) -> None:
+    arbiter = make_arbiter().start()
+    with WireClient(arbiter.endpoint) as client:
+        on = hold(client.hello(), arbiter, "holder", GIB)
+        assert client.ask("oom", **on, requested_bytes=2 * GIB, allocated_bytes=GIB)["ok"]
+        assert client.ask("bye")["ok"]
+    assert arbiter.stop() == 0
+    with sqlite3.connect(arbiter.state / "journal.sqlite") as database:
+        database.execute("UPDATE meta SET value = 'another' WHERE name = 'boot_id'")
+    database.close()
+    arbiter.start()
+    with WireClient(arbiter.endpoint) as client:
+        lease = client.hello().acquire("holder", GIB, nonce="again")["lease"]
+        assert lease["charge_bytes"] == 3 * GIB
+    assert arbiter.stop() == 0
+
+
 def set_fault(arbiter: ArbiterProcess, probe: str) -> None:
     path = arbiter.card / fakegpu.CARD_FILE
     config = json.loads(path.read_text())

@@ -48,6 +48,9 @@ class ScriptedCore:
     def why(self, consumer: str, now: float) -> dict[str, Any]:
         return {"consumer": consumer, "now": now}
 
+    def footprints(self) -> dict[str, dict[str, list[int]]]:
+        return {"detector m": {"steady": [5]}}
+
     def learnt(self) -> dict[str, dict[str, float]]:
         return {"detector": {"load_s": 2.0}}
 
@@ -87,6 +90,7 @@ def test_the_clock_is_monotonic_time() -> None:
         assert inbox.status()["now"] >= core.times[0]
         assert inbox.why("c")["consumer"] == "c"
         assert inbox.learnt() == {"detector": {"load_s": 2.0}}
+        assert inbox.footprints() == {"detector m": {"steady": [5]}}
 
     with_inbox(test)
 

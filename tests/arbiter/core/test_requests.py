@@ -79,6 +79,7 @@ def test_what_can_never_fit_fails_at_once(driver: CoreDriver) -> None:
     assert refused.code == "vram_insufficient"
     assert refused.details == {
         "needed_bytes": 8 * GIB,
+        "declared_bytes": 8 * GIB,
         "capacity_bytes": 8 * GIB,
         "reserve_bytes": d.RESERVE_BYTES,
         "pinned": [],

@@ -66,6 +66,7 @@ def test_readings_are_dense_while_memory_usually_comes_back_and_rarer_later() ->
     driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
     driver.card.lag_s = 7.0
     det, lease = held(driver, "det", 5)
+    driver.advance(0.1)  # the last of the readings that follow a load
     det.unload(lease)
     began = driver.now
     driver.until(lambda: driver.state(lease) == "over")

@@ -130,13 +130,30 @@ def test_records_that_nobody_understands_are_put_aside_in_the_same_epoch(tmp_pat
 def test_what_was_learnt_survives_a_boot_and_nonsense_is_nothing(tmp_path: Path) -> None:
     journal = Journal.open(tmp_path, "boot-1")
     assert journal.opened.learnt == {}
-    journal.keep_learnt({"detector": {"load_s": 2.5}})
+    journal.keep("learnt", {"detector": {"load_s": 2.5}})
     journal.close()
     assert Journal.open(tmp_path, "boot-2").opened.learnt == {"detector": {"load_s": 2.5}}
     for nonsense in ("[1]", "{", '{"a": {"b": "c"}}', '{"a": 1}'):
         edit(tmp_path / "journal.sqlite", f"UPDATE meta SET value = '{nonsense}' WHERE name = 'learnt'")
         opened = Journal.open(tmp_path, "boot-2").opened
         assert (opened.learnt, opened.put_aside) == ({}, None)
+
+
+def test_footprints_survive_a_boot_and_a_journal_that_is_put_aside(tmp_path: Path) -> None:
+    journal = Journal.open(tmp_path, "boot-1")
+    kept = {"detector m@1": {"load_peak": [5, 6], "oom": [9, 20]}}
+    journal.keep("footprints", kept)
+    journal.keep("footprints", kept)
+    journal.close()
+    journal = Journal.open(tmp_path, "boot-2")
+    assert journal.opened.footprints == kept
+    journal.put_aside("KeyError: 'spec'")
+    assert journal.opened.footprints == kept, "for this run; it will be kept again"
+    journal.close()
+    for nonsense in ("[1]", "{", '{"a": {"b": "c"}}', '{"a": {"b": 1}}', '{"a": 1}'):
+        edit(tmp_path / "journal.sqlite", f"INSERT OR REPLACE INTO meta VALUES ('footprints', '{nonsense}')")
+        opened = Journal.open(tmp_path, "boot-2").opened
+        assert (opened.footprints, opened.put_aside) == ({}, None)
 
 
 def test_a_write_that_fails_is_typed_and_writes_nothing(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """What `vramctl` prints, to the letter."""
 
+from typing import Any
+
 import pytest
 
 from clients.cli import text
@@ -122,6 +124,31 @@ def test_why_somebody_waits() -> None:
     ]
     unknown = text.why_lines({"consumer": "grab", "leases": [entry | {"eta_s": None, "eta_source": "none"}]})
     assert unknown[-1] == "  expected  unknown, never seen before"
+
+
+def test_drift_is_a_column_only_where_somebody_drifts() -> None:
+    def shown(*drifts: int) -> list[str]:
+        leases = [LEASE | {"drift_bytes": drift} if drift else LEASE for drift in drifts]
+        return text.status_lines(STATUS | {"leases": leases})[-len(drifts) - 1 :]
+
+    assert "DRIFT" not in shown(0)[0]
+    head, above, below, none = shown(GIB, -GIB // 2, 0)
+    assert head.index("CHARGE") < head.index("DRIFT") < head.index("USES")
+    assert ("+1 GiB" in above, "-512 MiB" in below, "+" in none) == (True, True, False)
+
+
+def test_why_tells_what_was_measured_before() -> None:
+    parts = ("load_peak", "steady", "residue")
+    never = {"declared_bytes": dict.fromkeys(parts, GIB), "learnt_bytes": dict.fromkeys(parts, 0)}
+    entry = {"lease_id": "L1-1", "state": "held", "text": "detector: it is resident, idle"}
+
+    def lines(footprint: dict[str, Any]) -> list[str]:
+        return text.why_lines({"consumer": "detector", "leases": [entry | {"footprint": footprint}]})
+
+    assert len(lines(never)) == 2
+    assert lines(never | {"learnt_bytes": {"load_peak": 2 * GIB, "steady": GIB, "residue": 0}})[-1] == (
+        "  footprint load peak 1 GiB (measured 2 GiB), steady 1 GiB (measured 1 GiB), residue 1 GiB"
+    )
 
 
 def test_why_somebody_runs_or_is_not_there() -> None:

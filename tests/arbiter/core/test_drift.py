@@ -1,0 +1,225 @@
+"""Declared against measured: what is learnt from a lease's life, and who is told."""
+
+import pytest
+
+from arbiter.core.effects import Sample
+from arbiter.testing.core_driver import CoreDriver, refusal
+from schemas import defaults as d
+from schemas.ids import LeaseId
+
+GIB, MIB = d.GIB, d.MIB
+
+
+def lived(driver: CoreDriver, name: str, *, peak: float, steady: float, residue: float = 0.0) -> None:
+    """One life: loads with a peak, serves, unloads, ends. It declared 2 GiB (and 450 MiB of residue)."""
+    person = driver.consumer(name)
+    lease = person.acquire(2 * GIB, residue_bytes=450 * MIB)
+    driver.until(lambda: driver.state(lease) == "loading")
+    person.hold(int(peak * GIB))
+    driver.advance(0.2)
+    person.hold(int(steady * GIB))
+    person.ready(lease)
+    driver.advance(1.5)
+    person.unloading(lease)
+    person.hold(int(residue * GIB))
+    person.release(lease)
+    driver.until(lambda: driver.state(lease) == "over", limit_s=20.0)
+    person.die()
+    driver.advance(0.1)
+
+
+def charge(driver: CoreDriver, lease: LeaseId) -> float:
+    view = driver.view(lease)
+    assert view is not None
+    return float(view["charge_bytes"] / GIB)
+
+
+def learnt(driver: CoreDriver, consumer: str) -> dict[str, float]:
+    (lease,) = driver.arbiter.why(consumer, driver.now)["leases"]
+    return {part: count / GIB for part, count in lease["footprint"]["learnt_bytes"].items()}
+
+
+def test_the_next_load_is_charged_what_the_last_ones_took() -> None:
+    driver = CoreDriver(8 * GIB)
+    lived(driver, "det", peak=4, steady=3, residue=0.5)
+    det = driver.consumer("det")
+    lease = det.acquire(2 * GIB, residue_bytes=450 * MIB)
+    assert learnt(driver, "det") == {"load_peak": 4, "steady": 3, "residue": 0.5}
+    assert charge(driver, lease) == 4
+    det.hold(3 * GIB)
+    det.ready(lease)
+    assert charge(driver, lease) == 3, "it did not say what it holds: what it held before counts"
+
+
+def test_a_smaller_measurement_never_lowers_what_was_declared() -> None:
+    driver = CoreDriver(8 * GIB)
+    lived(driver, "det", peak=1, steady=1)
+    assert charge(driver, driver.consumer("det").acquire(2 * GIB, residue_bytes=450 * MIB)) == 2
+
+
+def test_another_consumer_or_model_learns_for_itself() -> None:
+    driver = CoreDriver(8 * GIB)
+    lived(driver, "det", peak=4, steady=3)
+    assert charge(driver, driver.consumer("other").acquire(2 * GIB)) == 2
+
+
+def test_the_holders_own_word_counts_where_the_driver_lists_nobody() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lists_processes = False
+    driver.advance(1.5)
+    det = driver.consumer("det")
+    lease = det.acquire(2 * GIB)
+    det.load(lease, measured_bytes=3 * GIB)
+    (note,) = [note for note in driver.notes("drift") if note["part"] == "steady"]
+    assert (note["declared_bytes"], note["measured_bytes"], note["drift_bytes"]) == (2 * GIB, 3 * GIB, GIB)
+    assert "above" in note["reason"]
+    view = driver.view(lease)
+    assert view is not None
+    assert view["drift_bytes"] == GIB
+    assert (
+        "it holds 3.00 GiB, 2.00 GiB were declared"
+        in driver.arbiter.why("det", driver.now)["leases"][0]["text"]
+    )
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over", limit_s=20.0)
+    again = driver.consumer("det").acquire(2 * GIB)
+    driver.until(lambda: driver.state(again) == "loading", limit_s=20.0)
+    assert charge(driver, again) == 3
+
+
+def test_drift_is_said_once_a_lease_and_part() -> None:
+    driver = CoreDriver(8 * GIB)
+    lived(driver, "det", peak=4, steady=3)
+    assert [(note["part"], note["measured_bytes"] / GIB) for note in driver.notes("drift")] == [
+        ("load_peak", 4),
+        ("steady", 3),
+    ]
+    assert {note["consumer"] for note in driver.notes("drift")} == {"det"}
+
+
+def test_who_holds_less_than_declared_is_named_when_it_leaves() -> None:
+    """Before, it may still be growing into what it declared."""
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    lease = det.acquire(2 * GIB)
+    det.hold(1 * GIB)
+    det.ready(lease)
+    driver.advance(3.0)
+    assert driver.notes("drift") == []
+    view = driver.view(lease)
+    assert view is not None
+    assert view["drift_bytes"] == -GIB, "shown all the same"
+    det.unload(lease)
+    (note,) = driver.notes("drift")
+    assert (note["part"], note["drift_bytes"]) == ("steady", -GIB)
+    assert "below" in note["reason"]
+
+
+def test_within_the_tolerance_nobody_drifts() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    lease = det.acquire(2 * GIB)
+    det.load(lease, measured_bytes=2 * GIB + 60 * MIB)
+    driver.advance(2.0)
+    det.unload(lease)
+    assert driver.notes("drift") == []
+    assert "drift_bytes" not in (driver.view(lease) or {})
+
+
+def test_while_somebody_loads_the_card_is_read_twenty_times_a_second() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.consumer("det").acquire(2 * GIB)
+    driver.advance(0.1)
+    before = len(driver.effects)
+    driver.advance(1.0)
+    assert sum(isinstance(effect, Sample) for effect in driver.effects[before:]) == pytest.approx(20, abs=1)
+
+
+def test_a_load_that_is_cut_off_teaches_only_that_it_was_too_much() -> None:
+    driver = CoreDriver(8 * GIB)
+    for peak in (1, 5):
+        det = driver.consumer("det")
+        lease = det.acquire(2 * GIB)
+        driver.until(lambda lease=lease: driver.state(lease) == "loading", limit_s=20.0)  # type: ignore[misc]
+        det.hold(peak * GIB)
+        driver.advance(0.2)
+        det.die()
+        driver.advance(0.2)
+    again = driver.consumer("det").acquire(2 * GIB)
+    assert charge(driver, again) == 5
+    assert [note["part"] for note in driver.notes("drift")] == ["load_peak"]
+
+
+def test_a_process_with_two_leases_teaches_nothing() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    first = det.acquire(1 * GIB)
+    det.hold(1 * GIB)
+    det.ready(first)
+    driver.advance(0.01)
+    second = det.acquire(2 * GIB)
+    driver.until(lambda: driver.state(second) == "loading")
+    det.hold(5 * GIB)
+    driver.advance(1.0)
+    det.ready(second)
+    driver.advance(1.5)
+    det.release(first)
+    driver.advance(15.0)
+    det.release(second)
+    driver.advance(15.0)
+    footprints = driver.arbiter.footprints()
+    assert max(footprints["det det-model"].get("load_peak", [1 * GIB])) == 1 * GIB
+
+
+def test_what_was_learnt_never_asks_for_more_than_a_whole_card() -> None:
+    driver = CoreDriver(8 * GIB, settings={"footprints": {"det det-model": {"load_peak": [9 * GIB]}}})
+    lease = driver.consumer("det").acquire(2 * GIB)
+    assert driver.state(lease) == "loading"
+    assert charge(driver, lease) == (8 * GIB - d.RESERVE_BYTES) / GIB
+
+
+def test_a_refusal_says_that_the_figure_was_learnt() -> None:
+    driver = CoreDriver(8 * GIB, settings={"footprints": {"det det-model": {"steady": [6 * GIB]}}})
+    pin = driver.consumer("pin")
+    pin.acquire(4 * GIB, evictable=False)
+    refused = refusal(driver.consumer("det").try_acquire(2 * GIB))
+    assert "declared, more was measured" in refused.message
+    assert (refused.details["needed_bytes"], refused.details["declared_bytes"]) == (6 * GIB, 2 * GIB)
+
+
+def test_why_says_that_a_waiter_needs_more_than_it_declared() -> None:
+    driver = CoreDriver(8 * GIB, settings={"footprints": {"w w-model": {"load_peak": [5 * GIB]}}})
+    det = driver.consumer("det")
+    lease = det.acquire(4 * GIB)
+    det.load(lease)
+    det.use_begin(lease)
+    driver.consumer("w").acquire(2 * GIB)
+    assert "(2.00 GiB declared, 5.00 GiB learnt)" in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
+
+
+def test_a_lease_that_comes_back_after_a_restart_is_measured_on() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    lease = det.acquire(2 * GIB)
+    token = det.token(lease)
+    det.load(lease)
+    driver.restart()
+    det.connect()
+    det.reattach(lease, token)
+    det.hold(3 * GIB)
+    driver.advance(2.0)
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over", limit_s=20.0)
+    assert driver.arbiter.footprints()["det det-model"]["steady"] == [3 * GIB]
+
+
+def test_the_residue_of_a_process_that_exits_teaches_nothing() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    lease = det.acquire(2 * GIB)
+    det.load(lease)
+    driver.advance(1.5)
+    det.release(lease, exiting=True)
+    det.die()
+    driver.advance(1.0)
+    assert "residue" not in driver.arbiter.footprints()["det det-model"]
