@@ -10,6 +10,7 @@ because dumping a model costs more than the whole codec. New fields always have 
 
 The life of a lease on the wire: `acquire` → reply `loading` (granted at once) or `queued`, then push `granted` → `ready` →
 `use_begin`/`use_end`… → push `revoke` → `revoke_ack` → `unloading` → `release`. `renew` keeps all leases of a connection alive.
+A lease with `standby` that was asked to leave lives on after its `release`: push `granted` (with a new token) when it is back, or `reacquire`.
 """
 
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
@@ -54,6 +55,7 @@ class LeaseSpec(_Frozen):
     on_deadline: Literal["wait", "deny"] = (
         "wait"  # what a waiter gets when a holder outstays the ladder's deadline
     )
+    standby: bool = False  # asked to leave, it comes back by itself when there is room
 
 
 class _Request(_Frozen):
@@ -147,11 +149,18 @@ class Cancel(_Request):
     lease_id: LeaseIdText
 
 
+class Reacquire(_OnLease):
+    """A lease that is away is wanted now: it waits like any other. `token` is the last one, so a late repeat asks for nothing."""
+
+    op: Literal["reacquire"]
+    wait_timeout_s: Seconds | None = None
+
+
 class ReattachLease(_Frozen):
     lease_id: LeaseIdText
     token: TokenPair
     spec: LeaseSpec
-    state: Literal["loading", "held"]
+    state: Literal["loading", "held", "standby"]  # standby: `token` is the last one
     measured_bytes: Bytes | None = None
     use_ids: Annotated[tuple[Name, ...], Field(max_length=d.USES_PER_LEASE_MAX)] = ()
 
@@ -248,14 +257,15 @@ class Bye(_Request):
 
 
 Request = Annotated[
-    Hello | Acquire | Ready | UseBegin | UseEnd | Yield | Renew | RevokeAck | Unloading | Release | Cancel | Reattach | Oom
+    Hello | Acquire | Ready | UseBegin | UseEnd | Yield | Renew | RevokeAck | Unloading | Release | Cancel | Reacquire | Reattach | Oom
     | Status | Why | History | Subscribe | Evict | Pin | Unpin | ReleaseDead | Drain | Resume | Ping | Bye,
     Field(discriminator="op"),
 ]  # fmt: skip
 REQUEST: TypeAdapter[Request] = TypeAdapter(Request)
 OPS: tuple[str, ...] = (
     "hello", "acquire", "ready", "use_begin", "use_end", "yield", "renew", "revoke_ack", "unloading", "release", "cancel",
-    "reattach", "oom", "status", "why", "history", "subscribe", "evict", "pin", "unpin", "release_dead", "drain", "resume", "ping", "bye",
+    "reacquire", "reattach", "oom", "status", "why", "history", "subscribe", "evict", "pin", "unpin", "release_dead", "drain", "resume",
+    "ping", "bye",
 )  # fmt: skip
 
 
@@ -276,6 +286,7 @@ class LeaseView(TypedDict):
     uses: int  # busy ones
     pid: int
     since_s: float  # seconds in this state
+    standby: NotRequired[bool]  # asked to leave, it comes back by itself
     waited_s: NotRequired[float]
     position: NotRequired[int]
     pinned: NotRequired[str]  # which operator pinned it, and why

@@ -3,7 +3,7 @@
 `handle` is one decision tree:
   1. what happened
      1.1 connections: hello, bye, death of a process
-     1.2 requests: acquire and cancel · ready, uses, renew, oom · revoke_ack, unloading, release · reattach · operators
+     1.2 requests: acquire, reacquire and cancel · ready, uses, renew, oom · revoke_ack, unloading, release · reattach · operators
      1.3 the machine: a reading, a failed reading, a failed journal write, a journal from before the restart, a resume from suspend
      1.4 time: every timer that is due
   2. recovery ends when everybody is accounted for
@@ -40,6 +40,7 @@ from arbiter.core.events import (
     OperatorAsked,
     ProbeFailed,
     ProcessDied,
+    Reacquired,
     ReadyReported,
     Reattached,
     Recovered,
@@ -163,6 +164,7 @@ class Arbiter:
         | RevokeAcknowledged
         | UnloadStarted
         | ReleaseReported
+        | Reacquired
         | Reattached
         | OperatorAsked,
     ) -> None:
@@ -190,6 +192,8 @@ class Arbiter:
                 requests.unloading(core, event)
             case ReleaseReported():
                 requests.release(core, event)
+            case Reacquired():
+                requests.reacquire(core, event)
             case Reattached():
                 recovery.on_reattached(core, event)
             case _:  # OperatorAsked
@@ -212,7 +216,7 @@ class Arbiter:
                     measure.on_probe_due(core, subject)
                 case "recover":
                     recovery.on_recover_due(core, subject)
-                case _:  # "plan": a residency ended, or somebody has aged
+                case _:  # "plan": a residency ended, or somebody has aged; "return": the card has been quiet
                     core.wake(core.gpus[GpuId(subject)])
 
     def _keep_reading(self) -> None:

@@ -69,6 +69,7 @@ def on_leaving(core: Core, lease: Lease) -> None:
     elif lease.peak_seen_bytes > lease.load_peak_bytes:
         core.footprints.measured(name, "load_peak", lease.peak_seen_bytes)
         _note_drift(core, lease, "load_peak", lease.peak_seen_bytes)
+    lease.peak_seen_bytes = lease.steady_seen_bytes = 0  # it may come back from standby and load again
 
 
 def on_verdict(core: Core, gpu: Gpu, verification: Verification) -> None:

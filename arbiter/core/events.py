@@ -55,6 +55,7 @@ class Spec:
     ttl_s: float
     min_residency_s: float
     deny_on_deadline: bool
+    standby: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +150,17 @@ class CancelRequested:
 
 
 @dataclass(frozen=True, slots=True)
+class Reacquired:
+    """A lease that is away is wanted now: from here on it is a waiter like any other."""
+
+    client: ClientId
+    request: RequestId
+    lease: LeaseId
+    token: Token
+    wait_timeout_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class ReattachedLease:
     lease: LeaseId
     token: Token
@@ -156,6 +168,7 @@ class ReattachedLease:
     held: bool  # False: still loading
     measured_bytes: int | None
     uses: tuple[UseId, ...]
+    away: bool = False  # on standby
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,6 +259,6 @@ class Tick:
 
 Event = (
     ClientConnected | ClientLeft | ProcessDied | AcquireRequested | ReadyReported | UseBegan | UseEnded | UseYielded
-    | Renewed | RevokeAcknowledged | UnloadStarted | ReleaseReported | CancelRequested | Reattached | OomReported | OperatorAsked
-    | MemorySampled | ProbeFailed | JournalFailed | Recovered | Resumed | Tick
+    | Renewed | RevokeAcknowledged | UnloadStarted | ReleaseReported | CancelRequested | Reacquired | Reattached | OomReported
+    | OperatorAsked | MemorySampled | ProbeFailed | JournalFailed | Recovered | Resumed | Tick
 )  # fmt: skip

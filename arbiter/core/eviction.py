@@ -13,18 +13,21 @@ from schemas.ids import LeaseId
 
 def ask(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: str) -> None:
     """Send the first `revoke` and start the ladder. A fresh reading is taken, so that there is something to compare with."""
+    holder.left_for = "" if waiter is None else waiter.spec.consumer
     holder.eviction = Eviction(
         lease=holder.id,
         consumer=holder.spec.consumer,
         charge_bytes=gpu.ledger.charge_bytes(holder.id),
         wanted_by=None if waiter is None else waiter.id,
-        wanted_consumer="" if waiter is None else waiter.spec.consumer,
+        wanted_consumer=holder.left_for,
         reason=reason,
         asked_at=core.now,
         next_push_at=core.now + core.settings.revoke_resend_s,
     )
     gpu.evictions.append(holder.eviction)
     holder.move(LeaseState.REVOKING, core.now, reason)
+    if holder.spec.standby:  # a restart must not take a release that was asked for as one that was wished for
+        core.record_lease(holder)
     core.want_sample(gpu, core.now)
     _push_now(core, holder, holder.eviction)
     core.note(

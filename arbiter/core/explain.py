@@ -4,14 +4,15 @@ from collections.abc import Sequence
 from statistics import median
 from typing import Any
 
-from arbiter.core import drift, policy
-from arbiter.core.lease import LEAVING, Lease, LeaseState
+from arbiter.core import drift, policy, standby
+from arbiter.core.lease import AWAY, LEAVING, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 
 NOTE_KINDS: tuple[str, ...] = (
     "queued", "granted", "ready", "switch", "use_began", "use_ended", "use_yielded", "revoke_asked", "revoke_acked", "reminded",
     "deadline_passed", "unloading", "released", "verified", "denied", "cancelled", "expired", "lost", "reattached", "oom",
     "pressure", "stowaway", "probe_failed", "probe_ok", "drift", "journal_failed", "recovered", "serving", "operator", "resumed",
+    "standby",
 )  # fmt: skip
 """Every kind of `effects.Note`. `switch` comes with each `ready`; its field `switched` says whether anybody had to leave."""
 
@@ -30,7 +31,7 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
         "mode": "exclusive" if lease.spec.exclusive else "shared",
         "priority": lease.spec.priority,
         "evictable": lease.evictable,
-        "charge_bytes": lease.load_peak_bytes if gpu is None else gpu.ledger.charge_bytes(lease.id),
+        "charge_bytes": _charge_bytes(lease, gpu),
         "uses": len(lease.uses),
         "pid": lease.process.pid,
         "since_s": core.now - lease.since,
@@ -40,13 +41,22 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
         shown["pinned"] = str(lease.pinned)
     if lease.yielded:
         shown["yielded"] = len(lease.yielded)
+    if lease.spec.standby:
+        shown["standby"] = True
     if lease.state is LeaseState.QUEUED:
         shown["position"] = min(core.gpus[gpu_id].queue.position(lease) for gpu_id in lease.gpus)
-    elif lease.state is not LeaseState.VERIFYING:
+    elif lease.state is not LeaseState.VERIFYING and lease.state not in AWAY:
         if drifted := drift.drift_bytes(core, core.gpu_of(lease), lease):
             shown["drift_bytes"] = drifted
         shown["ttl_left_s"] = max(0.0, lease.expires_at - core.now)
     return shown
+
+
+def _charge_bytes(lease: Lease, gpu: Gpu | None) -> int:
+    """What is charged, or will be; nothing for a lease that is away."""
+    if gpu is not None:
+        return gpu.ledger.charge_bytes(lease.id)
+    return 0 if lease.state in AWAY else lease.load_peak_bytes
 
 
 def gpu_view(core: Core, gpu: Gpu) -> dict[str, Any]:
@@ -180,7 +190,7 @@ def _explain_resident(core: Core, gpu: Gpu, lease: Lease, free: int) -> dict[str
         LeaseState.REVOKING: f"it was asked to leave for {_wanted_by(lease)}, {_uses(lease)}",
         LeaseState.UNLOADING: "it is unloading",
         LeaseState.VERIFYING: "it let go; its bytes are being measured",
-    }[lease.state]
+    }.get(lease.state) or standby.outlook(core, lease)
     if drift.drift_bytes(core, gpu, lease):
         held = drift.held_bytes(gpu, lease)
         says += f"; it holds {_gib(held)}, {_gib(lease.spec.steady_bytes)} were declared"

@@ -2,8 +2,8 @@
 
 Per card, in this order (the numbers stand in `_serve`):
   1. under pressure: ask idle holders to leave, grant nothing
-  2. nobody waits: done
-  3. blocked (recovering, reading unknown, a load under way): grant nothing, ask nobody
+  2. blocked (recovering, reading unknown, a load under way): grant nothing, ask nobody
+  3. nobody waits: whoever is on standby and fits may come back, asking nobody to leave
   4. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading
   5. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out already
   6. backfill: the first waiter behind the head that fits, evicts nobody and cannot delay the head
@@ -11,7 +11,7 @@ Per card, in this order (the numbers stand in `_serve`):
 
 from collections.abc import Mapping
 
-from arbiter.core import eviction, explain, policy
+from arbiter.core import eviction, explain, policy, standby
 from arbiter.core.lease import Lease, LeaseState
 from arbiter.core.measure import note_pressure
 from arbiter.core.state import Core, Gpu
@@ -37,7 +37,12 @@ def _serve(core: Core, gpu: Gpu) -> None:
         _relieve(core, gpu)
         return
     head = gpu.queue.head()
-    if head is None or gpu.blocked:  # 2, 3
+    if gpu.blocked:  # 2
+        return
+    if head is None:  # 3
+        back = standby.next_back(core, gpu)
+        if back is not None:
+            _grant_if_measured(core, gpu, back)
         return
     if policy.fits(gpu, head):  # 4
         _grant_if_measured(core, gpu, head)
@@ -117,10 +122,11 @@ def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int],
 def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     """Give the lease its card and its token. The record goes to the journal before the holder hears of it."""
     core.dequeue(lease)
+    by_itself = standby.taken_back(core, lease)
     token = core.next_token()
     lease.token = token
     lease.gpu = gpu.info.id
-    lease.move(LeaseState.LOADING, core.now, "granted")
+    lease.move(LeaseState.LOADING, core.now, "came back by itself" if by_itself else "granted")
     lease.granted_at = core.now
     lease.reason = ""
     gpu.residents[lease.id] = lease
@@ -144,11 +150,17 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
         charge_bytes=lease.load_peak_bytes,
         waited_ms=(core.now - lease.arrived_at) * 1e3,
         evicted=[e.consumer for e in lease.evicted],
-        reason="fits after " + ", ".join(e.consumer for e in lease.evicted) + " left"
-        if lease.evicted
-        else "fits",
+        reason=_why_now(lease, by_itself=by_itself),
     )
     gpu.blocked = policy.blocked(core, gpu)
+
+
+def _why_now(lease: Lease, *, by_itself: bool) -> str:
+    if by_itself:
+        return "back from standby: there is room and nobody waits"
+    if lease.evicted:
+        return "fits after " + ", ".join(e.consumer for e in lease.evicted) + " left"
+    return "fits"
 
 
 def _collect_evictions(core: Core, gpu: Gpu, lease: Lease) -> None:

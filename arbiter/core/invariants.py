@@ -8,12 +8,13 @@ Numbers are those of the design:
   1. approved bytes never exceed capacity − reserve, and a grant fits together with stowaways at its moment
   2. nobody is resident beside an exclusive lease
   3. nothing that is in use unloads
-  4. bytes stay charged until a verdict: whoever is resident is charged, whoever is charged is resident or under measurement
+  4. bytes stay charged until a verdict: whoever is resident is charged, whoever is charged is resident or under measurement,
+     whoever is away is neither
   5. tokens only grow
   6. every waiter is in a queue, has a timer if it has a bound, and its card has a next reading scheduled
 """
 
-from arbiter.core.lease import Lease, LeaseState
+from arbiter.core.lease import AWAY, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 
 _UNUSED = tuple(state for state in LeaseState if state not in (LeaseState.HELD, LeaseState.REVOKING))
@@ -36,6 +37,7 @@ def check(core: Core) -> None:
         _charges(gpu)
     _tokens(core)
     _waiters(core)
+    _away(core)
 
 
 def check_all(core: Core) -> None:
@@ -105,6 +107,14 @@ def _charges(gpu: Gpu) -> None:
             raise InvariantViolation(4, f"{lease.id} waits for a verdict that nobody works on")
     ledger.touched.clear()
     residents.touched.clear()
+
+
+def _away(core: Core) -> None:
+    for lease in core.away.values():
+        if lease.state not in AWAY or lease.id not in core.leases:
+            raise InvariantViolation(4, f"{lease.id} is {lease.state}, yet it counts as away")
+        if lease.gpu is not None or lease.id in core.waiting:
+            raise InvariantViolation(4, f"{lease.id} is on standby, yet it has a card or waits for one")
 
 
 def _tokens(core: Core) -> None:

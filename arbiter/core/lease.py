@@ -3,6 +3,7 @@
 Knows nothing of bytes on a card (`ledger`), of order (`queue`) or of clients beyond their ids.
 """
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -24,6 +25,7 @@ class LeaseState(StrEnum):
     REVOKING = "revoking"
     UNLOADING = "unloading"
     VERIFYING = "verifying"
+    STANDBY = "standby"  # asked to leave, away, comes back by itself when there is room
     RELEASED = "released"
     EXPIRED = "expired"
     LOST = "lost"
@@ -42,7 +44,8 @@ TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
         _S.HELD: frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING, *_GONE}),
         _S.REVOKING: frozenset({_S.UNLOADING, _S.VERIFYING, *_GONE}),
         _S.UNLOADING: frozenset({_S.VERIFYING, *_GONE}),
-        _S.VERIFYING: frozenset({_S.RELEASED}),
+        _S.VERIFYING: frozenset({_S.RELEASED, _S.STANDBY}),
+        _S.STANDBY: frozenset({_S.LOADING, _S.QUEUED, _S.CANCELLED, _S.LOST}),
         _S.RELEASED: frozenset(),
         _S.EXPIRED: frozenset(),
         _S.LOST: frozenset(),
@@ -54,8 +57,14 @@ TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
 
 TERMINAL = frozenset(state for state, following in TRANSITIONS.items() if not following)
 LEAVING = frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING})
+AWAY = frozenset({_S.STANDBY})
+"""States of a lease that lives on without bytes on a card: nobody renews it, it waits for nothing with a bound."""
 EXPIRING = frozenset({_S.LOADING, _S.HELD, _S.REVOKING, _S.UNLOADING})
 """States that a holder must renew."""
+NONCES_MAX = 8
+"""Acquires remembered of a lease that is taken over again and again; an older repeat would be a new acquire."""
+STORY_MAX = 32
+"""Steps remembered of a lease; one that goes and comes back lives long."""
 
 
 class IllegalTransition(Exception):
@@ -117,12 +126,20 @@ class Roster(Protocol):
     def moved(self, lease: "Lease", before: LeaseState) -> None: ...
 
 
+@dataclass(frozen=True, slots=True)
+class Recall:
+    """A wait that begins when the lease is measured away."""
+
+    asked_at: float
+    wait_timeout_s: float | None
+
+
 @dataclass(slots=True)
 class Lease:
     """A live lease. `load_peak_bytes` is the spec's, raised by what was learnt; the spec itself is never changed."""
 
     id: LeaseId
-    nonce: str
+    nonce: str  # of the acquire that it answers to; a lease that is taken over has had others
     spec: Spec
     process: ProcessKey
     client: ClientId
@@ -154,14 +171,18 @@ class Lease:
     attached: bool = True  # False after a restart until its holder has come back
     traceparent: str | None = None
     baseline: MemorySampled | None = None  # the card as it was when the unloading began
+    earlier_nonces: deque[str] = field(default_factory=lambda: deque(maxlen=NONCES_MAX))
     reason: str = ""  # why it waits, in words; for people
     planned_gpu: GpuId | None = None  # a card where somebody was asked to leave for it
     pinned: Order | None = None  # by an operator
+    comes_back: bool = False  # on standby once its bytes are measured gone
+    left_for: str = ""  # the consumer that it left for last; it does not come back beside that one
+    away_since: float = 0.0
+    uncalled: bool = False  # it came back by itself and nobody has used it since
+    recalled: Recall | None = None  # its holder wants it back before it is gone
     eviction: Eviction | None = None
     evicted: list[Eviction] = field(default_factory=list)  # who left for it
-    story: list[tuple[float, LeaseState, str]] = field(
-        default_factory=list
-    )  # as long as the table's longest path
+    story: list[tuple[float, LeaseState, str]] = field(default_factory=list)  # the last STORY_MAX steps
     roster: Roster | None = field(default=None, repr=False, compare=False)  # of the card that it is on
 
     def move(self, to: LeaseState, now: float, why: str) -> None:
@@ -171,6 +192,7 @@ class Lease:
         before, self.state = self.state, to
         self.since = now
         self.story.append((now, to, why))
+        del self.story[:-STORY_MAX]
         if self.roster is not None:
             self.roster.moved(self, before)
 

@@ -6,9 +6,9 @@ Starts, polls and ends verifications; the judgement itself is in `verify`. A fai
 from collections.abc import Mapping
 from typing import Any
 
-from arbiter.core import drift
+from arbiter.core import drift, standby
 from arbiter.core.events import MemorySampled, ProbeFailed
-from arbiter.core.lease import Lease, LeaseState
+from arbiter.core.lease import AWAY, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 from arbiter.core.verify import Judgement, Verdict, Verification, judge
 from schemas.defaults import VERIFY_READING_SHARE
@@ -323,8 +323,7 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
     _close_eviction(core, gpu, verification, judgement)
     lease = core.leases.get(verification.lease)
     if lease is not None and lease.state is LeaseState.VERIFYING:
-        lease.move(LeaseState.RELEASED, core.now, str(judgement.verdict))
-        core.end(lease, None)
+        standby.settle(core, lease, str(judgement.verdict))
     if core.recovering is not None:
         core.recovering.discard(verification.lease)
 
@@ -358,6 +357,9 @@ def lose(
 def on_expiry_due(core: Core, lease_id: str) -> None:
     """A holder did not renew (who has let go has no such timer)."""
     lease = core.leases[LeaseId(lease_id)]
+    if lease.state in AWAY:
+        standby.give_up(core, lease, LeaseState.CANCELLED, "lease_lost", standby.NOT_BACK)
+        return
     expire(core, lease, f"{lease.id} was not renewed for {lease.spec.ttl_s:g} s")
 
 

@@ -8,9 +8,9 @@ The role was checked where the request came in.
 from collections.abc import Mapping
 from typing import Any
 
-from arbiter.core import eviction, explain
+from arbiter.core import eviction, explain, standby
 from arbiter.core.events import OperatorAsked
-from arbiter.core.lease import EXPIRING, LEAVING, Lease, LeaseState, Order
+from arbiter.core.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState, Order
 from arbiter.core.measure import expire
 from arbiter.core.requests import client_of, ended_error
 from arbiter.core.state import Core, Refused
@@ -65,8 +65,17 @@ def find(core: Core, target: str) -> Lease:
 
 
 def evict(core: Core, lease: Lease, order: Order) -> None:
-    """Ask a holder to leave, as the engine would for a waiter. In use, it finishes first. Asking twice is fine."""
+    """Ask a holder to leave, as the engine would for a waiter. In use, it finishes first. Asking twice is fine.
+
+    A lease on standby ends with it: what an operator sends away does not come back by itself.
+    """
+    if lease.state in AWAY:
+        _note(core, "evict", order, lease)
+        standby.send_off(core, lease, f"evicted by {order}")
+        return
     if lease.state in LEAVING:
+        standby.renounce(lease)
+        _ordered(core, lease, order)
         _note(core, "evict", order, lease, repeated=True)
         return
     if lease.state is not LeaseState.HELD:
@@ -82,9 +91,15 @@ def evict(core: Core, lease: Lease, order: Order) -> None:
         )
     gpu = core.gpu_of(lease)
     eviction.ask(core, gpu, lease, None, f"evicted by {order}")
-    assert lease.eviction is not None, f"{lease.id} was asked without an eviction"
-    lease.eviction.order = order
+    _ordered(core, lease, order)
     _note(core, "evict", order, lease, uses=len(lease.uses))
+
+
+def _ordered(core: Core, lease: Lease, order: Order) -> None:
+    if lease.eviction is not None:
+        lease.eviction.order = order
+    if lease.spec.standby:
+        core.record_lease(lease)
 
 
 def pin(core: Core, lease: Lease, order: Order) -> None:
@@ -155,6 +170,8 @@ def drained(core: Core) -> str:
 
 
 def _pins_changed(core: Core, lease: Lease) -> None:
+    if lease.state in AWAY:
+        core.record_lease(lease)
     if lease.gpu is None:
         return
     core.gpu_of(lease).residents.refresh(lease)

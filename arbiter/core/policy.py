@@ -155,7 +155,8 @@ def choose_relief(core: Core, gpu: Gpu, going: Mapping[LeaseId, int], over_bytes
 
 
 def residency_ends_at(lease: Lease) -> float:
-    return lease.ready_at + lease.spec.min_residency_s
+    """Who came back by itself and was not used since has no claim to stay: its return must cost nobody time."""
+    return lease.ready_at + (0.0 if lease.uncalled else lease.spec.min_residency_s)
 
 
 def wake_when_evictable(core: Core, gpu: Gpu, waiter: Lease | None) -> None:

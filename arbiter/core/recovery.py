@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from arbiter.core import drift, eviction, explain, operators
+from arbiter.core import drift, eviction, explain, operators, standby
 from arbiter.core.events import MemorySampled, Reattached, ReattachedLease, Recovered, Spec
-from arbiter.core.lease import EXPIRING, Lease, LeaseState, Order, Use
+from arbiter.core.lease import AWAY, EXPIRING, Eviction, Lease, LeaseState, Order, Use
 from arbiter.core.measure import begin_for_lease
-from arbiter.core.requests import become_held, client_of, ended_error, touch
+from arbiter.core.requests import become_held, client_of, ended_error, let_go, touch
 from arbiter.core.state import Client, Core, Ended, Gpu, Refused
 from schemas import defaults
 from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, Token
@@ -29,7 +29,9 @@ def on_recovered(core: Core, event: Recovered) -> None:
         operators.restore_drain(core, event.records[operators.DRAIN_KEY])
     for key, record in held.items():
         gpu = core.gpus.get(GpuId(str(record["gpu"])))
-        if gpu is None:
+        if record.get("state") in AWAY:
+            _restore_away(core, record)
+        elif gpu is None:
             core.forget(key)
         elif key.startswith("residue:"):
             process = ProcessKey(int(record["pid"]), int(record["start_ticks"]))
@@ -43,27 +45,38 @@ def on_recovered(core: Core, event: Recovered) -> None:
     core.note("recovered", leases=sorted(core.recovering), records=len(held))
 
 
-def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
-    lease_id = LeaseId(str(record["lease_id"]))
-    process = ProcessKey(int(record["pid"]), int(record["start_ticks"]))
-    token = Token(int(record["token"][0]), int(record["token"][1]))
-    state = str(record["state"])
+def _restore_away(core: Core, record: Mapping[str, Any]) -> None:
+    """A lease on standby holds nothing: nobody waits for its holder, but it does not come back before him either."""
+    lease = _remembered(core, record, LeaseState(str(record["state"])))
+    lease.gpus = tuple(gpu.info.id for gpu in _selected(core, lease.spec))
+    core.add(lease)
+    core.nonces[lease.process, lease.nonce] = lease.id
+    lease.away_since = core.now
+    core.away[lease.id] = lease
+    core.timers.set(("ttl", lease.id), core.now + lease.spec.ttl_s + core.settings.fence_grace_s)
+
+
+def _selected(core: Core, spec: Spec) -> list[Gpu]:
+    return [gpu for gpu in core.gpus.values() if spec.gpu in ("any", gpu.info.id, str(gpu.info.index))]
+
+
+def _remembered(core: Core, record: Mapping[str, Any], state: LeaseState) -> Lease:
+    """The lease of a record, on no card yet."""
     spec = spec_from_record(record["spec"])
-    lease = Lease(
-        id=lease_id,
+    return Lease(
+        id=LeaseId(str(record["lease_id"])),
         nonce=str(record["nonce"]),
         spec=spec,
-        process=process,
+        process=ProcessKey(int(record["pid"]), int(record["start_ticks"])),
         client=ClientId(""),
         arrived_at=core.now,
         arrival=core.next_arrival(),
         load_peak_bytes=int(record["load_peak_bytes"]),
         steady_bytes=max(spec.steady_bytes, spec.residue_bytes),
-        gpus=(gpu.info.id,),
-        state=LeaseState.HELD if state == "debt" else LeaseState(state),
+        gpus=(),
+        state=state,
         since=core.now,
-        token=token,
-        gpu=gpu.info.id,
+        token=Token(int(record["token"][0]), int(record["token"][1])),
         measured_bytes=record["measured_bytes"],
         granted_at=core.now,
         ready_at=core.now,
@@ -72,8 +85,17 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
         exiting=bool(record["exiting"]),
         pinned=None if record.get("pinned") is None else Order(*record["pinned"]),
         attached=False,
-        story=[(core.now, LeaseState.HELD, "recovered from the journal")],
+        comes_back=bool(record.get("comes_back", False)),
+        left_for=str(record.get("left_for", "")),
+        story=[(core.now, state, "recovered from the journal")],
     )
+
+
+def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
+    state = str(record["state"])
+    lease = _remembered(core, record, LeaseState.HELD if state == "debt" else LeaseState(state))
+    lease_id, process, token, spec = lease.id, lease.process, lease.token, lease.spec
+    lease.gpu, lease.gpus = gpu.info.id, (gpu.info.id,)
     _place(core, gpu, lease, int(record["charge_bytes"]))
     core.nonces[process, lease.nonce] = lease_id
     if state == "debt":
@@ -86,10 +108,29 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
     if lease.state is LeaseState.VERIFYING:
         begin_for_lease(core, gpu, lease, alive=True)
         return
+    if lease.state is LeaseState.REVOKING:
+        lease.eviction = _asked_before(core, gpu, lease)
+        lease.eviction.order = None if record.get("ordered") is None else Order(*record["ordered"])
     lease.expires_at = core.now + spec.ttl_s + core.settings.fence_grace_s
     core.timers.set(("ttl", lease_id), lease.expires_at)
     assert core.recovering is not None, "restoring outside recovery"
     core.recovering.add(lease_id)
+
+
+def _asked_before(core: Core, gpu: Gpu, lease: Lease) -> Eviction:
+    """The `revoke` of the earlier daemon stands: its holder may be unloading by now. It is sent again when he comes back."""
+    asked = Eviction(
+        lease=lease.id,
+        consumer=lease.spec.consumer,
+        charge_bytes=gpu.ledger.charge_bytes(lease.id),
+        wanted_by=None,
+        wanted_consumer=lease.left_for,
+        reason="asked to leave before the restart",
+        asked_at=core.now,
+        next_push_at=core.now + core.settings.revoke_resend_s,
+    )
+    gpu.evictions.append(asked)
+    return asked
 
 
 def _place(core: Core, gpu: Gpu, lease: Lease, charge_bytes: int) -> None:
@@ -114,6 +155,7 @@ def spec_from_record(record: Mapping[str, Any]) -> Spec:
         ttl_s=float(record["ttl_s"]),
         min_residency_s=float(record["min_residency_s"]),
         deny_on_deadline=bool(record["deny_on_deadline"]),
+        standby=bool(record.get("standby", False)),
     )
 
 
@@ -147,7 +189,7 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
         if item.lease in core.ended:
             raise ended_error(core.ended[item.lease])
         lease = _adopt(core, client, item)
-    elif lease.token != item.token:
+    elif lease.token != item.token and not _missed_its_grant(lease, client, item):
         raise Refused(
             "stale_token", f"{item.token} is not the token of {item.lease}", "unload, then acquire again"
         )
@@ -161,15 +203,43 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
         lease.ready_at = (
             core.now
         )  # its residency begins anew: who marked uses on it may still be on the way back
-        core.gpu_of(lease).residents.recent[lease.id] = lease
-    if lease.state is LeaseState.LOADING and item.held:  # its `ready` was lost
+        if lease.gpu is not None:
+            core.gpu_of(lease).residents.recent[lease.id] = lease
+    if item.away:
+        _believe_away(core, lease, item)
+    elif lease.state is LeaseState.LOADING and item.held:  # its `ready` was lost
         become_held(core, lease, item.measured_bytes)
         core.record_lease(lease)
-    _restore_uses(core, lease, client, item)
+    if lease.gpu is not None:
+        _restore_uses(core, lease, client, item)
     touch(core, lease)
     account_for(core, lease.id)
     core.note("reattached", lease, uses=len(lease.uses), state=str(lease.state))
     return lease
+
+
+def _missed_its_grant(lease: Lease, client: Client, item: ReattachedLease) -> bool:
+    """It came back from standby while its holder was not connected, who knows the token before."""
+    return (
+        item.away
+        and lease.state is LeaseState.LOADING
+        and lease.process == client.process
+        and lease.token is not None
+        and item.token < lease.token
+    )
+
+
+def _believe_away(core: Core, lease: Lease, item: ReattachedLease) -> None:
+    """The holder says that it let go. What was lost on the way is made up for: its `release`, or the `granted` to it."""
+    if lease.state in AWAY:
+        core.timers.clear(("ttl", lease.id))
+        standby.wake_all(core, lease)
+    elif lease.token != item.token:
+        core.push(lease, {"push": "granted", "lease": explain.view(core, lease)})
+    elif lease.state in EXPIRING:
+        ordered = lease.eviction is not None and lease.eviction.order is not None
+        back = lease.spec.standby and not ordered
+        let_go(core, lease, exiting=False, why="let go, says its holder", comes_back=back)
 
 
 def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLease) -> None:
@@ -196,7 +266,7 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
     """The journal does not know this lease but its token is of an earlier epoch: its holder is believed while recovering."""
     if core.recovering is None or item.token.epoch >= core.settings.epoch:
         raise Refused("lease_lost", f"{item.lease} is not known", "unload, then acquire again")
-    gpus = [gpu for gpu in core.gpus.values() if item.spec.gpu in ("any", gpu.info.id, str(gpu.info.index))]
+    gpus = _selected(core, item.spec)
     if not gpus:
         raise Refused("unknown_gpu", f"there is no GPU {item.spec.gpu!r}", "unload, then acquire again")
     gpu = gpus[0]
@@ -227,10 +297,15 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
         answered=True,
         story=[(core.now, LeaseState.HELD, "adopted: the journal did not know it")],
     )
-    _place(core, gpu, lease, charge)
     core.add(lease)
-    gpu.residents[lease.id] = lease
     core.nonces[lease.process, lease.nonce] = lease.id
+    if item.away:
+        lease.state, lease.gpu, lease.comes_back = LeaseState.STANDBY, None, True
+        lease.gpus = tuple(gpu.info.id for gpu in gpus)
+        standby.enter(core, lease)
+        return lease
+    _place(core, gpu, lease, charge)
+    gpu.residents[lease.id] = lease
     core.record_lease(lease)
     return lease
 
@@ -261,6 +336,9 @@ def void_at_baseline(core: Core, sample: MemorySampled) -> None:
         if lease.attached or lease.state not in EXPIRING - {LeaseState.LOADING}:
             continue
         if gpu.ledger.charge_bytes(lease.id) <= noise_bytes:
+            continue
+        if lease.state is LeaseState.REVOKING and standby.stays_on(lease):  # it left as it was asked to
+            let_go(core, lease, exiting=False, why="the card is empty", comes_back=True)
             continue
         gpu.ledger.drop(lease.id, 0, 0, core.now)
         core.forget(f"lease:{lease.id}")

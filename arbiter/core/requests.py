@@ -6,11 +6,12 @@ anyone who knows the exact token.
 
 from dataclasses import replace
 
-from arbiter.core import drift, eviction, explain
+from arbiter.core import drift, eviction, explain, standby
 from arbiter.core.events import (
     AcquireRequested,
     CancelRequested,
     OomReported,
+    Reacquired,
     ReadyReported,
     ReleaseReported,
     Renewed,
@@ -18,10 +19,10 @@ from arbiter.core.events import (
     Spec,
     UnloadStarted,
 )
-from arbiter.core.lease import EXPIRING, LEAVING, Lease, LeaseState, Use
+from arbiter.core.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState, Recall, Use
 from arbiter.core.measure import begin_for_lease
 from arbiter.core.state import Client, Core, Ended, Refused
-from schemas.ids import ClientId, GpuId, LeaseId, Token
+from schemas.ids import ClientId, GpuId, LeaseId, RequestId, Token
 
 _HINT_ACQUIRE = "unload, then acquire again"
 
@@ -105,8 +106,11 @@ def acquire(core: Core, event: AcquireRequested) -> None:
     spec = replace(event.spec, exclusive=True) if core.settings.scheduling.alone else event.spec
     load_peak, steady = drift.expected_bytes(core, spec)
     gpus = _places(core, spec, load_peak)
-    if len(core.waiting) >= core.settings.waiters_max:
-        raise Refused("limit_exceeded", "too many wait already", "try again later", limit="waiters_max")
+    _check_waiters(core)
+    away = standby.find(core, client.process, spec.consumer, spec.key)
+    if away is not None:
+        _take_over(core, event, away, spec, gpus)
+        return
     owned = sum(1 for lease in core.leases_of(client.process) if lease.client == client.id)
     if owned >= core.settings.leases_per_client_max:
         raise Refused(
@@ -133,14 +137,63 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         story=[(core.now, LeaseState.QUEUED, "acquired")],
     )
     core.add(lease)
-    core.waiting[lease.id] = lease
     core.nonces[nonce] = lease.id
-    for gpu_id in gpus:
-        core.gpus[gpu_id].queue.add(lease)
-        core.wake(core.gpus[gpu_id])
-    if event.wait_timeout_s is not None:
-        core.timers.set(("wait", lease.id), core.now + event.wait_timeout_s)
+    core.enqueue(lease)
     core.unanswered.append(lease)
+
+
+def _check_waiters(core: Core) -> None:
+    if len(core.waiting) >= core.settings.waiters_max:
+        raise Refused("limit_exceeded", "too many wait already", "try again later", limit="waiters_max")
+
+
+def _take_over(
+    core: Core, event: AcquireRequested, lease: Lease, spec: Spec, gpus: tuple[GpuId, ...]
+) -> None:
+    """The process has a lease for this model, away: the acquire means that one, as it is asked for now."""
+    lease.earlier_nonces.append(lease.nonce)
+    lease.nonce = event.nonce
+    core.nonces[lease.process, event.nonce] = lease.id
+    lease.spec = spec
+    lease.traceparent = event.traceparent
+    _call_back(core, lease, event.client, event.request, event.wait_timeout_s, gpus)
+
+
+def _call_back(
+    core: Core,
+    lease: Lease,
+    client: ClientId,
+    request: RequestId,
+    wait_timeout_s: float | None,
+    gpus: tuple[GpuId, ...],
+) -> None:
+    lease.gpus = gpus
+    lease.load_peak_bytes, lease.steady_bytes = drift.expected_bytes(core, lease.spec)
+    standby.queue_again(core, lease, client, request, core.now, wait_timeout_s)
+    core.unanswered.append(lease)
+
+
+def reacquire(core: Core, event: Reacquired) -> None:
+    """A lease that is away, or on its way there, is wanted now. One that is wanted or back already is answered as it is."""
+    client = client_of(core, event.client)
+    lease = lease_for(core, event.lease, event.token)
+    if lease.process != client.process:
+        raise Refused(
+            "not_permitted", f"{lease.id} belongs to process {lease.process.pid}", "ask as its holder"
+        )
+    if lease.state in AWAY:
+        gpus = _places(core, lease.spec, drift.expected_bytes(core, lease.spec)[0])
+        _check_waiters(core)
+        _call_back(core, lease, event.client, event.request, event.wait_timeout_s, gpus)
+        return
+    if lease.state is LeaseState.VERIFYING and lease.comes_back:
+        lease.recalled = lease.recalled or Recall(core.now, event.wait_timeout_s)
+    elif lease.state is not LeaseState.QUEUED:
+        raise bad_state(
+            lease, "only a lease that is away, or being measured on its way there, is called back"
+        )
+    lease.client = client.id
+    core.reply(event.client, event.request, {"state": "queued", "lease": explain.view(core, lease)})
 
 
 def answer_queued(core: Core) -> None:
@@ -159,7 +212,7 @@ def _acquire_again(core: Core, event: AcquireRequested, lease_id: LeaseId) -> No
     if lease is None:
         raise ended_error(core.ended[lease_id])
     lease.client = event.client  # the newest connection of the process is the one that listens
-    state = "queued" if lease.state is LeaseState.QUEUED else "loading"
+    state = str(lease.state) if lease.state in (LeaseState.QUEUED, *AWAY) else "loading"
     core.reply(event.client, event.request, {"state": state, "lease": explain.view(core, lease)})
 
 
@@ -223,6 +276,10 @@ def cancel(core: Core, event: CancelRequested) -> None:
         raise Refused(
             "not_permitted", f"{lease.id} belongs to process {lease.process.pid}", "ask as its holder"
         )
+    if lease.state in AWAY:
+        standby.give_up(core, lease, LeaseState.CANCELLED, "cancelled", "its holder gave up")
+        core.reply(event.client, event.request, {"state": "cancelled"})
+        return
     if lease.state is not LeaseState.QUEUED:
         raise bad_state(lease, "it is granted already, release it")
     cancel_waiter(core, lease, "its holder gave up")
@@ -336,7 +393,7 @@ def unloading(core: Core, event: UnloadStarted) -> None:
 
 
 def release(core: Core, event: ReleaseReported) -> None:
-    """The holder let go. Its bytes stay charged until they are measured gone."""
+    """The holder let go. Its bytes stay charged until they are measured gone. A repeat never ends a lease that went on standby."""
     process = client_of(core, event.client).process
     ended = core.ended.get(event.lease)
     same = ended is not None and (ended.token, ended.process) == (event.token, process)
@@ -344,8 +401,14 @@ def release(core: Core, event: ReleaseReported) -> None:
         core.reply(event.client, event.request, {"state": str(ended.state)})
         return
     lease = own_lease(core, event.client, event.lease, event.token)
-    if lease.state is not LeaseState.VERIFYING:
-        let_go(core, lease, exiting=event.exiting, why="exits" if event.exiting else "let go")
+    if lease.gpu is not None and lease.state is not LeaseState.VERIFYING:  # else: a repeat
+        let_go(
+            core,
+            lease,
+            exiting=event.exiting,
+            why="exits" if event.exiting else "let go",
+            comes_back=standby.stays_on(lease) and not event.exiting,
+        )
     core.reply(event.client, event.request, {"state": str(lease.state)})
 
 
@@ -364,12 +427,13 @@ def note_ended(core: Core, lease: Lease, use: Use, why: str) -> None:
     )
 
 
-def let_go(core: Core, lease: Lease, *, exiting: bool, why: str) -> None:
+def let_go(core: Core, lease: Lease, *, exiting: bool, why: str, comes_back: bool = False) -> None:
     """From any resident state to verification. Uses that others left on it end with it."""
     gpu = core.gpu_of(lease)
     end_uses(core, lease, why)
     before = lease.state
     lease.exiting = exiting
+    lease.comes_back = comes_back
     lease.move(LeaseState.VERIFYING, core.now, why)
     core.timers.clear(("ttl", lease.id))
     if lease.eviction is not None:
@@ -385,6 +449,8 @@ def let_go(core: Core, lease: Lease, *, exiting: bool, why: str) -> None:
 def oom(core: Core, event: OomReported) -> None:
     """An allocation failed. If the holder asked for more than it was granted, its footprint was wrong: learn it."""
     lease = own_lease(core, event.client, event.lease, event.token)
+    if lease.gpu is None:
+        raise bad_state(lease, "it holds nothing")
     gpu = core.gpu_of(lease)
     charge = gpu.ledger.charge_bytes(lease.id)
     allocated = charge if event.allocated_bytes is None else event.allocated_bytes

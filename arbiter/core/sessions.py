@@ -4,8 +4,9 @@ Leases belong to processes: a connection that drops loses nothing that is reside
 out); `bye` gives everything back; death ends everything, and what was held is measured away before anyone else gets it.
 """
 
+from arbiter.core import standby
 from arbiter.core.events import BYE, ClientConnected, ClientLeft, JournalFailed
-from arbiter.core.lease import EXPIRING, Lease, LeaseState
+from arbiter.core.lease import AWAY, EXPIRING, Lease, LeaseState
 from arbiter.core.measure import begin_for_residue, bereave, lose
 from arbiter.core.recovery import account_for
 from arbiter.core.requests import cancel_waiter, let_go
@@ -36,6 +37,12 @@ def on_left(core: Core, event: ClientLeft) -> None:
             continue
         if lease.state is LeaseState.QUEUED:
             cancel_waiter(core, lease, f"its client left: {event.reason}")
+        elif lease.state in AWAY:
+            standby.give_up(
+                core, lease, LeaseState.CANCELLED, "cancelled", f"its client left: {event.reason}"
+            )
+        elif lease.state is LeaseState.VERIFYING:
+            standby.renounce(lease)
         elif lease.state in EXPIRING and event.reason == BYE:
             let_go(core, lease, exiting=False, why="its client said bye")
 
@@ -68,12 +75,15 @@ def _bereave(core: Core, lease: Lease) -> None:
     account_for(core, lease.id)
     if lease.state is LeaseState.QUEUED:
         cancel_waiter(core, lease, "its process died")
+    elif lease.state in AWAY:
+        standby.give_up(core, lease, LeaseState.LOST, "lease_lost", "its process died")
     elif lease.state in EXPIRING:
         message = f"{lease.id}: process {lease.process.pid} died"
         core.note("lost", lease, reason=message)
         error = {"code": "lease_lost", "message": message, "hint": "acquire again", "details": {}}
         lose(core, lease, LeaseState.LOST, error, alive=False, grace_s=0.0)
-    # a lease under verification goes on: only its residue is no longer expected
+    else:  # a lease under verification goes on: only its residue is no longer expected
+        standby.renounce(lease)
 
 
 def on_journal_failed(core: Core, event: JournalFailed) -> None:

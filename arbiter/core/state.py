@@ -60,6 +60,7 @@ class Ended:
     token: Token | None
     state: LeaseState
     error: Mapping[str, Any] | None
+    earlier_nonces: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
@@ -114,6 +115,7 @@ class Core:
         self.leases: dict[LeaseId, Lease] = {}
         self._of_process: dict[ProcessKey, dict[LeaseId, Lease]] = {}
         self.waiting: dict[LeaseId, Lease] = {}
+        self.away: dict[LeaseId, Lease] = {}  # without bytes on a card, in the order of their leaving
         self.nonces: dict[tuple[ProcessKey, str], LeaseId] = {}
         self.clients: dict[ClientId, Client] = {}
         self.ended: OrderedDict[LeaseId, Ended] = OrderedDict()
@@ -211,6 +213,7 @@ class Core:
         """A use is busy from now on."""
         lease.yielded.pop((use.process, use.id), None)
         lease.uses[use.process, use.id] = use
+        lease.uncalled = False
         self.users.setdefault(use.process, {})[lease.id, use.id] = lease
 
     def unmark(self, lease: Lease, use: Use) -> None:
@@ -220,6 +223,15 @@ class Core:
         del mine[lease.id, use.id]
         if not mine:
             del self.users[use.process]
+
+    def enqueue(self, lease: Lease) -> None:
+        """A lease begins to wait, on every card that it may be placed on."""
+        self.waiting[lease.id] = lease
+        for gpu_id in lease.gpus:
+            self.gpus[gpu_id].queue.add(lease)
+            self.wake(self.gpus[gpu_id])
+        if lease.wait_timeout_s is not None:
+            self.timers.set(("wait", lease.id), lease.arrived_at + lease.wait_timeout_s)
 
     def dequeue(self, lease: Lease) -> None:
         self.waiting.pop(lease.id, None)
@@ -237,17 +249,22 @@ class Core:
             del self._of_process[lease.process]
         for kind in ("ttl", "revoke"):
             self.timers.clear((kind, lease.id))
+        self.away.pop(lease.id, None)
         if lease.gpu is not None:
             gpu = self.gpus[lease.gpu]
             gpu.residents.pop(lease.id, None)
             self.wake(gpu)
-        self.remember(Ended(lease.id, lease.process, lease.nonce, lease.token, lease.state, error))
+        elif lease.token is not None:  # it was resident once: the journal knows it as away
+            self.forget(f"lease:{lease.id}")
+        earlier = tuple(lease.earlier_nonces)
+        self.remember(Ended(lease.id, lease.process, lease.nonce, lease.token, lease.state, error, earlier))
 
     def remember(self, ended: Ended) -> None:
         self.ended[ended.lease] = ended
         while len(self.ended) > ENDED_REMEMBERED:
             _, oldest = self.ended.popitem(last=False)
-            self.nonces.pop((oldest.process, oldest.nonce), None)
+            for nonce in (oldest.nonce, *oldest.earlier_nonces):
+                self.nonces.pop((oldest.process, nonce), None)
 
     def learn(self, consumer: str, phase: str, seconds: float) -> None:
         """Remember how long a phase (`drain_s`, `unload_s`, `verify_s`, `load_s`) took for a consumer."""
@@ -260,10 +277,11 @@ class Core:
         return median(seen) if seen else None
 
     def record_lease(self, lease: Lease, *, debt: bool = False) -> None:
-        """Write a resident lease (or its debt) to the journal."""
+        """Write a lease that is resident (or its debt) or away to the journal."""
         spec = lease.spec
-        gpu = self.gpu_of(lease)
-        assert lease.token is not None, f"{lease.id} is resident without a token"
+        charge_bytes = 0 if lease.gpu is None else self.gpu_of(lease).ledger.charge_bytes(lease.id)
+        assert lease.token is not None, f"{lease.id} is recorded without a token"
+        order = None if lease.eviction is None else lease.eviction.order
         self.journal(
             f"lease:{lease.id}",
             {
@@ -274,11 +292,14 @@ class Core:
                 "pid": lease.process.pid,
                 "start_ticks": lease.process.start_ticks,
                 "nonce": lease.nonce,
-                "charge_bytes": gpu.ledger.charge_bytes(lease.id),
+                "charge_bytes": charge_bytes,
                 "load_peak_bytes": lease.load_peak_bytes,
                 "measured_bytes": lease.measured_bytes,
                 "exiting": lease.exiting,
                 "pinned": None if lease.pinned is None else [lease.pinned.by, lease.pinned.reason],
+                "comes_back": lease.comes_back,
+                "left_for": lease.left_for,
+                "ordered": None if order is None else [order.by, order.reason],
                 "spec": {
                     "consumer": spec.consumer,
                     "model_id": spec.key.model_id,
@@ -293,6 +314,7 @@ class Core:
                     "ttl_s": spec.ttl_s,
                     "min_residency_s": spec.min_residency_s,
                     "deny_on_deadline": spec.deny_on_deadline,
+                    "standby": spec.standby,
                 },
             },
         )

@@ -387,6 +387,8 @@ class SessionTable:
                 post(ev.ReleaseReported(client, re, *_on_lease(request), request.exiting))
             case w.Cancel():
                 post(ev.CancelRequested(client, re, LeaseId(request.lease_id)))
+            case w.Reacquire():
+                post(ev.Reacquired(client, re, *_on_lease(request), request.wait_timeout_s))
             case w.Reattach():
                 session.leased = True
                 post(ev.Reattached(client, re, tuple(_reattached(lease) for lease in request.leases)))
@@ -431,6 +433,7 @@ def to_spec(spec: w.LeaseSpec) -> ev.Spec:
         ttl_s=spec.ttl_s,
         min_residency_s=spec.min_residency_s,
         deny_on_deadline=spec.on_deadline == "deny",
+        standby=spec.standby,
     )
 
 
@@ -440,7 +443,7 @@ def _operator(session: Session) -> str:
 
 
 def _on_lease(
-    request: w.Ready | w.UseBegin | w.UseEnd | w.Yield | w.RevokeAck | w.Unloading | w.Release,
+    request: w.Ready | w.UseBegin | w.UseEnd | w.Yield | w.RevokeAck | w.Unloading | w.Release | w.Reacquire,
 ) -> tuple[LeaseId, Token]:
     return LeaseId(request.lease_id), Token(*request.token)
 
@@ -453,4 +456,5 @@ def _reattached(lease: w.ReattachLease) -> ev.ReattachedLease:
         held=lease.state == "held",
         measured_bytes=lease.measured_bytes,
         uses=tuple(UseId(use) for use in lease.use_ids),
+        away=lease.state == "standby",
     )

@@ -28,6 +28,7 @@ from arbiter.core.events import (
     ProbeFailed,
     ProcessDied,
     ProcessUse,
+    Reacquired,
     ReadyReported,
     Reattached,
     ReattachedLease,
@@ -310,11 +311,13 @@ class Consumer:
         ttl_s: float = 3600.0,
         min_residency_s: float = 0.0,
         deny_on_deadline: bool = False,
+        standby: bool = False,
+        key: str | None = None,
     ) -> Spec:
         """A spec with the bytes that matter; no residue, no residency and a long ttl unless asked for."""
         return Spec(
             consumer=self.name,
-            key=ModelKey(f"{self.name}-model"),
+            key=ModelKey(key or f"{self.name}-model"),
             gpu=gpu,
             exclusive=exclusive,
             load_peak_bytes=load_peak_bytes,
@@ -325,6 +328,7 @@ class Consumer:
             ttl_s=ttl_s,
             min_residency_s=min_residency_s,
             deny_on_deadline=deny_on_deadline,
+            standby=standby,
         )
 
     def acquire(
@@ -421,6 +425,15 @@ class Consumer:
     def cancel(self, lease: LeaseId) -> list[Effect]:
         return self.driver.post(CancelRequested(self.client, self.driver.next_request(), lease))
 
+    def reacquire(
+        self, lease: LeaseId, *, wait_timeout_s: float | None = None, token: Token | None = None
+    ) -> list[Effect]:
+        return self.driver.post(
+            Reacquired(
+                self.client, self.driver.next_request(), lease, token or self.token(lease), wait_timeout_s
+            )
+        )
+
     def oom(self, lease: LeaseId, requested_bytes: int, allocated_bytes: int | None = None) -> list[Effect]:
         return self.driver.post(
             OomReported(
@@ -442,9 +455,16 @@ class Consumer:
         measured_bytes: int | None = None,
         uses: Sequence[str] = (),
         spec: Spec | None = None,
+        away: bool = False,
     ) -> list[Effect]:
         item = ReattachedLease(
-            lease, token, spec or self.specs[lease], held, measured_bytes, tuple(UseId(use) for use in uses)
+            lease,
+            token,
+            spec or self.specs[lease],
+            held,
+            measured_bytes,
+            tuple(UseId(use) for use in uses),
+            away,
         )
         return self.driver.post(Reattached(self.client, self.driver.next_request(), (item,)))
 

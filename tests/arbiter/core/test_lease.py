@@ -3,7 +3,15 @@
 import pytest
 
 from arbiter.core.events import Spec
-from arbiter.core.lease import TERMINAL, TRANSITIONS, IllegalTransition, Lease, LeaseState
+from arbiter.core.lease import (
+    AWAY,
+    STORY_MAX,
+    TERMINAL,
+    TRANSITIONS,
+    IllegalTransition,
+    Lease,
+    LeaseState,
+)
 from schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey
 
 
@@ -23,9 +31,19 @@ def test_every_state_is_in_the_table_and_terminal_ones_lead_nowhere() -> None:
     } == TERMINAL
 
 
-def test_no_way_leads_back_to_queued_or_out_of_expired() -> None:
-    assert not any(LeaseState.QUEUED in following for following in TRANSITIONS.values())
+def test_only_who_is_away_waits_again_and_nothing_leads_out_of_expired() -> None:
+    back = {state for state, following in TRANSITIONS.items() if LeaseState.QUEUED in following}
+    assert back == AWAY
     assert not TRANSITIONS[LeaseState.EXPIRED]
+
+
+def test_a_long_life_is_told_by_its_last_steps() -> None:
+    one = lease()
+    for turn in range(40):
+        for to in (LeaseState.LOADING, LeaseState.HELD, LeaseState.VERIFYING, LeaseState.STANDBY):
+            one.move(to, float(turn), f"turn {turn}")
+    assert len(one.story) == STORY_MAX
+    assert one.told().endswith("39.000 standby (turn 39)")
 
 
 def test_a_legal_life_is_told() -> None:

@@ -168,6 +168,20 @@ def test_roles(bench: Bench) -> None:
         assert code(bench.ask(op, b"v", **fields)) == "not_permitted"
 
 
+def test_requests_of_leases_that_come_back(bench: Bench) -> None:
+    bench.hello()
+    bench.events.clear()
+    me, token, on = ClientId(b"a".hex()), Token(3, 7), {"lease_id": "L3-1", "token": [3, 7]}
+    wanted = {"consumer": "detector", "model_id": "m", "footprint": FOOTPRINT, "standby": True}
+    bench.ask("reacquire", **on, wait_timeout_s=4.0)
+    bench.ask("reattach", leases=[{**on, "spec": wanted, "state": "standby"}])
+    reacquired, reattached = bench.events
+    assert reacquired == ev.Reacquired(me, RequestId(bench.next_id - 1), LEASE, token, 4.0)
+    assert isinstance(reattached, ev.Reattached)
+    (item,) = reattached.leases
+    assert (item.away, item.held, item.spec.standby) == (True, False, True)
+
+
 def test_every_request_on_leases_becomes_its_event(bench: Bench) -> None:
     bench.hello()
     bench.events.clear()
@@ -236,7 +250,7 @@ def test_every_op_of_the_wire_is_dispatched(bench: Bench) -> None:
         "hello": {"version": 1, "name": "n", "instance": "i-61"},
         "acquire": {"nonce": "n", "spec": {"consumer": "c", "model_id": "m", "footprint": FOOTPRINT}},
         "use_begin": {**on, "use_id": "u"}, "use_end": {**on, "use_id": "u"}, "renew": {"leases": []},
-        "cancel": {"lease_id": "L"}, "reattach": {"leases": []}, "oom": {**on, "requested_bytes": 1},
+        "cancel": {"lease_id": "L"}, "reacquire": on, "reattach": {"leases": []}, "oom": {**on, "requested_bytes": 1},
         "why": {"consumer": "c"}, **dict.fromkeys(("ready", "revoke_ack", "unloading", "release"), on),
     }  # fmt: skip
     bench.hello()

@@ -1,0 +1,189 @@
+"""Leases that live on without bytes on a card: they were asked to leave, and come back by themselves when there is room.
+
+Coming back is a favour, never a claim: nobody is asked to leave for it, nobody who waits is passed by, and it stays away while the
+consumer that it left for is on the card. A holder that needs its lease *now* says so (`reacquire`) and is a waiter like any other.
+Chooses who comes back; the grant itself is in `grants`. Must not know clients or requests beyond their ids.
+"""
+
+from collections.abc import Iterator
+
+from arbiter.core import drift, policy
+from arbiter.core.lease import AWAY, Lease, LeaseState
+from arbiter.core.state import Core, Gpu
+from schemas.ids import ClientId, ModelKey, ProcessKey, RequestId
+
+NOT_BACK = "its holder did not come back after the restart"
+
+
+# -- going away ------------------------------------------------------------------------------------------------------
+def stays_on(lease: Lease) -> bool:
+    """Does it go on standby when it lets go now? Only if the engine asked it to leave: who leaves by himself does not want back,
+    and whom an operator evicts is not wanted back."""
+    return lease.spec.standby and lease.eviction is not None and lease.eviction.order is None
+
+
+def settle(core: Core, lease: Lease, verdict: str) -> None:
+    """Its bytes are measured gone: the end, or standby."""
+    if not lease.comes_back:
+        lease.move(LeaseState.RELEASED, core.now, verdict)
+        core.end(lease, None)
+        return
+    gpu = core.gpu_of(lease)
+    del gpu.residents[lease.id]
+    core.wake(gpu)
+    lease.move(LeaseState.STANDBY, core.now, verdict)
+    lease.gpu = lease.baseline = lease.eviction = lease.measured_bytes = lease.request = None
+    lease.load_peak_bytes, lease.steady_bytes = drift.expected_bytes(core, lease.spec)
+    lease.evicted = []
+    lease.answered = True
+    enter(core, lease)
+    core.note("standby", lease, left_for=lease.left_for, reason="comes back by itself when there is room")
+    if lease.recalled is not None:
+        recall, lease.recalled = lease.recalled, None
+        queue_again(core, lease, lease.client, None, recall.asked_at, recall.wait_timeout_s)
+
+
+def enter(core: Core, lease: Lease) -> None:
+    """It is away from now on, in the journal too."""
+    lease.away_since = core.now
+    core.away[lease.id] = lease
+    core.record_lease(lease)
+    wake_all(core, lease)
+
+
+def renounce(lease: Lease) -> None:
+    """A lease under measurement whose holder does not want it back."""
+    lease.comes_back = False
+    lease.recalled = None
+
+
+def send_off(core: Core, lease: Lease, why: str) -> None:
+    """A lease that is away ends against its holder's wish: he is told."""
+    token = lease.token
+    assert token is not None, f"{lease.id} is away and was never granted"
+    error = {"code": "lease_lost", "message": f"{lease.id}: {why}", "hint": "acquire again", "details": {}}
+    told = {"push": "lost", "lease_id": lease.id, "token": [token.epoch, token.serial], "error": error}
+    core.push(lease, told)
+    give_up(core, lease, LeaseState.CANCELLED, "lease_lost", why)
+
+
+def give_up(core: Core, lease: Lease, to: LeaseState, code: str, why: str) -> None:
+    """A lease that is away ends; nothing has to be measured."""
+    lease.move(to, core.now, why)
+    core.note(str(to), lease, reason=why)
+    core.end(lease, {"code": code, "message": f"{lease.id}: {why}", "hint": "acquire again", "details": {}})
+
+
+# -- coming back -----------------------------------------------------------------------------------------------------
+def find(core: Core, process: ProcessKey, consumer: str, key: ModelKey) -> Lease | None:
+    """The lease of this process for this model that is away: a new acquire takes it over."""
+    return next(
+        (
+            lease
+            for lease in core.leases_of(process)
+            if lease.state in AWAY and (lease.spec.consumer, lease.spec.key) == (consumer, key)
+        ),
+        None,
+    )
+
+
+def queue_again(
+    core: Core,
+    lease: Lease,
+    client: ClientId,
+    request: RequestId | None,
+    asked_at: float,
+    wait_timeout_s: float | None,
+) -> None:
+    """From away into the queues, as somebody who came at `asked_at`. Without a request it is told by push."""
+    del core.away[lease.id]
+    lease.move(LeaseState.QUEUED, core.now, "wanted again")
+    lease.client = client
+    lease.request = request
+    lease.answered = request is None
+    lease.arrived_at = asked_at
+    lease.arrival = core.next_arrival()
+    lease.wait_timeout_s = wait_timeout_s
+    lease.planned_gpu = None
+    core.enqueue(lease)
+
+
+def taken_back(core: Core, lease: Lease) -> bool:
+    """The lease is being granted. Did it come back by itself? Then it has waited for nothing, and has no claim to stay yet."""
+    lease.comes_back = False
+    lease.uncalled = core.away.pop(lease.id, None) is not None
+    if lease.uncalled:
+        lease.arrived_at = core.now
+    return lease.uncalled
+
+
+def next_back(core: Core, gpu: Gpu) -> Lease | None:
+    """Who comes back to this card, on which nobody waits: by priority, then who left first.
+
+    One that does not fit yet keeps its turn: others pass it only where it would still fit beside them. The card has to be quiet
+    for the lease's own minimum residency first: between two goals a policy is away for a moment only.
+    """
+    ahead: Lease | None = None
+    spare_bytes = 0
+    for lease in _by_turn(core, gpu):
+        if ahead is not None and (ahead.spec.exclusive or policy.added_bytes(gpu, lease) > spare_bytes):
+            continue
+        if policy.fits(gpu, lease):
+            due_at = _quiet_at(gpu, lease)
+            if due_at <= core.now:
+                return lease
+            core.timers.set(("return", gpu.info.id), due_at)
+            return None
+        if ahead is None:
+            ahead, spare_bytes = lease, policy.spare_beside_bytes(gpu, lease, {}, planned=False)
+    return None
+
+
+def outlook(core: Core, lease: Lease) -> str:
+    """What it waits for, in words; of several cards the first that it may return to."""
+    if not lease.attached:
+        return f"on standby, but {NOT_BACK}"
+    gpu = core.gpus[lease.gpus[0]]
+    blocked = policy.blocked(core, gpu)
+    head = gpu.queue.head()
+    if head is not None:
+        return f"on standby: {head.spec.consumer} waits, and goes first"
+    if blocked:
+        return f"on standby: {blocked}"
+    if _left_for_is_here(gpu, lease):
+        return f"on standby until {lease.left_for} has left"
+    if not policy.fits(gpu, lease):
+        return "on standby until there is room; it asks nobody to leave"
+    due_at = _quiet_at(gpu, lease)
+    if due_at > core.now:
+        return f"on standby: comes back in {due_at - core.now:.1f} s if the card stays quiet"
+    return "on standby: comes back with the next reading of the card, or after those before it"
+
+
+def wake_all(core: Core, lease: Lease) -> None:
+    for gpu_id in lease.gpus:
+        core.wake(core.gpus[gpu_id])
+
+
+def _by_turn(core: Core, gpu: Gpu) -> list[Lease]:
+    return sorted(
+        _returning(core, gpu), key=lambda lease: (-lease.spec.priority, lease.away_since, lease.arrival)
+    )
+
+
+def _returning(core: Core, gpu: Gpu) -> Iterator[Lease]:
+    return (
+        lease
+        for lease in core.away.values()
+        if lease.attached and gpu.info.id in lease.gpus and not _left_for_is_here(gpu, lease)
+    )
+
+
+def _left_for_is_here(gpu: Gpu, lease: Lease) -> bool:
+    return bool(lease.left_for) and any(
+        other.spec.consumer == lease.left_for for other in gpu.residents.values()
+    )
+
+
+def _quiet_at(gpu: Gpu, lease: Lease) -> float:
+    return max(gpu.changed_at, lease.away_since) + lease.spec.min_residency_s

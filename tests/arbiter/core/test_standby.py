@@ -1,0 +1,810 @@
+"""Standby: who was asked to leave comes back by itself when there is room, never at anybody's cost, and a restart loses none of it."""
+
+from typing import Any
+
+import pytest
+
+from arbiter.core import invariants
+from arbiter.core.effects import Push
+from arbiter.core.events import ClientConnected, OperatorAsked, ProcessDied, Recovered
+from arbiter.core.invariants import InvariantViolation
+from arbiter.core.lease import LeaseState
+from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
+from schemas import defaults as d
+from schemas.ids import ClientId, LeaseId, ProcessKey, Token
+
+GIB, MIB = d.GIB, d.MIB
+
+
+def held(
+    driver: CoreDriver, name: str, gib: float, person: Consumer | None = None, **spec: Any
+) -> tuple[Consumer, LeaseId]:
+    person = person or driver.consumer(name)
+    lease = person.acquire(int(gib * GIB), **spec)
+    driver.until(lambda: driver.state(lease) == "loading")
+    person.load(lease)
+    driver.advance(0.01)
+    return person, lease
+
+
+def sent_away(
+    driver: CoreDriver, gib: float = 5, policy_gib: float = 5, **spec: Any
+) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
+    """A detector on standby, and the policy that it left for, resident."""
+    det, lease = held(driver, "det", gib, standby=True, **spec)
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(int(policy_gib * GIB))
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease)
+    driver.until(lambda: driver.state(wanted) == "loading")
+    assert driver.state(lease) == "standby"
+    policy.load(wanted)
+    driver.advance(0.01)
+    return det, lease, policy, wanted
+
+
+# -- there and back --------------------------------------------------------------------------------------------------
+def test_the_detector_returns_by_itself_after_the_grab() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver)
+    before = det.token(lease)
+    policy.use_begin(wanted, "grab")
+    driver.advance(60.0)
+    assert driver.state(lease) == "standby"
+    policy.use_end(wanted, "grab")
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
+    (granted,) = driver.pushes("granted", lease)
+    assert granted["lease"]["lease_id"] == lease
+    assert det.token(lease) > before, "a fresh token"
+    det.load(lease)
+    view = driver.view(lease)
+    assert view is not None
+    assert (view["state"], view["standby"], view["charge_bytes"]) == ("held", True, 5 * GIB)
+    assert driver.notes("granted")[-1]["reason"] == "back from standby: there is room and nobody waits"
+    assert driver.notes("switch")[-1]["switched"] is False
+
+
+def test_what_standby_looks_like() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _, _ = sent_away(driver)
+    view = driver.view(lease)
+    assert view is not None
+    assert (view["gpu"], view["charge_bytes"], view["uses"]) == (None, 0, 0)
+    assert "ttl_left_s" not in view
+    assert "position" not in view
+    assert driver.notes("standby")[-1]["left_for"] == "policy"
+    driver.advance(600.0)
+    assert driver.state(lease) == "standby", "nobody has to renew it"
+    assert answer(det.renew((lease, det.token(lease))))["alive"] == [lease]
+    (why,) = driver.arbiter.why("det", driver.now)["leases"]
+    assert why["text"] == "det: on standby until policy has left"
+
+
+def test_it_never_comes_back_beside_the_one_that_it_left_for() -> None:
+    """Even where both would fit: loading beside a running policy takes time from it."""
+    driver = CoreDriver(10 * GIB)
+    other, resident = held(driver, "vlm", 4)
+    _, lease, policy, wanted = sent_away(driver, gib=3, policy_gib=5)
+    other.unload(resident)
+    driver.advance(10.0)
+    assert driver.state(lease) == "standby"
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
+
+
+def test_it_asks_nobody_to_leave() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease, policy, wanted = sent_away(driver)
+    vlm = driver.consumer("vlm")
+    vlm_lease = vlm.acquire(4 * GIB)
+    driver.until(lambda: driver.state(wanted) == "revoking")
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(vlm_lease) == "loading")
+    vlm.load(vlm_lease)
+    driver.advance(600.0)
+    assert (driver.state(lease), driver.state(vlm_lease)) == ("standby", "held"), "5 + 4 do not fit on 8"
+    (why,) = driver.arbiter.why("det", driver.now)["leases"]
+    assert why["text"] == "det: on standby until there is room; it asks nobody to leave"
+
+
+def test_it_never_delays_a_waiter() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease, policy, wanted = sent_away(driver)
+    busy, small = held(driver, "busy", 1)
+    busy.use_begin(small)
+    policy.use_begin(wanted)
+    big = driver.consumer("big").acquire(7 * GIB)
+    policy.use_end(wanted)
+    policy.unload(wanted)
+    driver.advance(60.0)
+    assert driver.state(big) == "queued"
+    assert driver.state(lease) == "standby", "5 would fit, but somebody waits"
+    (why,) = driver.arbiter.why("det", driver.now)["leases"]
+    assert why["text"] == "det: on standby: big waits, and goes first"
+
+
+def test_it_waits_until_the_card_has_been_quiet() -> None:
+    """Between two goals the policy is away for a moment only."""
+    driver = CoreDriver(8 * GIB)
+    _, lease, policy, wanted = sent_away(driver, min_residency_s=2.0)
+    policy.unload(wanted)
+    driver.advance(1.0)
+    (why,) = driver.arbiter.why("det", driver.now)["leases"]
+    assert "comes back in 1." in why["text"]
+    again = policy.acquire(5 * GIB)
+    assert driver.state(again) == "loading", "the next goal does not wait for the detector"
+    policy.load(again)
+    policy.unload(again)
+    driver.advance(1.9)
+    assert driver.state(lease) == "standby"
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=0.2)
+
+
+def test_who_came_back_unasked_has_no_claim_to_stay() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver, min_residency_s=2.0)
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=3.0)
+    det.load(lease)
+    policy.acquire(5 * GIB)
+    driver.advance(0.01)
+    assert driver.state(lease) == "revoking", "its minimum residency counts from its first use"
+
+
+def test_once_used_it_has_its_residency() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver, min_residency_s=2.0)
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=3.0)
+    det.load(lease)
+    det.use_begin(lease)
+    det.use_end(lease)
+    policy.acquire(5 * GIB)
+    driver.advance(1.0)
+    assert driver.state(lease) == "held"
+    driver.until(lambda: driver.state(lease) == "revoking", limit_s=1.1)
+
+
+def all_away(
+    driver: CoreDriver, boss_gib: float, **wanted: tuple[float, dict[str, Any]]
+) -> dict[str, tuple[Consumer, LeaseId]]:
+    """Several on standby, in this order of leaving, and the card is empty again; nobody is back before a second of quiet."""
+    people = {
+        name: held(driver, name, gib, standby=True, min_residency_s=1.0, **spec)
+        for name, (gib, spec) in wanted.items()
+    }
+    boss = driver.consumer("boss")
+    all_of_it = boss.acquire(int(boss_gib * GIB), priority=90)
+    for person, lease in people.values():
+        driver.until(lambda lease=lease: driver.state(lease) == "revoking")  # type: ignore[misc]
+        person.unload(lease)
+        driver.advance(0.2)
+    boss.load(all_of_it)
+    boss.unload(all_of_it)
+    driver.until(lambda: driver.state(all_of_it) == "over")
+    return people
+
+
+def stay(driver: CoreDriver, gib: float) -> tuple[Consumer, LeaseId]:
+    """Somebody who is resident and stays."""
+    return held(driver, "stays", gib, evictable=False)
+
+
+def test_the_order_is_priority_then_who_left_first() -> None:
+    driver = CoreDriver(8 * GIB)
+    people = all_away(driver, 7, second=(2, {}), first=(2, {}), third=(2, {"priority": 60}))
+    back = []
+    for _ in people:
+        driver.until(lambda: any(driver.state(lease) == "loading" for _, lease in people.values()))
+        name = next(name for name, (_, lease) in people.items() if driver.state(lease) == "loading")
+        back.append(name)
+        person, lease = people[name]
+        person.load(lease)
+    assert back == ["third", "second", "first"]
+
+
+def test_a_small_one_does_not_take_the_place_of_the_one_before_it() -> None:
+    driver = CoreDriver(8 * GIB)
+    people = all_away(driver, 7, det=(5.2, {}), tiny=(2.4, {}))
+    driver.card.set(ProcessKey(9, 9), 1 * GIB, driver.now)
+    other, resident = stay(driver, 2)
+    driver.advance(20.0)
+    assert driver.state(people["det"][1]) == "standby", "5.2 do not fit beside 2 and a stowaway"
+    assert driver.state(people["tiny"][1]) == "standby", "2.4 would, but then the 5.2 never could"
+    (why,) = driver.arbiter.why("tiny", driver.now)["leases"]
+    assert "after those before it" in why["text"]
+    other.unload(resident)
+    driver.until(lambda: driver.state(people["det"][1]) == "loading", limit_s=2.0)
+
+
+def test_a_small_one_does_not_pass_an_exclusive_one() -> None:
+    driver = CoreDriver(8 * GIB)
+    people = all_away(driver, 7, det=(5, {"priority": 60}), tiny=(1, {}))
+    det, alone = people["det"]
+    det.try_acquire(5 * GIB, exclusive=True, standby=True, min_residency_s=1.0, priority=60)
+    det.load(alone)
+    wanted = driver.consumer("boss").acquire(7 * GIB, priority=90)
+    driver.until(lambda: driver.state(alone) == "revoking")
+    det.unload(alone)
+    driver.until(lambda: driver.state(wanted) == "loading")
+    driver.advance(0.1)
+    driver.post(ProcessDied(driver.arbiter._core.leases[wanted].process))
+    _, resident = stay(driver, 4)
+    driver.advance(20.0)
+    assert [driver.state(lease) for lease in (alone, people["tiny"][1], resident)] == [
+        "standby",
+        "standby",
+        "held",
+    ]
+
+
+def test_several_that_do_not_fit_keep_their_turns() -> None:
+    driver = CoreDriver(8 * GIB)
+    people = all_away(driver, 7.5, det=(4, {}), vlm=(3, {}), tiny=(0.5, {}))
+    other, resident = stay(driver, 6)
+    driver.until(lambda: driver.state(people["tiny"][1]) == "loading", limit_s=3.0)
+    people["tiny"][0].load(people["tiny"][1])
+    assert driver.state(people["det"][1]) == driver.state(people["vlm"][1]) == "standby"
+    other.unload(resident)
+    driver.until(lambda: driver.state(people["det"][1]) == "loading", limit_s=3.0)
+
+
+def test_who_leaves_unasked_does_not_want_back() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    assert driver.journal == {}
+
+
+def test_who_exits_does_not_come_back() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    driver.consumer("policy").acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.hold(0)
+    det.release(lease, exiting=True)
+    driver.until(lambda: driver.state(lease) == "over")
+
+
+def test_pressure_sends_on_standby_too_and_lets_back_when_it_is_over() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    game = driver.consumer("game")
+    driver.card.set(game.process, 4 * GIB, driver.now)
+    driver.until(lambda: driver.state(lease) == "revoking", limit_s=5.0)
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "standby")
+    driver.advance(5.0)
+    assert driver.state(lease) == "standby"
+    driver.card.set(game.process, 0, driver.now)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=5.0)
+
+
+def test_a_blocked_card_brings_nobody_back() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease, policy, wanted = sent_away(driver)
+    policy.unload(wanted)
+    driver.card.failing = "NVML_ERROR_UNKNOWN"
+    driver.advance(20.0)
+    assert driver.state(lease) == "standby"
+    (why,) = driver.arbiter.why("det", driver.now)["leases"]
+    assert "cannot be read" in why["text"]
+    driver.card.failing = ""
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=5.0)
+
+
+def test_the_reading_has_to_agree_before_it_comes_back() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = 1.0
+    _, lease, policy, wanted = sent_away(driver)
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading")
+    assert sum(driver.card.shown(driver.now).values()) == 0
+
+
+# -- wanted now ------------------------------------------------------------------------------------------------------
+def test_reacquire_makes_it_a_waiter_that_makes_others_leave() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver)
+    told = answer(det.reacquire(lease))
+    assert (told["state"], told["lease"]["position"]) == ("queued", 1)
+    driver.until(lambda: driver.state(wanted) == "revoking", limit_s=0.1)
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading")
+    assert driver.pushes("granted", lease)
+    det.load(lease)
+    assert driver.notes("switch")[-1]["evicted"][0]["consumer"] == "policy"
+
+
+def test_reacquire_with_room_is_answered_at_once() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver, min_residency_s=20.0)
+    policy.unload(wanted)
+    driver.advance(1.0)
+    told = answer(det.reacquire(lease))
+    assert told["state"] == "loading"
+    assert told["lease"]["token"] == [*told["lease"]["token"]]
+    det.load(lease)
+    assert refusal(det.reacquire(lease)).code == "bad_state"
+
+
+def test_a_late_repeat_of_reacquire_asks_for_nothing() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver)
+    old = det.token(lease)
+    det.reacquire(lease)
+    again = answer(det.reacquire(lease))
+    assert (again["state"], again["lease"]["position"]) == ("queued", 1)
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading")
+    det.load(lease)
+    assert refusal(det.reacquire(lease, token=old)).code == "stale_token"
+    thief = driver.consumer("thief")
+    assert refusal(thief.reacquire(lease)).code == "not_permitted"
+
+
+def test_reacquire_on_the_way_out_waits_for_the_verdict() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    assert refusal(det.reacquire(lease)).code == "bad_state", "it has not let go"
+    det.unload(lease)
+    assert answer(det.reacquire(lease, wait_timeout_s=30.0))["state"] == "queued"
+    assert driver.state(lease) == "verifying"
+    driver.until(lambda: driver.state(wanted) == "loading")
+    assert driver.state(lease) == "queued"
+    driver.advance(31.0)
+    assert driver.pushes("denied", lease)[-1]["error"]["code"] == "wait_timeout"
+    assert driver.state(lease) == "over"
+    assert f"lease:{lease}" not in driver.journal
+
+
+def test_reacquire_of_what_is_not_coming_back_is_refused() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    det.unload(lease)
+    assert refusal(det.reacquire(lease)).code == "bad_state"
+
+
+def test_reacquire_that_can_never_fit_changes_nothing() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(5 * GIB, evictable=False)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease)
+    driver.until(lambda: driver.state(wanted) == "loading")
+    policy.load(wanted)
+    assert refusal(det.reacquire(lease)).code == "vram_insufficient"
+    assert driver.state(lease) == "standby"
+
+
+def test_a_full_queue_refuses_reacquire_too() -> None:
+    driver = CoreDriver(8 * GIB, settings={"waiters_max": 1})
+    det, lease, policy, wanted = sent_away(driver)
+    policy.use_begin(wanted)
+    driver.consumer("x").acquire(5 * GIB)
+    assert refusal(det.reacquire(lease)).code == "limit_exceeded"
+    assert driver.state(lease) == "standby"
+
+
+def test_a_new_acquire_of_the_same_model_takes_the_lease_over() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver)
+    told = answer(det.try_acquire(4 * GIB, nonce="again", standby=True, priority=70))
+    assert (told["state"], told["lease"]["lease_id"], told["lease"]["priority"]) == ("queued", lease, 70)
+    assert answer(det.try_acquire(4 * GIB, nonce="again"))["lease"]["lease_id"] == lease, "a repeat"
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading")
+    view = driver.view(lease)
+    assert view is not None
+    assert view["charge_bytes"] == 4 * GIB, "as it is asked for now"
+    other = answer(det.try_acquire(1 * GIB, key="another"))
+    assert other["lease"]["lease_id"] != lease
+
+
+def there_and_back(
+    driver: CoreDriver, det: Consumer, lease: LeaseId, policy: Consumer, wanted: LeaseId, nonce: str
+) -> LeaseId:
+    """The detector takes its lease over, and leaves again for the next lease of the policy."""
+    det.try_acquire(5 * GIB, nonce=nonce, standby=True)
+    driver.until(lambda: driver.state(wanted) == "revoking")
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading")
+    det.load(lease)
+    following = policy.acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease)
+    driver.until(lambda: driver.state(following) == "loading")
+    policy.load(following)
+    return following
+
+
+def test_late_repeats_of_earlier_acquires_never_call_it_back() -> None:
+    driver = CoreDriver(8 * GIB, settings={"waiters_max": 64})
+    det, lease, policy, wanted = sent_away(driver)
+    for turn in range(12):
+        wanted = there_and_back(driver, det, lease, policy, wanted, f"turn{turn}")
+    told = answer(det.try_acquire(5 * GIB, nonce="turn5", standby=True))
+    assert (told["state"], told["lease"]["lease_id"]) == ("standby", lease)
+    assert driver.state(wanted) == "held"
+    det.cancel(lease)
+    core = driver.arbiter._core
+    for turn in range(1100):
+        (nonce,) = [f"filler{turn}"]
+        filler = det.try_acquire(8 * GIB - 300 * MIB - turn, nonce=nonce, key=nonce)
+        det.cancel(LeaseId(answer(filler)["lease"]["lease_id"]))
+    assert (det.process, "turn11") not in core.nonces
+    assert (det.process, "turn5") not in core.nonces, "forgotten with the lease"
+
+
+# -- ends ------------------------------------------------------------------------------------------------------------
+def test_giving_up_a_lease_on_standby() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _, _ = sent_away(driver)
+    assert answer(det.cancel(lease)) == {"state": "cancelled"}
+    assert answer(det.cancel(lease)) == {"state": "cancelled"}, "a repeat"
+    assert driver.state(lease) == "over"
+    assert f"lease:{lease}" not in driver.journal
+
+
+def test_a_repeat_of_the_release_does_not_end_it() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _, _ = sent_away(driver)
+    assert answer(det.release(lease))["state"] == "standby"
+    assert driver.state(lease) == "standby"
+
+
+def test_requests_that_make_no_sense_away_are_refused() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _, _ = sent_away(driver)
+    assert refusal(det.ready(lease)).code == "bad_state"
+    assert refusal(det.use_begin(lease)).code == "bad_state"
+    assert refusal(det.unloading(lease)).code == "bad_state"
+    assert refusal(det.oom(lease, 1)).code == "bad_state"
+    assert answer(det.ack(lease))["state"] == "standby"
+
+
+@pytest.mark.parametrize("reason", ["bye", "silent while connections were needed"])
+def test_it_ends_with_its_connection(reason: str) -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _, _ = sent_away(driver)
+    det.leave(reason)
+    assert driver.state(lease) == "over"
+    assert f"lease:{lease}" not in driver.journal
+
+
+def test_a_connection_that_ends_during_the_measurement_does_not_want_it_back() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease)
+    det.leave()
+    driver.until(lambda: driver.state(wanted) == "loading")
+    assert driver.state(lease) == "over"
+
+
+def test_it_ends_with_its_process() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _, _ = sent_away(driver)
+    det.die()
+    assert driver.state(lease) == "over"
+    assert driver.notes("lost")[-1]["lease_id"] == lease
+
+
+def test_a_process_that_dies_during_the_measurement_does_not_want_it_back() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease)
+    det.die()
+    driver.until(lambda: driver.state(wanted) == "loading")
+    assert driver.state(lease) == "over"
+
+
+# -- operators -------------------------------------------------------------------------------------------------------
+def order(driver: CoreDriver, action: Any, lease: LeaseId) -> None:
+    ops = driver.consumer("ops")
+    driver.post(OperatorAsked(ops.client, driver.next_request(), action, lease, "ops", "test"))
+
+
+def test_whom_an_operator_evicts_does_not_come_back() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    order(driver, "evict", lease)
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    assert driver.journal == {}
+
+
+def test_an_operators_word_outweighs_the_engines() -> None:
+    """The engine asked it to leave, then an operator evicts it: at any step of its way out."""
+    for steps in range(3):
+        driver = CoreDriver(8 * GIB)
+        driver.card.lag_s = 0.3
+        det, lease = held(driver, "det", 5, standby=True)
+        policy = driver.consumer("policy")
+        wanted = policy.acquire(5 * GIB)
+        driver.until(lambda: driver.state(lease) == "revoking")  # noqa: B023  # reason: run at once
+        if steps > 0:
+            det.unload(lease)
+        if steps > 1:
+            driver.until(lambda: driver.state(wanted) == "loading")  # noqa: B023  # reason: run at once
+        order(driver, "evict", lease)
+        if steps == 0:
+            det.unload(lease)
+        driver.until(lambda: driver.state(lease) == "over")  # noqa: B023  # reason: run at once
+        assert f"lease:{lease}" not in driver.journal
+    assert driver.pushes("lost", lease)[-1]["error"]["code"] == "lease_lost"
+
+
+def test_evicting_one_that_leaves_by_itself_is_fine() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    det.unload(lease)
+    order(driver, "evict", lease)
+    driver.until(lambda: driver.state(lease) == "over")
+
+
+def test_an_operators_eviction_outlives_a_restart() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    token = det.token(lease)
+    order(driver, "evict", lease)
+    driver.restart()
+    det.connect()
+    det.reattach(lease, token)
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+
+
+def test_what_an_operator_evicted_and_its_holder_thinks_away_is_over() -> None:
+    driver = CoreDriver(8 * GIB)
+    other, resident = held(driver, "other", 1)
+    det, lease = held(driver, "det", 5, standby=True)
+    token, other_token = det.token(lease), other.token(resident)
+    order(driver, "evict", lease)
+    det.hold(0)
+    driver.restart()
+    other.connect()
+    other.reattach(resident, other_token)
+    det.connect()
+    det.reattach(lease, token, away=True)
+    driver.until(lambda: driver.state(lease) == "over")
+
+
+def test_a_pin_on_standby_holds_after_the_return() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver)
+    order(driver, "pin", lease)
+    assert driver.journal[f"lease:{lease}"]["pinned"] == ["ops", "test"]
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading")
+    det.load(lease)
+    assert refusal(policy.try_acquire(5 * GIB)).code == "vram_insufficient"
+
+
+# -- restarts --------------------------------------------------------------------------------------------------------
+def test_a_restart_keeps_it_and_waits_for_its_holder() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver, ttl_s=10.0)
+    token, policy_token = det.token(lease), policy.token(wanted)
+    driver.restart()
+    policy.connect()
+    policy.reattach(wanted, policy_token)
+    policy.unload(wanted)
+    driver.advance(1.0)
+    assert driver.state(lease) == "standby", "its holder has not come back"
+    (why,) = driver.arbiter.why("det", driver.now)["leases"]
+    assert "its holder did not come back after the restart" in why["text"]
+    det.connect()
+    (kept,) = answer(det.reattach(lease, token, away=True))["leases"]
+    assert (kept["kept"], kept["lease"]["state"]) == (True, "standby")
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
+    det.load(lease)
+    driver.advance(60.0)
+
+
+def test_a_holder_that_does_not_come_back_loses_it() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease, policy, wanted = sent_away(driver, ttl_s=10.0)
+    policy_token = policy.token(wanted)
+    driver.restart()
+    policy.connect()
+    policy.reattach(wanted, policy_token)
+    driver.advance(14.9)
+    assert driver.state(lease) == "standby"
+    driver.advance(0.2)
+    assert driver.state(lease) == "over"
+    assert f"lease:{lease}" not in driver.journal
+
+
+def test_only_leases_on_standby_in_the_journal_hold_up_nobody() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver)
+    policy.unload(wanted)
+    driver.advance(0.0)
+    policy.die()
+    token = det.token(lease)
+    records = {key: record for key, record in driver.journal.items() if key == f"lease:{lease}"}
+    fresh = CoreDriver(8 * GIB)
+    fresh.post(Recovered(records))
+    assert fresh.arbiter.status(fresh.now)["phase"] == "serving"
+    assert fresh.state(lease) == "standby"
+    assert token == Token(1, 2)
+
+
+def test_a_restart_in_the_middle_of_the_way_out_does_not_make_it_a_wish() -> None:
+    """The holder was asked before the restart and lets go after it: it still comes back."""
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    policy = driver.consumer("policy")
+    policy.acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    token = det.token(lease)
+    driver.restart()
+    assert driver.state(lease) == "revoking"
+    driver.effects.clear()
+    det.connect()
+    det.reattach(lease, token)
+    (asked,) = driver.pushes("revoke", lease)
+    assert asked["reason"] == "asked to leave before the restart"
+    wanted = policy.acquire(5 * GIB) if policy.connect() is not None else None
+    assert wanted is not None
+    det.unload(lease)
+    driver.until(lambda: driver.state(wanted) == "loading")
+    assert driver.state(lease) == "standby"
+
+
+def test_a_restart_during_the_measurement() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = 0.5
+    det, lease = held(driver, "det", 5, standby=True)
+    driver.consumer("policy").acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    token = det.token(lease)
+    det.unload(lease)
+    driver.restart()
+    assert driver.state(lease) == "verifying"
+    det.connect()
+    det.reattach(lease, token, away=True)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
+    assert driver.notes("standby")[-1]["left_for"] == "policy"
+
+
+def test_a_release_that_was_lost_is_made_up_for() -> None:
+    """The daemon died with the release in its socket: the holder says that it let go."""
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    driver.consumer("policy").acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    token = det.token(lease)
+    other, resident = held(driver, "other", 1)
+    driver.advance(0.01)
+    det.hold(0)
+    other_token = other.token(resident)
+    driver.restart()
+    other.connect()
+    other.reattach(resident, other_token)
+    det.connect()
+    (kept,) = answer(det.reattach(lease, token, away=True))["leases"]
+    assert kept["lease"]["state"] == "verifying"
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
+    assert len(driver.notes("standby")) == 1
+
+
+def test_an_empty_card_after_a_restart_means_that_it_left_as_asked() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    driver.consumer("policy").acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    token = det.token(lease)
+    det.hold(0)
+    driver.restart()
+    driver.advance(0.2)
+    assert driver.state(lease) == "standby"
+    det.connect()
+    det.reattach(lease, token, away=True)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
+
+
+def test_a_grant_that_its_holder_missed_is_said_again() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver)
+    token = det.token(lease)
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
+    driver.effects.clear()
+    det.client = ClientId("c-new")
+    driver.post(ClientConnected(det.client, det.process, 1000, det.name, f"{det.name}-c101"))
+    (kept,) = answer(det.reattach(lease, token, away=True))["leases"]
+    assert kept["lease"]["state"] == "loading"
+    (granted,) = driver.pushes("granted", lease)
+    assert granted["lease"]["token"] == kept["lease"]["token"]
+    thief = driver.consumer("thief")
+    spec = det.specs[lease]
+    answers = answer(thief.reattach(lease, token, away=True, spec=spec))["leases"]
+    assert answers[0]["error"]["code"] == "stale_token"
+    answers = answer(det.reattach(lease, token))["leases"]
+    assert answers[0]["error"]["code"] == "stale_token", "to say that it is held takes its token"
+    det.load(lease)
+
+
+def test_one_that_is_queued_again_re_attaches_as_it_is() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver)
+    policy.use_begin(wanted)
+    det.reacquire(lease)
+    (kept,) = answer(det.reattach(lease, det.token(lease), away=True))["leases"]
+    assert kept["lease"]["state"] == "queued"
+
+
+def test_a_lost_journal_does_not_lose_it_either() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver)
+    token, policy_token = det.token(lease), policy.token(wanted)
+    driver.restart(keep_journal=False)
+    det.connect()
+    policy.connect()
+    policy.reattach(wanted, policy_token)
+    (kept,) = answer(det.reattach(lease, token, away=True))["leases"]
+    assert kept["lease"]["state"] == "standby"
+    assert driver.journal[f"lease:{lease}"]["state"] == "standby"
+    assert driver.gpu()["charged_bytes"] == 5 * GIB
+    policy.unload(wanted)
+    driver.advance(20.0)
+    assert driver.state(lease) == "loading"
+
+
+def test_a_return_that_cannot_be_journalled_is_not_made() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease, policy, wanted = sent_away(driver, min_residency_s=1.0)
+    policy.unload(wanted)
+    driver.advance(0.5)
+    driver.journal_failing = "disk full"
+    driver.advance(1.0)
+    assert driver.state(lease) == "over"
+    assert driver.pushes("denied", lease)[-1]["error"]["code"] == "journal_unavailable"
+    assert not any(isinstance(e, Push) and e.body["push"] == "granted" for e in driver.effects[-20:])
+    assert driver.gpu()["charged_bytes"] == 0
+
+
+# -- several cards, invariants ---------------------------------------------------------------------------------------
+def test_it_may_come_back_on_another_card() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    det, lease = held(driver, "det", 5, standby=True)
+    other, second = held(driver, "other", 5)
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(5 * GIB, gpu="0")
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease)
+    driver.until(lambda: driver.state(wanted) == "loading")
+    policy.load(wanted)
+    other.unload(second)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
+    view = driver.view(lease)
+    assert view is not None
+    assert view["gpu"] == "GPU-1", "beside nobody that it left for"
+
+
+def test_invariants_of_what_is_away() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease, _, _ = sent_away(driver)
+    core = driver.arbiter._core
+    core.granted.clear()
+    one = core.leases[lease]
+    one.state = LeaseState.HELD
+    with pytest.raises(InvariantViolation, match="counts as away"):
+        invariants.check(core)
+    one.state = LeaseState.STANDBY
+    one.gpu = next(iter(core.gpus))
+    with pytest.raises(InvariantViolation, match="it has a card"):
+        invariants.check(core)
