@@ -18,6 +18,9 @@ from arbiter.core.events import Event, Resumed, Tick
 
 log = logging.getLogger(__name__)
 
+HELD_UP_S = 1.0
+"""A daemon that wakes up so late did not run meanwhile (stopped, swapped out, a paused virtual machine). It has heard nobody, so nobody's
+silence counts: the core is told that it slept."""
 TIMER_FLOOR_S = 0.001
 """A deadline that has passed is served this soon, and not in a busy loop."""
 
@@ -43,8 +46,8 @@ class Inbox:
 
     `perform` runs the effects of one event; it may post events, which are handled after it returned. `failed` is called once with the
     exception if the core raises: its state can no longer be trusted, so nothing is handled after that. `slept_s` tells for how long the
-    machine was suspended since it was last asked; the core hears of it before any other event. `record` is told of every event and what
-    came of it (None: the core raised), before anything is performed.
+    machine was suspended since it was last asked; the core hears of it, and of a stop of this process alone, before any other event.
+    `record` is told of every event and what came of it (None: the core raised), before anything is performed.
     """
 
     def __init__(
@@ -67,6 +70,7 @@ class Inbox:
         self._closed = False
         self._timer: asyncio.TimerHandle | None = None
         self._deadline: float | None = None
+        self._wakes_at: float | None = None  # when the timer is to fire
         self._handled = 0
 
     def post(self, event: Event) -> None:
@@ -79,7 +83,8 @@ class Inbox:
         self._busy = True
         try:
             while self._queue and not self._closed:
-                if slept_s := self._slept_s():  # before anything is decided on what was known yesterday
+                # before anything is decided on what was known yesterday
+                if slept_s := max(self._slept_s(), self._held_up_s()):
                     self._queue.appendleft(Resumed(slept_s))
                 self._handle(self._queue.popleft())
         finally:
@@ -149,11 +154,20 @@ class Inbox:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        self._deadline = deadline
+        self._deadline, self._wakes_at = deadline, None
         if deadline is not None:
             loop = asyncio.get_running_loop()
             wait_s = max(TIMER_FLOOR_S, deadline - self._clock())
+            self._wakes_at = self._clock() + wait_s
             self._timer = loop.call_later(wait_s, self._tick)
+
+    def _held_up_s(self) -> float:
+        """By how much the timer is late, said once; 0.0 for what a busy loop may cost."""
+        late_s = 0.0 if self._wakes_at is None else self._clock() - self._wakes_at
+        if late_s < HELD_UP_S:
+            return 0.0
+        self._wakes_at = None
+        return late_s
 
     def _tick(self) -> None:
         self._timer = None

@@ -75,6 +75,11 @@ def _residents(core: Core, gpu: Gpu) -> None:
         if residents.exclusive and len(residents) > 1:
             alone = next(iter(residents.exclusive))
             raise InvariantViolation(2, f"{alone} is exclusive, yet {sorted(residents)} are on {gpu.info.id}")
+        debts = [v.lease for v in gpu.verifications.values() if v.exclusive and v.lease not in residents]
+        if debts:
+            raise InvariantViolation(
+                2, f"{debts[0]} was exclusive on {gpu.info.id} and is not measured gone, yet somebody came"
+            )
         loading = [lease.id for lease in residents.in_state(LeaseState.LOADING)]
         if len(loading) > 1:
             raise InvariantViolation(2, f"{loading} load at once on {gpu.info.id}")

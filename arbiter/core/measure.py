@@ -139,6 +139,7 @@ def begin_for_lease(core: Core, gpu: Gpu, lease: Lease, *, alive: bool, grace_s:
         paced_from=core.now + grace_s,
         alive=alive,
         exiting=lease.exiting,
+        exclusive=lease.spec.exclusive,
     )
     _begin(core, gpu, verification)
 

@@ -69,6 +69,8 @@ def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool
             return False
     elif any(other not in going for other in gpu.residents.exclusive):
         return False
+    elif any(v.exclusive and v.lease not in going for v in gpu.verifications.values()):
+        return False  # it died or expired, and still has the card to itself until it is measured gone
     return gpu.ledger.total_if(going, (lease.process, lease.load_peak_bytes)) <= gpu.ledger.budget_bytes
 
 

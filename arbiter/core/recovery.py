@@ -35,7 +35,7 @@ def on_recovered(core: Core, event: Recovered) -> None:
             core.forget(key)
         elif key.startswith("residue:"):
             process = ProcessKey(int(record["pid"]), int(record["start_ticks"]))
-            gpu.ledger.set_residue(process, int(record["residue_bytes"]), core.now)
+            gpu.ledger.set_residue(process, min(int(record["residue_bytes"]), _room_bytes(gpu)), core.now)
         else:
             _restore(core, gpu, record)
     if not held:
@@ -135,9 +135,14 @@ def _asked_before(core: Core, gpu: Gpu, lease: Lease) -> Eviction:
 
 def _place(core: Core, gpu: Gpu, lease: Lease, charge_bytes: int) -> None:
     """Charge what is there anyway. What the budget does not hold was never approved: it is pressure."""
-    room = max(0, gpu.ledger.budget_bytes - gpu.ledger.approved_bytes())
-    gpu.ledger.charge(lease.id, lease.process, charge_bytes, min(charge_bytes, room), core.now)
+    approved_bytes = min(charge_bytes, _room_bytes(gpu))
+    gpu.ledger.charge(lease.id, lease.process, charge_bytes, approved_bytes, core.now)
     gpu.changed_at = core.now
+
+
+def _room_bytes(gpu: Gpu) -> int:
+    """What can still be approved. A disk that was full keeps records that should be gone, and they may say more than the card has."""
+    return max(0, gpu.ledger.budget_bytes - gpu.ledger.approved_bytes())
 
 
 def spec_from_record(record: Mapping[str, Any]) -> Spec:

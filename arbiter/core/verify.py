@@ -54,6 +54,7 @@ class Verification:
     settling: bool = False  # the newest reading is on target: one more has to agree
     alive: bool = True
     exiting: bool = False
+    exclusive: bool = False  # nobody else may come before these bytes are gone, whatever would fit
     last_used_bytes: int | None = None  # of the newest counting reading
     verdict: Verdict | None = None  # announced, but not resolved
     overdue: bool = False

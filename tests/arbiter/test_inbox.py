@@ -149,6 +149,28 @@ def test_the_core_hears_of_a_suspend_before_anything_else() -> None:
     asyncio.run(run())
 
 
+def test_a_daemon_that_did_not_run_says_so_before_it_judges_anybody() -> None:
+    """SIGSTOP, swapping, a paused virtual machine: the renewals lie in the socket, and the timer that would expire everybody is due."""
+
+    async def run() -> None:
+        core, now = ScriptedCore(), [100.0]
+        inbox = Inbox(core, lambda effects: None, lambda error: None, lambda: now[0])
+        core.deadline = 105.0
+        inbox.post(left("a"))
+        now[0] = 105.9
+        inbox.post(left("busy"))
+        assert core.seen == [left("a"), left("busy")], "a little late is only late"
+        core.deadline = 110.0
+        inbox.post(left("b"))
+        now[0] = 130.0
+        inbox.post(left("c"))
+        inbox.post(left("d"))
+        assert core.seen[3:] == [Resumed(20.0), left("c"), left("d")]
+        inbox.close()
+
+    asyncio.run(run())
+
+
 def test_a_pulse_has_passed_through_the_core_and_its_effects() -> None:
     async def test(inbox: Inbox, core: ScriptedCore, done: list[Any]) -> None:
         inbox.post(left("a"))

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import pytest
+
 from arbiter.core.effects import Sample
 from arbiter.core.events import MemorySampled
 from arbiter.testing.core_driver import Consumer, CoreDriver, answer
@@ -92,6 +94,23 @@ def test_an_exclusive_waiter_never_passes() -> None:
 
 
 # -- exclusive -------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("end", ["death", "expiry"])
+def test_the_debt_of_an_exclusive_holder_keeps_the_card_to_itself(end: str) -> None:
+    """Whoever would fit beside its bytes waits all the same until they are measured gone."""
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = 1.0
+    alone, lease = held(driver, "alone", 2, exclusive=True, ttl_s=5.0)
+    waiter = driver.consumer("w").acquire(1 * GIB, priority=d.PRIORITY - 1)
+    if end == "death":
+        alone.use_begin(lease)
+        alone.die()
+    else:
+        driver.until(lambda: bool(driver.notes("expired")))
+        alone.hold(0)
+    driver.until(lambda: driver.state(waiter) == "loading")
+    assert not driver.card.shown(driver.now)
+
+
 def test_residues_may_stay_beside_an_exclusive_lease() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)

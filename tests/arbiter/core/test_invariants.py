@@ -1,10 +1,12 @@
 """Each invariant, broken by hand, is found by its number. A sound state is never complained about (the other tests)."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
 from arbiter.core import invariants
+from arbiter.core.events import ProcessDied
 from arbiter.core.invariants import InvariantViolation
 from arbiter.core.lease import Lease, LeaseState, Order, Use
 from arbiter.core.state import Core, Gpu
@@ -51,12 +53,17 @@ def granted_under_pressure(b: Broken) -> None:
 
 
 def beside_exclusive(b: Broken) -> None:
-    from dataclasses import replace
-
     b.held.spec = replace(b.held.spec, exclusive=True)
     b.gpu.residents[b.held.id] = b.held
     b.gpu.ledger.charge(b.queued.id, X, 1, 1, 0.0)
     b.gpu.residents[b.queued.id] = b.queued
+    b.core.granted.append((Token(1, 99), b.gpu.info.id))
+
+
+def beside_exclusive_debt(b: Broken) -> None:
+    b.driver.card.silent = True
+    b.held.spec = replace(b.held.spec, exclusive=True)
+    b.driver.post(ProcessDied(b.held.process))
     b.core.granted.append((Token(1, 99), b.gpu.info.id))
 
 
@@ -114,6 +121,7 @@ def no_next_reading(b: Broken) -> None:
         (1, over_budget, "approved"),
         (1, granted_under_pressure, "to bear"),
         (2, beside_exclusive, "is exclusive"),
+        (2, beside_exclusive_debt, "was exclusive"),
         (2, two_loads, "load at once"),
         (3, unloads_in_use, "with 2 uses"),
         (4, resident_without_charge, "not charged"),

@@ -272,3 +272,18 @@ def test_the_first_verdict_after_a_restart_needs_no_reading_from_before() -> Non
     again.advance(11.0)
     (note,) = again.notes("verified")
     assert (note["verdict"], note["before_bytes"]) == ("verified", None), "the stowaway explains the card"
+
+
+def test_records_that_a_full_disk_kept_may_say_more_than_the_card_has() -> None:
+    """They used to break the invariant on bytes at the start, and the whole journal was put aside for it."""
+    driver = CoreDriver(8 * GIB)
+    _, lease, _ = held(driver, "det", 5)
+    records = dict(driver.journal)
+    other = driver.consumer("other")
+    stale = {"gpu": "GPU-0", "pid": other.process.pid, "start_ticks": other.process.start_ticks}
+    records[f"residue:{other.process}:GPU-0"] = {**stale, "residue_bytes": 4 * GIB}
+    records["lease:L1-9"] = {**records[f"lease:{lease}"], "lease_id": "L1-9", "token": [1, 10], "nonce": "n9"}
+    again = CoreDriver(8 * GIB, start=False)
+    again.post(Recovered(records))
+    assert {lease, "L1-9"} <= {view["lease_id"] for view in again.arbiter.status(again.now)["leases"]}
+    assert again.gpu()["pressure_bytes"] > 0, "what was never approved is pressure"

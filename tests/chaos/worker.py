@@ -1,0 +1,227 @@
+"""What a process of the storm does: a consumer that leases and loads for ever, a stranger that takes bytes without asking, or a
+user that marks uses on other people's leases. Not a test module; run by `arbiter.testing.forkserver`.
+
+A consumer writes down what it does, and when, in a trace of JSON lines: the checker's second witness beside the arbiter's history.
+It is honest but not careful: it loads after its grant without looking twice, as real programs do.
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import random
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from clients.aio import ArbiterClient
+from clients.lease import Lease
+from schemas.errors import VramError
+from schemas.fakegpu import SimulatedOutOfMemory
+from schemas.wire import Footprint, LeaseSpec
+from sidecars.device.fake import FakeMemory
+from sidecars.device.memory import Block
+
+MIB = 1 << 20
+CHUNKS = 3
+LOAD_S, UNLOAD_S, USE_S, IDLE_S = 0.05, 0.03, 0.12, 0.1
+"""Longest pauses. A step has to last long enough for a fault to meet it."""
+CONNECT_S = 60.0
+
+
+class Trace:
+    """One line per fact, written in one `write` each: a kill loses whole lines only."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+        self._name = name
+
+    def say(self, event: str, **facts: object) -> None:
+        line = {"t": time.monotonic(), "pid": os.getpid(), "name": self._name, "event": event, **facts}
+        os.write(self._file, (json.dumps(line) + "\n").encode())
+
+
+class Consumer:
+    """One process with one lease at a time."""
+
+    def __init__(self, name: str, seed: str, card: Path, trace: Trace) -> None:
+        self._name = name
+        self._random = random.Random(f"{name} {seed}")
+        self._trace = trace
+        self._residue = self._random.choice([128, 256, 450]) * MIB
+        self._memory = FakeMemory(card, name, self._residue)
+        self._stopping = asyncio.Event()
+
+    async def run(self) -> None:
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._stopping.set)
+        async with ArbiterClient(name=self._name, connect_timeout_s=CONNECT_S) as client:
+            while not self._stopping.is_set():
+                work = asyncio.ensure_future(self._round(client))
+                stop = asyncio.ensure_future(self._stopping.wait())
+                await asyncio.wait([work, stop], return_when=asyncio.FIRST_COMPLETED)
+                stop.cancel()
+                if not work.done():
+                    work.cancel()
+                with contextlib.suppress(asyncio.CancelledError):
+                    await work
+        self._memory.close()
+        self._trace.say("done")
+
+    def _spec(self) -> LeaseSpec:
+        draw = self._random
+        steady = draw.choice([500, 700, 1200, 2000, 3000, 4500]) * MIB
+        peak = int(steady * draw.choice([1.0, 1.0, 1.2]))
+        return LeaseSpec(
+            consumer=self._name,
+            model_id=f"{self._name}-{steady}",
+            ttl_s=3.0,
+            min_residency_s=draw.choice([0.0, 0.2, 0.4]),
+            mode=draw.choice(["shared", "shared", "shared", "exclusive"]),
+            priority=draw.choice([40, 50, 50, 60]),
+            on_deadline=draw.choice(["wait", "wait", "deny"]),
+            footprint=Footprint(load_peak_bytes=peak, steady_bytes=steady, residue_bytes=self._residue),
+        )
+
+    async def _round(self, client: ArbiterClient) -> None:
+        """Acquire, load, use, leave. Whatever goes wrong ends the round, never the process."""
+        spec = self._spec()
+        blocks: list[Block] = []
+        say = self._trace.say
+
+        async def unload() -> None:
+            say("unload", lease_id=lease_id)
+            await self._free(blocks)
+            say("unloaded", lease_id=lease_id)
+
+        def lost(lease: Lease, error: VramError) -> None:
+            say("lost", lease_id=lease.lease_id, code=error.code)
+
+        lease_id = ""
+        say("asked", bytes=spec.footprint.load_peak_bytes, exclusive=spec.mode == "exclusive")
+        try:
+            lease = await client.acquire(
+                spec, self._random.choice([None, None, 5.0, 20.0]), unload=unload, on_lost=lost
+            )
+        except asyncio.CancelledError:
+            say("gave_up")
+            raise
+        except VramError as error:
+            say("denied", code=error.code)
+            await self._pause(IDLE_S)
+            return
+        lease_id = lease.lease_id
+        say(
+            "granted",
+            lease_id=lease_id,
+            token=list(lease.token),
+            exclusive=spec.mode == "exclusive",
+            bytes=spec.footprint.load_peak_bytes,
+            residue_bytes=self._residue,
+        )
+        try:
+            await self._load(lease, spec, blocks)
+            await self._use(lease)
+        except SimulatedOutOfMemory as error:
+            say("oom", lease_id=lease_id, requested_bytes=error.details["requested_bytes"])
+            with contextlib.suppress(VramError):
+                await lease.oom(int(error.details["requested_bytes"]), self._memory.used_bytes())
+        except VramError as error:
+            say("refused", lease_id=lease_id, code=error.code)
+        finally:
+            await lease.give_up()
+            await self._free(blocks)
+            say("over", lease_id=lease_id)
+
+    async def _load(self, lease: Lease, spec: LeaseSpec, blocks: list[Block]) -> None:
+        """In pieces, up to the peak and down again, as real loaders do."""
+        peak = spec.footprint.load_peak_bytes - self._residue
+        extra = spec.footprint.load_peak_bytes - spec.footprint.steady_bytes
+        for number in range(CHUNKS):
+            if lease.state != "loading" and lease.state != "revoking":
+                return
+            blocks.append(self._memory.allocate(lease.lease_id, (peak - extra) // CHUNKS))
+            await self._pause(LOAD_S / CHUNKS)
+        if extra:
+            scratch = self._memory.allocate(lease.lease_id, extra)
+            await self._pause(LOAD_S / CHUNKS)
+            self._memory.free(scratch)
+            self._memory.empty_cache()
+        await lease.ready(self._memory.used_bytes())
+        self._trace.say("ready", lease_id=lease.lease_id)
+
+    async def _use(self, lease: Lease) -> None:
+        for _ in range(self._random.randint(1, 4)):
+            async with lease.use("storm"):
+                self._trace.say("in_use", lease_id=lease.lease_id)
+                await self._pause(USE_S)
+                self._trace.say("idle", lease_id=lease.lease_id)
+            await self._pause(IDLE_S)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(lease.wait_gone(), self._random.uniform(0.0, 1.0))
+
+    async def _free(self, blocks: list[Block]) -> None:
+        await self._pause(UNLOAD_S)
+        while blocks:
+            self._memory.free(blocks.pop())
+        self._memory.empty_cache()
+
+    async def _pause(self, longest_s: float) -> None:
+        await asyncio.sleep(self._random.uniform(longest_s / 3, longest_s))
+
+
+async def take_bytes(card: Path, trace: Trace, size: int) -> None:
+    """A stowaway: allocates without a lease, and exits when it is told to or its standard input ends."""
+    memory = FakeMemory(card, "stowaway", 64 * MIB)
+    try:
+        memory.allocate("stowaway", size)
+        trace.say("took", bytes=size)
+    except SimulatedOutOfMemory:
+        trace.say("no_room", bytes=size)
+    print(json.dumps({"event": "took"}), flush=True)
+    await (await lines()).readline()
+    memory.close()
+    trace.say("done")
+
+
+async def mark_uses(trace: Trace) -> None:
+    """Like a runner: marks a use on the lease of whoever it is told of (`LEASE EPOCH SERIAL`), by its token."""
+    reader = await lines()
+    async with ArbiterClient(name="user", connect_timeout_s=CONNECT_S) as client:
+        while line := await reader.readline():
+            lease_id, epoch, serial = line.decode().split()
+            try:
+                async with client.use(lease_id, (int(epoch), int(serial)), "goal"):
+                    trace.say("foreign_use", lease_id=lease_id)
+                    await asyncio.sleep(USE_S)
+                    trace.say("foreign_idle", lease_id=lease_id)
+            except VramError as error:
+                trace.say("refused", lease_id=lease_id, code=error.code)
+    trace.say("done")
+
+
+async def lines() -> asyncio.StreamReader:
+    reader = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(
+        lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
+    )
+    return reader
+
+
+def main(arguments: Sequence[str]) -> None:
+    """`consumer NAME SEED CARD TRACES`, `stowaway NAME BYTES CARD TRACES` or `user NAME - CARD TRACES`."""
+    kind, name, what, card, traces = arguments
+    trace = Trace(Path(traces) / f"{name}.jsonl", name)
+    trace.say("born", kind=kind)
+    try:
+        match kind:
+            case "consumer":
+                asyncio.run(Consumer(name, what, Path(card), trace).run())
+            case "stowaway":
+                asyncio.run(take_bytes(Path(card), trace, int(what)))
+            case _:
+                asyncio.run(mark_uses(trace))
+    except BaseException as error:
+        trace.say("crashed", error=repr(error))
+        raise
