@@ -5,6 +5,8 @@ ARBITER ?= on
 GPU ?= fake:8GiB
 OUT ?= out/demo
 ARGS ?=
+# How long `make chaos` storms.
+SECONDS ?= 300
 
 BIN := .venv/bin
 CORE := .venv-core/bin
@@ -12,7 +14,7 @@ CORE := .venv-core/bin
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core demo test test-core lint format bench schemas clean
+.PHONY: help setup setup-core demo test test-core lint format chaos bench schemas clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' Makefile
@@ -42,6 +44,9 @@ lint: setup ## style, types and who may import whom
 format: setup ## rewrite the code in the project's style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+chaos: setup ## kill, stop and starve real processes at every step of a switch: SECONDS=300 SEED=0
+	$(BIN)/python tests/chaos/storm.py --seconds $(SECONDS) --seed $(SEED) --out out/chaos
 
 bench: setup ## measure grants and handovers against bare ZeroMQ
 	$(BIN)/python tests/bench/bench_wire.py $(ARGS)

@@ -63,7 +63,9 @@ class Child:
         return bool(data)
 
     def tell(self, command: str) -> None:
-        """One line on its standard input; nothing if it has ended."""
+        """One line on its standard input; nothing if that is closed, or if it has ended."""
+        if self._stdin < 0:
+            return
         with contextlib.suppress(BrokenPipeError):
             os.write(self._stdin, f"{command}\n".encode())
 
@@ -142,7 +144,8 @@ class ForkServer:
 def serve(program: Path, orders: socket.socket) -> None:
     """Fork a child for every order until the other end is closed."""
     spec = importlib.util.spec_from_file_location(program.stem, program)
-    assert spec is not None and spec.loader is not None, f"{program} is no Python file"
+    if spec is None or spec.loader is None:
+        raise SystemExit(f"{program} is no Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[program.stem] = module
     spec.loader.exec_module(module)
@@ -177,7 +180,7 @@ def _become(
         main(arguments)
         sys.stdout.flush()
         code = 0
-    except BaseException:  # outermost: it must never run on as a second server
+    except BaseException:  # noqa: BLE001 - outermost: it must never run on as a second server
         traceback.print_exc()
         sys.stderr.flush()
     finally:

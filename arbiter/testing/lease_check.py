@@ -106,7 +106,7 @@ def check_leases(
 ) -> Story:
     """Judge one card's log with the history of its arbiter and the traces of its consumers."""
     story = Story()
-    events = sorted(history, key=lambda event: int(event["seq"]))
+    events = sorted(history, key=lambda event: (float(event["at_wall_s"]), int(event["seq"])))
     times = [float(event["at_wall_s"]) - wall_minus_monotonic_s for event in events]
     claims = _claims(traces, events, times)
     owners = {claim.lease_id: claim.pid for mine in claims.values() for claim in mine}
@@ -182,7 +182,9 @@ def _check_history(
             case "ready" | "released" | "lost" | "expired" | "denied":
                 loading[gpu].pop(lease, None)
                 if kind == "expired" and not _hindered(hindrances, owners.get(lease), t):
-                    story.bad("expired", t, f"{lease} of {event['consumer']} expired, though nobody hindered it")
+                    story.bad(
+                        "expired", t, f"{lease} of {event['consumer']} expired, though nobody hindered it"
+                    )
             case "unloading" if uses[lease]:
                 story.bad("in_use", t, f"{lease} of {event['consumer']} unloads with {len(uses[lease])} uses")
             case "switch":
@@ -252,7 +254,9 @@ def _check_card(
             story.late_allocations += 1
             late.add(pid)
             if not _hindered(hindrances, pid, t):
-                story.bad("entitled", t, f"{line['name']} ({pid}) loads under {claim.lease_id}, which expired")
+                story.bad(
+                    "entitled", t, f"{line['name']} ({pid}) loads under {claim.lease_id}, which expired"
+                )
         elif op == "oom":
             _check_refusal(story, line, claim, held, strangers | late)
         else:
@@ -268,7 +272,10 @@ def _check_refusal(
             story.refusals_excused += 1
             return
     mine = held[claim.pid]
-    if mine.leaked and mine.on_card + line["bytes"] - mine.leaked <= claim.bytes < mine.on_card + line["bytes"]:
+    if (
+        mine.leaked
+        and mine.on_card + line["bytes"] - mine.leaked <= claim.bytes < mine.on_card + line["bytes"]
+    ):
         story.refusals_excused += 1  # what it leaked before is in its own way
         return
     others = {pid: h.on_card for pid, h in held.items() if h.on_card and pid != claim.pid}

@@ -105,7 +105,9 @@ class Storm:
         self._disk_is_full = False
         self._wall_minus_monotonic_s = time.time() - time.monotonic()
         self._findings: list[Finding] = []
-        self._plan: list[tuple[str, str, str]] = []  # what is still to be done of this turn: step, role, signal
+        self._plan: list[
+            tuple[str, str, str]
+        ] = []  # what is still to be done of this turn: step, role, signal
 
     # -- the run -------------------------------------------------------------------------------------------------------
     async def run(self) -> dict[str, Any]:
@@ -404,7 +406,9 @@ class Storm:
             try:
                 await asyncio.to_thread(child.wait, max(0.1, deadline - loop.time()))
             except AssertionError:
-                self._finding("stuck", f"{child.name} did not finish within {CALM_S:g} s after the last fault")
+                self._finding(
+                    "stuck", f"{child.name} did not finish within {CALM_S:g} s after the last fault"
+                )
 
     async def _settled(self) -> dict[str, Any]:
         """Nothing is left: no lease, no byte, no connection but ours."""
@@ -441,7 +445,11 @@ class Storm:
             self._hindrances,
             wall_minus_monotonic_s=self._wall_minus_monotonic_s,
         )
-        found = [*self._findings, *(Finding("card", 0.0, problem) for problem in card.problems), *story.findings]
+        found = [
+            *self._findings,
+            *(Finding("card", 0.0, problem) for problem in card.problems),
+            *story.findings,
+        ]
         return {
             "seed": self._seed,
             "seconds": round(seconds, 1),
@@ -502,7 +510,9 @@ async def _eventually(condition: Callable[[], Awaitable[bool]], limit_s: float) 
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Hit every process at every step of a switch, and judge what came of it.")
+    parser = argparse.ArgumentParser(
+        description="Hit every process at every step of a switch, and judge what came of it."
+    )
     parser.add_argument("--seconds", type=float, default=300.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/chaos"))

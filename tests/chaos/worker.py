@@ -138,8 +138,8 @@ class Consumer:
         """In pieces, up to the peak and down again, as real loaders do."""
         peak = spec.footprint.load_peak_bytes - self._residue
         extra = spec.footprint.load_peak_bytes - spec.footprint.steady_bytes
-        for number in range(CHUNKS):
-            if lease.state != "loading" and lease.state != "revoking":
+        for _ in range(CHUNKS):
+            if lease.state not in ("loading", "revoking"):
                 return
             blocks.append(self._memory.allocate(lease.lease_id, (peak - extra) // CHUNKS))
             await self._pause(LOAD_S / CHUNKS)
