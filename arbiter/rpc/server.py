@@ -10,6 +10,8 @@ import errno
 import logging
 import os
 import stat
+import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -84,6 +86,7 @@ class RouterServer:
         self._on_frame: OnFrame | None = None
         self._draining = False
         self._drain_scheduled = False
+        self._early: deque[list[zmq.Frame]] = deque()
         self.dropped = 0
 
     def bind(self) -> None:
@@ -103,14 +106,26 @@ class RouterServer:
         self._self_test()
 
     def _self_test(self) -> None:
-        """Send one frame to ourselves: the identity of every peer hangs on the kernel's word being there and readable."""
+        """Send one frame to ourselves: the identity of every peer hangs on the kernel's word being there and readable.
+
+        Clients of an earlier daemon are back the moment the socket is there; what they say meanwhile is kept for `start`.
+        """
+        word = os.urandom(16)
         with self._context.socket(zmq.DEALER) as probe:
             probe.setsockopt(zmq.LINGER, 0)
             probe.connect(f"ipc://{self._path}")
-            probe.send(b"")
-            if not self._socket.poll(int(SELF_TEST_S * 1000)):
-                raise InternalError(f"the socket did not answer its own self-test within {SELF_TEST_S:g} s")
-            frame = self._socket.recv_multipart(copy=False)[-1]
+            probe.send(word)
+            deadline = time.monotonic() + SELF_TEST_S
+            while True:
+                if not self._socket.poll(max(0, int((deadline - time.monotonic()) * 1000))):
+                    raise InternalError(
+                        f"the socket did not answer its own self-test within {SELF_TEST_S:g} s"
+                    )
+                frames = self._socket.recv_multipart(copy=False)
+                if frames[-1].bytes == word:
+                    break
+                self._early.append(frames)
+        frame = frames[-1]
         address = _peer_address(frame)
         try:
             found = parse_peer_address(address or "")
@@ -171,7 +186,7 @@ class RouterServer:
                 if self._on_frame is None:
                     return
                 try:
-                    frames = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
+                    frames = self._early.popleft() if self._early else self._receive()
                 except zmq.Again:
                     return
                 try:
@@ -181,6 +196,10 @@ class RouterServer:
         finally:
             self._draining = False
         self._schedule_drain()
+
+    def _receive(self) -> list[zmq.Frame]:
+        """Raises zmq.Again where nothing is there."""
+        return self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
 
     def _deliver(self, frames: list[zmq.Frame]) -> None:
         """`[id, payload]` from a DEALER, `[id, "", payload]` from a REQ; any other count of frames is no message of ours."""

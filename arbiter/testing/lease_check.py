@@ -208,7 +208,7 @@ def _hindered(hindrances: Sequence[Hindrance], pid: int | None, t: float, back_s
 # -- card --------------------------------------------------------------------------------------------------------------
 @dataclass(slots=True)
 class _Held:
-    """Bytes of one process as the log tells them. `floor` is what nobody expects back while it lives: context and leaks."""
+    """Bytes of one process as the log tells them. `floor` is what belongs to no lease: its context and what it leaked."""
 
     on_card: int = 0
     floor: int = 0
@@ -239,8 +239,6 @@ def _check_card(
         elif op == "leak":
             mine.floor += line["bytes"]
             mine.leaked += line["bytes"]
-        elif op == "died":
-            mine.floor = 0  # all of it must come back
         if pid:
             mine.on_card = line["process_bytes"]
         if op in ("context", "alloc") and line["delta"] > 0:

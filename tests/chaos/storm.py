@@ -98,6 +98,7 @@ class Storm:
         self._events: dict[tuple[int, float], dict[str, Any]] = {}
         self._steps: dict[str, list[asyncio.Future[dict[str, Any]]]] = defaultdict(list)
         self._queued: dict[str, str] = {}  # lease → consumer
+        self._tasks: set[asyncio.Task[None]] = set()
         self._hindrances: list[Hindrance] = []
         self._stopped: dict[int, Callable[[], None]] = {}  # by pid: how to let it go on
         self._tally = Tally()
@@ -334,8 +335,8 @@ class Storm:
                     "hidden processes": {"faults": {"hide_processes": True}},
                     "lag": {"release_lag_s": 1.5},
                 }[fault]
-                self._set_card(**faulty)
-                self._later(pause_s, lambda: self._set_card())
+                await asyncio.to_thread(self._set_card, **faulty)
+                self._later(pause_s, self._mend_card)
 
     async def _strike_disk(self, fault: str, pause_s: float) -> None:
         if self._disk_is_full or self._daemon_busy.locked():
@@ -362,7 +363,13 @@ class Storm:
             _, hard = resource.prlimit(self._arbiter.pid, resource.RLIMIT_FSIZE)
             resource.prlimit(self._arbiter.pid, resource.RLIMIT_FSIZE, (hard, hard))
 
+    def _mend_card(self) -> None:
+        mending = asyncio.get_running_loop().create_task(asyncio.to_thread(self._set_card))
+        self._tasks.add(mending)
+        mending.add_done_callback(self._tasks.discard)
+
     def _set_card(self, release_lag_s: float = LAG_S, faults: dict[str, Any] | None = None) -> None:
+        """Not on the loop: whoever holds the card's lock may have been stopped, and the loop lets it go on."""
         path = self._arbiter.card / fakegpu.CARD_FILE
         with locked(self._arbiter.card):
             config = fakegpu.parse_config(path.read_text())
@@ -392,7 +399,8 @@ class Storm:
         for go_on in list(self._stopped.values()):
             go_on()
         self._empty_disk()
-        self._set_card()
+        await asyncio.gather(*self._tasks)
+        await asyncio.to_thread(self._set_card)
         for stranger in self._strangers:
             stranger.hang_up()
         everybody = [*self._slots.values(), *self._strangers, *([self._user] if self._user else [])]

@@ -13,8 +13,9 @@ import random
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from pathlib import Path
+from typing import Any
 
 from clients.aio import ArbiterClient
 from clients.lease import Lease
@@ -58,14 +59,7 @@ class Consumer:
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._stopping.set)
         async with ArbiterClient(name=self._name, connect_timeout_s=CONNECT_S) as client:
             while not self._stopping.is_set():
-                work = asyncio.ensure_future(self._round(client))
-                stop = asyncio.ensure_future(self._stopping.wait())
-                await asyncio.wait([work, stop], return_when=asyncio.FIRST_COMPLETED)
-                stop.cancel()
-                if not work.done():
-                    work.cancel()
-                with contextlib.suppress(asyncio.CancelledError):
-                    await work
+                await self._round(client)
         self._memory.close()
         self._trace.say("done")
 
@@ -101,15 +95,17 @@ class Consumer:
         lease_id = ""
         say("asked", bytes=spec.footprint.load_peak_bytes, exclusive=spec.mode == "exclusive")
         try:
-            lease = await client.acquire(
-                spec, self._random.choice([None, None, 5.0, 20.0]), unload=unload, on_lost=lost
+            lease = await self._unless_stopping(
+                client.acquire(
+                    spec, self._random.choice([None, None, 5.0, 20.0]), unload=unload, on_lost=lost
+                )
             )
-        except asyncio.CancelledError:
-            say("gave_up")
-            raise
         except VramError as error:
             say("denied", code=error.code)
             await self._pause(IDLE_S)
+            return
+        if lease is None:
+            say("gave_up")
             return
         lease_id = lease.lease_id
         say(
@@ -126,7 +122,8 @@ class Consumer:
         except SimulatedOutOfMemory as error:
             say("oom", lease_id=lease_id, requested_bytes=error.details["requested_bytes"])
             with contextlib.suppress(VramError):
-                await lease.oom(int(error.details["requested_bytes"]), self._memory.used_bytes())
+                used_bytes = await asyncio.to_thread(self._memory.used_bytes)
+                await lease.oom(int(error.details["requested_bytes"]), used_bytes)
         except VramError as error:
             say("refused", lease_id=lease_id, code=error.code)
         finally:
@@ -141,18 +138,35 @@ class Consumer:
         for _ in range(CHUNKS):
             if lease.state not in ("loading", "revoking"):
                 return
-            blocks.append(self._memory.allocate(lease.lease_id, (peak - extra) // CHUNKS))
+            blocks.append(await self._allocate(lease, (peak - extra) // CHUNKS))
             await self._pause(LOAD_S / CHUNKS)
         if extra:
-            scratch = self._memory.allocate(lease.lease_id, extra)
-            await self._pause(LOAD_S / CHUNKS)
-            self._memory.free(scratch)
-            self._memory.empty_cache()
-        await lease.ready(self._memory.used_bytes())
+            scratch = [await self._allocate(lease, extra)]
+            await self._free(scratch)
+        await lease.ready(await asyncio.to_thread(self._memory.used_bytes))
         self._trace.say("ready", lease_id=lease.lease_id)
+
+    async def _allocate(self, lease: Lease, size: int) -> Block:
+        """Off the loop, as real loaders do: the card's lock may be held by a process that was stopped."""
+        return await asyncio.to_thread(self._memory.allocate, lease.lease_id, size)
+
+    async def _unless_stopping(self, work: Coroutine[Any, Any, Lease]) -> Lease | None:
+        """What the work gives; None if this process is to stop first."""
+        task = asyncio.ensure_future(work)
+        stop = asyncio.ensure_future(self._stopping.wait())
+        await asyncio.wait([task, stop], return_when=asyncio.FIRST_COMPLETED)
+        stop.cancel()
+        if task.done():
+            return task.result()
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+        return None
 
     async def _use(self, lease: Lease) -> None:
         for _ in range(self._random.randint(1, 4)):
+            if self._stopping.is_set():
+                return
             async with lease.use("storm"):
                 self._trace.say("in_use", lease_id=lease.lease_id)
                 await self._pause(USE_S)
@@ -164,8 +178,8 @@ class Consumer:
     async def _free(self, blocks: list[Block]) -> None:
         await self._pause(UNLOAD_S)
         while blocks:
-            self._memory.free(blocks.pop())
-        self._memory.empty_cache()
+            await asyncio.to_thread(self._memory.free, blocks.pop())
+        await asyncio.to_thread(self._memory.empty_cache)
 
     async def _pause(self, longest_s: float) -> None:
         await asyncio.sleep(self._random.uniform(longest_s / 3, longest_s))

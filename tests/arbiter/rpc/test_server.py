@@ -107,6 +107,32 @@ def test_another_process_has_another_pid(serving: Serving) -> None:
     assert done.returncode == 0
 
 
+def test_a_client_that_is_back_before_the_self_test_is_answered(folder: Path) -> None:
+    """After a restart, reconnecting clients are quicker than our own probe: theirs was taken for it, and the daemon did not start."""
+    server = RouterServer(folder / "a.sock", LIMIT, None)
+    server.bind()
+    with WireClient(f"ipc://{folder / 'a.sock'}") as client:
+        client.send_raw(b"early")
+        assert server._socket.poll(10_000)
+        server._self_test()
+        heard: list[bytes] = []
+
+        async def serve() -> None:
+            done = asyncio.Event()
+
+            def on_frame(routing_id: bytes, delimiter: bool, address: str | None, payload: bytes) -> None:
+                heard.append(payload)
+                done.set()
+
+            server.start(asyncio.get_running_loop(), on_frame)
+            async with asyncio.timeout(10.0):
+                await done.wait()
+            server.close()
+
+        asyncio.run(serve())
+    assert heard == [b"early"]
+
+
 def test_a_req_socket_is_served_too(serving: Serving) -> None:
     with WireClient(f"ipc://{serving.path}", kind=zmq.REQ) as client:
         client.send_raw(b"x")
