@@ -27,6 +27,7 @@ from arbiter.host.gpu.probe import Card, GpuProbe
 from arbiter.host.history import CLEAN_END, History
 from arbiter.host.journal import Journal, Opened
 from arbiter.host.lockfile import LockFile
+from arbiter.host.memory import park_budget_bytes
 from arbiter.host.probing import Prober, within
 from arbiter.host.recorder import Recorder, freezer
 from arbiter.host.suspend import SuspendWatch
@@ -133,6 +134,7 @@ def core_settings(config: ArbiterConfig, gpus: tuple[GpuInfo, ...], opened: Open
         waiters_max=config.limits.waiters_max,
         leases_per_client_max=config.limits.leases_per_client_max,
         uses_per_lease_max=config.limits.uses_per_lease_max,
+        host_ram_budget_bytes=park_budget_bytes(config.host.park_budget_bytes),
     )
 
 

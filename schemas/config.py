@@ -108,6 +108,13 @@ class LeaseConfig(_Section):
     """After a lease's ttl and this grace without the arbiter a client unloads by itself."""
 
 
+class HostConfig(_Section):
+    """Memory of the machine itself."""
+
+    park_budget_bytes: ByteSize | None = None
+    """Host RAM that parked models may keep together; 0: nobody parks. Null: half of what is available when the daemon starts."""
+
+
 class LimitsConfig(_Section):
     """Every queue and message has a limit; its breach is a typed error."""
 
@@ -189,6 +196,7 @@ class ArbiterConfig(_Section):
     verify: VerifyConfig = VerifyConfig()
     probe: ProbeConfig = ProbeConfig()
     lease: LeaseConfig = LeaseConfig()
+    host: HostConfig = HostConfig()
     limits: LimitsConfig = LimitsConfig()
     history: HistoryConfig = HistoryConfig()
     record: RecordConfig = RecordConfig()

@@ -81,6 +81,10 @@ class VramInsufficient(CallerError):
     code = "vram_insufficient"  # can never fit: details.needed_bytes, capacity_bytes, pinned
 
 
+class HostRamInsufficient(TransientError):
+    code = "host_ram_insufficient"  # no room to park: details.needed_bytes, budget_bytes, booked_bytes
+
+
 class UnknownGpu(CallerError):
     code = "unknown_gpu"
 

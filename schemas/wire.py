@@ -56,6 +56,7 @@ class LeaseSpec(_Frozen):
         "wait"  # what a waiter gets when a holder outstays the ladder's deadline
     )
     standby: bool = False  # asked to leave, it comes back by itself when there is room
+    park_bytes: Bytes = 0  # host RAM that keeps its weights while it is away; 0: it cannot be parked
 
 
 class _Request(_Frozen):
@@ -140,6 +141,7 @@ class Release(_OnLease):
 
     op: Literal["release"]
     exiting: bool = False
+    parked: bool = False  # the weights are in host RAM: the lease lives on as `parked`
 
 
 class Cancel(_Request):
@@ -160,7 +162,7 @@ class ReattachLease(_Frozen):
     lease_id: LeaseIdText
     token: TokenPair
     spec: LeaseSpec
-    state: Literal["loading", "held", "standby"]  # standby: `token` is the last one
+    state: Literal["loading", "held", "standby", "parked"]  # standby, parked: `token` is the last one
     measured_bytes: Bytes | None = None
     use_ids: Annotated[tuple[Name, ...], Field(max_length=d.USES_PER_LEASE_MAX)] = ()
 
@@ -287,6 +289,7 @@ class LeaseView(TypedDict):
     pid: int
     since_s: float  # seconds in this state
     standby: NotRequired[bool]  # asked to leave, it comes back by itself
+    parked_bytes: NotRequired[int]  # host RAM that is booked for it
     waited_s: NotRequired[float]
     position: NotRequired[int]
     pinned: NotRequired[str]  # which operator pinned it, and why
@@ -324,6 +327,7 @@ class RevokePush(TypedDict):
     wanted_by: str
     deadline_in_s: float
     uses: NotRequired[int]  # what still runs on the lease, whoever marked it; `unloading` is refused before 0
+    park: NotRequired[bool]  # host RAM for its weights is booked until it lets go: release with `parked`
 
 
 class GrantedPush(TypedDict):
@@ -375,6 +379,7 @@ class StatusReply(TypedDict):
     gpus: list[GpuView]
     leases: list[LeaseView]  # live ones: held, loading, …, then the queue in order
     clients: int
+    host_ram: NotRequired[dict[str, int]]  # {"budget_bytes", "parked_bytes"}
     drained: str  # who drained the arbiter and why; "" while it grants
 
 

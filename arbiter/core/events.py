@@ -56,6 +56,7 @@ class Spec:
     min_residency_s: float
     deny_on_deadline: bool
     standby: bool = False
+    park_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +141,7 @@ class ReleaseReported:
     lease: LeaseId
     token: Token
     exiting: bool
+    parked: bool = False  # its weights are in host RAM
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +170,8 @@ class ReattachedLease:
     held: bool  # False: still loading
     measured_bytes: int | None
     uses: tuple[UseId, ...]
-    away: bool = False  # on standby
+    away: bool = False  # on standby or parked
+    parked: bool = False
 
 
 @dataclass(frozen=True, slots=True)

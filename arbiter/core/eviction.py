@@ -26,7 +26,10 @@ def ask(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: str) 
     )
     gpu.evictions.append(holder.eviction)
     holder.move(LeaseState.REVOKING, core.now, reason)
-    if holder.spec.standby:  # a restart must not take a release that was asked for as one that was wished for
+    parks = core.host.book(holder.id, holder.spec.park_bytes)
+    if (
+        holder.spec.standby or parks
+    ):  # a restart must not take a release that was asked for as one that was wished for
         core.record_lease(holder)
     core.want_sample(gpu, core.now)
     _push_now(core, holder, holder.eviction)
@@ -53,6 +56,7 @@ def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
             "wanted_by": eviction.wanted_consumer,
             "deadline_in_s": max(0.0, eviction.asked_at + core.settings.revoke_deadline_s - core.now),
             "uses": len(holder.uses),
+            "park": holder.id in core.host.booked,
         },
     )
 

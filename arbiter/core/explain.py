@@ -12,7 +12,7 @@ NOTE_KINDS: tuple[str, ...] = (
     "queued", "granted", "ready", "switch", "use_began", "use_ended", "use_yielded", "revoke_asked", "revoke_acked", "reminded",
     "deadline_passed", "unloading", "released", "verified", "denied", "cancelled", "expired", "lost", "reattached", "oom",
     "pressure", "stowaway", "probe_failed", "probe_ok", "drift", "journal_failed", "recovered", "serving", "operator", "resumed",
-    "standby",
+    "standby", "parked",
 )  # fmt: skip
 """Every kind of `effects.Note`. `switch` comes with each `ready`; its field `switched` says whether anybody had to leave."""
 
@@ -43,6 +43,8 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
         shown["yielded"] = len(lease.yielded)
     if lease.spec.standby:
         shown["standby"] = True
+    if lease.id in core.host.booked:
+        shown["parked_bytes"] = core.host.booked[lease.id]
     if lease.state is LeaseState.QUEUED:
         shown["position"] = min(core.gpus[gpu_id].queue.position(lease) for gpu_id in lease.gpus)
     elif lease.state is not LeaseState.VERIFYING and lease.state not in AWAY:
@@ -121,6 +123,7 @@ def status(core: Core) -> dict[str, Any]:
         "gpus": [gpu_view(core, gpu) for gpu in core.gpus.values()],
         "leases": [view(core, lease) for lease in [*resident, *waiting]],
         "clients": len(core.clients),
+        "host_ram": {"budget_bytes": core.host.budget_bytes, "parked_bytes": core.host.used_bytes()},
         "drained": "" if core.drain is None else str(core.drain),
     }
 

@@ -9,7 +9,7 @@ Numbers are those of the design:
   2. nobody is resident beside an exclusive lease
   3. nothing that is in use unloads
   4. bytes stay charged until a verdict: whoever is resident is charged, whoever is charged is resident or under measurement,
-     whoever is away is neither
+     whoever is away is neither; parked weights never exceed the budget of host RAM
   5. tokens only grow
   6. every waiter is in a queue, has a timer if it has a bound, and its card has a next reading scheduled
 """
@@ -115,11 +115,14 @@ def _charges(gpu: Gpu) -> None:
 
 
 def _away(core: Core) -> None:
+    parked = core.host.granted_bytes()
+    if parked > core.host.budget_bytes:
+        raise InvariantViolation(4, f"{parked} bytes are parked, the budget is {core.host.budget_bytes}")
     for lease in core.away.values():
         if lease.state not in AWAY or lease.id not in core.leases:
             raise InvariantViolation(4, f"{lease.id} is {lease.state}, yet it counts as away")
         if lease.gpu is not None or lease.id in core.waiting:
-            raise InvariantViolation(4, f"{lease.id} is on standby, yet it has a card or waits for one")
+            raise InvariantViolation(4, f"{lease.id} is {lease.state}, yet it has a card or waits for one")
 
 
 def _tokens(core: Core) -> None:

@@ -25,6 +25,7 @@ class LeaseState(StrEnum):
     REVOKING = "revoking"
     UNLOADING = "unloading"
     VERIFYING = "verifying"
+    PARKED = "parked"  # away, its weights are in host RAM
     STANDBY = "standby"  # asked to leave, away, comes back by itself when there is room
     RELEASED = "released"
     EXPIRED = "expired"
@@ -44,7 +45,8 @@ TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
         _S.HELD: frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING, *_GONE}),
         _S.REVOKING: frozenset({_S.UNLOADING, _S.VERIFYING, *_GONE}),
         _S.UNLOADING: frozenset({_S.VERIFYING, *_GONE}),
-        _S.VERIFYING: frozenset({_S.RELEASED, _S.STANDBY}),
+        _S.VERIFYING: frozenset({_S.RELEASED, _S.PARKED, _S.STANDBY}),
+        _S.PARKED: frozenset({_S.LOADING, _S.QUEUED, _S.CANCELLED, _S.LOST}),
         _S.STANDBY: frozenset({_S.LOADING, _S.QUEUED, _S.CANCELLED, _S.LOST}),
         _S.RELEASED: frozenset(),
         _S.EXPIRED: frozenset(),
@@ -57,7 +59,7 @@ TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
 
 TERMINAL = frozenset(state for state, following in TRANSITIONS.items() if not following)
 LEAVING = frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING})
-AWAY = frozenset({_S.STANDBY})
+AWAY = frozenset({_S.PARKED, _S.STANDBY})
 """States of a lease that lives on without bytes on a card: nobody renews it, it waits for nothing with a bound."""
 EXPIRING = frozenset({_S.LOADING, _S.HELD, _S.REVOKING, _S.UNLOADING})
 """States that a holder must renew."""
@@ -175,7 +177,8 @@ class Lease:
     reason: str = ""  # why it waits, in words; for people
     planned_gpu: GpuId | None = None  # a card where somebody was asked to leave for it
     pinned: Order | None = None  # by an operator
-    comes_back: bool = False  # on standby once its bytes are measured gone
+    parks: bool = False  # it let go with its weights kept in host RAM
+    comes_back: bool = False  # by itself, once its bytes are measured gone and there is room
     left_for: str = ""  # the consumer that it left for last; it does not come back beside that one
     away_since: float = 0.0
     uncalled: bool = False  # it came back by itself and nobody has used it since

@@ -67,14 +67,15 @@ def find(core: Core, target: str) -> Lease:
 def evict(core: Core, lease: Lease, order: Order) -> None:
     """Ask a holder to leave, as the engine would for a waiter. In use, it finishes first. Asking twice is fine.
 
-    A lease on standby ends with it: what an operator sends away does not come back by itself.
+    What an operator sends away does not come back by itself: a lease on standby ends with it, a parked one waits for its holder.
     """
     if lease.state in AWAY:
         _note(core, "evict", order, lease)
         standby.send_off(core, lease, f"evicted by {order}")
         return
     if lease.state in LEAVING:
-        standby.renounce(lease)
+        lease.comes_back = False
+        lease.recalled = None
         _ordered(core, lease, order)
         _note(core, "evict", order, lease, repeated=True)
         return

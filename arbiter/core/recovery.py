@@ -46,13 +46,14 @@ def on_recovered(core: Core, event: Recovered) -> None:
 
 
 def _restore_away(core: Core, record: Mapping[str, Any]) -> None:
-    """A lease on standby holds nothing: nobody waits for its holder, but it does not come back before him either."""
+    """A lease that is away holds nothing on a card: nobody waits for its holder, but it does not come back before him either."""
     lease = _remembered(core, record, LeaseState(str(record["state"])))
     lease.gpus = tuple(gpu.info.id for gpu in _selected(core, lease.spec))
     core.add(lease)
     core.nonces[lease.process, lease.nonce] = lease.id
     lease.away_since = core.now
     core.away[lease.id] = lease
+    core.host.find(lease.id, int(record.get("parked_bytes", 0)))
     core.timers.set(("ttl", lease.id), core.now + lease.spec.ttl_s + core.settings.fence_grace_s)
 
 
@@ -85,6 +86,7 @@ def _remembered(core: Core, record: Mapping[str, Any], state: LeaseState) -> Lea
         exiting=bool(record["exiting"]),
         pinned=None if record.get("pinned") is None else Order(*record["pinned"]),
         attached=False,
+        parks=bool(record.get("parks", False)),
         comes_back=bool(record.get("comes_back", False)),
         left_for=str(record.get("left_for", "")),
         story=[(core.now, state, "recovered from the journal")],
@@ -97,6 +99,7 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
     lease_id, process, token, spec = lease.id, lease.process, lease.token, lease.spec
     lease.gpu, lease.gpus = gpu.info.id, (gpu.info.id,)
     _place(core, gpu, lease, int(record["charge_bytes"]))
+    core.host.find(lease.id, int(record.get("parked_bytes", 0)))
     core.nonces[process, lease.nonce] = lease_id
     if state == "debt":
         gpu.ledger.to_debt(lease_id)
@@ -161,6 +164,7 @@ def spec_from_record(record: Mapping[str, Any]) -> Spec:
         min_residency_s=float(record["min_residency_s"]),
         deny_on_deadline=bool(record["deny_on_deadline"]),
         standby=bool(record.get("standby", False)),
+        park_bytes=int(record.get("park_bytes", 0)),
     )
 
 
@@ -244,7 +248,9 @@ def _believe_away(core: Core, lease: Lease, item: ReattachedLease) -> None:
     elif lease.state in EXPIRING:
         ordered = lease.eviction is not None and lease.eviction.order is not None
         back = lease.spec.standby and not ordered
-        let_go(core, lease, exiting=False, why="let go, says its holder", comes_back=back)
+        if item.parked:
+            core.host.find(lease.id, lease.spec.park_bytes)
+        let_go(core, lease, exiting=False, why="let go, says its holder", comes_back=back, parks=item.parked)
 
 
 def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLease) -> None:
@@ -305,7 +311,10 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
     core.add(lease)
     core.nonces[lease.process, lease.nonce] = lease.id
     if item.away:
-        lease.state, lease.gpu, lease.comes_back = LeaseState.STANDBY, None, True
+        lease.state = LeaseState.PARKED if item.parked else LeaseState.STANDBY
+        lease.gpu, lease.comes_back, lease.parks = None, spec.standby or not item.parked, item.parked
+        if item.parked:
+            core.host.find(lease.id, spec.park_bytes)
         lease.gpus = tuple(gpu.info.id for gpu in gpus)
         standby.enter(core, lease)
         return lease
@@ -342,8 +351,16 @@ def void_at_baseline(core: Core, sample: MemorySampled) -> None:
             continue
         if gpu.ledger.charge_bytes(lease.id) <= noise_bytes:
             continue
-        if lease.state is LeaseState.REVOKING and standby.stays_on(lease):  # it left as it was asked to
-            let_go(core, lease, exiting=False, why="the card is empty", comes_back=True)
+        parks = lease.id in core.host.booked
+        if lease.state is LeaseState.REVOKING and (parks or standby.stays_on(lease)):  # as it was asked to
+            let_go(
+                core,
+                lease,
+                exiting=False,
+                why="the card is empty",
+                comes_back=standby.stays_on(lease),
+                parks=parks,
+            )
             continue
         gpu.ledger.drop(lease.id, 0, 0, core.now)
         core.forget(f"lease:{lease.id}")

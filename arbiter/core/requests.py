@@ -186,7 +186,7 @@ def reacquire(core: Core, event: Reacquired) -> None:
         _check_waiters(core)
         _call_back(core, lease, event.client, event.request, event.wait_timeout_s, gpus)
         return
-    if lease.state is LeaseState.VERIFYING and lease.comes_back:
+    if lease.state is LeaseState.VERIFYING and (lease.comes_back or lease.parks):
         lease.recalled = lease.recalled or Recall(core.now, event.wait_timeout_s)
     elif lease.state is not LeaseState.QUEUED:
         raise bad_state(
@@ -340,6 +340,7 @@ def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     drift.on_ready(core, lease, measured_bytes)
     steady = lease.steady_bytes if measured_bytes is None else max(measured_bytes, lease.spec.residue_bytes)
     gpu.ledger.recharge(lease.id, steady, core.now)
+    core.host.drop(lease.id)
     gpu.changed_at = core.now
     core.want_sample(gpu, core.now)  # what it holds now is what has to come back one day
     core.wake(gpu)
@@ -402,12 +403,14 @@ def release(core: Core, event: ReleaseReported) -> None:
         return
     lease = own_lease(core, event.client, event.lease, event.token)
     if lease.gpu is not None and lease.state is not LeaseState.VERIFYING:  # else: a repeat
+        _keep_parked(core, lease, parked=event.parked, exiting=event.exiting)
         let_go(
             core,
             lease,
             exiting=event.exiting,
             why="exits" if event.exiting else "let go",
             comes_back=standby.stays_on(lease) and not event.exiting,
+            parks=event.parked,
         )
     core.reply(event.client, event.request, {"state": str(lease.state)})
 
@@ -427,13 +430,39 @@ def note_ended(core: Core, lease: Lease, use: Use, why: str) -> None:
     )
 
 
-def let_go(core: Core, lease: Lease, *, exiting: bool, why: str, comes_back: bool = False) -> None:
+def _keep_parked(core: Core, lease: Lease, *, parked: bool, exiting: bool) -> None:
+    """Book host RAM for what the holder says that it keeps there; refuse what it has no room for."""
+    if not parked:
+        return
+    count = lease.spec.park_bytes
+    if exiting or not count:
+        what = "a process that exits keeps nothing" if exiting else "its spec has no park_bytes"
+        raise bad_state(lease, f"it cannot be parked: {what}")
+    if lease.id in core.host.booked or core.host.book(lease.id, count):
+        return
+    host = core.host
+    raise Refused(
+        "host_ram_insufficient",
+        f"{count} bytes of host RAM are asked for; of a budget of {host.budget_bytes} {host.used_bytes()} are booked",
+        "release without parking, or raise host.park_budget_bytes",
+        needed_bytes=count,
+        budget_bytes=host.budget_bytes,
+        booked_bytes=host.used_bytes(),
+    )
+
+
+def let_go(
+    core: Core, lease: Lease, *, exiting: bool, why: str, comes_back: bool = False, parks: bool = False
+) -> None:
     """From any resident state to verification. Uses that others left on it end with it."""
     gpu = core.gpu_of(lease)
     end_uses(core, lease, why)
     before = lease.state
     lease.exiting = exiting
     lease.comes_back = comes_back
+    lease.parks = parks
+    if not parks:
+        core.host.drop(lease.id)
     lease.move(LeaseState.VERIFYING, core.now, why)
     core.timers.clear(("ttl", lease.id))
     if lease.eviction is not None:

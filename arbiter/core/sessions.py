@@ -42,7 +42,7 @@ def on_left(core: Core, event: ClientLeft) -> None:
                 core, lease, LeaseState.CANCELLED, "cancelled", f"its client left: {event.reason}"
             )
         elif lease.state is LeaseState.VERIFYING:
-            standby.renounce(lease)
+            standby.renounce(core, lease)
         elif lease.state in EXPIRING and event.reason == BYE:
             let_go(core, lease, exiting=False, why="its client said bye")
 
@@ -83,7 +83,7 @@ def _bereave(core: Core, lease: Lease) -> None:
         error = {"code": "lease_lost", "message": message, "hint": "acquire again", "details": {}}
         lose(core, lease, LeaseState.LOST, error, alive=False, grace_s=0.0)
     else:  # a lease under verification goes on: only its residue is no longer expected
-        standby.renounce(lease)
+        standby.renounce(core, lease)
 
 
 def on_journal_failed(core: Core, event: JournalFailed) -> None:

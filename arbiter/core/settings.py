@@ -41,6 +41,8 @@ class Settings:
     waiters_max: int = d.WAITERS_MAX
     leases_per_client_max: int = d.LEASES_PER_CLIENT_MAX
     uses_per_lease_max: int = d.USES_PER_LEASE_MAX
+    host_ram_budget_bytes: int = 0
+    """Host RAM for the weights of parked leases; 0: nobody parks."""
     policy: str = DEFAULT
     """A name of `core.scheduling.SCHEDULING`."""
     learnt: dict[str, dict[str, float]] = field(default_factory=dict)

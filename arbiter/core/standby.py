@@ -1,4 +1,5 @@
-"""Leases that live on without bytes on a card: they were asked to leave, and come back by themselves when there is room.
+"""Leases that live on without bytes on a card: on standby they come back by themselves when there is room, parked they keep their
+weights in host RAM meanwhile (and come back by themselves only if they are on standby too).
 
 Coming back is a favour, never a claim: nobody is asked to leave for it, nobody who waits is passed by, and it stays away while the
 consumer that it left for is on the card. A holder that needs its lease *now* says so (`reacquire`) and is a waiter like any other.
@@ -23,21 +24,27 @@ def stays_on(lease: Lease) -> bool:
 
 
 def settle(core: Core, lease: Lease, verdict: str) -> None:
-    """Its bytes are measured gone: the end, or standby."""
-    if not lease.comes_back:
+    """Its bytes are measured gone: the end, or away."""
+    if not (lease.comes_back or lease.parks):
         lease.move(LeaseState.RELEASED, core.now, verdict)
         core.end(lease, None)
         return
     gpu = core.gpu_of(lease)
     del gpu.residents[lease.id]
     core.wake(gpu)
-    lease.move(LeaseState.STANDBY, core.now, verdict)
+    lease.move(LeaseState.PARKED if lease.parks else LeaseState.STANDBY, core.now, verdict)
     lease.gpu = lease.baseline = lease.eviction = lease.measured_bytes = lease.request = None
     lease.load_peak_bytes, lease.steady_bytes = drift.expected_bytes(core, lease.spec)
     lease.evicted = []
     lease.answered = True
     enter(core, lease)
-    core.note("standby", lease, left_for=lease.left_for, reason="comes back by itself when there is room")
+    core.note(
+        str(lease.state),
+        lease,
+        left_for=lease.left_for,
+        parked_bytes=core.host.booked.get(lease.id, 0),
+        reason=f"comes back {'by itself when there is room' if lease.comes_back else 'when its holder asks'}",
+    )
     if lease.recalled is not None:
         recall, lease.recalled = lease.recalled, None
         queue_again(core, lease, lease.client, None, recall.asked_at, recall.wait_timeout_s)
@@ -51,14 +58,19 @@ def enter(core: Core, lease: Lease) -> None:
     wake_all(core, lease)
 
 
-def renounce(lease: Lease) -> None:
-    """A lease under measurement whose holder does not want it back."""
-    lease.comes_back = False
+def renounce(core: Core, lease: Lease) -> None:
+    """A lease under measurement whose holder does not want it back, nor keeps anything of it."""
+    lease.comes_back = lease.parks = False
     lease.recalled = None
+    core.host.drop(lease.id)
 
 
 def send_off(core: Core, lease: Lease, why: str) -> None:
-    """A lease that is away ends against its holder's wish: he is told."""
+    """An operator does not want it back. On standby it ends, and its holder is told; parked it stays until its holder asks."""
+    if lease.state is LeaseState.PARKED:
+        lease.comes_back = False
+        core.record_lease(lease)
+        return
     token = lease.token
     assert token is not None, f"{lease.id} is away and was never granted"
     error = {"code": "lease_lost", "message": f"{lease.id}: {why}", "hint": "acquire again", "details": {}}
@@ -110,7 +122,7 @@ def queue_again(
 
 def taken_back(core: Core, lease: Lease) -> bool:
     """The lease is being granted. Did it come back by itself? Then it has waited for nothing, and has no claim to stay yet."""
-    lease.comes_back = False
+    lease.comes_back = lease.parks = False
     lease.uncalled = core.away.pop(lease.id, None) is not None
     if lease.uncalled:
         lease.arrived_at = core.now
@@ -141,23 +153,30 @@ def next_back(core: Core, gpu: Gpu) -> Lease | None:
 
 def outlook(core: Core, lease: Lease) -> str:
     """What it waits for, in words; of several cards the first that it may return to."""
+    where = "parked" if lease.state is LeaseState.PARKED else "on standby"
+    return f"{where}{_outlook(core, lease)}"
+
+
+def _outlook(core: Core, lease: Lease) -> str:
     if not lease.attached:
-        return f"on standby, but {NOT_BACK}"
+        return f", but {NOT_BACK}"
+    if not lease.comes_back:
+        return " in host RAM until its holder asks for it"
     gpu = core.gpus[lease.gpus[0]]
     blocked = policy.blocked(core, gpu)
     head = gpu.queue.head()
     if head is not None:
-        return f"on standby: {head.spec.consumer} waits, and goes first"
+        return f": {head.spec.consumer} waits, and goes first"
     if blocked:
-        return f"on standby: {blocked}"
+        return f": {blocked}"
     if _left_for_is_here(gpu, lease):
-        return f"on standby until {lease.left_for} has left"
+        return f" until {lease.left_for} has left"
     if not policy.fits(gpu, lease):
-        return "on standby until there is room; it asks nobody to leave"
+        return " until there is room; it asks nobody to leave"
     due_at = _quiet_at(gpu, lease)
     if due_at > core.now:
-        return f"on standby: comes back in {due_at - core.now:.1f} s if the card stays quiet"
-    return "on standby: comes back with the next reading of the card, or after those before it"
+        return f": comes back in {due_at - core.now:.1f} s if the card stays quiet"
+    return ": comes back with the next reading of the card, or after those before it"
 
 
 def wake_all(core: Core, lease: Lease) -> None:
@@ -175,7 +194,10 @@ def _returning(core: Core, gpu: Gpu) -> Iterator[Lease]:
     return (
         lease
         for lease in core.away.values()
-        if lease.attached and gpu.info.id in lease.gpus and not _left_for_is_here(gpu, lease)
+        if lease.comes_back
+        and lease.attached
+        and gpu.info.id in lease.gpus
+        and not _left_for_is_here(gpu, lease)
     )
 
 

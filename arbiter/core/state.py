@@ -14,6 +14,7 @@ from arbiter.core.events import MemorySampled
 from arbiter.core.footprints import Footprints
 from arbiter.core.lease import LEAVING, Eviction, Lease, LeaseState, Order, Use
 from arbiter.core.ledger import GpuLedger
+from arbiter.core.parking import HostRam
 from arbiter.core.queue import WaitQueue
 from arbiter.core.residents import Residents
 from arbiter.core.settings import GpuInfo, Settings
@@ -116,6 +117,7 @@ class Core:
         self._of_process: dict[ProcessKey, dict[LeaseId, Lease]] = {}
         self.waiting: dict[LeaseId, Lease] = {}
         self.away: dict[LeaseId, Lease] = {}  # without bytes on a card, in the order of their leaving
+        self.host = HostRam(settings.host_ram_budget_bytes)
         self.nonces: dict[tuple[ProcessKey, str], LeaseId] = {}
         self.clients: dict[ClientId, Client] = {}
         self.ended: OrderedDict[LeaseId, Ended] = OrderedDict()
@@ -250,6 +252,7 @@ class Core:
         for kind in ("ttl", "revoke"):
             self.timers.clear((kind, lease.id))
         self.away.pop(lease.id, None)
+        self.host.drop(lease.id)
         if lease.gpu is not None:
             gpu = self.gpus[lease.gpu]
             gpu.residents.pop(lease.id, None)
@@ -298,6 +301,8 @@ class Core:
                 "exiting": lease.exiting,
                 "pinned": None if lease.pinned is None else [lease.pinned.by, lease.pinned.reason],
                 "comes_back": lease.comes_back,
+                "parks": lease.parks,
+                "parked_bytes": self.host.booked.get(lease.id, 0),
                 "left_for": lease.left_for,
                 "ordered": None if order is None else [order.by, order.reason],
                 "spec": {
@@ -315,6 +320,7 @@ class Core:
                     "min_residency_s": spec.min_residency_s,
                     "deny_on_deadline": spec.deny_on_deadline,
                     "standby": spec.standby,
+                    "park_bytes": spec.park_bytes,
                 },
             },
         )

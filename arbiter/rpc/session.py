@@ -384,7 +384,7 @@ class SessionTable:
             case w.Unloading():
                 post(ev.UnloadStarted(client, re, *_on_lease(request)))
             case w.Release():
-                post(ev.ReleaseReported(client, re, *_on_lease(request), request.exiting))
+                post(ev.ReleaseReported(client, re, *_on_lease(request), request.exiting, request.parked))
             case w.Cancel():
                 post(ev.CancelRequested(client, re, LeaseId(request.lease_id)))
             case w.Reacquire():
@@ -434,6 +434,7 @@ def to_spec(spec: w.LeaseSpec) -> ev.Spec:
         min_residency_s=spec.min_residency_s,
         deny_on_deadline=spec.on_deadline == "deny",
         standby=spec.standby,
+        park_bytes=spec.park_bytes,
     )
 
 
@@ -456,5 +457,6 @@ def _reattached(lease: w.ReattachLease) -> ev.ReattachedLease:
         held=lease.state == "held",
         measured_bytes=lease.measured_bytes,
         uses=tuple(UseId(use) for use in lease.use_ids),
-        away=lease.state == "standby",
+        away=lease.state in ("standby", "parked"),
+        parked=lease.state == "parked",
     )

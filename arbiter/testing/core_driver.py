@@ -10,7 +10,7 @@ For tests of the core and of whatever stands on it. Knows nothing of sockets or 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from arbiter.core.arbiter import Arbiter
@@ -217,7 +217,7 @@ class CoreDriver:
 
     def restart(self, *, epoch: int = 2, keep_journal: bool = True) -> None:
         """kill -9 of the daemon: a new core, the journal's records, no memory of anything else."""
-        self.settings = Settings(epoch=epoch, gpus=self.settings.gpus)
+        self.settings = replace(self.settings, epoch=epoch)
         self.arbiter = Arbiter(self.settings, self.now)
         self._readings.clear()
         records = dict(self.journal) if keep_journal else {}
@@ -312,6 +312,7 @@ class Consumer:
         min_residency_s: float = 0.0,
         deny_on_deadline: bool = False,
         standby: bool = False,
+        park_bytes: int = 0,
         key: str | None = None,
     ) -> Spec:
         """A spec with the bytes that matter; no residue, no residency and a long ttl unless asked for."""
@@ -329,6 +330,7 @@ class Consumer:
             min_residency_s=min_residency_s,
             deny_on_deadline=deny_on_deadline,
             standby=standby,
+            park_bytes=park_bytes,
         )
 
     def acquire(
@@ -415,10 +417,12 @@ class Consumer:
             UnloadStarted(self.client, self.driver.next_request(), lease, self.token(lease))
         )
 
-    def release(self, lease: LeaseId, *, exiting: bool = False, token: Token | None = None) -> list[Effect]:
+    def release(
+        self, lease: LeaseId, *, exiting: bool = False, token: Token | None = None, parked: bool = False
+    ) -> list[Effect]:
         return self.driver.post(
             ReleaseReported(
-                self.client, self.driver.next_request(), lease, token or self.token(lease), exiting
+                self.client, self.driver.next_request(), lease, token or self.token(lease), exiting, parked
             )
         )
 
@@ -456,6 +460,7 @@ class Consumer:
         uses: Sequence[str] = (),
         spec: Spec | None = None,
         away: bool = False,
+        parked: bool = False,
     ) -> list[Effect]:
         item = ReattachedLease(
             lease,
@@ -464,7 +469,8 @@ class Consumer:
             held,
             measured_bytes,
             tuple(UseId(use) for use in uses),
-            away,
+            away or parked,
+            parked,
         )
         return self.driver.post(Reattached(self.client, self.driver.next_request(), (item,)))
 
@@ -483,15 +489,15 @@ class Consumer:
         self.hold(steady, gpu=GpuId(str(view["gpu"])))
         return self.ready(lease, measured_bytes)
 
-    def unload(self, lease: LeaseId, *, unload_s: float = 0.0) -> list[Effect]:
-        """At a safe point: `unloading`, the bytes go but for the residue, `release`."""
+    def unload(self, lease: LeaseId, *, unload_s: float = 0.0, parked: bool = False) -> list[Effect]:
+        """At a safe point: `unloading`, the bytes go (to host RAM if `parked`) but for the residue, `release`."""
         view = self.driver.view(lease)
         if view is None:
             raise AssertionError(f"{lease} is over")
         self.unloading(lease)
         self.driver.advance(unload_s)
         self.hold(self.specs[lease].residue_bytes, gpu=GpuId(str(view["gpu"])))
-        return self.release(lease)
+        return self.release(lease, parked=parked)
 
 
 def refusal(effects: Sequence[Effect]) -> Refuse:

@@ -30,6 +30,7 @@ def test_revoke_is_sent_again_until_acknowledged() -> None:
         "wanted_by": "vlm",
         "deadline_in_s": 30.0,
         "uses": 1,
+        "park": False,
     }
     driver.advance(1.01)
     assert len(driver.pushes("revoke")) == 5, "every 250 ms"

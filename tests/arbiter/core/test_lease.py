@@ -40,10 +40,10 @@ def test_only_who_is_away_waits_again_and_nothing_leads_out_of_expired() -> None
 def test_a_long_life_is_told_by_its_last_steps() -> None:
     one = lease()
     for turn in range(40):
-        for to in (LeaseState.LOADING, LeaseState.HELD, LeaseState.VERIFYING, LeaseState.STANDBY):
+        for to in (LeaseState.LOADING, LeaseState.HELD, LeaseState.VERIFYING, LeaseState.PARKED):
             one.move(to, float(turn), f"turn {turn}")
     assert len(one.story) == STORY_MAX
-    assert one.told().endswith("39.000 standby (turn 39)")
+    assert one.told().endswith("39.000 parked (turn 39)")
 
 
 def test_a_legal_life_is_told() -> None:
