@@ -4,6 +4,8 @@ SEED ?= 0
 ARBITER ?= on
 GPU ?= fake:8GiB
 OUT ?= out/demo
+PREFIX ?= /opt/vram-arbiter
+DESTDIR ?=
 ARGS ?=
 # How long `make chaos` storms.
 SECONDS ?= 300
@@ -14,10 +16,10 @@ CORE := .venv-core/bin
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core demo test test-core lint format chaos bench schemas clean
+.PHONY: help setup setup-core demo test test-core lint format chaos bench schemas install-units clean
 
 help: ## this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
 
 setup: ## environment with everything (.venv)
 	@bash .ci/setup full
@@ -53,6 +55,9 @@ bench: setup ## measure grants and handovers against bare ZeroMQ
 
 schemas: setup ## write the JSON Schemas anew after a model changed
 	$(BIN)/python -m schemas export schemas/json
+
+install-units: ## copy the systemd units into the system (docs/systemd.md): PREFIX=/opt/vram-arbiter DESTDIR=
+	@bash .ci/install-units "$(PREFIX)" "$(DESTDIR)"
 
 clean: ## remove environments, caches and outputs
 	rm -rf .venv .venv-core build dist out .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage

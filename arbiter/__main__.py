@@ -5,14 +5,23 @@ import asyncio
 import faulthandler
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 
 from schemas.config import ArbiterConfig, load_config
-from schemas.errors import AlreadyRunning, ConfigError, InternalError, NoGpu, ProbeFailed, VramError
+from schemas.errors import (
+    AlreadyRunning,
+    ConfigError,
+    InternalError,
+    JournalUnavailable,
+    NoGpu,
+    ProbeFailed,
+    VramError,
+)
 
-EXIT_USAGE, EXIT_ALREADY_RUNNING, EXIT_NO_GPU, EXIT_DEFECT = 2, 3, 4, 70
+EXIT_USAGE, EXIT_ALREADY_RUNNING, EXIT_NO_GPU, EXIT_NO_DISK, EXIT_DEFECT = 2, 3, 4, 5, 70
+CONFIG_NAME = "arbiter.yaml"
 
 _EPILOG = """\
 exit codes:
@@ -20,6 +29,7 @@ exit codes:
   2   wrong flags or configuration
   3   another arbiter serves this socket or uses this state folder
   4   no GPU: no NVIDIA driver or no card (--gpu fake:8GiB simulates one)
+  5   the disk of the state folder is full
   70  a defect: the core's state became invalid; the log says how, a restart recovers the leases
 
 environment:
@@ -40,7 +50,7 @@ def parser() -> argparse.ArgumentParser:
         "--config",
         metavar="FILE",
         type=Path,
-        help="YAML file; every key is explained in configs/arbiter.yaml",
+        help="YAML file; every key is explained in configs/arbiter.yaml (default: arbiter.yaml in CONFIGURATION_DIRECTORY)",
     )
     made.add_argument(
         "--gpu",
@@ -49,6 +59,9 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--endpoint", metavar="URL", help="where to listen, ipc:///absolute/path")
     made.add_argument("--state-dir", metavar="DIR", help="folder of journal and history")
+    made.add_argument(
+        "--operators-group", metavar="GROUP", help="Unix group that may connect and act as operator"
+    )
     made.add_argument(
         "--log-format", choices=("human", "json"), help="human (default) or one JSON object a line"
     )
@@ -63,6 +76,13 @@ def version() -> str:
         return metadata.version("vram-arbiter")
     except metadata.PackageNotFoundError:  # run from a source tree that is not installed
         return "0+source"
+
+
+def config_of_service(environ: Mapping[str, str]) -> Path | None:
+    """`arbiter.yaml` in the configuration folder that systemd names, if there is one."""
+    folder = environ.get("CONFIGURATION_DIRECTORY", "").split(":")[0]
+    found = Path(folder) / CONFIG_NAME
+    return found if folder and found.exists() else None
 
 
 def effective_config(flags: argparse.Namespace) -> ArbiterConfig:
@@ -81,6 +101,7 @@ def effective_config(flags: argparse.Namespace) -> ArbiterConfig:
         ("gpu", "source", flags.gpu, "--gpu"),
         ("wire", "endpoint", flags.endpoint, "--endpoint"),
         ("state", "dir", flags.state_dir, "--state-dir"),
+        ("wire", "operators_group", flags.operators_group, "--operators-group"),
         ("log", "format", flags.log_format, "--log-format"),
         ("log", "level", flags.log_level, "--log-level"),
     ):
@@ -108,6 +129,8 @@ def exit_code_of(error: VramError) -> int:
             return EXIT_ALREADY_RUNNING
         case NoGpu() | ProbeFailed():
             return EXIT_NO_GPU
+        case JournalUnavailable():
+            return EXIT_NO_DISK
         case InternalError():
             return EXIT_DEFECT
         case _:
@@ -119,6 +142,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     flags = parser().parse_args(argv)
     faulthandler.enable()  # the manager's watchdog kills by SIGABRT: the log then says where the daemon was stuck
     try:
+        flags.config = flags.config or config_of_service(os.environ)
         config = effective_config(flags)
         from arbiter.daemon import Daemon, find_places  # late: --help and --version need none of it
         from arbiter.telemetry import set_up_logging

@@ -6,6 +6,7 @@ boot id voids every record. Only the epoch must never go back, so it also lies i
 database is put aside and reported, never repaired by guessing. Must not know what the records mean.
 """
 
+import errno
 import json
 import logging
 import os
@@ -54,7 +55,8 @@ class Journal:
 
     @classmethod
     def open(cls, folder: Path, boot_id: str, *, wall_s: float | None = None) -> Self:
-        """Open or make the journal in `folder`, and count a new epoch. Raises ConfigError if the folder cannot be written.
+        """Open or make the journal in `folder`, and count a new epoch. Raises ConfigError if the folder cannot be written,
+        JournalUnavailable if its disk is full: without a durable epoch tokens could be given out twice.
 
         1. Read; corrupt: put aside, start empty. 2. Another boot id: drop the records. 3. Epoch = 1 + the greatest known.
         """
@@ -80,6 +82,11 @@ class Journal:
             epoch = _next_epoch(folder, meta, put_aside is not None, wall_s)  # 3
             _write_meta(connection, boot_id, epoch, drop_records=voided > 0)
         except (OSError, sqlite3.OperationalError) as error:
+            if _is_full(error):
+                raise JournalUnavailable(
+                    f"the disk of the state folder {folder} is full: {error}",
+                    hint="make room on it, or choose another --state-dir",
+                ) from error
             raise ConfigError(
                 f"the state folder {folder} cannot be used: {error}",
                 hint="make it writable, or choose another --state-dir",
@@ -202,6 +209,12 @@ def _is_corruption(error: sqlite3.OperationalError) -> bool:
         sqlite3.SQLITE_CORRUPT,
         sqlite3.SQLITE_NOTADB,
     )
+
+
+def _is_full(error: OSError | sqlite3.OperationalError) -> bool:
+    if isinstance(error, OSError):
+        return error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_FULL
 
 
 def _put_aside(path: Path) -> Path:
