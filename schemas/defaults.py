@@ -44,6 +44,7 @@ IMAGE_MESSAGE_MAX_BYTES = 16 * MIB  # sidecar and runner wires only
 SESSIONS_MAX = 1024
 WAITERS_MAX = 16_384
 LEASES_PER_CLIENT_MAX = 64
+SUBLEASE_DEPTH_MAX = 4  # a lease, its sub-leases, theirs, and once more
 USES_PER_LEASE_MAX = 256
 RATE_PER_CLIENT_PER_S = 2000
 SUBSCRIBERS_MAX = 64

@@ -39,6 +39,11 @@ class Footprint(_Frozen):
     residue_bytes: Bytes = d.RESIDUE_BYTES
 
 
+class LeaseRef(_Frozen):
+    lease_id: LeaseIdText
+    token: TokenPair
+
+
 class LeaseSpec(_Frozen):
     """What a lease is to be. `evictable=False` pins it: nobody makes it leave."""
 
@@ -57,6 +62,10 @@ class LeaseSpec(_Frozen):
     )
     standby: bool = False  # asked to leave, it comes back by itself when there is room
     park_bytes: Bytes = 0  # host RAM that keeps its weights while it is away; 0: it cannot be parked
+    parent: LeaseRef | None = None  # a sub-lease: carved at once out of that lease's bytes, on its card
+    independent: bool = (
+        False  # the process's own uses do not wait for this lease (a prefetch): no deadlock is seen in it
+    )
 
 
 class _Request(_Frozen):
@@ -113,11 +122,6 @@ class Yield(_OnLease):
 
     op: Literal["yield"]
     use_id: Name
-
-
-class LeaseRef(_Frozen):
-    lease_id: LeaseIdText
-    token: TokenPair
 
 
 class Renew(_Request):
@@ -296,6 +300,8 @@ class LeaseView(TypedDict):
     ttl_left_s: NotRequired[float]
     drift_bytes: NotRequired[int]  # measured less declared, where that is more than the tolerance
     yielded: NotRequired[int]  # uses that pause
+    parent: NotRequired[str]
+    children: NotRequired[list[str]]
 
 
 class AcquireReply(TypedDict):
@@ -326,7 +332,10 @@ class RevokePush(TypedDict):
     reason: str
     wanted_by: str
     deadline_in_s: float
-    uses: NotRequired[int]  # what still runs on the lease, whoever marked it; `unloading` is refused before 0
+    uses: NotRequired[
+        int
+    ]  # what still runs on the lease (or its tree), whoever marked it; `unloading` is refused before 0
+    children: NotRequired[int]  # sub-leases that have to leave first
     park: NotRequired[bool]  # host RAM for its weights is booked until it lets go: release with `parked`
 
 

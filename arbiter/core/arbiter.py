@@ -25,6 +25,7 @@ from arbiter.core import (
     recovery,
     requests,
     resume,
+    subleases,
     uses,
 )
 from arbiter.core.effects import Effect
@@ -74,6 +75,7 @@ class Arbiter:
         core.now = max(core.now, now)
         core.out = []
         self._happened(event)  # 1
+        subleases.finish(core)
         recovery.serve_if_accounted(core)  # 2
         grants.schedule(core)  # 3
         requests.answer_queued(core)
@@ -171,7 +173,10 @@ class Arbiter:
         core = self._core
         match event:
             case AcquireRequested():
-                requests.acquire(core, event)
+                if event.spec.parent is not None:
+                    subleases.acquire(core, event, event.spec.parent)
+                else:
+                    requests.acquire(core, event)
             case CancelRequested():
                 requests.cancel(core, event)
             case ReadyReported():

@@ -57,6 +57,8 @@ class Spec:
     deny_on_deadline: bool
     standby: bool = False
     park_bytes: int = 0
+    parent: tuple[LeaseId, Token] | None = None
+    independent: bool = False
 
 
 @dataclass(frozen=True, slots=True)

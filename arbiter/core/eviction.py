@@ -6,13 +6,29 @@ A holder is only ever *asked*. It unloads by itself at its safe point; the core 
 from collections.abc import Mapping
 from typing import Any
 
-from arbiter.core.lease import Eviction, Lease, LeaseState
+from arbiter.core import families
+from arbiter.core.lease import LEAVING, Eviction, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 from schemas.ids import LeaseId
 
 
 def ask(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: str) -> None:
-    """Send the first `revoke` and start the ladder. A fresh reading is taken, so that there is something to compare with."""
+    """Ask a holder to leave, and everything that was carved out of it: leaves first. A fresh reading is taken, so that there is
+    something to compare with."""
+    for member in reversed(list(holder.tree())):
+        if member.state is LeaseState.HELD:
+            member.move(LeaseState.REVOKING, core.now, reason)
+            _begin(core, gpu, member, waiter, reason)
+    if holder.children:  # a restart must find the whole tree asked, or none of it
+        for member in holder.tree():
+            core.record_lease(member)
+    core.want_sample(gpu, core.now)
+    for member in reversed(list(holder.tree())):
+        if member.eviction is not None and member.eviction.asked_at == core.now:
+            _tell(core, member, member.eviction)
+
+
+def _begin(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: str) -> None:
     holder.left_for = "" if waiter is None else waiter.spec.consumer
     holder.eviction = Eviction(
         lease=holder.id,
@@ -25,21 +41,23 @@ def ask(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: str) 
         next_push_at=core.now + core.settings.revoke_resend_s,
     )
     gpu.evictions.append(holder.eviction)
-    holder.move(LeaseState.REVOKING, core.now, reason)
     parks = core.host.book(holder.id, holder.spec.park_bytes)
     if (
         holder.spec.standby or parks
     ):  # a restart must not take a release that was asked for as one that was wished for
         core.record_lease(holder)
-    core.want_sample(gpu, core.now)
-    _push_now(core, holder, holder.eviction)
+
+
+def _tell(core: Core, holder: Lease, eviction: Eviction) -> None:
+    """The first `revoke`, and the start of the ladder."""
+    _push_now(core, holder, eviction)
     core.note(
         "revoke_asked",
         holder,
-        wanted_by=holder.eviction.wanted_consumer,
-        wanted_by_lease=holder.eviction.wanted_by,
-        uses=len(holder.uses),
-        reason=reason,
+        wanted_by=eviction.wanted_consumer,
+        wanted_by_lease=eviction.wanted_by,
+        uses=holder.busy_uses(),
+        reason=eviction.reason,
     )
 
 
@@ -55,7 +73,8 @@ def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
             "reason": eviction.reason,
             "wanted_by": eviction.wanted_consumer,
             "deadline_in_s": max(0.0, eviction.asked_at + core.settings.revoke_deadline_s - core.now),
-            "uses": len(holder.uses),
+            "uses": holder.busy_uses(),
+            **({"children": len(holder.children)} if holder.children else {}),
             "park": holder.id in core.host.booked,
         },
     )
@@ -69,13 +88,14 @@ def acknowledge(core: Core, holder: Lease, eta_s: float | None) -> None:
     eviction.safe_point_eta_s = eta_s
     if eviction.acked_at is None:
         eviction.acked_at = core.now
-        core.note("revoke_acked", holder, safe_point_eta_s=eta_s, uses=len(holder.uses))
+        core.note("revoke_acked", holder, safe_point_eta_s=eta_s, uses=holder.busy_uses())
 
 
 def reached_safe_point(core: Core, holder: Lease) -> None:
     """The last use ended while the holder is asked to leave: tell it, it may not know of uses that others marked."""
-    if holder.eviction is not None and holder.state is LeaseState.REVOKING:
-        _push_now(core, holder, holder.eviction)
+    for member in reversed(list(holder.root.tree())):
+        if member.eviction is not None and member.state is LeaseState.REVOKING and not member.busy_uses():
+            _push_now(core, member, member.eviction)
 
 
 def _push_now(core: Core, holder: Lease, eviction: Eviction) -> None:
@@ -100,11 +120,11 @@ def on_ladder_due(core: Core, lease_id: str) -> None:
     settings = core.settings
     if core.now >= eviction.next_push_at:
         eviction.next_push_at = core.now + settings.revoke_resend_s
-        if eviction.acked_at is None or not holder.uses:
+        if eviction.acked_at is None or _may_unload(holder):
             push_revoke(core, holder, eviction)
     if not eviction.reminded and core.now >= eviction.asked_at + settings.revoke_remind_s:
         eviction.reminded = True
-        core.note("reminded", holder, uses=len(holder.uses), acked=eviction.acked_at is not None)
+        core.note("reminded", holder, uses=holder.busy_uses(), acked=eviction.acked_at is not None)
     if not eviction.overdue and core.now >= eviction.asked_at + settings.revoke_deadline_s:
         eviction.overdue = True
         _deadline(core, holder, eviction)
@@ -113,7 +133,7 @@ def on_ladder_due(core: Core, lease_id: str) -> None:
 
 def _deadline(core: Core, holder: Lease, eviction: Eviction) -> None:
     """The holder outstayed. Its waiter is denied if that is its wish; the `revoke` stands in any case."""
-    core.note("deadline_passed", holder, uses=len(holder.uses), wanted_by=eviction.wanted_consumer)
+    core.note("deadline_passed", holder, uses=holder.busy_uses(), wanted_by=eviction.wanted_consumer)
     core.wake(core.gpu_of(holder))
     waiter = core.waiting.get(eviction.wanted_by) if eviction.wanted_by is not None else None
     if waiter is None or not waiter.spec.deny_on_deadline:
@@ -126,7 +146,7 @@ def _deadline(core: Core, holder: Lease, eviction: Eviction) -> None:
             "code": "holder_busy",
             "message": message,
             "hint": "try again later, or wait: on_deadline=wait",
-            "details": {"lease_id": holder.id, "consumer": holder.spec.consumer, "uses": len(holder.uses)},
+            "details": {"lease_id": holder.id, "consumer": holder.spec.consumer, "uses": holder.busy_uses()},
         },
     )
 
@@ -140,11 +160,47 @@ def deny(core: Core, waiter: Lease, error: Mapping[str, Any]) -> None:
     core.end(waiter, error)
 
 
+def _may_unload(holder: Lease) -> bool:
+    return not holder.children and not holder.busy_uses()
+
+
 def _set_timer(core: Core, holder: Lease, eviction: Eviction) -> None:
     times = [eviction.asked_at + core.settings.revoke_deadline_s] if not eviction.overdue else []
     if not eviction.reminded:
         times.append(eviction.asked_at + core.settings.revoke_remind_s)
-    if eviction.acked_at is None or not holder.uses:
+    if eviction.acked_at is None or _may_unload(holder):
         times.append(eviction.next_push_at)
     if times:
         core.timers.set(("revoke", holder.id), min(times))
+
+
+# -- families --------------------------------------------------------------------------------------------------------
+def depart(core: Core, lease: Lease, *, exiting: bool) -> None:
+    """Its holder lets go while sub-leases are there: they are asked to leave first, then it is over."""
+    lease.departing, lease.exiting = True, exiting
+    core.timers.clear(("ttl", lease.id))  # its holder has said its last word on it
+    if lease.state is not LeaseState.REVOKING:
+        lease.move(LeaseState.REVOKING, core.now, "leaves after its sub-leases")
+    gpu = core.gpu_of(lease)
+    for child in list(lease.children):
+        ask(core, gpu, child, None, f"{lease.spec.consumer} ({lease.id}) leaves")
+
+
+def follow(core: Core, lease: Lease) -> None:
+    """A sub-lease finished loading while what it was carved out of was asked to leave: it is asked too."""
+    parent = lease.parent
+    if parent is None or parent.state not in LEAVING:
+        return
+    gpu = core.gpu_of(lease)
+    wanted = parent.eviction.wanted_by if parent.eviction is not None else None
+    waiter = None if wanted is None else core.waiting.get(wanted)
+    ask(core, gpu, lease, waiter, f"{parent.spec.consumer} ({parent.id}) leaves")
+
+
+def part(core: Core, gpu: Gpu, lease: Lease) -> None:
+    """A lease is over: what was carved out of it stands for itself from now on, and may have reached its safe point."""
+    heirs = list(lease.children)
+    families.close(gpu, lease)
+    for heir in heirs:
+        core.note("orphaned", heir, parent=lease.id, reason=f"{lease.spec.consumer} ({lease.id}) is over")
+        reached_safe_point(core, heir)

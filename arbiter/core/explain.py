@@ -12,7 +12,7 @@ NOTE_KINDS: tuple[str, ...] = (
     "queued", "granted", "ready", "switch", "use_began", "use_ended", "use_yielded", "revoke_asked", "revoke_acked", "reminded",
     "deadline_passed", "unloading", "released", "verified", "denied", "cancelled", "expired", "lost", "reattached", "oom",
     "pressure", "stowaway", "probe_failed", "probe_ok", "drift", "journal_failed", "recovered", "serving", "operator", "resumed",
-    "standby", "parked",
+    "standby", "parked", "orphaned",
 )  # fmt: skip
 """Every kind of `effects.Note`. `switch` comes with each `ready`; its field `switched` says whether anybody had to leave."""
 
@@ -39,6 +39,10 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
     }
     if lease.pinned is not None:
         shown["pinned"] = str(lease.pinned)
+    if lease.parent is not None:
+        shown["parent"] = lease.parent.id
+    if lease.children:
+        shown["children"] = [child.id for child in lease.children]
     if lease.yielded:
         shown["yielded"] = len(lease.yielded)
     if lease.spec.standby:
@@ -272,14 +276,15 @@ def _holder_condition(core: Core, waiter: Lease, holder: Lease) -> str:
             LeaseState.UNLOADING: "is unloading",
             LeaseState.VERIFYING: "let go, its bytes are being measured",
         }[holder.state]
-    if not holder.evictable:
+    if not holder.root.may_leave:
         return f"is pinned by {holder.pinned}" if holder.pinned else "is pinned"
-    if policy.residency_ends_at(holder) > core.now:
-        return f"may stay {policy.residency_ends_at(holder) - core.now:.1f} s more (minimum residency)"
+    root = holder.root
+    if policy.residency_ends_at(root) > core.now:
+        return f"may stay {policy.residency_ends_at(root) - core.now:.1f} s more (minimum residency)"
     priority = waiter.priority_at(core.now, core.settings.ageing_s_per_point)
-    if holder.uses and holder.spec.priority > priority:
-        return f"is in use and has priority {holder.spec.priority}, the waiter {priority}"
-    return "is in use" if holder.uses else "is idle and may be asked"
+    if root.in_use and root.spec.priority > priority:
+        return f"is in use and has priority {root.spec.priority}, the waiter {priority}"
+    return "is in use" if root.in_use else "is idle and may be asked"
 
 
 def _condition(
@@ -307,10 +312,11 @@ def _condition(
 def _leaving_next(core: Core, gpu: Gpu, holder: Lease) -> str:
     charge = _gib(gpu.ledger.charge_bytes(holder.id))
     name = holder.spec.consumer
-    if holder.state is LeaseState.REVOKING and holder.uses:
-        plural = "use" if len(holder.uses) == 1 else "uses"
+    if holder.state is LeaseState.REVOKING and holder.busy_uses():
+        running = holder.busy_uses()
+        plural = "use" if running == 1 else "uses"
         return (
-            f"waits for {name} to finish {len(holder.uses)} {plural} (asked {_ago(core, holder)}), "
+            f"waits for {name} to finish {running} {plural} (asked {_ago(core, holder)}), "
             f"then it unloads and {charge} are verified"
         )
     if holder.state is LeaseState.REVOKING:
@@ -357,6 +363,8 @@ def _uses(lease: Lease) -> str:
 
 
 def _wanted_by(lease: Lease) -> str:
+    if lease.departing:
+        return "its own wish, once its sub-leases have left"
     return (lease.eviction.wanted_consumer if lease.eviction else "") or "relief of pressure"
 
 

@@ -11,7 +11,7 @@ Per card, in this order (the numbers stand in `_serve`):
 
 from collections.abc import Mapping
 
-from arbiter.core import eviction, explain, policy, standby
+from arbiter.core import eviction, explain, families, policy, standby
 from arbiter.core.lease import Lease, LeaseState
 from arbiter.core.measure import note_pressure
 from arbiter.core.state import Core, Gpu
@@ -130,6 +130,7 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     lease.granted_at = core.now
     lease.reason = ""
     gpu.residents[lease.id] = lease
+    families.claim(core, gpu, lease.process)
     gpu.ledger.charge(lease.id, lease.process, lease.load_peak_bytes, lease.load_peak_bytes, core.now)
     gpu.changed_at = core.now
     core.granted.append((token, gpu.info.id))

@@ -14,6 +14,7 @@ Numbers are those of the design:
   6. every waiter is in a queue, has a timer if it has a bound, and its card has a next reading scheduled
 """
 
+from arbiter.core import families
 from arbiter.core.lease import AWAY, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 
@@ -72,9 +73,11 @@ def _granted_on(core: Core, gpu: Gpu) -> bool:
 def _residents(core: Core, gpu: Gpu) -> None:
     residents = gpu.residents
     if _granted_on(core, gpu):
-        if residents.exclusive and len(residents) > 1:
-            alone = next(iter(residents.exclusive))
-            raise InvariantViolation(2, f"{alone} is exclusive, yet {sorted(residents)} are on {gpu.info.id}")
+        alone = next(iter(residents.exclusive.values()), None)
+        if alone is not None and any(lease.root is not alone for lease in residents.values()):
+            raise InvariantViolation(
+                2, f"{alone.id} is exclusive, yet {sorted(residents)} are on {gpu.info.id}"
+            )
         debts = [v.lease for v in gpu.verifications.values() if v.exclusive and v.lease not in residents]
         if debts:
             raise InvariantViolation(
@@ -110,6 +113,8 @@ def _charges(gpu: Gpu) -> None:
     for lease in residents.in_state(LeaseState.VERIFYING):
         if lease.id not in gpu.verifications:
             raise InvariantViolation(4, f"{lease.id} waits for a verdict that nobody works on")
+    if problem := families.unshared(gpu):
+        raise InvariantViolation(4, problem)
     ledger.touched.clear()
     residents.touched.clear()
 

@@ -4,7 +4,7 @@ Knows nothing of bytes on a card (`ledger`), of order (`queue`) or of clients be
 """
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
@@ -41,7 +41,8 @@ TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
     {
         _S.QUEUED: frozenset({_S.LOADING, _S.DENIED, _S.CANCELLED}),
         # denied from loading: the grant could not be journalled, so it was never sent
-        _S.LOADING: frozenset({_S.HELD, _S.VERIFYING, _S.DENIED, *_GONE}),
+        # revoking from loading: it gives up while its sub-leases still load
+        _S.LOADING: frozenset({_S.HELD, _S.REVOKING, _S.VERIFYING, _S.DENIED, *_GONE}),
         _S.HELD: frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING, *_GONE}),
         _S.REVOKING: frozenset({_S.UNLOADING, _S.VERIFYING, *_GONE}),
         _S.UNLOADING: frozenset({_S.VERIFYING, *_GONE}),
@@ -137,6 +138,28 @@ class Recall:
 
 
 @dataclass(slots=True)
+class Share:
+    """What one sub-lease takes from its parent. `fold_bytes` were its process's own before and are not taken."""
+
+    booked_bytes: int
+    approved_bytes: int
+    fold_bytes: int
+
+
+@dataclass(slots=True)
+class Estate:
+    """A lease that sub-leases were carved out of: what it was granted as a whole, and who has what of it (`families`)."""
+
+    booked_bytes: int
+    approved_bytes: int
+    shares: dict[LeaseId, Share] = field(
+        default_factory=dict
+    )  # also of sub-leases that are over and not measured gone
+    borne: dict[ProcessKey, int] = field(default_factory=dict)  # residues that former sub-leases left
+    told: bool = False  # asked to leave, it heard that its last sub-lease has
+
+
+@dataclass(slots=True)
 class Lease:
     """A live lease. `load_peak_bytes` is the spec's, raised by what was learnt; the spec itself is never changed."""
 
@@ -186,6 +209,11 @@ class Lease:
     eviction: Eviction | None = None
     evicted: list[Eviction] = field(default_factory=list)  # who left for it
     story: list[tuple[float, LeaseState, str]] = field(default_factory=list)  # the last STORY_MAX steps
+    parent: "Lease | None" = field(default=None, repr=False, compare=False)
+    children: list["Lease"] = field(default_factory=list, repr=False, compare=False)  # live ones
+    estate: Estate | None = None  # once anything was carved out of it
+    said_ready: bool = False  # by itself, not through a sub-lease
+    departing: bool = False  # its holder let go; it is over when its last sub-lease is
     roster: Roster | None = field(default=None, repr=False, compare=False)  # of the card that it is on
 
     def move(self, to: LeaseState, now: float, why: str) -> None:
@@ -206,6 +234,45 @@ class Lease:
     def priority_at(self, now: float, ageing_s_per_point: float) -> int:
         """Priority with one point for every `ageing_s_per_point` waited."""
         return self.spec.priority + int(max(0.0, now - self.arrived_at) / ageing_s_per_point)
+
+    @property
+    def root(self) -> "Lease":
+        """The lease that its tree was carved out of; itself for most."""
+        lease = self
+        while lease.parent is not None:
+            lease = lease.parent
+        return lease
+
+    def tree(self) -> Iterator["Lease"]:
+        """Itself, then its sub-leases and theirs: parents before children."""
+        yield self
+        for child in self.children:
+            yield from child.tree()
+
+    @property
+    def in_use(self) -> bool:
+        """A tree is in use while any lease of it is."""
+        if self.parent is None and not self.children:
+            return bool(self.uses)
+        return any(member.uses for member in self.root.tree())
+
+    def busy_uses(self) -> int:
+        """Uses that keep it from unloading: its own, those below and above it, and of all that was asked to leave with it."""
+        if self.parent is None and not self.children:
+            return len(self.uses)
+        unit, above, lease = self, 0, self
+        while lease.parent is not None:
+            lease = lease.parent
+            if lease.state in LEAVING:
+                unit, above = lease, 0
+            else:
+                above += len(lease.uses)
+        return above + sum(len(member.uses) for member in unit.tree())
+
+    @property
+    def may_leave(self) -> bool:
+        """May it be asked, with everything that was carved out of it?"""
+        return self.evictable and all(child.may_leave for child in self.children)
 
     def all_uses(self) -> list[Use]:
         """Busy and pausing ones."""

@@ -49,6 +49,10 @@ class Account:
     def approved_bytes(self) -> int:
         return max(self.charged_approved_bytes, self.residue_bytes)
 
+    def kept_bytes(self) -> int:
+        """What the process keeps beyond its charges: bytes that a new charge would be folded with."""
+        return max(0, self.residue_bytes - self.charged_bytes)
+
     def occupied_bytes(self) -> int:
         """Booked, or more where more was measured."""
         return max(self.charged_bytes, self.residue_bytes, self.measured_bytes)
@@ -212,6 +216,18 @@ class GpuLedger:
         after = Charge(booked_bytes, min(before.approved_bytes, booked_bytes), before.debt)
         self._charge(account, lease, after)
         self._changed(account, now)
+
+    def rebook(self, lease: LeaseId, booked_bytes: int, approved_bytes: int, now: float) -> None:
+        """Move bytes between the leases of a family: what one has less another has more (`families`)."""
+        account = self.accounts[self._owner[lease]]
+        before = account.charges[lease]
+        if (before.booked_bytes, before.approved_bytes) != (booked_bytes, approved_bytes):
+            self._charge(account, lease, Charge(booked_bytes, approved_bytes, before.debt))
+            self._changed(account, now)
+
+    def charge_of(self, lease: LeaseId) -> Charge:
+        """Raises KeyError if nothing is charged for it."""
+        return self.accounts[self._owner[lease]].charges[lease]
 
     def to_debt(self, lease: LeaseId) -> None:
         """The lease is over; its bytes stay charged until measured gone."""

@@ -6,7 +6,7 @@ Starts, polls and ends verifications; the judgement itself is in `verify`. A fai
 from collections.abc import Mapping
 from typing import Any
 
-from arbiter.core import drift, standby
+from arbiter.core import drift, eviction, families, standby
 from arbiter.core.events import MemorySampled, ProbeFailed
 from arbiter.core.lease import AWAY, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
@@ -115,6 +115,7 @@ def _shrink_residues(core: Core, gpu: Gpu, sample: MemorySampled) -> None:
         target = max(floor, account.measured_bytes)
         if target + tolerance < account.residue_bytes:
             gpu.ledger.set_residue(process, target, core.now)
+            families.residue_fell(core, gpu, process)
             core.record_residue(gpu, process, target)
 
 
@@ -123,6 +124,8 @@ def begin_for_lease(core: Core, gpu: Gpu, lease: Lease, *, alive: bool, grace_s:
     """Measure a lease's bytes away. Its charge is in the ledger and stays there until the verdict."""
     baseline = lease.baseline or gpu.sample
     drift.on_leaving(core, lease)
+    if lease.estate is not None and (baseline is None or baseline.processes is None):
+        baseline = None  # how much of a reservation was ever filled, a total cannot say
     comparable = baseline is not None and 0.0 < lease.ready_at <= baseline.taken_at
     verification = Verification(
         key=lease.id,
@@ -315,10 +318,12 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
     process = verification.process
     if verification.lease is None:
         gpu.ledger.set_residue(process, 0, core.now)
+        families.residue_fell(core, gpu, process)
         core.record_residue(gpu, process, 0)
         return
     drift.on_verdict(core, gpu, verification)
     residue = gpu.ledger.drop(verification.lease, judgement.residue_bytes, verification.kept_bytes, core.now)
+    families.gone(core, gpu, verification.lease, process)
     core.record_residue(gpu, process, residue)
     core.forget(f"lease:{verification.lease}")
     _close_eviction(core, gpu, verification, judgement)
@@ -331,9 +336,9 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
 
 def _close_eviction(core: Core, gpu: Gpu, verification: Verification, judgement: Judgement) -> None:
     core.learn(verification.consumer, "verify_s", core.now - verification.confirmed_at)
-    for eviction in gpu.evictions:
-        if eviction.lease == verification.lease:
-            eviction.verdict, eviction.verdict_at = str(judgement.verdict), core.now
+    for way_out in gpu.evictions:
+        if way_out.lease == verification.lease:
+            way_out.verdict, way_out.verdict_at = str(judgement.verdict), core.now
 
 
 # -- leases that end without their holder's word ---------------------------------------------------------------------
@@ -351,6 +356,7 @@ def lose(
         lease.eviction.released_at = core.now
         lease.eviction.unloading_at = lease.eviction.unloading_at or core.now
     begin_for_lease(core, gpu, lease, alive=alive, grace_s=grace_s)
+    eviction.part(core, gpu, lease)
     lease.move(to, core.now, str(error["message"]))
     core.end(lease, error)
 

@@ -81,7 +81,7 @@ def evict(core: Core, lease: Lease, order: Order) -> None:
         return
     if lease.state is not LeaseState.HELD:
         raise _refused_state(lease, "only a resident lease can be evicted")
-    if not lease.evictable:
+    if not lease.may_leave:
         by = "an operator pinned it" if lease.pinned else "its holder asked never to be evicted"
         hint = "unpin it first" if lease.pinned else "end its program: a pinned holder is never made to leave"
         raise Refused(

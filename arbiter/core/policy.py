@@ -7,7 +7,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 
-from arbiter.core.lease import Lease, LeaseState
+from arbiter.core.lease import LEAVING, Lease, LeaseState
 from arbiter.core.ledger import NOTHING, process_bytes
 from arbiter.core.state import Core, Gpu
 from schemas.ids import LeaseId
@@ -43,15 +43,19 @@ def leaving(gpu: Gpu) -> dict[LeaseId, int]:
     """Leases whose bytes are on their way back, with the residue each leaves. Those that outstayed a deadline do not count."""
     going: dict[LeaseId, int] = {}
     for lease in gpu.in_state(*_LEAVING):
+        if lease.parent is not None and lease.parent.state not in LEAVING:
+            continue  # its bytes are its parent's again
         verification = gpu.verifications.get(lease.id)
         late = verification.overdue if verification else bool(lease.eviction and lease.eviction.overdue)
         if not late:
             going[lease.id] = lease.residue_bytes
+    staying = [parent for parent in gpu.estates.values() if parent.state not in LEAVING]
     for verification in gpu.verifications.values():  # debts
         if (
             verification.lease is not None
             and verification.lease not in gpu.residents
             and not verification.overdue
+            and not any(parent.estate and verification.lease in parent.estate.shares for parent in staying)
         ):
             going[verification.lease] = verification.kept_bytes
     return going
@@ -127,7 +131,7 @@ def choose_victims(core: Core, gpu: Gpu, waiter: Lease, going: Mapping[LeaseId, 
     willing = [
         lease
         for lease in gpu.in_state(LeaseState.HELD)
-        if lease.evictable and (not lease.uses or lease.spec.priority <= priority)
+        if may_ask(lease) and (not lease.in_use or lease.spec.priority <= priority)
     ]
     search = _oldest if core.settings.scheduling.least_recent else _search
     ripe = [lease for lease in willing if residency_ends_at(lease) <= core.now]
@@ -145,7 +149,7 @@ def choose_relief(core: Core, gpu: Gpu, going: Mapping[LeaseId, int], over_bytes
     idle = [
         lease
         for lease in gpu.in_state(LeaseState.HELD)
-        if lease.evictable and not lease.uses and residency_ends_at(lease) <= core.now
+        if may_ask(lease) and not lease.in_use and residency_ends_at(lease) <= core.now
     ]
     ledger = gpu.ledger
     total = ledger.total_if(going)
@@ -154,6 +158,14 @@ def choose_relief(core: Core, gpu: Gpu, going: Mapping[LeaseId, int], over_bytes
         return total - ledger.total_if({**going, **more}) >= over_bytes
 
     return _search(idle, covers, _freed(gpu, going, idle)) if covers(_leave(idle)) else idle
+
+
+def may_ask(lease: Lease) -> bool:
+    """Of a tree only the root is asked, and not while any of it loads."""
+    if lease.estate is None:
+        return lease.evictable and lease.parent is None
+    loading = any(member.state is LeaseState.LOADING for member in lease.tree())
+    return lease.may_leave and lease.parent is None and not loading
 
 
 def residency_ends_at(lease: Lease) -> float:
@@ -166,10 +178,10 @@ def wake_when_evictable(core: Core, gpu: Gpu, waiter: Lease | None) -> None:
     ageing_s = core.settings.ageing_s_per_point
     times: list[float] = []
     for lease in gpu.in_state(LeaseState.HELD):
-        if not lease.evictable:
+        if not may_ask(lease):
             continue
         times.append(residency_ends_at(lease))
-        if waiter is not None and lease.uses:
+        if waiter is not None and lease.in_use:
             gap = lease.spec.priority - waiter.spec.priority
             times.append(waiter.arrived_at + gap * ageing_s + _WAKE_SLACK_S)
     later = [at for at in times if at > core.now]
@@ -207,19 +219,16 @@ def _cost(plan: Sequence[Lease], index: int) -> tuple[int, int, int, int, int]:
 
 
 def _in_use(plan: Sequence[Lease]) -> int:
-    return sum(1 for lease in plan if lease.uses)
+    return sum(1 for lease in plan if lease.in_use)
 
 
 def _leave(leases: Sequence[Lease]) -> dict[LeaseId, int]:
-    return {lease.id: lease.residue_bytes for lease in leases}
+    return {member.id: member.residue_bytes for lease in leases for member in lease.tree()}
 
 
 def _freed(gpu: Gpu, going: Mapping[LeaseId, int], candidates: Sequence[Lease]) -> dict[LeaseId, int]:
     total = gpu.ledger.total_if(going)
-    return {
-        lease.id: total - gpu.ledger.total_if({**going, lease.id: lease.residue_bytes})
-        for lease in candidates
-    }
+    return {lease.id: total - gpu.ledger.total_if({**going, **_leave([lease])}) for lease in candidates}
 
 
 def _cheapest(
@@ -246,8 +255,8 @@ def _search(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId
     """Cheapest covering set; all candidates together do cover. Fewest in use, then lowest priority, fewest, least bytes, LRU."""
     if len(candidates) > EXACT_SEARCH_MAX:
         return _greedy(candidates, covers, freed)
-    idle = [lease for lease in candidates if not lease.uses]
-    busy = [lease for lease in candidates if lease.uses]
+    idle = [lease for lease in candidates if not lease.in_use]
+    busy = [lease for lease in candidates if lease.in_use]
     count = next(
         k
         for k in range(len(busy) + 1)
@@ -268,7 +277,7 @@ def _oldest(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId
     """Idle ones first, then least recent use alone, until it is enough; all candidates together are."""
     order = sorted(
         candidates,
-        key=lambda lease: (bool(lease.uses), not freed[lease.id], lease.last_used_at, lease.arrival),
+        key=lambda lease: (lease.in_use, not freed[lease.id], lease.last_used_at, lease.arrival),
     )
     return order[: next(n for n in range(1, len(order) + 1) if covers(_leave(order[:n])))]
 
@@ -286,7 +295,7 @@ def _greedy(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId
     order = sorted(
         candidates,
         key=lambda lease: (
-            bool(lease.uses),
+            lease.in_use,
             lease.spec.priority,
             -freed[lease.id],
             lease.last_used_at,

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from arbiter.core import drift, eviction, explain, operators, standby
+from arbiter.core import drift, eviction, explain, families, operators, standby
 from arbiter.core.events import MemorySampled, Reattached, ReattachedLease, Recovered, Spec
 from arbiter.core.lease import AWAY, EXPIRING, Eviction, Lease, LeaseState, Order, Use
 from arbiter.core.measure import begin_for_lease
@@ -38,6 +38,9 @@ def on_recovered(core: Core, event: Recovered) -> None:
             gpu.ledger.set_residue(process, min(int(record["residue_bytes"]), _room_bytes(gpu)), core.now)
         else:
             _restore(core, gpu, record)
+    parents = {LeaseId(str(r["lease_id"])): str(r["parent"]) for r in held.values() if r.get("parent")}
+    for gpu in core.gpus.values():
+        families.tie(core, gpu, parents)
     if not held:
         core.recovering.add(EMPTY_JOURNAL)
         grace_s = defaults.LEASE_TTL_S + core.settings.fence_grace_s
@@ -108,6 +111,8 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
         return
     core.add(lease)
     gpu.residents[lease_id] = lease
+    if record["estate"] is not None:
+        families.restore(gpu, lease, record["estate"])
     if lease.state is LeaseState.VERIFYING:
         begin_for_lease(core, gpu, lease, alive=True)
         return
@@ -165,6 +170,10 @@ def spec_from_record(record: Mapping[str, Any]) -> Spec:
         deny_on_deadline=bool(record["deny_on_deadline"]),
         standby=bool(record.get("standby", False)),
         park_bytes=int(record.get("park_bytes", 0)),
+        parent=None
+        if record.get("parent") is None
+        else (LeaseId(record["parent"][0]), Token(*record["parent"][1:])),
+        independent=bool(record.get("independent", False)),
     )
 
 
@@ -218,7 +227,7 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
         _believe_away(core, lease, item)
     elif lease.state is LeaseState.LOADING and item.held:  # its `ready` was lost
         become_held(core, lease, item.measured_bytes)
-        core.record_lease(lease)
+        core.record_line(lease)
     if lease.gpu is not None:
         _restore_uses(core, lease, client, item)
     touch(core, lease)
@@ -320,8 +329,19 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
         return lease
     _place(core, gpu, lease, charge)
     gpu.residents[lease.id] = lease
-    core.record_lease(lease)
+    _reunite(core, gpu, lease)
+    core.record_line(lease)
     return lease
+
+
+def _reunite(core: Core, gpu: Gpu, lease: Lease) -> None:
+    """Adopted leases come in any order: tie this one to its parent and to its sub-leases, as far as they are here."""
+    parent = gpu.residents.get(lease.spec.parent[0]) if lease.spec.parent is not None else None
+    if parent is not None and parent.state in (LeaseState.LOADING, LeaseState.HELD):
+        families.join(core, gpu, parent, lease, 0)
+    for other in list(gpu.residents.values()):
+        if other.parent is None and other.spec.parent is not None and other.spec.parent[0] == lease.id:
+            families.join(core, gpu, lease, other, 0)
 
 
 # -- coming to an end --------------------------------------------------------------------------------------------------
@@ -347,8 +367,8 @@ def void_at_baseline(core: Core, sample: MemorySampled) -> None:
     if sample.used_bytes > noise_bytes:
         return
     for lease in list(gpu.residents.values()):
-        if lease.attached or lease.state not in EXPIRING - {LeaseState.LOADING}:
-            continue
+        if lease.attached or lease.state not in EXPIRING - {LeaseState.LOADING} or lease.estate is not None:
+            continue  # a reservation shows on no card
         if gpu.ledger.charge_bytes(lease.id) <= noise_bytes:
             continue
         parks = lease.id in core.host.booked
@@ -363,6 +383,7 @@ def void_at_baseline(core: Core, sample: MemorySampled) -> None:
             )
             continue
         gpu.ledger.drop(lease.id, 0, 0, core.now)
+        families.gone(core, gpu, lease.id, lease.process)
         core.forget(f"lease:{lease.id}")
         error = lost_error(lease.id)
         core.note("lost", lease, reason="the card is empty: its bytes are gone")

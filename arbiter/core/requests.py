@@ -6,7 +6,7 @@ anyone who knows the exact token.
 
 from dataclasses import replace
 
-from arbiter.core import drift, eviction, explain, standby
+from arbiter.core import drift, eviction, explain, families, standby
 from arbiter.core.events import (
     AcquireRequested,
     CancelRequested,
@@ -79,7 +79,7 @@ def own_lease(core: Core, client: ClientId, lease_id: LeaseId, token: Token) -> 
 
 def touch(core: Core, lease: Lease) -> None:
     """The holder lives: its time to live starts anew."""
-    if lease.state in EXPIRING and lease.attached:
+    if lease.state in EXPIRING and lease.attached and not lease.departing:
         lease.expires_at = core.now + lease.spec.ttl_s
         core.timers.set(("ttl", lease.id), lease.expires_at)
 
@@ -99,9 +99,7 @@ def bad_state(lease: Lease, what: str) -> Refused:
 def acquire(core: Core, event: AcquireRequested) -> None:
     """Queue a lease; the scheduling after this event may grant it in the same breath, and answers either way."""
     client = client_of(core, event.client)
-    nonce = (client.process, event.nonce)
-    if nonce in core.nonces:
-        _acquire_again(core, event, core.nonces[nonce])
+    if find_again(core, event, client):
         return
     spec = replace(event.spec, exclusive=True) if core.settings.scheduling.alone else event.spec
     load_peak, steady = drift.expected_bytes(core, spec)
@@ -111,6 +109,21 @@ def acquire(core: Core, event: AcquireRequested) -> None:
     if away is not None:
         _take_over(core, event, away, spec, gpus)
         return
+    lease = new_lease(core, event, client, spec, load_peak, steady, gpus)
+    core.enqueue(lease)
+    core.unanswered.append(lease)
+
+
+def new_lease(
+    core: Core,
+    event: AcquireRequested,
+    client: Client,
+    spec: Spec,
+    load_peak: int,
+    steady: int,
+    gpus: tuple[GpuId, ...],
+) -> Lease:
+    """A lease that is asked for, known by its nonce from now on. Refuses what is one too many for its connection."""
     owned = sum(1 for lease in core.leases_of(client.process) if lease.client == client.id)
     if owned >= core.settings.leases_per_client_max:
         raise Refused(
@@ -137,9 +150,8 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         story=[(core.now, LeaseState.QUEUED, "acquired")],
     )
     core.add(lease)
-    core.nonces[nonce] = lease.id
-    core.enqueue(lease)
-    core.unanswered.append(lease)
+    core.nonces[client.process, event.nonce] = lease.id
+    return lease
 
 
 def _check_waiters(core: Core) -> None:
@@ -207,13 +219,18 @@ def answer_queued(core: Core) -> None:
     core.unanswered.clear()
 
 
-def _acquire_again(core: Core, event: AcquireRequested, lease_id: LeaseId) -> None:
+def find_again(core: Core, event: AcquireRequested, client: Client) -> bool:
+    """Was this acquire said before? Then it is answered as it stands. Raises Refused where its lease is over."""
+    lease_id = core.nonces.get((client.process, event.nonce))
+    if lease_id is None:
+        return False
     lease = core.leases.get(lease_id)
     if lease is None:
         raise ended_error(core.ended[lease_id])
     lease.client = event.client  # the newest connection of the process is the one that listens
     state = str(lease.state) if lease.state in (LeaseState.QUEUED, *AWAY) else "loading"
     core.reply(event.client, event.request, {"state": state, "lease": explain.view(core, lease)})
+    return True
 
 
 def _places(core: Core, spec: Spec, load_peak: int) -> tuple[GpuId, ...]:
@@ -233,7 +250,10 @@ def _places(core: Core, spec: Spec, load_peak: int) -> tuple[GpuId, ...]:
     able: list[GpuId] = []
     pinned: dict[str, list[dict[str, object]]] = {}
     for gpu in gpus:
-        pins = [lease for lease in gpu.residents.pinned.values() if lease.state not in LEAVING]
+        pinned_trees = {lease.root.id: lease.root for lease in gpu.residents.pinned.values()}
+        pins = [
+            lease for root in pinned_trees.values() for lease in root.tree() if lease.state not in LEAVING
+        ]
         pinned[gpu.info.id] = [
             {"lease_id": p.id, "consumer": p.spec.consumer, "bytes": gpu.ledger.charge_bytes(p.id)}
             for p in pins
@@ -317,33 +337,40 @@ def ready(core: Core, event: ReadyReported) -> None:
         return
     if lease.state is not LeaseState.LOADING:
         raise bad_state(lease, "only a loading lease becomes ready")
-    become_held(core, lease, event.measured_bytes)
+    lease.said_ready = True
+    held = become_held(core, lease, event.measured_bytes)
     core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
-    core.record_lease(lease)  # after the reply: a record that fails here only makes a recovery more careful
-    core.learn(lease.spec.consumer, "load_s", core.now - lease.granted_at)
-    core.note(
-        "ready",
-        lease,
-        charge_bytes=core.gpu_of(lease).ledger.charge_bytes(lease.id),
-        declared_bytes=lease.steady_bytes,
-        measured_bytes=event.measured_bytes,
-        load_ms=(core.now - lease.granted_at) * 1e3,
-    )
-    core.note("switch", lease, **explain.switch_record(core, lease))
+    core.record_line(lease)  # after the reply: a record that fails here only makes a recovery more careful
+    for one in held:
+        core.learn(one.spec.consumer, "load_s", core.now - one.granted_at)
+        core.note(
+            "ready",
+            one,
+            charge_bytes=core.gpu_of(one).ledger.charge_bytes(one.id),
+            declared_bytes=one.steady_bytes,
+            measured_bytes=one.measured_bytes,
+            load_ms=(core.now - one.granted_at) * 1e3,
+        )
+        core.note("switch", one, **explain.switch_record(core, one))
+    eviction.follow(core, lease)
 
 
-def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
+def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> list[Lease]:
+    """Loaded, and with it what it was carved out of, if that has not said so itself. Returns who became ready."""
     gpu = core.gpu_of(lease)
     lease.move(LeaseState.HELD, core.now, "ready")
     lease.ready_at = lease.last_used_at = core.now
     lease.measured_bytes = measured_bytes
     drift.on_ready(core, lease, measured_bytes)
     steady = lease.steady_bytes if measured_bytes is None else max(measured_bytes, lease.spec.residue_bytes)
-    gpu.ledger.recharge(lease.id, steady, core.now)
+    families.recharge(core, gpu, lease, steady)
     core.host.drop(lease.id)
     gpu.changed_at = core.now
     core.want_sample(gpu, core.now)  # what it holds now is what has to come back one day
     core.wake(gpu)
+    if lease.parent is not None and lease.parent.state is LeaseState.LOADING:
+        return [lease, *become_held(core, lease.parent, None)]
+    return [lease]
 
 
 def renew(core: Core, event: Renewed) -> None:
@@ -368,7 +395,7 @@ def renew(core: Core, event: Renewed) -> None:
 def revoke_ack(core: Core, event: RevokeAcknowledged) -> None:
     lease = own_lease(core, event.client, event.lease, event.token)
     eviction.acknowledge(core, lease, event.safe_point_eta_s)
-    core.reply(event.client, event.request, {"state": str(lease.state), "uses": len(lease.uses)})
+    core.reply(event.client, event.request, {"state": str(lease.state), "uses": lease.busy_uses()})
 
 
 def unloading(core: Core, event: UnloadStarted) -> None:
@@ -379,8 +406,13 @@ def unloading(core: Core, event: UnloadStarted) -> None:
         return
     if lease.state not in (LeaseState.HELD, LeaseState.REVOKING):
         raise bad_state(lease, "only a held lease is unloaded; a loading one is released")
-    if lease.uses:
-        raise bad_state(lease, f"{len(lease.uses)} uses still run; wait for the `revoke` that says 0 uses")
+    if lease.children:
+        names = ", ".join(f"{child.spec.consumer} ({child.id})" for child in lease.children)
+        raise bad_state(
+            lease, f"sub-leases of it are still resident: {names}; release it, they are asked first"
+        )
+    if running := lease.busy_uses():
+        raise bad_state(lease, f"{running} uses still run; wait for the `revoke` that says 0 uses")
     gpu = core.gpu_of(lease)
     end_uses(core, lease, "unloaded while it paused")
     lease.move(LeaseState.UNLOADING, core.now, "at its safe point")
@@ -402,7 +434,9 @@ def release(core: Core, event: ReleaseReported) -> None:
         core.reply(event.client, event.request, {"state": str(ended.state)})
         return
     lease = own_lease(core, event.client, event.lease, event.token)
-    if lease.gpu is not None and lease.state is not LeaseState.VERIFYING:  # else: a repeat
+    if lease.children and not event.parked:
+        eviction.depart(core, lease, exiting=event.exiting)
+    elif lease.gpu is not None and lease.state is not LeaseState.VERIFYING:  # else: a repeat
         _keep_parked(core, lease, parked=event.parked, exiting=event.exiting)
         let_go(
             core,
@@ -470,6 +504,8 @@ def let_go(
         lease.eviction.released_at = core.now
         core.learn(lease.spec.consumer, "unload_s", core.now - lease.eviction.unloading_at)
     begin_for_lease(core, gpu, lease, alive=True)
+    eviction.part(core, gpu, lease)
+    lease.said_ready = False
     core.record_lease(lease)
     core.note("released", lease, exiting=exiting, was=str(before), reason=why)
     core.wake(gpu)

@@ -4,7 +4,7 @@ Leases belong to processes: a connection that drops loses nothing that is reside
 out); `bye` gives everything back; death ends everything, and what was held is measured away before anyone else gets it.
 """
 
-from arbiter.core import standby
+from arbiter.core import families, standby
 from arbiter.core.events import BYE, ClientConnected, ClientLeft, JournalFailed
 from arbiter.core.lease import AWAY, EXPIRING, Lease, LeaseState
 from arbiter.core.measure import begin_for_residue, bereave, lose
@@ -94,10 +94,11 @@ def on_journal_failed(core: Core, event: JournalFailed) -> None:
     """
     core.note("journal_failed", key=event.key, reason=event.reason)
     lease = core.leases.get(LeaseId(event.key.removeprefix("lease:")))
-    if lease is None or lease.state is not LeaseState.LOADING:
-        return
+    if lease is None or lease.state is not LeaseState.LOADING or lease.estate is not None:
+        return  # a sub-lease was carved out of it: its own grant was written and heard of long ago
     gpu = core.gpu_of(lease)
     gpu.ledger.drop(lease.id, 0, 0, core.now)
+    families.gone(core, gpu, lease.id, lease.process)
     core.forget(event.key)
     refused = Refused(
         "journal_unavailable",

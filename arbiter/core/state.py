@@ -5,14 +5,14 @@ Data and bookkeeping only: no decision is taken here.
 
 from collections import OrderedDict, deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from statistics import median
 from typing import Any
 
 from arbiter.core.effects import Effect, JournalDelete, JournalPut, Note, Push, Refuse, Reply, Sample
 from arbiter.core.events import MemorySampled
 from arbiter.core.footprints import Footprints
-from arbiter.core.lease import LEAVING, Eviction, Lease, LeaseState, Order, Use
+from arbiter.core.lease import LEAVING, Estate, Eviction, Lease, LeaseState, Order, Use
 from arbiter.core.ledger import GpuLedger
 from arbiter.core.parking import HostRam
 from arbiter.core.queue import WaitQueue
@@ -85,6 +85,7 @@ class Gpu:
     dirty: bool = True
     pressed: bool = False  # a pressure note is out
 
+    estates: dict[LeaseId, Lease] = field(default_factory=dict)  # leases that sub-leases were carved out of
     debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
 
     def in_state(self, *states: LeaseState) -> list[Lease]:
@@ -127,7 +128,9 @@ class Core:
         self.last_token = Token(settings.epoch, 0)
         self.users: dict[ProcessKey, dict[tuple[LeaseId, UseId], Lease]] = {}  # whose busy uses are where
         self.unanswered: list[Lease] = []  # acquires of the event being handled
-        self.granted: list[tuple[Token, GpuId]] = []  # by the event being handled; invariants look at it
+        self.granted: list[
+            tuple[Token, GpuId | None]
+        ] = []  # by the event being handled; invariants look at it
         self.last_client_at = now
         self.drain: Order | None = None  # an operator wants no new grants
         self.recovering: set[LeaseId] | None = (
@@ -244,6 +247,9 @@ class Core:
 
     def end(self, lease: Lease, error: Mapping[str, Any] | None) -> None:
         """Drop a lease that reached a terminal state; a bounded memory of it stays."""
+        if lease.parent is not None:
+            lease.parent.children.remove(lease)
+            lease.parent = None
         del self.leases[lease.id]
         siblings = self._of_process[lease.process]
         del siblings[lease.id]
@@ -299,6 +305,8 @@ class Core:
                 "load_peak_bytes": lease.load_peak_bytes,
                 "measured_bytes": lease.measured_bytes,
                 "exiting": lease.exiting,
+                "parent": None if lease.parent is None else lease.parent.id,
+                "estate": None if lease.estate is None else _estate(lease.estate),
                 "pinned": None if lease.pinned is None else [lease.pinned.by, lease.pinned.reason],
                 "comes_back": lease.comes_back,
                 "parks": lease.parks,
@@ -321,9 +329,17 @@ class Core:
                     "deny_on_deadline": spec.deny_on_deadline,
                     "standby": spec.standby,
                     "park_bytes": spec.park_bytes,
+                    "parent": None if spec.parent is None else [spec.parent[0], *astuple(spec.parent[1])],
+                    "independent": spec.independent,
                 },
             },
         )
+
+    def record_line(self, lease: Lease) -> None:
+        """Write a resident lease and what it was carved out of: their bytes moved together."""
+        self.record_lease(lease)
+        if lease.parent is not None:
+            self.record_line(lease.parent)
 
     def record_residue(self, gpu: Gpu, process: ProcessKey, residue_bytes: int) -> None:
         """Write (or, with 0, delete) what a process keeps."""
@@ -351,3 +367,12 @@ class Core:
             or self.recovering
             or self.now - self.last_client_at <= IDLE_PROBE_S
         )
+
+
+def _estate(estate: Estate) -> dict[str, Any]:
+    return {
+        "booked_bytes": estate.booked_bytes,
+        "approved_bytes": estate.approved_bytes,
+        "shares": {lease: [*astuple(share)] for lease, share in estate.shares.items()},
+        "borne": [[process.pid, process.start_ticks, count] for process, count in estate.borne.items()],
+    }

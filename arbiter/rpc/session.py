@@ -435,6 +435,8 @@ def to_spec(spec: w.LeaseSpec) -> ev.Spec:
         deny_on_deadline=spec.on_deadline == "deny",
         standby=spec.standby,
         park_bytes=spec.park_bytes,
+        parent=None if spec.parent is None else (LeaseId(spec.parent.lease_id), Token(*spec.parent.token)),
+        independent=spec.independent,
     )
 
 

@@ -314,6 +314,8 @@ class Consumer:
         standby: bool = False,
         park_bytes: int = 0,
         key: str | None = None,
+        parent: tuple[LeaseId, Token] | None = None,
+        independent: bool = False,
     ) -> Spec:
         """A spec with the bytes that matter; no residue, no residency and a long ttl unless asked for."""
         return Spec(
@@ -331,6 +333,8 @@ class Consumer:
             deny_on_deadline=deny_on_deadline,
             standby=standby,
             park_bytes=park_bytes,
+            parent=parent,
+            independent=independent,
         )
 
     def acquire(

@@ -1,0 +1,81 @@
+"""What users of other arbiters and model servers complain about, where one job needs several models. Numbers are those of the list."""
+
+from arbiter.testing.core_driver import CoreDriver
+from schemas import defaults as d
+
+GIB = d.GIB
+
+
+def test_3_a_hung_part_of_a_tree_is_not_stopping_for_ever() -> None:
+    """ollama#7606, #12179, llama-swap#125: "Stopping…" until somebody kills it. Here the hung sidecar's lease runs out, its death or the
+    measurement gives its bytes back, and the waiter is told all the while who is in its way."""
+    driver = CoreDriver(8 * GIB)
+    runner, policy = driver.consumer("runner"), driver.consumer("policy")
+    root = runner.acquire(5 * GIB)
+    leaf = policy.acquire(5 * GIB, ttl_s=10.0, parent=(root, runner.token(root)))
+    policy.load(leaf)
+    driver.advance(0.01)
+    waiter = driver.consumer("w").acquire(5 * GIB)
+    driver.advance(9.0)
+    assert "policy" in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
+    driver.advance(20.0)
+    assert (driver.state(leaf), driver.state(root), driver.state(waiter)) == ("over", "over", "queued")
+    policy.die()
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)
+
+
+def test_3_the_end_of_a_ttl_and_an_unload_do_not_block_each_other() -> None:
+    """llama-swap#946: a ttl that runs out while the model unloads deadlocks both. Here either order ends in the same state."""
+    for parent_first in (True, False):
+        driver = CoreDriver(8 * GIB)
+        runner, policy = driver.consumer("runner"), driver.consumer("policy")
+        root = runner.acquire(5 * GIB, ttl_s=2.0 if parent_first else 3600.0)
+        leaf = policy.acquire(
+            5 * GIB, ttl_s=3600.0 if parent_first else 2.0, parent=(root, runner.token(root))
+        )
+        policy.load(leaf)
+        driver.advance(0.01)
+        waiter = driver.consumer("w").acquire(5 * GIB)
+        policy.unloading(leaf)
+        driver.advance(3.0)
+        policy.hold(0)
+        if parent_first:
+            policy.release(leaf)
+        driver.until(lambda: driver.state(waiter) == "loading", limit_s=20.0)  # noqa: B023 - called at once
+
+
+def test_15_a_job_that_calls_a_model_in_its_middle_has_room_for_it_in_a_sub_lease() -> None:
+    """Berth#299: the LLM waits for the job, the job for the LLM. The job reserves for both and lends the LLM its part."""
+    driver = CoreDriver(8 * GIB)
+    comfy, llm = driver.consumer("comfy"), driver.consumer("llm")
+    job = comfy.acquire(7 * GIB)
+    comfy.hold(4 * GIB)
+    comfy.ready(job)
+    comfy.use_begin(job, "render")
+    driver.advance(1.5)
+    called = llm.acquire(3 * GIB, parent=(job, comfy.token(job)))
+    assert driver.state(called) == "loading", "at once, in the middle of the job"
+    llm.load(called)
+    llm.unload(called)
+    driver.until(lambda: driver.state(called) == "over")
+    assert driver.state(job) == "held"
+
+
+def test_15_or_the_job_yields_and_is_loaded_again_afterwards() -> None:
+    driver = CoreDriver(8 * GIB)
+    comfy, llm = driver.consumer("comfy"), driver.consumer("llm")
+    job = comfy.acquire(5 * GIB)
+    comfy.load(job)
+    comfy.use_begin(job, "render")
+    driver.advance(0.01)
+    called = llm.acquire(5 * GIB)
+    driver.advance(40.0)
+    assert driver.state(called) == "queued", "without a word nobody is evicted in the middle of a job"
+    comfy.use_yield(job, "render")
+    comfy.unload(job)
+    driver.until(lambda: driver.state(called) == "loading")
+    llm.load(called)
+    driver.advance(0.01)
+    again = comfy.acquire(5 * GIB)
+    llm.unload(called)
+    driver.until(lambda: driver.state(again) == "loading")
