@@ -23,7 +23,7 @@ from contextlib import asynccontextmanager
 from typing import Any, Self
 
 from clients import records as r
-from clients.lease import Callbacks, ForeignUse, Lease, OnLost, OnRevoke, SafePointEta, Unload
+from clients.lease import Callbacks, ForeignUse, Lease, OnLost, OnReturn, OnRevoke, SafePointEta, Unload
 from clients.protocol import REQUEST_TIMEOUT_S, ClientProtocol
 from clients.transport import Transport
 from schemas.endpoints import arbiter_endpoint
@@ -137,6 +137,8 @@ class ArbiterClient:
         wait_timeout_s: float | None = None,
         *,
         unload: Unload | None = None,
+        park: Unload | None = None,
+        on_return: OnReturn | None = None,
         on_revoke: OnRevoke | None = None,
         on_lost: OnLost | None = None,
         safe_point_eta_s: SafePointEta | None = None,
@@ -144,12 +146,22 @@ class ArbiterClient:
     ) -> Lease:
         """Wait for a lease; returns when it is granted (state `loading`): load the model now, then `lease.ready()`.
 
-        Raises WaitTimeout (details.why: who blocked), VramInsufficient, UnknownGpu, HolderBusy, LimitExceeded. Cancelling the
-        caller gives the place in the queue, or the lease, back.
+        With `spec.standby` or `park` the lease may be evicted and come back under the same object: `on_return` loads then, as
+        the caller does after this first grant.
+
+        Raises WaitTimeout (details.why: who blocked), VramInsufficient, UnknownGpu, HolderBusy, LimitExceeded.
+        Cancelling the caller gives the place in the queue, or the lease, back.
         """
         nonce = uuid.uuid4().hex
         granted: asyncio.Future[Lease] = asyncio.get_running_loop().create_future()
-        callbacks = Callbacks(unload, on_revoke, on_lost, safe_point_eta_s)
+        callbacks = Callbacks(
+            unload=unload,
+            park=park,
+            on_return=on_return,
+            on_revoke=on_revoke,
+            on_lost=on_lost,
+            safe_point_eta_s=safe_point_eta_s,
+        )
         self._acquires[nonce] = (granted, spec, callbacks)
         self.protocol.acquire(
             nonce,
@@ -178,6 +190,8 @@ class ArbiterClient:
         wait_timeout_s: float | None = None,
         *,
         unload: Unload | None = None,
+        park: Unload | None = None,
+        on_return: OnReturn | None = None,
         on_revoke: OnRevoke | None = None,
         on_lost: OnLost | None = None,
         safe_point_eta_s: SafePointEta | None = None,
@@ -187,6 +201,8 @@ class ArbiterClient:
             spec,
             wait_timeout_s,
             unload=unload,
+            park=park,
+            on_return=on_return,
             on_revoke=on_revoke,
             on_lost=on_lost,
             safe_point_eta_s=safe_point_eta_s,
@@ -400,6 +416,9 @@ class ArbiterClient:
             case r.Gone():
                 if lease := self._leases.get(event.record.lease_id):
                     lease.lost(event.error, event.fenced)
+            case r.Returned():
+                if lease := self._leases.get(event.record.lease_id):
+                    lease.returned()
             case r.UseLost():
                 if use := self._foreign.get(event.use_id):
                     use.lost = event.error

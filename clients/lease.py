@@ -15,15 +15,23 @@ from typing import Any, Literal, Protocol
 
 from clients.protocol import GONE_CODES, ClientProtocol
 from clients.records import LeaseRecord, TokenPair
-from schemas.errors import ArbiterUnreachable, BadState, LeaseLost, LeaseRevoking, VramError
+from schemas.errors import (
+    ArbiterUnreachable,
+    BadState,
+    HostRamInsufficient,
+    LeaseLost,
+    LeaseRevoking,
+    VramError,
+)
 from schemas.wire import LeaseSpec
 
 log = logging.getLogger(__name__)
 
-LeaseState = Literal["loading", "held", "revoking", "unloading", "gone"]
+LeaseState = Literal["loading", "held", "revoking", "unloading", "standby", "parked", "gone"]
 Unload = Callable[[], Awaitable[None]]
 OnRevoke = Callable[["Lease", Mapping[str, Any]], Awaitable[None] | None]
 OnLost = Callable[["Lease", VramError], Awaitable[None] | None]
+OnReturn = Callable[["Lease"], Awaitable[None] | None]
 SafePointEta = Callable[[], float | None]
 
 RETRY_UNLOADING_S = 0.25
@@ -58,9 +66,15 @@ class Driver(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Callbacks:
-    """What the holder does when the arbiter wants something. `unload` frees the bytes; it runs at a safe point, at most once."""
+    """What the holder does when the arbiter wants something.
+
+    `unload` frees the bytes; it runs at a safe point, at most once a grant. `park` frees them too, but keeps the weights in host RAM: it
+    runs in its place where the spec has `park_bytes` and the arbiter has room for them. `on_return` loads again after an eviction.
+    """
 
     unload: Unload | None = None
+    park: Unload | None = None
+    on_return: OnReturn | None = None
     on_revoke: OnRevoke | None = None
     on_lost: OnLost | None = None
     safe_point_eta_s: SafePointEta | None = None
@@ -101,6 +115,7 @@ class Lease:
         self._uses: set[str] = set()
         self._asked = False  # to leave: no new uses
         self._own_will = False  # the holder itself leaves, so it is not loading any more
+        self._park_now = False  # the holder itself wants to park
         self._unloading = False
         self._unloaded = False
         self._gone = False  # the lease itself
@@ -140,6 +155,8 @@ class Lease:
     def state(self) -> LeaseState:
         if self._gone:
             return "gone"
+        if self._record.asleep:
+            return "parked" if self._record.asleep == "parked" else "standby"
         if self._unloading:
             return "unloading"
         if self._asked:
@@ -159,25 +176,20 @@ class Lease:
         self._progress.changed()
 
     @asynccontextmanager
-    async def use(self, label: str = "") -> AsyncIterator[None]:
+    async def use(self, label: str = "") -> AsyncIterator["Use"]:
         """Mark a busy interval: nobody makes the holder leave inside it. Raises LeaseRevoking or LeaseLost before it begins.
 
-        A lease can be *lost* within a use (expired, fenced): look at `state` where a use is long.
+        A lease can be *lost* within a use (expired, fenced): look at `state` where a use is long. A use that has to wait for
+        somebody who may need this very room lets go of it meanwhile: `async with use.yielded(): …`.
         """
-        self._raise_if_gone()
-        if self._asked:
-            raise LeaseRevoking(
-                f"{self.lease_id} was asked to leave", hint="acquire again after it is released"
-            )
-        use_id = f"{self.lease_id}/{uuid.uuid4().hex[:12]}"
-        protocol, now = self._driver.protocol, self._driver.now
-        self._uses.add(use_id)
+        self._raise_if_leaving()
+        use = Use(self, f"{self.lease_id}/{uuid.uuid4().hex[:12]}", label)
         try:
-            await self._driver.reply(protocol.use_begin(self._record, use_id, label, now()))
-            yield
+            await use.begin()
+            yield use
         finally:
-            self._uses.discard(use_id)
-            protocol.use_end(self._record, use_id, now())
+            self._uses.discard(use.use_id)
+            self._driver.protocol.use_end(self._record, use.use_id, self._driver.now())
             self._driver.pump()
             self._progress.changed()
 
@@ -187,6 +199,36 @@ class Lease:
             self._driver.protocol.oom(self._record, requested_bytes, allocated_bytes, self._driver.now())
         )
 
+    async def park(self) -> None:
+        """Leave the card of our own will, at the safe point, and keep the weights in host RAM: `reacquire` brings the lease back.
+
+        Where the arbiter has no host RAM to give, the lease ends as by `give_up` (see `state`).
+        """
+        if self._callbacks.park is None or not self.spec.park_bytes:
+            raise BadState(f"{self.lease_id} cannot park", hint="give a `park` callback and park_bytes")
+        self._raise_if_gone()
+        self._park_now = True
+        self._start_leaving()
+        while not (self._over or self._record.asleep):
+            await self._progress.wait()
+
+    async def reacquire(self, wait_timeout_s: float | None = None) -> None:
+        """Come back from `standby` or `parked` as a waiter like any other; `on_return` has begun to load when this returns.
+
+        Raises WaitTimeout, VramInsufficient: the lease is over then.
+        """
+        self._raise_if_gone()
+        await self._driver.reply(
+            self._driver.protocol.reacquire(self._record, wait_timeout_s, self._driver.now())
+        )
+        await self.wait_returned()
+
+    async def wait_returned(self) -> None:
+        """Until a lease that was evicted is granted again (at once for one that was not). Raises what ended it."""
+        while self._record.asleep and not self._gone:
+            await self._progress.wait()
+        self._raise_if_gone()
+
     async def release(self, *, exiting: bool = False) -> None:
         """The bytes are freed already (`exiting`: the process ends now). Idempotent; a lease that is gone is released.
 
@@ -195,15 +237,24 @@ class Lease:
         self._asked = True
         if self._gone:
             return
-        self._unloaded = True
-        await self._release(exiting=exiting)
+        if self._record.asleep:
+            self._driver.protocol.give_up_asleep(self._record, self._driver.now())
+            self._driver.pump()
+        else:
+            self._unloaded = True
+            await self._release(exiting=exiting)
         self._end()
 
     async def give_up(self) -> None:
         """Leave of our own will: no new uses, wait for those that run, then `unload` and release. Idempotent.
 
-        Before `ready` it means that the load failed or was given up: `unload` frees what there is.
+        Before `ready` it means that the load failed or was given up: `unload` frees what there is. A lease that was evicted and
+        waits to come back waits no longer; one that is parked runs `unload` to free its host RAM.
         """
+        if self._record.asleep and not self._gone:
+            await self._unload_once()
+            await self.release()
+            return
         self._own_will = True
         self._start_leaving()
         self._progress.changed()
@@ -224,6 +275,14 @@ class Lease:
             self._start_leaving()
         self._progress.changed()
 
+    def returned(self) -> None:
+        """Granted again under a new token. The model is to be loaded now."""
+        self._asked = self._own_will = self._unloading = self._unloaded = self._park_now = False
+        self._leaving = None
+        if self._callbacks.on_return is not None:
+            self._driver.spawn(self._call(self._callbacks.on_return), f"on_return {self.lease_id}")
+        self._progress.changed()
+
     def lost(self, error: VramError, fenced: bool) -> None:
         """The lease ended without us. The bytes must go all the same, at the next safe point."""
         if self._gone:
@@ -237,22 +296,49 @@ class Lease:
         if self._gone:
             raise self.error or LeaseLost(f"{self.lease_id} was released", hint="acquire again")
 
+    def _raise_if_leaving(self) -> None:
+        self._raise_if_gone()
+        if self._asked or self._record.asleep:
+            raise LeaseRevoking(
+                f"{self.lease_id} was asked to leave",
+                hint="wait until it is granted again, or acquire again",
+                details={"state": self.state},
+            )
+
     def _start_leaving(self) -> None:
         self._asked = True
         if self._leaving is None and not self._gone:
             self._leaving = self._driver.spawn(self._leave(), f"leave {self.lease_id}")
 
     async def _leave(self) -> None:
-        """1. Wait for the safe point: no local use, not loading. 2. Announce, until no use of others is on it. 3. Unload. 4. Release."""
+        """1. Wait for the safe point: no local use, not loading. 2. Announce, until no use of others is on it. 3. Unload, or park.
+        4. Release. A lease that may come back sleeps then; any other is over."""
+        token = self._record.token
         while not self._gone:
             if self._uses or not (self._record.held or self._own_will):  # 1
                 await self._progress.wait()
             elif not self._record.held or await self._announced():  # 2
                 self._unloading = True
-                await self._unload_once()  # 3
+                asleep = await self._clear_the_card()  # 3
                 if not self._gone:
-                    await self._release(exiting=False)  # 4
-                self._end()
+                    await self._release(exiting=False, asleep=asleep)  # 4
+                if self._record.token != token:
+                    return  # granted again before this task came to hear of its release
+                if self._gone or not self._record.asleep:
+                    self._end()
+                self._unloading = False
+                self._progress.changed()
+                return
+
+    async def _clear_the_card(self) -> str:
+        """Free the bytes; says how the lease is to wait for its return ("" if it is over)."""
+        push = self._record.revoke
+        may_park = self._park_now or (push is not None and bool(push.get("park")))
+        if may_park and self._callbacks.park is not None and not self._own_will:
+            await self._guarded(self._callbacks.park, "park")
+            return "parked"
+        await self._unload_once()
+        return "standby" if self.spec.standby and push is not None and not self._own_will else ""
 
     async def _announced(self) -> bool:
         """Say `unloading`. False: not now; somebody else's use is on the lease, or there is no contact."""
@@ -262,7 +348,7 @@ class Lease:
         try:
             await self._driver.reply(request)
         except BadState as error:
-            if error.details.get("uses"):
+            if error.details.get("uses") or error.details.get("children"):
                 await self._progress.wait(RETRY_UNLOADING_S)
                 return False
         except ArbiterUnreachable:
@@ -292,15 +378,19 @@ class Lease:
         if self._unloaded:
             return
         self._unloaded = True
-        if self._callbacks.unload is None:
-            return
-        try:
-            await self._callbacks.unload()
-        except Exception:
-            log.exception("unload of %s failed; the arbiter will measure what is left", self.spec.consumer)
+        if self._callbacks.unload is not None:
+            await self._guarded(self._callbacks.unload, "unload")
 
-    async def _release(self, *, exiting: bool) -> None:
-        request = self._driver.protocol.release(self._record, exiting, self._driver.now(), RELEASE_TIMEOUT_S)
+    async def _guarded(self, work: Unload, what: str) -> None:
+        try:
+            await work()
+        except Exception:
+            log.exception("%s of %s failed; the arbiter will measure what is left", what, self.spec.consumer)
+
+    async def _release(self, *, exiting: bool, asleep: str = "") -> None:
+        request = self._driver.protocol.release(
+            self._record, exiting, self._driver.now(), RELEASE_TIMEOUT_S, asleep=asleep
+        )
         if not self._driver.connected:
             log.warning("%s is released without contact to the arbiter", self.lease_id)
             return  # said when contact comes back soon, else its ttl ends it
@@ -308,13 +398,19 @@ class Lease:
             await self._driver.reply(request)
         except ArbiterUnreachable:
             log.warning("the arbiter did not hear the release of %s; it ends by its ttl", self.lease_id)
+        except (
+            HostRamInsufficient
+        ) as error:  # parked by our own will, but no room is left: the weights go too
+            log.info("%s is not parked: %s", self.lease_id, error)
+            await self._unload_once()
+            await self._release(exiting=exiting)
         except VramError as error:
             if error.code not in GONE_CODES:
                 raise
 
-    async def _call(self, callback: Callable[..., Awaitable[None] | None], argument: object) -> None:
+    async def _call(self, callback: Callable[..., Awaitable[None] | None], *arguments: object) -> None:
         try:
-            result = callback(self, argument)
+            result = callback(self, *arguments)
             if inspect.isawaitable(result):
                 await result
         except Exception:
@@ -323,6 +419,45 @@ class Lease:
     def _end(self) -> None:
         self._gone = self._over = self._asked = True
         self._progress.changed()
+
+
+class Use:
+    """A use on one's own lease; made by `Lease.use`."""
+
+    def __init__(self, lease: Lease, use_id: str, label: str) -> None:
+        self.use_id = use_id
+        self._lease = lease
+        self._label = label
+
+    async def begin(self) -> None:
+        """Begin it, or take it up again. Raises LeaseRevoking or LeaseLost if the lease is on its way out or away."""
+        lease = self._lease
+        lease._raise_if_leaving()
+        lease._uses.add(self.use_id)
+        driver = lease._driver
+        try:
+            await driver.reply(
+                driver.protocol.use_begin(lease._record, self.use_id, self._label, driver.now())
+            )
+        except BaseException:
+            lease._uses.discard(self.use_id)
+            raise
+
+    @asynccontextmanager
+    async def yielded(self) -> AsyncIterator[None]:
+        """Inside, the use does not keep the lease: it may be evicted. At the end the use goes on, or begin's error is raised.
+
+        For a job that asks in its middle for something that may need this very room (an LLM, say).
+        """
+        lease = self._lease
+        driver = lease._driver
+        await driver.reply(driver.protocol.use_yield(lease._record, self.use_id, driver.now()))
+        lease._uses.discard(self.use_id)
+        lease._progress.changed()
+        try:
+            yield
+        finally:
+            await self.begin()
 
 
 class ForeignUse:

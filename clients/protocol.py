@@ -9,7 +9,6 @@ the client gives it up by itself. Nobody waits for ever: each request and each w
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from clients.records import (
@@ -17,17 +16,21 @@ from clients.records import (
     Denied,
     Event,
     Failed,
+    ForeignUseRecord,
     Gone,
     Granted,
     HistoryEvent,
     LeaseRecord,
     Message,
+    Pending,
     Refused,
     Replied,
+    Returned,
     RevokeAsked,
     TokenPair,
     Up,
     UseLost,
+    Waiter,
 )  # fmt: skip
 from schemas import defaults as d
 from schemas.errors import ArbiterUnreachable, LeaseLost, UnknownSession, VramError, WaitTimeout, from_wire
@@ -40,40 +43,6 @@ WAIT_SLACK_S = 5.0  # the arbiter ends waits; we only do if it does not
 
 GONE_CODES = frozenset({"lease_lost", "lease_expired", "unknown_lease", "stale_token"})
 """Replies that say that the lease is no longer ours."""
-
-
-# -- what it remembers --------------------------------------------------------------------------------------------------
-@dataclass(slots=True)
-class _Waiter:
-    nonce: str
-    spec: Message
-    extra: Message
-    asked_at: float
-    deadline: float | None
-    lease_id: str | None = None
-    request_id: int | None = None
-    abandoned: bool = False
-
-
-@dataclass(slots=True)
-class _Pending:
-    message: Message
-    deadline: float
-    sent_at: float | None = None
-    on_reply: Callable[[Message, float], None] | None = None  # our own bookkeeping, before the owner hears
-    on_error: Callable[[VramError, float], None] | None = None
-    quiet: bool = False  # nobody waits for it
-
-
-@dataclass(slots=True)
-class _ForeignUse:
-    lease_id: str
-    token: TokenPair
-    label: str
-
-    def begin(self, use_id: str) -> Message:
-        on = {"lease_id": self.lease_id, "token": list(self.token)}
-        return {"op": "use_begin", **on, "use_id": use_id, "label": self.label}
 
 
 class ClientProtocol:
@@ -94,12 +63,13 @@ class ClientProtocol:
         self.grace_s = d.FENCE_GRACE_S
         self.welcome: Message = {}
         self.leases: dict[str, LeaseRecord] = {}
+        self.asleep: dict[str, LeaseRecord] = {}  # evicted, waiting to come back: not renewed, not fenced
         self._next_id = 1
         self._outgoing: list[Message] = []
         self._events: list[Event] = []
-        self._pending: dict[int, _Pending] = {}
-        self._waiters: dict[str, _Waiter] = {}
-        self._foreign: dict[str, _ForeignUse] = {}
+        self._pending: dict[int, Pending] = {}
+        self._waiters: dict[str, Waiter] = {}
+        self._foreign: dict[str, ForeignUseRecord] = {}
         self._subscribed = False
         self._phase_deadline: float | None = None
         self._handshake_id = 0
@@ -167,7 +137,7 @@ class ClientProtocol:
         """Ask for a lease; ends as `Granted` or `Denied` with this nonce."""
         deadline = None if wait_timeout_s is None else now + wait_timeout_s
         extra = {"traceparent": traceparent} if traceparent else {}
-        waiter = _Waiter(nonce, dict(spec), extra, now, deadline)
+        waiter = Waiter(nonce, dict(spec), extra, now, deadline)
         self._waiters[nonce] = waiter
         self._send_acquire(waiter, now)
 
@@ -209,7 +179,7 @@ class ClientProtocol:
         self, lease_id: str, token: TokenPair, use_id: str, label: str, now: float, timeout_s: float
     ) -> int:
         """Begin a use on somebody else's lease; begun again after every reconnect until `foreign_use_end`."""
-        use = _ForeignUse(lease_id, token, label)
+        use = ForeignUseRecord(lease_id, token, label)
 
         def begun(_: Message, __: float) -> None:
             self._foreign[use_id] = use
@@ -232,12 +202,52 @@ class ClientProtocol:
     def unloading(self, record: LeaseRecord, now: float, timeout_s: float = REQUEST_TIMEOUT_S) -> int:
         return self._ask({"op": "unloading", **record.ref()}, now, timeout_s, record=record)
 
-    def release(self, record: LeaseRecord, exiting: bool, now: float, timeout_s: float) -> int:
-        """From here on the lease is not ours: no renewal, no re-attachment. A lease that is gone already counts as released."""
+    def release(
+        self, record: LeaseRecord, exiting: bool, now: float, timeout_s: float, *, asleep: str = ""
+    ) -> int:
+        """From here on nothing is held: no renewal. A lease that is gone already counts as released.
+
+        `asleep`: how it waits to come back (`standby`, `parked`), if the arbiter agrees; "" means never again.
+        """
         record.released = True
         self.leases.pop(record.lease_id, None)
-        message = {"op": "release", **record.ref(), "exiting": exiting}
-        return self._ask(message, now, timeout_s)
+        if asleep:
+            record.asleep = asleep
+            self.asleep[record.lease_id] = record
+        message = {"op": "release", **record.ref(), "exiting": exiting, "parked": asleep == "parked"}
+
+        def let_go(reply: Message, at: float) -> None:
+            then = str(reply.get("next", ""))
+            if asleep and then not in ("standby", "parked"):
+                self._wake(record)
+            elif asleep:
+                record.asleep = then
+            elif then in ("standby", "parked"):
+                self._ask({"op": "cancel", "lease_id": record.lease_id}, at, quiet=True)
+
+        def refused(_: VramError, __: float) -> None:
+            self._wake(record)
+
+        return self._ask(message, now, timeout_s, on_reply=let_go, on_error=refused)
+
+    def give_up_asleep(self, record: LeaseRecord, now: float) -> None:
+        """A lease on standby or parked is not wanted any more."""
+        self._wake(record)
+        self._ask({"op": "cancel", "lease_id": record.lease_id}, now, quiet=True)
+
+    def reacquire(self, record: LeaseRecord, wait_timeout_s: float | None, now: float) -> int:
+        """A lease on standby or parked wants in now, as a waiter like any other. Its grant comes as `Returned`."""
+
+        def replied(message: Message, at: float) -> None:
+            self._returned(message["lease"], at)
+
+        message = {"op": "reacquire", **record.ref(), "wait_timeout_s": wait_timeout_s}
+        return self._ask(message, now, on_reply=replied)
+
+    def use_yield(self, record: LeaseRecord, use_id: str, now: float) -> int:
+        """The use goes on, but no longer keeps the lease: `use_begin` with the same id takes it up again."""
+        record.uses.discard(use_id)
+        return self._ask({"op": "yield", **record.ref(), "use_id": use_id}, now, record=record)
 
     def oom(self, record: LeaseRecord, requested_bytes: int, allocated_bytes: int | None, now: float) -> int:
         message = {
@@ -320,11 +330,12 @@ class ClientProtocol:
             self.epoch = int(message["epoch"])
             self.heartbeat_s = float(message.get("heartbeat_s", self.heartbeat_s))
             self.grace_s = float(message.get("grace_s", self.grace_s))
-            if self.leases:
+            if self.leases or self.asleep:
                 self.phase = "reattaching"
                 self._handshake_id, self._handshake_at = self._new_id(), now
                 self._phase_deadline = now + HELLO_TIMEOUT_S
-                leases = [record.reattachment() for record in self.leases.values()]
+                kept = [*self.leases.values(), *self.asleep.values()]
+                leases = [record.reattachment() for record in kept]
                 self._outgoing.append({"op": "reattach", "id": self._handshake_id, "leases": leases})
                 return
         else:
@@ -333,10 +344,12 @@ class ClientProtocol:
 
     def _reattached(self, message: Message, now: float) -> None:
         for entry in message.get("leases", ()):
-            record = self.leases.get(entry["lease_id"])
+            record = self.leases.get(entry["lease_id"]) or self.asleep.get(entry["lease_id"])
             if record is None:
                 continue
-            if entry.get("kept"):
+            if entry.get("kept") and record.asleep:
+                self._returned(entry["lease"], now)  # if its grant was lost on the way
+            elif entry.get("kept"):
                 record.confirmed_at = record.renewed_at = self._handshake_at
                 record.revoke = None  # a push that is still meant comes again
             else:
@@ -359,7 +372,7 @@ class ClientProtocol:
         for request in again:
             self._send(request, now)
 
-    def _renew_use(self, use_id: str, use: _ForeignUse, now: float) -> None:
+    def _renew_use(self, use_id: str, use: ForeignUseRecord, now: float) -> None:
         def lost(error: VramError, _: float) -> None:
             if self._foreign.pop(use_id, None) is not None:
                 self._events.append(UseLost(use_id, error))
@@ -393,7 +406,7 @@ class ClientProtocol:
         if not request.quiet:
             self._events.append(Failed(request_id, error))
 
-    def _acquire_replied(self, waiter: _Waiter, message: Message, now: float) -> None:
+    def _acquire_replied(self, waiter: Waiter, message: Message, now: float) -> None:
         view = message["lease"]
         waiter.lease_id = view["lease_id"]
         if view.get("token") is not None:
@@ -401,7 +414,7 @@ class ClientProtocol:
         elif waiter.abandoned:
             self._cancel(waiter, now)
 
-    def _granted(self, waiter: _Waiter, view: Message, now: float) -> None:
+    def _granted(self, waiter: Waiter, view: Message, now: float) -> None:
         self._waiters.pop(waiter.nonce, None)
         token = (int(view["token"][0]), int(view["token"][1]))
         record = LeaseRecord(
@@ -419,11 +432,11 @@ class ClientProtocol:
         self.leases[record.lease_id] = record
         self._events.append(Granted(waiter.nonce, record))
 
-    def _denied(self, waiter: _Waiter, error: VramError) -> None:
+    def _denied(self, waiter: Waiter, error: VramError) -> None:
         if self._waiters.pop(waiter.nonce, None) is not None and not waiter.abandoned:
             self._events.append(Denied(waiter.nonce, error))
 
-    def _deny_locally(self, waiter: _Waiter, now: float) -> None:
+    def _deny_locally(self, waiter: Waiter, now: float) -> None:
         """The wait's time is over and the arbiter did not say so: it is out of reach."""
         waited_s = now - waiter.asked_at
         error = WaitTimeout(
@@ -437,7 +450,7 @@ class ClientProtocol:
         if waiter.lease_id is not None:
             self._cancel(waiter, now)
 
-    def _cancel(self, waiter: _Waiter, now: float) -> None:
+    def _cancel(self, waiter: Waiter, now: float) -> None:
         def over(_: object, __: float) -> None:
             self._waiters.pop(waiter.nonce, None)
 
@@ -451,9 +464,10 @@ class ClientProtocol:
                 view = message["lease"]
                 if waiter := self._waiter_of(view["lease_id"]):
                     self._granted(waiter, view, now)
+                else:
+                    self._returned(view, now)
             case "denied":
-                if waiter := self._waiter_of(message["lease_id"]):
-                    self._denied(waiter, from_wire(message["error"]))
+                self._refused_later(message["lease_id"], from_wire(message["error"]))
             case "revoke":
                 record = self.leases.get(message["lease_id"])
                 if record is not None and list(record.token) == list(message["token"]):
@@ -461,24 +475,52 @@ class ClientProtocol:
                     record.server_uses = message.get("uses")
                     self._events.append(RevokeAsked(record, message, first))
             case "lost":
-                record = self.leases.get(message["lease_id"])
+                record = self.leases.get(message["lease_id"]) or self.asleep.get(message["lease_id"])
                 if record is not None and list(record.token) == list(message["token"]):
                     self._gone(record, from_wire(message["error"]))
             case "event":
                 self._events.append(HistoryEvent(message["event"]))
 
-    def _waiter_of(self, lease_id: str) -> _Waiter | None:
+    def _refused_later(self, lease_id: str, error: VramError) -> None:
+        """A wait that ended without a grant: of an acquire, or of a lease that wanted to come back."""
+        if waiter := self._waiter_of(lease_id):
+            self._denied(waiter, error)
+        elif record := self.asleep.get(lease_id):
+            self._gone(record, error)
+
+    def _waiter_of(self, lease_id: str) -> Waiter | None:
         return next((w for w in self._waiters.values() if w.lease_id == lease_id), None)
 
     # -- steps: leases -------------------------------------------------------------------------------------------------
     def _gone(self, record: LeaseRecord, error: VramError, fenced: bool = False) -> None:
-        if self.leases.pop(record.lease_id, None) is None:
+        if not (self.leases.pop(record.lease_id, None) or self._wake(record)):
             return
         record.uses.clear()
         self._drop_unsent(
             lambda m: m.get("lease_id") == record.lease_id and m["op"] in ("revoke_ack", "use_end")
         )
         self._events.append(Gone(record, error, fenced))
+
+    def _wake(self, record: LeaseRecord) -> bool:
+        """It waits no longer. Did it?"""
+        record.asleep = ""
+        return self.asleep.pop(record.lease_id, None) is not None
+
+    def _returned(self, view: Message, now: float) -> None:
+        """Granted again? The same record goes on under the new token."""
+        record = self.asleep.get(view["lease_id"])
+        if record is None or view.get("token") is None or view["state"] != "loading":
+            return
+        token = (int(view["token"][0]), int(view["token"][1]))
+        if token <= record.token:
+            return
+        self._wake(record)
+        record.token, record.view = token, view
+        record.confirmed_at = record.renewed_at = now
+        record.held = record.released = False
+        record.measured_bytes = record.revoke = record.server_uses = None
+        self.leases[record.lease_id] = record
+        self._events.append(Returned(record))
 
     def _renew(self, now: float) -> None:
         """One message for all leases as soon as one is due."""
@@ -508,7 +550,7 @@ class ClientProtocol:
     def _fence_at(self, record: LeaseRecord) -> float:
         return record.confirmed_at + record.ttl_s + self.grace_s
 
-    def _wait_limit(self, waiter: _Waiter) -> float:
+    def _wait_limit(self, waiter: Waiter) -> float:
         if waiter.deadline is None:
             return float("inf")
         return waiter.deadline + (WAIT_SLACK_S if self.phase == "up" else 0.0)
@@ -530,14 +572,15 @@ class ClientProtocol:
         quiet: bool = False,
     ) -> int:
         request_id = self._new_id()
+        token = None if record is None else record.token
 
         def refused(error: VramError, at: float) -> None:
             if on_error is not None:
                 on_error(error, at)
-            if record is not None and error.code in GONE_CODES:
+            if record is not None and record.token == token and error.code in GONE_CODES:
                 self._gone(record, error)
 
-        request = _Pending(
+        request = Pending(
             {**message, "id": request_id}, now + timeout_s, on_reply=on_reply, on_error=refused, quiet=quiet
         )
         self._pending[request_id] = request
@@ -545,11 +588,11 @@ class ClientProtocol:
             self._send(request, now)
         return request_id
 
-    def _send(self, request: _Pending, now: float) -> None:
+    def _send(self, request: Pending, now: float) -> None:
         request.sent_at = now
         self._outgoing.append(request.message)
 
-    def _send_acquire(self, waiter: _Waiter, now: float) -> None:
+    def _send_acquire(self, waiter: Waiter, now: float) -> None:
         left_s = None if waiter.deadline is None else max(0.0, waiter.deadline - now)
         if waiter.abandoned:
             left_s = 0.0

@@ -1,5 +1,6 @@
-"""What the client's protocol tells its owner, and the lease as the protocol remembers it. Plain data, no behaviour."""
+"""What the client's protocol tells its owner, and what it remembers of leases, waits, requests and uses. Plain data, no behaviour."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -75,6 +76,13 @@ class Gone:
 
 
 @dataclass(frozen=True, slots=True)
+class Returned:
+    """A lease that was evicted is granted again, with a new token: load, then `ready`."""
+
+    record: "LeaseRecord"
+
+
+@dataclass(frozen=True, slots=True)
 class UseLost:
     """A use on somebody else's lease could not be renewed after a reconnect."""
 
@@ -97,6 +105,7 @@ Event = (
     | Denied
     | RevokeAsked
     | Gone
+    | Returned
     | UseLost
     | HistoryEvent
 )
@@ -120,6 +129,7 @@ class LeaseRecord:
     revoke: Message | None = None
     server_uses: int | None = None
     released: bool = False
+    asleep: str = ""  # `standby` or `parked`: evicted, and may come back under the same id
 
     @property
     def ttl_s(self) -> float:
@@ -134,7 +144,46 @@ class LeaseRecord:
         return {
             **self.ref(),
             "spec": self.spec,
-            "state": "held" if self.held else "loading",
+            "state": self.asleep or ("held" if self.held else "loading"),
             "measured_bytes": self.measured_bytes,
             "use_ids": sorted(self.uses),
         }
+
+
+@dataclass(slots=True)
+class Waiter:
+    """An acquire that is not granted yet."""
+
+    nonce: str
+    spec: Message
+    extra: Message
+    asked_at: float
+    deadline: float | None
+    lease_id: str | None = None
+    request_id: int | None = None
+    abandoned: bool = False
+
+
+@dataclass(slots=True)
+class Pending:
+    """A request whose reply is not here yet; sent again after a reconnect."""
+
+    message: Message
+    deadline: float
+    sent_at: float | None = None
+    on_reply: Callable[[Message, float], None] | None = None  # our own bookkeeping, before the owner hears
+    on_error: Callable[[VramError, float], None] | None = None
+    quiet: bool = False  # nobody waits for it
+
+
+@dataclass(slots=True)
+class ForeignUseRecord:
+    """A use on somebody else's lease; begun again after a reconnect."""
+
+    lease_id: str
+    token: TokenPair
+    label: str
+
+    def begin(self, use_id: str) -> Message:
+        on = {"lease_id": self.lease_id, "token": list(self.token)}
+        return {"op": "use_begin", **on, "use_id": use_id, "label": self.label}

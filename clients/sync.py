@@ -16,10 +16,11 @@ import os
 import threading
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Self, TypeVar
 
 from clients.aio import CONNECT_TIMEOUT_S, ArbiterClient
-from clients.lease import ForeignUse, Lease, LeaseState, SafePointEta
+from clients.lease import ForeignUse, Lease, LeaseState, SafePointEta, Use
 from schemas.errors import BadState, VramError
 from schemas.wire import LeaseSpec
 
@@ -27,6 +28,7 @@ T = TypeVar("T")
 Message = dict[str, Any]
 SyncUnload = Callable[[], None]
 SyncOnRevoke = Callable[["SyncLease", Mapping[str, Any]], None]
+SyncOnReturn = Callable[["SyncLease"], None]
 SyncOnLost = Callable[["SyncLease", VramError], None]
 
 CLOSE_TIMEOUT_S = 10.0  # the thread's own end, after leases are given up
@@ -79,17 +81,26 @@ class SyncLease:
         self._client.run(self._lease.ready(measured_bytes))
 
     @contextmanager
-    def use(self, label: str = "") -> Iterator[None]:
+    def use(self, label: str = "") -> Iterator["SyncUse"]:
         """A busy interval. Raises LeaseRevoking or LeaseLost before it begins."""
         interval = self._lease.use(label)
-        self._client.run(interval.__aenter__())
+        use = self._client.run(interval.__aenter__())
         try:
-            yield
+            yield SyncUse(self._client, use)
         finally:
             self._client.run(interval.__aexit__(None, None, None))
 
     def oom(self, requested_bytes: int, allocated_bytes: int | None = None) -> None:
         self._client.run(self._lease.oom(requested_bytes, allocated_bytes))
+
+    def park(self) -> None:
+        self._client.run(self._lease.park())
+
+    def reacquire(self, wait_timeout_s: float | None = None) -> None:
+        self._client.run(self._lease.reacquire(wait_timeout_s))
+
+    def wait_returned(self) -> None:
+        self._client.run(self._lease.wait_returned())
 
     def release(self, *, exiting: bool = False) -> None:
         self._client.run(self._lease.release(exiting=exiting))
@@ -99,6 +110,24 @@ class SyncLease:
 
     def wait_gone(self) -> None:
         self._client.run(self._lease.wait_gone())
+
+
+class SyncUse:
+    """A use on one's own lease; see `clients.lease.Use`."""
+
+    def __init__(self, client: "SyncArbiterClient", use: Use) -> None:
+        self._client = client
+        self._use = use
+
+    @contextmanager
+    def yielded(self) -> Iterator[None]:
+        """Inside, the use does not keep the lease. Raises LeaseRevoking or LeaseLost at the end if it has left meanwhile."""
+        interval = self._use.yielded()
+        self._client.run(interval.__aenter__())
+        try:
+            yield
+        finally:
+            self._client.run(interval.__aexit__(None, None, None))
 
 
 class SyncArbiterClient:
@@ -179,6 +208,8 @@ class SyncArbiterClient:
         wait_timeout_s: float | None = None,
         *,
         unload: SyncUnload | None = None,
+        park: SyncUnload | None = None,
+        on_return: SyncOnReturn | None = None,
         on_revoke: SyncOnRevoke | None = None,
         on_lost: SyncOnLost | None = None,
         safe_point_eta_s: SafePointEta | None = None,
@@ -193,14 +224,16 @@ class SyncArbiterClient:
             if on_lost is not None:
                 await asyncio.to_thread(on_lost, SyncLease(self, lease), error)
 
-        async def unloaded() -> None:
-            if unload is not None:
-                await asyncio.to_thread(unload)
+        async def returned(lease: Lease) -> None:
+            if on_return is not None:
+                await asyncio.to_thread(on_return, SyncLease(self, lease))
 
         granted = self._client.acquire(
             spec,
             wait_timeout_s,
-            unload=unloaded,
+            unload=None if unload is None else partial(asyncio.to_thread, unload),
+            park=None if park is None else partial(asyncio.to_thread, park),
+            on_return=returned,
             on_revoke=revoked,
             on_lost=lost,
             safe_point_eta_s=safe_point_eta_s,
@@ -214,6 +247,8 @@ class SyncArbiterClient:
         wait_timeout_s: float | None = None,
         *,
         unload: SyncUnload | None = None,
+        park: SyncUnload | None = None,
+        on_return: SyncOnReturn | None = None,
         on_revoke: SyncOnRevoke | None = None,
         on_lost: SyncOnLost | None = None,
         safe_point_eta_s: SafePointEta | None = None,
@@ -223,6 +258,8 @@ class SyncArbiterClient:
             spec,
             wait_timeout_s,
             unload=unload,
+            park=park,
+            on_return=on_return,
             on_revoke=on_revoke,
             on_lost=on_lost,
             safe_point_eta_s=safe_point_eta_s,

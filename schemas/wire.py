@@ -141,7 +141,10 @@ class Unloading(_OnLease):
 
 
 class Release(_OnLease):
-    """The holder has let go of the bytes (its process lives on: residue) or is about to exit (`exiting`)."""
+    """The holder has let go of the bytes (its process lives on: residue) or is about to exit (`exiting`).
+
+    The reply's `next` says where the lease goes once the bytes are measured gone: `released`, `standby` or `parked`.
+    """
 
     op: Literal["release"]
     exiting: bool = False

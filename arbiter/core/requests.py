@@ -431,7 +431,7 @@ def release(core: Core, event: ReleaseReported) -> None:
     ended = core.ended.get(event.lease)
     same = ended is not None and (ended.token, ended.process) == (event.token, process)
     if ended is not None and same and ended.state is LeaseState.RELEASED:  # a repeat
-        core.reply(event.client, event.request, {"state": str(ended.state)})
+        core.reply(event.client, event.request, {"state": str(ended.state), "next": str(ended.state)})
         return
     lease = own_lease(core, event.client, event.lease, event.token)
     if lease.children and not event.parked:
@@ -446,7 +446,8 @@ def release(core: Core, event: ReleaseReported) -> None:
             comes_back=standby.stays_on(lease) and not event.exiting,
             parks=event.parked,
         )
-    core.reply(event.client, event.request, {"state": str(lease.state)})
+    after = {"state": str(lease.state), "next": str(standby.next_state(lease))}
+    core.reply(event.client, event.request, after)
 
 
 def end_uses(core: Core, lease: Lease, why: str) -> None:

@@ -23,6 +23,15 @@ def stays_on(lease: Lease) -> bool:
     return lease.spec.standby and lease.eviction is not None and lease.eviction.order is None
 
 
+def next_state(lease: Lease) -> LeaseState:
+    """Where a lease that let go is, or goes after its verdict."""
+    if lease.state in AWAY:
+        return lease.state
+    if lease.parks:
+        return LeaseState.PARKED
+    return LeaseState.STANDBY if lease.comes_back else LeaseState.RELEASED
+
+
 def settle(core: Core, lease: Lease, verdict: str) -> None:
     """Its bytes are measured gone: the end, or away."""
     if not (lease.comes_back or lease.parks):
@@ -32,7 +41,7 @@ def settle(core: Core, lease: Lease, verdict: str) -> None:
     gpu = core.gpu_of(lease)
     del gpu.residents[lease.id]
     core.wake(gpu)
-    lease.move(LeaseState.PARKED if lease.parks else LeaseState.STANDBY, core.now, verdict)
+    lease.move(next_state(lease), core.now, verdict)
     lease.gpu = lease.baseline = lease.eviction = lease.measured_bytes = lease.request = None
     lease.load_peak_bytes, lease.steady_bytes = drift.expected_bytes(core, lease.spec)
     lease.evicted = []

@@ -575,3 +575,108 @@ def test_bad_state_is_no_loss(link: Wire) -> None:
     assert isinstance(failed, r.Failed)
     assert isinstance(failed.error, BadState)
     assert link.protocol.leases
+
+
+# -- leases that leave and come back -------------------------------------------------------------------------------------
+def evict(link: Wire, record: r.LeaseRecord, asleep: str = "standby", then: str | None = None) -> None:
+    """The holder is asked, lets go, and hears how the lease waits."""
+    link.push(
+        "revoke", lease_id=record.lease_id, token=list(record.token), reason="", wanted_by="", park=True
+    )
+    link.protocol.release(record, False, link.now, 5.0, asleep=asleep)
+    message = link.one("release")
+    assert message["parked"] == (asleep == "parked")
+    link.reply(message, state="verifying", next=asleep if then is None else then)
+    link.told()
+
+
+def test_an_evicted_lease_comes_back_under_a_new_token(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record)
+    assert (record.asleep, link.protocol.leases) == ("standby", {})
+    link.tick(60.0)
+    assert "renew" not in [message["op"] for message in link.sent()], (
+        "nothing is held, nothing is renewed or fenced"
+    )
+    link.push("granted", lease=view(token=[1, 9]))
+    assert link.told() == [r.Returned(record)]
+    assert (record.token, record.asleep, record.held, record.released) == ((1, 9), "", False, False)
+    assert link.protocol.leases == {record.lease_id: record}
+
+
+def test_an_old_grant_said_again_is_no_return(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record)
+    link.push("granted", lease=view(token=list(record.token)))
+    assert link.told() == []
+
+
+def test_the_arbiter_decides_whether_a_lease_may_come_back(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record, "standby", then="released")
+    assert (record.asleep, link.protocol.asleep) == ("", {})
+    parked = link.hold(nonce="n2", lease_id="L1-5", serial=6)
+    evict(link, parked, "parked", then="standby")
+    assert parked.asleep == "standby"
+
+
+def test_who_does_not_want_to_come_back_says_so(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record, "", then="standby")
+    assert link.one("cancel")["lease_id"] == record.lease_id
+
+
+def test_a_lease_on_standby_is_attached_again_and_may_have_returned_meanwhile(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record, "parked")
+    request = link.reconnect()
+    assert [(item["lease_id"], item["state"]) for item in request["leases"]] == [(record.lease_id, "parked")]
+    kept = {"lease_id": record.lease_id, "kept": True, "lease": view(token=None, state="parked")}
+    link.reply(request, leases=[kept])
+    assert link.told() == [r.Up(1)]
+    assert record.asleep == "parked"
+    request = link.reconnect()
+    link.reply(request, leases=[{**kept, "lease": view(token=[2, 4])}])
+    assert link.told() == [r.Returned(record), r.Up(1)]
+
+
+def test_a_lease_that_is_lost_while_it_waits_ends(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record)
+    request = link.reconnect()
+    error = {"code": "lease_lost", "message": "gone", "hint": "", "details": {}}
+    link.reply(request, leases=[{"lease_id": record.lease_id, "kept": False, "error": error}])
+    gone, up = link.told()
+    assert isinstance(gone, r.Gone)
+    assert isinstance(gone.error, LeaseLost)
+    assert isinstance(up, r.Up)
+
+
+def test_reacquire_is_granted_at_once_or_later_or_never(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record)
+    link.protocol.reacquire(record, 5.0, link.now)
+    link.reply(link.one("reacquire"), state="loading", lease=view(token=[1, 9]))
+    assert r.Returned(record) in link.told()
+    evict(link, record)
+    link.protocol.reacquire(record, 5.0, link.now)
+    link.reply(link.one("reacquire"), state="queued", lease=view(state="queued"))
+    link.told()
+    link.push(
+        "denied",
+        lease_id=record.lease_id,
+        error={"code": "wait_timeout", "message": "", "hint": "", "details": {}},
+    )
+    (gone,) = link.told()
+    assert isinstance(gone, r.Gone)
+    assert isinstance(gone.error, WaitTimeout)
+
+
+def test_a_yielded_use_is_not_attached_again(link: Wire) -> None:
+    record = link.hold()
+    link.protocol.use_begin(record, "u1", "", link.now)
+    link.reply(link.one("use_begin"), uses=1)
+    link.protocol.use_yield(record, "u1", link.now)
+    link.reply(link.one("yield"), uses=0)
+    link.told()
+    assert link.reconnect()["leases"][0]["use_ids"] == []

@@ -267,10 +267,10 @@ def test_release_may_be_repeated_before_and_after_the_verdict(driver: CoreDriver
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB)
     token = det.token(lease)
-    assert answer(det.release(lease)) == {"state": "verifying"}
-    assert answer(det.release(lease)) == {"state": "verifying"}
+    assert answer(det.release(lease)) == {"state": "verifying", "next": "released"}
+    assert answer(det.release(lease)) == {"state": "verifying", "next": "released"}
     driver.advance(1.0)
-    assert answer(det.release(lease, token=token)) == {"state": "released"}
+    assert answer(det.release(lease, token=token)) == {"state": "released", "next": "released"}
     assert refusal(det.release(lease, token=Token(1, 99))).code == "bad_state"
 
 

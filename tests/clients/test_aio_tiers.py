@@ -1,0 +1,159 @@
+"""Leases that leave and come back, pause and park: the asyncio client against a real daemon."""
+
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from clients.aio import ArbiterClient
+from clients.lease import Lease, Use
+from schemas.errors import BadState, LeaseRevoking, VramError
+from schemas.wire import LeaseSpec
+from sidecars.device.fake import FakeMemory
+
+pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
+
+GIB = 1 << 30
+Spec = Callable[..., LeaseSpec]
+Until = Callable[[Callable[[], bool]], Awaitable[None]]
+
+
+class Model:
+    """What a holder does to its bytes, as a list of words."""
+
+    def __init__(self) -> None:
+        self.did: list[str] = []
+
+    async def unload(self) -> None:
+        self.did.append("unload")
+
+    async def park(self) -> None:
+        self.did.append("park")
+
+    async def load(self, lease: Lease) -> None:
+        self.did.append("load")
+        await lease.ready()
+
+
+async def lend(use: Use, work: Awaitable[object]) -> None:
+    """Wait for something without keeping the lease meanwhile."""
+    async with use.yielded():
+        await work
+
+
+async def states(client: ArbiterClient) -> dict[str, str]:
+    return {lease["consumer"]: lease["state"] for lease in (await client.status())["leases"]}
+
+
+async def test_a_standby_lease_returns_by_itself_when_there_is_room(
+    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
+) -> None:
+    model = Model()
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        detector = await client.acquire(
+            spec("detector", 5, standby=True), unload=model.unload, on_return=model.load
+        )
+        await detector.ready()
+        first = detector.token
+        policy = await client.acquire(spec("policy", 4), 20.0)
+        await policy.ready()
+        assert detector.state == "standby"
+        with pytest.raises(LeaseRevoking):
+            async with detector.use():
+                raise AssertionError("a lease on standby cannot be used")
+        await policy.give_up()
+        await until(lambda: detector.state == "held")
+        assert detector.token > first
+        assert model.did == ["unload", "load"]
+        async with detector.use():
+            assert (await states(client))["detector"] == "held"
+        await detector.give_up()
+        assert (model.did[-1], detector.state) == ("unload", "gone")
+
+
+async def test_a_standby_lease_survives_the_daemon(
+    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
+) -> None:
+    model = Model()
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        detector = await client.acquire(
+            spec("detector", 5, standby=True), unload=model.unload, on_return=model.load
+        )
+        await detector.ready()
+        memory = FakeMemory(arbiter_daemon.card, "t", 0)
+        policy = await client.acquire(spec("policy", 4), 20.0)
+        block = memory.allocate("policy", 4 * GIB)
+        await policy.ready()
+        arbiter_daemon.kill()
+        arbiter_daemon.start()
+        await until(lambda: client.connected)
+        assert (await states(client)) == {"policy": "held", "detector": "standby"}
+        memory.free(block)
+        memory.empty_cache()
+        await policy.give_up()
+        await until(lambda: detector.state == "held")
+
+
+async def test_a_standby_lease_can_ask_to_come_back_or_be_given_up(
+    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
+) -> None:
+    model = Model()
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        detector = await client.acquire(
+            spec("detector", 5, standby=True), unload=model.unload, on_return=model.load
+        )
+        await detector.ready()
+        other = Model()
+        policy = await client.acquire(spec("policy", 4), 20.0, unload=other.unload)
+        await policy.ready()
+        await detector.reacquire(20.0)
+        await until(lambda: detector.state == "held")
+        assert (other.did, policy.state) == (["unload"], "gone")
+        policy = await client.acquire(spec("policy", 4), 20.0)
+        assert detector.state == "standby"
+        await detector.give_up()
+        assert detector.state == "gone"
+        assert "detector" not in await states(client)
+
+
+async def test_weights_are_parked_where_the_budget_has_room(
+    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
+) -> None:
+    arbiter = make_arbiter(config="host:\n  park_budget_bytes: 6GiB\n").start()
+    model = Model()
+    async with ArbiterClient(arbiter.endpoint, name="t") as client:
+        detector = await client.acquire(
+            spec("detector", 5, park_bytes=5 * GIB),
+            unload=model.unload,
+            park=model.park,
+            on_return=model.load,
+        )
+        await detector.ready()
+        policy = await client.acquire(spec("policy", 4, park_bytes=5 * GIB), 20.0, unload=model.unload)
+        await policy.ready()
+        assert (detector.state, model.did) == ("parked", ["park"])
+        await detector.reacquire(20.0)
+        await until(lambda: detector.state == "held")
+        assert model.did == ["park", "unload", "load"]
+        await detector.park()
+        assert detector.state == "parked"
+        with pytest.raises(BadState):
+            await policy.park()
+        await detector.give_up()
+        assert (model.did[-1], detector.state) == ("unload", "gone")
+
+
+async def test_a_yielded_use_lets_the_holder_go_and_says_so_at_its_end(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    model = Model()
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        job = await client.acquire(spec("job", 5), unload=model.unload)
+        await job.ready()
+        async with job.use("render") as use:
+            async with use.yielded():
+                assert (await client.status())["leases"][0]["uses"] == 0
+            assert (await client.status())["leases"][0]["uses"] == 1
+            with pytest.raises(VramError):
+                await lend(use, client.acquire(spec("llm", 5), 20.0))
+        assert model.did == ["unload"]
