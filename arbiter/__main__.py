@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--gpu",
         metavar="SOURCE",
-        help="nvml (default): the NVIDIA cards; fake:8GiB: a simulated card in the runtime folder; fake:FOLDER: that one",
+        help="auto (default), nvml: the NVIDIA cards, unified: Jetson and GB10; fake:8GiB: a simulated card in the runtime folder; fake:FOLDER: that one",
     )
     made.add_argument("--endpoint", metavar="URL", help="where to listen, ipc:///absolute/path")
     made.add_argument("--state-dir", metavar="DIR", help="folder of journal and history")

@@ -22,8 +22,9 @@ from arbiter.core.events import ProcessDied, Recovered, Tick
 from arbiter.core.settings import GpuInfo, Settings
 from arbiter.host.executor import Executor
 from arbiter.host.gpu.fake import open_cards
-from arbiter.host.gpu.nvml import NvmlProbe
+from arbiter.host.gpu.pids import PidMap
 from arbiter.host.gpu.probe import Card, GpuProbe
+from arbiter.host.gpu.unified import choose
 from arbiter.host.history import CLEAN_END, History
 from arbiter.host.journal import Journal, Opened
 from arbiter.host.lockfile import LockFile
@@ -38,7 +39,7 @@ from arbiter.inbox import Inbox
 from arbiter.rpc.peer import group_id, start_ticks
 from arbiter.rpc.server import RouterServer, make_private_folder, socket_path
 from arbiter.rpc.session import SessionSettings, SessionTable
-from schemas.config import ArbiterConfig
+from schemas.config import ArbiterConfig, GpuConfig
 from schemas.endpoints import arbiter_endpoint, runtime_dir
 from schemas.errors import ConfigError
 from schemas.ids import ProcessKey
@@ -82,26 +83,31 @@ def find_places(config: ArbiterConfig, environ: Mapping[str, str], uid: int) -> 
     return Places(endpoint, socket_path(endpoint), runtime.absolute(), state.absolute())
 
 
-def open_probe(source: str, runtime: Path) -> GpuProbe:
-    """The backend of `gpu.source`. Raises NoGpu or ConfigError. A simulated card is never a fallback: it has to be asked for."""
-    kind, _, what = source.partition(":")
-    return open_cards(what, runtime) if kind == "fake" else NvmlProbe()
+def open_probe(config: GpuConfig, runtime: Path) -> tuple[GpuProbe, str]:
+    """(backend, its name) for `gpu.source`. Raises NoGpu or ConfigError. A simulated card is never a fallback: it has to be asked for."""
+    kind, _, what = config.source.partition(":")
+    if kind == "fake":
+        return open_cards(what, runtime), "fake"
+    host_proc = None if config.host_proc is None else Path(config.host_proc)
+    pids = PidMap(config.pids, host_proc)
+    return choose("nvml" if kind == "nvml" else "unified" if kind == "unified" else "auto", pids)
 
 
-def budget(cards: Sequence[Card], config: ArbiterConfig) -> tuple[GpuInfo, ...]:
+def budget(cards: Sequence[Card], config: ArbiterConfig, source: str = "") -> tuple[GpuInfo, ...]:
     """What of each card is leased out. Raises ConfigError for a cap on a card that is not there, or a reserve larger than a card."""
     caps = dict(config.gpu.capacity_bytes)
     found = []
     for card in cards:
         by_id, by_index = caps.pop(card.id, None), caps.pop(str(card.index), None)
         capacity = min(size for size in (card.total_bytes, by_id, by_index) if size is not None)
-        if capacity <= config.gpu.reserve_bytes:
+        reserve = max(config.gpu.reserve_bytes, card.margin_bytes)
+        if capacity <= reserve:
             raise ConfigError(
-                f"gpu.reserve_bytes ({format_bytes(config.gpu.reserve_bytes)}) leaves nothing of {card.name} "
+                f"gpu.reserve_bytes ({format_bytes(reserve)}) leaves nothing of {card.name} "
                 f"({format_bytes(capacity)})",
                 hint="lower the reserve or raise the cap",
             )
-        found.append(GpuInfo(card.id, card.index, card.name, capacity, config.gpu.reserve_bytes))
+        found.append(GpuInfo(card.id, card.index, card.name, capacity, reserve, source, card.noise_bytes))
     if caps:
         known = ", ".join(f"{card.index} ({card.id})" for card in cards)
         raise ConfigError(
@@ -126,7 +132,7 @@ def core_settings(config: ArbiterConfig, gpus: tuple[GpuInfo, ...], opened: Open
         verify_poll_until_s=config.verify.poll_until_s,
         verify_confirm_s=config.verify.confirm_s,
         verify_slow_poll_s=config.verify.slow_poll_s,
-        verify_tolerance_bytes=config.verify.tolerance_bytes,
+        verify_tolerance_bytes=max(config.verify.tolerance_bytes, *(gpu.noise_bytes for gpu in gpus)),
         sample_max_age_s=config.probe.sample_max_age_s,
         probe_period_s=config.probe.period_s,
         load_probe_s=config.probe.load_s,
@@ -256,11 +262,13 @@ class Daemon:
             undo.callback(lock.release)
 
     async def _open_cards(self, places: Places) -> tuple[GpuProbe, tuple[GpuInfo, ...]]:
-        source = self._config.gpu.source
-        probe = await within(PROBE_START_S, lambda: open_probe(source, places.runtime), "the GPU driver")
+        chosen = self._config.gpu
+        probe, source = await within(
+            PROBE_START_S, lambda: open_probe(chosen, places.runtime), "the GPU driver"
+        )
         try:
             cards = await within(PROBE_START_S, probe.cards, "the GPU driver")
-            return probe, budget(cards, self._config)
+            return probe, budget(cards, self._config, source)
         except BaseException:
             probe.close()
             raise
@@ -317,7 +325,10 @@ class Daemon:
             "epoch": found.epoch,
             "endpoint": places.endpoint,
             "state_dir": str(places.state),
-            "gpus": [{"gpu": g.id, "name": g.name, "capacity_bytes": g.capacity_bytes} for g in gpus],
+            "gpus": [
+                {"gpu": g.id, "name": g.name, "capacity_bytes": g.capacity_bytes, "source": g.source}
+                for g in gpus
+            ],
             "records": len(found.records),
             "records_of_earlier_boot": found.voided,
         }

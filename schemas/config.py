@@ -23,18 +23,26 @@ class _Section(BaseModel):
 class GpuConfig(_Section):
     """Which cards are leased and how much of each."""
 
-    source: str = "nvml"
-    """`nvml`: the NVIDIA cards of this machine. `fake:8GiB`: one simulated card. `fake:FOLDER`: the card in that folder."""
+    source: str = "auto"
+    """`auto`: `nvml` or `unified`, by what this machine is. `nvml`: its NVIDIA cards. `unified`: the memory that CPU and GPU share on a
+    Jetson or a GB10. `fake:8GiB`: one simulated card. `fake:FOLDER`: the card in that folder."""
     reserve_bytes: ByteSize = d.RESERVE_BYTES
-    """Bytes of every card that are never leased: driver, display, allocator slack."""
+    """Bytes of every card that are never leased: driver, display, allocator slack. At least 15 % of a memory shared with the CPU."""
     capacity_bytes: dict[str, ByteSize] = Field(default_factory=dict)
     """Cap per card, by UUID or index as text: lease out less than the card has. A card that is not named has no cap."""
+
+    pids: Literal["auto", "own", "host"] = "auto"
+    """In whose pid namespace the driver counts. `auto`: this one on a host, the host's in a container."""
+    host_proc: Annotated[str, Field(pattern="^/")] | None = None
+    """In a container: where the host's /proc is mounted, so that the driver's pids can be told apart. Null: lists are no evidence there."""
 
     @field_validator("source")
     @classmethod
     def _known_source(cls, value: str) -> str:
-        if value != "nvml" and not (value.startswith("fake:") and len(value) > len("fake:")):
-            raise ValueError(f"{value!r} is no source of cards; write nvml, fake:8GiB or fake:FOLDER")
+        if value not in ("auto", "nvml", "unified") and not (value.startswith("fake:") and len(value) > 5):
+            raise ValueError(
+                f"{value!r} is no source of cards; write auto, nvml, unified, fake:8GiB or fake:FOLDER"
+            )
         return value
 
 

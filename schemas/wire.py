@@ -373,6 +373,7 @@ class GpuView(TypedDict):
     gpu: str
     index: int
     name: str
+    source: NotRequired[str]  # what reads it: nvml, unified, fake
     capacity_bytes: int
     reserve_bytes: int
     charged_bytes: int

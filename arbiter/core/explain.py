@@ -73,6 +73,7 @@ def gpu_view(core: Core, gpu: Gpu) -> dict[str, Any]:
         "gpu": gpu.info.id,
         "index": gpu.info.index,
         "name": gpu.info.name,
+        "source": gpu.info.source,
         "capacity_bytes": gpu.info.capacity_bytes,
         "reserve_bytes": gpu.info.reserve_bytes,
         "charged_bytes": ledger.booked_bytes(),

@@ -16,6 +16,8 @@ class GpuInfo:
     name: str
     capacity_bytes: int
     reserve_bytes: int = d.RESERVE_BYTES
+    source: str = ""  # what reads it: nvml, unified, fake
+    noise_bytes: int = 0  # by how much its readings move when nothing happens
 
 
 @dataclass(frozen=True, slots=True)

@@ -68,9 +68,24 @@ def _driver() -> Finding:
         return Finding("nvidia driver", None, f"{error}; `vram-arbiter --gpu fake:8GiB` simulates a card")
     try:
         cards = pynvml.nvmlDeviceGetCount()
-        return Finding("nvidia driver", True, f"{pynvml.nvmlSystemGetDriverVersion()}, {cards} cards")
+        first = pynvml.nvmlDeviceGetHandleByIndex(0) if cards else None
+        said = f"{pynvml.nvmlSystemGetDriverVersion()}, {cards} cards"
+        return Finding("nvidia driver", True, said + _memory_of(pynvml, first))
     finally:
         pynvml.nvmlShutdown()
+
+
+def _memory_of(nvml: Any, card: Any) -> str:
+    """Jetson and GB10 have no memory of their own: the arbiter's source `auto` reads the machine's there."""
+    if card is None:
+        return ""
+    try:
+        nvml.nvmlDeviceGetMemoryInfo(card)
+    except nvml.NVMLError_NotSupported:
+        return "; without memory of its own (source unified)"
+    except nvml.NVMLError as error:
+        return f"; its memory cannot be read: {error}"
+    return ""
 
 
 def _arbiter(endpoint: str) -> tuple[bool, list[Finding]]:
@@ -94,4 +109,6 @@ def _card(gpu: dict[str, Any]) -> Finding:
         )
     if gpu["blocked"]:
         return Finding(what, None, f"{gpu['name']}: no grants now: {gpu['blocked']}")
-    return Finding(what, True, f"{gpu['name']}, its probe answers")
+    reads = {"unified": "memory shared with the CPU, read from /proc/meminfo", "fake": "a simulated card"}
+    source = gpu.get("source") or "?"
+    return Finding(what, True, f"{gpu['name']}, its probe answers ({reads.get(source, source)})")

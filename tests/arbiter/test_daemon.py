@@ -61,7 +61,7 @@ def test_a_typo_in_the_configuration_is_named_with_its_line(make_arbiter: Make) 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--gpu", "cuda"], "write nvml, fake:8GiB or fake:FOLDER"),
+        (["--gpu", "cuda"], "write auto, nvml, unified, fake:8GiB"),
         (["--gpu", "fake:lots"], "not a size"),
         (["--gpu", "fake:100MiB"], "leaves nothing of"),
         (["--endpoint", "tcp://127.0.0.1:5555"], "without CURVE keys"),

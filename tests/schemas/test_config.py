@@ -118,7 +118,7 @@ def test_a_wrong_list_item_is_named_by_its_place() -> None:
         ("wire:\n  endpoint: ipc://relative.sock\n", 2, "absolute path"),
         ("wire:\n  endpoint: ipc:///" + "x" * 120 + "\n", 2, "Linux allows 107"),
         ("wire:\n  endpoint: nonsense\n", 2, "is no endpoint"),
-        ("gpu:\n  source: cuda\n", 2, "write nvml, fake:8GiB or fake:FOLDER"),
+        ("gpu:\n  source: cuda\n", 2, "write auto, nvml, unified, fake:8GiB"),
     ],
 )
 def test_bad_text_is_a_config_error_with_a_line(text: str, line: int, words: str) -> None:

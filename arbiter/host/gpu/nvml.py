@@ -3,14 +3,14 @@
 NVML only reads: it creates no CUDA context, which alone would cost 120-550 MB of the card. It knows nothing of leases.
 """
 
-from pathlib import Path
+import threading
 from typing import Any
 
 from arbiter.core.events import ProcessUse
+from arbiter.host.gpu.pids import PidMap
 from arbiter.host.gpu.probe import Card, Reading
-from schemas.errors import NoGpu, ProbeFailed, UnknownGpu
-from schemas.fakegpu import parse_stat
-from schemas.ids import GpuId, ProcessKey
+from schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
+from schemas.ids import GpuId
 
 _HINT = "install the NVIDIA driver, or start with --gpu fake:8GiB to simulate a card"
 
@@ -18,21 +18,29 @@ _HINT = "install the NVIDIA driver, or start with --gpu fake:8GiB to simulate a 
 class NvmlProbe:
     """`GpuProbe` over all NVIDIA cards of the machine, by UUID.
 
-    `nvml` is the module `pynvml` unless a test brings its own. Raises NoGpu without library, driver or card.
+    `nvml` is the module `pynvml` unless a test brings its own. Raises NoGpu without library, driver or card, ConfigError for a card in
+    MIG mode. When no card answers any more, everything is opened anew: after a reset of the driver old handles are dead.
     """
 
-    def __init__(self, nvml: Any = None) -> None:
+    def __init__(self, nvml: Any = None, pids: PidMap | None = None) -> None:
         if nvml is None:
             import pynvml
 
             nvml = pynvml
         self._nvml = nvml
+        self._pids = pids or PidMap()
+        self._lock = threading.Lock()
+        self._failing: set[GpuId] = set()
+        self._handles = self._open()
+
+    def _open(self) -> dict[GpuId, Any]:
+        nvml = self._nvml
         try:
             nvml.nvmlInit()
         except nvml.NVMLError as error:
             raise NoGpu(f"no NVIDIA driver answers: {error}", hint=_HINT) from error
         try:
-            self._handles = self._find()
+            return self._find()
         except BaseException:
             self.close()
             raise
@@ -43,7 +51,13 @@ class NvmlProbe:
         try:
             for index in range(nvml.nvmlDeviceGetCount()):
                 handle = nvml.nvmlDeviceGetHandleByIndex(index)
-                handles[GpuId(_text(nvml.nvmlDeviceGetUUID(handle)))] = handle
+                gpu = GpuId(_text(nvml.nvmlDeviceGetUUID(handle)))
+                if self._is_split(handle):
+                    raise ConfigError(
+                        f"{gpu} is in MIG mode: its instances have memory of their own, which cannot be leased",
+                        hint=f"nvidia-smi -i {index} -mig 0",
+                    )
+                handles[gpu] = handle
         except nvml.NVMLError as error:
             raise NoGpu(
                 f"the NVIDIA driver cannot list its cards: {error}", hint="see nvidia-smi -L"
@@ -51,6 +65,27 @@ class NvmlProbe:
         if not handles:
             raise NoGpu("the NVIDIA driver knows no card", hint=_HINT)
         return handles
+
+    def _is_split(self, handle: Any) -> bool:
+        try:
+            return bool(self._nvml.nvmlDeviceGetMigMode(handle)[0])
+        except self._nvml.NVMLError:
+            return False  # most cards have no such mode
+
+    def _reopen_if_dead(self) -> None:
+        """While another card still answers, its readings are not disturbed."""
+        with self._lock:
+            if len(self._failing) < len(self._handles):
+                return
+            self.close()
+            try:
+                found = self._open()
+            except (NoGpu, ConfigError) as error:
+                raise ProbeFailed(error.message, hint=error.hint) from error
+            if lost := sorted(self._handles.keys() - found.keys()):
+                raise ProbeFailed(f"the NVIDIA driver no longer lists {', '.join(lost)}", hint="see dmesg")
+            self._handles = found
+            self._failing.clear()
 
     def cards(self) -> tuple[Card, ...]:
         found = []
@@ -67,11 +102,40 @@ class NvmlProbe:
         return tuple(sorted(found, key=lambda card: card.index))
 
     def sample(self, gpu: GpuId) -> Reading:
-        handle = self._handles.get(gpu)
-        if handle is None:
+        if gpu not in self._handles:
             raise UnknownGpu(f"no NVIDIA card {gpu}", details={"known": sorted(self._handles)})
-        used, total, _ = self._memory(gpu, handle)
+        self._reopen_if_dead()
+        handle = self._handles[gpu]
+        try:
+            used, total, _ = self._memory(gpu, handle)
+        except ProbeFailed:
+            self._failing.add(gpu)
+            raise
+        self._failing.discard(gpu)
         return Reading(used, total, self._processes(handle))
+
+    def memory_supported(self) -> bool:
+        """False where the card has no memory of its own (GB10): NVML says NOT_SUPPORTED. Other failures may pass."""
+        handle = next(iter(self._handles.values()))
+        try:
+            self._nvml.nvmlDeviceGetMemoryInfo(handle)
+        except self._nvml.NVMLError_NotSupported:
+            return False
+        except self._nvml.NVMLError:
+            return True
+        return True
+
+    def first(self) -> tuple[GpuId, str]:
+        """Id and name of the first card. Raises ProbeFailed."""
+        gpu, handle = next(iter(self._handles.items()))
+        try:
+            return gpu, _text(self._nvml.nvmlDeviceGetName(handle))
+        except self._nvml.NVMLError as error:
+            raise ProbeFailed(f"{gpu} does not answer: {error}", hint="see nvidia-smi and dmesg") from error
+
+    def processes(self, gpu: GpuId) -> tuple[ProcessUse, ...] | None:
+        """Who is on a card; None where the driver does not say."""
+        return self._processes(self._handles[gpu])
 
     def close(self) -> None:
         try:
@@ -99,6 +163,8 @@ class NvmlProbe:
     def _processes(self, handle: Any) -> tuple[ProcessUse, ...] | None:
         """Compute and graphics processes; None where the driver does not list them. A process in both lists counts once."""
         nvml = self._nvml
+        if not self._pids.knows:
+            return None
         used: dict[int, int | None] = {}
         for read in (nvml.nvmlDeviceGetComputeRunningProcesses, nvml.nvmlDeviceGetGraphicsRunningProcesses):
             try:
@@ -108,24 +174,7 @@ class NvmlProbe:
             for process in listed:
                 known, size = used.get(process.pid), process.usedGpuMemory
                 used[process.pid] = known if size is None else max(int(size), known or 0)
-        return tuple(ProcessUse(_process_key(pid), _process_name(pid), used[pid]) for pid in sorted(used))
-
-
-def _process_key(pid: int) -> ProcessKey:
-    """With the start time if the process can be seen from here (it may live in another pid namespace or be gone)."""
-    try:
-        return ProcessKey(pid, parse_stat(Path(f"/proc/{pid}/stat").read_text())[1])
-    except (OSError, IndexError, ValueError):
-        return ProcessKey(pid, 0)
-
-
-def _process_name(pid: int) -> str:
-    """Program and, for an interpreter, what it runs: `python -m sidecars` says more than `python`."""
-    try:
-        words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
-    except OSError:
-        return ""
-    return " ".join([Path(words[0]).name, *(word for word in words[1:3] if word)])[:128].strip()
+        return tuple(ProcessUse(*self._pids.translate(pid), used[pid]) for pid in sorted(used))
 
 
 def _text(value: str | bytes) -> str:

@@ -13,13 +13,18 @@ from schemas.ids import GpuId
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """One GPU as its backend names it. `reserved_bytes` the driver keeps for itself: nobody can ever use them."""
+    """One GPU as its backend names it. `reserved_bytes` the driver keeps for itself: nobody can ever use them.
+
+    A card whose memory others live in too asks for more: `margin_bytes` is its least reserve, `noise_bytes` its least tolerance.
+    """
 
     id: GpuId
     index: int
     name: str
     total_bytes: int
     reserved_bytes: int = 0
+    margin_bytes: int = 0
+    noise_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True)

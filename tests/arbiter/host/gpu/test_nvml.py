@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from arbiter.host.gpu.nvml import NvmlProbe
+from arbiter.host.gpu.pids import PidMap
 from schemas.errors import NoGpu, ProbeFailed, UnknownGpu
 from schemas.ids import GpuId
 
@@ -60,6 +61,11 @@ class Driver:
 
     def nvmlDeviceGetName(self, handle):
         return handle.get("name", "NVIDIA Card")
+
+    def nvmlDeviceGetMigMode(self, handle):
+        if "mig" not in handle:
+            raise NotSupported("Not Supported")
+        return [handle["mig"], handle["mig"]]
 
     def nvmlDeviceGetMemoryInfo(self, handle, version=None):
         if "memory_error" in handle:
@@ -150,6 +156,27 @@ def test_no_driver_no_card_unknown_card():
     assert empty.shutdowns == 1
     with pytest.raises(UnknownGpu):
         NvmlProbe(Driver(card())).sample(GpuId("GPU-2"))
+
+
+def test_one_card_that_fails_does_not_disturb_the_other():
+    lost, fine = card(), card(uuid="GPU-2", index=1, used=5)
+    driver = Driver(lost, fine)
+    probe = NvmlProbe(driver)
+    lost["memory_error"] = NVMLError("GPU is lost")
+    for _ in range(3):
+        with pytest.raises(ProbeFailed, match="GPU is lost"):
+            probe.sample(GpuId("GPU-1"))
+        assert probe.sample(GpuId("GPU-2")).used_bytes == 5
+    assert driver.shutdowns == 0
+    del lost["memory_error"]
+    assert probe.sample(GpuId("GPU-1")).used_bytes == GIB
+
+
+def test_a_list_whose_pids_mean_nothing_here_is_no_evidence(tmp_path):
+    (tmp_path / "self" / "ns").mkdir(parents=True)
+    os.symlink("pid:[4026532999]", tmp_path / "self" / "ns" / "pid")
+    probe = NvmlProbe(Driver(card(compute=[(os.getpid(), 300)])), PidMap(proc=tmp_path))
+    assert probe.sample(GpuId("GPU-1")).processes is None
 
 
 def test_closing_twice_is_harmless():

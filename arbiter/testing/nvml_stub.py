@@ -1,0 +1,32 @@
+"""Control of a compiled `libnvidia-ml.so.1` for tests (`tests/arbiter/host/gpu/nvml_stub.c`): a text file that it reads at every call."""
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+GIB, MIB = 2**30, 2**20
+
+
+@dataclass
+class NvmlStub:
+    """One control file. `write` replaces it in one step; the library reads it at every call."""
+
+    library: Path
+    control: Path
+    cards: list[str] = field(default_factory=lambda: [f"card GPU-stub-0 {8 * GIB} {256 * MIB} 0"])
+
+    @property
+    def environ(self) -> dict[str, str]:
+        path = os.environ.get("LD_LIBRARY_PATH")
+        folders = f"{self.library}:{path}" if path else str(self.library)
+        return {"LD_LIBRARY_PATH": folders, "NVML_STUB": str(self.control)}
+
+    def write(self, *lines: str) -> None:
+        """The cards, and what is said of them now."""
+        fresh = self.control.with_suffix(".new")
+        fresh.write_text("\n".join([*self.cards, *lines]) + "\n")
+        fresh.rename(self.control)
+
+    def card(self, used: int, *, more: str = "") -> None:
+        """One card of 8 GiB, of which the driver keeps 256 MiB."""
+        self.cards = [f"card GPU-stub-0 {8 * GIB} {256 * MIB} {used} {more}".rstrip()]

@@ -1,0 +1,33 @@
+"""A `libnvidia-ml.so.1` that answers from a text file: the real `pynvml` loads it in a process of its own."""
+
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from arbiter.testing.nvml_stub import NvmlStub
+
+SOURCE = Path(__file__).with_name("nvml_stub.c")
+
+
+@pytest.fixture(scope="session")
+def nvml_library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    compiler = shutil.which("gcc") or shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler: libnvidia-ml.so.1 cannot be simulated")
+    folder = tmp_path_factory.mktemp("nvml")
+    subprocess.run(
+        [compiler, "-shared", "-fPIC", "-O1", "-o", str(folder / "libnvidia-ml.so.1"), str(SOURCE)],
+        check=True,
+    )
+    return folder
+
+
+@pytest.fixture
+def nvml(nvml_library: Path, tmp_path: Path) -> Iterator[NvmlStub]:
+    stub = NvmlStub(nvml_library, tmp_path / "nvml.txt")
+    stub.write()
+    yield stub
+    stub.write()  # lets a hanging call return

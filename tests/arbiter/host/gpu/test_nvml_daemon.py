@@ -1,0 +1,178 @@
+"""A real daemon with `--gpu nvml` on a compiled library: grant → release → verdict, with lag, N/A, errors and a call that hangs."""
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arbiter.testing.nvml_stub import GIB, MIB, NvmlStub
+from arbiter.testing.process import ArbiterProcess
+from arbiter.testing.wire import WireClient
+
+pytestmark = pytest.mark.e2e
+pytest.importorskip("pynvml")
+ME = os.getpid()
+CONFIG = "probe: {deadline_s: 0.4, period_s: 0.1}\nverify: {timeout_s: 1.0, slow_poll_s: 0.1}\n"
+Make = Callable[..., ArbiterProcess]
+
+
+@pytest.fixture
+def daemon(nvml: NvmlStub, make_arbiter: Make) -> ArbiterProcess:
+    return make_arbiter(gpu="nvml", config=CONFIG).start(nvml.environ)
+
+
+@pytest.fixture
+def client(daemon: ArbiterProcess) -> Iterator[WireClient]:
+    with WireClient(daemon.endpoint) as client:
+        yield client.hello("holder")
+
+
+def granted(client: WireClient, name: str, size: int, **spec: Any) -> dict[str, Any]:
+    """Acquire and wait for the grant."""
+    reply = client.acquire(name, size, ttl_s=60.0, **spec)
+    assert reply["ok"], reply
+    lease: dict[str, Any] = reply["lease"] if reply["state"] == "loading" else client.push("granted")["lease"]
+    return {"lease_id": lease["lease_id"], "token": lease["token"]}
+
+
+def held(client: WireClient, nvml: NvmlStub, size: int) -> dict[str, Any]:
+    """This very process holds a lease and its bytes."""
+    on = granted(client, "holder", size)
+    nvml.card(size)
+    nvml.write(f"process 0 compute {ME} {size}")
+    assert client.ask("ready", **on, measured_bytes=size)["ok"]
+    client.ask("ping")
+    return on
+
+
+def let_go(client: WireClient, on: dict[str, Any]) -> None:
+    assert client.ask("unloading", **on)["ok"]
+    assert client.ask("release", **on)["ok"]
+
+
+def event(
+    client: WireClient, kind: str, where: Callable[[dict[str, Any]], bool] = lambda _: True
+) -> dict[str, Any]:
+    """The next event of a kind, for who has subscribed."""
+    found = client.push("event", where=lambda push: push["event"]["kind"] == kind and where(push["event"]))
+    happened: dict[str, Any] = found["event"]
+    return happened
+
+
+def test_a_cycle_with_release_lag(client: WireClient, daemon: ArbiterProcess, nvml: NvmlStub) -> None:
+    (card,) = client.ask("status")["gpus"]
+    assert (card["gpu"], card["name"]) == ("GPU-stub-0", "NVIDIA Stub")
+    assert card["capacity_bytes"] == 8 * GIB - 256 * MIB, "less what the driver keeps"
+    assert client.ask("subscribe")["ok"]
+    on = held(client, nvml, 5 * GIB)
+    until = time.monotonic() + 0.3
+    nvml.card(0)
+    nvml.write(f"late 0 {5 * GIB} {until}", f"process 0 compute {ME} {5 * GIB} {until}")
+    let_go(client, on)
+    waiter = client.acquire("next", 5 * GIB, nonce="next")
+    assert waiter["state"] == "queued", "released is not free"
+    client.push("granted")
+    assert time.monotonic() >= until, "not before the card shows it"
+    verdict = event(client, "verified")
+    assert (verdict["verdict"], verdict["resolved"], verdict["culprits"]) == ("verified", True, [])
+    assert (verdict["before_bytes"], verdict["after_bytes"]) == (5 * GIB, 0)
+
+
+def test_a_call_that_hangs_is_unknown_blocks_and_recovers(client: WireClient, nvml: NvmlStub) -> None:
+    assert client.ask("subscribe")["ok"]
+    on = held(client, nvml, 5 * GIB)
+    nvml.card(0)
+    nvml.write("hang memory")
+    let_go(client, on)
+    assert "no answer within 0.4 s" in event(client, "probe_failed")["reason"]
+    assert event(client, "verified")["verdict"] == "stale"
+    waiter = client.acquire("next", GIB, nonce="next")
+    assert waiter["state"] == "queued"
+    (card,) = client.ask("status")["gpus"]
+    assert card["measured_used_bytes"] is None
+    assert "cannot be read" in card["blocked"]
+    assert client.ask("ping")["ok"], "the daemon itself hangs on nothing"
+    nvml.write()
+    event(client, "probe_ok")
+    client.push("granted")
+
+
+@pytest.mark.parametrize(
+    ("code", "words"), [(15, "GPU is lost"), (999, "Unknown Error"), (3, "Not Supported")]
+)
+def test_an_error_code_is_unknown_blocks_and_recovers(
+    client: WireClient, nvml: NvmlStub, code: int, words: str
+) -> None:
+    assert client.ask("subscribe")["ok"]
+    nvml.write(f"error memory {code}")
+    assert words in event(client, "probe_failed")["reason"]
+    assert client.acquire("next", GIB)["state"] == "queued"
+    nvml.write()
+    event(client, "probe_ok")
+    client.push("granted")
+
+
+def test_bytes_that_stay_are_charged_to_the_process_that_holds_them(
+    client: WireClient, nvml: NvmlStub
+) -> None:
+    assert client.ask("subscribe")["ok"]
+    on = held(client, nvml, 5 * GIB)
+    nvml.card(2 * GIB)
+    nvml.write(f"process 0 compute {ME} {2 * GIB}")
+    let_go(client, on)
+    verdict = event(client, "verified")
+    assert (verdict["verdict"], verdict["culprits"][0]["pid"]) == ("residue", ME)
+    assert client.ask("status")["gpus"][0]["charged_bytes"] == 2 * GIB
+
+
+@pytest.mark.parametrize(("left", "verdict"), [(0, "verified"), (2 * GIB, "residue")])
+def test_where_bytes_per_process_are_na_the_total_decides(
+    client: WireClient, nvml: NvmlStub, left: int, verdict: str
+) -> None:
+    """WSL2 and WDDM: processes are listed, their bytes are not. What stays is charged to who let go, as nobody else can be named."""
+    assert client.ask("subscribe")["ok"]
+    on = granted(client, "holder", 5 * GIB)
+    nvml.card(5 * GIB)
+    nvml.write(f"process 0 compute {ME} na")
+    assert client.ask("ready", **on)["ok"]
+    client.ask("ping")
+    event(client, "ready")
+    nvml.card(left)
+    nvml.write(f"process 0 compute {ME} na")
+    let_go(client, on)
+    said = event(client, "verified")
+    assert (said["verdict"], said["culprits"]) == (verdict, [])
+    assert client.ask("status")["gpus"][0]["charged_bytes"] == left
+
+
+def test_a_stowaway_is_named_and_charged_as_reserve(client: WireClient, nvml: NvmlStub) -> None:
+    assert client.ask("subscribe")["ok"]
+    parent = os.getppid()
+    nvml.card(3 * GIB)
+    nvml.write(f"process 0 graphics {parent} {3 * GIB}")
+    found = event(client, "stowaway")
+    assert (found["pid"], found["used_bytes"]) == (parent, 3 * GIB)
+    assert found["name"], "with the name of its program"
+    assert client.acquire("next", 6 * GIB)["state"] == "queued"
+
+
+def test_mig_mode_is_an_error_of_the_configuration(make_arbiter: Make, nvml: NvmlStub) -> None:
+    nvml.card(0, more="mig")
+    nvml.write()
+    arbiter = make_arbiter(gpu="nvml")
+    assert arbiter.spawn(nvml.environ).wait(60) == 2
+    assert "MIG mode" in arbiter.log
+    assert "-mig 0" in arbiter.log
+    assert "Traceback" not in arbiter.log
+
+
+def test_the_daemon_makes_no_cuda_context(daemon: ArbiterProcess) -> None:
+    """llama.cpp#20582: a manager that asks CUDA for free memory eats 120-550 MB of every card itself."""
+    mapped = {
+        Path(line.split()[-1]).name for line in Path(f"/proc/{daemon.pid}/maps").read_text().splitlines()
+    }
+    assert "libnvidia-ml.so.1" in mapped
+    assert not [name for name in mapped if name.startswith(("libcuda", "libcudart", "libtorch"))]

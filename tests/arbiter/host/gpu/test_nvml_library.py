@@ -1,0 +1,150 @@
+"""The NVML reader through the real `pynvml` and a compiled library: structs, versions, N/A fields and error codes as they really arrive."""
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+from typing import Any
+
+import pytest
+
+from arbiter.testing.nvml_stub import GIB, MIB, NvmlStub
+
+pytest.importorskip("pynvml")
+READ = """
+    from arbiter.host.gpu.nvml import NvmlProbe
+    probe = NvmlProbe()
+    cards = probe.cards()
+    reading = probe.sample(cards[0].id)
+    print(json.dumps({
+        "cards": [[c.id, c.index, c.name, c.total_bytes, c.reserved_bytes] for c in cards],
+        "used": reading.used_bytes,
+        "total": reading.total_bytes,
+        "processes": reading.processes and [[p.process.pid, p.process.start_ticks, p.used_bytes] for p in reading.processes],
+    }))
+"""
+REFUSED = """
+    from arbiter.host.gpu.nvml import NvmlProbe
+    from schemas.errors import VramError
+    try:
+        NvmlProbe().cards()
+    except VramError as error:
+        print(json.dumps([type(error).__name__, error.message, error.hint]))
+"""
+LOST = """
+    from arbiter.host.gpu.nvml import NvmlProbe
+    from schemas.errors import ProbeFailed
+    probe = NvmlProbe()
+    gpu = probe.cards()[0].id
+    said = []
+    for line in sys.stdin:
+        with open(os.environ["NVML_STUB"], "w") as control:
+            control.write(line.replace(";", "\\n"))
+        try:
+            said.append(probe.sample(gpu).used_bytes)
+        except ProbeFailed as error:
+            said.append(error.message)
+    print(json.dumps(said))
+"""
+
+
+def ask(stub: NvmlStub, code: str, text: str = "") -> Any:
+    """What a child process prints as JSON that runs `code` with the stub's library."""
+    done = subprocess.run(
+        [sys.executable, "-c", "import json, os, sys\n" + textwrap.dedent(code)],
+        env={**os.environ, **stub.environ},
+        input=text,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_memory_v2_leaves_the_drivers_reserve_out(nvml: NvmlStub) -> None:
+    nvml.cards = [
+        f"card GPU-stub-b {8 * GIB} {256 * MIB} {GIB}",
+        f"card GPU-stub-a {24 * GIB} {512 * MIB} 0",
+    ]
+    nvml.write()
+    said = ask(nvml, READ)
+    assert said["cards"] == [
+        ["GPU-stub-b", 0, "NVIDIA Stub", 8 * GIB - 256 * MIB, 256 * MIB],
+        ["GPU-stub-a", 1, "NVIDIA Stub", 24 * GIB - 512 * MIB, 512 * MIB],
+    ]
+    assert (said["used"], said["total"], said["processes"]) == (GIB, 8 * GIB - 256 * MIB, [])
+
+
+@pytest.mark.parametrize("code", [13, 3], ids=["FUNCTION_NOT_FOUND", "NOT_SUPPORTED"])
+def test_a_driver_without_memory_v2_counts_its_reserve_as_used(nvml: NvmlStub, code: int) -> None:
+    nvml.card(GIB)
+    nvml.write(f"error memory_v2 {code}")
+    said = ask(nvml, READ)
+    assert (said["used"], said["total"]) == (GIB + 256 * MIB, 8 * GIB)
+
+
+def test_process_lists_come_with_na_as_unknown_and_both_kinds_counted_once(nvml: NvmlStub) -> None:
+    me = os.getpid()
+    nvml.card(3 * GIB)
+    nvml.write(
+        f"process 0 compute {me} {2 * GIB}",
+        f"process 0 graphics {me} {2 * GIB}",
+        "process 0 compute 4194301 na",
+        "process 0 graphics 4194302 7",
+    )
+    mine, unknown, other = ask(nvml, READ)["processes"]
+    assert (mine[0], mine[2]) == (me, 2 * GIB)
+    assert mine[1] > 0, "seen from here: with its start time"
+    assert unknown == [4194301, 0, None], "all ones is N/A, not 16 EiB"
+    assert other == [4194302, 0, 7]
+
+
+def test_a_list_that_is_refused_leaves_the_total_as_truth(nvml: NvmlStub) -> None:
+    nvml.card(GIB)
+    nvml.write("error compute 3")
+    said = ask(nvml, READ)
+    assert (said["used"], said["processes"]) == (GIB, None)
+
+
+@pytest.mark.parametrize(
+    ("more", "lines", "error", "words"),
+    [
+        ("", ["error init 9"], "NoGpu", "Driver Not Loaded"),
+        ("", ["error memory 15"], "ProbeFailed", "GPU is lost"),
+        ("", ["error memory 999"], "ProbeFailed", "Unknown Error"),
+        ("", ["error count 999"], "NoGpu", "cannot list its cards"),
+        ("mig", [], "ConfigError", "MIG mode"),
+    ],
+)
+def test_what_cannot_be_served_is_a_typed_error(
+    nvml: NvmlStub, more: str, lines: list[str], error: str, words: str
+) -> None:
+    nvml.card(0, more=more)
+    nvml.write(*lines)
+    name, message, hint = ask(nvml, REFUSED)
+    assert (name, words in message) == (error, True), message
+    assert hint
+
+
+def test_no_card_at_all(nvml: NvmlStub) -> None:
+    nvml.cards = []
+    nvml.write()
+    assert ask(nvml, REFUSED)[0] == "NoGpu"
+
+
+def test_a_card_that_was_lost_is_read_again_after_the_driver_came_back(nvml: NvmlStub) -> None:
+    """Every card failed, so everything is opened anew; a driver that is away meanwhile is one more failed reading."""
+    card = f"card GPU-stub-0 {8 * GIB} 0"
+    said = ask(
+        nvml,
+        LOST,
+        f"{card} 1\n{card} 2;error memory 15\n{card} 3;error init 9\ncard GPU-other {GIB} 0 4\n{card} 5\n{card} 6\n",
+    )
+    assert said[0] == 1
+    assert "GPU is lost" in said[1]
+    assert "Driver Not Loaded" in said[2]
+    assert "no longer lists GPU-stub-0" in said[3]
+    assert said[4:] == [5, 6]
