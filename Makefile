@@ -16,7 +16,7 @@ CORE := .venv-core/bin
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core demo test test-core lint format chaos bench schemas install-units clean
+.PHONY: help setup setup-core demo test test-core lint format chaos sim bench schemas install-units clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -49,6 +49,9 @@ format: setup ## rewrite the code in the project's style
 
 chaos: setup ## kill, stop and starve real processes at every step of a switch: SECONDS=300 SEED=0
 	$(BIN)/python tests/chaos/storm.py --seconds $(SECONDS) --seed $(SEED) --out out/chaos
+
+sim: setup ## the daemon under simulated faults: SEED=n one run with its story, SEEDS=1000 many on all cores
+	$(BIN)/python tests/sim/sim_run.py $(if $(SEEDS),--seeds $(SEEDS) --out out/sim/sums.json,--seed $(SEED)) $(ARGS)
 
 bench: setup ## measure grants and handovers against bare ZeroMQ
 	$(BIN)/python tests/bench/bench_wire.py $(ARGS)

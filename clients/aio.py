@@ -65,7 +65,7 @@ class ArbiterClient:
         self._leases: dict[str, Lease] = {}
         self._foreign: dict[str, ForeignUse] = {}
         self._subscribers: set[asyncio.Queue[r.Message]] = set()
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: dict[asyncio.Task[None], None] = {}  # in the order of their beginning
         self._closing = False
         self._lost = False
 
@@ -152,7 +152,7 @@ class ArbiterClient:
         Raises WaitTimeout (details.why: who blocked), VramInsufficient, UnknownGpu, HolderBusy, LimitExceeded.
         Cancelling the caller gives the place in the queue, or the lease, back.
         """
-        nonce = uuid.uuid4().hex
+        nonce = self.new_id()
         granted: asyncio.Future[Lease] = asyncio.get_running_loop().create_future()
         callbacks = Callbacks(
             unload=unload,
@@ -222,7 +222,7 @@ class ArbiterClient:
     ) -> ForeignUse:
         """Begin a use on a lease of another process, whose token was handed to us. Raises LeaseRevoking, StaleToken, LeaseLost …"""
         pair = (int(token[0]), int(token[1]))
-        use = ForeignUse(self, lease_id, pair, f"{self.protocol.instance}/{uuid.uuid4().hex[:12]}")
+        use = ForeignUse(self, lease_id, pair, f"{self.protocol.instance}/{self.new_id()}")
         request = self.protocol.foreign_use_begin(
             lease_id, pair, use.use_id, label, self.now(), timeout_s=timeout_s
         )
@@ -280,6 +280,9 @@ class ArbiterClient:
     def now(self) -> float:
         return time.monotonic()
 
+    def new_id(self) -> str:
+        return uuid.uuid4().hex
+
     async def reply(self, request_id: int) -> r.Message:
         if self._transport is None:
             raise ArbiterUnreachable("this client is closed", hint="use it inside `async with`")
@@ -300,8 +303,8 @@ class ArbiterClient:
                 log.warning("%s: %s", name, error)
 
         task = asyncio.get_running_loop().create_task(run(), name=name)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self._tasks[task] = None
+        task.add_done_callback(lambda done: self._tasks.pop(done, None))
         return task
 
     def pump(self) -> None:
@@ -328,9 +331,12 @@ class ArbiterClient:
         loop = asyncio.get_running_loop()
         if self._transport is not None:
             self._transport.close()
-        self._transport = Transport(self.endpoint, loop, self._received, self._hung_up)
+        self._transport = self._new_transport(loop)
         self.protocol.connected(self.now())
         self.pump()
+
+    def _new_transport(self, loop: asyncio.AbstractEventLoop) -> Transport:
+        return Transport(self.endpoint, loop, self._received, self._hung_up)
 
     def _shut(self) -> None:
         """Close the socket; whoever still waits is told."""

@@ -7,7 +7,6 @@ It owns no socket: everything that goes over the wire goes through the `Driver`.
 import asyncio
 import inspect
 import logging
-import uuid
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -51,6 +50,10 @@ class Driver(Protocol):
 
     def now(self) -> float: ...
 
+    def new_id(self) -> str:
+        """A name that nobody else uses; short enough for a use id."""
+        ...
+
     async def reply(self, request_id: int) -> dict[str, Any]:
         """Send what is to be sent and wait for that answer. Raises its typed error."""
         ...
@@ -84,7 +87,7 @@ class Callbacks:
 class _Progress:
     """Wakes whoever waits for a change of a lease."""
 
-    waiters: set["asyncio.Future[None]"] = field(default_factory=set)
+    waiters: dict["asyncio.Future[None]", None] = field(default_factory=dict)  # in the order of their coming
 
     def changed(self) -> None:
         for waiter in self.waiters:
@@ -94,13 +97,13 @@ class _Progress:
 
     async def wait(self, timeout_s: float | None = None) -> None:
         waiter: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self.waiters.add(waiter)
+        self.waiters[waiter] = None
         try:
             await asyncio.wait_for(waiter, timeout_s)
         except TimeoutError:
             pass
         finally:
-            self.waiters.discard(waiter)
+            self.waiters.pop(waiter, None)
 
 
 class Lease:
@@ -183,7 +186,7 @@ class Lease:
         somebody who may need this very room lets go of it meanwhile: `async with use.yielded(): …`.
         """
         self._raise_if_leaving()
-        use = Use(self, f"{self.lease_id}/{uuid.uuid4().hex[:12]}", label)
+        use = Use(self, f"{self.lease_id}/{self._driver.new_id()}", label)
         try:
             await use.begin()
             yield use

@@ -75,6 +75,7 @@ class ClientProtocol:
         self._handshake_id = 0
         self._handshake_at = 0.0
         self._heard_at = 0.0
+        self._asked_at = 0.0  # when the newest request that this connection answered was *sent*
         self._pinged = False
 
     # -- in and out --------------------------------------------------------------------------------------------------
@@ -114,6 +115,7 @@ class ClientProtocol:
         if "push" in message:
             self._push(message, now)
         elif message.get("re") == self._handshake_id and self.phase != "up":
+            self._asked_at = self._handshake_at
             self._handshake(message, now)
         else:
             self._reply(message, now)
@@ -282,8 +284,7 @@ class ClientProtocol:
             due.append(self._phase_deadline)
         if self.phase == "up":
             due += [record.renewed_at + record.ttl_s * d.RENEW_FRACTION for record in self.leases.values()]
-            beats = SILENCE_BEATS if self._pinged else 1
-            due.append(self._heard_at + beats * self.heartbeat_s)
+            due.append(self._heard_at + SILENCE_BEATS * self.heartbeat_s if self._pinged else self._ping_at())
         return min(due, default=None)
 
     def tick(self, now: float) -> None:
@@ -311,7 +312,7 @@ class ClientProtocol:
             self.contact_lost(f"the arbiter said nothing for {now - self._heard_at:.1f} s")
             return
         self._renew(now)  # 4
-        if not self._pinged and now >= self._heard_at + self.heartbeat_s:
+        if not self._pinged and now >= self._ping_at():
             self._pinged = True
             self._ask({"op": "ping"}, now, quiet=True)
 
@@ -383,6 +384,8 @@ class ClientProtocol:
     def _reply(self, message: Message, now: float) -> None:
         request_id = message.get("re")
         request = self._pending.get(request_id) if isinstance(request_id, int) else None
+        if request is not None and request.sent_at is not None:
+            self._asked_at = max(self._asked_at, request.sent_at)
         if message.get("ok"):
             if request is not None and isinstance(request_id, int):
                 del self._pending[request_id]
@@ -415,6 +418,8 @@ class ClientProtocol:
             self._cancel(waiter, now)
 
     def _granted(self, waiter: Waiter, view: Message, now: float) -> None:
+        """The message may have waited for us longer than the lease lives: what is sure is only that it was sent after the arbiter
+        heard the newest request that it has answered."""
         self._waiters.pop(waiter.nonce, None)
         token = (int(view["token"][0]), int(view["token"][1]))
         record = LeaseRecord(
@@ -423,8 +428,8 @@ class ClientProtocol:
             nonce=waiter.nonce,
             spec=waiter.spec,
             view=view,
-            confirmed_at=now,
-            renewed_at=now,
+            confirmed_at=self._asked_at,
+            renewed_at=self._asked_at,
         )
         if waiter.abandoned:  # granted while we turned away: hand it back at once, nothing was loaded
             self._ask({"op": "release", **record.ref(), "exiting": False}, now, quiet=True)
@@ -516,7 +521,7 @@ class ClientProtocol:
             return
         self._wake(record)
         record.token, record.view = token, view
-        record.confirmed_at = record.renewed_at = now
+        record.confirmed_at = record.renewed_at = self._asked_at  # as a grant's: see `_granted`
         record.held = record.released = False
         record.measured_bytes = record.revoke = record.server_uses = None
         self.leases[record.lease_id] = record
@@ -546,6 +551,11 @@ class ClientProtocol:
                 on_reply=renewed,
                 quiet=True,
             )
+
+    def _ping_at(self) -> float:
+        """After a silence; and while we wait for a grant, so that its age is known, also if pushes keep coming."""
+        waits = bool(self._waiters or self.asleep)
+        return (min(self._heard_at, self._asked_at) if waits else self._heard_at) + self.heartbeat_s
 
     def _fence_at(self, record: LeaseRecord) -> float:
         return record.confirmed_at + record.ttl_s + self.grace_s

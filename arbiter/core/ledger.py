@@ -249,10 +249,19 @@ class GpuLedger:
         self._close_if_empty(account)
         return account.residue_bytes
 
-    def set_residue(self, process: ProcessKey, residue_bytes: int, now: float) -> None:
-        """Charge (or, with 0, forget) what a process keeps outside its leases."""
+    def withdraw(self, lease: LeaseId, now: float) -> None:
+        """Take a grant back that nobody has heard of: the account is as it was before."""
+        account = self.accounts[self._owner.pop(lease)]
+        self._charge(account, lease, None)
+        self.touched.add(lease)
+        self._changed(account, now)
+        self._close_if_empty(account)
+
+    def set_residue(self, process: ProcessKey, residue_bytes: int, now: float, floor_bytes: int = 0) -> None:
+        """Charge (or, with 0, forget) what a process keeps outside its leases; `floor_bytes` of it were declared."""
         account = self._open(process, now)
         account.residue_bytes = residue_bytes
+        account.residue_floor_bytes = max(account.residue_floor_bytes, floor_bytes)
         account.residue_floor_bytes = min(account.residue_floor_bytes, residue_bytes)
         self._changed(account, now)
         self._close_if_empty(account)

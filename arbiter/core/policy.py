@@ -92,7 +92,10 @@ def largest_fold_bytes(gpu: Gpu) -> int:
 
 # -- the measurement ---------------------------------------------------------------------------------------------------
 def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
-    """Free bytes by the newest reading, less the leases that it cannot have seen. None: no reading young enough."""
+    """Free bytes by the newest reading, less the leases that it cannot have seen. None: no reading young enough.
+
+    A lease that became ready since counts with its load peak: what it freed at the end of its load may not be back yet.
+    """
     sample = gpu.sample
     if (
         sample is None
@@ -100,7 +103,10 @@ def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
         or core.now - sample.taken_at > core.settings.sample_max_age_s
     ):
         return None
-    unseen = sum(gpu.ledger.charge_bytes(lease.id) for lease in gpu.residents.unseen(sample.taken_at))
+    unseen = sum(
+        max(gpu.ledger.charge_bytes(lease.id), lease.load_peak_bytes)
+        for lease in gpu.residents.unseen(sample.taken_at)
+    )
     return min(gpu.info.capacity_bytes, sample.total_bytes) - sample.used_bytes - unseen
 
 

@@ -35,7 +35,9 @@ def on_recovered(core: Core, event: Recovered) -> None:
             core.forget(key)
         elif key.startswith("residue:"):
             process = ProcessKey(int(record["pid"]), int(record["start_ticks"]))
-            gpu.ledger.set_residue(process, min(int(record["residue_bytes"]), _room_bytes(gpu)), core.now)
+            residue_bytes = min(int(record["residue_bytes"]), _room_bytes(gpu))
+            floor_bytes = min(int(record.get("floor_bytes", residue_bytes)), residue_bytes)
+            gpu.ledger.set_residue(process, residue_bytes, core.now, floor_bytes)
         else:
             _restore(core, gpu, record)
     parents = {LeaseId(str(r["lease_id"])): str(r["parent"]) for r in held.values() if r.get("parent")}

@@ -97,7 +97,7 @@ def on_journal_failed(core: Core, event: JournalFailed) -> None:
     if lease is None or lease.state is not LeaseState.LOADING or lease.estate is not None:
         return  # a sub-lease was carved out of it: its own grant was written and heard of long ago
     gpu = core.gpu_of(lease)
-    gpu.ledger.drop(lease.id, 0, 0, core.now)
+    gpu.ledger.withdraw(lease.id, core.now)
     families.gone(core, gpu, lease.id, lease.process)
     core.forget(event.key)
     refused = Refused(

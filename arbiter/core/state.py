@@ -354,6 +354,7 @@ class Core:
                 "start_ticks": process.start_ticks,
                 "gpu": gpu.info.id,
                 "residue_bytes": residue_bytes,
+                "floor_bytes": gpu.ledger.accounts[process].residue_floor_bytes,
             },
         )
 

@@ -58,6 +58,8 @@ class Executor:
         self._sample = sample
         self._post = post
         self._log_event = log_event
+        self.owed: dict[str, None] = {}
+        """Records still to be deleted: the disk was full when they ended. The next write does it."""
 
     def perform(self, effects: Sequence[fx.Effect]) -> None:
         """One batch. A grant is on disk before its holder hears of it: consecutive journal effects are one transaction, and if that
@@ -104,12 +106,20 @@ class Executor:
         self, run: Sequence[fx.JournalPut | fx.JournalDelete], refused: dict[str, JournalUnavailable]
     ) -> None:
         changes = [(e.key, e.record if isinstance(e, fx.JournalPut) else None) for e in run]
+        named = {key for key, _ in changes}
+        owed: list[tuple[str, Mapping[str, Any] | None]] = [
+            (key, None) for key in self.owed if key not in named
+        ]
         try:
-            self._journal.apply(changes)
+            self._journal.apply([*owed, *changes])
+            self.owed.clear()
         except JournalUnavailable as error:
             log.error("journal: %s", error)
             for key, record in changes:
-                if record is not None:
+                if record is None:
+                    self.owed[key] = None
+                else:
+                    self.owed.pop(key, None)
                     refused[key.removeprefix("lease:")] = error
                     self._post(ev.JournalFailed(key, error.message))
 

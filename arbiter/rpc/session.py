@@ -94,6 +94,7 @@ class SessionTable:
         history: HistoryReader,
         watch: Callable[[ProcessKey], None],
         clock: Callable[[], float],
+        identify: Callable[[str], Peer] = identify,
     ) -> None:
         self._settings = settings
         self._wire = wire
@@ -101,6 +102,7 @@ class SessionTable:
         self._history = history
         self._watch = watch
         self._clock = clock
+        self._identify = identify
         self._sessions: dict[ClientId, Session] = {}
         self._of_process: dict[ProcessKey, dict[ClientId, Session]] = {}
         self._subscribers: dict[ClientId, Session] = {}
@@ -207,7 +209,7 @@ class SessionTable:
     ) -> None:
         """1. Version. 2. The kernel's word on the process. 3. Role. 4. Room. 5. Watch it, tell the core, welcome it."""
         self._check_version(hello)  # 1
-        peer = identify(address or "")  # 2
+        peer = self._identify(address or "")  # 2
         if hello.role == "operator" and not is_operator(peer.credentials, self._settings.operators_gid):  # 3
             raise NotPermitted(
                 "only the daemon's user, root and the operators' group may be operator",

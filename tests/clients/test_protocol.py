@@ -387,6 +387,34 @@ def test_a_renewal_tells_that_a_lease_is_gone(link: Wire) -> None:
     assert link.protocol.leases == {}
 
 
+def test_a_grant_that_was_read_too_late_is_fenced_at_once(link: Wire) -> None:
+    """Regression: a process that was stopped while its grant lay in its socket took it for new, and loaded what had been given to
+    others meanwhile (`lost` had been lost with the connection)."""
+    link.protocol.acquire("n1", SPEC, link.now)
+    link.reply(link.one("acquire"), state="queued", lease=view())
+    link.now += 20.0  # stopped; the arbiter granted, waited for a renewal, and gave the room away
+    link.push("granted", lease=view(token=[1, 2]))
+    link.tick(0.0)
+    granted, gone = link.told()
+    assert isinstance(granted, r.Granted)
+    assert isinstance(gone, r.Gone)
+    assert gone.fenced
+
+
+def test_a_waiter_asks_often_enough_to_know_the_age_of_its_grant(link: Wire) -> None:
+    link.protocol.acquire("n1", SPEC, link.now)
+    link.reply(link.one("acquire"), state="queued", lease=view())
+    for _ in range(5):  # pushes keep coming, so silence alone would never make it ask
+        link.tick(1.9)
+        for message in link.sent():
+            assert message["op"] == "ping"
+            link.reply(message)
+        link.push("event", event={})
+    link.push("granted", lease=view(token=[1, 2]))
+    (granted,) = [event for event in link.told() if isinstance(event, r.Granted)]
+    assert link.now - granted.record.confirmed_at < 4.0
+
+
 def test_fenced_after_ttl_and_grace_without_a_word(link: Wire) -> None:
     record = link.hold()
     link.protocol.contact_lost("test")

@@ -165,6 +165,37 @@ def test_a_reading_from_before_the_last_ready_is_not_believed_to_be_full() -> No
     assert driver.state(vlm) == "loading"
 
 
+def test_a_load_peak_that_is_not_back_yet_carries_no_grant() -> None:
+    """Regression: the peak that a loader gave up with `ready` was believed free on a reading from before it was there."""
+    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1.5})
+    driver.card.lag_s = 1.0
+    det = driver.consumer("det")
+    first = det.acquire(6 * GIB, 2 * GIB)
+    driver.advance(0.1)
+    vlm = driver.consumer("vlm").acquire(4 * GIB)
+    det.hold(6 * GIB)
+    det.hold(2 * GIB)  # the driver gives the rest back late
+    det.ready(first)
+    assert driver.state(vlm) == "queued"
+    driver.advance(0.5)
+    assert driver.state(vlm) == "queued", "6 GiB are still occupied"
+    driver.until(lambda: driver.state(vlm) == "loading", limit_s=3.0)
+
+
+def test_an_exclusive_lease_that_expired_keeps_others_out_until_it_is_measured_gone() -> None:
+    """Regression: its debt kept its bytes charged, but a neighbour came in while its hung holder was still on the card."""
+    driver = CoreDriver(8 * GIB)
+    hung = driver.consumer("hung")
+    lease = hung.acquire(2 * GIB, exclusive=True, ttl_s=2.0)
+    hung.load(lease)
+    waiter = driver.consumer("w").acquire(1 * GIB, evictable=False)
+    driver.until(lambda: driver.state(lease) == "over", limit_s=5.0)
+    driver.advance(8.0)
+    assert driver.state(waiter) == "queued"
+    hung.hold(0)
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=10.0)
+
+
 # -- pressure ----------------------------------------------------------------------------------------------------------------
 def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder() -> None:
     driver = CoreDriver(8 * GIB)

@@ -151,6 +151,24 @@ def test_a_grant_that_cannot_be_written_is_taken_back() -> None:
     assert driver.gpu()["charged_bytes"] == 0, "nothing stays charged for it"
 
 
+def test_a_grant_taken_back_leaves_the_residue_of_its_process_charged() -> None:
+    """Regression: with the grant the ledger forgot the context that the process had all along."""
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB, residue_bytes=1 * GIB)
+    det.load(lease)
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    driver.restart()
+    det.connect()
+    driver.until(lambda: bool(driver.notes("serving")), limit_s=30.0)
+    assert driver.gpu()["charged_bytes"] == 1 * GIB
+    driver.journal_failing = "disk full"
+    det.try_acquire(2 * GIB)
+    driver.advance(0.1)
+    assert driver.gpu()["charged_bytes"] == 1 * GIB
+
+
 def test_a_grant_in_reply_that_cannot_be_written_is_refused_once() -> None:
     driver = CoreDriver(8 * GIB)
     det = driver.consumer("det")

@@ -105,3 +105,27 @@ def test_a_record_that_cannot_be_deleted_stops_nobody() -> None:
     recorder.disk_full = True
     recorder.executor.perform([fx.JournalDelete("lease:L1-1"), fx.Reply(A, ONE, {"lease": LEASE})])
     assert recorder.done == [("reply", A, ONE, {"lease": LEASE})]
+
+
+def test_a_record_that_a_full_disk_could_not_delete_goes_with_the_next_write() -> None:
+    """Regression: it stayed for ever, and every restart recovered a lease that nobody had."""
+    recorder = Recorder()
+    recorder.disk_full = True
+    recorder.executor.perform([fx.JournalDelete("lease:L1-1"), fx.JournalDelete("residue:1@1:GPU-1")])
+    recorder.disk_full = False
+    recorder.executor.perform([fx.JournalPut("residue:1@1:GPU-1", {"a": 1})])
+    recorder.executor.perform([fx.JournalDelete("lease:L1-2")])
+    assert recorder.done == [
+        ("journal", ("lease:L1-1", None), ("residue:1@1:GPU-1", {"a": 1})),
+        ("journal", ("lease:L1-2", None)),
+    ]
+
+
+def test_a_record_that_is_written_again_is_not_deleted_later() -> None:
+    recorder = Recorder()
+    recorder.disk_full = True
+    recorder.executor.perform([fx.JournalDelete("residue:1@1:GPU-1")])
+    recorder.executor.perform([fx.JournalPut("residue:1@1:GPU-1", {"a": 1})])
+    recorder.disk_full = False
+    recorder.executor.perform([fx.JournalDelete("lease:L1-2")])
+    assert recorder.done[-1] == ("journal", ("lease:L1-2", None))
