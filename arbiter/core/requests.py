@@ -90,7 +90,8 @@ def bad_state(lease: Lease, what: str) -> Refused:
         f"{lease.id} is {lease.state}: {what}",
         "see the lease's story",
         state=str(lease.state),
-        uses=len(lease.uses),
+        uses=lease.busy_uses(),
+        children=len(lease.children),
         story=lease.told(),
     )
 

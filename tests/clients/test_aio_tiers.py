@@ -1,14 +1,16 @@
-"""Leases that leave and come back, pause and park: the asyncio client against a real daemon."""
+"""Leases that leave and come back, pause, park and lend: the asyncio client against a real daemon."""
 
+import asyncio
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 import pytest
 
 from arbiter.testing.process import ArbiterProcess
 from clients.aio import ArbiterClient
 from clients.lease import Lease, Use
-from schemas.errors import BadState, LeaseRevoking, VramError
-from schemas.wire import LeaseSpec
+from schemas.errors import BadState, LeaseRevoking, ParentTooSmall, VramError
+from schemas.wire import LeaseRef, LeaseSpec
 from sidecars.device.fake import FakeMemory
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
@@ -157,3 +159,36 @@ async def test_a_yielded_use_lets_the_holder_go_and_says_so_at_its_end(
             with pytest.raises(VramError):
                 await lend(use, client.acquire(spec("llm", 5), 20.0))
         assert model.did == ["unload"]
+
+
+async def test_a_sub_lease_is_carved_out_of_its_parents(
+    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
+) -> None:
+    """The runner holds the room, its sidecar holds the bytes: the eviction asks the sidecar first, and the runner hears of it."""
+    asked: list[str] = []
+
+    def told(lease: Lease, _: Any) -> None:
+        asked.append(lease.spec.consumer)
+
+    model = Model()
+    async with (
+        ArbiterClient(arbiter_daemon.endpoint, name="runner") as runner,
+        ArbiterClient(arbiter_daemon.endpoint, name="sidecar") as sidecar,
+        ArbiterClient(arbiter_daemon.endpoint, name="other") as other,
+    ):
+        root = await runner.acquire(spec("goal", 5), on_revoke=told)
+        parent = LeaseRef(lease_id=root.lease_id, token=root.token)
+        with pytest.raises(ParentTooSmall):
+            await sidecar.acquire(spec("policy", 6, parent=parent))
+        leaf = await sidecar.acquire(spec("policy", 4, parent=parent), unload=model.unload, on_revoke=told)
+        await leaf.ready()
+        await root.ready()
+        async with root.use("grab"):
+            waiting = asyncio.ensure_future(other.acquire(spec("detector", 5), 20.0))
+            await until(lambda: sorted(asked) == ["goal", "policy"])
+            assert leaf.state == "revoking"
+            assert model.did == [], "the tree is in use"
+        detector = await waiting
+        assert (model.did, leaf.state) == (["unload"], "gone")
+        await root.wait_gone()
+        await detector.give_up()

@@ -236,7 +236,8 @@ def test_a_tree_is_in_use_while_any_of_it_is(tree: Tree, on: str) -> None:
     ]
     assert [p["uses"] for p in tree.driver.pushes("revoke")][-2:] == [1, 1]
     tree.driver.advance(40.0)
-    assert refusal(tree.policy.unloading(tree.leaf)).code == "bad_state"
+    refused = refusal(tree.policy.unloading(tree.leaf))
+    assert (refused.code, refused.details["uses"]) == ("bad_state", 1), "a holder waits while it is told of uses"
     assert "1 use" in tree.driver.arbiter.why("w", tree.driver.now)["leases"][0]["text"]
     effects = tree.runner.use_end(lease, "goal", owner.token(lease))
     assert revokes(effects) == [(tree.leaf, 0, 0), (tree.root, 0, 1)], "the leaf first, both may leave now"
@@ -269,7 +270,8 @@ def test_eviction_asks_the_leaf_first_tells_the_root_and_needs_no_word_of_a_mere
     effects = tree.driver.consumer("w").try_acquire(5 * GIB)
     assert revokes(effects) == [(tree.leaf, 0, 0), (tree.root, 0, 1)]
     waiter = LeaseId(answer(effects)["lease"]["lease_id"])
-    assert refusal(tree.runner.unloading(tree.root)).code == "bad_state", "its sub-lease is there"
+    refused = refusal(tree.runner.unloading(tree.root))
+    assert (refused.code, refused.details["children"]) == ("bad_state", 1), "its sub-lease is there"
     assert refusal(tree.policy.use_begin(tree.leaf)).code == "lease_revoking"
     assert (
         refusal(tree.driver.consumer("x").try_acquire(1, parent=(tree.root, tree.token))).code
