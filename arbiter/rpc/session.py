@@ -254,6 +254,7 @@ class SessionTable:
                 if new == earlier:
                     self._moved[old] = session.client
             self._moved[earlier] = session.client
+        self._moved.pop(session.client, None)  # it was replaced once; from here on it speaks for itself
         self._instances[key] = session.client
 
     def _connect(self, session: Session) -> None:

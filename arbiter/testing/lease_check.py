@@ -109,8 +109,8 @@ def check_leases(
     events = sorted(history, key=lambda event: (float(event["at_wall_s"]), int(event["seq"])))
     times = [float(event["at_wall_s"]) - wall_minus_monotonic_s for event in events]
     claims = _claims(traces, events, times)
-    owners = {claim.lease_id: claim.pid for mine in claims.values() for claim in mine}
-    _check_history(story, events, times, owners, hindrances)
+    known = {claim.lease_id: claim for mine in claims.values() for claim in mine}
+    _check_history(story, events, times, known, hindrances)
     _check_card(story, read_lines([log]), claims, traces, hindrances)
     _check_uses(story, read_lines([log]), traces)
     _check_waits(story, traces, hindrances, stuck_s)
@@ -155,7 +155,7 @@ def _check_history(
     story: Story,
     events: Sequence[Line],
     times: Sequence[float],
-    owners: Mapping[str, int],
+    claims: Mapping[str, Claim],
     hindrances: Sequence[Hindrance],
 ) -> None:
     loading: dict[str, dict[str, str]] = defaultdict(dict)  # card → lease → consumer
@@ -181,7 +181,12 @@ def _check_history(
                 loading[gpu][lease] = str(event["consumer"])
             case "ready" | "released" | "lost" | "expired" | "denied":
                 loading[gpu].pop(lease, None)
-                if kind == "expired" and not _hindered(hindrances, owners.get(lease), t):
+                claim = claims.get(
+                    lease
+                )  # whoever let go while the arbiter was down ends by time, and rightly
+                if kind == "expired" and claim is not None and t < claim.until:
+                    if _hindered(hindrances, claim.pid, t):
+                        continue
                     story.bad(
                         "expired", t, f"{lease} of {event['consumer']} expired, though nobody hindered it"
                     )
@@ -198,10 +203,9 @@ def _check_history(
                 uses[lease].discard(event["use_id"])
 
 
-def _hindered(hindrances: Sequence[Hindrance], pid: int | None, t: float, back_s: float = 10.0) -> bool:
+def _hindered(hindrances: Sequence[Hindrance], pid: int, t: float, back_s: float = 10.0) -> bool:
     return any(
-        (pid is None or found.pid == pid) and found.since <= t + SLACK_S and t - back_s <= found.until
-        for found in hindrances
+        found.pid == pid and found.since <= t + SLACK_S and t - back_s <= found.until for found in hindrances
     )
 
 

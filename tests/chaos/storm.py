@@ -53,7 +53,7 @@ STRIKERS = 3
 STEP_WAIT_S = 3.0
 LAG_S = 0.1
 CALM_S = 45.0
-STATE_BYTES = 4 << 20
+STATE_BYTES = 64 << 20
 MIB = 1 << 20
 CONFIG = """
 verify: {timeout_s: 1.0}

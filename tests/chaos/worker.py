@@ -29,6 +29,7 @@ MIB = 1 << 20
 CHUNKS = 3
 LOAD_S, UNLOAD_S, USE_S, IDLE_S = 0.05, 0.03, 0.12, 0.1
 """Longest pauses. A step has to last long enough for a fault to meet it."""
+RETRY_S = 0.5  # where the arbiter has a disk that is full
 CONNECT_S = 60.0
 
 
@@ -102,7 +103,7 @@ class Consumer:
             )
         except VramError as error:
             say("denied", code=error.code)
-            await self._pause(IDLE_S)
+            await self._pause(IDLE_S if error.code != "journal_unavailable" else RETRY_S)
             return
         if lease is None:
             say("gave_up")

@@ -301,6 +301,15 @@ def test_an_instance_on_a_new_connection_replaces_its_old_one(bench: Bench) -> N
     assert left == [ClientId(routing.hex()) for routing in (b"a", b"b", b"c")]
 
 
+def test_a_connection_that_was_replaced_and_comes_back_hears_its_own_answers(bench: Bench) -> None:
+    bench.hello(b"a", instance="one")
+    bench.hello(b"b", instance="one")
+    assert bench.hello(b"a", instance="two")["ok"]
+    assert bench.sent[-1][0] == b"a", "they used to go to the connection that had replaced it"
+    assert bench.ask("ping", b"a")["ok"]
+    assert bench.sent[-1][0] == b"a"
+
+
 def test_the_same_instance_of_another_process_is_another_client(bench: Bench) -> None:
     assert bench.hello(b"a", instance="same")["ok"]
     assert bench.hello(b"b", address=PARENT, instance="same")["ok"]

@@ -1,0 +1,80 @@
+"""Whatever arrives is a request or a typed error, quickly, in little memory, and the answer to it can be sent and is short."""
+
+import random
+import tracemalloc
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from arbiter.rpc import codec
+from arbiter.testing.hostile import BOMBS, Forger, pack
+from schemas.defaults import MESSAGE_MAX_BYTES, MIB
+from schemas.wire import OPS
+
+ANSWER_MAX_BYTES = 16_384
+RANDOM = st.randoms(use_true_random=False)
+SETTINGS = settings(deadline=None, suppress_health_check=list(HealthCheck))
+
+
+def outcome(frame: bytes) -> str:
+    """`ok`, or the code of the error; anything else that is raised fails the test."""
+    try:
+        codec.decode(frame, MESSAGE_MAX_BYTES)
+    except codec.Undecodable as bad:
+        answer = codec.refusal(bad.request_id, 1, bad.error.to_wire())
+        assert len(answer) <= ANSWER_MAX_BYTES, "a refusal never echoes what it refuses at length"
+        return bad.error.code
+    return "ok"
+
+
+@SETTINGS
+@given(RANDOM, st.sampled_from(OPS))
+def test_the_forger_knows_every_op_of_the_wire(draw: random.Random, op: str) -> None:
+    assert outcome(pack(Forger(draw).request(op))) == "ok"
+
+
+@SETTINGS
+@given(RANDOM)
+def test_a_frame_of_any_kind_is_a_request_or_a_typed_error(draw: random.Random) -> None:
+    assert outcome(Forger(draw).frame()) in (
+        "ok", "bad_frame", "bad_request", "unknown_op", "message_too_large"
+    )  # fmt: skip
+
+
+@SETTINGS
+@given(RANDOM, st.sampled_from(OPS))
+def test_a_mutated_request_keeps_its_id_in_the_answer(draw: random.Random, op: str) -> None:
+    forger = Forger(draw)
+    mutant = forger.mutant(forger.request(op, id=77))
+    refused: codec.Undecodable | None = None
+    try:
+        request = codec.decode(pack(mutant), MESSAGE_MAX_BYTES)
+    except codec.Undecodable as bad:
+        refused = bad
+    if refused is None:
+        assert request.id == mutant["id"]
+        return
+    expected = mutant.get("id") if isinstance(mutant, dict) else None
+    whole = type(expected) is int and 0 <= expected < 1 << 53
+    read = refused.error.code in ("bad_request", "unknown_op")
+    assert refused.request_id == (expected if whole and read else None)
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_bomb_is_defused_in_little_memory(name: str) -> None:
+    frame = BOMBS[name]
+    codec.decode(pack({"op": "ping", "id": 1}), MESSAGE_MAX_BYTES)  # whatever is made once is made now
+    tracemalloc.start()
+    try:
+        found = outcome(frame)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert found in ("bad_frame", "bad_request") or name in ("duplicate keys", "id that is true")
+    assert peak_bytes < 16 * MIB + 8 * len(frame)
+
+
+def test_of_a_duplicate_key_the_last_counts_and_only_once() -> None:
+    request = codec.decode(BOMBS["duplicate keys"], MESSAGE_MAX_BYTES)
+    assert (request.op, request.id) == ("bye", 2)

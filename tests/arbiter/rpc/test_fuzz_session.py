@@ -1,0 +1,293 @@
+"""Hostile connections against the session table, with a list for a core and with the real core: nothing raises, every frame is answered
+exactly once, nobody else's lease changes, and when the processes are gone nothing of them is left."""
+
+import os
+import random
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import hypothesis.strategies as st
+import msgpack
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from arbiter.core import effects as fx
+from arbiter.core import events as ev
+from arbiter.core.arbiter import Arbiter
+from arbiter.core.settings import GpuInfo, Settings
+from arbiter.host.executor import Executor
+from arbiter.rpc.session import SessionSettings, SessionTable
+from arbiter.testing.core_driver import SimCard
+from arbiter.testing.hostile import Forger, pack
+from schemas import defaults as d
+from schemas.ids import ClientId, GpuId, ProcessKey
+
+GPU = GpuId("GPU-0")
+STRANGER_UID = 54_321
+VICTIM = f"localhost:{os.getuid()}:{os.getgid()}:{os.getpid()}"
+ATTACKERS = [f"localhost:{STRANGER_UID}:{STRANGER_UID}:{pid}" for pid in (os.getppid(), 1)]
+SEED = st.integers(0, 1 << 32)  # draws through Hypothesis would cost more than what they test
+SETTINGS = settings(deadline=None, max_examples=40, suppress_health_check=list(HealthCheck))
+
+
+class Recording:
+    """A core that answers nothing and remembers everything."""
+
+    def __init__(self) -> None:
+        self.events: list[ev.Event] = []
+
+    def post(self, event: ev.Event) -> None:
+        self.events.append(event)
+
+    def status(self) -> dict[str, Any]:
+        return {}
+
+    def why(self, consumer: str) -> dict[str, Any]:
+        return {"consumer": consumer, "leases": []}
+
+
+@dataclass
+class RealCore:
+    """The core with its executor, a card that shows nothing, a journal in a dict, and time that moves when told."""
+
+    plant: "Plant"
+    journal: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    history: list[Mapping[str, Any]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        info = GpuInfo(GPU, 0, "simulated", 8 * d.GIB, d.RESERVE_BYTES)
+        self.card = SimCard(GPU, 8 * d.GIB)
+        self.arbiter = Arbiter(Settings(epoch=1, gpus=(info,)), self.plant.now)
+        self.executor = Executor(self.plant.outbox, self, self, self._sample, self.post, lambda event: None)
+        self._queue: deque[ev.Event] = deque()
+        self._busy = False
+
+    # Decisions
+    def post(self, event: ev.Event) -> None:
+        self._queue.append(event)
+        if self._busy:
+            return
+        self._busy = True
+        while self._queue:
+            self.executor.perform(self.arbiter.handle(self._queue.popleft(), self.plant.now))
+            self.arbiter.check_all()
+        self._busy = False
+
+    def status(self) -> dict[str, Any]:
+        return self.arbiter.status(self.plant.now)
+
+    def why(self, consumer: str) -> dict[str, Any]:
+        return self.arbiter.why(consumer, self.plant.now)
+
+    # the machine
+    def apply(self, changes: Sequence[tuple[str, Mapping[str, Any] | None]]) -> None:
+        for key, record in changes:
+            if record is None:
+                self.journal.pop(key, None)
+            else:
+                self.journal[key] = record
+
+    def append(self, kind: str, data: Mapping[str, Any]) -> Mapping[str, Any]:
+        self.history.append({"seq": len(self.history) + 1, "kind": kind, **data})
+        return self.history[-1]
+
+    def _sample(self, gpu: GpuId) -> None:
+        self.plant.now += 0.001
+        self.post(self.card.read(self.plant.now))
+
+    def advance(self, seconds: float) -> None:
+        end = self.plant.now + seconds
+        while (deadline := self.arbiter.next_deadline()) is not None and deadline <= end:
+            self.plant.now = max(self.plant.now + 0.0005, deadline)
+            self.post(ev.Tick())
+        self.plant.now = max(self.plant.now, end)
+
+
+class Plant:
+    """A session table between connections and a core."""
+
+    def __init__(self, *, real: bool, **limits: int) -> None:
+        self.now = 100.0
+        self.answers: list[tuple[bytes, dict[str, Any]]] = []
+        self.watched: set[ProcessKey] = set()
+        self.outbox: Any = self  # the executor's way out, until the table is there
+        values: dict[str, int] = {"sessions_max": 50, "rate_per_s": 1_000_000, "subscribers_max": 3, **limits}
+        settings_ = SessionSettings(
+            epoch=1, boot_id="b", server="test", heartbeat_s=2.0, grace_s=5.0, message_max_bytes=d.MESSAGE_MAX_BYTES,
+            operators_gid=None, **values,
+        )  # fmt: skip
+        self.core: Any = Recording() if not real else RealCore(self)
+        self.table = SessionTable(settings_, self, self.core, self._read, self.watched.add, lambda: self.now)
+        self.outbox = self.table
+
+    # Wire
+    def send(self, routing_id: bytes, delimiter: bool, payload: bytes) -> bool:
+        self.answers.append((routing_id, msgpack.unpackb(payload)))
+        return True
+
+    # the executor's way out
+    def reply(self, *arguments: Any) -> None:
+        self.table.reply(*arguments)
+
+    def refuse(self, *arguments: Any) -> None:
+        self.table.refuse(*arguments)
+
+    def push(self, *arguments: Any) -> None:
+        self.table.push(*arguments)
+
+    def broadcast(self, event: Mapping[str, Any]) -> None:
+        self.table.broadcast(event)
+
+    def _read(
+        self, after: int, limit: int, kinds: tuple[str, ...], done: Callable[[Mapping[str, Any]], None]
+    ) -> None:
+        done({"events": [], "last_seq": 0})
+
+    def say(self, routing_id: bytes, address: str | None, frame: bytes) -> list[dict[str, Any]]:
+        """Deliver a frame; the answers (not pushes) to it."""
+        before = len(self.answers)
+        self.table.receive(routing_id, False, address, frame)
+        return [answer for to, answer in self.answers[before:] if to == routing_id and "re" in answer]
+
+    def ask(self, routing_id: bytes, address: str, op: str, **fields: Any) -> dict[str, Any]:
+        (answer,) = self.say(routing_id, address, msgpack.packb({"op": op, "id": 1, **fields}))
+        return answer
+
+    def hello(self, routing_id: bytes, address: str, **fields: Any) -> dict[str, Any]:
+        facts = {"version": 1, "name": "n", "instance": routing_id.hex(), **fields}
+        return self.ask(routing_id, address, "hello", **facts)
+
+    def everybody_dies(self) -> None:
+        """The kernel tells of every process that was watched."""
+        for process in sorted(self.watched):
+            self.table.process_died(process)
+            self.core.post(ev.ProcessDied(process))
+
+    def leftovers(self) -> dict[str, int]:
+        """Everything that the table remembers of somebody."""
+        table = self.table
+        return {
+            name: len(getattr(table, name))
+            for name in ("_sessions", "_of_process", "_subscribers", "_instances", "_moved")
+            if getattr(table, name)
+        }
+
+
+def attack(plant: Plant, draw: random.Random, forger: Forger, frames: int) -> Counter[int]:
+    """Hellos, valid requests, mutants, bombs and noise over a few connections of two processes. Counts answers per frame."""
+    counts: Counter[int] = Counter()
+    connections = [b"c%d" % number for number in range(6)]
+    for number in range(frames):
+        routing_id, address = draw.choice(connections), draw.choice(ATTACKERS)
+        match draw.randint(0, 5):
+            case 0:
+                role = draw.choice(["client", "client", "observer", "operator"])
+                frame = pack(forger.request("hello", id=number, version=1, role=role))
+            case 1 | 2 | 3:
+                frame = pack(forger.request(id=number))
+            case _:
+                frame = forger.frame()
+        answers = plant.say(routing_id, address, frame)
+        counts[len(answers)] += 1
+        for answer in answers:
+            learn(forger, answer)
+        if draw.random() < 0.1:
+            plant.now += draw.random()
+    return counts
+
+
+def learn(forger: Forger, answer: Mapping[str, Any]) -> None:
+    """A clever attacker uses what it was told."""
+    lease = answer.get("lease")
+    if isinstance(lease, Mapping):
+        forger.lease_ids.append(lease["lease_id"])
+        if lease["token"] is not None:
+            forger.tokens.append(lease["token"])
+
+
+@SETTINGS
+@given(SEED)
+def test_nothing_raises_and_nothing_is_left(seed: int) -> None:
+    draw = random.Random(seed)
+    plant = Plant(real=False)
+    counts = attack(plant, draw, Forger(draw), 60)
+    assert max(counts) <= 1, "nothing is answered twice"
+    plant.everybody_dies()
+    assert not plant.leftovers()
+
+
+@SETTINGS
+@given(SEED)
+def test_the_core_answers_every_frame_once_and_leaves_others_alone(seed: int) -> None:
+    draw = random.Random(seed)
+    plant = Plant(real=True)
+    core: RealCore = plant.core
+    core.advance(0.1)
+    plant.hello(b"victim", VICTIM)
+    spec = {"consumer": "victim", "model_id": "m", "evictable": False, "ttl_s": 3600.0,
+            "footprint": {"load_peak_bytes": d.GIB, "steady_bytes": d.GIB, "residue_bytes": 0}}  # fmt: skip
+    lease = plant.ask(b"victim", VICTIM, "acquire", nonce="v", spec=spec)["lease"]
+    on = {"lease_id": lease["lease_id"], "token": lease["token"]}
+    assert plant.ask(b"victim", VICTIM, "ready", **on)["ok"]
+    forger = Forger(draw)
+    forger.lease_ids += [lease["lease_id"], "victim"]
+    forger.tokens.append(lease["token"])  # stolen
+    counts = attack(plant, draw, forger, 60)
+    assert set(counts) <= {1}, f"every frame is answered exactly once: {counts}"
+    core.advance(draw.choice([0.0, 1.0, 40.0]))
+    (mine,) = (view for view in core.status()["leases"] if view["consumer"] == "victim")
+    assert (mine["state"], mine["token"], mine["lease_id"]) == ("held", lease["token"], lease["lease_id"])
+    assert plant.ask(b"victim", VICTIM, "renew", leases=[on])["alive"] == [lease["lease_id"]]
+    plant.everybody_dies()
+    core.advance(60.0)
+    status = core.status()
+    assert (status["leases"], status["clients"], status["gpus"][0]["charged_bytes"]) == ([], 0, 0)
+    assert not plant.leftovers()
+    assert not core.journal, "nothing is kept for a next start"
+
+
+@pytest.mark.parametrize("sessions_max", [1, 4])
+def test_at_the_limit_of_sessions_hellos_are_refused_and_remembered_by_nobody(sessions_max: int) -> None:
+    plant = Plant(real=True, sessions_max=sessions_max)
+    answers = [plant.hello(b"h%d" % number, ATTACKERS[0]) for number in range(2000)]
+    assert sum(answer["ok"] for answer in answers) == sessions_max
+    assert len(plant.table) == plant.core.status()["clients"] == sessions_max
+    plant.everybody_dies()
+    assert not plant.leftovers()
+
+
+def test_an_instance_that_reconnects_for_ever_is_one_session() -> None:
+    plant = Plant(real=True)
+    for number in range(3000):
+        assert plant.hello(b"r%d" % number, ATTACKERS[0], instance="same")["ok"]
+    assert len(plant.table) == 1
+    plant.everybody_dies()
+    assert not plant.leftovers()
+    assert plant.core.status()["clients"] == 0
+
+
+def test_acquire_and_cancel_for_ever_keeps_nothing() -> None:
+    plant = Plant(real=True)
+    core: RealCore = plant.core
+    core.advance(0.1)
+    plant.hello(b"c", ATTACKERS[0])
+    big = {
+        "consumer": "c",
+        "model_id": "m",
+        "footprint": {"load_peak_bytes": 7 * d.GIB, "steady_bytes": 7 * d.GIB},
+    }
+    first = plant.ask(b"c", ATTACKERS[0], "acquire", nonce="first", spec=big)["lease"]
+    assert first["state"] == "loading"
+    for number in range(3000):
+        waiting = plant.ask(b"c", ATTACKERS[0], "acquire", nonce=f"n{number}", spec=big)["lease"]
+        assert plant.ask(b"c", ATTACKERS[0], "cancel", lease_id=waiting["lease_id"])["state"] == "cancelled"
+    inside = core.arbiter._core
+    assert len(inside.leases) == 1
+    assert not inside.waiting
+    assert len(inside.ended) <= 1024
+    assert len(inside.nonces) <= 1025
+    assert isinstance(core.executor, Executor)
+    assert ClientId(b"c".hex()) in inside.clients
+    assert not any(isinstance(effect, fx.Push) for effect in inside.out)
