@@ -85,6 +85,10 @@ class HostRamInsufficient(TransientError):
     code = "host_ram_insufficient"  # no room to park: details.needed_bytes, budget_bytes, booked_bytes
 
 
+class WouldDeadlock(CallerError):
+    code = "would_deadlock"  # the wait is for what a use of this process keeps: details.cycle, who uses and waits for what
+
+
 class ParentTooSmall(CallerError):
     code = "parent_too_small"  # a sub-lease needs more than its parent has left: details.needed_bytes, left_bytes
 

@@ -7,7 +7,7 @@
      1.3 the machine: a reading, a failed reading, a failed journal write, a journal from before the restart, a resume from suspend
      1.4 time: every timer that is due
   2. recovery ends when everybody is accounted for
-  3. who gets a card next (its own numbered tree: `grants`), and the answer to an acquire that has to wait
+  3. waits that could never end are denied; who gets a card next (its own numbered tree: `grants`), and the answer to an acquire that has to wait
   4. background readings
   5. invariants
 It must not know how effects are performed, nor that a wire exists.
@@ -16,6 +16,7 @@ It must not know how effects are performed, nor that a wire exists.
 from typing import Any
 
 from arbiter.core import (
+    deadlock,
     eviction,
     explain,
     grants,
@@ -77,7 +78,8 @@ class Arbiter:
         self._happened(event)  # 1
         subleases.finish(core)
         recovery.serve_if_accounted(core)  # 2
-        grants.schedule(core)  # 3
+        deadlock.resolve(core)  # 3
+        grants.schedule(core)
         requests.answer_queued(core)
         self._keep_reading()  # 4
         invariants.check(core)  # 5

@@ -127,6 +127,9 @@ class Core:
         self.arrivals = 0
         self.last_token = Token(settings.epoch, 0)
         self.users: dict[ProcessKey, dict[tuple[LeaseId, UseId], Lease]] = {}  # whose busy uses are where
+        self.suspects: set[ProcessKey] = (
+            set()
+        )  # began to use or to wait with the event being handled (`deadlock`)
         self.unanswered: list[Lease] = []  # acquires of the event being handled
         self.granted: list[
             tuple[Token, GpuId | None]
@@ -220,6 +223,7 @@ class Core:
         lease.uses[use.process, use.id] = use
         lease.uncalled = False
         self.users.setdefault(use.process, {})[lease.id, use.id] = lease
+        self.suspects.add(use.process)
 
     def unmark(self, lease: Lease, use: Use) -> None:
         """A busy use ends or pauses."""
@@ -232,6 +236,7 @@ class Core:
     def enqueue(self, lease: Lease) -> None:
         """A lease begins to wait, on every card that it may be placed on."""
         self.waiting[lease.id] = lease
+        self.suspects.add(lease.process)
         for gpu_id in lease.gpus:
             self.gpus[gpu_id].queue.add(lease)
             self.wake(self.gpus[gpu_id])

@@ -1,6 +1,6 @@
 """What users of other arbiters and model servers complain about, where one job needs several models. Numbers are those of the list."""
 
-from arbiter.testing.core_driver import CoreDriver
+from arbiter.testing.core_driver import CoreDriver, refusal
 from schemas import defaults as d
 
 GIB = d.GIB
@@ -79,3 +79,18 @@ def test_15_or_the_job_yields_and_is_loaded_again_afterwards() -> None:
     again = comfy.acquire(5 * GIB)
     llm.unload(called)
     driver.until(lambda: driver.state(again) == "loading")
+
+
+def test_15_and_a_job_that_does_neither_is_told_instead_of_hanging() -> None:
+    """The job's own process asks for the LLM's lease in the middle of its use."""
+    driver = CoreDriver(8 * GIB)
+    comfy = driver.consumer("comfy")
+    job = comfy.acquire(5 * GIB)
+    comfy.load(job)
+    comfy.use_begin(job, "render")
+    driver.advance(0.01)
+    refused = refusal(comfy.try_acquire(5 * GIB))
+    assert refused.code == "would_deadlock"
+    assert refused.details["cycle"][0]["consumer"] == "comfy"
+    assert "yield" in refused.hint
+    assert driver.state(job) == "held", "and nobody was asked to leave for it"
