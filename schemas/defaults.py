@@ -28,7 +28,7 @@ VERIFY_POLL_UNTIL_S = (
     5.0,
 )  # how long each but the last is kept; drivers take 0.5-1.5 s, and this is what is waited for
 VERIFY_CONFIRM_S = 0.002  # after a reading that is on target: the second one, which has to agree
-VERIFY_READING_SHARE = 0.25  # a slow card is not read more than this share of the time
+VERIFY_READING_SHARE = 0.5  # a slow card is not read more than this share of the time
 VERIFY_SLOW_POLL_S = 0.5  # after a verdict that does not allow a grant
 VERIFY_TOLERANCE_BYTES = 64 * MIB  # allocator granularity and driver bookkeeping
 PROBE_DEADLINE_S = 2.0
