@@ -7,6 +7,7 @@ OUT ?= out/demo
 PREFIX ?= /opt/vram-arbiter
 DESTDIR ?=
 ARGS ?=
+QUICK ?=
 # How long `make chaos` storms.
 SECONDS ?= 300
 
@@ -53,8 +54,8 @@ chaos: setup ## kill, stop and starve real processes at every step of a switch: 
 sim: setup ## the daemon under simulated faults: SEED=n one run with its story, SEEDS=1000 many on all cores
 	$(BIN)/python tests/sim/sim_run.py $(if $(SEEDS),--seeds $(SEEDS) --out out/sim/sums.json,--seed $(SEED)) $(ARGS)
 
-bench: setup ## measure grants and handovers against bare ZeroMQ
-	$(BIN)/python tests/bench/bench_wire.py $(ARGS)
+bench: setup ## how fast it is, beside bare ZeroMQ and Redis locks: QUICK=1 takes less of everything
+	$(BIN)/python tests/bench/run.py $(if $(QUICK),--quick) $(ARGS)
 
 schemas: setup ## write the JSON Schemas anew after a model changed
 	$(BIN)/python -m schemas export schemas/json

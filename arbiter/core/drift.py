@@ -13,6 +13,7 @@ from arbiter.core.lease import Lease, LeaseState
 from arbiter.core.ledger import process_bytes
 from arbiter.core.state import Core, Gpu
 from arbiter.core.verify import Verification
+from schemas.ids import LeaseId
 
 _RESIDENT = frozenset({LeaseState.HELD, LeaseState.REVOKING})
 
@@ -36,9 +37,9 @@ def expected_bytes(core: Core, spec: Spec) -> tuple[int, int]:
 # -- what is seen ------------------------------------------------------------------------------------------------------
 def on_evidence(core: Core, gpu: Gpu) -> None:
     """The ledger has taken the evidence of a reading."""
-    for lease in gpu.residents.values():
-        held = measured_bytes(gpu, lease)
-        if not held:
+    for account in gpu.ledger.accounts.values():
+        lease = gpu.residents.get(next(iter(account.charges), LeaseId("")))
+        if lease is None or not (held := measured_bytes(gpu, lease)):
             continue
         if lease.state is LeaseState.LOADING:
             lease.peak_seen_bytes = max(lease.peak_seen_bytes, held)

@@ -20,6 +20,8 @@ from arbiter.core.state import Core, Gpu
 
 _UNUSED = tuple(state for state in LeaseState if state not in (LeaseState.HELD, LeaseState.REVOKING))
 """States in which nobody may use a lease."""
+_UNUSED_HERE = (LeaseState.LOADING, LeaseState.UNLOADING, LeaseState.VERIFYING)
+"""Those of them that a resident can be in."""
 
 
 class InvariantViolation(Exception):
@@ -43,6 +45,8 @@ def check(core: Core) -> None:
 
 def check_all(core: Core) -> None:
     """The same for everybody, whoever was touched, and for the tables that `check` stands on."""
+    if problem := core.disagreement():
+        raise InvariantViolation(0, problem)
     for gpu in core.gpus.values():
         problem = gpu.ledger.disagreement() or gpu.residents.disagreement()
         if problem:
@@ -86,7 +90,7 @@ def _residents(core: Core, gpu: Gpu) -> None:
         loading = [lease.id for lease in residents.in_state(LeaseState.LOADING)]
         if len(loading) > 1:
             raise InvariantViolation(2, f"{loading} load at once on {gpu.info.id}")
-    for lease in residents.in_state(*_UNUSED):
+    for lease in residents.in_state(*_UNUSED_HERE):
         _unused(lease)
 
 

@@ -217,7 +217,7 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
         raise Refused(
             "not_permitted", f"{item.lease} belongs to process {lease.process.pid}", "ask as its holder"
         )
-    lease.client = client.id
+    core.hand_to(lease, client.id)
     if not lease.attached:
         lease.attached = True
         lease.ready_at = (

@@ -125,7 +125,7 @@ def new_lease(
     gpus: tuple[GpuId, ...],
 ) -> Lease:
     """A lease that is asked for, known by its nonce from now on. Refuses what is one too many for its connection."""
-    owned = sum(1 for lease in core.leases_of(client.process) if lease.client == client.id)
+    owned = core.count_of_client(client.id)
     if owned >= core.settings.leases_per_client_max:
         raise Refused(
             "limit_exceeded",
@@ -205,7 +205,7 @@ def reacquire(core: Core, event: Reacquired) -> None:
         raise bad_state(
             lease, "only a lease that is away, or being measured on its way there, is called back"
         )
-    lease.client = client.id
+    core.hand_to(lease, client.id)
     core.reply(event.client, event.request, {"state": "queued", "lease": explain.view(core, lease)})
 
 
@@ -228,7 +228,7 @@ def find_again(core: Core, event: AcquireRequested, client: Client) -> bool:
     lease = core.leases.get(lease_id)
     if lease is None:
         raise ended_error(core.ended[lease_id])
-    lease.client = event.client  # the newest connection of the process is the one that listens
+    core.hand_to(lease, event.client)  # the newest connection of the process is the one that listens
     state = str(lease.state) if lease.state in (LeaseState.QUEUED, *AWAY) else "loading"
     core.reply(event.client, event.request, {"state": state, "lease": explain.view(core, lease)})
     return True

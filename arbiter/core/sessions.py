@@ -30,7 +30,7 @@ def on_left(core: Core, event: ClientLeft) -> None:
     if client is None:
         return
     core.last_client_at = core.now
-    for lease in list(core.leases.values()):
+    for lease in _concerned(core, core.leases_of_client(event.client)):
         for use in [use for use in lease.all_uses() if use.client == event.client]:
             end_use(core, lease, use, f"its client left: {event.reason}")
         if lease.client != event.client or lease.process != client.process:
@@ -45,6 +45,17 @@ def on_left(core: Core, event: ClientLeft) -> None:
             standby.renounce(core, lease)
         elif lease.state in EXPIRING and event.reason == BYE:
             let_go(core, lease, exiting=False, why="its client said bye")
+
+
+def _concerned(core: Core, own: list[Lease]) -> list[Lease]:
+    """Somebody's own leases, and all that are in use, perhaps by him, in the order of their arrival."""
+    used = (
+        lease
+        for gpu in core.gpus.values()
+        for lease in gpu.in_state(LeaseState.HELD, LeaseState.REVOKING)
+        if lease.uses or lease.yielded
+    )
+    return sorted({lease.id: lease for lease in (*own, *used)}.values(), key=lambda lease: lease.arrival)
 
 
 def on_died(core: Core, process: ProcessKey) -> None:
@@ -64,7 +75,7 @@ def on_died(core: Core, process: ProcessKey) -> None:
                 bereave(core, gpu, verification)
         if not account.charges and f"residue:{process}" not in gpu.verifications:
             begin_for_residue(core, gpu, process)
-    for lease in list(core.leases.values()):
+    for lease in _concerned(core, core.leases_of(process)):
         for use in [use for use in lease.all_uses() if use.process == process]:
             end_use(core, lease, use, "its process died")
         if lease.process == process:

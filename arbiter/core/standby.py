@@ -98,6 +98,8 @@ def give_up(core: Core, lease: Lease, to: LeaseState, code: str, why: str) -> No
 # -- coming back -----------------------------------------------------------------------------------------------------
 def find(core: Core, process: ProcessKey, consumer: str, key: ModelKey) -> Lease | None:
     """The lease of this process for this model that is away: a new acquire takes it over."""
+    if not core.away:
+        return None
     return next(
         (
             lease
@@ -119,7 +121,7 @@ def queue_again(
     """From away into the queues, as somebody who came at `asked_at`. Without a request it is told by push."""
     del core.away[lease.id]
     lease.move(LeaseState.QUEUED, core.now, "wanted again")
-    lease.client = client
+    core.hand_to(lease, client)
     lease.request = request
     lease.answered = request is None
     lease.arrived_at = asked_at

@@ -116,6 +116,7 @@ class Core:
         }
         self.leases: dict[LeaseId, Lease] = {}
         self._of_process: dict[ProcessKey, dict[LeaseId, Lease]] = {}
+        self._of_client: dict[ClientId, dict[LeaseId, Lease]] = {}
         self.waiting: dict[LeaseId, Lease] = {}
         self.away: dict[LeaseId, Lease] = {}  # without bytes on a card, in the order of their leaving
         self.host = HostRam(settings.host_ram_budget_bytes)
@@ -212,6 +213,32 @@ class Core:
         """A lease begins to live."""
         self.leases[lease.id] = lease
         self._of_process.setdefault(lease.process, {})[lease.id] = lease
+        self._of_client.setdefault(lease.client, {})[lease.id] = lease
+
+    def hand_to(self, lease: Lease, client: ClientId) -> None:
+        """Another connection of its process speaks for a lease from now on."""
+        _take_out(self._of_client, lease.client, lease.id)
+        lease.client = client
+        self._of_client.setdefault(client, {})[lease.id] = lease
+
+    def leases_of_client(self, client: ClientId) -> list[Lease]:
+        """Live leases that a connection speaks for."""
+        return list(self._of_client.get(client, {}).values())
+
+    def count_of_client(self, client: ClientId) -> int:
+        return len(self._of_client.get(client, {}))
+
+    def disagreement(self) -> str:
+        """Where the tables of owners and the leases disagree; "" if nowhere. Looks at everybody: for tests."""
+        by_process = {lease_id: owner for owner, some in self._of_process.items() for lease_id in some}
+        by_client = {lease_id: owner for owner, some in self._of_client.items() for lease_id in some}
+        for lease in self.leases.values():
+            if (by_process.pop(lease.id, None), by_client.pop(lease.id, None)) != (
+                lease.process,
+                lease.client,
+            ):
+                return f"{lease.id} is not listed under its process and its client"
+        return f"{sorted({**by_process, **by_client})} are listed and gone" if by_process or by_client else ""
 
     def leases_of(self, process: ProcessKey) -> list[Lease]:
         """Live leases of a process, oldest first."""
@@ -256,10 +283,8 @@ class Core:
             lease.parent.children.remove(lease)
             lease.parent = None
         del self.leases[lease.id]
-        siblings = self._of_process[lease.process]
-        del siblings[lease.id]
-        if not siblings:
-            del self._of_process[lease.process]
+        _take_out(self._of_process, lease.process, lease.id)
+        _take_out(self._of_client, lease.client, lease.id)
         for kind in ("ttl", "revoke"):
             self.timers.clear((kind, lease.id))
         self.away.pop(lease.id, None)
@@ -382,3 +407,11 @@ def _estate(estate: Estate) -> dict[str, Any]:
         "shares": {lease: [*astuple(share)] for lease, share in estate.shares.items()},
         "borne": [[process.pid, process.start_ticks, count] for process, count in estate.borne.items()],
     }
+
+
+def _take_out[K](table: dict[K, dict[LeaseId, Lease]], owner: K, lease_id: LeaseId) -> None:
+    """An owner without leases has no entry."""
+    some = table[owner]
+    del some[lease_id]
+    if not some:
+        del table[owner]

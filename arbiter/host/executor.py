@@ -63,7 +63,13 @@ class Executor:
 
     def perform(self, effects: Sequence[fx.Effect]) -> None:
         """One batch. A grant is on disk before its holder hears of it: consecutive journal effects are one transaction, and if that
-        fails, what the batch still has to say about those leases is not said (the waiting request is refused instead)."""
+        fails, what the batch still has to say about those leases is not said (the waiting request is refused instead).
+
+        Whoever waits for an answer has it first: facts are written down after all answers, and readings are begun last of all, since
+        their thread takes the interpreter from this one.
+        """
+        notes: list[fx.Note] = []
+        samples: list[fx.Sample] = []
         refused: dict[str, JournalUnavailable] = {}  # lease id → why
         index = 0
         while index < len(effects):
@@ -82,25 +88,24 @@ class Executor:
                 if isinstance(effect, fx.Reply):
                     self._outbox.refuse(effect.client, effect.request, why.to_wire())
                 continue
-            self._do(effect)
-
-    def _do(self, effect: fx.Effect) -> None:
-        match effect:
-            case fx.Reply(client, request, body):
-                self._outbox.reply(client, request, body)
-            case fx.Refuse(client, request, code, message, hint, details):
-                error = {"code": code, "message": message, "hint": hint, "details": dict(details)}
-                self._outbox.refuse(client, request, error)
-            case fx.Push(client, body):
-                self._outbox.push(client, body)
-            case fx.Sample(gpu):
-                self._sample(gpu)
-            case fx.Note(kind, data):
-                event = self._history.append(kind, data)
-                self._log_event(event)
-                self._outbox.broadcast(event)
-            case fx.JournalPut() | fx.JournalDelete():
-                self._write([effect], {})
+            match effect:
+                case fx.Reply(client, request, body):
+                    self._outbox.reply(client, request, body)
+                case fx.Push(client, body):
+                    self._outbox.push(client, body)
+                case fx.Note():
+                    notes.append(effect)
+                case fx.Sample():
+                    samples.append(effect)
+                case fx.Refuse(client, request, code, message, hint, details):
+                    error = {"code": code, "message": message, "hint": hint, "details": dict(details)}
+                    self._outbox.refuse(client, request, error)
+        for note in notes:
+            event = self._history.append(note.kind, note.data)
+            self._log_event(event)
+            self._outbox.broadcast(event)
+        for sample in samples:
+            self._sample(sample.gpu)
 
     def _write(
         self, run: Sequence[fx.JournalPut | fx.JournalDelete], refused: dict[str, JournalUnavailable]

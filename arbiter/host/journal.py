@@ -28,6 +28,9 @@ CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, json TEXT NOT NULL) WI
 """
 
 
+_text = json.JSONEncoder(separators=(",", ":")).encode
+
+
 @dataclass(frozen=True, slots=True)
 class Opened:
     """What a start found. `put_aside` names the corrupt file that was moved away; `voided` counts records of an earlier boot.
@@ -110,18 +113,23 @@ class Journal:
     def apply(self, changes: Sequence[tuple[str, Mapping[str, Any] | None]]) -> None:
         """Write all changes in one transaction; None deletes. Raises JournalUnavailable (nothing is written then)."""
         try:
+            if len(changes) == 1:  # a statement alone is a transaction
+                self._change(*changes[0])
+                return
             with self._connection:
                 self._connection.execute("BEGIN IMMEDIATE")
                 for key, record in changes:
-                    if record is None:
-                        self._connection.execute("DELETE FROM records WHERE key = ?", (key,))
-                    else:
-                        text = json.dumps(record, separators=(",", ":"))
-                        self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (key, text))
+                    self._change(key, record)
         except sqlite3.Error as error:
             raise JournalUnavailable(
                 f"the journal cannot be written: {error}", hint="see the disk of the daemon's state folder"
             ) from error
+
+    def _change(self, key: str, record: Mapping[str, Any] | None) -> None:
+        if record is None:
+            self._connection.execute("DELETE FROM records WHERE key = ?", (key,))
+        else:
+            self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (key, _text(record)))
 
     def keep(self, name: Literal["learnt", "footprints"], learnt: Mapping[str, Mapping[str, Any]]) -> None:
         """Keep what was learnt for the next start. Losing it costs estimates only: a failure is logged."""

@@ -130,7 +130,7 @@ class Forger:
     def _text(self, schema: Mapping[str, Any], name: str) -> str:
         if name in ("lease_id", "target"):
             return self._draw.choice(self.lease_ids)
-        text = self._draw.choice(["a", "u1", "any", "0", "L1-1", "π", "x" * schema.get("maxLength", 20)])
+        text: str = self._draw.choice(["a", "u1", "any", "0", "L1-1", "π", "x" * schema.get("maxLength", 20)])
         return text[: schema.get("maxLength", 1000)]
 
     # -- wrong -----------------------------------------------------------------------------------------------------

@@ -187,9 +187,19 @@ def pin_off(b: Broken) -> None:
     b.held.pinned = Order("somebody", "by hand")
 
 
+def client_off(b: Broken) -> None:
+    b.held.client = ClientId("somebody")
+
+
+def gone_and_listed(b: Broken) -> None:
+    del b.core.leases[b.held.id]
+
+
 @pytest.mark.parametrize(
     ("breaks", "says"),
     [
+        (client_off, "not listed under its process and its client"),
+        (gone_and_listed, "listed and gone"),
         (sum_off, "the sums are"),
         (account_off, "is charged"),
         (state_off, "listed as held"),

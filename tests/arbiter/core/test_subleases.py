@@ -237,7 +237,9 @@ def test_a_tree_is_in_use_while_any_of_it_is(tree: Tree, on: str) -> None:
     assert [p["uses"] for p in tree.driver.pushes("revoke")][-2:] == [1, 1]
     tree.driver.advance(40.0)
     refused = refusal(tree.policy.unloading(tree.leaf))
-    assert (refused.code, refused.details["uses"]) == ("bad_state", 1), "a holder waits while it is told of uses"
+    assert (refused.code, refused.details["uses"]) == ("bad_state", 1), (
+        "a holder waits while it is told of uses"
+    )
     assert "1 use" in tree.driver.arbiter.why("w", tree.driver.now)["leases"][0]["text"]
     effects = tree.runner.use_end(lease, "goal", owner.token(lease))
     assert revokes(effects) == [(tree.leaf, 0, 0), (tree.root, 0, 1)], "the leaf first, both may leave now"

@@ -52,7 +52,7 @@ class Recorder:
         self.done.append(("log", event["kind"]))
 
 
-def test_every_effect_is_performed_in_order() -> None:
+def test_answers_go_out_in_order_then_facts_then_readings() -> None:
     recorder = Recorder()
     recorder.executor.perform(
         [
@@ -70,12 +70,12 @@ def test_every_effect_is_performed_in_order() -> None:
         ("journal", ("lease:L1-1", {"a": 1}), ("lease:L1-0", None)),
         ("reply", A, ONE, {"lease": LEASE}),
         ("push", A, {"push": "revoke"}),
-        ("sample", GPU),
+        ("refuse", A, ONE, "bad_state"),
+        ("journal", ("lease:L1-1", None)),
         ("history", "granted"),
         ("log", "granted"),
         ("broadcast", "granted"),
-        ("refuse", A, ONE, "bad_state"),
-        ("journal", ("lease:L1-1", None)),
+        ("sample", GPU),
     ]
 
 

@@ -1,0 +1,117 @@
+"""One decision of the core alone, in this process: 100 leases and 1,000 waiters, and how its cost grows with ten times as many."""
+
+import math
+import random
+import time
+from typing import Any
+
+from harness import SLIVER, Suite, p50
+
+from arbiter.core import events as ev
+from arbiter.core.arbiter import Arbiter
+from arbiter.core.effects import Push, Reply, Sample
+from arbiter.core.settings import GpuInfo, Settings
+from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
+
+CARD = GpuId("GPU-0")
+STEP_S = 0.001
+PER_CLIENT = 50
+
+
+class Bench:
+    """A core with `leases` holders, all in use, on a full card, and `waiters` of whom none fits."""
+
+    def __init__(self, leases: int, waiters: int) -> None:
+        self.capacity = leases * SLIVER
+        gpu = GpuInfo(CARD, 0, "bench", self.capacity, 0)
+        settings = Settings(epoch=1, gpus=(gpu,), leases_per_client_max=PER_CLIENT, verify_tolerance_bytes=0)
+        self.core = Arbiter(settings, 0.0)
+        self.now = 1.0
+        self.requests = 0
+        self.tokens: dict[LeaseId, tuple[ClientId, Token]] = {}
+        self.queued: list[tuple[ClientId, LeaseId]] = []
+        self.samples: dict[str, list[float]] = {}
+        clients = [ClientId(f"{n:04x}") for n in range((leases + 2 * waiters) // PER_CLIENT + 2)]
+        for number, client in enumerate(clients):
+            process = ProcessKey(1000 + number, 1)
+            self.handle(ev.ClientConnected(client, process, 0, f"c{number}", f"i{number}"))
+        self.read()
+        for number in range(leases):
+            lease = self.acquire(clients[number % len(clients)], SLIVER)
+            client, token = self.tokens[lease]
+            self.handle(ev.ReadyReported(client, self.request(), lease, token, None))
+            self.handle(ev.UseBegan(client, self.request(), lease, token, UseId("u"), ""))
+        for number in range(waiters):
+            self.acquire(clients[number % len(clients)], 2 * SLIVER)
+        self.samples.clear()
+
+    def request(self) -> RequestId:
+        self.requests += 1
+        return RequestId(self.requests)
+
+    def handle(self, event: ev.Event) -> list[Any]:
+        self.now += STEP_S
+        start = time.perf_counter()
+        effects = self.core.handle(event, self.now)
+        self.samples.setdefault(type(event).__name__, []).append((time.perf_counter() - start) * 1e6)
+        for effect in effects:
+            if isinstance(effect, Push) and effect.body["push"] == "granted":
+                raise RuntimeError("nobody fits on this card")
+        if any(isinstance(effect, Sample) for effect in effects):
+            self.read()
+        return effects
+
+    def read(self) -> None:
+        self.handle(ev.MemorySampled(CARD, self.now, 0, self.capacity, None))
+
+    def acquire(self, client: ClientId, size: int) -> LeaseId:
+        spec = ev.Spec(
+            consumer="bench", key=ModelKey("m"), gpu="any", exclusive=False, load_peak_bytes=size,
+            steady_bytes=size, residue_bytes=0, priority=50, evictable=True, ttl_s=1e9, min_residency_s=0.0,
+            deny_on_deadline=False,
+        )  # fmt: skip
+        event = ev.AcquireRequested(client, self.request(), f"n{self.requests}", spec, None)
+        reply = next(effect for effect in self.handle(event) if isinstance(effect, Reply))
+        lease = LeaseId(reply.body["lease"]["lease_id"])
+        if reply.body["state"] == "loading":
+            self.tokens[lease] = (client, Token(*reply.body["lease"]["token"]))
+        else:
+            self.queued.append((client, lease))
+        return lease
+
+    def mix(self, rounds: int) -> None:
+        """What a busy card sees: renewals, uses, waiters that come and give up, readings."""
+        dice = random.Random(7)
+        held = list(self.tokens)
+        for _ in range(rounds):
+            lease = held[dice.randrange(len(held))]
+            client, token = self.tokens[lease]
+            self.handle(ev.Renewed(client, self.request(), ((lease, token),)))
+            self.handle(ev.UseBegan(client, self.request(), lease, token, UseId("v"), ""))
+            self.handle(ev.UseEnded(client, self.request(), lease, token, UseId("v")))
+            place = dice.randrange(len(self.queued))
+            self.queued[place], self.queued[-1] = self.queued[-1], self.queued[place]
+            client, waiting = self.queued.pop()
+            self.handle(ev.CancelRequested(client, self.request(), waiting))
+            self.acquire(client, 2 * SLIVER)
+            self.read()
+
+
+def run(suite: Suite) -> None:
+    rounds = suite.size(400, 40)
+    small, large = Bench(100, 1000), Bench(1000, 10_000)
+    for _ in range(4):
+        small.mix(rounds // 4)
+        large.mix(rounds // 4)
+    size = "100 leases, 1,000 waiters"
+    for kind, samples in sorted(small.samples.items()):
+        suite.time(f"core: {kind}, {size}", samples)
+    suite.limit(f"core: one decision, {size}", everything(small), p99_max_us=1000.0)
+    growth = p50(everything(large)) / p50(everything(small))
+    allowed = math.log(11_000) / math.log(1100)
+    name = "core: growth with ten times as many"
+    suite.figure(name, growth, "x", at_most=round(allowed, 2), note="no faster than log n")
+
+
+def everything(bench: Bench) -> list[float]:
+    return [took for samples in bench.samples.values() for took in samples]

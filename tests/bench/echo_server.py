@@ -1,0 +1,30 @@
+"""The floor of the wire: a blocking ZeroMQ ROUTER that validates each request and answers. Ends with its standard input."""
+
+import sys
+import threading
+
+import msgpack
+import zmq
+
+from schemas.wire import REQUEST
+
+PAD = "x" * 160
+
+
+def main(endpoint: str) -> None:
+    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.ROUTER)
+    socket.bind(endpoint)
+    ended = threading.Event()
+    threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
+    print("up", flush=True)
+    while not ended.is_set():
+        if socket.poll(50):
+            client, frame = socket.recv_multipart()
+            request = REQUEST.validate_python(msgpack.unpackb(frame))
+            body = {"re": request.id, "epoch": 1, "ok": True, "pad": PAD}
+            socket.send_multipart([client, msgpack.packb(body)])
+    socket.close(linger=0)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,34 @@
+"""A client that sends pings as fast as its socket takes them and reads what comes back. Ends with its standard input."""
+
+import sys
+import threading
+
+import msgpack
+import zmq
+from harness import Peer
+
+BURST = 100
+
+
+def main(endpoint: str) -> None:
+    peer = Peer(endpoint, "flooder").hello()
+    ended = threading.Event()
+    threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
+    print("up", flush=True)
+    payload = msgpack.packb({"op": "ping", "id": 9})
+    while not ended.is_set():
+        try:
+            for _ in range(BURST):
+                peer.socket.send(payload, zmq.NOBLOCK)
+        except zmq.Again:
+            pass
+        try:
+            while True:
+                peer.socket.recv(zmq.NOBLOCK)
+        except zmq.Again:
+            pass
+    peer.close()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

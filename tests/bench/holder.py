@@ -1,0 +1,10 @@
+"""A process that holds a lease until it is killed; says a line once it has it."""
+
+import sys
+
+from harness import Peer
+
+if __name__ == "__main__":
+    Peer(sys.argv[1], "victim").hello().acquire()
+    print("holds", flush=True)
+    sys.stdin.read()
