@@ -1,7 +1,7 @@
-"""What `replay` says to people, as lines. Pure."""
+"""What `replay` and `simulate` say to people, as lines. Pure."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from arbiter.replay.codec import digest, summary, to_json
@@ -67,6 +67,35 @@ def _entry(entry: Entry) -> str:
 
 def _cut(text: str) -> str:
     return text if len(text) <= WIDTH else text[: WIDTH - 1] + "…"
+
+
+DECISIONS = frozenset(
+    {
+        "queued",
+        "granted",
+        "ready",
+        "revoke_asked",
+        "deadline_passed",
+        "verified",
+        "denied",
+        "pressure",
+        "standby",
+        "parked",
+    }
+)
+"""Kinds of notes that a timeline shows."""
+
+
+def timeline_lines(
+    policy: str, timeline: Sequence[tuple[float, str, Mapping[str, Any]]], limit: int
+) -> list[str]:
+    """The first decisions of a run, each with its reason."""
+    decided = [(at, kind, data) for at, kind, data in timeline if kind in DECISIONS]
+    lines = [f"decisions under {policy} (the first {min(limit, len(decided))} of {len(decided)})"]
+    for at, kind, data in decided[:limit]:
+        why = data.get("reason") or data.get("verdict") or ""
+        lines.append(_cut(f"{at:9.3f} s  {kind:<12}  {data.get('consumer', ''):<12}  {why}".rstrip()))
+    return lines
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[Any]], left: int = 1) -> list[str]:

@@ -1,9 +1,19 @@
-"""An event log of what a `CoreDriver` went through, written at once and without a daemon."""
+"""Event logs without a daemon: of what a `CoreDriver` went through, and of a simulated run."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 from arbiter.core.arbiter import Arbiter
+from arbiter.core.effects import Effect
+from arbiter.core.events import Event
+from arbiter.core.settings import Settings
+from arbiter.replay.actors import START_S as SIMULATED_START_S
 from arbiter.replay.logfile import Header, engine_id, entry_line, file_name, header_line
+from arbiter.replay.outcome import Outcome
+from arbiter.replay.simulator import Engine, simulate
+from arbiter.replay.workload import Workload
 from arbiter.testing.core_driver import START_S, CoreDriver
 
 
@@ -17,3 +27,30 @@ def write_log(driver: CoreDriver, folder: Path, *, made_at: float = START_S) -> 
         for now, event in driver.events:
             file.write(entry_line(now, event, engine.handle(event, now)))
     return path
+
+
+@dataclass(slots=True)
+class Recording:
+    """A simulated engine whose every event goes to a log file: what a daemon with these consumers would have recorded."""
+
+    engine: Engine
+    file: TextIO
+    holders_exit: bool = False
+
+    def handle(self, event: Event, now: float) -> Sequence[Effect]:
+        effects = self.engine.handle(event, now)
+        self.file.write(entry_line(now, event, effects))
+        return effects
+
+    def next_deadline(self) -> float | None:
+        return self.engine.next_deadline()
+
+
+def record_workload(workload: Workload, settings: Settings, folder: Path) -> tuple[Path, Outcome]:
+    """Simulate and record: the log, and what came of it."""
+    header = Header("0", engine_id(), settings.epoch, 0, "start", 0.0, SIMULATED_START_S, settings, None)
+    path = folder / file_name(0.0, settings.epoch, 0)
+    with path.open("w") as file:
+        file.write(header_line(header))
+        recording = Recording(Engine.under(settings, settings.policy), file)
+        return path, simulate(workload, recording, settings.policy)

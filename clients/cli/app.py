@@ -204,10 +204,22 @@ _PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_op
 
 @app.command(context_settings=_PASSED_ON)
 def replay(context: typer.Context) -> None:
-    """Run a recorded event log through the engine again: the same decisions, byte for byte? See `vramctl replay --help`."""
+    """Run a recorded event log through the engine again: the same decisions, byte for byte? What would another policy have done?
+
+    See `vramctl replay --help`.
+    """
     from clients.cli.engine import run as start
 
     raise typer.Exit(start(["replay", *context.args]))
+
+
+@app.command(context_settings=_PASSED_ON)
+def simulate(context: typer.Context) -> None:
+    """Run a scenario through the engine, under one policy or several side by side; see `vramctl simulate --help`."""
+    from clients.cli.engine import run as start
+    from clients.cli.engine import with_scenario
+
+    raise typer.Exit(start(["simulate", *with_scenario(context.args)]))
 
 
 @app.command(context_settings=_PASSED_ON)

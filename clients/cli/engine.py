@@ -1,9 +1,13 @@
-"""`vramctl replay`: needs the engine, which clients never import, so it is a program of the arbiter's that is started here."""
+"""`vramctl replay` and `simulate`: they need the engine, which clients never import, so it is a program of the arbiter's that is started here."""
 
+import os
 import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from pathlib import Path
+
+from clients.configs import configs_folder
 
 PROGRAM = "arbiter.replay"
 
@@ -14,7 +18,18 @@ def run(arguments: Sequence[str]) -> int:
         signal.SIGINT, signal.SIG_IGN
     )  # Ctrl-C is the program's; it is waited for in any case
     try:
-        code = subprocess.run([sys.executable, "-m", PROGRAM, *arguments], check=False).returncode
+        code = subprocess.run(
+            [sys.executable, "-m", PROGRAM, *arguments],
+            check=False,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        ).returncode
     finally:
         signal.signal(signal.SIGINT, before)
     return code if code >= 0 else 128 - code
+
+
+def with_scenario(arguments: Sequence[str]) -> list[str]:
+    """A word that is no file but names a shipped scenario becomes its path."""
+    folder = configs_folder(os.environ) / "scenarios"
+    shipped = {path.stem: str(path) for path in folder.glob("*.yaml")}
+    return [shipped[word] if word in shipped and not Path(word).exists() else word for word in arguments]
