@@ -29,7 +29,7 @@ exit codes:
   2   wrong flags or configuration
   3   another arbiter serves this socket or uses this state folder
   4   no GPU: no NVIDIA driver or no card (--gpu fake:8GiB simulates one)
-  5   the disk of the state folder is full
+  5   the disk of the state folder is full or failing
   70  a defect: the core's state became invalid; the log says how, a restart recovers the leases
 
 environment:

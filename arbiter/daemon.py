@@ -153,6 +153,7 @@ class Parts:
     sessions: SessionTable
     history: History
     journal: Journal
+    executor: Executor
 
 
 class Daemon:
@@ -235,7 +236,15 @@ class Daemon:
         watch = ProcessWatch(loop, start_ticks, died)
         undo.callback(watch.close)
         wire = self._session_settings(journal.opened.epoch, boot, group)
-        sessions = SessionTable(wire, server, inbox, history.read, watch.add, time.monotonic)
+        sessions = SessionTable(
+            wire,
+            server,
+            inbox,
+            history.read,
+            watch.add,
+            time.monotonic,
+            problems=lambda: problems(journal, history),
+        )
         executor = Executor(sessions, journal, history, prober.sample, inbox.post, telemetry.log_event)
 
         self._tell_start(history, journal, places, gpus)  # 5
@@ -248,7 +257,7 @@ class Daemon:
         server.bind()  # 6
         server.start(loop, sessions.receive)
         undo.callback(server.stop_receiving)
-        return Parts(gpus, inbox, sessions, history, journal)
+        return Parts(gpus, inbox, sessions, history, journal, executor)
 
     def _take_folders(self, places: Places, group: int | None, undo: contextlib.ExitStack) -> None:
         make_private_folder(places.socket.parent, group)
@@ -349,7 +358,12 @@ class Daemon:
             await asyncio.sleep(period_s)
             if notifier.watchdog_s is not None and parts.inbox.pulse():
                 notifier.watchdog()
-            if text != (text := f"{status_text(parts.gpus)}; {len(parts.sessions)} clients"):
+            parts.journal.settle()
+            parts.executor.settle()
+            wrong = problems(parts.journal, parts.history)
+            if text != (
+                text := "; ".join([*wrong, status_text(parts.gpus), f"{len(parts.sessions)} clients"])
+            ):
                 notifier.status(text)
             if time.monotonic() - kept_at >= KEEP_LEARNT_EVERY_S and not parts.inbox.closed:
                 keep_learnt(parts)
@@ -364,6 +378,13 @@ def keep_learnt(parts: Parts) -> None:
 
 def status_text(gpus: Sequence[GpuInfo]) -> str:
     return f"serving {', '.join(f'{gpu.name} ({format_bytes(gpu.capacity_bytes)})' for gpu in gpus)}"
+
+
+def problems(journal: Journal, history: History) -> list[str]:
+    """What an operator should know of the daemon's own files, in words."""
+    aside = journal.opened.put_aside
+    corrupt = "" if aside is None else f"the journal was not readable and was put aside as {aside}"
+    return [problem for problem in (corrupt, journal.problem, history.problem) if problem]
 
 
 def boot_id() -> str:

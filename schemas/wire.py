@@ -394,6 +394,7 @@ class StatusReply(TypedDict):
     clients: int
     host_ram: NotRequired[dict[str, int]]  # {"budget_bytes", "parked_bytes"}
     drained: str  # who drained the arbiter and why; "" while it grants
+    problems: list[str]  # what is wrong with the daemon's own files, in words; empty when all is well
 
 
 class WhyReply(TypedDict):

@@ -39,11 +39,12 @@ class Push:
 
 @dataclass(frozen=True, slots=True)
 class JournalPut:
-    """Write a record durably *before* any later effect of the same batch. Failure posts JournalFailed(key) and drops the rest of
-    the batch that names the same key's lease."""
+    """Write a record durably *before* any later effect of the same batch. Failure posts JournalFailed(key); where the record `gates`
+    what follows (a grant), the rest of the batch that names the same key's lease is dropped."""
 
     key: str  # "lease:L3-17" or "residue:PID@START:GPU"
     record: Mapping[str, Any]
+    gates: bool = False
 
 
 @dataclass(frozen=True, slots=True)

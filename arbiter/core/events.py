@@ -237,10 +237,11 @@ class ProbeFailed:
 
 @dataclass(frozen=True, slots=True)
 class JournalFailed:
-    """A record could not be written: the grant that it was for has not been sent and is withdrawn."""
+    """A record could not be written. `gates`: it was that of a grant, which has not been sent and is withdrawn."""
 
     key: str
     reason: str
+    gates: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -137,7 +137,7 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     _collect_evictions(core, gpu, lease)
     lease.expires_at = core.now + lease.spec.ttl_s
     core.timers.set(("ttl", lease.id), lease.expires_at)
-    core.record_lease(lease)
+    core.record_lease(lease, gates=True)
     if lease.answered:
         core.push(lease, {"push": "granted", "lease": explain.view(core, lease)})
         lease.request = None

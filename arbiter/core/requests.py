@@ -341,7 +341,7 @@ def ready(core: Core, event: ReadyReported) -> None:
     lease.said_ready = True
     held = become_held(core, lease, event.measured_bytes)
     core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
-    core.record_line(lease)  # after the reply: a record that fails here only makes a recovery more careful
+    core.record_line(lease)
     for one in held:
         core.learn(one.spec.consumer, "load_s", core.now - one.granted_at)
         core.note(

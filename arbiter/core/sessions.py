@@ -105,8 +105,8 @@ def on_journal_failed(core: Core, event: JournalFailed) -> None:
     """
     core.note("journal_failed", key=event.key, reason=event.reason)
     lease = core.leases.get(LeaseId(event.key.removeprefix("lease:")))
-    if lease is None or lease.state is not LeaseState.LOADING or lease.estate is not None:
-        return  # a sub-lease was carved out of it: its own grant was written and heard of long ago
+    if not event.gates or lease is None or lease.state is not LeaseState.LOADING or lease.estate is not None:
+        return  # with an estate, a sub-lease was carved out of it: its own grant was written and heard of long ago
     gpu = core.gpu_of(lease)
     gpu.ledger.withdraw(lease.id, core.now)
     families.gone(core, gpu, lease.id, lease.process)

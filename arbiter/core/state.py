@@ -167,8 +167,8 @@ class Core:
                 facts["traceparent"] = lease.traceparent
         self.out.append(Note(kind, {**facts, **data}))
 
-    def journal(self, key: str, record: Mapping[str, Any]) -> None:
-        self.out.append(JournalPut(key, record))
+    def journal(self, key: str, record: Mapping[str, Any], *, gates: bool = False) -> None:
+        self.out.append(JournalPut(key, record, gates))
 
     def forget(self, key: str) -> None:
         self.out.append(JournalDelete(key))
@@ -315,8 +315,9 @@ class Core:
         seen = self.durations.get(consumer, {}).get(phase)
         return median(seen) if seen else None
 
-    def record_lease(self, lease: Lease, *, debt: bool = False) -> None:
-        """Write a lease that is resident (or its debt) or away to the journal."""
+    def record_lease(self, lease: Lease, *, debt: bool = False, gates: bool = False) -> None:
+        """Write a lease that is resident (or its debt) or away to the journal. `gates`: it is a grant, which does not take place
+        unless its record is written. Whatever else is recorded has happened; a stale record makes a later recovery more careful."""
         spec = lease.spec
         charge_bytes = 0 if lease.gpu is None else self.gpu_of(lease).ledger.charge_bytes(lease.id)
         assert lease.token is not None, f"{lease.id} is recorded without a token"
@@ -363,6 +364,7 @@ class Core:
                     "independent": spec.independent,
                 },
             },
+            gates=gates,
         )
 
     def record_line(self, lease: Lease) -> None:

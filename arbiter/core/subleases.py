@@ -46,7 +46,7 @@ def acquire(core: Core, event: AcquireRequested, ref: tuple[LeaseId, Token]) -> 
     core.granted.append((token, None))
     lease.expires_at = core.now + spec.ttl_s
     core.timers.set(("ttl", lease.id), lease.expires_at)
-    core.record_lease(lease)
+    core.record_lease(lease, gates=True)
     core.record_lease(parent)
     lease.answered = True
     core.reply(lease.client, event.request, {"state": "loading", "lease": explain.view(core, lease)})

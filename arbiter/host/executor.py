@@ -63,7 +63,7 @@ class Executor:
 
     def perform(self, effects: Sequence[fx.Effect]) -> None:
         """One batch. A grant is on disk before its holder hears of it: consecutive journal effects are one transaction, and if that
-        fails, what the batch still has to say about those leases is not said (the waiting request is refused instead).
+        fails, what the batch still has to say about leases granted in it is not said (the waiting request is refused instead).
 
         Whoever waits for an answer has it first: facts are written down after all answers, and readings are begun last of all, since
         their thread takes the interpreter from this one.
@@ -107,10 +107,16 @@ class Executor:
         for sample in samples:
             self._sample(sample.gpu)
 
+    def settle(self) -> None:
+        """Try again to delete what could not be deleted, if anything is left of that."""
+        if self.owed:
+            self._write((), {})
+
     def _write(
         self, run: Sequence[fx.JournalPut | fx.JournalDelete], refused: dict[str, JournalUnavailable]
     ) -> None:
         changes = [(e.key, e.record if isinstance(e, fx.JournalPut) else None) for e in run]
+        gates = {e.key for e in run if isinstance(e, fx.JournalPut) and e.gates}
         named = {key for key, _ in changes}
         owed: list[tuple[str, Mapping[str, Any] | None]] = [
             (key, None) for key in self.owed if key not in named
@@ -123,10 +129,11 @@ class Executor:
             for key, record in changes:
                 if record is None:
                     self.owed[key] = None
-                else:
-                    self.owed.pop(key, None)
+                    continue
+                self.owed.pop(key, None)
+                if key in gates:
                     refused[key.removeprefix("lease:")] = error
-                    self._post(ev.JournalFailed(key, error.message))
+                self._post(ev.JournalFailed(key, error.message, key in gates))
 
 
 def _lease_of(effect: fx.Effect) -> str | None:

@@ -10,6 +10,7 @@ import json
 import logging
 import queue
 import sqlite3
+import sys
 import threading
 import time
 from collections import deque
@@ -66,15 +67,16 @@ class History:
         self._thread: threading.Thread | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
+        self.problem = "" if store is not None else "history is kept in memory only: its file cannot be used"
 
     @classmethod
-    def open(cls, folder: Path, max_events: int, days: float) -> Self:
+    def open(cls, folder: Path, max_events: int, days: float, wall: Callable[[], float] = time.time) -> Self:
         """Open or make `history.sqlite`; numbering goes on where it ended. Never fails: without a disk it is memory only."""
         path = folder / "history.sqlite"
         for attempt in (1, 2):
             try:
-                store = _Store(path, max_events, days)
-                return cls(store, store.last_seq())
+                store = _Store(path, max_events, days, wall)
+                return cls(store, store.last_seq(), wall)
             except sqlite3.DatabaseError as error:
                 log.error("history %s: %s", path, error)
                 if attempt == 1 and not isinstance(error, sqlite3.OperationalError) and path.exists():
@@ -84,7 +86,7 @@ class History:
                     continue
                 break
         log.error("history is kept in memory only")
-        return cls(None, 0)
+        return cls(None, 0, wall)
 
     def start(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
@@ -143,7 +145,7 @@ class History:
 
     # -- the thread ----------------------------------------------------------------------------------------------
     def _run(self, store: "_Store") -> None:
-        failing = False
+        owed: deque[Event] = deque(maxlen=BUFFER_MAX)  # what the disk did not take
         while (work := self._work.get()) is not None:
             try:
                 if isinstance(work, _Question):
@@ -153,12 +155,14 @@ class History:
                     }
                     self._answer(work.done, body)
                 else:
-                    store.add(work)
-                    failing = False
+                    owed.extend(work)
+                    store.add(tuple(owed))
+                    owed.clear()
+                    self.problem = ""
             except sqlite3.Error as error:
-                if not failing:  # a full disk is worth one line, not five a second
+                if not self.problem:  # a full disk is worth one line, not five a second
                     log.error("history: %s; events are kept in memory only until that ends", error)
-                failing = True
+                self.problem = f"history cannot be written ({error}): events are kept in memory only"
                 if isinstance(work, _Question):
                     self._answer(work.done, {"events": [], "last_seq": self._last_seq, "problem": str(error)})
         store.close()
@@ -174,10 +178,13 @@ class History:
 class _Store:
     """The table. Made by the main thread, used by the history thread alone."""
 
-    def __init__(self, path: Path, max_events: int, days: float) -> None:
+    def __init__(self, path: Path, max_events: int, days: float, wall: Callable[[], float]) -> None:
+        self._wall = wall
+        self._opened_at = time.monotonic()
         self._max_events = max_events
         self._days = days
         self._since_prune = 0
+        self._earlier = 0  # the last number of earlier runs
         self._db = sqlite3.connect(path, isolation_level=None, timeout=1.0, check_same_thread=False)
         try:
             path.chmod(0o600)
@@ -191,9 +198,9 @@ class _Store:
     def last_seq(self) -> int:
         """The number after which numbering goes on: never one that was given out before."""
         row = self._db.execute("SELECT seq, kind FROM events ORDER BY seq DESC LIMIT 1").fetchone()
-        if row is None:
-            return 0
-        return int(row[0]) + (0 if row[1] == CLEAN_END else SKIPPED_AFTER_CRASH)
+        if row is not None:
+            self._earlier = int(row[0]) + (0 if row[1] == CLEAN_END else SKIPPED_AFTER_CRASH)
+        return self._earlier
 
     def add(self, events: Sequence[Event]) -> None:
         rows = [
@@ -205,15 +212,18 @@ class _Store:
             self._db.executemany("INSERT OR REPLACE INTO events VALUES (?, ?, ?, ?)", rows)
             self._since_prune += len(rows)
             if self._since_prune >= PRUNE_EVERY_EVENTS:
-                self.prune(time.time())
+                self.prune(self._wall())
 
     def prune(self, wall_s: float) -> None:
-        """Drop what is beyond the number or the age."""
+        """Drop what is beyond the number or the age. The wall clock may be set meanwhile, by decades on a machine without a battery: an
+        event of this run is old only when the run itself is."""
         self._since_prune = 0
         self._db.execute(
             "DELETE FROM events WHERE seq <= (SELECT MAX(seq) FROM events) - ?", (self._max_events,)
         )
-        self._db.execute("DELETE FROM events WHERE at_wall_s < ?", (wall_s - self._days * 86_400,))
+        age_s = self._days * 86_400
+        up_to = self._earlier if time.monotonic() - self._opened_at < age_s else sys.maxsize
+        self._db.execute("DELETE FROM events WHERE at_wall_s < ? AND seq <= ?", (wall_s - age_s, up_to))
 
     def find(self, after: int, limit: int, kinds: tuple[str, ...]) -> list[Event]:
         wanted = json.dumps(list(kinds))

@@ -54,12 +54,13 @@ class Journal:
         self._boot_id = boot_id
         self._connection = connection
         self._kept: dict[str, str] = {}  # what `keep` wrote last
+        self.problem = ""
         self.opened = opened
 
     @classmethod
     def open(cls, folder: Path, boot_id: str, *, wall_s: float | None = None) -> Self:
         """Open or make the journal in `folder`, and count a new epoch. Raises ConfigError if the folder cannot be written,
-        JournalUnavailable if its disk is full: without a durable epoch tokens could be given out twice.
+        JournalUnavailable if its disk is full or failing: without a durable epoch tokens could be given out twice.
 
         1. Read; corrupt: put aside, start empty. 2. Another boot id: drop the records. 3. Epoch = 1 + the greatest known.
         """
@@ -85,9 +86,9 @@ class Journal:
             epoch = _next_epoch(folder, meta, put_aside is not None, wall_s)  # 3
             _write_meta(connection, boot_id, epoch, drop_records=voided > 0)
         except (OSError, sqlite3.OperationalError) as error:
-            if _is_full(error):
+            if _is_disk(error):
                 raise JournalUnavailable(
-                    f"the disk of the state folder {folder} is full: {error}",
+                    f"the disk of the state folder {folder} is full or failing: {error}",
                     hint="make room on it, or choose another --state-dir",
                 ) from error
             raise ConfigError(
@@ -112,6 +113,7 @@ class Journal:
 
     def apply(self, changes: Sequence[tuple[str, Mapping[str, Any] | None]]) -> None:
         """Write all changes in one transaction; None deletes. Raises JournalUnavailable (nothing is written then)."""
+        written = self._connection.total_changes
         try:
             if len(changes) == 1:  # a statement alone is a transaction
                 self._change(*changes[0])
@@ -121,9 +123,24 @@ class Journal:
                 for key, record in changes:
                     self._change(key, record)
         except sqlite3.Error as error:
+            self.problem = (
+                f"the journal cannot be written ({error}): what is held stays, nothing new is granted"
+            )
             raise JournalUnavailable(
                 f"the journal cannot be written: {error}", hint="see the disk of the daemon's state folder"
             ) from error
+        if self._connection.total_changes > written:  # else nothing was written, which a full disk allows
+            self.problem = ""
+
+    def settle(self) -> None:
+        """After a failure: can it be written again? Asked now and then, so that room on the disk is noticed without a request."""
+        if self.problem:
+            try:
+                self._connection.execute("INSERT OR REPLACE INTO meta VALUES ('settled', hex(randomblob(8)))")
+            except sqlite3.Error as error:
+                log.debug("journal: %s", error)
+            else:
+                self.problem = ""
 
     def _change(self, key: str, record: Mapping[str, Any] | None) -> None:
         if record is None:
@@ -219,10 +236,11 @@ def _is_corruption(error: sqlite3.OperationalError) -> bool:
     )
 
 
-def _is_full(error: OSError | sqlite3.OperationalError) -> bool:
+def _is_disk(error: OSError | sqlite3.OperationalError) -> bool:
+    """Trouble that may be over soon, unlike a wrong folder."""
     if isinstance(error, OSError):
-        return error.errno in (errno.ENOSPC, errno.EDQUOT)
-    return error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_FULL
+        return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+    return error.sqlite_errorcode & 0xFF in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR)
 
 
 def _put_aside(path: Path) -> Path:

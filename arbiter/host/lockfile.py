@@ -4,6 +4,7 @@ The socket needs it because libzmq silently takes over an existing socket path a
 daemons lock two files of one name. A dead daemon's lock is gone with it. Must not know what is being protected.
 """
 
+import contextlib
 import fcntl
 import os
 from pathlib import Path
@@ -37,9 +38,12 @@ class LockFile:
                 hint="stop it first, or give this one another --endpoint and --state-dir",
                 details={"pid": int(text) if text.isdecimal() else None, "lock": str(self._path)},
             ) from error
-        os.ftruncate(fd, 0)
-        os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
         self._fd = fd
+        with contextlib.suppress(
+            OSError
+        ):  # a full disk: the lock holds, only the pid for the other's message is missing
+            os.ftruncate(fd, 0)
+            os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
 
     def release(self) -> None:
         if self._fd is not None:

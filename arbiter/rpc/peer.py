@@ -60,6 +60,11 @@ def start_ticks(pid: int) -> int | None:
 
 def identify(address: str) -> Peer:
     """The process behind a peer address. Raises NotPermitted if it cannot be known or has ended."""
+    if address.endswith(":0"):
+        raise NotPermitted(
+            "the process at the other end cannot be seen from here: it runs in another pid namespace, not below the arbiter's",
+            hint="run the arbiter in the host's pid namespace (docker: --pid=host); clients may be in containers",
+        )
     try:
         credentials = parse_peer_address(address)
     except ValueError as error:

@@ -95,6 +95,7 @@ class SessionTable:
         watch: Callable[[ProcessKey], None],
         clock: Callable[[], float],
         identify: Callable[[str], Peer] = identify,
+        problems: Callable[[], list[str]] = list,
     ) -> None:
         self._settings = settings
         self._wire = wire
@@ -103,6 +104,7 @@ class SessionTable:
         self._watch = watch
         self._clock = clock
         self._identify = identify
+        self._problems = problems
         self._sessions: dict[ClientId, Session] = {}
         self._of_process: dict[ProcessKey, dict[ClientId, Session]] = {}
         self._subscribers: dict[ClientId, Session] = {}
@@ -344,7 +346,7 @@ class SessionTable:
             case w.Ping():
                 self.reply(client, re, {"server": self._settings.server})
             case w.Status():
-                self.reply(client, re, self._decisions.status())
+                self.reply(client, re, {**self._decisions.status(), "problems": self._problems()})
             case w.Why():
                 self.reply(client, re, self._decisions.why(request.consumer))
             case w.History():

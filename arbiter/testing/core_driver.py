@@ -153,11 +153,12 @@ class CoreDriver:
         effects = self.arbiter.handle(event, self.now)
         self.arbiter.check_all()
         failed: list[JournalPut] = []
+        held_back: list[JournalPut] = []
         performed: list[Effect] = []
         for effect in effects:
-            if failed and _names(effect, failed[0].key.removeprefix("lease:")):
+            if held_back and _names(effect, held_back[0].key.removeprefix("lease:")):
                 if isinstance(effect, Reply):
-                    details = {"key": failed[0].key}
+                    details = {"key": held_back[0].key}
                     performed.append(
                         Refuse(
                             effect.client,
@@ -174,6 +175,7 @@ class CoreDriver:
                 case JournalPut():
                     if self.journal_failing:
                         failed.append(effect)
+                        held_back += [effect] if effect.gates else []
                     else:
                         self.journal[effect.key] = effect.record
                 case JournalDelete():
@@ -186,7 +188,7 @@ class CoreDriver:
                     pass
         self.effects += performed
         for put in failed:
-            self.post(JournalFailed(put.key, self.journal_failing))
+            self.post(JournalFailed(put.key, self.journal_failing, put.gates))
         return effects
 
     def advance(self, seconds: float) -> None:

@@ -45,6 +45,7 @@ def status_lines(status: Message) -> list[str]:
         lines.append("  after a restart nothing is granted until every lease is accounted for")
     if status.get("drained"):
         lines.append(f"  drained by {status['drained']}; nothing is granted until `vramctl resume`")
+    lines += [f"  {problem}" for problem in status.get("problems", ())]
     for gpu in status["gpus"]:
         lines += ["", *_gpu_lines(gpu)]
     lines.append("")

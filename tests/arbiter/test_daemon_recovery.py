@@ -129,6 +129,7 @@ def test_a_corrupt_journal_is_reported_and_the_holder_is_believed(make_arbiter: 
         client.hello()
         status = client.ask("status")
         assert (status["phase"], status["epoch"]) == ("recovering", 2)
+        assert f"put aside as {arbiter.state / 'journal.sqlite.corrupt-1'}" in status["problems"][0]
         kinds = [event["kind"] for event in client.ask("history")["events"]]
         assert "journal_put_aside" in kinds
         assert client.acquire("waiter", GIB)["state"] == "queued", "somebody may hold what nobody remembers"

@@ -1,8 +1,8 @@
 """Connections that come and go, deaths, and a journal that fails."""
 
 from arbiter.core.effects import Note, Push, Refuse
-from arbiter.core.events import ClientLeft, JournalFailed, ProcessDied
-from arbiter.testing.core_driver import CoreDriver, refusal
+from arbiter.core.events import ClientLeft, JournalFailed, OperatorAsked, ProcessDied
+from arbiter.testing.core_driver import CoreDriver, answer, refusal
 from schemas import defaults as d
 from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
 
@@ -190,6 +190,30 @@ def test_other_records_that_fail_are_noted_and_nothing_else() -> None:
     assert driver.state(held) == "held"
     effects = driver.post(JournalFailed("residue:1@2:GPU-0", "disk full"))
     assert [type(effect) for effect in effects] == [Note]
+
+
+def test_a_loading_holder_is_not_undone_by_a_later_record() -> None:
+    """Regression: a pin that a full disk did not take withdrew the lease of a holder that was loading, and its bytes were given away."""
+    driver = CoreDriver(8 * GIB)
+    det, ops = driver.consumer("det"), driver.consumer("ops")
+    loading = det.acquire(5 * GIB)
+    driver.journal_failing = "disk full"
+    driver.post(OperatorAsked(ops.client, driver.next_request(), "pin", loading, "uid 0", "demo"))
+    assert driver.notes("journal_failed")
+    assert driver.state(loading) == "loading"
+    assert driver.gpu()["charged_bytes"] == 5 * GIB
+    assert not driver.pushes("denied")
+
+
+def test_a_release_is_told_though_its_record_fails() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    held = det.acquire(5 * GIB)
+    det.load(held)
+    driver.journal_failing = "disk full"
+    det.hold(0)
+    answer(det.release(held))
+    assert driver.notes("released")
 
 
 def test_strangers_to_the_core_die_unmourned() -> None:

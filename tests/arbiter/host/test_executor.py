@@ -84,7 +84,7 @@ def test_a_grant_that_cannot_be_written_is_not_sent() -> None:
     recorder.disk_full = True
     recorder.executor.perform(
         [
-            fx.JournalPut("lease:L1-1", {"a": 1}),
+            fx.JournalPut("lease:L1-1", {"a": 1}, gates=True),
             fx.Reply(A, ONE, {"state": "loading", "lease": LEASE}),
             fx.Note("granted", {"lease_id": "L1-1"}),
             fx.Push(A, {"push": "granted", "lease": LEASE}),
@@ -97,6 +97,26 @@ def test_a_grant_that_cannot_be_written_is_not_sent() -> None:
         ("refuse", A, ONE, "journal_unavailable"),
         ("push", A, {"push": "revoke", "lease_id": "L1-9"}),
         ("sample", GPU),
+    ]
+
+
+def test_what_has_happened_is_told_though_its_record_cannot_be_written() -> None:
+    """Regression: with a full disk a release was refused and missing in the history although it had taken place."""
+    recorder = Recorder()
+    recorder.disk_full = True
+    recorder.executor.perform(
+        [
+            fx.JournalPut("lease:L1-1", {"state": "verifying"}),
+            fx.Note("released", {"lease_id": "L1-1"}),
+            fx.Reply(A, ONE, {"lease": LEASE}),
+        ]
+    )
+    assert recorder.done == [
+        ("post", ev.JournalFailed("lease:L1-1", "disk full", gates=False)),
+        ("reply", A, ONE, {"lease": LEASE}),
+        ("history", "released"),
+        ("log", "released"),
+        ("broadcast", "released"),
     ]
 
 
@@ -129,3 +149,15 @@ def test_a_record_that_is_written_again_is_not_deleted_later() -> None:
     recorder.disk_full = False
     recorder.executor.perform([fx.JournalDelete("lease:L1-2")])
     assert recorder.done[-1] == ("journal", ("lease:L1-2", None))
+
+
+def test_what_is_owed_is_deleted_without_a_further_change() -> None:
+    recorder = Recorder()
+    recorder.disk_full = True
+    recorder.executor.perform([fx.JournalDelete("lease:L1-1")])
+    recorder.executor.settle()
+    assert recorder.done == [], "the disk is no better yet"
+    recorder.disk_full = False
+    recorder.executor.settle()
+    recorder.executor.settle()
+    assert recorder.done == [("journal", ("lease:L1-1", None))], "once"

@@ -103,10 +103,51 @@ def test_number_and_age_are_bounded(tmp_path: Path) -> None:
 
     with_history(tmp_path, many, max_events=100)
     with_history(tmp_path, look, max_events=100)
-    store = module._Store(tmp_path / "history.sqlite", 100, 1.0)
+    store = module._Store(tmp_path / "history.sqlite", 100, 1.0, time.time)
+    store.last_seq()
     store.prune(time.time() + 2 * 86_400)
     assert store.find(0, 10, ()) == []
     store.close()
+
+
+WILD = (1e9, 0.0, 4e9, -1e6, 1e9, 1e12, 5.0)
+"""A clock without a battery: 2001, 1970, 2096, before the epoch, back, far away, 1970."""
+
+
+def test_a_wild_wall_clock_only_dates_events(tmp_path: Path) -> None:
+    """Numbers, order and what is kept follow the run, not the clock that is set meanwhile."""
+    clock = iter(WILD)
+
+    async def run() -> None:
+        history = History.open(tmp_path, 100_000, 7.0, lambda: next(clock))
+        history.start(asyncio.get_running_loop())
+        for number in range(len(WILD)):
+            history.append("x", {"number": number})
+        found = (await read(history))["events"]
+        assert [(e["seq"], e["number"], e["at_wall_s"]) for e in found] == [
+            (number + 1, number, at) for number, at in enumerate(WILD)
+        ]
+        history.close()
+
+    asyncio.run(run())
+    store = module._Store(tmp_path / "history.sqlite", 100_000, 7.0, time.time)
+    assert len(store.find(0, 100, ())) == len(WILD)
+    store.close()
+
+
+def test_a_clock_that_is_set_by_decades_does_not_empty_the_history_of_this_run(tmp_path: Path) -> None:
+    """Regression: a robot boots in 1970 and hears the time from the network; its morning was pruned as older than a week."""
+    store = module._Store(tmp_path / "history.sqlite", 100_000, 7.0, time.time)
+    assert store.last_seq() == 0
+    store.add([{"seq": number, "at_wall_s": 60.0 * number, "kind": "x"} for number in range(1, 6)])
+    store.prune(1.8e9)
+    assert [event["seq"] for event in store.find(0, 100, ())] == [1, 2, 3, 4, 5]
+    store.close()
+    later = module._Store(tmp_path / "history.sqlite", 100_000, 7.0, time.time)
+    assert later.last_seq() == 5 + SKIPPED_AFTER_CRASH
+    later.prune(1.8e9)
+    assert later.find(0, 100, ()) == [], "the next run may"
+    later.close()
 
 
 def test_a_broken_database_is_put_aside(tmp_path: Path) -> None:

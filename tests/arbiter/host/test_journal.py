@@ -156,6 +156,24 @@ def test_footprints_survive_a_boot_and_a_journal_that_is_put_aside(tmp_path: Pat
         assert (opened.footprints, opened.put_aside) == ({}, None)
 
 
+def test_a_write_that_writes_nothing_proves_nothing(tmp_path: Path) -> None:
+    """A full disk lets an empty transaction pass."""
+    journal = Journal.open(tmp_path, "boot-1")
+    blocker = sqlite3.connect(tmp_path / "journal.sqlite", isolation_level=None)
+    blocker.execute("BEGIN IMMEDIATE")
+    with pytest.raises(JournalUnavailable):
+        journal.apply([("lease:L1-1", {"a": 1})])
+    journal.settle()
+    assert "nothing new is granted" in journal.problem, "the disk is no better yet"
+    blocker.execute("ROLLBACK")
+    blocker.close()
+    journal.apply([("lease:L1-1", None)])
+    assert journal.problem
+    journal.settle()
+    assert journal.problem == ""
+    journal.close()
+
+
 def test_a_write_that_fails_is_typed_and_writes_nothing(tmp_path: Path) -> None:
     journal = Journal.open(tmp_path, "boot-1")
     blocker = sqlite3.connect(tmp_path / "journal.sqlite", isolation_level=None)

@@ -51,6 +51,13 @@ def test_a_living_peer_is_identified_with_its_start_time() -> None:
     assert peer.process == ProcessKey(os.getpid(), ticks)
 
 
+def test_a_peer_of_another_pid_namespace_is_told_what_to_do() -> None:
+    """The kernel says pid 0 of a process that cannot be seen from here."""
+    with pytest.raises(NotPermitted, match="another pid namespace") as refused:
+        identify("localhost:1000:1000:0")
+    assert "--pid=host" in refused.value.hint
+
+
 def test_a_dead_or_unknown_peer_is_not_permitted() -> None:
     with subprocess.Popen([sys.executable, "-c", ""]) as child:
         child.wait()

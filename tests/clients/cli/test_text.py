@@ -62,6 +62,11 @@ def test_status() -> None:
     ]
 
 
+def test_status_says_what_is_wrong_with_the_daemons_own_files() -> None:
+    problems = ["the journal cannot be written (disk full): what is held stays, nothing new is granted"]
+    assert text.status_lines(STATUS | {"problems": problems})[1] == f"  {problems[0]}"
+
+
 def test_status_of_a_card_in_trouble() -> None:
     processes = [
         {"pid": 8, "name": "Xorg", "used_bytes": 200 * MIB, "residue_bytes": 0, "stowaway": True},

@@ -144,7 +144,8 @@ def test_status_why_history(client: SyncArbiterClient, arbiter_daemon: ArbiterPr
     assert shown.returncode == 0
     assert "L1-1   detector  detector  held, idle   5 GiB" in shown.stdout
     status = json.loads(vramctl("status", "--json", environ=environ).stdout)
-    assert set(status) == {"epoch", "phase", "uptime_s", "gpus", "leases", "clients", "drained"}
+    wanted = {"epoch", "phase", "uptime_s", "gpus", "leases", "clients", "drained", "problems", "host_ram"}
+    assert set(status) == wanted
     assert status["leases"][0]["consumer"] == "detector"
 
     why = vramctl("why", "detector", environ=environ)

@@ -1,0 +1,186 @@
+"""The disk of the state folder fills up, under a running daemon and before one starts. A real disk, or a real limit of the kernel's.
+
+What is held stays held, nothing is granted that could not be recovered, it is said, and it ends with the trouble.
+"""
+
+import contextlib
+import os
+import resource
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from arbiter.testing.wire import WireClient
+
+pytestmark = pytest.mark.e2e
+PATIENCE_S = 60
+GIB = 1 << 30
+BEAT = {"WATCHDOG_USEC": "600000"}
+"""The daemon looks after its files at every beat, which this makes 0.2 s."""
+
+
+class Tmpfs:
+    """The state folder lies on a small file system of its own, which a file of ours can fill."""
+
+    def __init__(self, arbiter: ArbiterProcess) -> None:
+        self._folder = arbiter.state
+        self._ballast = arbiter.state / "ballast"
+        arbiter.state.mkdir(mode=0o700)
+        options = ["-t", "tmpfs", "-o", "size=1m,mode=0700", "none"]
+        done = subprocess.run(
+            ["mount", *options, str(self._folder)], capture_output=True, text=True, timeout=60
+        )
+        if done.returncode:
+            pytest.skip(f"no small disk can be mounted here: {done.stderr.strip()}")
+
+    def fill(self) -> None:
+        with self._ballast.open("ab", buffering=0) as file, contextlib.suppress(OSError):
+            while True:
+                file.write(b"\0" * 4096)
+
+    def free(self) -> None:
+        self._ballast.unlink()
+
+    def close(self) -> None:
+        subprocess.run(["umount", str(self._folder)], check=True, timeout=60)
+
+
+class SizeLimit:
+    """The kernel refuses the daemon to write to any file (RLIMIT_FSIZE): needs no privilege."""
+
+    def __init__(self, arbiter: ArbiterProcess) -> None:
+        self._arbiter = arbiter
+
+    def _limit(self, soft: int) -> None:
+        resource.prlimit(self._arbiter.pid, resource.RLIMIT_FSIZE, (soft, resource.RLIM_INFINITY))
+
+    def fill(self) -> None:
+        self._limit(0)
+
+    def free(self) -> None:
+        self._limit(resource.RLIM_INFINITY)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def arbiter() -> Iterator[ArbiterProcess]:
+    made = ArbiterProcess(config="record:\n  enabled: false\n")
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def tmpfs(arbiter: ArbiterProcess) -> Iterator[Tmpfs]:
+    if os.getuid() != 0 or shutil.which("mount") is None:
+        pytest.skip("needs root and mount for a small disk")
+    disk = Tmpfs(arbiter)
+    yield disk
+    if arbiter.process is not None and arbiter.process.poll() is None:
+        arbiter.kill()
+    disk.close()
+
+
+@pytest.fixture(params=["tmpfs", "limit"])
+def disk(arbiter: ArbiterProcess, request: pytest.FixtureRequest) -> Tmpfs | SizeLimit:
+    if request.param == "tmpfs":
+        found: Tmpfs = request.getfixturevalue("tmpfs")
+        return found
+    return SizeLimit(arbiter)
+
+
+def consumers(client: WireClient) -> list[str]:
+    return [lease["consumer"] for lease in client.ask("status")["leases"]]
+
+
+def wait_until(client: WireClient, good: Callable[[], bool]) -> None:
+    """Look again with every event, and at every beat of the wire at the latest."""
+    for _ in range(int(PATIENCE_S / 0.1)):
+        if good():
+            return
+        client.receive(0.1)
+    raise AssertionError(f"never: {client.ask('status')}")
+
+
+def test_a_full_disk_blocks_grants_and_nothing_else(arbiter: ArbiterProcess, disk: Tmpfs | SizeLimit) -> None:
+    arbiter.start(BEAT)
+    with WireClient(arbiter.endpoint) as client:
+        client.hello().ask("subscribe")
+        held = [client.acquire(name, 200 << 20, ttl_s=600.0)["lease"] for name in ("stays",)]
+        on = {"lease_id": held[0]["lease_id"], "token": held[0]["token"]}
+        assert client.ask("ready", **on)["ok"]
+        goes = client.acquire("goes", 200 << 20, ttl_s=600.0)["lease"]
+        goes_on = {"lease_id": goes["lease_id"], "token": goes["token"]}
+        assert client.ask("ready", **goes_on)["ok"]
+        disk.fill()
+        refused = client.acquire("refused", GIB)
+        assert refused["error"]["code"] == "journal_unavailable"
+        assert any("journal cannot be written" in problem for problem in client.ask("status")["problems"])
+        arbiter.wait_for("journal cannot be written", PATIENCE_S)
+        assert sorted(consumers(client)) == ["goes", "stays"]
+        assert client.ask("renew", leases=[on])["ok"]
+
+        assert client.ask("unloading", **goes_on)["ok"]
+        assert client.ask("release", **goes_on)["ok"]
+        wait_until(client, lambda: consumers(client) == ["stays"])  # its record could not be deleted
+
+        disk.free()
+        wait_until(client, lambda: client.ask("status")["problems"] == [])
+        later = client.acquire("later", 200 << 20, ttl_s=600.0)
+        if later["state"] == "queued":
+            client.push("granted")
+        kinds = {event["kind"] for event in client.ask("history", limit=1000)["events"]}
+        assert {"journal_failed", "released", "granted"} <= kinds, sorted(kinds)
+    arbiter.kill()
+    arbiter.start()
+    with WireClient(arbiter.endpoint) as client:
+        client.hello()
+        assert sorted(consumers(client)) == ["later", "stays"], (
+            "what was released does not come back as a lease"
+        )
+        events = client.ask("history", kinds=["journal_failed", "denied"], limit=1000)["events"]
+        assert {event["kind"] for event in events} >= {"journal_failed"}, (
+            "history of the bad time is on disk too"
+        )
+
+
+def test_a_start_on_a_full_disk_says_so_and_is_worth_another_try(
+    arbiter: ArbiterProcess, tmpfs: Tmpfs
+) -> None:
+    tmpfs.fill()
+    with pytest.raises(RuntimeError, match="ended with 5"):
+        arbiter.start()
+    assert "full or failing" in arbiter.log
+    assert "Traceback" not in arbiter.log
+    tmpfs.free()
+    arbiter.start()
+    with WireClient(arbiter.endpoint) as client:
+        assert client.hello().acquire("later", GIB)["ok"]
+
+
+def test_a_restart_on_a_full_disk_loses_no_lease(arbiter: ArbiterProcess, tmpfs: Tmpfs) -> None:
+    arbiter.start()
+    with WireClient(arbiter.endpoint) as client:
+        held = client.hello().acquire("stays", 200 << 20, ttl_s=600.0)["lease"]
+    arbiter.kill()
+    tmpfs.fill()
+    with pytest.raises(RuntimeError, match="ended with 5"):
+        arbiter.start()
+    tmpfs.free()
+    arbiter.start()
+    with WireClient(arbiter.endpoint) as client:
+        (lease,) = client.hello().ask("status")["leases"]
+        assert (lease["lease_id"], lease["token"]) == (held["lease_id"], held["token"])
+
+
+def test_the_state_folder_is_the_small_disk(arbiter: ArbiterProcess, tmpfs: Tmpfs) -> None:
+    """What the tests above rest on."""
+    assert os.stat(arbiter.state).st_dev != os.stat(arbiter.runtime).st_dev
+    tmpfs.fill()
+    with pytest.raises(OSError, match="No space left"):
+        Path(arbiter.state / "more").write_bytes(b"x" * 8192)

@@ -1,0 +1,76 @@
+"""Pid namespaces: below the arbiter's a client is known by the pid that the arbiter sees, beside or above it cannot be known and is refused."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from arbiter.testing.wire import WireClient
+
+pytestmark = pytest.mark.e2e
+PATIENCE_S = 60
+GIB = 1 << 30
+UNSHARE = ["unshare", "--pid", "--fork", "--kill-child", "--mount-proc"]
+INSIDE = """
+import os, sys
+from arbiter.testing.wire import WireClient
+with WireClient(sys.argv[1]) as client:
+    client.hello("inside").acquire("inside", 1 << 30)
+    print(os.getpid(), flush=True)
+    sys.stdin.read()
+"""
+
+Make = Callable[..., ArbiterProcess]
+
+
+def can_unshare() -> bool:
+    if shutil.which("unshare") is None:
+        return False
+    done = subprocess.run([*UNSHARE, "true"], capture_output=True, timeout=60)
+    return done.returncode == 0
+
+
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.skipif(not can_unshare(), reason="pid namespaces cannot be made here (unshare, root)"),
+]
+
+
+def test_a_client_in_a_namespace_below_is_known_by_its_pid_out_here(make_arbiter: Make) -> None:
+    arbiter = make_arbiter().start()
+    command = [*UNSHARE, sys.executable, "-c", INSIDE, arbiter.endpoint]
+    with WireClient(arbiter.endpoint) as watcher:
+        watcher.hello("watcher", role="observer").ask("subscribe")
+        inside = subprocess.Popen(
+            command, env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        try:
+            assert inside.stdout is not None
+            assert inside.stdout.readline().strip() == "1", "in there it is the first of all"
+            (lease,) = watcher.ask("status")["leases"]
+            children = Path(f"/proc/{inside.pid}/task/{inside.pid}/children").read_text().split()
+            assert [lease["pid"]] == [int(pid) for pid in children]
+            os.kill(lease["pid"], 9)
+            gone = watcher.push("event", where=lambda push: push["event"]["kind"] == "lost")
+            assert gone["event"]["lease_id"] == lease["lease_id"]
+        finally:
+            inside.kill()
+            inside.wait(PATIENCE_S)
+
+
+def test_a_client_that_cannot_be_seen_is_refused_and_told_why(make_arbiter: Make) -> None:
+    arbiter = make_arbiter()
+    arbiter.program = [*UNSHARE, *arbiter.program]
+    arbiter.start()
+    with WireClient(arbiter.endpoint) as client:
+        refused = client.ask("hello", version=1, name="outside", instance="o")
+        assert not refused["ok"]
+        assert refused["error"]["code"] == "not_permitted"
+        assert "pid namespace" in refused["error"]["message"]
+        assert "--pid=host" in refused["error"]["hint"]
+        assert client.ask("status")["error"]["code"] == "unknown_session", "and stays a stranger"
