@@ -9,7 +9,7 @@ import pytest
 from arbiter.testing.process import ArbiterProcess
 from clients.aio import ArbiterClient
 from clients.lease import Lease, Use
-from schemas.errors import BadState, LeaseRevoking, ParentTooSmall, VramError
+from schemas.errors import BadState, LeaseRevoking, ParentTooSmall, VramError, WouldDeadlock
 from schemas.wire import LeaseRef, LeaseSpec
 from sidecars.device.fake import FakeMemory
 
@@ -184,7 +184,9 @@ async def test_a_sub_lease_is_carved_out_of_its_parents(
         await leaf.ready()
         await root.ready()
         async with root.use("grab"):
-            waiting = asyncio.ensure_future(other.acquire(spec("detector", 5), 20.0))
+            # one process plays all three: the goal does not wait for the detector
+            wanted = spec("detector", 5, independent=True)
+            waiting = asyncio.ensure_future(other.acquire(wanted, 20.0))
             await until(lambda: sorted(asked) == ["goal", "policy"])
             assert leaf.state == "revoking"
             assert model.did == [], "the tree is in use"
@@ -192,3 +194,18 @@ async def test_a_sub_lease_is_carved_out_of_its_parents(
         assert (model.did, leaf.state) == (["unload"], "gone")
         await root.wait_gone()
         await detector.give_up()
+
+
+async def test_a_job_that_waits_for_its_own_room_is_told(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    """One process holds in use what it would itself have to give up: that would never end."""
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        job = await client.acquire(spec("job", 5))
+        await job.ready()
+        async with job.use():
+            with pytest.raises(WouldDeadlock) as told:
+                await client.acquire(spec("llm", 5))
+            assert [link["consumer"] for link in told.value.details["cycle"]] == ["llm"]
+            assert "job" in str(told.value)
+            prefetch = asyncio.ensure_future(client.acquire(spec("next", 5, independent=True), 20.0))
+        await job.give_up()
+        assert (await prefetch).state == "loading"
