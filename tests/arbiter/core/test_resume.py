@@ -91,7 +91,7 @@ def test_a_verification_begins_again() -> None:
     assert len(driver.notes("verified")) == before, "no verdict of yesterday is repeated"
     driver.card.set(other.process, 0, driver.now)
     driver.card.lag_s = 0.0
-    driver.until(lambda: newest(driver, "verified")["resolved"], limit_s=2000.0)
+    driver.until(lambda: newest(driver, "verified")["resolved"], limit_s=2000.0, step_s=0.5)
     assert driver.state(second) == "over"
 
 

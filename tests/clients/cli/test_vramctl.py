@@ -194,6 +194,7 @@ def test_doctor_with_a_daemon(arbiter_daemon: ArbiterProcess) -> None:
     done = vramctl("doctor", environ=arbiter_daemon.environ)
     assert done.returncode == 0, done.stdout
     assert "ok   gpu 0" in done.stdout
+    assert "its probe answers (a simulated card)" in done.stdout, "what reads the card is said"
 
 
 @pytest.mark.e2e
