@@ -85,6 +85,12 @@ class HostRamInsufficient(TransientError):
     code = "host_ram_insufficient"  # no room to park: details.needed_bytes, budget_bytes, booked_bytes
 
 
+class GangBroken(TransientError):
+    code = (
+        "gang_broken"  # another member was denied, lost or gave up before all were granted: details.gang, why
+    )
+
+
 class WouldDeadlock(CallerError):
     code = "would_deadlock"  # the wait is for what a use of this process keeps: details.cycle, who uses and waits for what
 

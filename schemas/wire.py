@@ -44,6 +44,13 @@ class LeaseRef(_Frozen):
     token: TokenPair
 
 
+class Gang(_Frozen):
+    """Several leases, of whatever processes, that are granted together or not at all. One id for each time."""
+
+    id: Name
+    size: Annotated[int, Field(ge=2, le=16)]
+
+
 class LeaseSpec(_Frozen):
     """What a lease is to be. `evictable=False` pins it: nobody makes it leave."""
 
@@ -62,6 +69,7 @@ class LeaseSpec(_Frozen):
     )
     standby: bool = False  # asked to leave, it comes back by itself when there is room
     park_bytes: Bytes = 0  # host RAM that keeps its weights while it is away; 0: it cannot be parked
+    gang: Gang | None = None
     parent: LeaseRef | None = None  # a sub-lease: carved at once out of that lease's bytes, on its card
     independent: bool = (
         False  # the process's own uses do not wait for this lease (a prefetch): no deadlock is seen in it
@@ -305,6 +313,7 @@ class LeaseView(TypedDict):
     yielded: NotRequired[int]  # uses that pause
     parent: NotRequired[str]
     children: NotRequired[list[str]]
+    gang: NotRequired[str]  # until all of it is held: name, phase, how many have come of how many
 
 
 class AcquireReply(TypedDict):

@@ -19,6 +19,7 @@ from arbiter.core import (
     deadlock,
     eviction,
     explain,
+    gangs,
     grants,
     invariants,
     measure,
@@ -79,6 +80,7 @@ class Arbiter:
         subleases.finish(core)
         recovery.serve_if_accounted(core)  # 2
         deadlock.resolve(core)  # 3
+        gangs.settle(core)
         grants.schedule(core)
         requests.answer_queued(core)
         self._keep_reading()  # 4
@@ -221,6 +223,8 @@ class Arbiter:
                     measure.on_poll_due(core, subject)
                 case "probe":
                     measure.on_probe_due(core, subject)
+                case "gang":
+                    gangs.on_due(core, subject)
                 case "recover":
                     recovery.on_recover_due(core, subject)
                 case _:  # "plan": a residency ended, or somebody has aged; "return": the card has been quiet

@@ -12,7 +12,7 @@ of the newest in the circle, before anybody is asked to leave for it.
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from arbiter.core import policy
+from arbiter.core import eviction, policy
 from arbiter.core.lease import Lease, LeaseState
 from arbiter.core.state import Core, Gpu, Refused
 from schemas.ids import LeaseId, ProcessKey
@@ -58,7 +58,9 @@ class _Reduction:
 
     def __init__(self, core: Core) -> None:
         self.core = core
-        self.served: set[LeaseId] = set()
+        # a gang's member that stands in no queue waits for its fellows, not for bytes
+        aside = (one for gang in core.gangs.values() if gang.phase != "waiting" for one in gang.members)
+        self.served: set[LeaseId] = {lease.id for lease in aside}
 
     def run(self) -> list[Lease]:
         """Waiters that are left over, by arrival."""
@@ -167,14 +169,7 @@ def _deny(core: Core, waiter: Lease, cycle: list[Lease]) -> None:
     links = [_link(core, one, cycle[(n + 1) % len(cycle)]) for n, one in enumerate(cycle)]
     story = "; ".join(f"{link['consumer']} (pid {link['pid']}) {_words(link)}" for link in links)
     refused = Refused("would_deadlock", f"this wait would never end: {story}", HINT, cycle=links)
-    waiter.move(LeaseState.DENIED, core.now, refused.message)
-    core.dequeue(waiter)
-    if waiter.answered or waiter.request is None:
-        core.push(waiter, {"push": "denied", "lease_id": waiter.id, "error": refused.wire()})
-    else:
-        core.refuse(waiter.client, waiter.request, refused)
-    core.note("denied", waiter, code=refused.code, reason=refused.message, cycle=links)
-    core.end(waiter, refused.wire())
+    eviction.deny(core, waiter, refused.wire())
 
 
 def _link(core: Core, waiter: Lease, following: Lease) -> dict[str, Any]:

@@ -59,6 +59,7 @@ class Spec:
     park_bytes: int = 0
     parent: tuple[LeaseId, Token] | None = None
     independent: bool = False
+    gang: tuple[str, int] | None = None  # (id, size)
 
 
 @dataclass(frozen=True, slots=True)

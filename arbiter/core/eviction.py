@@ -8,7 +8,7 @@ from typing import Any
 
 from arbiter.core import families
 from arbiter.core.lease import LEAVING, Eviction, Lease, LeaseState
-from arbiter.core.state import Core, Gpu
+from arbiter.core.state import Core, Gpu, Refused
 from schemas.ids import LeaseId
 
 
@@ -155,7 +155,11 @@ def deny(core: Core, waiter: Lease, error: Mapping[str, Any]) -> None:
     """End a waiter's wait with a typed error."""
     waiter.move(LeaseState.DENIED, core.now, str(error["message"]))
     core.dequeue(waiter)
-    core.push(waiter, {"push": "denied", "lease_id": waiter.id, "error": error})
+    if waiter.answered or waiter.request is None:
+        core.push(waiter, {"push": "denied", "lease_id": waiter.id, "error": error})
+    else:  # it has only just asked
+        refused = Refused(error["code"], error["message"], error["hint"], **error["details"])
+        core.refuse(waiter.client, waiter.request, refused)
     core.note("denied", waiter, code=error["code"], reason=error["message"])
     core.end(waiter, error)
 

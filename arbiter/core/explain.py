@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from statistics import median
 from typing import Any
 
-from arbiter.core import drift, policy, standby
+from arbiter.core import drift, gangs, policy, standby
 from arbiter.core.lease import AWAY, LEAVING, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 
@@ -12,7 +12,7 @@ NOTE_KINDS: tuple[str, ...] = (
     "queued", "granted", "ready", "switch", "use_began", "use_ended", "use_yielded", "revoke_asked", "revoke_acked", "reminded",
     "deadline_passed", "unloading", "released", "verified", "denied", "cancelled", "expired", "lost", "reattached", "oom",
     "pressure", "stowaway", "probe_failed", "probe_ok", "drift", "journal_failed", "recovered", "serving", "operator", "resumed",
-    "standby", "parked", "orphaned",
+    "standby", "parked", "orphaned", "gang",
 )  # fmt: skip
 """Every kind of `effects.Note`. `switch` comes with each `ready`; its field `switched` says whether anybody had to leave."""
 
@@ -43,6 +43,10 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
         shown["parent"] = lease.parent.id
     if lease.children:
         shown["children"] = [child.id for child in lease.children]
+    if lease.gang is not None:
+        shown["gang"] = (
+            f"{lease.gang.name}: {lease.gang.phase}, {len(lease.gang.members)} of {lease.gang.size}"
+        )
     if lease.yielded:
         shown["yielded"] = len(lease.yielded)
     if lease.spec.standby:
@@ -50,7 +54,7 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
     if lease.id in core.host.booked:
         shown["parked_bytes"] = core.host.booked[lease.id]
     if lease.state is LeaseState.QUEUED:
-        shown["position"] = min(core.gpus[gpu_id].queue.position(lease) for gpu_id in lease.gpus)
+        shown["position"] = _best_position(core, lease)
     elif lease.state is not LeaseState.VERIFYING and lease.state not in AWAY:
         if drifted := drift.drift_bytes(core, core.gpu_of(lease), lease):
             shown["drift_bytes"] = drifted
@@ -134,7 +138,9 @@ def status(core: Core) -> dict[str, Any]:
 
 
 def _best_position(core: Core, lease: Lease) -> int:
-    return min(core.gpus[gpu_id].queue.position(lease) for gpu_id in lease.gpus)
+    """Its best place in a queue; 0: it stands in none, its gang is not complete or loads already."""
+    places = [core.gpus[gpu_id].queue for gpu_id in lease.gpus if lease in core.gpus[gpu_id].queue]
+    return min((queue.position(lease) for queue in places), default=0)
 
 
 # -- why ---------------------------------------------------------------------------------------------------------------
@@ -292,6 +298,8 @@ def _condition(
     core: Core, gpu: Gpu, lease: Lease, blockers: Sequence[dict[str, Any]], position: int
 ) -> tuple[str, str]:
     """(short condition, what happens next in words)."""
+    if lease.gang is not None and position <= 1:
+        return f"gang {lease.gang.phase}", gangs.outlook(lease.gang, lease)
     leaving = [other for other in gpu.residents.values() if other.state in LEAVING]
     if position > 1:
         return "queued", _behind(core, lease, position)

@@ -2,16 +2,17 @@
 
 Per card, in this order (the numbers stand in `_serve`):
   1. under pressure: ask idle holders to leave, grant nothing
-  2. blocked (recovering, reading unknown, a load under way): grant nothing, ask nobody
+  2. a gang loads here: its next member; blocked (recovering, reading unknown, a load under way): grant nothing, ask nobody
   3. nobody waits: whoever is on standby and fits may come back, asking nobody to leave
-  4. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading
-  5. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out already
-  6. backfill: the first waiter behind the head that fits, evicts nobody and cannot delay the head
+  4. the head is one of a gang: all of it or nothing, on all its cards (`gangs`); nobody passes it
+  5. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading
+  6. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out already
+  7. backfill: the first waiter behind the head that fits, evicts nobody and cannot delay the head
 """
 
 from collections.abc import Mapping
 
-from arbiter.core import eviction, explain, families, policy, standby
+from arbiter.core import eviction, explain, families, gangs, policy, standby
 from arbiter.core.lease import Lease, LeaseState
 from arbiter.core.measure import note_pressure
 from arbiter.core.state import Core, Gpu
@@ -36,6 +37,11 @@ def _serve(core: Core, gpu: Gpu) -> None:
     if gpu.pressed and core.recovering is None:  # 1
         _relieve(core, gpu)
         return
+    if gpu.gang is not None:  # 2
+        member = gangs.next_load(core, gpu, gpu.gang) if core.recovering is None else None
+        if member is not None:
+            grant(core, gpu, member)
+        return
     head = gpu.queue.head()
     if gpu.blocked:  # 2
         return
@@ -44,16 +50,19 @@ def _serve(core: Core, gpu: Gpu) -> None:
         if back is not None:
             _grant_if_measured(core, gpu, back)
         return
-    if policy.fits(gpu, head):  # 4
+    if head.gang is not None:  # 4
+        gangs.serve(core, gpu, head.gang)
+        return
+    if policy.fits(gpu, head):  # 5
         _grant_if_measured(core, gpu, head)
         return
     leaving = policy.leaving(gpu)
     planned = policy.fits(gpu, head, leaving)
     if planned:
         head.reason = "room is being made"
-    elif _ask_victims(core, gpu, head, leaving):  # 5
+    elif _ask_victims(core, gpu, head, leaving):  # 6
         leaving, planned = policy.leaving(gpu), True
-    _backfill(core, gpu, head, leaving, planned=planned)  # 6
+    _backfill(core, gpu, head, leaving, planned=planned)  # 7
 
 
 def _relieve(core: Core, gpu: Gpu) -> None:
@@ -114,7 +123,7 @@ def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int],
     if smallest > spare:
         return
     for lease in gpu.queue.behind_head():
-        if policy.added_bytes(gpu, lease) <= spare and policy.fits(gpu, lease):
+        if lease.gang is None and policy.added_bytes(gpu, lease) <= spare and policy.fits(gpu, lease):
             _grant_if_measured(core, gpu, lease)
             return
 

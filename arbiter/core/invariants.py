@@ -12,9 +12,10 @@ Numbers are those of the design:
      whoever is away is neither; parked weights never exceed the budget of host RAM
   5. tokens only grow
   6. every waiter is in a queue, has a timer if it has a bound, and its card has a next reading scheduled
+  7. of a gang, until it is complete or broken, all that wait are charged or none
 """
 
-from arbiter.core import families
+from arbiter.core import families, gangs
 from arbiter.core.lease import AWAY, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 
@@ -40,6 +41,8 @@ def check(core: Core) -> None:
         _charges(gpu)
     _tokens(core)
     _waiters(core)
+    if problem := gangs.unsound(core):
+        raise InvariantViolation(7, problem)
     _away(core)
 
 
@@ -112,7 +115,7 @@ def _charges(gpu: Gpu) -> None:
     ]:
         gpu.debts.discard(lease_id)
     for lease_id in sorted(gpu.debts):
-        if lease_id not in gpu.verifications:
+        if lease_id not in gpu.verifications and lease_id not in gpu.reserved:
             raise InvariantViolation(4, f"the bytes of {lease_id} are charged for ever")
     for lease in residents.in_state(LeaseState.VERIFYING):
         if lease.id not in gpu.verifications:
@@ -144,8 +147,10 @@ def _tokens(core: Core) -> None:
 
 def _waiters(core: Core) -> None:
     queued = sum(len(gpu.queue) for gpu in core.gpus.values())
-    if queued < len(core.waiting) or (len(core.gpus) == 1 and queued != len(core.waiting)):
-        raise InvariantViolation(6, f"{len(core.waiting)} leases wait, {queued} are in queues")
+    aside = sum(len(gang.waiting()) for gang in core.gangs.values() if gang.phase != "waiting")
+    waiting = len(core.waiting) - aside
+    if queued < waiting or (len(core.gpus) == 1 and queued != waiting):
+        raise InvariantViolation(6, f"{waiting} leases wait, {queued} are in queues")
     for gpu in core.gpus.values():
         head = gpu.queue.head()
         if head is None:

@@ -160,6 +160,33 @@ class Estate:
 
 
 @dataclass(slots=True)
+class Gang:
+    """Leases that are granted together or not at all (`gangs`). Forgotten once all are held, or one has failed."""
+
+    name: str
+    size: int
+    first_at: float
+    phase: str = "gathering"  # → waiting → loading
+    members: list["Lease"] = field(default_factory=list, repr=False)
+    planned: dict[GpuId, list["Lease"]] = field(default_factory=dict, repr=False)  # where room is being made
+    cards: list[GpuId] = field(default_factory=list)  # loading: where its bytes are charged
+    reserved_bytes: dict[GpuId, int] = field(default_factory=dict)  # what was admitted there
+
+    def waiting(self) -> list["Lease"]:
+        return [lease for lease in self.members if lease.state is LeaseState.QUEUED]
+
+    @property
+    def priority(self) -> int:
+        """Of the least of its members."""
+        return min(lease.spec.priority for lease in self.members)
+
+    @property
+    def headroom_id(self) -> LeaseId:
+        """Under this name the ledger keeps what one of them needs on top of its steady bytes while it loads."""
+        return LeaseId(f"gang:{self.name}")
+
+
+@dataclass(slots=True)
 class Lease:
     """A live lease. `load_peak_bytes` is the spec's, raised by what was learnt; the spec itself is never changed."""
 
@@ -213,6 +240,9 @@ class Lease:
     children: list["Lease"] = field(default_factory=list, repr=False, compare=False)  # live ones
     estate: Estate | None = None  # once anything was carved out of it
     said_ready: bool = False  # by itself, not through a sub-lease
+    gang: Gang | None = field(default=None, repr=False, compare=False)  # until it is complete or broken
+    rank: float | None = None  # its gang's place in the queues
+    needs: Mapping[ProcessKey, int] | None = None  # of a gang's members on one card together
     departing: bool = False  # its holder let go; it is over when its last sub-lease is
     roster: Roster | None = field(default=None, repr=False, compare=False)  # of the card that it is on
 

@@ -17,6 +17,7 @@ from arbiter.core.settings import GpuInfo
 from schemas.ids import LeaseId, ProcessKey
 
 NOTHING: Mapping[LeaseId, int] = {}
+NOBODY: Mapping[ProcessKey, int] = {}
 
 
 @dataclass(slots=True)
@@ -125,21 +126,21 @@ class GpuLedger:
         return account.occupied_bytes() - account.booked_bytes()
 
     def total_if(
-        self, leaving: Mapping[LeaseId, int] = NOTHING, joining: tuple[ProcessKey, int] | None = None
+        self, leaving: Mapping[LeaseId, int] = NOTHING, joining: Mapping[ProcessKey, int] = NOBODY
     ) -> int:
-        """Total bytes if some leases left (each keeping the residue given) and a process got so many more."""
+        """Total bytes if some leases left (each keeping the residue given) and processes got so many more."""
         total = self.total_bytes()
-        if not leaving and joining is None:
+        if not leaving and not joining:
             return total
         by_process: dict[ProcessKey, dict[LeaseId, int]] = {}
         for lease, residue_bytes in leaving.items():
             owner = self._owner.get(lease)
             if owner is not None:
                 by_process.setdefault(owner, {})[lease] = residue_bytes
-        if joining is not None:
-            by_process.setdefault(joining[0], {})
+        for process in joining:
+            by_process.setdefault(process, {})
         for process, going in by_process.items():
-            more_bytes = joining[1] if joining is not None and joining[0] == process else 0
+            more_bytes = joining.get(process, 0)
             account = self.accounts.get(process)
             if account is None:
                 stranger = self._stranger_of(process)
@@ -228,6 +229,14 @@ class GpuLedger:
     def charge_of(self, lease: LeaseId) -> Charge:
         """Raises KeyError if nothing is charged for it."""
         return self.accounts[self._owner[lease]].charges[lease]
+
+    def uncharge(self, lease: LeaseId, now: float) -> None:
+        """Take back a charge that was never filled. What its process keeps otherwise stays as it is."""
+        account = self.accounts[self._owner.pop(lease)]
+        self._charge(account, lease, None)
+        self.touched.add(lease)
+        self._changed(account, now)
+        self._close_if_empty(account)
 
     def to_debt(self, lease: LeaseId) -> None:
         """The lease is over; its bytes stay charged until measured gone."""

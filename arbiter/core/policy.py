@@ -10,7 +10,7 @@ from itertools import combinations
 from arbiter.core.lease import LEAVING, Lease, LeaseState
 from arbiter.core.ledger import NOTHING, process_bytes
 from arbiter.core.state import Core, Gpu
-from schemas.ids import LeaseId
+from schemas.ids import LeaseId, ProcessKey
 
 EXACT_SEARCH_MAX = 12  # candidates; beyond that the search is greedy
 _WAKE_SLACK_S = 0.001  # so that a wake-up for an ageing step does not come a rounding error too early
@@ -34,6 +34,8 @@ def blocked(core: Core, gpu: Gpu) -> str:
         return "the card has not been read yet"
     if loading := gpu.in_state(LeaseState.LOADING):
         return f"{loading[0].spec.consumer} is loading"
+    if gpu.gang is not None:
+        return f"gang {gpu.gang.name} is loading"
     if gpu.pressed:
         return f"pressure: {gpu.ledger.pressure_bytes()} bytes more than the budget are held"
     return ""
@@ -66,6 +68,11 @@ def residue_under_measurement(gpu: Gpu) -> bool:
     return any(v.lease is None and not v.overdue for v in gpu.verifications.values())
 
 
+def joining(lease: Lease) -> Mapping[ProcessKey, int]:
+    """What a grant charges, by process: one lease's load peak, or what a gang's members on one card need together."""
+    return {lease.process: lease.load_peak_bytes} if lease.needs is None else lease.needs
+
+
 def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool:
     """Would the ledger hold this waiter at its load peak, once these leases are gone?"""
     if lease.spec.exclusive:
@@ -75,12 +82,12 @@ def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool
         return False
     elif any(v.exclusive and v.lease not in going for v in gpu.verifications.values()):
         return False  # it died or expired, and still has the card to itself until it is measured gone
-    return gpu.ledger.total_if(going, (lease.process, lease.load_peak_bytes)) <= gpu.ledger.budget_bytes
+    return gpu.ledger.total_if(going, joining(lease)) <= gpu.ledger.budget_bytes
 
 
 def added_bytes(gpu: Gpu, lease: Lease) -> int:
     """What a grant would add to the ledger: the load peak less the residue it is folded with."""
-    return gpu.ledger.total_if(joining=(lease.process, lease.load_peak_bytes)) - gpu.ledger.total_bytes()
+    return gpu.ledger.total_if(joining=joining(lease)) - gpu.ledger.total_bytes()
 
 
 def largest_fold_bytes(gpu: Gpu) -> int:
@@ -111,14 +118,18 @@ def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
 
 
 def measured_need_bytes(gpu: Gpu, lease: Lease) -> int:
-    """What the reading must have free: the load peak less what the process already holds (its context)."""
-    account = gpu.ledger.accounts.get(lease.process)
+    """What the reading must have free: what a grant charges, less what the processes already hold (their contexts)."""
+    return sum(_unheld_bytes(gpu, process, count) for process, count in joining(lease).items())
+
+
+def _unheld_bytes(gpu: Gpu, process: ProcessKey, count: int) -> int:
+    account = gpu.ledger.accounts.get(process)
     if account is not None and account.charges:
-        return lease.load_peak_bytes
-    own = None if gpu.sample is None else process_bytes(gpu.sample, lease.process)
+        return count
+    own = None if gpu.sample is None else process_bytes(gpu.sample, process)
     if own is None:
         own = account.residue_bytes if account is not None else 0
-    return max(0, lease.load_peak_bytes - own)
+    return max(0, count - own)
 
 
 def sample_is_behind(gpu: Gpu) -> bool:
@@ -168,6 +179,8 @@ def choose_relief(core: Core, gpu: Gpu, going: Mapping[LeaseId, int], over_bytes
 
 def may_ask(lease: Lease) -> bool:
     """Of a tree only the root is asked, and not while any of it loads."""
+    if lease.gang is not None:
+        return False  # not before all of it is held
     if lease.estate is None:
         return lease.evictable and lease.parent is None
     loading = any(member.state is LeaseState.LOADING for member in lease.tree())
@@ -323,4 +336,4 @@ def spare_beside_bytes(gpu: Gpu, head: Lease, going: Mapping[LeaseId, int], *, p
     Counts what the head's plan frees (`planned`: `going` is enough for it); without a plan, everything that could ever be freed.
     """
     freed = going if planned else {**_leave(list(gpu.residents.values())), **going}
-    return gpu.ledger.budget_bytes - gpu.ledger.total_if(freed, (head.process, head.load_peak_bytes))
+    return gpu.ledger.budget_bytes - gpu.ledger.total_if(freed, joining(head))

@@ -66,4 +66,6 @@ class WaitQueue:
         return self._leases[self._ranks[index][1]].id if index >= 0 else None
 
     def _rank(self, lease: Lease) -> _Rank:
+        if lease.rank is not None:
+            return (lease.rank, lease.arrival)
         return (lease.arrived_at - lease.spec.priority * self._ageing_s, lease.arrival)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from arbiter.core import drift, eviction, explain, families, operators, standby
+from arbiter.core import drift, eviction, explain, families, gangs, operators, standby
 from arbiter.core.events import MemorySampled, Reattached, ReattachedLease, Recovered, Spec
 from arbiter.core.lease import AWAY, EXPIRING, Eviction, Lease, LeaseState, Order, Use
 from arbiter.core.measure import begin_for_lease
@@ -121,6 +121,8 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
     if lease.state is LeaseState.REVOKING:
         lease.eviction = _asked_before(core, gpu, lease)
         lease.eviction.order = None if record.get("ordered") is None else Order(*record["ordered"])
+    if record.get("gang") is not None:
+        gangs.restore(core, lease, str(record["gang"][0]), int(record["gang"][1]))
     lease.expires_at = core.now + spec.ttl_s + core.settings.fence_grace_s
     core.timers.set(("ttl", lease_id), lease.expires_at)
     assert core.recovering is not None, "restoring outside recovery"
@@ -176,6 +178,7 @@ def spec_from_record(record: Mapping[str, Any]) -> Spec:
         if record.get("parent") is None
         else (LeaseId(record["parent"][0]), Token(*record["parent"][1:])),
         independent=bool(record.get("independent", False)),
+        gang=None if record.get("gang") is None else (str(record["gang"][0]), int(record["gang"][1])),
     )
 
 

@@ -6,7 +6,7 @@ anyone who knows the exact token.
 
 from dataclasses import replace
 
-from arbiter.core import drift, eviction, explain, families, standby
+from arbiter.core import drift, eviction, explain, families, gangs, standby
 from arbiter.core.events import (
     AcquireRequested,
     CancelRequested,
@@ -104,15 +104,25 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         return
     spec = replace(event.spec, exclusive=True) if core.settings.scheduling.alone else event.spec
     load_peak, steady = drift.expected_bytes(core, spec)
-    gpus = _places(core, spec, load_peak)
+    if spec.gang is not None:
+        gangs.check(core, *spec.gang)
+    try:
+        gpus = _places(core, spec, load_peak)
+    except Refused as refused:
+        if spec.gang is not None:
+            gangs.left_out(core, spec.gang[0], refused.message)
+        raise
     _check_waiters(core)
-    away = standby.find(core, client.process, spec.consumer, spec.key)
+    away = None if spec.gang is not None else standby.find(core, client.process, spec.consumer, spec.key)
     if away is not None:
         _take_over(core, event, away, spec, gpus)
         return
     lease = new_lease(core, event, client, spec, load_peak, steady, gpus)
-    core.enqueue(lease)
     core.unanswered.append(lease)
+    if spec.gang is None:
+        core.enqueue(lease)
+    else:
+        gangs.join(core, lease, *spec.gang)
 
 
 def new_lease(

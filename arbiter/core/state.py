@@ -12,7 +12,7 @@ from typing import Any
 from arbiter.core.effects import Effect, JournalDelete, JournalPut, Note, Push, Refuse, Reply, Sample
 from arbiter.core.events import MemorySampled
 from arbiter.core.footprints import Footprints
-from arbiter.core.lease import LEAVING, Estate, Eviction, Lease, LeaseState, Order, Use
+from arbiter.core.lease import LEAVING, Estate, Eviction, Gang, Lease, LeaseState, Order, Use
 from arbiter.core.ledger import GpuLedger
 from arbiter.core.parking import HostRam
 from arbiter.core.queue import WaitQueue
@@ -85,6 +85,8 @@ class Gpu:
     dirty: bool = True
     pressed: bool = False  # a pressure note is out
 
+    gang: Gang | None = None  # it is loading here
+    reserved: set[LeaseId] = field(default_factory=set)  # charged for members of it that are not granted yet
     estates: dict[LeaseId, Lease] = field(default_factory=dict)  # leases that sub-leases were carved out of
     debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
 
@@ -128,6 +130,7 @@ class Core:
         self.arrivals = 0
         self.last_token = Token(settings.epoch, 0)
         self.users: dict[ProcessKey, dict[tuple[LeaseId, UseId], Lease]] = {}  # whose busy uses are where
+        self.gangs: dict[str, Gang] = {}
         self.suspects: set[ProcessKey] = (
             set()
         )  # began to use or to wait with the event being handled (`deadlock`)
@@ -262,11 +265,15 @@ class Core:
 
     def enqueue(self, lease: Lease) -> None:
         """A lease begins to wait, on every card that it may be placed on."""
-        self.waiting[lease.id] = lease
-        self.suspects.add(lease.process)
+        self.hold_back(lease)
         for gpu_id in lease.gpus:
             self.gpus[gpu_id].queue.add(lease)
             self.wake(self.gpus[gpu_id])
+
+    def hold_back(self, lease: Lease) -> None:
+        """It waits, but in no queue yet."""
+        self.waiting[lease.id] = lease
+        self.suspects.add(lease.process)
         if lease.wait_timeout_s is not None:
             self.timers.set(("wait", lease.id), lease.arrived_at + lease.wait_timeout_s)
 
@@ -337,6 +344,7 @@ class Core:
                 "measured_bytes": lease.measured_bytes,
                 "exiting": lease.exiting,
                 "parent": None if lease.parent is None else lease.parent.id,
+                "gang": None if lease.gang is None else [lease.gang.name, lease.gang.size],
                 "estate": None if lease.estate is None else _estate(lease.estate),
                 "pinned": None if lease.pinned is None else [lease.pinned.by, lease.pinned.reason],
                 "comes_back": lease.comes_back,
@@ -362,6 +370,7 @@ class Core:
                     "park_bytes": spec.park_bytes,
                     "parent": None if spec.parent is None else [spec.parent[0], *astuple(spec.parent[1])],
                     "independent": spec.independent,
+                    "gang": None if spec.gang is None else [*spec.gang],
                 },
             },
             gates=gates,

@@ -20,6 +20,10 @@ def acquire(core: Core, event: AcquireRequested, ref: tuple[LeaseId, Token]) -> 
     client = client_of(core, event.client)
     if find_again(core, event, client):
         return
+    if event.spec.gang is not None:
+        raise Refused(
+            "bad_request", "a sub-lease is granted at once: it is in no gang", "let its parent join"
+        )
     parent = lease_for(core, *ref)
     gpu = _may_carve(core, parent, event.spec)
     # its root says who may be beside the tree, and comes back for all of it

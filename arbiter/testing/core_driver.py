@@ -318,6 +318,7 @@ class Consumer:
         key: str | None = None,
         parent: tuple[LeaseId, Token] | None = None,
         independent: bool = False,
+        gang: tuple[str, int] | None = None,
     ) -> Spec:
         """A spec with the bytes that matter; no residue, no residency and a long ttl unless asked for."""
         return Spec(
@@ -337,6 +338,7 @@ class Consumer:
             park_bytes=park_bytes,
             parent=parent,
             independent=independent,
+            gang=gang,
         )
 
     def acquire(

@@ -135,6 +135,14 @@ def child_without_parent(b: Broken) -> None:
     b.core.granted.clear()
 
 
+def half_a_gang(b: Broken) -> None:
+    one = b.driver.consumer("one")
+    lease = b.core.leases[one.acquire(GIB, gang=("g", 2))]
+    lease.gpu = b.gpu.info.id
+    b.gpu.reserved.add(lease.id)
+    b.gpu.ledger.charge(lease.id, lease.process, 1, 1, 0.0)
+
+
 @pytest.mark.parametrize(
     ("number", "breaks", "says"),
     [
@@ -153,6 +161,7 @@ def child_without_parent(b: Broken) -> None:
         (6, waiter_in_no_queue, "are in queues"),
         (6, queue_without_waiter, "is the head"),
         (6, bound_without_timer, "no timer"),
+        (7, half_a_gang, "is gathering"),
         (6, no_next_reading, "nobody will read"),
     ],
 )

@@ -24,8 +24,8 @@ def test_a_residue_is_folded_into_the_next_lease_of_its_process() -> None:
     books.charge(LA, A, 500, 500, 1.0)
     assert books.drop(LA, 50, 50, 2.0) == 50
     assert books.total_bytes() == 50
-    assert books.total_if(joining=(A, 300)) == 300, "not 350: the context is shared"
-    assert books.total_if(joining=(B, 300)) == 350
+    assert books.total_if(joining={A: 300}) == 300, "not 350: the context is shared"
+    assert books.total_if(joining={B: 300}) == 350
     books.charge(LA2, A, 300, 300, 3.0)
     assert books.total_bytes() == 300
     assert books.drop(LA2, 0, 0, 4.0) == 50, "what was declared once stays while the process lives"
@@ -91,7 +91,7 @@ def test_evidence_counts_only_above_the_booking_and_only_if_it_is_new() -> None:
     assert books.total_bytes() == 700
     assert books.drift_bytes(A) == 200
     assert books.total_if({LA: 0}) == 0
-    assert books.total_if(joining=(B, 100)) == 800
+    assert books.total_if(joining={B: 100}) == 800
     books.observe(sample(13.0, 0), quiet=True)
     assert books.total_bytes() == 500, "gone from the list: only the booking counts"
 
@@ -111,8 +111,8 @@ def test_stowaways_are_named_and_leave_no_trace_once_they_lease() -> None:
     books.observe(sample(1.0, 240, (A, 200), (C, 40)), quiet=True)
     assert {s.process: s.used_bytes for s in books.strangers.values()} == {A: 200, C: 40}
     assert books.total_bytes() == 240
-    assert books.total_if(joining=(A, 500)) == 540, "its bytes become part of its lease"
-    assert books.total_if(joining=(A, 100)) == 240
+    assert books.total_if(joining={A: 500}) == 540, "its bytes become part of its lease"
+    assert books.total_if(joining={A: 100}) == 240
     books.charge(LA, A, 500, 500, 2.0)
     assert books.total_bytes() == 540
 
@@ -121,7 +121,7 @@ def test_a_process_known_by_pid_alone_is_found() -> None:
     books = ledger()
     unknown_start = ProcessKey(A.pid, 0)
     books.observe(sample(1.0, 200, (unknown_start, 200)), quiet=True)
-    assert books.total_if(joining=(A, 500)) == 500
+    assert books.total_if(joining={A: 500}) == 500
     books.charge(LA, A, 500, 500, 2.0)
     books.observe(sample(3.0, 600, (unknown_start, 600), (ProcessKey(77, 0), 5)), quiet=True)
     assert books.drift_bytes(A) == 100
