@@ -4,6 +4,8 @@ Leases belong to processes: a connection that drops loses nothing that is reside
 out); `bye` gives everything back; death ends everything, and what was held is measured away before anyone else gets it.
 """
 
+from dataclasses import replace
+
 from arbiter.core import families, standby
 from arbiter.core.events import BYE, ClientConnected, ClientLeft, JournalFailed
 from arbiter.core.lease import AWAY, EXPIRING, Lease, LeaseState
@@ -12,23 +14,49 @@ from arbiter.core.recovery import account_for
 from arbiter.core.requests import cancel_waiter, let_go
 from arbiter.core.state import Client, Core, Refused
 from arbiter.core.uses import end_use
-from schemas.ids import LeaseId, ProcessKey
+from schemas.ids import ClientId, LeaseId, ProcessKey
 
 
 def on_connected(core: Core, event: ClientConnected) -> None:
-    """A hello. The same instance on a new connection takes over what is still queued for it."""
+    """A hello. The same instance on a new connection is the same client: its leases, waits and uses are the new connection's."""
+    if event.client in core.clients:
+        _forget(core, core.clients[event.client])
+    instance = (event.process, event.instance)
+    earlier = core.instances.get(instance)
+    if earlier is not None:
+        _take_over(core, earlier, event.client)
     core.clients[event.client] = Client(event.client, event.process, event.name, event.instance)
+    core.instances[instance] = event.client
     core.last_client_at = core.now
     for gpu in core.gpus.values():
         if gpu.sample is None or core.now - gpu.sample.taken_at > core.settings.sample_max_age_s:
             core.want_sample(gpu, core.now - core.settings.sample_max_age_s)
 
 
+def _take_over(core: Core, earlier: ClientId, client: ClientId) -> None:
+    """However often somebody reconnects, only its newest connection is remembered."""
+    del core.clients[earlier]
+    mine = core.leases_of_client(earlier)
+    for lease in _concerned(core, mine):
+        for table in (lease.uses, lease.yielded):
+            for key, use in table.items():
+                if use.client == earlier:
+                    table[key] = replace(use, client=client)
+    for lease in mine:
+        core.hand_to(lease, client)
+
+
+def _forget(core: Core, client: Client) -> None:
+    del core.clients[client.id]
+    core.instances.pop((client.process, client.instance), None)
+
+
 def on_left(core: Core, event: ClientLeft) -> None:
     """Queued leases and uses of the connection end. Resident leases end with a `bye` only."""
-    client = core.clients.pop(event.client, None)
+    client = core.clients.get(event.client)
     if client is None:
         return
+    _forget(core, client)
     core.last_client_at = core.now
     for lease in _concerned(core, core.leases_of_client(event.client)):
         for use in [use for use in lease.all_uses() if use.client == event.client]:
@@ -60,9 +88,9 @@ def _concerned(core: Core, own: list[Lease]) -> list[Lease]:
 
 def on_died(core: Core, process: ProcessKey) -> None:
     """Everything of a process ends. Its bytes become debts, measured gone before they count as free."""
-    gone = [client for client, known in core.clients.items() if known.process == process]
+    gone = [client for client in core.clients.values() if client.process == process]
     for client in gone:
-        del core.clients[client]
+        _forget(core, client)
     if gone:
         core.last_client_at = core.now
     for gpu in core.gpus.values():

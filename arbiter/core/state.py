@@ -124,6 +124,7 @@ class Core:
         self.host = HostRam(settings.host_ram_budget_bytes)
         self.nonces: dict[tuple[ProcessKey, str], LeaseId] = {}
         self.clients: dict[ClientId, Client] = {}
+        self.instances: dict[tuple[ProcessKey, str], ClientId] = {}  # the connection of each client object
         self.ended: OrderedDict[LeaseId, Ended] = OrderedDict()
         self.timers = Timers()
         self.serial = 0

@@ -111,7 +111,7 @@ class SessionTable:
         self._instances: dict[tuple[ProcessKey, str], ClientId] = {}
         self._moved: dict[
             ClientId, ClientId
-        ] = {}  # connections that their instance has replaced → the newest one
+        ] = {}  # the connection that each instance had before → the one that it has
         self._strangers_budget = float(settings.rate_per_s)
         self._strangers_at = clock()
 
@@ -246,15 +246,13 @@ class SessionTable:
         self._welcome(session, hello)
 
     def _replace_earlier(self, session: Session) -> None:
-        """A client object that comes back on a new connection: the old one is gone, though ROUTER never says so. What the core still
-        sends to the old one goes to the new one; its leases and waits are not ended, the client re-attaches them."""
+        """A client object that comes back on a new connection: the old one is gone, though ROUTER never says so. The core moves what was
+        its own to the new one; answers under way to the old one, and to no older one, go there too."""
         key = (session.peer.process, session.instance)
         earlier = self._instances.get(key)
         if earlier is not None and earlier in self._sessions:
             self._forget(self._sessions[earlier])
-            for old, new in self._moved.items():
-                if new == earlier:
-                    self._moved[old] = session.client
+            self._stop_standing_for(earlier)
             self._moved[earlier] = session.client
         self._moved.pop(session.client, None)  # it was replaced once; from here on it speaks for itself
         self._instances[key] = session.client
@@ -306,8 +304,8 @@ class SessionTable:
         self._leave(min(silent, key=lambda s: s.heard_at), "silent while connections were needed")
 
     def _leave(self, session: Session, reason: str) -> None:
-        for client in (*self._drop(session), session.client):
-            self._decisions.post(ev.ClientLeft(client, reason))
+        self._drop(session)
+        self._decisions.post(ev.ClientLeft(session.client, reason))
 
     def _forget(self, session: Session) -> None:
         del self._sessions[session.client]
@@ -317,14 +315,15 @@ class SessionTable:
         if not siblings:
             del self._of_process[session.peer.process]
 
-    def _drop(self, session: Session) -> list[ClientId]:
-        """Forget a connection; returns the earlier connections that it stood for."""
+    def _drop(self, session: Session) -> None:
         self._forget(session)
         self._instances.pop((session.peer.process, session.instance), None)
-        earlier = [old for old, new in self._moved.items() if new == session.client]
-        for old in earlier:
+        self._stop_standing_for(session.client)
+
+    def _stop_standing_for(self, client: ClientId) -> None:
+        """Forget whom a connection has replaced."""
+        for old in [old for old, new in self._moved.items() if new == client]:
             del self._moved[old]
-        return earlier
 
     def _send(self, session: Session, payload: bytes) -> None:
         if not self._wire.send(session.routing_id, session.delimiter, payload):

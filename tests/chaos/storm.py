@@ -333,7 +333,7 @@ class Storm:
                     "probe hangs": {"faults": {"probe": "hang"}},
                     "leak": {"faults": {"leak_bytes": 600 * MIB}},
                     "hidden processes": {"faults": {"hide_processes": True}},
-                    "lag": {"release_lag_s": 1.5},
+                    "lag": {"release_lag_s": 0.7},
                 }[fault]
                 await asyncio.to_thread(self._set_card, **faulty)
                 self._later(pause_s, self._mend_card)

@@ -1,8 +1,8 @@
 """Connections that come and go, deaths, and a journal that fails."""
 
 from arbiter.core.effects import Note, Push, Refuse
-from arbiter.core.events import ClientLeft, JournalFailed, OperatorAsked, ProcessDied
-from arbiter.testing.core_driver import CoreDriver, answer, refusal
+from arbiter.core.events import ClientConnected, ClientLeft, JournalFailed, OperatorAsked, ProcessDied
+from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
 from schemas import defaults as d
 from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
 
@@ -237,3 +237,38 @@ def test_who_owns_bytes_of_a_card_and_who_is_connected() -> None:
     assert driver.arbiter.clients() == {watcher.process}
     assert driver.arbiter.owners(first) == {det.process}, "a debt is not measured gone yet"
     driver.until(lambda: not driver.arbiter.owners(first))
+
+
+def test_an_instance_that_reconnects_is_one_client_with_everything_that_was_its_own() -> None:
+    """However often it comes back: a client that reconnects for ever used to be remembered for ever."""
+    driver = CoreDriver(8 * GIB)
+    det, other = driver.consumer("det"), driver.consumer("other")
+    held = det.acquire(2 * GIB)
+    det.load(held)
+    lent = other.acquire(1 * GIB)
+    driver.until(lambda: driver.state(lent) == "loading")
+    other.load(lent)
+    det.use_begin(held, "mine")
+    det.use_begin(lent, "theirs", other.token(lent))
+    other.use_begin(lent, "its own")
+    queued = det.acquire(7 * GIB, independent=True)
+    beside = Consumer(driver, "beside", det.process, ClientId("beside"))
+    beside.connect()
+    theirs = beside.acquire(7 * GIB, nonce="theirs", independent=True)
+    for number in range(3):
+        det.client = ClientId(f"new{number}")
+        driver.post(ClientConnected(det.client, det.process, 1000, "det", "det-c101"))
+    assert driver.arbiter.status(driver.now)["clients"] == 3
+    det.leave("silent")
+    assert (driver.state(queued), driver.state(theirs)) == ("over", "queued")
+    views = (driver.view(held), driver.view(lent))
+    assert [view and view["uses"] for view in views] == [0, 1], "its uses end with its newest connection"
+
+
+def test_a_connection_that_says_hello_as_another_instance_is_only_that() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    driver.post(ClientConnected(det.client, det.process, 1000, "det", "second"))
+    back = ClientId("back")
+    driver.post(ClientConnected(back, det.process, 1000, "det", "det-c101"))
+    assert driver.arbiter.status(driver.now)["clients"] == 2, "nobody was taken over"

@@ -262,7 +262,8 @@ def test_an_instance_that_reconnects_for_ever_is_one_session() -> None:
     plant = Plant(real=True)
     for number in range(3000):
         assert plant.hello(b"r%d" % number, ATTACKERS[0], instance="same")["ok"]
-    assert len(plant.table) == 1
+    assert len(plant.table) == plant.core.status()["clients"] == 1
+    assert plant.leftovers()["_moved"] == 1, "only the connection before this one is remembered"
     plant.everybody_dies()
     assert not plant.leftovers()
     assert plant.core.status()["clients"] == 0

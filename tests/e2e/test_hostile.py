@@ -1,0 +1,311 @@
+"""Hostile clients against a real daemon: whatever they do, the one honest holder keeps its lease and its answers, and when they are gone
+nothing of them is left: no session, no lease, no descriptor, no memory."""
+
+import json
+import os
+import random
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+
+from arbiter.testing.hostile import BOMBS, Forger
+from arbiter.testing.process import ArbiterProcess
+from arbiter.testing.wire import WireClient
+
+pytestmark = pytest.mark.e2e
+GIB, MIB = 1 << 30, 1 << 20
+MEMORY_SLACK_KIB = 64 * 1024
+DESCRIPTOR_SLACK = 8
+ATTACKER = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from arbiter.testing.wire import WireClient
+import json, msgpack, os, zmq
+endpoint, words = sys.argv[2], json.loads(sys.argv[3])
+def done(**facts):
+    print(json.dumps(facts), flush=True)
+"""
+ROOT = Path(__file__).parents[2]
+
+Connect = Callable[..., WireClient]
+
+
+class Honest:
+    """A client with a pinned lease in use, which looks at itself and at the daemon before and after."""
+
+    def __init__(self, arbiter: ArbiterProcess, connect: Connect) -> None:
+        self.arbiter = arbiter
+        self.client = connect().hello("honest")
+        reply = self.client.acquire("honest", GIB, evictable=False, ttl_s=300.0)
+        lease = reply["lease"] if reply["state"] == "loading" else self.client.push("granted")["lease"]
+        self.on = {"lease_id": lease["lease_id"], "token": lease["token"]}
+        assert self.client.ask("ready", **self.on)["ok"]
+        assert self.client.ask("use_begin", **self.on, use_id="work")["ok"]
+        self.descriptors = self._descriptors()
+        self.memory_kib = self._memory_kib()
+
+    def _descriptors(self) -> int:
+        return len(os.listdir(f"/proc/{self.arbiter.pid}/fd"))
+
+    def _memory_kib(self) -> int:
+        status = Path(f"/proc/{self.arbiter.pid}/status").read_text()
+        return int(next(line for line in status.splitlines() if line.startswith("VmRSS")).split()[1])
+
+    def is_served(self) -> None:
+        """Answered, and its lease as it was."""
+        status = self.client.ask("status")
+        (mine,) = (lease for lease in status["leases"] if lease["consumer"] == "honest")
+        assert (mine["state"], mine["token"], mine["uses"]) == ("held", self.on["token"], 1)
+        assert self.client.ask("renew", leases=[self.on])["alive"] == [self.on["lease_id"]]
+
+    def is_alone(self) -> None:
+        """Everybody else is gone without a trace. Descriptors of connections that broke are closed a little later."""
+        self.is_served()
+        for _ in range(200):
+            status = self.client.ask("status")
+            quiet = status["clients"] == 1 and len(status["leases"]) == 1
+            if quiet and self._descriptors() <= self.descriptors + DESCRIPTOR_SLACK:
+                break
+            self.client.receive(0.05)
+        assert (status["clients"], len(status["leases"])) == (1, 1), status
+        assert self._descriptors() <= self.descriptors + DESCRIPTOR_SLACK
+        assert self._memory_kib() <= self.memory_kib + MEMORY_SLACK_KIB
+
+
+@pytest.fixture
+def honest(arbiter_daemon: ArbiterProcess, connect: Connect) -> Honest:
+    return Honest(arbiter_daemon, connect)
+
+
+def attack(arbiter: ArbiterProcess, script: str, **words: Any) -> "subprocess.Popen[str]":
+    """Another process that attacks; what it prints last are its findings. It is ended by the caller or by itself."""
+    return subprocess.Popen(
+        [sys.executable, "-c", ATTACKER + script, str(ROOT), arbiter.endpoint, json.dumps(words)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def findings(attacker: "subprocess.Popen[str]") -> dict[str, Any]:
+    out, _ = attacker.communicate(timeout=60)
+    assert attacker.returncode == 0, out
+    found: dict[str, Any] = json.loads(out.splitlines()[-1])
+    return found
+
+
+# -- floods ----------------------------------------------------------------------------------------------------------------
+def test_a_flood_from_another_process_does_not_silence_others(honest: Honest) -> None:
+    flood = attack(
+        honest.arbiter,
+        """
+client = WireClient(endpoint).hello("flood")
+done(flooding=True)
+frame = msgpack.packb({"op": "status", "id": 1})
+while True:
+    client.send_raw(frame)
+    while client.receive(0) is not None:
+        pass
+""",
+    )
+    assert flood.stdout is not None
+    flood.stdout.readline()
+    for _ in range(20):
+        honest.is_served()
+    flood.kill()
+    flood.communicate()
+    honest.is_alone()
+
+
+def test_one_that_never_reads_loses_its_answers_and_costs_nobody_else(
+    honest: Honest, connect: Connect
+) -> None:
+    deaf = attack(
+        honest.arbiter,
+        """
+client = WireClient(endpoint).hello("deaf")
+client._socket.setsockopt(zmq.SNDTIMEO, 200)
+assert client.ask("subscribe")["ok"]
+frame = msgpack.packb({"op": "status", "id": 1})
+sent = 0
+try:
+    for sent in range(200_000):
+        client.send_raw(frame)
+except zmq.Again:
+    pass
+done(sent=sent)
+import sys
+sys.stdin.readline()
+""",
+    )
+    assert deaf.stdout is not None
+    deaf.stdout.readline()
+    for _ in range(10):
+        honest.is_served()
+    deaf.kill()
+    deaf.communicate()
+    honest.is_alone()
+
+
+def test_waits_that_are_asked_for_and_given_up_without_end_leave_nothing(
+    honest: Honest, connect: Connect
+) -> None:
+    churner = connect().hello("churner")
+    for number in range(500):
+        waiting = churner.acquire("churner", 6 * GIB, nonce=f"n{number}")
+        if waiting["state"] == "loading":
+            lease = waiting["lease"]
+            answer = churner.ask("release", lease_id=lease["lease_id"], token=lease["token"])
+        else:
+            answer = churner.ask("cancel", lease_id=waiting["lease"]["lease_id"])
+        assert answer["ok"] or answer["error"]["code"] == "bad_state", answer  # granted in the same breath
+        if not answer["ok"]:
+            lease = churner.push("granted")["lease"]
+            assert churner.ask("release", lease_id=lease["lease_id"], token=lease["token"])["ok"]
+    honest.is_served()
+    assert churner.ask("bye")["ok"]
+    honest.is_alone()
+
+
+def test_a_thousand_hellos_that_vanish_leave_nothing(honest: Honest) -> None:
+    hasty = attack(
+        honest.arbiter,
+        """
+context = zmq.Context()
+context.set(zmq.MAX_SOCKETS, 1100)
+for number in range(1000):
+    socket = context.socket(zmq.DEALER)
+    socket.connect(endpoint)
+    name = f"h{number}"
+    socket.send(msgpack.packb({"op": "hello", "id": 1, "version": 1, "name": name, "instance": name}))
+    if number % 2:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.close()
+done()
+os._exit(0)
+""",
+    )
+    findings(hasty)
+    honest.is_alone()
+
+
+# -- junk ------------------------------------------------------------------------------------------------------------------
+def test_bombs_and_giants_are_answered_or_cut_off(honest: Honest, connect: Connect) -> None:
+    bomber = connect().hello("bomber")
+    for name, bomb in BOMBS.items():
+        bomber.send_raw(bomb)
+        answer = bomber.receive()
+        assert answer is not None, name
+        if name == "duplicate keys":  # its last op is `bye`
+            bomber.hello("bomber")
+    bomber.send_raw(b"\xc6" + (3 * MIB).to_bytes(4, "big") + bytes(3 * MIB))
+    answer = bomber.receive()
+    assert answer is not None
+    assert answer["error"]["code"] == "message_too_large"
+    for _ in range(4):
+        giant = connect().hello("giant")
+        giant.send_raw(bytes(32 * MIB))  # beyond what is read at all: libzmq hangs up
+    honest.is_served()
+
+
+def test_thousands_of_forged_frames_are_answered_one_by_one(honest: Honest, connect: Connect) -> None:
+    """Valid requests, mutants and noise, with the honest one's lease and token among them."""
+    forger = Forger(random.Random(5))
+    forger.lease_ids += [honest.on["lease_id"], "honest"]
+    liar = connect().hello("liar", role="observer")  # an observer can change nothing, whatever it knows
+    for number in range(1500):
+        frame = forger.frame() if number % 2 else msgpack.packb(forger.request(id=number))
+        liar.send_raw(frame)
+        answer = liar.receive()
+        while answer is not None and "push" in answer:
+            answer = liar.receive()
+        assert answer is not None, frame[:80]
+        if answer.get("ok") is False and answer["error"]["code"] == "unknown_session":
+            liar.hello("liar", role="observer")  # one of them was a `bye`
+    honest.is_served()
+
+
+# -- somebody else's words ----------------------------------------------------------------------------------------------------
+def test_a_stolen_token_lets_another_process_mark_a_use_and_nothing_else(honest: Honest) -> None:
+    """Handing a token over is how a runner marks a goal; its thief can keep the holder resident, but never make it leave."""
+    thief = attack(
+        honest.arbiter,
+        """
+client = WireClient(endpoint).hello("thief")
+on = words["on"]
+codes = {}
+for op in ("ready", "revoke_ack", "unloading", "release"):
+    codes[op] = client.ask(op, **on)["error"]["code"]
+codes["oom"] = client.ask("oom", **on, requested_bytes=1)["error"]["code"]
+codes["cancel"] = client.ask("cancel", lease_id=on["lease_id"])["error"]["code"]
+codes["renew"] = client.ask("renew", leases=[on])["gone"][0]["error"]["code"]
+spec = {"consumer": "honest", "model_id": "m", "footprint": {"load_peak_bytes": 1, "steady_bytes": 1}}
+held = {**on, "spec": spec, "state": "held"}
+codes["reattach"] = client.ask("reattach", leases=[held])["leases"][0]["error"]["code"]
+codes["end"] = client.ask("use_end", **on, use_id="work")["uses"]
+old = {**on, "token": [0, 1]}
+codes["stale"] = client.ask("use_begin", **old, use_id="x")["error"]["code"]
+codes["use"] = client.ask("use_begin", **on, use_id="x")["uses"]
+done(**codes)
+""",
+        on=honest.on,
+    )
+    found = findings(thief)
+    assert {found.pop(op) for op in ("ready", "revoke_ack", "unloading", "release", "oom", "cancel", "renew",
+                                     "reattach")} == {"not_permitted"}  # fmt: skip
+    assert found == {"end": 1, "stale": "stale_token", "use": 2}, (
+        "the honest one's own use is not the thief's to end"
+    )
+    honest.is_alone()
+
+
+def test_a_frame_under_another_ones_routing_id_is_nobodys(honest: Honest, connect: Connect) -> None:
+    mine = connect(routing_id=b"mine").hello("mine")
+    forger = attack(
+        honest.arbiter,
+        """
+client = WireClient(endpoint, routing_id=b"mine")
+client.send("hello", version=1, name="mine", instance="mine-1")
+client.send("bye")
+done(answer=client.receive(1.0))
+""",
+    )
+    assert findings(forger)["answer"] is None, (
+        "a second connection under a living routing id is not even heard"
+    )
+    assert mine.ask("ping")["ok"]
+    honest.is_served()
+
+
+def test_a_pid_cannot_be_claimed_in_a_message(honest: Honest) -> None:
+    """The kernel says who connected; there is no field for it."""
+    liar = attack(
+        honest.arbiter,
+        """
+client = WireClient(endpoint)
+answer = client.ask("hello", version=1, name="liar", instance="i", pid=words["pid"])
+done(code=answer["error"]["code"])
+""",
+        pid=os.getpid(),
+    )
+    assert findings(liar)["code"] == "bad_request"
+    honest.is_alone()
+
+
+def test_a_reconnect_storm_under_one_instance_is_one_session(honest: Honest, connect: Connect) -> None:
+    storm = attack(
+        honest.arbiter,
+        """
+for number in range(150):
+    with WireClient(endpoint) as client:
+        client.hello("again", instance="one")
+with WireClient(endpoint) as client:
+    done(clients=client.hello("again", instance="one").ask("status")["clients"])
+""",
+    )
+    assert findings(storm)["clients"] == 2
+    honest.is_alone()
