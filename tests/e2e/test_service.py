@@ -107,26 +107,32 @@ class Holder:
     """A real consumer process with a lease and bytes on the card."""
 
     def __init__(self, service: Service) -> None:
-        card = str(service.card)
         self.process = subprocess.Popen(
-            [sys.executable, str(CONSUMER), "holder", str(3 * GIB), card, str(GIB // 2)],
-            env=service.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            [sys.executable, str(CONSUMER), "holder", str(3 * GIB), str(service.card), str(GIB // 2)],
+            env=service.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0,
         )  # fmt: skip
+        self._said = b""
 
     def until(self, event: str) -> dict[str, Any]:
+        """Read its lines until an event comes. Not through a buffered file: what that holds back, `select` does not see."""
         assert self.process.stdout is not None
-        while select.select([self.process.stdout], [], [], PATIENCE_S)[0]:
-            line = self.process.stdout.readline()
-            assert line, f"the holder ended with {self.process.wait()} before {event}"
-            found: dict[str, Any] = json.loads(line)
-            if found["event"] == event:
-                return found
-        raise AssertionError(f"no {event} from the holder")
+        while True:
+            line, newline, rest = self._said.partition(b"\n")
+            if newline:
+                self._said = rest
+                found: dict[str, Any] = json.loads(line)
+                if found["event"] == event:
+                    return found
+                continue
+            readable, _, _ = select.select([self.process.stdout], [], [], PATIENCE_S)
+            assert readable, f"no {event} from the holder"
+            more = os.read(self.process.stdout.fileno(), 65_536)
+            assert more, f"the holder ended with {self.process.wait()} before {event}"
+            self._said += more
 
     def tell(self, command: str) -> None:
         assert self.process.stdin is not None
-        self.process.stdin.write(f"{command}\n")
-        self.process.stdin.flush()
+        self.process.stdin.write(f"{command}\n".encode())
 
 
 def status_when(service: Service, good: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
