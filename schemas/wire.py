@@ -412,5 +412,6 @@ class WhyReply(TypedDict):
     consumer: str
     leases: list[dict[str, Any]]
     # {"lease_id", "state", "needed_bytes", "free_bytes", "deficit_bytes", "condition", "blockers": [{"lease_id", "consumer",
-    #  "bytes", "state", "uses", "condition"}], "next": str, "eta_s": float | None, "eta_source": "learnt" | "none", "footprint":
+    #  "bytes", "state", "uses", "condition"}], "next": str, "plan": [{"action", "consumer", "lease_id", "in_s": float | None,
+    #  "text"}], "eta_s": float | None, "eta_source": "learnt" | "none", "footprint":
     #  {"declared_bytes": {part: int}, "learnt_bytes": {part: int}, "held_bytes": int | None}, "text": str}

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from statistics import median
 from typing import Any
 
-from arbiter.core import drift, gangs, policy, standby
+from arbiter.core import drift, gangs, outlook, policy, standby
 from arbiter.core.lease import AWAY, LEAVING, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 
@@ -147,7 +147,33 @@ def _best_position(core: Core, lease: Lease) -> int:
 def why(core: Core, consumer: str) -> dict[str, Any]:
     """`schemas.wire.WhyReply`: why a consumer is not running, or that it is."""
     mine = [lease for lease in core.leases.values() if lease.spec.consumer == consumer]
-    return {"consumer": consumer, "leases": [explain_lease(core, lease) for lease in mine]}
+    return {"consumer": consumer, "leases": [_with_plan(core, lease) for lease in mine]}
+
+
+def _with_plan(core: Core, lease: Lease) -> dict[str, Any]:
+    """What happens next with its instant, where one is planned; it also gives an estimate where nobody was asked yet."""
+    told = explain_lease(core, lease)
+    told["plan"] = []
+    if lease.state is LeaseState.QUEUED:
+        gpu = core.gpus[lease.planned_gpu or lease.gpus[0]]
+        told["plan"] = plan = outlook.steps(core, gpu, lease)
+        if told["eta_s"] is None and (eta := _eta_of_plan(core, lease, plan)) is not None:
+            told["eta_s"], told["eta_source"] = eta, "learnt"
+    return told
+
+
+def _eta_of_plan(core: Core, waiter: Lease, plan: Sequence[dict[str, Any]]) -> float | None:
+    """Seconds until it is loaded if everybody who is to be asked takes as long as usual. None: never seen, or nothing planned."""
+    load = core.learnt_s(waiter.spec.consumer, "load_s")
+    ends: list[float] = []
+    for step in plan:
+        if step["action"] == "ask":
+            phases = [core.learnt_s(step["consumer"], phase) for phase in ("drain_s", "unload_s", "verify_s")]
+            known = [seconds for seconds in phases if seconds is not None]
+            if len(known) < len(phases):
+                return None
+            ends.append(float(step["in_s"]) + sum(known))
+    return load + max(ends) if load is not None and ends else None
 
 
 def explain_lease(core: Core, lease: Lease) -> dict[str, Any]:

@@ -138,20 +138,24 @@ def sample_is_behind(gpu: Gpu) -> bool:
 
 
 # -- victims -----------------------------------------------------------------------------------------------------------
-def choose_victims(core: Core, gpu: Gpu, waiter: Lease, going: Mapping[LeaseId, int]) -> list[Lease] | None:
+def choose_victims(
+    core: Core, gpu: Gpu, waiter: Lease, going: Mapping[LeaseId, int], at: float | None = None
+) -> list[Lease] | None:
     """The cheapest holders whose leaving lets the waiter in. None: nobody may be asked now, or it would not help.
 
     Idle holders may be asked by anyone once they have had their minimum residency, holders in use only by a waiter of
     at least their priority (they finish first). If a set with fewer holders in use is only a residency away, it is waited for.
+    `at`: as it will be then, if nothing else changes (default: now).
     """
-    priority = waiter.priority_at(core.now, core.settings.ageing_s_per_point)
+    at = core.now if at is None else at
+    priority = waiter.priority_at(at, core.settings.ageing_s_per_point)
     willing = [
         lease
         for lease in gpu.in_state(LeaseState.HELD)
         if may_ask(lease) and (not lease.in_use or lease.spec.priority <= priority)
     ]
     search = _oldest if core.settings.scheduling.least_recent else _search
-    ripe = [lease for lease in willing if residency_ends_at(lease) <= core.now]
+    ripe = [lease for lease in willing if residency_ends_at(lease) <= at]
     now = _cheapest(gpu, waiter, going, ripe, search)
     if now is not None and not _in_use(now):
         return now
@@ -194,6 +198,13 @@ def residency_ends_at(lease: Lease) -> float:
 
 def wake_when_evictable(core: Core, gpu: Gpu, waiter: Lease | None) -> None:
     """Look again when a residency ends or the waiter has aged enough to ask somebody in use."""
+    later = ask_times(core, gpu, waiter)
+    if later:
+        core.timers.set(("plan", gpu.info.id), min(later))
+
+
+def ask_times(core: Core, gpu: Gpu, waiter: Lease | None) -> list[float]:
+    """Instants to come at which somebody may be asked who may not be asked now."""
     ageing_s = core.settings.ageing_s_per_point
     times: list[float] = []
     for lease in gpu.in_state(LeaseState.HELD):
@@ -203,9 +214,7 @@ def wake_when_evictable(core: Core, gpu: Gpu, waiter: Lease | None) -> None:
         if waiter is not None and lease.in_use:
             gap = lease.spec.priority - waiter.spec.priority
             times.append(waiter.arrived_at + gap * ageing_s + _WAKE_SLACK_S)
-    later = [at for at in times if at > core.now]
-    if later:
-        core.timers.set(("plan", gpu.info.id), min(later))
+    return [at for at in times if at > core.now]
 
 
 def is_best_place(core: Core, gpu: Gpu, waiter: Lease, plan: Sequence[Lease]) -> bool:

@@ -158,6 +158,7 @@ def _why_details(lease: Message) -> list[str]:
             f"{blocker['state']}, {blocker['condition']}"
         )
     lines.append(f"  next      {lease['next']}")
+    lines += [f"  then      {step['text']}" for step in lease.get("plan", ())]
     eta = lease["eta_s"]
     lines.append(
         f"  expected  {'unknown, never seen before' if eta is None else f'in {duration(eta)} ({lease["eta_source"]})'}"

@@ -142,6 +142,25 @@ def test_drift_is_a_column_only_where_somebody_drifts() -> None:
     assert ("+1 GiB" in above, "-512 MiB" in below, "+" in none) == (True, True, False)
 
 
+def test_why_tells_what_is_planned() -> None:
+    plan = [{"action": "ask", "in_s": 1.2, "text": "asks detector in 1.2 s, when its minimum residency ends"}]
+    entry = {
+        "lease_id": "L1-2",
+        "state": "queued",
+        "needed_bytes": 4 << 30,
+        "free_bytes": 0,
+        "deficit_bytes": 4 << 30,
+        "blockers": [],
+        "next": "waits for detector",
+        "plan": plan,
+        "eta_s": None,
+        "eta_source": "none",
+        "text": "t",
+    }
+    lines = text.why_lines({"consumer": "grab", "leases": [entry]})
+    assert "  then      asks detector in 1.2 s, when its minimum residency ends" in lines
+
+
 def test_why_tells_what_was_measured_before() -> None:
     parts = ("load_peak", "steady", "residue")
     never = {"declared_bytes": dict.fromkeys(parts, GIB), "learnt_bytes": dict.fromkeys(parts, 0)}

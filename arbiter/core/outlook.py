@@ -1,0 +1,143 @@
+"""What the arbiter will do next for a waiter, and at which instant where that is planned. Reads only; for people who ask `why`.
+
+A step is `{"action", "consumer", "lease_id", "in_s", "text"}`; `in_s` None: it depends on somebody, no instant is planned.
+Not on the path of a decision: looking ahead costs a search for victims per instant.
+"""
+
+from typing import Any
+
+from arbiter.core import policy
+from arbiter.core.lease import LEAVING, Lease, LeaseState
+from arbiter.core.state import Core, Gpu
+
+LOOKED_AT_MAX = 16
+"""Instants at which somebody could be asked that are looked at, the nearest first."""
+
+type Step = dict[str, Any]
+
+
+def steps(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
+    """For a queued lease, the nearest first; what has no instant comes last."""
+    alone = waiter.gang is None and gpu.queue.position(waiter) == 1  # a gang is told by its own phase
+    found = _of_head(core, gpu, waiter) if alone else []
+    if waiter.wait_timeout_s is not None:
+        at = waiter.arrived_at + waiter.wait_timeout_s
+        found.append(_step(core, "give_up", waiter, at, "gives up", "when its wait timeout is over"))
+    return sorted(found, key=lambda step: float("inf") if step["in_s"] is None else step["in_s"])
+
+
+def _of_head(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
+    if core.recovering is not None:
+        ends = [core.leases[lease].expires_at for lease in core.recovering if lease in core.leases]
+        at = max(ends, default=None)
+        return [
+            _step(
+                core, "serve", None, at, "grants again", "when every holder has come back or its time is over"
+            )
+        ]
+    if gpu.failed_at is not None or gpu.sample is None:
+        return [_next_reading(core, gpu, "nothing is granted on a card that cannot be read")]
+    found = [
+        _step(
+            core,
+            "loaded",
+            lease,
+            _learnt_end(core, lease),
+            f"lets {lease.spec.consumer} finish loading",
+            "one loads at a time",
+        )
+        for lease in gpu.in_state(LeaseState.LOADING)
+    ]
+    found += [_leaving(core, gpu, waiter, lease) for lease in gpu.in_state(*LEAVING)]
+    going = policy.leaving(gpu)
+    if found or policy.blocked(core, gpu):
+        return found
+    if policy.fits(gpu, waiter, going):
+        return [_next_reading(core, gpu, "the ledger has room, the card has to show it")]
+    return _asking(core, gpu, waiter)
+
+
+def _asking(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
+    """Whom it will ask, and when: at the first instant at which somebody may be asked whose leaving is enough."""
+    going = policy.leaving(gpu)
+    for at in sorted({core.now, *policy.ask_times(core, gpu, waiter)})[:LOOKED_AT_MAX]:
+        victims = policy.choose_victims(core, gpu, waiter, going, at)
+        if victims is None:
+            continue
+        return [
+            _step(core, "ask", victim, at, f"asks {victim.spec.consumer}", _because(core, victim, at))
+            for victim in victims
+        ]
+    return [
+        _step(
+            core,
+            "wait",
+            None,
+            None,
+            "asks nobody",
+            "those who could make room are pinned or in use above its priority",
+        )
+    ]
+
+
+def _because(core: Core, victim: Lease, at: float) -> str:
+    if at <= core.now:
+        return "as soon as the card is looked at again"
+    if at == policy.residency_ends_at(victim):
+        return "when its minimum residency ends"
+    return (
+        "when the waiter's priority has aged to its own"
+        if victim.in_use
+        else "when enough may be asked together"
+    )
+
+
+def _leaving(core: Core, gpu: Gpu, waiter: Lease, holder: Lease) -> Step:
+    name = holder.spec.consumer
+    verification = gpu.verifications.get(holder.id)
+    if verification is not None:
+        latest = max(0.0, verification.deadline_at - core.now)
+        because = (
+            f"a verdict comes in {latest:.1f} s at the latest"
+            if latest
+            else "until its bytes are measured gone"
+        )
+        return _step(
+            core, "measure", holder, verification.next_poll_at, f"measures {name}'s bytes again", because
+        )
+    eviction = holder.eviction
+    if eviction is None or holder.state is LeaseState.UNLOADING or eviction.overdue:
+        return _step(core, "wait", holder, None, f"waits for {name} to let go", "it is on its way out")
+    at = eviction.asked_at + core.settings.revoke_deadline_s
+    then = "is denied" if waiter.spec.deny_on_deadline else "waits on, and the holder's own rule applies"
+    return _step(
+        core,
+        "deadline",
+        holder,
+        at,
+        f"waits for {name} to let go",
+        f"after that {waiter.spec.consumer} {then}",
+    )
+
+
+def _next_reading(core: Core, gpu: Gpu, because: str) -> Step:
+    times = [core.timers.at((kind, gpu.info.id)) for kind in ("verify", "probe")]
+    at = min((time for time in times if time is not None), default=None)
+    return _step(core, "read", None, at, "reads the card again", because)
+
+
+def _learnt_end(core: Core, lease: Lease) -> float | None:
+    end = lease.granted_at + (core.learnt_s(lease.spec.consumer, "load_s") or 0.0)
+    return end if end > core.now else None
+
+
+def _step(core: Core, action: str, lease: Lease | None, at: float | None, what: str, because: str) -> Step:
+    in_s = None if at is None else max(0.0, at - core.now)
+    when = "" if in_s is None else f" for {in_s:.1f} s more" if action == "deadline" else f" in {in_s:.1f} s"
+    return {
+        "action": action,
+        "consumer": "" if lease is None else lease.spec.consumer,
+        "lease_id": None if lease is None else lease.id,
+        "in_s": in_s,
+        "text": f"{what}{when}, {because}",
+    }

@@ -1,0 +1,224 @@
+"""What happens next for a waiter, with its instant where one is planned; and it does happen then."""
+
+from typing import Any
+
+import pytest
+
+from arbiter.testing.core_driver import Consumer, CoreDriver
+from schemas import defaults as d
+from schemas.ids import LeaseId, ProcessKey
+
+GIB = d.GIB
+
+
+def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
+    person = driver.consumer(name)
+    lease = person.acquire(int(gib * GIB), **spec)
+    driver.until(lambda: driver.state(lease) == "loading")
+    person.load(lease)
+    driver.advance(0.01)
+    return person, lease
+
+
+def plan(driver: CoreDriver, consumer: str = "w") -> list[dict[str, Any]]:
+    (entry,) = driver.arbiter.why(consumer, driver.now)["leases"]
+    steps: list[dict[str, Any]] = entry["plan"]
+    return steps
+
+
+def only(driver: CoreDriver, consumer: str = "w") -> dict[str, Any]:
+    (step,) = plan(driver, consumer)
+    return step
+
+
+def test_it_asks_when_the_minimum_residency_ends() -> None:
+    driver = CoreDriver()
+    _, lease = held(driver, "detector", 6, min_residency_s=2.0)
+    driver.consumer("w").acquire(4 * GIB)
+    step = only(driver)
+    assert (step["action"], step["consumer"], step["lease_id"]) == ("ask", "detector", lease)
+    assert step["text"] == f"asks detector in {step['in_s']:.1f} s, when its minimum residency ends"
+    assert not driver.pushes("revoke", lease)
+    driver.advance(step["in_s"] - 0.01)
+    assert not driver.pushes("revoke", lease)
+    driver.advance(0.02)
+    assert driver.pushes("revoke", lease)
+
+
+def test_it_asks_when_the_waiter_has_aged_enough() -> None:
+    driver = CoreDriver()
+    holder, lease = held(driver, "important", 6, priority=52)
+    holder.use_begin(lease)
+    driver.consumer("w").acquire(4 * GIB, priority=50)
+    step = only(driver)
+    assert step["in_s"] == pytest.approx(2 * d.AGEING_S_PER_POINT, abs=0.1)
+    assert step["text"].endswith("when the waiter's priority has aged to its own")
+    driver.advance(step["in_s"] + 0.01)
+    assert driver.pushes("revoke", lease)
+
+
+def test_several_are_asked_together_when_the_last_of_them_may_be() -> None:
+    driver = CoreDriver()
+    held(driver, "first", 3.5, min_residency_s=1.0)
+    held(driver, "second", 3.5, min_residency_s=3.0)
+    driver.consumer("w").acquire(7 * GIB)
+    steps = plan(driver)
+    assert [(step["action"], step["consumer"]) for step in steps] == [("ask", "first"), ("ask", "second")]
+    assert steps[0]["in_s"] == steps[1]["in_s"]
+    assert steps[0]["text"].endswith("when enough may be asked together")
+    assert steps[1]["text"].endswith("when its minimum residency ends")
+
+
+def test_nobody_is_asked_where_nobody_could_make_room() -> None:
+    driver = CoreDriver()
+    driver.card.names[ProcessKey(9, 9)] = "game"
+    driver.card.set(ProcessKey(9, 9), 5 * GIB, driver.now)
+    driver.advance(1.5)
+    driver.consumer("w").acquire(4 * GIB)
+    step = only(driver)
+    assert (step["action"], step["consumer"], step["lease_id"], step["in_s"]) == ("wait", "", None, None)
+    assert step["text"] == "asks nobody, those who could make room are pinned or in use above its priority"
+
+
+def test_whoever_may_be_asked_already_waits_for_a_measurement_first() -> None:
+    """A dead process's residue may come back any moment: nobody is asked meanwhile."""
+    driver = CoreDriver()
+    gone, lease = held(driver, "gone", 1, residue_bytes=1 * GIB)
+    gone.unload(lease)
+    driver.advance(1.0)
+    held(driver, "holder", 5)
+    driver.card.lag_s = 5.0
+    gone.die()
+    driver.consumer("w").acquire(4 * GIB)
+    step = only(driver)
+    assert (step["action"], step["in_s"]) == ("ask", 0.0)
+    assert step["text"] == "asks holder in 0.0 s, as soon as the card is looked at again"
+
+
+def test_a_holder_on_its_way_out() -> None:
+    driver = CoreDriver()
+    holder, lease = held(driver, "holder", 6)
+    holder.use_begin(lease)
+    driver.consumer("w").acquire(4 * GIB)
+    driver.consumer("strict").acquire(7 * GIB, deny_on_deadline=True)
+    step = only(driver)
+    assert step["action"] == "deadline"
+    assert step["in_s"] == pytest.approx(d.REVOKE_DEADLINE_S, abs=0.1)
+    assert (
+        step["text"]
+        == "waits for holder to let go for 30.0 s more, after that w waits on, and the holder's own rule applies"
+    )
+    driver.advance(d.REVOKE_DEADLINE_S + 0.1)
+    assert (only(driver)["action"], only(driver)["in_s"]) == ("wait", None)
+    holder.use_end(lease)
+    holder.unloading(lease)
+    assert only(driver)["text"] == "waits for holder to let go, it is on its way out"
+    driver.card.lag_s = 20.0
+    holder.hold(0)
+    holder.release(lease)
+    step = only(driver)
+    assert (step["action"], step["lease_id"]) == ("measure", lease)
+    assert 0 <= step["in_s"] <= 0.05
+    assert "a verdict comes in 10.0 s at the latest" in step["text"]
+    driver.card.silent = True  # no reading comes, so the verdict is late
+    driver.advance(11)
+    assert "until its bytes are measured gone" in only(driver)["text"]
+
+
+def test_who_wants_to_be_denied_at_the_deadline_is_told() -> None:
+    driver = CoreDriver()
+    holder, lease = held(driver, "holder", 6)
+    holder.use_begin(lease)
+    driver.consumer("w").acquire(4 * GIB, deny_on_deadline=True)
+    assert only(driver)["text"].endswith("after that w is denied")
+
+
+def test_a_load_under_way() -> None:
+    driver = CoreDriver()
+    driver.consumer("loader").acquire(3 * GIB)
+    driver.advance(0.01)
+    driver.consumer("w").acquire(3 * GIB)
+    step = only(driver)
+    assert (step["text"], step["in_s"]) == ("lets loader finish loading, one loads at a time", None)
+
+    known = CoreDriver(settings={"learnt": {"loader": {"load_s": 4.0}}})
+    known.consumer("loader").acquire(3 * GIB)
+    known.advance(0.5)
+    known.consumer("w").acquire(3 * GIB)
+    assert only(known)["in_s"] == pytest.approx(3.5, abs=0.1)
+
+
+def test_a_card_that_cannot_be_read_and_one_that_shows_no_room() -> None:
+    driver = CoreDriver()
+    driver.card.failing = "hangs"
+    driver.advance(1.5)
+    driver.consumer("w").acquire(3 * GIB)
+    step = only(driver)
+    assert (step["action"], step["text"].split(",")[1]) == (
+        "read",
+        " nothing is granted on a card that cannot be read",
+    )
+    assert 0 < step["in_s"] <= d.PROBE_PERIOD_S
+
+    silent = CoreDriver()
+    silent.card.silent = True
+    silent.advance(3)
+    silent.consumer("w").acquire(3 * GIB)
+    assert only(silent)["text"].endswith("the ledger has room, the card has to show it")
+
+
+def test_pressure_plans_nothing_of_its_own() -> None:
+    driver = CoreDriver()
+    holder, _ = held(driver, "holder", 4, evictable=False)
+    holder.hold(int(7.9 * GIB))
+    driver.advance(1.5)
+    driver.consumer("w").acquire(3 * GIB)
+    assert plan(driver) == []
+
+
+def test_after_a_restart_the_latest_holder_gives_the_bound() -> None:
+    driver = CoreDriver()
+    held(driver, "holder", 4, ttl_s=10.0)
+    driver.restart()
+    driver.consumer("w").acquire(3 * GIB)
+    step = only(driver)
+    assert step["action"] == "serve"
+    assert step["in_s"] == pytest.approx(10.0 + d.FENCE_GRACE_S, abs=0.1)
+
+
+def test_behind_others_only_its_own_end_is_planned() -> None:
+    driver = CoreDriver()
+    holder, lease = held(driver, "holder", 6)
+    holder.use_begin(lease)
+    driver.consumer("head").acquire(4 * GIB)
+    driver.consumer("w").acquire(5 * GIB, wait_timeout_s=12.0)
+    step = only(driver)
+    assert (step["action"], step["in_s"]) == ("give_up", 12.0)
+    assert step["text"] == "gives up in 12.0 s, when its wait timeout is over"
+
+
+def test_the_estimate_counts_those_who_will_be_asked() -> None:
+    learnt = {"detector": {"drain_s": 1.0, "unload_s": 0.5, "verify_s": 0.5}, "w": {"load_s": 3.0}}
+    driver = CoreDriver(settings={"learnt": learnt})
+    held(driver, "detector", 6, min_residency_s=2.0)
+    driver.consumer("w").acquire(4 * GIB)
+    (entry,) = driver.arbiter.why("w", driver.now)["leases"]
+    assert entry["eta_source"] == "learnt"
+    assert entry["eta_s"] == pytest.approx(7.0, abs=0.1)
+    unknown = CoreDriver(settings={"learnt": {"w": {"load_s": 3.0}}})
+    held(unknown, "detector", 6, min_residency_s=2.0)
+    unknown.consumer("w").acquire(4 * GIB)
+    (entry,) = unknown.arbiter.why("w", unknown.now)["leases"]
+    assert (entry["eta_s"], entry["eta_source"]) == (None, "none")
+
+
+def test_a_member_of_a_gang_is_told_by_its_gang() -> None:
+    driver = CoreDriver()
+    driver.consumer("w").acquire(3 * GIB, gang=("team", 2))
+    assert plan(driver) == []
+
+
+def test_a_resident_lease_has_no_plan() -> None:
+    driver = CoreDriver()
+    held(driver, "w", 3)
+    assert plan(driver) == []
