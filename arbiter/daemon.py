@@ -124,9 +124,12 @@ def core_settings(config: ArbiterConfig, gpus: tuple[GpuInfo, ...], opened: Open
         footprints=dict(opened.footprints),
         policy=config.scheduling.policy,
         ageing_s_per_point=config.scheduling.ageing_s_per_point,
+        thrash_window_s=config.scheduling.thrash_window_s,
+        thrash_hold_max_s=config.scheduling.thrash_hold_max_s,
         revoke_resend_s=config.revoke.resend_s,
         revoke_remind_s=config.revoke.remind_s,
         revoke_deadline_s=config.revoke.deadline_s,
+        terminate_grace_s=config.revoke.terminate_grace_s,
         verify_timeout_s=config.verify.timeout_s,
         verify_poll_s=config.verify.poll_s,
         verify_poll_until_s=config.verify.poll_until_s,
@@ -245,7 +248,9 @@ class Daemon:
             time.monotonic,
             problems=lambda: problems(journal, history),
         )
-        executor = Executor(sessions, journal, history, prober.sample, inbox.post, telemetry.log_event)
+        executor = Executor(
+            sessions, journal, history, prober.sample, inbox.post, telemetry.log_event, watch.signal
+        )
 
         self._tell_start(history, journal, places, gpus)  # 5
         if journal.opened.records or journal.opened.put_aside:

@@ -51,6 +51,10 @@ class SchedulingConfig(_Section):
 
     ageing_s_per_point: Seconds = d.AGEING_S_PER_POINT
     """A waiter gains one point of priority per so many seconds, so that nobody starves."""
+    thrash_window_s: Seconds = d.THRASH_WINDOW_S
+    """Two consumers that made each other leave within so many seconds are thrashing."""
+    thrash_hold_max_s: Annotated[float, Field(ge=0, le=86_400, allow_inf_nan=False)] = d.THRASH_HOLD_MAX_S
+    """Of two that thrash, whoever is there stays for what a switch costs, at most so long. 0: never."""
     policy: Literal["default", "fifo", "no_backfill", "lru", "one_model"] = "default"
     """Who is next and who leaves; docs/policies.md compares them."""
 
@@ -64,6 +68,8 @@ class RevokeConfig(_Section):
     """After this long without a safe point the history says so."""
     deadline_s: Seconds = d.REVOKE_DEADLINE_S
     """After this long the waiter's own policy applies: keep waiting (`wait`) or a typed error (`deny`)."""
+    terminate_grace_s: Seconds = d.TERMINATE_GRACE_S
+    """A holder whose lease says `on_overstay: kill` is killed so long after it was told to terminate."""
 
 
 class VerifyConfig(_Section):

@@ -13,12 +13,15 @@ FENCE_GRACE_S = 5.0  # after ttl + grace without the arbiter a client unloads by
 MIN_RESIDENCY_S = 2.0
 PRIORITY = 50
 PRIORITY_MAX = 100
+THRASH_WINDOW_S = 60.0  # two consumers that throw each other out within so long are switching too often
+THRASH_HOLD_MAX_S = 30.0
 AGEING_S_PER_POINT = 5.0  # one priority point per 5 s waited
 
 # The ladder towards a holder
 REVOKE_RESEND_S = 0.25
 REVOKE_REMIND_S = 2.0
 REVOKE_DEADLINE_S = 30.0
+TERMINATE_GRACE_S = 5.0  # between SIGTERM and SIGKILL, for holders that agreed to be killed
 
 # Measurement
 VERIFY_TIMEOUT_S = 10.0

@@ -3,7 +3,7 @@
 Request   {"op": …, "id": n, …fields, "traceparent"?}            client → arbiter
 Reply     {"re": n, "epoch": e, "ok": true, …}                   arbiter → client
           {"re": n, "epoch": e, "ok": false, "error": {"code", "message", "hint", "details"}}
-Push      {"push": "revoke" | "granted" | "denied" | "lost" | "event", "seq": n, "epoch": e, …}
+Push      {"push": "revoke" | "granted" | "denied" | "resized" | "lost" | "event", "seq": n, "epoch": e, …}
 
 Requests are validated here (frozen, unknown keys refused). Replies and pushes are plain maps: the shapes are the TypedDicts below,
 because dumping a model costs more than the whole codec. New fields always have defaults; a type never changes.
@@ -66,6 +66,9 @@ class LeaseSpec(_Frozen):
     min_residency_s: Seconds = d.MIN_RESIDENCY_S
     on_deadline: Literal["wait", "deny"] = (
         "wait"  # what a waiter gets when a holder outstays the ladder's deadline
+    )
+    on_overstay: Literal["wait", "terminate", "kill"] = (
+        "wait"  # what may be done to its own process if that outstays the deadline idle
     )
     standby: bool = False  # asked to leave, it comes back by itself when there is room
     park_bytes: Bytes = 0  # host RAM that keeps its weights while it is away; 0: it cannot be parked
@@ -173,6 +176,14 @@ class Reacquire(_OnLease):
     wait_timeout_s: Seconds | None = None
 
 
+class Resize(_OnLease):
+    """The holder freed bytes, or needs more. Reply state `held`, `shrinking` or `growing`; then push `resized`, or `denied` for a growth."""
+
+    op: Literal["resize"]
+    footprint: Footprint
+    wait_timeout_s: Seconds | None = None
+
+
 class ReattachLease(_Frozen):
     lease_id: LeaseIdText
     token: TokenPair
@@ -274,14 +285,14 @@ class Bye(_Request):
 
 
 Request = Annotated[
-    Hello | Acquire | Ready | UseBegin | UseEnd | Yield | Renew | RevokeAck | Unloading | Release | Cancel | Reacquire | Reattach | Oom
+    Hello | Acquire | Ready | UseBegin | UseEnd | Yield | Renew | RevokeAck | Unloading | Release | Cancel | Reacquire | Resize | Reattach | Oom
     | Status | Why | History | Subscribe | Evict | Pin | Unpin | ReleaseDead | Drain | Resume | Ping | Bye,
     Field(discriminator="op"),
 ]  # fmt: skip
 REQUEST: TypeAdapter[Request] = TypeAdapter(Request)
 OPS: tuple[str, ...] = (
     "hello", "acquire", "ready", "use_begin", "use_end", "yield", "renew", "revoke_ack", "unloading", "release", "cancel",
-    "reacquire", "reattach", "oom", "status", "why", "history", "subscribe", "evict", "pin", "unpin", "release_dead", "drain", "resume",
+    "reacquire", "resize", "reattach", "oom", "status", "why", "history", "subscribe", "evict", "pin", "unpin", "release_dead", "drain", "resume",
     "ping", "bye",
 )  # fmt: skip
 
@@ -304,6 +315,8 @@ class LeaseView(TypedDict):
     pid: int
     since_s: float  # seconds in this state
     standby: NotRequired[bool]  # asked to leave, it comes back by itself
+    grows: NotRequired[str]  # it waits for bytes for that lease
+    resizing: NotRequired[str]  # growing or shrinking
     parked_bytes: NotRequired[int]  # host RAM that is booked for it
     waited_s: NotRequired[float]
     position: NotRequired[int]
@@ -360,6 +373,15 @@ class DeniedPush(TypedDict):
     push: Literal["denied"]
     lease_id: str
     error: dict[str, Any]
+
+
+class ResizedPush(TypedDict):
+    """The lease has this size now: it has grown, it has shrunk, or it could not be measured smaller in time."""
+
+    push: Literal["resized"]
+    lease_id: str
+    token: list[int]
+    charge_bytes: int
 
 
 class LostPush(TypedDict):

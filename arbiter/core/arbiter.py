@@ -21,11 +21,13 @@ from arbiter.core import (
     explain,
     gangs,
     grants,
+    growth,
     invariants,
     measure,
     operators,
     recovery,
     requests,
+    resizing,
     resume,
     subleases,
     uses,
@@ -49,6 +51,7 @@ from arbiter.core.events import (
     Recovered,
     ReleaseReported,
     Renewed,
+    ResizeAsked,
     Resumed,
     RevokeAcknowledged,
     Tick,
@@ -138,6 +141,7 @@ class Arbiter:
             # 1.3 the machine
             case MemorySampled():
                 measure.on_sample(core, event)
+                growth.on_sample(core, event)
                 recovery.void_at_baseline(core, event)
             case ProbeFailed():
                 measure.on_probe_failed(core, event)
@@ -171,6 +175,7 @@ class Arbiter:
         | UnloadStarted
         | ReleaseReported
         | Reacquired
+        | ResizeAsked
         | Reattached
         | OperatorAsked,
     ) -> None:
@@ -201,6 +206,8 @@ class Arbiter:
                 requests.unloading(core, event)
             case ReleaseReported():
                 requests.release(core, event)
+            case ResizeAsked():
+                resizing.resize(core, event)
             case Reacquired():
                 requests.reacquire(core, event)
             case Reattached():
@@ -219,6 +226,10 @@ class Arbiter:
                     requests.on_wait_timeout(core, subject)
                 case "revoke":
                     eviction.on_ladder_due(core, subject)
+                case "shrink":
+                    growth.on_shrink_due(core, subject)
+                case "overstay":
+                    eviction.on_overstay_due(core, subject)
                 case "verify":
                     measure.on_poll_due(core, subject)
                 case "probe":

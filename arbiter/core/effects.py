@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
-from schemas.ids import ClientId, GpuId, RequestId
+from schemas.ids import ClientId, GpuId, ProcessKey, RequestId
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,4 +67,13 @@ class Note:
     data: Mapping[str, Any]
 
 
-Effect = Reply | Refuse | Push | JournalPut | JournalDelete | Sample | Note
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """Send a signal to a process that agreed to it (`on_overstay`), by the descriptor that its start was checked with. One that is gone
+    already is fine: its death is told as an event."""
+
+    process: ProcessKey
+    kind: Literal["term", "kill"]
+
+
+Effect = Reply | Refuse | Push | JournalPut | JournalDelete | Sample | Signal | Note

@@ -57,6 +57,7 @@ class Spec:
     deny_on_deadline: bool
     standby: bool = False
     park_bytes: int = 0
+    on_overstay: str = "wait"  # or "terminate", "kill"
     parent: tuple[LeaseId, Token] | None = None
     independent: bool = False
     gang: tuple[str, int] | None = None  # (id, size)
@@ -166,6 +167,20 @@ class Reacquired:
 
 
 @dataclass(frozen=True, slots=True)
+class ResizeAsked:
+    """The holder gave bytes back, or needs more. `wait_timeout_s` bounds a growth's wait."""
+
+    client: ClientId
+    request: RequestId
+    lease: LeaseId
+    token: Token
+    load_peak_bytes: int
+    steady_bytes: int
+    residue_bytes: int
+    wait_timeout_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class ReattachedLease:
     lease: LeaseId
     token: Token
@@ -266,6 +281,6 @@ class Tick:
 
 Event = (
     ClientConnected | ClientLeft | ProcessDied | AcquireRequested | ReadyReported | UseBegan | UseEnded | UseYielded
-    | Renewed | RevokeAcknowledged | UnloadStarted | ReleaseReported | CancelRequested | Reacquired | Reattached | OomReported
+    | Renewed | RevokeAcknowledged | UnloadStarted | ReleaseReported | CancelRequested | Reacquired | ResizeAsked | Reattached | OomReported
     | OperatorAsked | MemorySampled | ProbeFailed | JournalFailed | Recovered | Resumed | Tick
 )  # fmt: skip

@@ -1,12 +1,14 @@
 """The ladder towards a holder: ask, ask again until heard, remind, deadline.
 
-A holder is only ever *asked*. It unloads by itself at its safe point; the core refuses its `unloading` before that.
+A holder is only ever *asked*. It unloads by itself at its safe point; the core refuses its `unloading` before that. What comes after the
+deadline was agreed by the holder itself (`on_overstay` of its own lease), and is never done to a process that uses anything.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 from arbiter.core import families
+from arbiter.core.effects import Signal
 from arbiter.core.lease import LEAVING, Eviction, Lease, LeaseState
 from arbiter.core.state import Core, Gpu, Refused
 from schemas.ids import LeaseId
@@ -51,6 +53,8 @@ def _begin(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: st
 def _tell(core: Core, holder: Lease, eviction: Eviction) -> None:
     """The first `revoke`, and the start of the ladder."""
     _push_now(core, holder, eviction)
+    if holder.spec.on_overstay != "wait":
+        core.timers.set(("overstay", holder.id), _overstays_at(core, holder, eviction))
     core.note(
         "revoke_asked",
         holder,
@@ -136,6 +140,8 @@ def _deadline(core: Core, holder: Lease, eviction: Eviction) -> None:
     core.note("deadline_passed", holder, uses=holder.busy_uses(), wanted_by=eviction.wanted_consumer)
     core.wake(core.gpu_of(holder))
     waiter = core.waiting.get(eviction.wanted_by) if eviction.wanted_by is not None else None
+    for gpu_id in () if waiter is None else waiter.gpus:
+        core.wake(core.gpus[gpu_id])  # it may be served on another card now
     if waiter is None or not waiter.spec.deny_on_deadline:
         return
     message = f"{holder.spec.consumer} did not leave within {core.settings.revoke_deadline_s:g} s"
@@ -151,15 +157,58 @@ def _deadline(core: Core, holder: Lease, eviction: Eviction) -> None:
     )
 
 
+def on_overstay_due(core: Core, lease_id: str) -> None:
+    """Has the holder outstayed, idle, for the whole deadline since its last use or step? Then its process is told to end, as it agreed.
+
+    Nothing is done to a process that uses any lease, its own or another's: that is looked at again later.
+    """
+    holder = core.leases[LeaseId(lease_id)]
+    eviction = holder.eviction
+    if eviction is None or holder.state not in (LeaseState.REVOKING, LeaseState.UNLOADING):
+        return
+    due_at = _overstays_at(core, holder, eviction)
+    if _process_in_use(core, holder):
+        due_at = core.now + core.settings.revoke_deadline_s
+    if due_at > core.now:
+        core.timers.set(("overstay", holder.id), due_at)
+        return
+    kind: Literal["term", "kill"] = "kill" if eviction.signalled else "term"
+    eviction.signalled = kind
+    core.out.append(Signal(holder.process, kind))
+    core.note(
+        "signalled",
+        holder,
+        signal=kind,
+        pid=holder.process.pid,
+        wanted_by=eviction.wanted_consumer,
+        reason=f"asked {core.now - eviction.asked_at:.1f} s ago, idle, and its lease says on_overstay={holder.spec.on_overstay}",
+    )
+    if kind == "term" and holder.spec.on_overstay == "kill":
+        core.timers.set(("overstay", holder.id), core.now + core.settings.terminate_grace_s)
+
+
+def _overstays_at(core: Core, holder: Lease, eviction: Eviction) -> float:
+    """A whole deadline after it was asked, after its last use and after its last step towards the exit."""
+    if eviction.signalled:
+        return core.now
+    return max(eviction.asked_at, holder.last_used_at, holder.since) + core.settings.revoke_deadline_s
+
+
+def _process_in_use(core: Core, holder: Lease) -> bool:
+    return holder.process in core.users or any(lease.busy_uses() for lease in core.leases_of(holder.process))
+
+
 def deny(core: Core, waiter: Lease, error: Mapping[str, Any]) -> None:
     """End a waiter's wait with a typed error."""
     waiter.move(LeaseState.DENIED, core.now, str(error["message"]))
     core.dequeue(waiter)
     if waiter.answered or waiter.request is None:
-        core.push(waiter, {"push": "denied", "lease_id": waiter.id, "error": error})
+        core.push(waiter, {"push": "denied", "lease_id": waiter.grows or waiter.id, "error": error})
     else:  # it has only just asked
         refused = Refused(error["code"], error["message"], error["hint"], **error["details"])
         core.refuse(waiter.client, waiter.request, refused)
+    if waiter.grows is not None:
+        core.leases[waiter.grows].growth = None
     core.note("denied", waiter, code=error["code"], reason=error["message"])
     core.end(waiter, error)
 

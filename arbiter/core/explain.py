@@ -12,7 +12,7 @@ NOTE_KINDS: tuple[str, ...] = (
     "queued", "granted", "ready", "switch", "use_began", "use_ended", "use_yielded", "revoke_asked", "revoke_acked", "reminded",
     "deadline_passed", "unloading", "released", "verified", "denied", "cancelled", "expired", "lost", "reattached", "oom",
     "pressure", "stowaway", "probe_failed", "probe_ok", "drift", "journal_failed", "recovered", "serving", "operator", "resumed",
-    "standby", "parked", "orphaned", "gang",
+    "standby", "parked", "orphaned", "gang", "signalled", "resized",
 )  # fmt: skip
 """Every kind of `effects.Note`. `switch` comes with each `ready`; its field `switched` says whether anybody had to leave."""
 
@@ -49,6 +49,10 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
         )
     if lease.yielded:
         shown["yielded"] = len(lease.yielded)
+    if lease.grows is not None:
+        shown["grows"] = lease.grows
+    if lease.growth is not None or lease.shrink is not None:
+        shown["resizing"] = "growing" if lease.growth is not None else "shrinking"
     if lease.spec.standby:
         shown["standby"] = True
     if lease.id in core.host.booked:
@@ -312,8 +316,11 @@ def _holder_condition(core: Core, waiter: Lease, holder: Lease) -> str:
     if not holder.root.may_leave:
         return f"is pinned by {holder.pinned}" if holder.pinned else "is pinned"
     root = holder.root
-    if policy.residency_ends_at(root) > core.now:
-        return f"may stay {policy.residency_ends_at(root) - core.now:.1f} s more (minimum residency)"
+    ends_at = policy.residency_ends_at(core, root, waiter)
+    if ends_at > core.now:
+        stretched = ends_at > root.ready_at + root.spec.min_residency_s
+        why = "they keep throwing each other out" if stretched else "minimum residency"
+        return f"may stay {ends_at - core.now:.1f} s more ({why})"
     priority = waiter.priority_at(core.now, core.settings.ageing_s_per_point)
     if root.in_use and root.spec.priority > priority:
         return f"is in use and has priority {root.spec.priority}, the waiter {priority}"

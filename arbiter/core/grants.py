@@ -5,14 +5,15 @@ Per card, in this order (the numbers stand in `_serve`):
   2. a gang loads here: its next member; blocked (recovering, reading unknown, a load under way): grant nothing, ask nobody
   3. nobody waits: whoever is on standby and fits may come back, asking nobody to leave
   4. the head is one of a gang: all of it or nothing, on all its cards (`gangs`); nobody passes it
-  5. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading
+  5. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a head for which another card is
+     being emptied is passed over from here on
   6. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out already
   7. backfill: the first waiter behind the head that fits, evicts nobody and cannot delay the head
 """
 
 from collections.abc import Mapping
 
-from arbiter.core import eviction, explain, families, gangs, policy, standby
+from arbiter.core import costs, eviction, explain, families, gangs, growth, policy, standby
 from arbiter.core.lease import Lease, LeaseState
 from arbiter.core.measure import note_pressure
 from arbiter.core.state import Core, Gpu
@@ -56,6 +57,16 @@ def _serve(core: Core, gpu: Gpu) -> None:
     if policy.fits(gpu, head):  # 5
         _grant_if_measured(core, gpu, head)
         return
+    here = next((lease for lease in gpu.queue if not _placed_elsewhere(core, gpu, lease)), None)
+    if here is None:
+        return
+    if here.gang is not None:  # 4
+        gangs.serve(core, gpu, here.gang)
+        return
+    if here is not head and policy.fits(gpu, here):  # 5
+        _grant_if_measured(core, gpu, here)
+        return
+    head = here
     leaving = policy.leaving(gpu)
     planned = policy.fits(gpu, head, leaving)
     if planned:
@@ -91,9 +102,6 @@ def _grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> bool:
 
 
 def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int]) -> bool:
-    elsewhere = head.planned_gpu is not None and head.planned_gpu != gpu.info.id
-    if elsewhere and any(e.wanted_by == head.id for other in core.gpus.values() for e in other.evictions):
-        return False  # another card is being emptied for it
     if policy.residue_under_measurement(gpu):
         head.reason = "a dead process's memory is being measured"
         return False
@@ -108,7 +116,22 @@ def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, in
     head.reason = "room is being made"
     for victim in plan:
         eviction.ask(core, gpu, victim, head, f"{head.spec.consumer} needs the room")
+    for gpu_id in head.gpus:
+        core.wake(core.gpus[gpu_id])  # those behind it there are no longer behind it
     return True
+
+
+def _placed_elsewhere(core: Core, gpu: Gpu, lease: Lease) -> bool:
+    """Is another card being emptied for this waiter? Then it is nobody's head here, unless it fits as it is.
+
+    Not once a holder there has outstayed the deadline, or has left and it was not enough.
+    """
+    there = lease.planned_gpu
+    if there is None or there == gpu.info.id:
+        return False
+    return any(
+        e.wanted_by == lease.id and not e.verdict and not e.overdue for e in core.gpus[there].evictions
+    )
 
 
 def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int], *, planned: bool) -> None:
@@ -123,13 +146,19 @@ def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int],
     if smallest > spare:
         return
     for lease in gpu.queue.behind_head():
-        if lease.gang is None and policy.added_bytes(gpu, lease) <= spare and policy.fits(gpu, lease):
+        if lease is head or lease.gang is not None:
+            continue
+        if policy.added_bytes(gpu, lease) <= spare and policy.fits(gpu, lease):
             _grant_if_measured(core, gpu, lease)
             return
 
 
 def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     """Give the lease its card and its token. The record goes to the journal before the holder hears of it."""
+    if lease.grows is not None:
+        _collect_evictions(core, gpu, lease)
+        growth.merge(core, gpu, lease)
+        return
     core.dequeue(lease)
     by_itself = standby.taken_back(core, lease)
     token = core.next_token()
@@ -182,3 +211,5 @@ def _collect_evictions(core: Core, gpu: Gpu, lease: Lease) -> None:
     ]
     lease.evicted = [e for e in mine if e.verdict]
     gpu.evictions = [e for e in gpu.evictions if e not in mine]
+    for gone in lease.evicted:
+        costs.switched(core, gone.consumer, lease.spec.consumer)

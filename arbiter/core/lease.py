@@ -39,7 +39,8 @@ _GONE = {_S.EXPIRED, _S.LOST}
 
 TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
     {
-        _S.QUEUED: frozenset({_S.LOADING, _S.DENIED, _S.CANCELLED}),
+        # released from queued: a growth that was merged into its lease
+        _S.QUEUED: frozenset({_S.LOADING, _S.DENIED, _S.CANCELLED, _S.RELEASED}),
         # denied from loading: the grant could not be journalled, so it was never sent
         # revoking from loading: it gives up while its sub-leases still load
         _S.LOADING: frozenset({_S.HELD, _S.REVOKING, _S.VERIFYING, _S.DENIED, *_GONE}),
@@ -116,6 +117,7 @@ class Eviction:
     safe_point_eta_s: float | None = None
     reminded: bool = False
     overdue: bool = False  # the ladder's deadline has passed
+    signalled: str = ""  # what was sent to its process: "", "term" or "kill"
     unloading_at: float | None = None
     released_at: float | None = None
     verdict_at: float | None = None
@@ -127,6 +129,16 @@ class Roster(Protocol):
     """A table that is kept by state (`residents`)."""
 
     def moved(self, lease: "Lease", before: LeaseState) -> None: ...
+
+
+@dataclass(slots=True)
+class Shrink:
+    """Bytes that the holder says it gave back, until the card says so too."""
+
+    target_bytes: int
+    asked_at: float
+    deadline_at: float
+    agreed: bool = False  # by the newest counting reading
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,10 +241,16 @@ class Lease:
     pinned: Order | None = None  # by an operator
     parks: bool = False  # it let go with its weights kept in host RAM
     comes_back: bool = False  # by itself, once its bytes are measured gone and there is room
+    asked_before: bool = False  # to leave, by a daemon that has ended since; its holder may be acting on it
+    dismissed: bool = False  # an operator sent it away: it does not come back by itself
     left_for: str = ""  # the consumer that it left for last; it does not come back beside that one
     away_since: float = 0.0
     uncalled: bool = False  # it came back by itself and nobody has used it since
     recalled: Recall | None = None  # its holder wants it back before it is gone
+    grows: LeaseId | None = None  # it is no lease of its own: that one waits for so many bytes more
+    growth: LeaseId | None = None  # who waits for its bytes
+    shrink: Shrink | None = None
+    resized_at: float = 0.0
     eviction: Eviction | None = None
     evicted: list[Eviction] = field(default_factory=list)  # who left for it
     story: list[tuple[float, LeaseState, str]] = field(default_factory=list)  # the last STORY_MAX steps

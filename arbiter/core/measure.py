@@ -6,7 +6,7 @@ Starts, polls and ends verifications; the judgement itself is in `verify`. A fai
 from collections.abc import Mapping
 from typing import Any
 
-from arbiter.core import drift, eviction, families, standby
+from arbiter.core import costs, drift, eviction, families, growth, standby
 from arbiter.core.events import MemorySampled, ProbeFailed
 from arbiter.core.lease import AWAY, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
@@ -327,6 +327,7 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
     core.record_residue(gpu, process, residue)
     core.forget(f"lease:{verification.lease}")
     _close_eviction(core, gpu, verification, judgement)
+    costs.left(core, verification.consumer)
     lease = core.leases.get(verification.lease)
     if lease is not None and lease.state is LeaseState.VERIFYING:
         standby.settle(core, lease, str(judgement.verdict))
@@ -339,6 +340,9 @@ def _close_eviction(core: Core, gpu: Gpu, verification: Verification, judgement:
     for way_out in gpu.evictions:
         if way_out.lease == verification.lease:
             way_out.verdict, way_out.verdict_at = str(judgement.verdict), core.now
+            waiter = core.waiting.get(way_out.wanted_by) if way_out.wanted_by is not None else None
+            for gpu_id in () if waiter is None else waiter.gpus:
+                core.wake(core.gpus[gpu_id])  # if this was not enough, it may be served on another card
 
 
 # -- leases that end without their holder's word ---------------------------------------------------------------------
@@ -350,6 +354,7 @@ def lose(
     for use in list(lease.uses.values()):
         core.unmark(lease, use)
     lease.yielded.clear()
+    growth.abandon(core, lease, "the lease is over")
     gpu.ledger.to_debt(lease.id)
     core.record_lease(lease, debt=True)
     if lease.eviction is not None:

@@ -97,6 +97,7 @@ def evict(core: Core, lease: Lease, order: Order) -> None:
 
 
 def _ordered(core: Core, lease: Lease, order: Order) -> None:
+    lease.dismissed = True
     if lease.eviction is not None:
         lease.eviction.order = order
     if lease.spec.standby:

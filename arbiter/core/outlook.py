@@ -65,7 +65,7 @@ def _asking(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
         if victims is None:
             continue
         return [
-            _step(core, "ask", victim, at, f"asks {victim.spec.consumer}", _because(core, victim, at))
+            _step(core, "ask", victim, at, f"asks {victim.spec.consumer}", _because(core, waiter, victim, at))
             for victim in victims
         ]
     return [
@@ -80,10 +80,10 @@ def _asking(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
     ]
 
 
-def _because(core: Core, victim: Lease, at: float) -> str:
+def _because(core: Core, waiter: Lease, victim: Lease, at: float) -> str:
     if at <= core.now:
         return "as soon as the card is looked at again"
-    if at == policy.residency_ends_at(victim):
+    if at == policy.residency_ends_at(core, victim, waiter):
         return "when its minimum residency ends"
     return (
         "when the waiter's priority has aged to its own"

@@ -7,6 +7,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 
+from arbiter.core import costs
 from arbiter.core.lease import LEAVING, Lease, LeaseState
 from arbiter.core.ledger import NOTHING, process_bytes
 from arbiter.core.state import Core, Gpu
@@ -18,7 +19,7 @@ _WAKE_SLACK_S = 0.001  # so that a wake-up for an ageing step does not come a ro
 _LEAVING = (LeaseState.REVOKING, LeaseState.UNLOADING, LeaseState.VERIFYING)  # in a fixed order
 
 type _Covers = Callable[[Mapping[LeaseId, int]], bool]
-type _Choice = Callable[[Sequence[Lease], _Covers, Mapping[LeaseId, int]], list[Lease]]
+type _Choice = Callable[[Core, Sequence[Lease], _Covers, Mapping[LeaseId, int]], list[Lease]]
 
 
 # -- fits ------------------------------------------------------------------------------------------------------------
@@ -78,11 +79,18 @@ def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool
     if lease.spec.exclusive:
         if any(other not in going for other in gpu.ledger.leases()):
             return False
-    elif any(other not in going for other in gpu.residents.exclusive):
+    elif any(other not in going and other != lease.grows for other in gpu.residents.exclusive):
         return False
     elif any(v.exclusive and v.lease not in going for v in gpu.verifications.values()):
         return False  # it died or expired, and still has the card to itself until it is measured gone
     return gpu.ledger.total_if(going, joining(lease)) <= gpu.ledger.budget_bytes
+
+
+def largest_growth_bytes(gpu: Gpu, lease: Lease) -> int:
+    """The most that a resident lease could ever get on top, once everybody has left who may be asked to."""
+    stay = {lease.id, *gpu.residents.pinned}
+    going = {other.id: 0 for other in gpu.residents.values() if other.id not in stay}
+    return gpu.ledger.budget_bytes - gpu.ledger.total_if(going)
 
 
 def added_bytes(gpu: Gpu, lease: Lease) -> int:
@@ -152,14 +160,16 @@ def choose_victims(
     willing = [
         lease
         for lease in gpu.in_state(LeaseState.HELD)
-        if may_ask(lease) and (not lease.in_use or lease.spec.priority <= priority)
+        if may_ask(lease)
+        and lease.id != waiter.grows
+        and (not lease.in_use or lease.spec.priority <= priority)
     ]
     search = _oldest if core.settings.scheduling.least_recent else _search
-    ripe = [lease for lease in willing if residency_ends_at(lease) <= at]
-    now = _cheapest(gpu, waiter, going, ripe, search)
+    ripe = [lease for lease in willing if residency_ends_at(core, lease, waiter) <= at]
+    now = _cheapest(core, gpu, waiter, going, ripe, search)
     if now is not None and not _in_use(now):
         return now
-    later = _cheapest(gpu, waiter, going, willing, search)
+    later = _cheapest(core, gpu, waiter, going, willing, search)
     if now is None or later is None or _in_use(later) < _in_use(now):
         return None
     return now
@@ -170,7 +180,7 @@ def choose_relief(core: Core, gpu: Gpu, going: Mapping[LeaseId, int], over_bytes
     idle = [
         lease
         for lease in gpu.in_state(LeaseState.HELD)
-        if may_ask(lease) and not lease.in_use and residency_ends_at(lease) <= core.now
+        if may_ask(lease) and not lease.in_use and residency_ends_at(core, lease, None) <= core.now
     ]
     ledger = gpu.ledger
     total = ledger.total_if(going)
@@ -178,7 +188,7 @@ def choose_relief(core: Core, gpu: Gpu, going: Mapping[LeaseId, int], over_bytes
     def covers(more: Mapping[LeaseId, int]) -> bool:
         return total - ledger.total_if({**going, **more}) >= over_bytes
 
-    return _search(idle, covers, _freed(gpu, going, idle)) if covers(_leave(idle)) else idle
+    return _search(core, idle, covers, _freed(gpu, going, idle)) if covers(_leave(idle)) else idle
 
 
 def may_ask(lease: Lease) -> bool:
@@ -191,9 +201,16 @@ def may_ask(lease: Lease) -> bool:
     return lease.may_leave and lease.parent is None and not loading
 
 
-def residency_ends_at(lease: Lease) -> float:
-    """Who came back by itself and was not used since has no claim to stay: its return must cost nobody time."""
-    return lease.ready_at + (0.0 if lease.uncalled else lease.spec.min_residency_s)
+def residency_ends_at(core: Core, lease: Lease, waiter: Lease | None) -> float:
+    """Until when a holder is not asked to leave for this waiter (or for relief).
+
+    Who came back by itself and was not used since has no claim to stay: its return must cost nobody time. Two that keep throwing each
+    other out stay longer, by what a switch of theirs costs.
+    """
+    if lease.uncalled:
+        return lease.ready_at
+    held_s = 0.0 if waiter is None else costs.hold_s(core, lease, waiter)
+    return lease.ready_at + max(lease.spec.min_residency_s, held_s)
 
 
 def wake_when_evictable(core: Core, gpu: Gpu, waiter: Lease | None) -> None:
@@ -210,7 +227,7 @@ def ask_times(core: Core, gpu: Gpu, waiter: Lease | None) -> list[float]:
     for lease in gpu.in_state(LeaseState.HELD):
         if not may_ask(lease):
             continue
-        times.append(residency_ends_at(lease))
+        times.append(residency_ends_at(core, lease, waiter))
         if waiter is not None and lease.in_use:
             gap = lease.spec.priority - waiter.spec.priority
             times.append(waiter.arrived_at + gap * ageing_s + _WAKE_SLACK_S)
@@ -260,7 +277,12 @@ def _freed(gpu: Gpu, going: Mapping[LeaseId, int], candidates: Sequence[Lease]) 
 
 
 def _cheapest(
-    gpu: Gpu, waiter: Lease, going: Mapping[LeaseId, int], candidates: Sequence[Lease], search: _Choice
+    core: Core,
+    gpu: Gpu,
+    waiter: Lease,
+    going: Mapping[LeaseId, int],
+    candidates: Sequence[Lease],
+    search: _Choice,
 ) -> list[Lease] | None:
     if waiter.spec.exclusive:
         must = list(candidates)
@@ -276,13 +298,16 @@ def _cheapest(
 
     if not rest or not covers(_leave(rest)):
         return None
-    return must + search(rest, covers, _freed(gpu, base, rest))
+    return must + search(core, rest, covers, _freed(gpu, base, rest))
 
 
-def _search(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]) -> list[Lease]:
-    """Cheapest covering set; all candidates together do cover. Fewest in use, then lowest priority, fewest, least bytes, LRU."""
+def _search(
+    core: Core, candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]
+) -> list[Lease]:
+    """Cheapest covering set; all candidates together do cover. Fewest in use, then lowest priority, fewest; of those alike the ones that
+    can park, that cost the least to reload as far as that is likely, the least bytes, LRU."""
     if len(candidates) > EXACT_SEARCH_MAX:
-        return _greedy(candidates, covers, freed)
+        return _greedy(core, candidates, covers, freed)
     idle = [lease for lease in candidates if not lease.in_use]
     busy = [lease for lease in candidates if lease.in_use]
     count = next(
@@ -298,10 +323,12 @@ def _search(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId
         for size in range(len(calm) + 1)
     )
     found = next(found for group in groups if (found := [plan for plan in group if covers(_leave(plan))]))
-    return min(found, key=lambda plan: _fineness(plan, freed))
+    return min(found, key=lambda plan: _fineness(core, plan, freed))
 
 
-def _oldest(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]) -> list[Lease]:
+def _oldest(
+    core: Core, candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]
+) -> list[Lease]:
     """Idle ones first, then least recent use alone, until it is enough; all candidates together are."""
     order = sorted(
         candidates,
@@ -310,21 +337,28 @@ def _oldest(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId
     return order[: next(n for n in range(1, len(order) + 1) if covers(_leave(order[:n])))]
 
 
-def _fineness(plan: Sequence[Lease], freed: Mapping[LeaseId, int]) -> tuple[int, float, tuple[int, ...]]:
+def _fineness(
+    core: Core, plan: Sequence[Lease], freed: Mapping[LeaseId, int]
+) -> tuple[int, float, int, float, tuple[int, ...]]:
     return (
+        sum(1 for lease in plan if not costs.can_park(core, lease)),
+        sum(costs.reload_s(core, lease) for lease in plan),
         sum(freed[lease.id] for lease in plan),
         max(lease.last_used_at for lease in plan),
         tuple(lease.arrival for lease in plan),
     )
 
 
-def _greedy(candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]) -> list[Lease]:
+def _greedy(
+    core: Core, candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]
+) -> list[Lease]:
     """Cheap classes first, the largest of a class first; then give back whoever turns out not to be needed."""
     order = sorted(
         candidates,
         key=lambda lease: (
             lease.in_use,
             lease.spec.priority,
+            not costs.can_park(core, lease),
             -freed[lease.id],
             lease.last_used_at,
             lease.arrival,

@@ -10,7 +10,8 @@ from typing import Any
 
 from arbiter.core import drift, eviction, explain, families, gangs, operators, standby
 from arbiter.core.events import MemorySampled, Reattached, ReattachedLease, Recovered, Spec
-from arbiter.core.lease import AWAY, EXPIRING, Eviction, Lease, LeaseState, Order, Use
+from arbiter.core.lease import AWAY, EXPIRING, Lease, LeaseState, Order, Use
+from arbiter.core.ledger import process_bytes
 from arbiter.core.measure import begin_for_lease
 from arbiter.core.requests import become_held, client_of, ended_error, let_go, touch
 from arbiter.core.state import Client, Core, Ended, Gpu, Refused
@@ -91,6 +92,7 @@ def _remembered(core: Core, record: Mapping[str, Any], state: LeaseState) -> Lea
         exiting=bool(record["exiting"]),
         pinned=None if record.get("pinned") is None else Order(*record["pinned"]),
         attached=False,
+        dismissed=bool(record.get("dismissed", False)),
         parks=bool(record.get("parks", False)),
         comes_back=bool(record.get("comes_back", False)),
         left_for=str(record.get("left_for", "")),
@@ -100,11 +102,12 @@ def _remembered(core: Core, record: Mapping[str, Any], state: LeaseState) -> Lea
 
 def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
     state = str(record["state"])
-    lease = _remembered(core, record, LeaseState.HELD if state == "debt" else LeaseState(state))
+    asked = state == LeaseState.REVOKING
+    lease = _remembered(core, record, LeaseState.HELD if asked or state == "debt" else LeaseState(state))
+    lease.asked_before = asked
     lease_id, process, token, spec = lease.id, lease.process, lease.token, lease.spec
     lease.gpu, lease.gpus = gpu.info.id, (gpu.info.id,)
     _place(core, gpu, lease, int(record["charge_bytes"]))
-    core.host.find(lease.id, int(record.get("parked_bytes", 0)))
     core.nonces[process, lease.nonce] = lease_id
     if state == "debt":
         gpu.ledger.to_debt(lease_id)
@@ -112,37 +115,19 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
         core.remember(Ended(lease_id, process, lease.nonce, token, LeaseState.LOST, lost_error(lease_id)))
         return
     core.add(lease)
+    core.host.find(lease.id, int(record.get("parked_bytes", 0)))
     gpu.residents[lease_id] = lease
     if record["estate"] is not None:
         families.restore(gpu, lease, record["estate"])
     if lease.state is LeaseState.VERIFYING:
         begin_for_lease(core, gpu, lease, alive=True)
         return
-    if lease.state is LeaseState.REVOKING:
-        lease.eviction = _asked_before(core, gpu, lease)
-        lease.eviction.order = None if record.get("ordered") is None else Order(*record["ordered"])
     if record.get("gang") is not None:
         gangs.restore(core, lease, str(record["gang"][0]), int(record["gang"][1]))
     lease.expires_at = core.now + spec.ttl_s + core.settings.fence_grace_s
     core.timers.set(("ttl", lease_id), lease.expires_at)
     assert core.recovering is not None, "restoring outside recovery"
     core.recovering.add(lease_id)
-
-
-def _asked_before(core: Core, gpu: Gpu, lease: Lease) -> Eviction:
-    """The `revoke` of the earlier daemon stands: its holder may be unloading by now. It is sent again when he comes back."""
-    asked = Eviction(
-        lease=lease.id,
-        consumer=lease.spec.consumer,
-        charge_bytes=gpu.ledger.charge_bytes(lease.id),
-        wanted_by=None,
-        wanted_consumer=lease.left_for,
-        reason="asked to leave before the restart",
-        asked_at=core.now,
-        next_push_at=core.now + core.settings.revoke_resend_s,
-    )
-    gpu.evictions.append(asked)
-    return asked
 
 
 def _place(core: Core, gpu: Gpu, lease: Lease, charge_bytes: int) -> None:
@@ -173,6 +158,7 @@ def spec_from_record(record: Mapping[str, Any]) -> Spec:
         min_residency_s=float(record["min_residency_s"]),
         deny_on_deadline=bool(record["deny_on_deadline"]),
         standby=bool(record.get("standby", False)),
+        on_overstay=str(record.get("on_overstay", "wait")),
         park_bytes=int(record.get("park_bytes", 0)),
         parent=None
         if record.get("parent") is None
@@ -260,8 +246,7 @@ def _believe_away(core: Core, lease: Lease, item: ReattachedLease) -> None:
     elif lease.token != item.token:
         core.push(lease, {"push": "granted", "lease": explain.view(core, lease)})
     elif lease.state in EXPIRING:
-        ordered = lease.eviction is not None and lease.eviction.order is not None
-        back = lease.spec.standby and not ordered
+        back = lease.spec.standby and not lease.dismissed
         if item.parked:
             core.host.find(lease.id, lease.spec.park_bytes)
         let_go(core, lease, exiting=False, why="let go, says its holder", comes_back=back, parks=item.parked)
@@ -287,6 +272,11 @@ def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLeas
     core.wake(core.gpu_of(lease))
 
 
+def _seen_bytes(gpu: Gpu, process: ProcessKey) -> int:
+    """What the newest reading shows of a process; nothing where it cannot say. The journal that knew the card is lost."""
+    return 0 if gpu.sample is None else process_bytes(gpu.sample, process) or 0
+
+
 def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
     """The journal does not know this lease but its token is of an earlier epoch: its holder is believed while recovering."""
     if core.recovering is None or item.token.epoch >= core.settings.epoch:
@@ -294,7 +284,7 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
     gpus = _selected(core, item.spec)
     if not gpus:
         raise Refused("unknown_gpu", f"there is no GPU {item.spec.gpu!r}", "unload, then acquire again")
-    gpu = gpus[0]
+    gpu = max(gpus, key=lambda gpu: (_seen_bytes(gpu, client.process), -gpu.info.index))
     spec = item.spec
     peak, steady = drift.expected_bytes(core, spec)
     charge = peak
@@ -377,7 +367,7 @@ def void_at_baseline(core: Core, sample: MemorySampled) -> None:
         if gpu.ledger.charge_bytes(lease.id) <= noise_bytes:
             continue
         parks = lease.id in core.host.booked
-        if lease.state is LeaseState.REVOKING and (parks or standby.stays_on(lease)):  # as it was asked to
+        if lease.asked_before:  # it left as it was asked to
             let_go(
                 core,
                 lease,

@@ -6,7 +6,7 @@ anyone who knows the exact token.
 
 from dataclasses import replace
 
-from arbiter.core import drift, eviction, explain, families, gangs, standby
+from arbiter.core import costs, drift, eviction, explain, families, gangs, growth, standby
 from arbiter.core.events import (
     AcquireRequested,
     CancelRequested,
@@ -112,7 +112,7 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         if spec.gang is not None:
             gangs.left_out(core, spec.gang[0], refused.message)
         raise
-    _check_waiters(core)
+    check_waiters(core)
     away = None if spec.gang is not None else standby.find(core, client.process, spec.consumer, spec.key)
     if away is not None:
         _take_over(core, event, away, spec, gpus)
@@ -162,10 +162,11 @@ def new_lease(
     )
     core.add(lease)
     core.nonces[client.process, event.nonce] = lease.id
+    costs.wanted(core, spec.consumer)
     return lease
 
 
-def _check_waiters(core: Core) -> None:
+def check_waiters(core: Core) -> None:
     if len(core.waiting) >= core.settings.waiters_max:
         raise Refused("limit_exceeded", "too many wait already", "try again later", limit="waiters_max")
 
@@ -193,6 +194,7 @@ def _call_back(
     lease.gpus = gpus
     lease.load_peak_bytes, lease.steady_bytes = drift.expected_bytes(core, lease.spec)
     standby.queue_again(core, lease, client, request, core.now, wait_timeout_s)
+    costs.wanted(core, lease.spec.consumer)
     core.unanswered.append(lease)
 
 
@@ -206,7 +208,7 @@ def reacquire(core: Core, event: Reacquired) -> None:
         )
     if lease.state in AWAY:
         gpus = _places(core, lease.spec, drift.expected_bytes(core, lease.spec)[0])
-        _check_waiters(core)
+        check_waiters(core)
         _call_back(core, lease, event.client, event.request, event.wait_timeout_s, gpus)
         return
     if lease.state is LeaseState.VERIFYING and (lease.comes_back or lease.parks):
@@ -426,6 +428,7 @@ def unloading(core: Core, event: UnloadStarted) -> None:
         raise bad_state(lease, f"{running} uses still run; wait for the `revoke` that says 0 uses")
     gpu = core.gpu_of(lease)
     end_uses(core, lease, "unloaded while it paused")
+    growth.abandon(core, lease, "it unloads")
     lease.move(LeaseState.UNLOADING, core.now, "at its safe point")
     lease.baseline = gpu.sample
     if lease.eviction is not None:
@@ -505,6 +508,7 @@ def let_go(
     end_uses(core, lease, why)
     before = lease.state
     lease.exiting = exiting
+    growth.abandon(core, lease, "it let go")
     lease.comes_back = comes_back
     lease.parks = parks
     if not parks:

@@ -100,4 +100,4 @@ class Residents(dict[LeaseId, Lease]):
 
 
 def _after(lease: Lease, taken_at: float) -> bool:
-    return max(lease.granted_at, lease.ready_at) > taken_at
+    return max(lease.granted_at, lease.ready_at, lease.resized_at) > taken_at

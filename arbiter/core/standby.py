@@ -19,8 +19,9 @@ NOT_BACK = "its holder did not come back after the restart"
 # -- going away ------------------------------------------------------------------------------------------------------
 def stays_on(lease: Lease) -> bool:
     """Does it go on standby when it lets go now? Only if the engine asked it to leave: who leaves by himself does not want back,
-    and whom an operator evicts is not wanted back."""
-    return lease.spec.standby and lease.eviction is not None and lease.eviction.order is None
+    whom an operator evicts is not wanted back, and a sub-lease has no place of its own to come back to."""
+    asked = lease.eviction is not None or lease.asked_before
+    return lease.spec.standby and asked and not lease.dismissed and lease.spec.parent is None
 
 
 def next_state(lease: Lease) -> LeaseState:
@@ -40,6 +41,7 @@ def settle(core: Core, lease: Lease, verdict: str) -> None:
         return
     gpu = core.gpu_of(lease)
     del gpu.residents[lease.id]
+    core.timers.clear(("overstay", lease.id))
     core.wake(gpu)
     lease.move(next_state(lease), core.now, verdict)
     lease.gpu = lease.baseline = lease.eviction = lease.measured_bytes = lease.request = None
@@ -133,7 +135,7 @@ def queue_again(
 
 def taken_back(core: Core, lease: Lease) -> bool:
     """The lease is being granted. Did it come back by itself? Then it has waited for nothing, and has no claim to stay yet."""
-    lease.comes_back = lease.parks = False
+    lease.comes_back = lease.parks = lease.asked_before = lease.dismissed = False
     lease.uncalled = core.away.pop(lease.id, None) is not None
     if lease.uncalled:
         lease.arrived_at = core.now

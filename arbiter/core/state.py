@@ -65,6 +65,18 @@ class Ended:
 
 
 @dataclass(slots=True)
+class Reuse:
+    """Departures of one consumer: was it wanted again soon?"""
+
+    left_at: float | None = None
+    soon: deque[bool] = field(default_factory=lambda: deque(maxlen=LEARNT_REMEMBERED))
+
+    def chance(self) -> float:
+        """Half for one that is not known, nearer to what was seen with every departure."""
+        return (1 + sum(self.soon)) / (2 + len(self.soon))
+
+
+@dataclass(slots=True)
 class Gpu:
     """One card: its ledger, who is on it, who waits for it, what was measured."""
 
@@ -146,6 +158,8 @@ class Core:
         )
         self.footprints = Footprints()
         self.footprints.restore(settings.footprints)
+        self.reuse: dict[str, Reuse] = {}  # by consumer
+        self.switches: dict[tuple[str, str], float] = {}  # (who left, for whom) → when last
         self.durations: dict[str, dict[str, deque[float]]] = {}
         for consumer, medians in sorted(settings.learnt.items()):
             for phase, seconds in sorted(medians.items()):
@@ -293,7 +307,7 @@ class Core:
         del self.leases[lease.id]
         _take_out(self._of_process, lease.process, lease.id)
         _take_out(self._of_client, lease.client, lease.id)
-        for kind in ("ttl", "revoke"):
+        for kind in ("ttl", "revoke", "overstay", "shrink"):
             self.timers.clear((kind, lease.id))
         self.away.pop(lease.id, None)
         self.host.drop(lease.id)
@@ -329,7 +343,6 @@ class Core:
         spec = lease.spec
         charge_bytes = 0 if lease.gpu is None else self.gpu_of(lease).ledger.charge_bytes(lease.id)
         assert lease.token is not None, f"{lease.id} is recorded without a token"
-        order = None if lease.eviction is None else lease.eviction.order
         self.journal(
             f"lease:{lease.id}",
             {
@@ -352,7 +365,7 @@ class Core:
                 "parks": lease.parks,
                 "parked_bytes": self.host.booked.get(lease.id, 0),
                 "left_for": lease.left_for,
-                "ordered": None if order is None else [order.by, order.reason],
+                "dismissed": lease.dismissed,
                 "spec": {
                     "consumer": spec.consumer,
                     "model_id": spec.key.model_id,
@@ -368,6 +381,7 @@ class Core:
                     "min_residency_s": spec.min_residency_s,
                     "deny_on_deadline": spec.deny_on_deadline,
                     "standby": spec.standby,
+                    "on_overstay": spec.on_overstay,
                     "park_bytes": spec.park_bytes,
                     "parent": None if spec.parent is None else [spec.parent[0], *astuple(spec.parent[1])],
                     "independent": spec.independent,

@@ -9,7 +9,7 @@ from dataclasses import replace
 from arbiter.core import drift, eviction, explain, families, standby
 from arbiter.core.events import AcquireRequested, Spec
 from arbiter.core.lease import LEAVING, Lease, LeaseState
-from arbiter.core.requests import client_of, find_again, lease_for, let_go, new_lease
+from arbiter.core.requests import bad_state, client_of, find_again, lease_for, let_go, new_lease
 from arbiter.core.state import Core, Gpu, Refused
 from schemas import defaults
 from schemas.ids import LeaseId, Token
@@ -60,6 +60,10 @@ def acquire(core: Core, event: AcquireRequested, ref: tuple[LeaseId, Token]) -> 
 
 
 def _may_carve(core: Core, parent: Lease, spec: Spec) -> Gpu:
+    if parent.gpu is None:
+        raise bad_state(parent, "it holds nothing to carve from")
+    if parent.growth is not None or parent.shrink is not None:
+        raise bad_state(parent, "it changes its size; carve when it has the new one")
     gpu = core.gpu_of(parent)
     depth, lease = 2, parent
     while True:

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from arbiter.core import effects as fx
 from arbiter.core import events as ev
 from schemas.errors import JournalUnavailable
-from schemas.ids import ClientId, GpuId, RequestId
+from schemas.ids import ClientId, GpuId, ProcessKey, RequestId
 
 log = logging.getLogger(__name__)
 
@@ -51,6 +51,7 @@ class Executor:
         sample: Callable[[GpuId], None],
         post: Callable[[ev.Event], None],
         log_event: Callable[[Mapping[str, Any]], None],
+        signal: Callable[[ProcessKey, str], None],
     ) -> None:
         self._outbox = outbox
         self._journal = journal
@@ -58,6 +59,7 @@ class Executor:
         self._sample = sample
         self._post = post
         self._log_event = log_event
+        self._signal = signal
         self.owed: dict[str, None] = {}
         """Records still to be deleted: the disk was full when they ended. The next write does it."""
 
@@ -97,6 +99,8 @@ class Executor:
                     notes.append(effect)
                 case fx.Sample():
                     samples.append(effect)
+                case fx.Signal(process, kind):
+                    self._signal(process, kind)
                 case fx.Refuse(client, request, code, message, hint, details):
                     error = {"code": code, "message": message, "hint": hint, "details": dict(details)}
                     self._outbox.refuse(client, request, error)

@@ -5,10 +5,16 @@ names then is the process that was meant, or that one is dead already. Must not 
 """
 
 import asyncio
+import logging
 import os
+import signal
 from collections.abc import Callable
 
 from schemas.ids import ProcessKey
+
+log = logging.getLogger(__name__)
+
+_SIGNALS = {"term": signal.SIGTERM, "kill": signal.SIGKILL}
 
 
 class ProcessWatch:
@@ -43,6 +49,18 @@ class ProcessWatch:
             return
         self._fds[process] = fd
         self._loop.add_reader(fd, self._readable, process, fd)
+
+    def signal(self, process: ProcessKey, kind: str) -> None:
+        """Send SIGTERM ("term") or SIGKILL ("kill") through the pidfd, which names the process whose start time was compared. One that is
+        not watched (it died) gets nothing, nor does one whose start time was never known. Must not raise: a refusal is logged."""
+        fd = self._fds.get(process)
+        if fd is None or process.start_ticks == 0:
+            log.warning("no %s for %s: it is gone or not known by its start time", kind, process)
+            return
+        try:
+            signal.pidfd_send_signal(fd, _SIGNALS[kind])
+        except OSError as error:
+            log.error("%s could not be sent to %s: %s", kind, process, error)
 
     def __len__(self) -> int:
         return len(self._fds)

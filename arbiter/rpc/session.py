@@ -393,6 +393,10 @@ class SessionTable:
                 post(ev.CancelRequested(client, re, LeaseId(request.lease_id)))
             case w.Reacquire():
                 post(ev.Reacquired(client, re, *_on_lease(request), request.wait_timeout_s))
+            case w.Resize():
+                size = request.footprint
+                sizes = (size.load_peak_bytes, size.steady_bytes, size.residue_bytes)
+                post(ev.ResizeAsked(client, re, *_on_lease(request), *sizes, request.wait_timeout_s))
             case w.Reattach():
                 session.leased = True
                 post(ev.Reattached(client, re, tuple(_reattached(lease) for lease in request.leases)))
@@ -438,6 +442,7 @@ def to_spec(spec: w.LeaseSpec) -> ev.Spec:
         min_residency_s=spec.min_residency_s,
         deny_on_deadline=spec.on_deadline == "deny",
         standby=spec.standby,
+        on_overstay=spec.on_overstay,
         park_bytes=spec.park_bytes,
         parent=None if spec.parent is None else (LeaseId(spec.parent.lease_id), Token(*spec.parent.token)),
         independent=spec.independent,
@@ -451,7 +456,15 @@ def _operator(session: Session) -> str:
 
 
 def _on_lease(
-    request: w.Ready | w.UseBegin | w.UseEnd | w.Yield | w.RevokeAck | w.Unloading | w.Release | w.Reacquire,
+    request: w.Ready
+    | w.UseBegin
+    | w.UseEnd
+    | w.Yield
+    | w.RevokeAck
+    | w.Unloading
+    | w.Release
+    | w.Reacquire
+    | w.Resize,
 ) -> tuple[LeaseId, Token]:
     return LeaseId(request.lease_id), Token(*request.token)
 

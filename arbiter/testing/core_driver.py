@@ -35,6 +35,7 @@ from arbiter.core.events import (
     Recovered,
     ReleaseReported,
     Renewed,
+    ResizeAsked,
     RevokeAcknowledged,
     Spec,
     Tick,
@@ -313,6 +314,7 @@ class Consumer:
         ttl_s: float = 3600.0,
         min_residency_s: float = 0.0,
         deny_on_deadline: bool = False,
+        on_overstay: str = "wait",
         standby: bool = False,
         park_bytes: int = 0,
         key: str | None = None,
@@ -335,6 +337,7 @@ class Consumer:
             min_residency_s=min_residency_s,
             deny_on_deadline=deny_on_deadline,
             standby=standby,
+            on_overstay=on_overstay,
             park_bytes=park_bytes,
             parent=parent,
             independent=independent,
@@ -443,6 +446,28 @@ class Consumer:
         return self.driver.post(
             Reacquired(
                 self.client, self.driver.next_request(), lease, token or self.token(lease), wait_timeout_s
+            )
+        )
+
+    def resize(
+        self,
+        lease: LeaseId,
+        steady_bytes: int,
+        *,
+        load_peak_bytes: int = 0,
+        residue_bytes: int = 0,
+        wait_timeout_s: float | None = None,
+    ) -> list[Effect]:
+        return self.driver.post(
+            ResizeAsked(
+                self.client,
+                self.driver.next_request(),
+                lease,
+                self.token(lease),
+                max(load_peak_bytes, steady_bytes),
+                steady_bytes,
+                residue_bytes,
+                wait_timeout_s,
             )
         )
 

@@ -125,6 +125,7 @@ class SimDaemon:
             self._sample,
             self._post,
             lambda event: None,
+            lambda process, kind: clock.say(f"{kind} for {process}"),
         )
         records = self.journal.opened.records
         clock.say(f"daemon starts, epoch {epoch}, {len(records)} records")

@@ -7,7 +7,7 @@ from arbiter.core import effects as fx
 from arbiter.core import events as ev
 from arbiter.host.executor import Executor
 from schemas.errors import JournalUnavailable
-from schemas.ids import ClientId, GpuId, RequestId
+from schemas.ids import ClientId, GpuId, ProcessKey, RequestId
 
 A, ONE, GPU = ClientId("aa"), RequestId(1), GpuId("GPU-1")
 LEASE = {"lease_id": "L1-1", "state": "loading"}
@@ -19,7 +19,7 @@ class Recorder:
     def __init__(self) -> None:
         self.done: list[tuple[Any, ...]] = []
         self.disk_full = False
-        self.executor = Executor(self, self, self, self.sample, self.post, self.log_event)
+        self.executor = Executor(self, self, self, self.sample, self.post, self.log_event, self.signal)
 
     def reply(self, client: ClientId, request: RequestId, body: Mapping[str, Any]) -> None:
         self.done.append(("reply", client, request, body))
@@ -45,11 +45,20 @@ class Recorder:
     def sample(self, gpu: GpuId) -> None:
         self.done.append(("sample", gpu))
 
+    def signal(self, process: ProcessKey, kind: str) -> None:
+        self.done.append(("signal", process, kind))
+
     def post(self, event: ev.Event) -> None:
         self.done.append(("post", event))
 
     def log_event(self, event: Mapping[str, Any]) -> None:
         self.done.append(("log", event["kind"]))
+
+
+def test_a_signal_goes_to_whoever_watches_the_process() -> None:
+    recorder = Recorder()
+    recorder.executor.perform([fx.Signal(ProcessKey(7, 8), "term")])
+    assert recorder.done == [("signal", ProcessKey(7, 8), "term")]
 
 
 def test_answers_go_out_in_order_then_facts_then_readings() -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Awaitable, Callable, Iterator
@@ -130,5 +131,53 @@ def test_no_descriptor_is_left_behind(children: Callable[[], "subprocess.Popen[b
         assert open_files() == before + 2
         watch.close()
         assert open_files() == before
+
+    watching(test)
+
+
+@pytest.mark.parametrize(("kind", "number"), [("term", signal.SIGTERM), ("kill", signal.SIGKILL)])
+def test_a_signal_goes_through_the_descriptor(
+    children: Callable[[], "subprocess.Popen[bytes]"], kind: str, number: signal.Signals
+) -> None:
+    child = children()
+    key = key_of(child)
+
+    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+        watch.add(key)
+        watch.signal(key, kind)
+        assert await died.get() == key
+
+    watching(test)
+    assert child.wait(PATIENCE_S) == -number
+
+
+def test_whoever_is_not_watched_or_not_surely_known_gets_no_signal(
+    children: Callable[[], "subprocess.Popen[bytes]"],
+) -> None:
+    child = children()
+
+    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+        watch.signal(key_of(child), "kill")
+        unsure = ProcessKey(child.pid, 0)
+        watch.add(unsure)
+        watch.signal(unsure, "kill")
+        child.kill()
+        assert await died.get() == unsure
+        watch.signal(unsure, "kill")
+
+    watching(test)
+    assert child.wait(PATIENCE_S) == -signal.SIGKILL
+
+
+def test_a_signal_that_comes_too_late_is_no_error(children: Callable[[], "subprocess.Popen[bytes]"]) -> None:
+    child = children()
+
+    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+        key = key_of(child)
+        watch.add(key)
+        child.kill()
+        child.wait(PATIENCE_S)  # the loop has not heard of it yet
+        watch.signal(key, "term")
+        assert await died.get() == key
 
     watching(test)

@@ -60,9 +60,14 @@ class RealCore:
         info = GpuInfo(GPU, 0, "simulated", 8 * d.GIB, d.RESERVE_BYTES)
         self.card = SimCard(GPU, 8 * d.GIB)
         self.arbiter = Arbiter(Settings(epoch=1, gpus=(info,)), self.plant.now)
-        self.executor = Executor(self.plant.outbox, self, self, self._sample, self.post, lambda event: None)
+        self.executor = Executor(
+            self.plant.outbox, self, self, self._sample, self.post, lambda event: None, self._signal
+        )
         self._queue: deque[ev.Event] = deque()
         self._busy = False
+
+    def _signal(self, process: ProcessKey, kind: str) -> None:
+        """Nobody is ended here, whatever somebody agreed to."""
 
     # Decisions
     def post(self, event: ev.Event) -> None:

@@ -175,8 +175,10 @@ def test_requests_of_leases_that_come_back(bench: Bench) -> None:
     wanted = {"consumer": "detector", "model_id": "m", "footprint": FOOTPRINT, "standby": True}
     bench.ask("reacquire", **on, wait_timeout_s=4.0)
     bench.ask("reattach", leases=[{**on, "spec": wanted, "state": "standby"}])
-    reacquired, reattached = bench.events
-    assert reacquired == ev.Reacquired(me, RequestId(bench.next_id - 1), LEASE, token, 4.0)
+    bench.ask("resize", **on, footprint=FOOTPRINT, wait_timeout_s=2.0)
+    reacquired, reattached, resized = bench.events
+    assert resized == ev.ResizeAsked(me, RequestId(bench.next_id), LEASE, token, 10, 8, 2, 2.0)
+    assert reacquired == ev.Reacquired(me, RequestId(bench.next_id - 2), LEASE, token, 4.0)
     assert isinstance(reattached, ev.Reattached)
     (item,) = reattached.leases
     assert (item.away, item.held, item.spec.standby) == (True, False, True)
@@ -250,7 +252,7 @@ def test_every_op_of_the_wire_is_dispatched(bench: Bench) -> None:
         "hello": {"version": 1, "name": "n", "instance": "i-61"},
         "acquire": {"nonce": "n", "spec": {"consumer": "c", "model_id": "m", "footprint": FOOTPRINT}},
         "use_begin": {**on, "use_id": "u"}, "use_end": {**on, "use_id": "u"}, "renew": {"leases": []},
-        "cancel": {"lease_id": "L"}, "reacquire": on, "reattach": {"leases": []}, "oom": {**on, "requested_bytes": 1},
+        "cancel": {"lease_id": "L"}, "reacquire": on, "resize": {**on, "footprint": FOOTPRINT}, "reattach": {"leases": []}, "oom": {**on, "requested_bytes": 1},
         "why": {"consumer": "c"}, **dict.fromkeys(("ready", "revoke_ack", "unloading", "release"), on),
     }  # fmt: skip
     bench.hello()

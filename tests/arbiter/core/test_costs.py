@@ -1,0 +1,180 @@
+"""What was learnt of leaving and coming back orders victims that are otherwise alike, and keeps two from throwing each other out."""
+
+from typing import Any
+
+import pytest
+
+from arbiter.core import costs
+from arbiter.testing.core_driver import Consumer, CoreDriver
+from schemas import defaults as d
+from schemas.ids import LeaseId
+
+GIB = d.GIB
+
+
+def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
+    person = driver.consumer(name)
+    lease = person.acquire(int(gib * GIB), **spec)
+    driver.until(lambda: driver.state(lease) == "loading")
+    person.load(lease)
+    driver.advance(0.01)
+    return person, lease
+
+
+def asked(driver: CoreDriver, leases: dict[str, LeaseId]) -> list[str]:
+    return [name for name, lease in leases.items() if driver.state(lease) == "revoking"]
+
+
+# -- victims ---------------------------------------------------------------------------------------------------------
+def test_of_two_alike_the_one_that_reloads_faster_goes() -> None:
+    driver = CoreDriver(8 * GIB, settings={"learnt": {"slow": {"load_s": 40.0}, "fast": {"load_s": 2.0}}})
+    _, slow = held(driver, "slow", 3)
+    _, fast = held(driver, "fast", 3)
+    driver.consumer("w").acquire(4 * GIB)
+    assert asked(driver, {"slow": slow, "fast": fast}) == ["fast"], "though the slow one is older"
+
+
+def test_who_can_park_goes_before_who_cannot() -> None:
+    driver = CoreDriver(
+        8 * GIB,
+        settings={"host_ram_budget_bytes": 16 * GIB, "learnt": {"parks": {"load_s": 40.0}}},
+    )
+    _, stuck = held(driver, "stuck", 3)
+    _, parks = held(driver, "parks", 3, park_bytes=3 * GIB)
+    driver.consumer("w").acquire(4 * GIB)
+    assert asked(driver, {"stuck": stuck, "parks": parks}) == ["parks"]
+
+
+def test_who_could_park_but_finds_no_room_is_like_the_others() -> None:
+    driver = CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": 1 * GIB})
+    _, stuck = held(driver, "stuck", 3)
+    _, parks = held(driver, "parks", 3, park_bytes=3 * GIB)
+    driver.consumer("w").acquire(4 * GIB)
+    assert asked(driver, {"stuck": stuck, "parks": parks}) == ["stuck"], "least recently used"
+
+
+def test_a_lower_priority_goes_whatever_it_costs() -> None:
+    driver = CoreDriver(8 * GIB, settings={"learnt": {"cheap": {"load_s": 0.1}, "dear": {"load_s": 99.0}}})
+    _, cheap = held(driver, "cheap", 3, priority=60)
+    _, dear = held(driver, "dear", 3, priority=40)
+    driver.consumer("w").acquire(4 * GIB, priority=70)
+    assert asked(driver, {"cheap": cheap, "dear": dear}) == ["dear"]
+
+
+def come_and_go(driver: CoreDriver, person: Consumer, pause_s: float) -> None:
+    """Ten seconds of loading, gone at once, and a pause until it is wanted again."""
+    lease = person.acquire(3 * GIB)
+    driver.until(lambda: driver.state(lease) == "loading")
+    driver.advance(10.0)
+    person.load(lease)
+    person.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    driver.advance(pause_s)
+
+
+def stay(driver: CoreDriver, person: Consumer) -> LeaseId:
+    lease = person.acquire(3 * GIB)
+    driver.until(lambda: driver.state(lease) == "loading")
+    driver.advance(10.0)
+    person.load(lease)
+    driver.advance(0.01)
+    return lease
+
+
+def test_who_never_comes_back_is_cheaper_to_send_away() -> None:
+    driver = CoreDriver(8 * GIB)
+    rare, regular = driver.consumer("rare"), driver.consumer("regular")
+    for _ in range(4):
+        come_and_go(driver, rare, 100.0)
+    for _ in range(4):
+        come_and_go(driver, regular, 1.0)
+    core = driver.arbiter._core
+    leases = {"regular": stay(driver, regular), "rare": stay(driver, rare)}
+    assert core.reuse["regular"].chance() > 0.5 > core.reuse["rare"].chance()
+    driver.consumer("w").acquire(4 * GIB)
+    assert asked(driver, leases) == ["rare"], "though it was used last"
+
+
+def test_many_candidates_are_searched_with_parking_in_mind_too() -> None:
+    driver = CoreDriver(17 * GIB, settings={"host_ram_budget_bytes": 64 * GIB})
+    leases = {f"n{n}": held(driver, f"n{n}", 1, park_bytes=GIB if n == 9 else 0)[1] for n in range(16)}
+    driver.consumer("w").acquire(int(1.2 * GIB))
+    assert asked(driver, leases) == ["n9"]
+
+
+# -- thrash ----------------------------------------------------------------------------------------------------------
+LEARNT = {name: {"load_s": 6.0, "unload_s": 1.0, "verify_s": 1.0} for name in ("a", "b")}
+
+
+class Pair:
+    """Two consumers that each need the whole card, again and again."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.driver = CoreDriver(8 * GIB, settings={"learnt": LEARNT, **settings})
+        self.people = {name: self.driver.consumer(name) for name in ("a", "b")}
+        self.holder, self.lease = "a", self.people["a"].acquire(5 * GIB)
+        self.people["a"].load(self.lease)
+
+    def want(self, **spec: Any) -> LeaseId:
+        """The other one asks."""
+        return self.people["b" if self.holder == "a" else "a"].acquire(5 * GIB, **spec)
+
+    def switch(self, wanted: LeaseId) -> float:
+        """The holder leaves when it is asked. Returns how long that took; the loads themselves take no time here."""
+        waited = self.driver.until(lambda: self.driver.state(self.lease) == "revoking")
+        self.people[self.holder].unload(self.lease)
+        self.driver.until(lambda: self.driver.state(wanted) == "loading")
+        self.holder, self.lease = ("b" if self.holder == "a" else "a"), wanted
+        self.people[self.holder].load(wanted)
+        return waited
+
+
+def test_two_that_throw_each_other_out_stay_for_what_a_switch_costs() -> None:
+    pair = Pair()
+    assert pair.switch(pair.want()) < 0.1, "the first time"
+    assert pair.switch(pair.want()) < 0.1, "and back: only now they have switched both ways"
+    wanted = pair.want()
+    pair.driver.advance(0.1)
+    assert pair.driver.state(pair.lease) == "held"
+    why = pair.driver.arbiter.why("b", pair.driver.now)["leases"]
+    (blocker,) = next(one["blockers"] for one in why if one["lease_id"] == wanted)
+    assert "they keep throwing each other out" in blocker["condition"]
+    core = pair.driver.arbiter._core
+    expected = costs.hold_s(core, core.leases[pair.lease], core.leases[wanted])
+    assert pair.switch(wanted) == pytest.approx(expected, abs=0.2)
+    assert 3.0 < expected <= 8.0
+
+
+def test_the_hold_is_capped_and_can_be_turned_off() -> None:
+    for cap, low, high in ((1.0, 0.8, 1.2), (0.0, 0.0, 0.1)):
+        pair = Pair(thrash_hold_max_s=cap)
+        pair.switch(pair.want())
+        pair.switch(pair.want())
+        assert low <= pair.switch(pair.want()) <= high
+
+
+def test_a_higher_priority_is_not_held_up() -> None:
+    pair = Pair()
+    pair.switch(pair.want())
+    pair.switch(pair.want())
+    assert pair.switch(pair.want(priority=51)) < 0.1
+
+
+def test_a_pair_that_was_calm_for_a_while_is_forgotten() -> None:
+    pair = Pair(thrash_window_s=20.0)
+    pair.switch(pair.want())
+    pair.driver.advance(15.0)
+    pair.switch(pair.want())
+    pair.driver.advance(10.0)
+    assert pair.switch(pair.want()) < 0.1, "the first way is older than the window"
+    assert set(pair.driver.arbiter._core.switches) == {("b", "a"), ("a", "b")}
+    pair.driver.advance(100.0)
+    pair.switch(pair.want())
+    assert len(pair.driver.arbiter._core.switches) == 1
+
+
+def test_nothing_learnt_holds_nobody() -> None:
+    pair = Pair(learnt={})
+    pair.switch(pair.want())
+    pair.switch(pair.want())
+    assert pair.switch(pair.want()) < 0.2

@@ -1,0 +1,334 @@
+"""Several cards: a lease is placed on one of them and never split, every card has its own queue, and no card waits for another's sake."""
+
+import random
+from typing import Any
+
+import pytest
+
+from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
+from schemas import defaults as d
+from schemas.ids import GpuId, LeaseId
+
+GIB = d.GIB
+ZERO, ONE = GpuId("GPU-0"), GpuId("GPU-1")
+
+
+def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
+    person = driver.consumer(name)
+    lease = person.acquire(int(gib * GIB), **spec)
+    driver.until(lambda: driver.state(lease) == "loading")
+    person.load(lease)
+    driver.advance(0.01)
+    return person, lease
+
+
+def card(driver: CoreDriver, lease: LeaseId) -> str | None:
+    view = driver.view(lease)
+    assert view is not None
+    return None if view["gpu"] is None else str(view["gpu"])
+
+
+# -- selector and placement ------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("selector", "wanted"), [("1", ONE), ("GPU-1", ONE), ("0", ZERO), ("any", ZERO)])
+def test_a_selector_is_an_uuid_an_index_or_any(selector: str, wanted: GpuId) -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    _, lease = held(driver, "a", 5, gpu=selector)
+    assert card(driver, lease) == wanted
+    assert [driver.gpu(n)["charged_bytes"] for n in (0, 1)] == [
+        5 * GIB if wanted is gpu else 0 for gpu in (ZERO, ONE)
+    ]
+
+
+def test_an_unknown_card_is_named_with_those_that_are_there() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    refused = refusal(driver.consumer("a").try_acquire(1 * GIB, gpu="GPU-7"))
+    assert (refused.code, refused.details["known"]) == ("unknown_gpu", [ZERO, ONE])
+
+
+def test_a_lease_is_never_split() -> None:
+    """12 GiB are free on two cards, 7 on each is all that one lease can ever have."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    assert refusal(driver.consumer("a").try_acquire(9 * GIB)).code == "vram_insufficient"
+    _, lease = held(driver, "b", 7)
+    assert sum(1 for n in (0, 1) if driver.gpu(n)["charged_bytes"]) == 1
+    _, other = held(driver, "c", 7)
+    assert {card(driver, lease), card(driver, other)} == {ZERO, ONE}
+
+
+def test_a_model_over_two_cards_is_two_leases_of_one_process() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    big = driver.consumer("big")
+    halves = [big.acquire(6 * GIB, gpu=str(n), key=f"half {n}", residue_bytes=GIB // 2) for n in (0, 1)]
+    assert [driver.state(half) for half in halves] == ["loading", "loading"], (
+        "one load a card, not one in all"
+    )
+    for half in halves:
+        big.load(half)
+    driver.advance(0.01)
+    big.unload(halves[0])
+    driver.until(lambda: driver.state(halves[0]) == "over")
+    assert [driver.gpu(n)["charged_bytes"] for n in (0, 1)] == [GIB // 2, 6 * GIB], "a context a card"
+    big.die()
+    driver.until(lambda: driver.gpu(0)["charged_bytes"] + driver.gpu(1)["charged_bytes"] == 0, limit_s=2.0)
+
+
+def test_pins_count_for_their_own_card_only() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    _, pinned = held(driver, "pinned", 5, gpu="0", evictable=False)
+    assert (
+        refusal(driver.consumer("a").try_acquire(5 * GIB, gpu="0")).details["pinned"][0]["lease_id"] == pinned
+    )
+    _, lease = held(driver, "b", 5)
+    assert card(driver, lease) == ONE
+
+
+def test_exclusive_means_alone_on_its_card() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    _, alone = held(driver, "alone", 2, exclusive=True, evictable=False)
+    _, other = held(driver, "other", 2)
+    assert (card(driver, alone), card(driver, other)) == (ZERO, ONE)
+
+
+# -- queues ----------------------------------------------------------------------------------------------------------
+def test_a_waiter_for_one_card_does_not_hold_up_another() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    busy, lease = held(driver, "busy", 6, gpu="0")
+    busy.use_begin(lease)
+    waits = driver.consumer("w").acquire(6 * GIB, gpu="0", priority=90)
+    _, free = held(driver, "free", 6, gpu="1")
+    assert (driver.state(waits), card(driver, free)) == ("queued", ONE)
+
+
+def test_whoever_waits_for_any_takes_the_first_card_that_is_free_and_leaves_both_queues() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    people = [held(driver, f"busy{n}", 6, gpu=str(n)) for n in (0, 1)]
+    for person, lease in people:
+        person.use_begin(lease)
+    waiter = driver.consumer("w").acquire(6 * GIB, priority=0)
+    driver.advance(1.0)
+    assert driver.state(waiter) == "queued"
+    people[1][0].use_end(people[1][1])
+    people[1][0].unload(people[1][1])
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)
+    assert card(driver, waiter) == ONE
+    assert driver.state(people[0][1]) == "held", "nobody is asked in vain on the other card"
+    assert all(len(gpu.queue) == 0 for gpu in driver.arbiter._core.gpus.values())
+
+
+def test_while_one_card_is_emptied_for_the_head_the_next_one_is_served_on_the_other() -> None:
+    """Regression: the head of both queues held up the other card while its victim finished a long use."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    busy, used = held(driver, "busy", 6, gpu="0", priority=10)
+    idle, unused = held(driver, "idle", 6, gpu="1", evictable=False)
+    busy.use_begin(used)
+    head = driver.consumer("head").acquire(6 * GIB, gpu="0")
+    assert driver.state(used) == "revoking"
+    anywhere = driver.consumer("anywhere").acquire(int(1.5 * GIB), gpu="1")
+    driver.until(lambda: driver.state(anywhere) == "loading", limit_s=1.0)
+    assert (card(driver, anywhere), driver.state(head)) == (ONE, "queued")
+    assert driver.state(unused) == "held"
+    assert idle.driver is driver
+
+
+def test_the_head_that_is_placed_elsewhere_does_not_keep_a_card_from_the_next() -> None:
+    """Regression: with `any` at the head, a waiter for card 1 waited until card 0 had been emptied."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    first, a = held(driver, "a", 6, gpu="0", priority=10)
+    second, b = held(driver, "b", 6, gpu="1", priority=20)
+    first.use_begin(a)
+    second.use_begin(b)
+    head = driver.consumer("head").acquire(6 * GIB)
+    assert (driver.state(a), driver.state(b)) == ("revoking", "held"), "the cheaper card"
+    other = driver.consumer("other").acquire(6 * GIB, gpu="1")
+    driver.until(lambda: driver.state(b) == "revoking", limit_s=0.1)
+    second.use_end(b)
+    second.unload(b)
+    driver.until(lambda: "loading" in (driver.state(other), driver.state(head)), limit_s=1.0)
+    placed = head if driver.state(head) == "loading" else other
+    assert card(driver, placed) == ONE, "whoever it is, the free card is used at once"
+
+
+def test_what_fits_beside_the_head_that_is_placed_elsewhere_is_granted() -> None:
+    """It is the head here: no backfill has to let it pass, and nothing is spared for a waiter that comes to another card."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    first, a = held(driver, "a", 6, gpu="0", priority=10)
+    second, b = held(driver, "b", 4, gpu="1", priority=90)
+    first.use_begin(a)
+    second.use_begin(b)
+    head = driver.consumer("head").acquire(6 * GIB)
+    assert driver.state(a) == "revoking"
+    other = driver.consumer("other").acquire(int(3.5 * GIB), gpu="1")
+    driver.until(lambda: driver.state(other) == "loading", limit_s=1.0)
+    assert (card(driver, other), driver.state(head)) == (ONE, "queued")
+
+
+def test_two_heads_that_are_placed_elsewhere_leave_the_card_to_nobody() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    first, a = held(driver, "a", 3, gpu="0", priority=10)
+    second, b = held(driver, "b", 3, gpu="0", priority=10)
+    third, c = held(driver, "c", 6, gpu="1", priority=90)
+    for person, lease in ((first, a), (second, b), (third, c)):
+        person.use_begin(lease)
+    waiting = [driver.consumer(f"w{n}").acquire(4 * GIB) for n in range(2)]
+    driver.advance(1.0)
+    assert driver.state(c) == "held"
+    assert [driver.state(lease) for lease in waiting] == ["queued", "queued"]
+    for person, lease in ((first, a), (second, b)):
+        person.use_end(lease)
+        if driver.state(lease) == "revoking":
+            person.unload(lease)
+    driver.until(lambda: driver.state(waiting[0]) == "loading", limit_s=2.0)
+
+
+def test_a_holder_that_outstays_on_one_card_frees_its_waiter_for_another() -> None:
+    """Regression: once somebody was asked on card 0, no other card was ever considered."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    stuck, a = held(driver, "stuck", 6, gpu="0", priority=10)
+    later, b = held(driver, "later", 6, gpu="1", priority=20, min_residency_s=5.0)
+    stuck.use_begin(a)
+    later.use_begin(b)
+    waiter = driver.consumer("w").acquire(6 * GIB)
+    assert driver.state(a) == "revoking"
+    later.use_end(b)
+    driver.advance(20.0)
+    assert driver.state(b) == "held", "one card is being emptied: nothing is evicted in vain"
+    driver.until(lambda: driver.state(b) == "revoking", limit_s=15.0)
+    later.unload(b)
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
+    assert card(driver, waiter) == ONE
+
+
+def test_a_leave_that_was_not_enough_frees_its_waiter_for_another_card() -> None:
+    """The bytes of the victim stay on card 0 as a residue that nobody expected: card 1 is emptied then."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    leaky, a = held(driver, "leaky", 6, gpu="0", priority=10)
+    _, b = held(driver, "b", 6, gpu="1", priority=20)
+    waiter = driver.consumer("w").acquire(6 * GIB)
+    assert (driver.state(a), driver.state(b)) == ("revoking", "held")
+    leaky.unloading(a)
+    leaky.release(a)
+    driver.until(lambda: driver.state(b) == "revoking", limit_s=15.0)
+    assert driver.state(waiter) == "queued"
+
+
+# -- cards that fail, drains -----------------------------------------------------------------------------------------
+def test_a_card_that_cannot_be_read_blocks_itself_only() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    driver.cards[ZERO].failing = "NVML_ERROR_GPU_IS_LOST"
+    driver.advance(1.5)
+    anywhere = driver.consumer("a").acquire(5 * GIB)
+    driver.until(lambda: driver.state(anywhere) == "loading", limit_s=1.0)
+    assert card(driver, anywhere) == ONE
+    there = driver.consumer("b").acquire(5 * GIB, gpu="0")
+    driver.advance(10.0)
+    assert driver.state(there) == "queued"
+    driver.cards[ZERO].failing = ""
+    driver.until(lambda: driver.state(there) == "loading", limit_s=2.0)
+
+
+def test_pressure_on_one_card_asks_nobody_on_another() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    _, a = held(driver, "a", 6, gpu="0")
+    _, b = held(driver, "b", 6, gpu="1")
+    driver.cards[ZERO].set(driver.consumer("game").process, 4 * GIB, driver.now)
+    driver.until(lambda: driver.state(a) == "revoking", limit_s=5.0)
+    assert driver.state(b) == "held"
+
+
+def test_verifications_are_per_card() -> None:
+    """The bytes that one card gets back do not prove that another did."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    big = driver.consumer("big")
+    halves = [big.acquire(6 * GIB, gpu=str(n), key=f"half {n}") for n in (0, 1)]
+    for half in halves:
+        big.load(half)
+    driver.advance(0.01)
+    driver.cards[ONE].lag_s = 3.0
+    for half in halves:
+        big.unload(half)
+    driver.until(lambda: driver.state(halves[0]) == "over", limit_s=1.0)
+    assert driver.state(halves[1]) == "verifying"
+    assert driver.gpu(1)["charged_bytes"] == 6 * GIB
+    driver.until(lambda: driver.state(halves[1]) == "over", limit_s=4.0)
+
+
+# -- restarts --------------------------------------------------------------------------------------------------------
+def test_a_restart_keeps_every_lease_on_its_card() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    people = [held(driver, f"p{n}", 5, gpu=str(n)) for n in (0, 1)]
+    tokens = [person.token(lease) for person, lease in people]
+    driver.restart()
+    assert [driver.gpu(n)["charged_bytes"] for n in (0, 1)] == [5 * GIB, 5 * GIB]
+    for (person, lease), token in zip(people, tokens, strict=True):
+        person.connect()
+        answer(person.reattach(lease, token))
+    assert [card(driver, lease) for _, lease in people] == [ZERO, ONE]
+
+
+@pytest.mark.parametrize("lists", [True, False])
+def test_without_a_journal_a_lease_is_found_on_the_card_that_shows_its_process(lists: bool) -> None:
+    """Regression: with `any` it was charged to the first card, and its own was granted again."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    held(driver, "first", 5, gpu="0")
+    person, lease = held(driver, "second", 5)
+    assert card(driver, lease) == ONE
+    token = person.token(lease)
+    for one in driver.cards.values():
+        one.lists_processes = lists
+    driver.restart(keep_journal=False)
+    person.connect()
+    (kept,) = answer(person.reattach(lease, token))["leases"]
+    assert kept["kept"] is True
+    assert card(driver, lease) == (ONE if lists else ZERO), "without a list nobody can say"
+
+
+# -- at random -------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("seed", range(8))
+def test_whatever_happens_no_card_overflows_and_everybody_is_served(seed: int) -> None:
+    draw = random.Random(seed)
+    driver = CoreDriver(8 * GIB, cards=3)
+    for one in driver.cards.values():
+        one.lag_s = draw.choice([0.0, 0.2])
+    people = [driver.consumer(f"p{n}") for n in range(5)]
+    mine: dict[LeaseId, Consumer] = {}
+    for _ in range(60):
+        person = draw.choice(people)
+        live = [lease for lease, owner in mine.items() if owner is person and driver.state(lease) != "over"]
+        if not live:
+            size = draw.choice([1, 2, 3, 5, 7]) * GIB
+            spec = {
+                "gpu": draw.choice(["any", "any", "0", "1", "GPU-2"]),
+                "priority": draw.choice([40, 50, 60]),
+            }
+            mine[person.acquire(size, **spec)] = person
+        for lease in live:
+            step(driver, draw, person, lease)
+        driver.advance(draw.choice([0.01, 0.3, 2.0]))
+        for one in driver.cards.values():
+            assert sum(one.shown(driver.now).values()) <= 8 * GIB
+    for _ in range(400):
+        waiting = [lease for lease in mine if driver.state(lease) == "queued"]
+        if not waiting:
+            break
+        for lease, person in mine.items():
+            step(driver, random.Random(0), person, lease, willing=True)
+        driver.advance(0.2)
+    assert not [lease for lease in mine if driver.state(lease) == "queued"]
+    driver.arbiter.check_all()
+
+
+def step(
+    driver: CoreDriver, draw: random.Random, person: Consumer, lease: LeaseId, *, willing: bool = False
+) -> None:
+    """What its holder does next with a lease."""
+    view = driver.view(lease)
+    if view is None:
+        return
+    if view["state"] == "loading":
+        person.load(lease)
+    elif view["uses"] and (willing or draw.random() < 0.5):
+        person.use_end(lease)
+    elif view["state"] == "revoking" and not view["uses"]:
+        person.unload(lease)
+    elif view["state"] == "held" and not view["uses"] and not willing:
+        person.use_begin(lease)
