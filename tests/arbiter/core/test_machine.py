@@ -25,7 +25,7 @@ class Leases(RuleBasedStateMachine):
 
     @initialize(lag=st.sampled_from([0.0, 0.03, 0.8]), lists=st.booleans())
     def start(self, lag: float, lists: bool) -> None:
-        self.driver = CoreDriver(CAPACITY)
+        self.driver = CoreDriver(CAPACITY, settings={"host_ram_budget_bytes": 3 * d.GIB})
         self.driver.card.lag_s = lag
         self.driver.card.lists_processes = lists
         self.people = [self.driver.consumer(f"p{n}") for n in range(4)]
@@ -46,6 +46,8 @@ class Leases(RuleBasedStateMachine):
                 "evictable": st.sampled_from([True, True, True, False]),
                 "residue_bytes": st.sampled_from([0, 450 * d.MIB]),
                 "min_residency_s": st.sampled_from([0.0, 0.5]),
+                "standby": st.sampled_from([False, False, True]),
+                "park_bytes": st.sampled_from([0, 0, 2 * d.GIB]),
             }
         ),
     )
@@ -86,7 +88,8 @@ class Leases(RuleBasedStateMachine):
         person.unloading(lease)
         del self.loaded[person.process][lease]
         self.show(person.process)
-        person.release(lease)
+        view = self.driver.view(lease)
+        person.release(lease, parked=view is not None and "parked_bytes" in view)
 
     @rule(lease=leases, who=st.integers(0, 3))
     def use(self, lease: LeaseId, who: int) -> None:
@@ -112,6 +115,29 @@ class Leases(RuleBasedStateMachine):
         view = self.driver.view(lease)
         if view is not None and view["state"] == "held" and not view["uses"]:
             self.unload(lease)
+
+    @rule(lease=leases)
+    def want_back(self, lease: LeaseId) -> None:
+        if self.driver.state(lease) in ("standby", "parked", "verifying"):
+            self.mine[lease].reacquire(lease)
+
+    @rule(lease=leases, less=st.sampled_from([0, 100 * d.MIB, 1 * d.GIB]))
+    def shrink(self, lease: LeaseId, less: int) -> None:
+        if self.driver.state(lease) == "held":
+            person = self.mine[lease]
+            spec = person.specs[lease]
+            size = max(self.loaded[person.process][lease] - less, spec.residue_bytes)
+            self.loaded[person.process][lease] = size
+            self.show(person.process)
+            person.resize(lease, size, residue_bytes=spec.residue_bytes)
+
+    @rule(lease=leases, more=st.sampled_from([100 * d.MIB, 1 * d.GIB]))
+    def grow(self, lease: LeaseId, more: int) -> None:
+        """Asks only: what it was granted it may use, and need not."""
+        if self.driver.state(lease) == "held":
+            person = self.mine[lease]
+            size = self.loaded[person.process][lease] + more
+            person.resize(lease, size, residue_bytes=person.specs[lease].residue_bytes)
 
     @rule(lease=leases)
     def fail_to_load(self, lease: LeaseId) -> None:
@@ -150,11 +176,18 @@ class Leases(RuleBasedStateMachine):
             if (view := self.driver.view(lease)) is not None
             and view["state"] in ("loading", "held", "revoking", "unloading")
         }
+        away = {
+            lease: (view["state"], person.token(lease))
+            for lease, person in self.mine.items()
+            if (view := self.driver.view(lease)) is not None and view["state"] in ("standby", "parked")
+        }
         self.driver.restart(epoch=self.driver.settings.epoch + 1)
         for person in self.people:
             person.connect()
         for lease, (state, token, _) in held.items():
             self.mine[lease].reattach(lease, token, held=state != "loading")
+        for lease, (state, token) in away.items():
+            self.mine[lease].reattach(lease, token, away=True, parked=state == "parked")
 
     # -- what must hold ------------------------------------------------------------------------------------------------
     @invariant()
