@@ -82,15 +82,33 @@ def history(
         int, typer.Option("--limit", "-n", min=1, max=5000, help="At most so many events.")
     ] = 50,
     after: Annotated[
-        int | None, typer.Option(min=0, help="Events after this number (default: the newest).")
+        int | None, typer.Option(min=0, help="The first events after this number (default: the newest).")
+    ] = None,
+    since: Annotated[
+        str | None, typer.Option(help="Since 90s, 10m, 2h or 1d ago, 14:30, or 2026-11-21 14:30.")
+    ] = None,
+    consumer: Annotated[
+        list[str] | None,
+        typer.Option("--consumer", "-c", help="Only about this consumer; may be given several times."),
     ] = None,
     kind: Annotated[
         list[str] | None, typer.Option(help="Only this kind; may be given several times.")
     ] = None,
+    follow: Annotated[
+        bool, typer.Option("--follow", "-f", help="Then every further one as it happens, until Ctrl-C.")
+    ] = False,
 ) -> None:
-    """What happened: grants, evictions, verdicts, with their reasons."""
-    code = quick.history(as_json=as_json, endpoint=endpoint, after=after, limit=limit, kinds=kind or ())
-    raise typer.Exit(code)
+    """What happened: grants, evictions, verdicts, with their reasons. With --follow --json one JSON object a line."""
+    from clients.cli import history as past
+
+    try:
+        since_wall_s = None if since is None else past.since_now(since)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    wanted = past.Wanted(kind or (), consumer or (), since_wall_s, limit, after)
+    if follow:
+        raise typer.Exit(asyncio.run(past.follow(wanted, as_json=as_json, endpoint=endpoint)))
+    raise typer.Exit(past.history(wanted, as_json=as_json, endpoint=endpoint))
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""`vramctl status`, `why` and `history` on the shortest way: one blocking DEALER, two messages, two answers.
+"""`vramctl status` and `why` on the shortest way: one blocking DEALER, two messages, two answers.
 
 An operator types these a hundred times, scripts poll them: the path imports zmq and msgpack and nothing heavier (no pydantic, asyncio,
 typer, rich, OpenTelemetry; a test holds it to that). Output and exit codes are the same as through `clients.cli.app`.
@@ -21,10 +21,6 @@ OK, NO, USAGE, UNREACHABLE = 0, 1, 2, 3
 
 TIMEOUT_S = 3.0
 ENVELOPE = frozenset({"re", "ok"})
-HISTORY_LIMIT = 50
-PAGE = 2000  # events in one reply; more would not fit a message
-GAP_MAX = 4000  # numbers that the daemon may leave out after a crash
-NEVER = 1 << 62  # no event has a number beyond it
 
 Message = dict[str, Any]
 
@@ -144,43 +140,6 @@ def by_hand(
         lines=lambda reply: text.by_hand_lines(action, reply),
         question=partial(ask, role="operator"),
     )[0]
-
-
-def history(
-    *,
-    as_json: bool = False,
-    endpoint: str | None = None,
-    after: int | None = None,
-    limit: int = HISTORY_LIMIT,
-    kinds: Sequence[str] = (),
-) -> int:
-    """The newest `limit` events (of some kinds), or the first `limit` after a sequence number."""
-
-    def shown(reply: Message) -> list[str]:
-        return [text.event_line(event) for event in reply["events"]]
-
-    fields = {"after": after or 0, "limit": limit, "kinds": list(kinds)}
-    question = ask if after is not None else _newest
-    hidden = ENVELOPE | {"epoch"}
-    return answer(
-        "history", fields, endpoint=endpoint, as_json=as_json, lines=shown, hidden=hidden, question=question
-    )[0]
-
-
-def _newest(op: str, fields: Mapping[str, Any], endpoint: str | None = None) -> Message:
-    """Page forward to the end and keep the tail: numbers have gaps, so the start of the tail cannot be computed."""
-    reply = ask(op, {**fields, "after": NEVER, "limit": 1}, endpoint)
-    limit = int(fields["limit"])
-    after = 0 if fields["kinds"] else max(0, int(reply.get("last_seq", 0)) - limit - GAP_MAX)
-    tail: list[Any] = []
-    while reply.get("ok"):
-        reply = ask(op, {**fields, "after": after, "limit": PAGE}, endpoint)
-        events = reply.get("events", [])
-        tail = [*tail, *events][-limit:]
-        if len(events) < PAGE:
-            return {**reply, "events": tail} if reply.get("ok") else reply
-        after = events[-1]["seq"]
-    return reply
 
 
 def try_run(arguments: Sequence[str]) -> int | None:

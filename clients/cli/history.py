@@ -1,0 +1,173 @@
+"""`vramctl history`: what happened, with its reasons; newest events, from a number or a time on, of some kinds or consumers, or live.
+
+The daemon filters by kind; consumers and times are filtered here, page by page.
+"""
+
+import asyncio
+import contextlib
+import datetime
+import json
+import re
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from clients.cli import quick, text
+from clients.cli.quick import ENVELOPE, Message
+
+LIMIT = 50
+PAGE = 2000  # events in one reply; more would not fit a message
+GAP_MAX = 4000  # numbers that the daemon may leave out after a crash
+NEVER = 1 << 62  # no event has a number beyond it
+
+_AGO = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|d)")
+_UNITS = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
+
+
+def parse_since(written: str, now_wall_s: float) -> float:
+    """`90s`, `10m`, `2h`, `1d` ago; `14:30` or `14:30:05`, the last time it was so late; or a date, `2026-11-21 14:30`. Wall seconds.
+
+    Raises ValueError that says what may be written.
+    """
+    if ago := _AGO.fullmatch(written.strip()):
+        return now_wall_s - float(ago[1]) * _UNITS[ago[2]]
+    if ":" in written and "-" not in written:  # a bare number is no time of day
+        with contextlib.suppress(ValueError):
+            clock = datetime.time.fromisoformat(written.strip())
+            today = datetime.datetime.fromtimestamp(now_wall_s)
+            at = datetime.datetime.combine(today.date(), clock).timestamp()
+            return at if at <= now_wall_s else at - _UNITS["d"]
+    with contextlib.suppress(ValueError):
+        return datetime.datetime.fromisoformat(written.strip()).timestamp()
+    raise ValueError(f"{written!r} is no time; write 90s, 10m, 2h, 1d, 14:30 or 2026-11-21 14:30")
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """Which events."""
+
+    kinds: Sequence[str] = ()
+    consumers: Sequence[str] = ()
+    since_wall_s: float | None = None
+    limit: int = LIMIT
+    after: int | None = None
+
+    def keeps(self, event: Mapping[str, Any]) -> bool:
+        """Also what was done to others for a consumer's sake is about it."""
+        about = (event.get("consumer"), event.get("wanted_by"))
+        return (
+            (not self.kinds or event["kind"] in self.kinds)
+            and (not self.consumers or any(name in about for name in self.consumers))
+            and (self.since_wall_s is None or event["at_wall_s"] >= self.since_wall_s)
+        )
+
+
+def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = None) -> int:
+    """The newest events that are wanted, or the first ones after a number."""
+
+    def shown(reply: Message) -> list[str]:
+        return [text.event_line(event) for event in reply["events"]]
+
+    def question(op: str, fields: Mapping[str, Any], where: str | None) -> Message:
+        return collect(wanted, where)
+
+    hidden = ENVELOPE | {"epoch"}
+    return quick.answer(
+        "history", {}, endpoint=endpoint, as_json=as_json, lines=shown, hidden=hidden, question=question
+    )[0]
+
+
+def collect(wanted: Wanted, endpoint: str | None) -> Message:
+    """Page forward: to the end, keeping the tail, or (`after`) until there are enough. Raises quick.Unreachable."""
+    reply = _page(NEVER, 1, (), endpoint)
+    after = (
+        wanted.after if wanted.after is not None else _start(wanted, int(reply.get("last_seq", 0)), endpoint)
+    )
+    found: list[Any] = []
+    while reply.get("ok"):
+        reply = _page(after, PAGE, wanted.kinds, endpoint)
+        events = reply.get("events", [])
+        found += [event for event in events if wanted.keeps(event)]
+        if wanted.after is None:
+            found = found[-wanted.limit :]
+        if len(events) < PAGE or (wanted.after is not None and len(found) >= wanted.limit):
+            return {**reply, "events": found[: wanted.limit]} if reply.get("ok") else reply
+        after = events[-1]["seq"]
+    return reply
+
+
+def _page(after: int, limit: int, kinds: Sequence[str], endpoint: str | None) -> Message:
+    return quick.ask("history", {"after": after, "limit": limit, "kinds": list(kinds)}, endpoint)
+
+
+def _start(wanted: Wanted, last_seq: int, endpoint: str | None) -> int:
+    """A number before the first event that can be wanted."""
+    if wanted.since_wall_s is not None:
+        return _before(wanted.since_wall_s, last_seq, endpoint)
+    if wanted.kinds or wanted.consumers:
+        return 0
+    return max(
+        0, last_seq - wanted.limit - GAP_MAX
+    )  # numbers have gaps: the start of the tail cannot be computed
+
+
+def _before(wall_s: float, last_seq: int, endpoint: str | None) -> int:
+    """By halves: a number not later than the first event since that time."""
+    low, high = 0, last_seq
+    while high - low > PAGE:
+        middle = (low + high) // 2
+        events = _page(middle, 1, (), endpoint).get("events", [])
+        if events and events[0]["at_wall_s"] < wall_s:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = None) -> int:
+    """The newest events, then every further one as it happens, until Ctrl-C; also across restarts of the arbiter.
+
+    Raises ArbiterUnreachable if nobody answers at first.
+    """
+    from clients.aio import ArbiterClient
+
+    def tell(event: Mapping[str, Any]) -> None:
+        if wanted.keeps(event):
+            print(json.dumps(event) if as_json else text.event_line(event), flush=True)
+
+    client = ArbiterClient(
+        endpoint, name="vramctl history", role="observer", connect_timeout_s=quick.TIMEOUT_S
+    )
+    live: asyncio.Queue[Message] = asyncio.Queue()
+
+    async def listen() -> None:
+        async for event in client.subscribe():
+            live.put_nowait(event)
+
+    async with client:
+        listening = asyncio.create_task(listen())
+        try:
+            await asyncio.sleep(0)  # the subscription is on its way, so nothing falls between it and the past
+            await client.ping()
+            past = await asyncio.to_thread(collect, wanted, client.endpoint)
+            last = int(past.get("last_seq", 0))
+            for event in past.get("events", []):
+                tell(event)
+            while True:
+                event = await live.get()
+                if event["seq"] > last + 1:  # the arbiter was away, or we were slow
+                    missed = await client.history(last, PAGE)
+                    for older in missed["events"]:
+                        if last < older["seq"] < event["seq"]:
+                            tell(older)
+                if event["seq"] > last:
+                    last = event["seq"]
+                    tell(event)
+        finally:
+            listening.cancel()
+
+
+def since_now(written: str) -> float:
+    """`parse_since` from this very moment."""
+    return parse_since(written, time.time())

@@ -1,0 +1,153 @@
+"""`vramctl history`: times as people write them, filters, paging, and following a real daemon."""
+
+import datetime
+import json
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from clients.cli import history
+from clients.cli.history import Wanted, collect, parse_since
+from clients.sync import SyncArbiterClient
+from schemas.wire import LeaseSpec
+
+PATIENCE_S = 30.0
+NOON = datetime.datetime(2026, 11, 21, 12, 0).timestamp()
+
+
+@pytest.mark.parametrize(
+    ("written", "ago_s"),
+    [
+        ("90s", 90),
+        ("10m", 600),
+        ("10 min", 600),
+        ("1.5h", 5400),
+        ("2d", 172_800),
+        ("11:30", 1800),
+        ("11:59:30", 30),
+        ("12:30", 23.5 * 3600),  # not yet today: yesterday's
+        ("2026-11-21 11:00", 3600),
+    ],
+)
+def test_times_as_people_write_them(written: str, ago_s: float) -> None:
+    assert parse_since(written, NOON) == pytest.approx(NOON - ago_s)
+
+
+@pytest.mark.parametrize("written", ["", "yesterday", "10", "1010", "25:00", "-3s"])
+def test_what_is_no_time_says_what_may_be_written(written: str) -> None:
+    with pytest.raises(ValueError, match="write 90s, 10m"):
+        parse_since(written, NOON)
+
+
+def test_a_filter_knows_kind_consumer_and_time() -> None:
+    event = {
+        "seq": 1,
+        "kind": "revoke_asked",
+        "consumer": "detector",
+        "wanted_by": "grab",
+        "at_wall_s": 100.0,
+    }
+    assert Wanted().keeps(event)
+    assert Wanted(consumers=["grab"]).keeps(event)
+    assert Wanted(consumers=["detector"], kinds=["revoke_asked"], since_wall_s=100.0).keeps(event)
+    assert not Wanted(consumers=["chat"]).keeps(event)
+    assert not Wanted(kinds=["granted"]).keeps(event)
+    assert not Wanted(since_wall_s=100.1).keeps(event)
+
+
+class Archive:
+    """A daemon's answers: one event a second, with a gap in the numbers."""
+
+    def __init__(self, count: int) -> None:
+        self.events = [
+            {
+                "seq": n if n < 1000 else n + 2000,
+                "kind": "granted",
+                "consumer": f"c{n % 3}",
+                "at_wall_s": float(n),
+            }
+            for n in range(1, count + 1)
+        ]
+        self.asked = 0
+
+    def ask(self, op: str, fields: Mapping[str, Any], endpoint: str | None) -> dict[str, Any]:
+        assert op == "history"
+        self.asked += 1
+        later = [event for event in self.events if int(str(event["seq"])) > fields["after"]]
+        return {"ok": True, "events": later[: fields["limit"]], "last_seq": self.events[-1]["seq"]}
+
+
+@pytest.fixture
+def archive(monkeypatch: pytest.MonkeyPatch) -> Archive:
+    made = Archive(9000)
+    monkeypatch.setattr(history.quick, "ask", made.ask)
+    return made
+
+
+def test_the_newest_are_found_without_reading_everything(archive: Archive) -> None:
+    found = collect(Wanted(limit=3), None)["events"]
+    assert [event["at_wall_s"] for event in found] == [8998.0, 8999.0, 9000.0]
+    assert archive.asked <= 5
+
+
+def test_since_starts_at_its_time(archive: Archive) -> None:
+    found = collect(Wanted(since_wall_s=8000.0, consumers=["c1"], limit=5000), None)["events"]
+    assert found[0]["at_wall_s"] == 8002.0
+    assert len(found) == 333
+    assert archive.asked < 12
+
+
+def test_after_a_number_come_the_first_that_are_wanted(archive: Archive) -> None:
+    found = collect(Wanted(after=990, consumers=["c0"], limit=4), None)["events"]
+    assert [event["at_wall_s"] for event in found] == [993.0, 996.0, 999.0, 1002.0]
+
+
+def vramctl(arbiter: ArbiterProcess, *arguments: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
+        [sys.executable, "-m", "clients", *arguments],
+        env=arbiter.environ,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+
+
+@pytest.mark.e2e
+def test_following_shows_the_past_and_then_the_present(
+    arbiter_daemon: ArbiterProcess, spec: Callable[..., LeaseSpec]
+) -> None:
+    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        client.acquire(spec("early", 1)).ready()
+        shown = vramctl(arbiter_daemon, "history", "--since", "1h", "-c", "early", "--json")
+        kinds = [event["kind"] for event in json.loads(shown.stdout)["events"]]
+        assert kinds == ["granted", "ready", "switch"]
+        assert vramctl(arbiter_daemon, "history", "-c", "nobody").stdout.strip() == ""
+        assert vramctl(arbiter_daemon, "history", "--since", "soon").returncode == 2
+
+        process = subprocess.Popen(
+            [sys.executable, "-m", "clients", "history", "--follow", "--kind", "granted", "--json"],
+            env=arbiter_daemon.environ,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            lines: queue.Queue[str] = queue.Queue()
+            output = process.stdout
+            assert output is not None
+            threading.Thread(target=lambda: [lines.put(line) for line in output], daemon=True).start()
+            assert json.loads(lines.get(timeout=PATIENCE_S))["consumer"] == "early"
+            client.acquire(spec("late", 1)).ready()
+            assert json.loads(lines.get(timeout=PATIENCE_S))["consumer"] == "late"
+            process.send_signal(signal.SIGINT)
+            assert process.wait(PATIENCE_S) in (0, 130)
+        finally:
+            process.kill()
+            process.wait()
