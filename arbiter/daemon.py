@@ -11,6 +11,7 @@ import logging
 import os
 import resource
 import signal
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -53,6 +54,9 @@ EXIT_DEFECT = 70
 PROBE_START_S = 30.0
 """Without persistence mode the NVIDIA driver needs seconds to initialise its cards."""
 OPEN_FILES = 65_536
+SWITCH_S = 0.0005
+"""How long the loop may keep the interpreter from a thread that reads a card, which asks for it some twenty times per reading: with
+Python's own 5 ms a client that floods the loop makes every reading take a tenth of a second."""
 STATUS_EVERY_S = 5.0
 KEEP_LEARNT_EVERY_S = 10.0
 
@@ -175,6 +179,7 @@ class Daemon:
     async def run(self) -> int:
         notifier = Notifier(self._environ)
         raise_open_files()
+        sys.setswitchinterval(SWITCH_S)
         with contextlib.ExitStack() as undo:
             parts = await self._start(undo)
             for number in (signal.SIGTERM, signal.SIGINT):

@@ -23,7 +23,7 @@ from schemas.errors import ConfigError, InternalError
 
 log = logging.getLogger(__name__)
 
-DRAIN_MAX = 256
+DRAIN_MAX = 64
 """Messages handled in one go; then timers and deaths get their turn before the rest."""
 SEND_QUEUE_MAX = 4096
 """Messages queued per peer that does not read; more are dropped, and the peer's own ttl decides."""
