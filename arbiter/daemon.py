@@ -7,6 +7,7 @@ stop: their holders keep what they have and re-attach. Must not decide anything 
 
 import asyncio
 import contextlib
+import gc
 import logging
 import os
 import resource
@@ -184,6 +185,7 @@ class Daemon:
             parts = await self._start(undo)
             for number in (signal.SIGTERM, signal.SIGINT):
                 asyncio.get_running_loop().add_signal_handler(number, self._stop.set)
+            gc.freeze()  # modules live as long as we do: no collection has to look at them again, and stop the loop for it
             notifier.ready(status_text(parts.gpus))
             beat = asyncio.get_running_loop().create_task(self._beat(parts, notifier))
             undo.callback(beat.cancel)

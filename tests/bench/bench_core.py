@@ -31,18 +31,19 @@ class Bench:
         self.tokens: dict[LeaseId, tuple[ClientId, Token]] = {}
         self.queued: list[tuple[ClientId, LeaseId]] = []
         self.samples: dict[str, list[float]] = {}
-        clients = [ClientId(f"{n:04x}") for n in range((leases + 2 * waiters) // PER_CLIENT + 2)]
+        clients = [ClientId(f"{n:04x}") for n in range((leases + 2 * waiters) // PER_CLIENT + 4)]
+        holders = leases // PER_CLIENT + 1  # whoever waits holds nothing: nobody stands in his own way
         for number, client in enumerate(clients):
             process = ProcessKey(1000 + number, 1)
             self.handle(ev.ClientConnected(client, process, 0, f"c{number}", f"i{number}"))
         self.read()
         for number in range(leases):
-            lease = self.acquire(clients[number % len(clients)], SLIVER)
+            lease = self.acquire(clients[number % holders], SLIVER)
             client, token = self.tokens[lease]
             self.handle(ev.ReadyReported(client, self.request(), lease, token, None))
             self.handle(ev.UseBegan(client, self.request(), lease, token, UseId("u"), ""))
         for number in range(waiters):
-            self.acquire(clients[number % len(clients)], 2 * SLIVER)
+            self.acquire(clients[holders + number % (len(clients) - holders)], 2 * SLIVER)
         self.samples.clear()
 
     def request(self) -> RequestId:
