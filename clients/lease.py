@@ -17,7 +17,6 @@ from clients.records import LeaseRecord, TokenPair
 from schemas.errors import (
     ArbiterUnreachable,
     BadState,
-    HostRamInsufficient,
     LeaseLost,
     LeaseRevoking,
     VramError,
@@ -254,14 +253,19 @@ class Lease:
         Before `ready` it means that the load failed or was given up: `unload` frees what there is. A lease that was evicted and
         waits to come back waits no longer; one that is parked runs `unload` to free its host RAM.
         """
-        if self._record.asleep and not self._gone:
-            await self._unload_once()
-            await self.release()
-            return
-        self._own_will = True
-        self._start_leaving()
-        self._progress.changed()
-        await self.wait_gone()
+        while not self._over:
+            if self._record.asleep and not self._gone:
+                if not self._unloading:
+                    await self._unload_once()
+                    await self.release()
+                    return
+            elif (
+                not self._own_will
+            ):  # also where it went to sleep, and came back, while we waited for its end
+                self._own_will = True
+                self._start_leaving()
+                self._progress.changed()
+            await self._progress.wait()
 
     async def wait_gone(self) -> None:
         """Until the lease has ended and its `unload`, if any, is done."""
@@ -324,7 +328,12 @@ class Lease:
                 self._unloading = True
                 asleep = await self._clear_the_card()  # 3
                 if not self._gone:
-                    await self._release(exiting=False, asleep=asleep)  # 4
+                    try:
+                        await self._release(exiting=False, asleep=asleep)  # 4
+                    except (
+                        VramError
+                    ) as error:  # whatever it was: nothing is held any more, and its ttl ends it there
+                        log.warning("%s: its release was refused: %s", self.lease_id, error)
                 if self._record.token != token:
                     return  # granted again before this task came to hear of its release
                 if self._gone or not self._record.asleep:
@@ -396,20 +405,29 @@ class Lease:
         )
         if not self._driver.connected:
             log.warning("%s is released without contact to the arbiter", self.lease_id)
+            self._driver.spawn(self._hear_of_release(request), f"release of {self.lease_id}")
             return  # said when contact comes back soon, else its ttl ends it
         try:
             await self._driver.reply(request)
         except ArbiterUnreachable:
             log.warning("the arbiter did not hear the release of %s; it ends by its ttl", self.lease_id)
-        except (
-            HostRamInsufficient
-        ) as error:  # parked by our own will, but no room is left: the weights go too
+        except VramError as error:
+            if error.code in GONE_CODES:
+                return
+            if asleep != "parked":
+                raise
+            # no host RAM is left, or the arbiter does not let this lease park: the weights go too
             log.info("%s is not parked: %s", self.lease_id, error)
             await self._unload_once()
             await self._release(exiting=exiting)
-        except VramError as error:
-            if error.code not in GONE_CODES:
-                raise
+
+    async def _hear_of_release(self, request: int) -> None:
+        """A lease that sleeps without the arbiter's word may turn out to be over."""
+        try:
+            await self._driver.reply(request)
+        finally:
+            if self._record.released and not self._record.asleep and not self._over:
+                self._end()
 
     async def _call(self, callback: Callable[..., Awaitable[None] | None], *arguments: object) -> None:
         try:

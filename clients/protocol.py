@@ -240,11 +240,9 @@ class ClientProtocol:
     def reacquire(self, record: LeaseRecord, wait_timeout_s: float | None, now: float) -> int:
         """A lease on standby or parked wants in now, as a waiter like any other. Its grant comes as `Returned`."""
 
-        def replied(message: Message, at: float) -> None:
-            self._returned(message["lease"], at)
-
-        message = {"op": "reacquire", **record.ref(), "wait_timeout_s": wait_timeout_s}
-        return self._ask(message, now, on_reply=replied)
+        record.wanted = True
+        record.wanted_until = None if wait_timeout_s is None else now + wait_timeout_s
+        return self._send_reacquire(record, now)
 
     def use_yield(self, record: LeaseRecord, use_id: str, now: float) -> int:
         """The use goes on, but no longer keeps the lease: `use_begin` with the same id takes it up again."""
@@ -280,6 +278,8 @@ class ClientProtocol:
         due: list[float] = [request.deadline for request in self._pending.values()]
         due += [self._wait_limit(w) for w in self._waiters.values() if w.deadline is not None]
         due += [self._fence_at(record) for record in self.leases.values()]
+        wanted = [record for record in self.asleep.values() if record.wanted]
+        due += [self._wanted_limit(record) for record in wanted if record.wanted_until is not None]
         if self._phase_deadline is not None:
             due.append(self._phase_deadline)
         if self.phase == "up":
@@ -304,6 +304,9 @@ class ClientProtocol:
             self._fail(request_id, _unreachable(self._pending[request_id].message["op"]), now)
         for waiter in [w for w in self._waiters.values() if now >= self._wait_limit(w)]:
             self._deny_locally(waiter, now)
+        for record in [r for r in self.asleep.values() if r.wanted and now >= self._wanted_limit(r)]:
+            self._gone(record, _waited_in_vain(record.spec, "its return"))
+            self._ask({"op": "cancel", "lease_id": record.lease_id}, now, quiet=True)
         if self._phase_deadline is not None and now >= self._phase_deadline:  # 3
             self.contact_lost("no answer to hello")
         if self.phase != "up":
@@ -368,10 +371,28 @@ class ClientProtocol:
         for waiter in self._waiters.values():
             if waiter.request_id not in self._pending:
                 self._send_acquire(waiter, now)
+        for record in self.asleep.values():
+            if record.wanted and not any(_reacquires(request.message, record) for request in again):
+                self._send_reacquire(record, now, quiet=True)
         for use_id, use in self._foreign.items():
             self._renew_use(use_id, use, now)
         for request in again:
             self._send(request, now)
+
+    def _send_reacquire(self, record: LeaseRecord, now: float, *, quiet: bool = False) -> int:
+        """Said again after a restart of the daemon: it knows that the lease is away, not that it is wanted."""
+
+        def replied(message: Message, at: float) -> None:
+            self._returned(message["lease"], at)
+
+        def refused(error: VramError, _: float) -> None:
+            record.wanted = False
+            if quiet:
+                self._gone(record, error)
+
+        left_s = None if record.wanted_until is None else max(0.0, record.wanted_until - now)
+        message = {"op": "reacquire", **record.ref(), "wait_timeout_s": left_s}
+        return self._ask(message, now, on_reply=replied, on_error=refused, quiet=quiet)
 
     def _renew_use(self, use_id: str, use: ForeignUseRecord, now: float) -> None:
         def lost(error: VramError, _: float) -> None:
@@ -412,7 +433,9 @@ class ClientProtocol:
     def _acquire_replied(self, waiter: Waiter, message: Message, now: float) -> None:
         view = message["lease"]
         waiter.lease_id = view["lease_id"]
-        if view.get("token") is not None:
+        if (
+            message.get("state") == "loading"
+        ):  # a lease that comes back has a token while it waits, the last one
             self._granted(waiter, view, now)
         elif waiter.abandoned:
             self._cancel(waiter, now)
@@ -443,12 +466,7 @@ class ClientProtocol:
 
     def _deny_locally(self, waiter: Waiter, now: float) -> None:
         """The wait's time is over and the arbiter did not say so: it is out of reach."""
-        waited_s = now - waiter.asked_at
-        error = WaitTimeout(
-            f"no lease for {waiter.spec.get('consumer')} within {waited_s:.1f} s, and no contact to the arbiter",
-            hint="is the arbiter running? see `vramctl status`",
-            details={"waited_s": waited_s},
-        )
+        error = _waited_in_vain(waiter.spec, "a lease", now - waiter.asked_at)
         if not waiter.abandoned:
             self._events.append(Denied(waiter.nonce, error))
         waiter.abandoned, waiter.deadline = True, None
@@ -508,7 +526,7 @@ class ClientProtocol:
 
     def _wake(self, record: LeaseRecord) -> bool:
         """It waits no longer. Did it?"""
-        record.asleep = ""
+        record.asleep, record.wanted = "", False
         return self.asleep.pop(record.lease_id, None) is not None
 
     def _returned(self, view: Message, now: float) -> None:
@@ -559,6 +577,11 @@ class ClientProtocol:
 
     def _fence_at(self, record: LeaseRecord) -> float:
         return record.confirmed_at + record.ttl_s + self.grace_s
+
+    def _wanted_limit(self, record: LeaseRecord) -> float:
+        if record.wanted_until is None:
+            return float("inf")
+        return record.wanted_until + (WAIT_SLACK_S if self.phase == "up" else 0.0)
 
     def _wait_limit(self, waiter: Waiter) -> float:
         if waiter.deadline is None:
@@ -632,6 +655,19 @@ class ClientProtocol:
     def _drop_unsent(self, matches: Callable[[Message], bool]) -> None:
         for request_id in [i for i, r in self._pending.items() if r.sent_at is None and matches(r.message)]:
             del self._pending[request_id]
+
+
+def _reacquires(message: Message, record: LeaseRecord) -> bool:
+    return bool(message["op"] == "reacquire" and message["lease_id"] == record.lease_id)
+
+
+def _waited_in_vain(spec: Message, what: str, waited_s: float | None = None) -> WaitTimeout:
+    within = "in time" if waited_s is None else f"within {waited_s:.1f} s"
+    return WaitTimeout(
+        f"no word on {what} for {spec.get('consumer')} {within}, and no contact to the arbiter",
+        hint="is the arbiter running? see `vramctl status`",
+        details={} if waited_s is None else {"waited_s": waited_s},
+    )
 
 
 def _unreachable(op: str) -> ArbiterUnreachable:

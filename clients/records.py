@@ -130,6 +130,8 @@ class LeaseRecord:
     server_uses: int | None = None
     released: bool = False
     asleep: str = ""  # `standby` or `parked`: evicted, and may come back under the same id
+    wanted: bool = False  # asleep, and its owner waits for its return
+    wanted_until: float | None = None  # None: for ever
 
     @property
     def ttl_s(self) -> float:

@@ -111,7 +111,7 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
     core.nonces[process, lease.nonce] = lease_id
     if state == "debt":
         gpu.ledger.to_debt(lease_id)
-        begin_for_lease(core, gpu, lease, alive=True)
+        begin_for_lease(core, gpu, lease, alive=True, grace_s=core.settings.fence_grace_s)
         core.remember(Ended(lease_id, process, lease.nonce, token, LeaseState.LOST, lost_error(lease_id)))
         return
     core.add(lease)

@@ -313,6 +313,11 @@ def cancel(core: Core, event: CancelRequested) -> None:
         standby.give_up(core, lease, LeaseState.CANCELLED, "cancelled", "its holder gave up")
         core.reply(event.client, event.request, {"state": "cancelled"})
         return
+    if lease.state is LeaseState.VERIFYING and (lease.comes_back or lease.parks):
+        standby.renounce(core, lease)  # on its way there: its bytes are measured away, and then it is over
+        core.record_lease(lease)
+        core.reply(event.client, event.request, {"state": str(lease.state)})
+        return
     if lease.state is not LeaseState.QUEUED:
         raise bad_state(lease, "it is granted already, release it")
     cancel_waiter(core, lease, "its holder gave up")

@@ -401,6 +401,17 @@ def test_a_grant_that_was_read_too_late_is_fenced_at_once(link: Wire) -> None:
     assert gone.fenced
 
 
+def test_a_queued_lease_that_was_away_is_no_grant(link: Wire) -> None:
+    """Regression: it shows its last token while it waits, and was taken for granted."""
+    link.protocol.acquire("n1", SPEC, link.now)
+    link.reply(link.one("acquire"), state="queued", lease=view(token=[1, 2], state="queued"))
+    assert link.told() == []
+    link.push("granted", lease=view(token=[1, 3]))
+    (granted,) = link.told()
+    assert isinstance(granted, r.Granted)
+    assert granted.record.token == (1, 3)
+
+
 def test_a_waiter_asks_often_enough_to_know_the_age_of_its_grant(link: Wire) -> None:
     link.protocol.acquire("n1", SPEC, link.now)
     link.reply(link.one("acquire"), state="queued", lease=view())

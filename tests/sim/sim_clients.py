@@ -6,7 +6,7 @@ wait is remembered, so that in the end nobody may still be waiting.
 """
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Awaitable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,6 +36,9 @@ class SimClient(ArbiterClient):
         super().__init__("ipc://simulated", name=process.name, role=role)
         self._world, self._process = world, process
         self.protocol = ClientProtocol(name=process.name, instance=world.clock.new_id("i"), role=role)
+        self.reserves = (
+            False  # its leases are for others to carve theirs out of: by itself it puts nothing on a card
+        )
         process.on_kill.append(self._killed)
 
     @property
@@ -104,6 +107,10 @@ class Character:
     gives_up_waiting: float = 0.1
     pinned: float = 0.05
     exclusive: float = 0.15
+    standby: float = 0.2
+    parks: float = 0.2
+    yields: float = 0.25
+    borrows: float = 0.3  # takes a sub-lease where one is offered
     leases: int = 1
 
 
@@ -123,11 +130,12 @@ class Cast:
     ooms: int = 0
     refusals: dict[str, int] = field(default_factory=dict)
     clients: list[SimClient] = field(default_factory=list)
+    offers: dict[str, Lease] = field(default_factory=dict)  # leases out of which others may carve theirs
 
     def entitlements(self) -> Iterator[Entitlement]:
         """Leases that living clients believe in, and would not have fenced by their own clock."""
         for client in self.clients:
-            if not client.process.alive:
+            if not client.process.alive or client.reserves:
                 continue
             for record in client.protocol.leases.values():
                 if client.now() >= client.protocol._fence_at(record):
@@ -232,6 +240,10 @@ class Consumer(Program):
     def _spec(self, slot: int) -> LeaseSpec:
         chance, choice = self.world.clock.chance, self.random.choice
         peak = choice(SIZES)
+        parent: Lease | None = None
+        if self.cast.offers and chance(self.character.borrows):
+            parent = choice(list(self.cast.offers.values()))
+            peak = int(parent.spec.footprint.load_peak_bytes * choice((0.3, 0.6, 1.0)))
         steady = peak if chance(0.5) else max(peak // 2, self.residue_bytes)
         gpus = ["any", *(str(info.index) for info in self.world.gpus), *self.world.cards]
         return LeaseSpec.model_validate(
@@ -239,7 +251,7 @@ class Consumer(Program):
                 "consumer": self.process.name,
                 "model_id": f"{self.process.name}-{slot}",
                 "gpu": choice(gpus),
-                "mode": "exclusive" if chance(self.character.exclusive) else "shared",
+                "mode": "exclusive" if parent is None and chance(self.character.exclusive) else "shared",
                 "footprint": Footprint(
                     load_peak_bytes=max(peak, self.residue_bytes),
                     steady_bytes=steady,
@@ -250,6 +262,10 @@ class Consumer(Program):
                 "ttl_s": choice((2.0, 5.0, 10.0)),
                 "min_residency_s": choice((0.0, 0.5, 2.0)),
                 "on_deadline": choice(("wait", "wait", "deny")),
+                "standby": chance(self.character.standby),
+                "park_bytes": steady if chance(self.character.parks) else 0,
+                "parent": parent and {"lease_id": parent.lease_id, "token": parent.token},
+                "independent": chance(0.2),
             }
         )
 
@@ -263,7 +279,9 @@ class Consumer(Program):
             self.client.acquire(
                 spec,
                 timeout_s,
-                unload=lambda: self._unload(holding[0]),
+                unload=lambda: self._watched(self._unload(holding[0])),
+                park=lambda: self._watched(self._unload(holding[0])),
+                on_return=lambda lease: self._watched(self._come_back(holding[0])),
                 on_lost=lambda lease, error: self.cast.count_refusal(error),
             )
         )
@@ -285,30 +303,70 @@ class Consumer(Program):
         held = Holding(self.client, self.process, lease, GpuId(lease.gpu))
         holding.append(held)
         self.cast.holdings[lease.lease_id] = held
+        if spec.parent is not None:
+            self.world.carved[lease.lease_id] = spec.parent.lease_id
+            self.world.faults["sublease"] += 1
         return lease
+
+    async def _watched(self, work: Awaitable[None]) -> None:
+        """The library survives what a callback raises; here it is a defect of the simulation."""
+        try:
+            await work
+        except VramError as error:
+            self.cast.count_refusal(error)
+        except Exception as error:
+            self.world.fail(f"{self.process.name}: {type(error).__name__}: {error}")
+            raise
 
     # -- holding -----------------------------------------------------------------------------------------------------
     async def _hold(self, lease: Lease) -> None:
         holding = self.cast.holdings[lease.lease_id]
         try:
-            if not await self._load(holding):
-                await lease.give_up()
-                return
-            measured = await self._settle(holding)
-            holding.loaded = True
-            self.world.touch()
-            await lease.ready(measured)
-            await self._work(holding)
-            if self.cast.stopping or not lease.spec.evictable or self.world.clock.chance(0.5):
-                await lease.give_up()
+            await self._make_use_of(holding)
         except VramError as error:
             self.cast.count_refusal(error)
-        while lease.state != "gone":  # idle until somebody wants the room
+        while lease.state != "gone":  # idle, or away, until somebody wants the room
             await asyncio.sleep(0.5)
             if self.cast.stopping:
                 await self.pause(3.0)
                 await lease.give_up()
+            elif lease.state in ("standby", "parked") and self.world.clock.chance(0.1):
+                await self._want_back(lease)
+            elif lease.state == "held" and lease.spec.park_bytes and self.world.clock.chance(0.05):
+                await lease.park()
+                self.world.faults["parked_by_itself"] += 1
         await lease.wait_gone()
+
+    async def _make_use_of(self, holding: Holding) -> None:
+        lease = holding.lease
+        if not await self._load(holding):
+            await lease.give_up()
+            return
+        measured = await self._settle(holding)
+        holding.loaded = True
+        self.world.touch()
+        await lease.ready(measured)
+        await self._work(holding)
+        if self.cast.stopping or not lease.spec.evictable or self.world.clock.chance(0.3):
+            await lease.give_up()
+
+    async def _come_back(self, holding: Holding) -> None:
+        """Granted again after an eviction."""
+        holding.loaded = holding.over = False
+        holding.gpu = GpuId(holding.lease.gpu)
+        self.world.faults["returned"] += 1
+        await self._make_use_of(holding)
+
+    async def _want_back(self, lease: Lease) -> None:
+        ask = Ask(self.process.name, self.world.clock.now, 10.0, self.process, lease.spec)
+        self.cast.asks.append(ask)
+        self.world.faults["reacquired"] += 1
+        try:
+            await lease.reacquire(10.0)
+            ask.outcome = "returned"
+        except VramError as error:
+            ask.outcome = error.code
+            self.cast.count_refusal(error)
 
     async def _load(self, holding: Holding) -> bool:
         """In steps, context first; the last step is the temporary peak. False: given up or failed."""
@@ -369,8 +427,12 @@ class Consumer(Program):
             await self.pause(1.0)
             if lease.state != "held":
                 return
-            async with lease.use("work"):
+            async with lease.use("work") as use:
                 await self.pause(self.random.choice((0.05, 0.5, 3.0)))
+                if self.world.clock.chance(self.character.yields):
+                    self.world.faults["yielded"] += 1
+                    async with use.yielded():
+                        await self.pause(2.0)
 
     async def _unload(self, holding: Holding) -> None:
         """Called by the library at the safe point, or after a loss."""
@@ -411,6 +473,43 @@ class Runner(Program):
         await self.pause(self.random.choice((0.1, 1.0, 5.0)))
         del marks[use.use_id]
         await use.end()
+
+
+class Lender(Program):
+    """Takes a lease for others: puts nothing on the card itself, and lets whoever knows the token carve sub-leases out of it."""
+
+    async def life(self) -> None:
+        self.client.reserves = True
+        while not self.cast.stopping:
+            await self.pause(6.0)
+            if not self.cast.stopping:
+                try:
+                    await self._lend()
+                except VramError as error:
+                    self.cast.count_refusal(error)
+
+    async def _lend(self) -> None:
+        size = self.random.choice(SIZES[2:])
+        footprint = Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=0)
+        spec = LeaseSpec(
+            consumer=self.process.name,
+            model_id="reservation",
+            footprint=footprint,
+            ttl_s=5.0,
+            min_residency_s=0.5,
+        )
+        lease = await self.client.acquire(spec, 10.0)
+        self.cast.offers[lease.lease_id] = lease
+        try:
+            if self.world.clock.chance(0.5):
+                await lease.ready()
+                async with lease.use("goal"):
+                    await self.pause(5.0)
+            else:
+                await self.pause(5.0)
+        finally:
+            del self.cast.offers[lease.lease_id]
+        await lease.give_up()
 
 
 class Observer(Program):

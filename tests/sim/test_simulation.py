@@ -1,17 +1,21 @@
 """The whole arbiter under faults, a few seeds of it; `make sim SEEDS=1000` runs more, `make sim SEED=n` one again."""
 
-from collections.abc import Iterator
+import asyncio
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
 import pytest
+from sim_clients import SimClient
 from sim_run import run_seed, summary
 
 from arbiter.testing.simulation.card import Device, SimOutOfMemory
 from arbiter.testing.simulation.clock import Clock, ProcessLoop
 from arbiter.testing.simulation.daemon import Happening
 from arbiter.testing.simulation.world import Entitlement, SimFailure, World
+from clients.lease import Lease
 from schemas.defaults import GIB
 from schemas.ids import GpuId, ProcessKey
+from schemas.wire import Footprint, LeaseSpec
 
 A, B, GPU = ProcessKey(1, 1), ProcessKey(2, 2), GpuId("GPU-0")
 
@@ -119,3 +123,102 @@ def test_the_card_refuses_what_it_has_not_got_and_gives_back_late() -> None:
     clock.run_until(clock.now + 1.0)
     card.allocate(B, "x", 4 * GIB)
     assert card.used_bytes() == 4 * GIB
+
+
+# -- clients -----------------------------------------------------------------------------------------------------------
+async def parked_slowly(client: SimClient, size: int, parked: list[str], **fields: object) -> Lease:
+    """A lease that is loaded and can park, which takes it a second."""
+
+    async def park() -> None:
+        parked.append("began")
+        await asyncio.sleep(1.0)
+
+    async def unload() -> None:
+        parked.append("unloaded")
+
+    footprint = Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=0)
+    spec = {
+        "consumer": client.process.name,
+        "model_id": "m",
+        "footprint": footprint,
+        "min_residency_s": 0.0,
+        **fields,
+    }
+    lease = await client.acquire(LeaseSpec.model_validate(spec), park=park, unload=unload)
+    await lease.ready()
+    return lease
+
+
+def run_client(made: World, life: Callable[[SimClient], Awaitable[None]], seconds: float = 60.0) -> bool:
+    """Connect a client and run its life. Did it come to its end within so much simulated time?"""
+    process = made.spawn("client")
+    client = SimClient(made, process)
+    done: list[bool] = []
+
+    async def run() -> None:
+        await client.connect()
+        await life(client)
+        done.append(True)
+
+    process.loop.enter(lambda: process.loop.create_task(run()))
+    made.run(seconds, lambda: bool(done))
+    made.kill(process)
+    made.kill_daemon()
+    return bool(done)
+
+
+def test_a_lease_that_is_given_up_while_it_parks_ends(tmp_path: Path) -> None:
+    """Regression: `give_up` waited for ever for an end, and the lease slept."""
+    made = world(tmp_path)
+    parked: list[str] = []
+
+    async def life(client: SimClient) -> None:
+        lease = await parked_slowly(client, GIB, parked, park_bytes=GIB)
+        parking = asyncio.ensure_future(lease.park())
+        await asyncio.sleep(0.5)
+        await lease.give_up()
+        await parking
+
+    assert run_client(made, life)
+    assert parked == ["began", "unloaded"]
+
+
+def test_a_wait_to_come_back_outlives_the_daemon(tmp_path: Path) -> None:
+    """Regression: after a restart the arbiter knew that the lease was parked, but not that it was wanted."""
+    made = world(tmp_path)
+    parked: list[str] = []
+
+    async def life(client: SimClient) -> None:
+        lease = await parked_slowly(client, 5 * GIB, parked, park_bytes=5 * GIB, independent=True)
+        await lease.park()
+        other = await parked_slowly(client, 5 * GIB, parked, consumer="other", model_id="other")
+        card, key = made.cards[GPU], client.process.key
+        card.allocate(key, other.lease_id, 5 * GIB)
+        async with other.use():
+            back = asyncio.ensure_future(lease.reacquire())
+            await asyncio.sleep(0.5)
+            made.clock.after(0.0, made.kill_daemon)
+            made.clock.after(0.1, made.start_daemon)
+            await asyncio.sleep(3.0)
+        card.free(key, other.lease_id)
+        await other.wait_gone()
+        await back
+
+    assert run_client(made, life)
+
+
+def test_a_sub_lease_that_may_not_park_is_released_all_the_same(tmp_path: Path) -> None:
+    """Regression: a release that was refused ended the task that leaves, and the lease stayed `unloading` for ever."""
+    made = world(tmp_path)
+    parked: list[str] = []
+
+    async def life(client: SimClient) -> None:
+        parent = await parked_slowly(client, 5 * GIB, parked)
+        ref = {"lease_id": parent.lease_id, "token": parent.token}
+        lease = await parked_slowly(client, GIB, parked, park_bytes=GIB, parent=ref)
+        waiting = asyncio.ensure_future(lease.park())
+        await lease.wait_gone()
+        await waiting
+
+    assert run_client(made, life)
+    assert parked == ["began", "unloaded"]

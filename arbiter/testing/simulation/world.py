@@ -35,6 +35,7 @@ QUICK: Mapping[str, float] = {
     "revoke_deadline_s": 8.0,
     "verify_timeout_s": 4.0,
     "fence_grace_s": 2.0,
+    "host_ram_budget_bytes": 6 * d.GIB,
 }
 """Shorter than in production, so that a minute of simulated time sees several of each."""
 
@@ -106,6 +107,9 @@ class World:
         self.daemon: SimDaemon | None = None
         self.processes: dict[ProcessKey, SimProcess] = {}
         self.faults: Counter[str] = Counter()
+        self.carved: dict[
+            str, str
+        ] = {}  # sub-lease → the lease that it was carved out of, also when it is over
         self.entitlements: Callable[[], Iterator[Entitlement]] = lambda: iter(())
         self.failure: str | None = None
         self.distrusted_until = (
@@ -241,6 +245,11 @@ class World:
     def _check_cards(self) -> None:
         granted: dict[GpuId, list[Entitlement]] = {gpu: [] for gpu in self.cards}
         for entitlement in self.entitlements():
+            if entitlement.gpu not in granted:
+                self.fail(
+                    f"{entitlement.process} believes that {entitlement.lease_id} is on {entitlement.gpu}"
+                )
+                return
             granted[entitlement.gpu].append(entitlement)
         for gpu, card in self.cards.items():
             self._check_card(card, granted[gpu])
@@ -274,7 +283,8 @@ class World:
                 f"{weights}, contexts {contexts}, leaks {leaks}"
             )
         for exclusive in (e for e in granted if e.exclusive):
-            others = [e.lease_id for e in granted if e.lease_id != exclusive.lease_id]
+            family = {exclusive.lease_id, *(c for c, p in self.carved.items() if p == exclusive.lease_id)}
+            others = [e.lease_id for e in granted if e.lease_id not in family]
             if others:
                 self.fail(f"{card.gpu}: {others} beside the exclusive {exclusive.lease_id}")
 

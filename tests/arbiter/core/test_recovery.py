@@ -177,6 +177,19 @@ def test_verifications_and_debts_go_on_after_the_restart() -> None:
     assert token.epoch == 1
 
 
+def test_a_debt_keeps_its_fence_grace_over_a_restart() -> None:
+    """Regression: the hung holder may still be loading until it fences itself; a restart forgot that and gave its room away."""
+    driver = CoreDriver(8 * GIB)
+    hung = driver.consumer("hung")
+    lease = hung.acquire(5 * GIB, ttl_s=2.0)
+    driver.until(lambda: driver.state(lease) == "over", limit_s=5.0)
+    driver.restart()
+    waiter = driver.consumer("w").acquire(5 * GIB)
+    driver.advance(driver.settings.fence_grace_s - 0.5)
+    assert driver.state(waiter) == "queued"
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
+
+
 def test_a_lost_journal_believes_holders_for_a_while() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease, token = held(driver, "det", 5)

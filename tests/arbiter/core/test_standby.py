@@ -93,6 +93,19 @@ def test_it_never_comes_back_beside_the_one_that_it_left_for() -> None:
     driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
 
 
+def test_cancel_on_the_way_to_standby_is_heard() -> None:
+    """Regression: it was refused while the bytes were measured, and the lease came back to a holder that did not want it."""
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    driver.consumer("policy").acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    driver.card.lag_s = 0.5
+    det.unload(lease)
+    assert driver.state(lease) == "verifying"
+    assert answer(det.cancel(lease)) == {"state": "verifying"}
+    driver.until(lambda: driver.state(lease) == "over", limit_s=5.0)
+
+
 def test_it_asks_nobody_to_leave() -> None:
     driver = CoreDriver(8 * GIB)
     _, lease, policy, wanted = sent_away(driver)
