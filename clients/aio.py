@@ -28,7 +28,7 @@ from clients.protocol import REQUEST_TIMEOUT_S, ClientProtocol
 from clients.transport import Transport
 from schemas.endpoints import arbiter_endpoint
 from schemas.errors import ArbiterUnreachable, VramError
-from schemas.wire import LeaseSpec
+from schemas.wire import Gang, LeaseSpec
 
 log = logging.getLogger(__name__)
 
@@ -211,6 +211,33 @@ class ArbiterClient:
             yield lease
         finally:
             await lease.give_up()
+
+    async def gang(
+        self, specs: Sequence[LeaseSpec], wait_timeout_s: float | None = None
+    ) -> AsyncIterator[tuple[int, Lease]]:
+        """All of these leases or none: `async for index, lease in client.gang([policy, reward]): load, then await lease.ready()`.
+
+        One is granted after the other, each as the one before is ready. Raises GangBroken, VramInsufficient, WaitTimeout; what was
+        granted until then stays the caller's to give up.
+        """
+        gang = Gang(id=f"{self.protocol.instance}/{uuid.uuid4().hex[:12]}", size=len(specs))
+
+        async def member(index: int, spec: LeaseSpec) -> tuple[int, Lease]:
+            return index, await self.acquire(spec.model_copy(update={"gang": gang}), wait_timeout_s)
+
+        waiting = [asyncio.ensure_future(member(index, spec)) for index, spec in enumerate(specs)]
+        taken: set[int] = set()
+        try:
+            for granted in asyncio.as_completed(waiting):
+                index, lease = await granted
+                taken.add(index)
+                yield index, lease
+        finally:
+            for task in waiting:
+                task.cancel()
+            for found in await asyncio.gather(*waiting, return_exceptions=True):
+                if not isinstance(found, BaseException) and found[0] not in taken:
+                    await found[1].release()  # granted while the caller turned away: nothing was loaded
 
     async def begin_use(
         self,

@@ -9,7 +9,15 @@ import pytest
 from arbiter.testing.process import ArbiterProcess
 from clients.aio import ArbiterClient
 from clients.lease import Lease, Use
-from schemas.errors import BadState, LeaseRevoking, ParentTooSmall, VramError, WouldDeadlock
+from schemas.errors import (
+    BadState,
+    GangBroken,
+    LeaseRevoking,
+    ParentTooSmall,
+    VramError,
+    VramInsufficient,
+    WouldDeadlock,
+)
 from schemas.wire import LeaseRef, LeaseSpec
 from sidecars.device.fake import FakeMemory
 
@@ -159,6 +167,21 @@ async def test_a_yielded_use_lets_the_holder_go_and_says_so_at_its_end(
             with pytest.raises(VramError):
                 await lend(use, client.acquire(spec("llm", 5), 20.0))
         assert model.did == ["unload"]
+
+
+async def test_a_gang_is_granted_together_one_load_after_the_other(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        held: list[Lease] = []
+        async for _, lease in client.gang([spec("policy", 4), spec("reward", 3)], 20.0):
+            assert [other.state for other in held] == ["held"] * len(held)
+            await lease.ready()
+            held.append(lease)
+        assert sorted(lease.spec.consumer for lease in held) == ["policy", "reward"]
+        with pytest.raises((VramInsufficient, GangBroken)):
+            await anext(client.gang([spec("a", 5), spec("b", 5)], 20.0))
+        assert set(await states(client)) == {"policy", "reward"}
 
 
 async def test_a_sub_lease_is_carved_out_of_its_parents(
