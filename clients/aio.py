@@ -452,6 +452,9 @@ class ArbiterClient:
             case r.Returned():
                 if lease := self._leases.get(event.record.lease_id):
                     lease.returned()
+            case r.Resized():
+                if lease := self._leases.get(event.record.lease_id):
+                    lease.resized(event.error)
             case r.UseLost():
                 if use := self._foreign.get(event.use_id):
                     use.lost = event.error

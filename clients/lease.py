@@ -21,7 +21,7 @@ from schemas.errors import (
     LeaseRevoking,
     VramError,
 )
-from schemas.wire import LeaseSpec
+from schemas.wire import Footprint, LeaseSpec
 
 log = logging.getLogger(__name__)
 
@@ -124,6 +124,8 @@ class Lease:
         self._over = False  # lease gone and unload done
         self._progress = _Progress()
         self._leaving: asyncio.Task[None] | None = None
+        self._resizing = False
+        self._resize_error: VramError | None = None
 
     # -- what it is ------------------------------------------------------------------------------------------------
     @property
@@ -200,6 +202,27 @@ class Lease:
         await self._driver.reply(
             self._driver.protocol.oom(self._record, requested_bytes, allocated_bytes, self._driver.now())
         )
+
+    async def resize(self, footprint: Footprint, wait_timeout_s: float | None = None) -> None:
+        """Hold more (returns once there is room for it: allocate then) or less (free first; returns once it is measured gone).
+
+        Raises VramInsufficient, WaitTimeout, WouldDeadlock, LeaseLost; the lease then keeps the size that it had.
+        """
+        self._raise_if_leaving()
+        self._resize_error = None
+        request = self._driver.protocol.resize(
+            self._record, footprint.model_dump(mode="json"), wait_timeout_s, self._driver.now()
+        )
+        self._resizing = True
+        reply = await self._driver.reply(request)
+        if reply["state"] == "held":
+            self._resizing = False
+        while self._resizing and not self._gone:
+            await self._progress.wait()
+        self._raise_if_gone()
+        if self._resize_error is not None:
+            raise self._resize_error
+        self.spec = self.spec.model_copy(update={"footprint": footprint})
 
     async def park(self) -> None:
         """Leave the card of our own will, at the safe point, and keep the weights in host RAM: `reacquire` brings the lease back.
@@ -288,6 +311,11 @@ class Lease:
         self._leaving = None
         if self._callbacks.on_return is not None:
             self._driver.spawn(self._call(self._callbacks.on_return), f"on_return {self.lease_id}")
+        self._progress.changed()
+
+    def resized(self, error: VramError | None) -> None:
+        """A resize that had to wait came to its end."""
+        self._resizing, self._resize_error = False, error
         self._progress.changed()
 
     def lost(self, error: VramError, fenced: bool) -> None:

@@ -25,6 +25,7 @@ from clients.records import (
     Pending,
     Refused,
     Replied,
+    Resized,
     Returned,
     RevokeAsked,
     TokenPair,
@@ -248,6 +249,22 @@ class ClientProtocol:
         """The use goes on, but no longer keeps the lease: `use_begin` with the same id takes it up again."""
         record.uses.discard(use_id)
         return self._ask({"op": "yield", **record.ref(), "use_id": use_id}, now, record=record)
+
+    def resize(
+        self, record: LeaseRecord, footprint: Message, wait_timeout_s: float | None, now: float
+    ) -> int:
+        """Hold more, or less. The reply says `held` when it is done; else its end comes as `Resized`."""
+
+        def accepted(_: Message, __: float) -> None:
+            record.spec = {**record.spec, "footprint": footprint}
+
+        message = {
+            "op": "resize",
+            **record.ref(),
+            "footprint": footprint,
+            "wait_timeout_s": wait_timeout_s,
+        }
+        return self._ask(message, now, on_reply=accepted, record=record)
 
     def oom(self, record: LeaseRecord, requested_bytes: int, allocated_bytes: int | None, now: float) -> int:
         message = {
@@ -491,6 +508,9 @@ class ClientProtocol:
                     self._returned(view, now)
             case "denied":
                 self._refused_later(message["lease_id"], from_wire(message["error"]))
+            case "resized":
+                if record := self.leases.get(message["lease_id"]):
+                    self._events.append(Resized(record))
             case "revoke":
                 record = self.leases.get(message["lease_id"])
                 if record is not None and list(record.token) == list(message["token"]):
@@ -505,9 +525,11 @@ class ClientProtocol:
                 self._events.append(HistoryEvent(message["event"]))
 
     def _refused_later(self, lease_id: str, error: VramError) -> None:
-        """A wait that ended without a grant: of an acquire, or of a lease that wanted to come back."""
+        """A wait that ended without a grant: of an acquire, of a resize, or of a lease that wanted to come back."""
         if waiter := self._waiter_of(lease_id):
             self._denied(waiter, error)
+        elif record := self.leases.get(lease_id):
+            self._events.append(Resized(record, error))
         elif record := self.asleep.get(lease_id):
             self._gone(record, error)
 

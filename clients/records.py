@@ -83,6 +83,14 @@ class Returned:
 
 
 @dataclass(frozen=True, slots=True)
+class Resized:
+    """A resize came to its end: the bytes that are charged now, or why they did not change."""
+
+    record: "LeaseRecord"
+    error: VramError | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class UseLost:
     """A use on somebody else's lease could not be renewed after a reconnect."""
 
@@ -106,6 +114,7 @@ Event = (
     | RevokeAsked
     | Gone
     | Returned
+    | Resized
     | UseLost
     | HistoryEvent
 )

@@ -22,7 +22,7 @@ from typing import Any, Self, TypeVar
 from clients.aio import CONNECT_TIMEOUT_S, ArbiterClient
 from clients.lease import ForeignUse, Lease, LeaseState, SafePointEta, Use
 from schemas.errors import BadState, VramError
-from schemas.wire import LeaseSpec
+from schemas.wire import Footprint, LeaseSpec
 
 T = TypeVar("T")
 Message = dict[str, Any]
@@ -92,6 +92,9 @@ class SyncLease:
 
     def oom(self, requested_bytes: int, allocated_bytes: int | None = None) -> None:
         self._client.run(self._lease.oom(requested_bytes, allocated_bytes))
+
+    def resize(self, footprint: Footprint, wait_timeout_s: float | None = None) -> None:
+        self._client.run(self._lease.resize(footprint, wait_timeout_s))
 
     def park(self) -> None:
         self._client.run(self._lease.park())

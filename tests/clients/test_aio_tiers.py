@@ -18,7 +18,7 @@ from schemas.errors import (
     VramInsufficient,
     WouldDeadlock,
 )
-from schemas.wire import LeaseRef, LeaseSpec
+from schemas.wire import Footprint, LeaseRef, LeaseSpec
 from sidecars.device.fake import FakeMemory
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
@@ -182,6 +182,25 @@ async def test_a_gang_is_granted_together_one_load_after_the_other(
         with pytest.raises((VramInsufficient, GangBroken)):
             await anext(client.gang([spec("a", 5), spec("b", 5)], 20.0))
         assert set(await states(client)) == {"policy", "reward"}
+
+
+async def test_a_lease_grows_and_shrinks(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    def size(gib: int) -> Footprint:
+        return Footprint(load_peak_bytes=gib * GIB, steady_bytes=gib * GIB, residue_bytes=0)
+
+    async def charged(client: ArbiterClient) -> int:
+        return int((await client.status())["leases"][0]["charge_bytes"])
+
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        cache = await client.acquire(spec("cache", 2))
+        await cache.ready()
+        await cache.resize(size(4), 20.0)
+        assert await charged(client) == 4 * GIB
+        await cache.resize(size(1))
+        assert await charged(client) == 1 * GIB
+        with pytest.raises(VramInsufficient):
+            await cache.resize(size(9))
+        assert (cache.state, cache.spec.footprint.steady_bytes) == ("held", 1 * GIB)
 
 
 async def test_a_sub_lease_is_carved_out_of_its_parents(

@@ -711,6 +711,25 @@ def test_reacquire_is_granted_at_once_or_later_or_never(link: Wire) -> None:
     assert isinstance(gone.error, WaitTimeout)
 
 
+def test_a_resize_ends_by_reply_push_or_denial(link: Wire) -> None:
+    record = link.hold()
+    footprint = {"load_peak_bytes": 9, "steady_bytes": 9, "residue_bytes": 1}
+    link.protocol.resize(record, footprint, None, link.now)
+    link.reply(link.one("resize"), state="growing", lease=view())
+    assert record.spec["footprint"] == footprint
+    link.told()
+    link.push("resized", lease_id=record.lease_id, token=list(record.token), charge_bytes=9)
+    assert link.told() == [r.Resized(record)]
+    link.push(
+        "denied",
+        lease_id=record.lease_id,
+        error={"code": "wait_timeout", "message": "", "hint": "", "details": {}},
+    )
+    (resized,) = link.told()
+    assert isinstance(resized, r.Resized)
+    assert isinstance(resized.error, WaitTimeout)
+
+
 def test_a_yielded_use_is_not_attached_again(link: Wire) -> None:
     record = link.hold()
     link.protocol.use_begin(record, "u1", "", link.now)
