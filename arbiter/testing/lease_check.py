@@ -23,10 +23,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from schemas.defaults import RESERVE_BYTES, VERIFY_TOLERANCE_BYTES
+
 SLACK_S = 0.005
 """Between the clocks of history (wall) and of card and traces (monotonic)."""
 UNSEEN_S = 2.5
 """A stowaway younger than the oldest reading that may carry a grant cannot have been seen."""
+NOISE_BYTES = RESERVE_BYTES + VERIFY_TOLERANCE_BYTES
+"""So much may be the driver's own, as far as a reading can tell: who has no more than that on its way back is not seen to be there."""
 STUCK_S = 60.0
 
 type Line = Mapping[str, Any]
@@ -298,7 +302,7 @@ def _check_alone(
 ) -> None:
     t = line["t"]
     for pid, other in held.items():
-        if pid == claim.pid or not other.own:
+        if pid == claim.pid or other.own <= NOISE_BYTES:
             continue
         theirs = next((c for c in reversed(claims.get(pid, ())) if c.since <= t), None)
         if theirs is None or theirs.expired_at < t:  # a stowaway, or a holder that time took the lease from

@@ -1,0 +1,81 @@
+"""A consumer that stops at every step of its life and goes on when it is told `go`. Not a test module; run by `arbiter.testing.forkserver`.
+
+Arguments: NAME BYTES CARD_FOLDER RESIDUE_BYTES. It says `waiting`, `loading`, `ready`, `in_use`, `unloading`, `released`; it waits for `go`
+after `loading`, `in_use` and `unloading`. `use` begins a use, which the next `go` ends.
+"""
+
+import asyncio
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from clients.aio import ArbiterClient
+from schemas.wire import Footprint, LeaseSpec
+from sidecars.device.fake import FakeMemory
+
+TTL_S = 5.0
+
+
+def say(event: str, **facts: object) -> None:
+    print(json.dumps({"event": event, **facts}), flush=True)
+
+
+async def live(name: str, size: int, card: Path, residue: int) -> None:
+    reader = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(
+        lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
+    )
+    told: asyncio.Queue[str] = asyncio.Queue()
+
+    async def listen() -> None:
+        while line := await reader.readline():
+            told.put_nowait(line.decode().strip())
+
+    async def go() -> None:
+        while await told.get() != "go":
+            pass
+
+    listening = asyncio.ensure_future(listen())
+    memory = FakeMemory(card, name, residue)
+    block = None
+
+    async def unload() -> None:
+        say("unloading")
+        await go()
+        if block is not None:
+            memory.free(block)
+        memory.empty_cache()
+
+    spec = LeaseSpec(
+        consumer=name, model_id=name, ttl_s=TTL_S, min_residency_s=0.0,
+        footprint=Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=residue),
+    )  # fmt: skip
+    async with ArbiterClient(name=name, connect_timeout_s=30.0) as client:
+        say("waiting")
+        lease = await client.acquire(spec, unload=unload)
+        say("loading", token=list(lease.token))
+        await go()
+        block = memory.allocate(name, size - residue)
+        await lease.ready(memory.used_bytes())
+        say("ready")
+        using = asyncio.ensure_future(told.get())
+        gone = asyncio.ensure_future(lease.wait_gone())
+        await asyncio.wait([using, gone], return_when=asyncio.FIRST_COMPLETED)
+        if using.done() and using.result() == "use":
+            async with lease.use("work"):
+                say("in_use")
+                await go()
+            say("idle")
+        elif using.done():
+            told.put_nowait(using.result())  # a `go` for the unloading, said early
+        else:
+            using.cancel()
+        await gone
+        say("released")
+        await listening
+
+
+def main(arguments: Sequence[str]) -> None:
+    name, size, card, residue = arguments
+    asyncio.run(live(name, int(size), Path(card), int(residue)))
