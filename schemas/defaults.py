@@ -1,4 +1,4 @@
-"""Every default of the product, each a named constant (design §12). Pure constants; the core may import this."""
+"""Every default of the product, each a named constant. Pure constants; the core may import this."""
 
 KIB = 1024
 MIB = 1024 * KIB

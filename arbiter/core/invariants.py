@@ -4,7 +4,7 @@
 grow with the number of leases. `check_all` looks at everybody and at those tables too; whatever it finds that `check` did not is a
 defect of the tables. Tests' drivers and the simulation run it after every event.
 
-Numbers are those of the design:
+Numbers are those of ARCHITECTURE.md:
   1. approved bytes never exceed capacity − reserve, and a grant fits together with stowaways at its moment
   2. nobody is resident beside an exclusive lease
   3. nothing that is in use unloads

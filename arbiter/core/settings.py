@@ -1,4 +1,4 @@
-"""What the core is told at its construction: the cards and the constants of design §12."""
+"""What the core is told at its construction: the cards and the constants of the configuration."""
 
 from dataclasses import dataclass, field
 
