@@ -22,6 +22,7 @@ from collections.abc import AsyncIterator, Awaitable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from typing import Any, Self
 
+from clients import inside
 from clients import records as r
 from clients.lease import Callbacks, ForeignUse, Lease, OnLost, OnReturn, OnRevoke, SafePointEta, Unload
 from clients.protocol import REQUEST_TIMEOUT_S, ClientProtocol
@@ -149,9 +150,12 @@ class ArbiterClient:
         With `spec.standby` or `park` the lease may be evicted and come back under the same object: `on_return` loads then, as
         the caller does after this first grant.
 
-        Raises WaitTimeout (details.why: who blocked), VramInsufficient, UnknownGpu, HolderBusy, LimitExceeded.
+        Raises WaitTimeout (details.why: who blocked), VramInsufficient, UnknownGpu, HolderBusy, LimitExceeded; from inside a use also
+        WouldDeadlock, if that use is in its own way (`clients.inside`).
         Cancelling the caller gives the place in the queue, or the lease, back.
         """
+        if not inside.a_use():
+            spec = spec.model_copy(update={"independent": True})
         nonce = self.new_id()
         granted: asyncio.Future[Lease] = asyncio.get_running_loop().create_future()
         callbacks = Callbacks(
@@ -259,6 +263,7 @@ class ArbiterClient:
         except BaseException:
             await use.end()
             raise
+        inside.enter(use.use_id)
         return use
 
     @asynccontextmanager

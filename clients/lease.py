@@ -12,6 +12,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
+from clients import inside
 from clients.protocol import GONE_CODES, ClientProtocol
 from clients.records import LeaseRecord, TokenPair
 from schemas.errors import (
@@ -192,6 +193,7 @@ class Lease:
             await use.begin()
             yield use
         finally:
+            inside.leave(use.use_id)
             self._uses.discard(use.use_id)
             self._driver.protocol.use_end(self._record, use.use_id, self._driver.now())
             self._driver.pump()
@@ -491,6 +493,7 @@ class Use:
         except BaseException:
             lease._uses.discard(self.use_id)
             raise
+        inside.enter(self.use_id)
 
     @asynccontextmanager
     async def yielded(self) -> AsyncIterator[None]:
@@ -501,6 +504,7 @@ class Use:
         lease = self._lease
         driver = lease._driver
         await driver.reply(driver.protocol.use_yield(lease._record, self.use_id, driver.now()))
+        inside.leave(self.use_id)
         lease._uses.discard(self.use_id)
         lease._progress.changed()
         try:
@@ -526,5 +530,6 @@ class ForeignUse:
         if self._ended:
             return
         self._ended = True
+        inside.leave(self.use_id)
         self._driver.protocol.foreign_use_end(self.lease_id, self.token, self.use_id, self._driver.now())
         self._driver.pump()

@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Self, TypeVar
 
+from clients import inside
 from clients.aio import CONNECT_TIMEOUT_S, ArbiterClient
 from clients.lease import ForeignUse, Lease, LeaseState, SafePointEta, Use
 from schemas.errors import BadState, VramError
@@ -85,6 +86,7 @@ class SyncLease:
         """A busy interval. Raises LeaseRevoking or LeaseLost before it begins."""
         interval = self._lease.use(label)
         use = self._client.run(interval.__aenter__())
+        inside.enter(use.use_id)  # the loop's thread entered it for itself only
         try:
             yield SyncUse(self._client, use)
         finally:
@@ -131,6 +133,7 @@ class SyncUse:
             yield
         finally:
             self._client.run(interval.__aexit__(None, None, None))
+            inside.enter(self._use.use_id)
 
 
 class SyncArbiterClient:
@@ -276,6 +279,7 @@ class SyncArbiterClient:
     def use(self, lease_id: str, token: Sequence[int], label: str = "") -> Iterator[ForeignUse]:
         """A use on a lease of another process, by its token."""
         use = self.run(self._client.begin_use(lease_id, token, label))
+        inside.enter(use.use_id)
         try:
             yield use
         finally:

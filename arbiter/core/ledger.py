@@ -308,7 +308,6 @@ class GpuLedger:
                 named_bytes += use.used_bytes or 0
                 complete = complete and use.used_bytes is not None
             elif use.used_bytes is None:
-                named_bytes += account.booked_bytes()
                 complete = False
             else:
                 named_bytes += use.used_bytes
@@ -316,7 +315,13 @@ class GpuLedger:
                 if sample.taken_at > account.changed_at:
                     account.measured_bytes = use.used_bytes
         for account in self.accounts.values():
-            if account.process not in seen and sample.taken_at > account.changed_at:
+            if account.process in seen:
+                continue
+            # A driver forgets a dying process before it has freed its bytes, and cannot show one of another container: what
+            # nobody in the list explains is theirs first, up to what they are charged, and no stowaway's.
+            named_bytes += account.booked_bytes()
+            complete = complete and not account.booked_bytes()
+            if sample.taken_at > account.changed_at:
                 account.measured_bytes = 0
         self.strangers = strangers
         if quiet:

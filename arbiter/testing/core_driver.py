@@ -69,6 +69,7 @@ class SimCard:
     reading_s: float = READING_S
     held: dict[ProcessKey, int] = field(default_factory=dict)
     names: dict[ProcessKey, str] = field(default_factory=dict)
+    unlisted: set[ProcessKey] = field(default_factory=set)  # counted in the total only
     _late: list[tuple[float, ProcessKey, int]] = field(
         default_factory=list
     )  # (until, process, bytes still shown)
@@ -102,6 +103,7 @@ class SimCard:
                     process, self.names.get(process, f"p{process.pid}"), count if self.knows_bytes else None
                 )
                 for process, count in sorted(seen.items())
+                if process not in self.unlisted
             )
         return MemorySampled(
             self.gpu,

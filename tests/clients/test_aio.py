@@ -123,7 +123,7 @@ async def test_revoked_at_the_safe_point_and_not_before(arbiter_daemon: ArbiterP
         )
         await lease.ready()
         async with lease.use("first"):
-            wanted = asyncio.create_task(waiter.acquire(spec("b", 5)))
+            wanted = asyncio.create_task(waiter.acquire(spec("b", 5, independent=True)))
             while not lease.revoking:
                 await asyncio.sleep(0.01)
             with pytest.raises(LeaseRevoking):
@@ -154,7 +154,7 @@ async def test_a_use_of_somebody_else_keeps_the_holder_in_place(
         lease = await sidecar.acquire(spec("a", 5), unload=unload)
         await lease.ready()
         async with runner.use(lease.lease_id, lease.token, "goal"):
-            wanted = asyncio.create_task(runner.acquire(spec("b", 5)))
+            wanted = asyncio.create_task(runner.acquire(spec("b", 5, independent=True)))
             while not lease.revoking:
                 await asyncio.sleep(0.01)
             while (await states(runner))["a"] != "revoking":
@@ -195,7 +195,7 @@ async def test_wait_timeout_says_who_blocked(arbiter_daemon: ArbiterProcess, spe
         await lease.ready()
         async with lease.use():
             with pytest.raises(WaitTimeout) as late:
-                await client.acquire(spec("b", 5), 0.2)
+                await client.acquire(spec("b", 5, independent=True), 0.2)
             assert late.value.details["why"]["blockers"][0]["consumer"] == "a"
 
 
@@ -204,7 +204,7 @@ async def test_a_cancelled_acquire_leaves_the_queue(arbiter_daemon: ArbiterProce
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
         async with lease.use():
-            waiting = asyncio.create_task(client.acquire(spec("b", 5)))
+            waiting = asyncio.create_task(client.acquire(spec("b", 5, independent=True)))
             while "b" not in await states(client):
                 await asyncio.sleep(0.01)
             waiting.cancel()

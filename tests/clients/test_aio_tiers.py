@@ -239,15 +239,25 @@ async def test_a_sub_lease_is_carved_out_of_its_parents(
 
 
 async def test_a_job_that_waits_for_its_own_room_is_told(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
-    """One process holds in use what it would itself have to give up: that would never end."""
+    """It holds in use what it would itself have to give up: that would never end. Another task of the process may wait."""
     async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
         job = await client.acquire(spec("job", 5))
         await job.ready()
+        inside = asyncio.Event()
+        beside = asyncio.ensure_future(asked_when(inside, client, spec("another request", 5)))
         async with job.use():
+            inside.set()
             with pytest.raises(WouldDeadlock) as told:
                 await client.acquire(spec("llm", 5))
             assert [link["consumer"] for link in told.value.details["cycle"]] == ["llm"]
             assert "job" in str(told.value)
             prefetch = asyncio.ensure_future(client.acquire(spec("next", 5, independent=True), 20.0))
         await job.give_up()
+        assert (await beside).state == "loading"
+        await (await beside).give_up()
         assert (await prefetch).state == "loading"
+
+
+async def asked_when(happens: asyncio.Event, client: ArbiterClient, spec: LeaseSpec) -> Lease:
+    await happens.wait()
+    return await client.acquire(spec, 20.0)

@@ -108,7 +108,7 @@ class Nemesis:
 
     def _heal(self, faults: ProbeFaults) -> None:
         faults.failing, faults.hanging, faults.behind_s, faults.factor = "", False, 0.0, 1.0
-        faults.unlisted = faults.unnamed_bytes = False
+        faults.unlisted = faults.unnamed_bytes = faults.forgets_the_dead = False
         faults.blind_to.clear()
 
     # -- processes -----------------------------------------------------------------------------------------------------
@@ -288,6 +288,7 @@ class Nemesis:
         def spoil(faults: ProbeFaults) -> None:
             faults.unlisted = self.clock.chance(0.5)
             faults.unnamed_bytes = self.clock.chance(0.5)
+            faults.forgets_the_dead = self.clock.chance(0.5)
             if living := [process for process in self.world.processes.values() if process.alive]:
                 faults.blind_to.add(self.random.choice(living).key)
 

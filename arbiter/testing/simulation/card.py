@@ -38,6 +38,7 @@ class Device:
         self.overhead_bytes = overhead_bytes
         self.lag_s = 0.0
         self.names: dict[ProcessKey, str] = {}
+        self.dead: set[ProcessKey] = set()
         self.held: dict[tuple[ProcessKey, str], int] = {}
         self.late: list[tuple[float, ProcessKey, str, int]] = []
         self.peak_bytes = 0
@@ -79,6 +80,7 @@ class Device:
 
     def bury(self, process: ProcessKey) -> None:
         """The process is dead: the driver takes everything back, in its own time."""
+        self.dead.add(process)
         for owner, tag in list(self.held):
             if owner == process:
                 self.free(process, tag)
@@ -127,6 +129,7 @@ class ProbeFaults:
     unlisted: bool = False  # no process list
     unnamed_bytes: bool = False  # a list without bytes
     factor: float = 1.0  # > 1: says that more is used than is; < 1: less
+    forgets_the_dead: bool = False  # the list leaves a dying process out before its bytes are back
     blind_to: set[ProcessKey] = field(
         default_factory=set
     )  # processes that the list leaves out, the total does not
@@ -202,7 +205,7 @@ class _Reader:
                     None if faults.unnamed_bytes else count,
                 )
                 for process, count in sorted(seen.items())
-                if process not in faults.blind_to
+                if process not in faults.blind_to and not (faults.forgets_the_dead and process in card.dead)
             )
         return MemorySampled(card.gpu, taken_at, used, card.total_bytes, processes)
 

@@ -57,6 +57,35 @@ def test_1_waiting_for_the_driver_costs_no_more_than_the_driver_takes(lag_s: flo
     assert lag_s < took <= lag_s + 0.010 + 2 * READING_S
 
 
+def test_1_a_dying_process_leaves_the_list_before_its_bytes_leave_the_card() -> None:
+    """And a reading may come in between, before anybody says that it died: those bytes are its own still, and no stowaway's."""
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 4, min_residency_s=60.0)  # so that it is not asked to leave meanwhile
+    waiter = driver.consumer("vlm").acquire(1 * GIB, exclusive=True)
+    driver.card.unlisted.add(det.process)
+    driver.post(driver.card.read(driver.now))
+    assert driver.gpu()["stowaway_bytes"] == 0
+    driver.card.lag_s = 0.5
+    det.hold(0)
+    det.die()
+    took = driver.until(lambda: driver.state(waiter) == "loading", step_s=0.001)
+    assert 0.5 < took <= 0.51 + 2 * READING_S
+    (note,) = (note for note in driver.notes("verified") if note["lease_id"] == lease)
+    assert (note["verdict"], note["after_bytes"]) == ("verified", 0)
+
+
+def test_1_a_holder_that_the_driver_cannot_list_is_not_charged_twice() -> None:
+    """NVML shows no process of another container. What is beyond what such a holder is charged is a stowaway all the same."""
+    driver = CoreDriver(8 * GIB, reserve_bytes=0)
+    det, _ = held(driver, "det", 4)
+    driver.card.unlisted |= {det.process, BROWSER}
+    driver.advance(3.0)
+    assert (driver.gpu()["charged_bytes"], driver.gpu()["stowaway_bytes"]) == (4 * GIB, 0)
+    driver.card.set(BROWSER, GIB, driver.now)
+    driver.advance(3.0)
+    assert (driver.gpu()["charged_bytes"], driver.gpu()["stowaway_bytes"]) == (4 * GIB, GIB)
+
+
 def test_1_a_recovery_that_never_comes_is_not_admitted_after_a_while() -> None:
     """ollama: "gpu VRAM usage didn't recover within timeout", and then loads all the same."""
     driver = CoreDriver(8 * GIB)
