@@ -24,8 +24,9 @@ from typing import Any, Self
 
 from clients import inside
 from clients import records as r
+from clients.connection import REQUEST_TIMEOUT_S
 from clients.lease import Callbacks, ForeignUse, Lease, OnLost, OnReturn, OnRevoke, SafePointEta, Unload
-from clients.protocol import REQUEST_TIMEOUT_S, ClientProtocol
+from clients.protocol import ClientProtocol
 from clients.transport import Transport
 from schemas.endpoints import arbiter_endpoint
 from schemas.errors import ArbiterUnreachable, VramError
@@ -80,12 +81,12 @@ class ArbiterClient:
 
     @property
     def connected(self) -> bool:
-        return self.protocol.phase == "up"
+        return self.protocol.connection.phase == "up"
 
     @property
     def epoch(self) -> int | None:
         """Which start of the daemon this is; None before the first greeting."""
-        return self.protocol.epoch
+        return self.protocol.connection.epoch
 
     @property
     def leases(self) -> Sequence[Lease]:
@@ -125,7 +126,9 @@ class ArbiterClient:
                 log.warning("closing although leases are still in use: %s", self.leases)
             if self.connected:
                 with contextlib.suppress(VramError):
-                    await self.reply(self.protocol.request("bye", {}, self.now(), timeout_s=BYE_TIMEOUT_S))
+                    await self.reply(
+                        self.protocol.connection.request("bye", {}, self.now(), timeout_s=BYE_TIMEOUT_S)
+                    )
         finally:
             for leave in leaving:
                 leave.cancel()
@@ -167,7 +170,7 @@ class ArbiterClient:
             safe_point_eta_s=safe_point_eta_s,
         )
         self._acquires[nonce] = (granted, spec, callbacks)
-        self.protocol.acquire(
+        self.protocol.waits.acquire(
             nonce,
             spec.model_dump(mode="json"),
             self.now(),
@@ -181,7 +184,7 @@ class ArbiterClient:
             if granted.done() and not granted.cancelled() and granted.exception() is None:
                 self.spawn(granted.result().release(), f"cancelled acquire {nonce}")  # nothing was loaded yet
             else:
-                self.protocol.cancel_acquire(nonce, self.now())
+                self.protocol.waits.cancel(nonce, self.now())
                 self.pump()
             raise
         finally:
@@ -224,7 +227,7 @@ class ArbiterClient:
         One is granted after the other, each as the one before is ready. Raises GangBroken, VramInsufficient, WaitTimeout; what was
         granted until then stays the caller's to give up.
         """
-        gang = Gang(id=f"{self.protocol.instance}/{uuid.uuid4().hex[:12]}", size=len(specs))
+        gang = Gang(id=f"{self.protocol.connection.instance}/{uuid.uuid4().hex[:12]}", size=len(specs))
 
         async def member(index: int, spec: LeaseSpec) -> tuple[int, Lease]:
             return index, await self.acquire(spec.model_copy(update={"gang": gang}), wait_timeout_s)
@@ -253,8 +256,8 @@ class ArbiterClient:
     ) -> ForeignUse:
         """Begin a use on a lease of another process, whose token was handed to us. Raises LeaseRevoking, StaleToken, LeaseLost …"""
         pair = (int(token[0]), int(token[1]))
-        use = ForeignUse(self, lease_id, pair, f"{self.protocol.instance}/{self.new_id()}")
-        request = self.protocol.foreign_use_begin(
+        use = ForeignUse(self, lease_id, pair, f"{self.protocol.connection.instance}/{self.new_id()}")
+        request = self.protocol.foreign_uses.begin(
             lease_id, pair, use.use_id, label, self.now(), timeout_s=timeout_s
         )
         self._foreign[use.use_id] = use
@@ -280,7 +283,9 @@ class ArbiterClient:
         self, op: str, fields: Mapping[str, Any] | None = None, *, timeout_s: float = REQUEST_TIMEOUT_S
     ) -> r.Message:
         """Any request of `schemas.wire` that has no method here."""
-        return await self.reply(self.protocol.request(op, fields or {}, self.now(), timeout_s=timeout_s))
+        return await self.reply(
+            self.protocol.connection.request(op, fields or {}, self.now(), timeout_s=timeout_s)
+        )
 
     async def status(self) -> r.Message:
         """`schemas.wire.StatusReply`."""
@@ -325,7 +330,7 @@ class ArbiterClient:
             return await answer
         finally:
             if self._replies.pop(request_id, None) is not None and not answer.done():
-                self.protocol.forget(request_id)
+                self.protocol.connection.forget(request_id)
 
     def spawn(self, work: Awaitable[None], name: str) -> asyncio.Task[None]:
         async def run() -> None:
@@ -345,11 +350,11 @@ class ArbiterClient:
         if transport is None:
             return
         while True:
-            for message in self.protocol.take_outgoing():
+            for message in self.protocol.connection.take_outgoing():
                 if not transport.send(message):
-                    self.protocol.contact_lost("the socket takes no more messages")
+                    self.protocol.connection.contact_lost("the socket takes no more messages")
                     break
-            events = self.protocol.take_events()
+            events = self.protocol.connection.take_events()
             if not events:
                 break
             for event in events:
@@ -364,7 +369,7 @@ class ArbiterClient:
         if self._transport is not None:
             self._transport.close()
         self._transport = self._new_transport(loop)
-        self.protocol.connected(self.now())
+        self.protocol.connection.connected(self.now())
         self.pump()
 
     def _new_transport(self, loop: asyncio.AbstractEventLoop) -> Transport:
@@ -377,8 +382,8 @@ class ArbiterClient:
         if self._transport is not None:
             self._transport.close()
         self._transport = self._timer = None
-        self.protocol.contact_lost("closed")
-        self.protocol.take_events()
+        self.protocol.connection.contact_lost("closed")
+        self.protocol.connection.take_events()
         closed = ArbiterUnreachable("the client was closed", hint="keep it open while leases are wanted")
         for answer in self._replies.values():
             if not answer.done():
@@ -390,12 +395,12 @@ class ArbiterClient:
             task.cancel()
 
     def _received(self, message: r.Message) -> None:
-        self.protocol.receive(message, self.now())
+        self.protocol.connection.receive(message, self.now())
         if self._transport is not None:
             self.pump()
 
     def _hung_up(self) -> None:
-        self.protocol.contact_lost("the arbiter hung up")
+        self.protocol.connection.contact_lost("the arbiter hung up")
         if self._transport is not None:
             self.pump()
 
@@ -406,7 +411,7 @@ class ArbiterClient:
             self.pump()
 
     def _reopen(self) -> None:
-        if self._transport is not None and self.protocol.phase == "down":
+        if self._transport is not None and self.protocol.connection.phase == "down":
             self._open()
 
     def _arm(self) -> None:
@@ -476,7 +481,7 @@ class ArbiterClient:
     def _granted(self, event: r.Granted) -> None:
         entry = self._acquires.get(event.nonce)
         if entry is None or entry[0].done():  # the caller was cancelled in this very moment
-            self.protocol.release(event.record, False, self.now(), REQUEST_TIMEOUT_S)
+            self.protocol.holdings.release(event.record, False, self.now(), REQUEST_TIMEOUT_S)
             return
         granted, spec, callbacks = entry
         lease = Lease(self, event.record, spec, callbacks)

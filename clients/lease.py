@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 from clients import inside
-from clients.protocol import GONE_CODES, ClientProtocol
+from clients.holdings import GONE_CODES
+from clients.protocol import ClientProtocol
 from clients.records import LeaseRecord, TokenPair
 from schemas.errors import (
     ArbiterUnreachable,
@@ -176,7 +177,7 @@ class Lease:
         """The model is loaded: `measured_bytes` is what the holder sees of its own allocation. Raises LeaseLost, BadState."""
         self._raise_if_gone()
         await self._driver.reply(
-            self._driver.protocol.ready(self._record, measured_bytes, self._driver.now())
+            self._driver.protocol.holdings.ready(self._record, measured_bytes, self._driver.now())
         )
         self._progress.changed()
 
@@ -195,14 +196,16 @@ class Lease:
         finally:
             inside.leave(use.use_id)
             self._uses.discard(use.use_id)
-            self._driver.protocol.use_end(self._record, use.use_id, self._driver.now())
+            self._driver.protocol.holdings.use_end(self._record, use.use_id, self._driver.now())
             self._driver.pump()
             self._progress.changed()
 
     async def oom(self, requested_bytes: int, allocated_bytes: int | None = None) -> None:
         """Tell the arbiter that an allocation failed: it raises the footprint that it knows of this model."""
         await self._driver.reply(
-            self._driver.protocol.oom(self._record, requested_bytes, allocated_bytes, self._driver.now())
+            self._driver.protocol.holdings.oom(
+                self._record, requested_bytes, allocated_bytes, self._driver.now()
+            )
         )
 
     async def resize(self, footprint: Footprint, wait_timeout_s: float | None = None) -> None:
@@ -212,7 +215,7 @@ class Lease:
         """
         self._raise_if_leaving()
         self._resize_error = None
-        request = self._driver.protocol.resize(
+        request = self._driver.protocol.holdings.resize(
             self._record, footprint.model_dump(mode="json"), wait_timeout_s, self._driver.now()
         )
         self._resizing = True
@@ -246,7 +249,7 @@ class Lease:
         """
         self._raise_if_gone()
         await self._driver.reply(
-            self._driver.protocol.reacquire(self._record, wait_timeout_s, self._driver.now())
+            self._driver.protocol.holdings.reacquire(self._record, wait_timeout_s, self._driver.now())
         )
         await self.wait_returned()
 
@@ -265,7 +268,7 @@ class Lease:
         if self._gone:
             return
         if self._record.asleep:
-            self._driver.protocol.give_up_asleep(self._record, self._driver.now())
+            self._driver.protocol.holdings.give_up_asleep(self._record, self._driver.now())
             self._driver.pump()
         else:
             self._unloaded = True
@@ -301,7 +304,9 @@ class Lease:
     def revoke_asked(self, push: Mapping[str, Any], first: bool) -> None:
         if first and not self._gone:
             eta = self._callbacks.safe_point_eta_s
-            self._driver.protocol.revoke_ack(self._record, eta() if eta else None, self._driver.now())
+            self._driver.protocol.holdings.revoke_ack(
+                self._record, eta() if eta else None, self._driver.now()
+            )
             if not self._asked and self._callbacks.on_revoke is not None:
                 self._driver.spawn(self._call(self._callbacks.on_revoke, push), f"on_revoke {self.lease_id}")
             self._start_leaving()
@@ -386,7 +391,9 @@ class Lease:
         """Say `unloading`. False: not now; somebody else's use is on the lease, or there is no contact."""
         if self._own_will and not self._driver.connected:
             return True  # nobody can refuse, nobody can be granted: whoever wants to go may go
-        request = self._driver.protocol.unloading(self._record, self._driver.now(), ANNOUNCE_TIMEOUT_S)
+        request = self._driver.protocol.holdings.unloading(
+            self._record, self._driver.now(), ANNOUNCE_TIMEOUT_S
+        )
         try:
             await self._driver.reply(request)
         except BadState as error:
@@ -410,7 +417,7 @@ class Lease:
         else:
             await self._unload_once()
         if fenced:  # the arbiter may live: tell it as soon as it can be reached
-            self._driver.protocol.release(self._record, False, self._driver.now(), RELEASE_TIMEOUT_S)
+            self._driver.protocol.holdings.release(self._record, False, self._driver.now(), RELEASE_TIMEOUT_S)
             self._driver.pump()
         if self._callbacks.on_lost is not None:
             await self._call(self._callbacks.on_lost, error)
@@ -430,7 +437,7 @@ class Lease:
             log.exception("%s of %s failed; the arbiter will measure what is left", what, self.spec.consumer)
 
     async def _release(self, *, exiting: bool, asleep: str = "") -> None:
-        request = self._driver.protocol.release(
+        request = self._driver.protocol.holdings.release(
             self._record, exiting, self._driver.now(), RELEASE_TIMEOUT_S, asleep=asleep
         )
         if not self._driver.connected:
@@ -488,7 +495,7 @@ class Use:
         driver = lease._driver
         try:
             await driver.reply(
-                driver.protocol.use_begin(lease._record, self.use_id, self._label, driver.now())
+                driver.protocol.holdings.use_begin(lease._record, self.use_id, self._label, driver.now())
             )
         except BaseException:
             lease._uses.discard(self.use_id)
@@ -503,7 +510,7 @@ class Use:
         """
         lease = self._lease
         driver = lease._driver
-        await driver.reply(driver.protocol.use_yield(lease._record, self.use_id, driver.now()))
+        await driver.reply(driver.protocol.holdings.use_yield(lease._record, self.use_id, driver.now()))
         inside.leave(self.use_id)
         lease._uses.discard(self.use_id)
         lease._progress.changed()
@@ -531,5 +538,5 @@ class ForeignUse:
             return
         self._ended = True
         inside.leave(self.use_id)
-        self._driver.protocol.foreign_use_end(self.lease_id, self.token, self.use_id, self._driver.now())
+        self._driver.protocol.foreign_uses.end(self.lease_id, self.token, self.use_id, self._driver.now())
         self._driver.pump()

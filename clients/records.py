@@ -9,6 +9,14 @@ from schemas.errors import VramError
 
 Message = dict[str, Any]
 TokenPair = tuple[int, int]
+OnReply = Callable[[Message, float], None]
+OnError = Callable[[VramError, float], None]
+
+
+def token_of(message: Message) -> TokenPair:
+    """The token in a lease's view or in a push."""
+    epoch, serial = message["token"]
+    return int(epoch), int(serial)
 
 
 # -- what the owner is told -----------------------------------------------------------------------------------------
@@ -141,6 +149,7 @@ class LeaseRecord:
     asleep: str = ""  # `standby` or `parked`: evicted, and may come back under the same id
     wanted: bool = False  # asleep, and its owner waits for its return
     wanted_until: float | None = None  # None: for ever
+    reacquire_id: int | None = None  # the newest request that asked for it
 
     @property
     def ttl_s(self) -> float:
@@ -182,8 +191,8 @@ class Pending:
     message: Message
     deadline: float
     sent_at: float | None = None
-    on_reply: Callable[[Message, float], None] | None = None  # our own bookkeeping, before the owner hears
-    on_error: Callable[[VramError, float], None] | None = None
+    on_reply: OnReply | None = None  # our own bookkeeping, before the owner hears
+    on_error: OnError | None = None
     quiet: bool = False  # nobody waits for it
 
 
@@ -194,6 +203,7 @@ class ForeignUseRecord:
     lease_id: str
     token: TokenPair
     label: str
+    begun: bool = False
 
     def begin(self, use_id: str) -> Message:
         on = {"lease_id": self.lease_id, "token": list(self.token)}

@@ -1,12 +1,18 @@
-"""What the tests of the clients share: a way to write specs, and waiting for a condition with a deadline."""
+"""What the tests of the clients share: a scripted arbiter, a way to write specs, and waiting for a condition with a deadline."""
 
 import asyncio
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from schemas.defaults import GIB
 from schemas.wire import Footprint, LeaseSpec
+
+sys.path.insert(0, str(Path(__file__).parent))  # for the helpers beside it
+
+from protocol_wire import Wire
 
 DEADLINE_S = 20.0
 
@@ -15,6 +21,14 @@ DEADLINE_S = 20.0
 def anyio_backend() -> str:
     """The clients are asyncio programs."""
     return "asyncio"
+
+
+@pytest.fixture
+def link() -> Wire:
+    """The client's protocol after its greeting, and the arbiter's end."""
+    made = Wire()
+    made.greet()
+    return made
 
 
 @pytest.fixture

@@ -323,7 +323,7 @@ async def test_self_fencing(make_arbiter: Callable[..., ArbiterProcess], spec: S
 
     arbiter = make_arbiter().start()
     async with ArbiterClient(arbiter.endpoint, name="t") as client:
-        client.protocol.grace_s = 0.3
+        client.protocol.connection.grace_s = 0.3
         lease = await client.acquire(
             spec("a", 5, ttl_s=0.5), unload=unload, on_lost=lambda _, error: lost.append(error)
         )
@@ -347,7 +347,7 @@ async def test_a_hung_daemon_is_noticed_by_silence(
 ) -> None:
     arbiter = make_arbiter().start()
     async with ArbiterClient(arbiter.endpoint, name="t") as client:
-        client.protocol.heartbeat_s = 0.1
+        client.protocol.connection.heartbeat_s = 0.1
         process = arbiter.process
         assert process is not None
         process.send_signal(signal.SIGSTOP)

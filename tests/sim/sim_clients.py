@@ -58,8 +58,8 @@ class SimClient(ArbiterClient):
 
     def may_load(self, lease: Lease) -> bool:
         """What a careful holder asks before it puts more on the card: is the lease still mine, by my own clock too?"""
-        record = self.protocol.leases.get(lease.lease_id)
-        return record is not None and self.now() < self.protocol._fence_at(record)
+        record = self.protocol.holdings.held.get(lease.lease_id)
+        return record is not None and self.now() < self.protocol.holdings.fence_at(record)
 
     def _new_transport(self, loop: asyncio.AbstractEventLoop) -> Transport:
         return self._world.open_link(self._process, self._received, self._hung_up)  # type: ignore[return-value]
@@ -137,8 +137,8 @@ class Cast:
         for client in self.clients:
             if not client.process.alive or client.reserves:
                 continue
-            for record in client.protocol.leases.values():
-                if client.now() >= client.protocol._fence_at(record):
+            for record in client.protocol.holdings.held.values():
+                if client.now() >= client.protocol.holdings.fence_at(record):
                     continue
                 footprint = record.spec["footprint"]
                 holding = self.holdings.get(record.lease_id)

@@ -1,0 +1,104 @@
+"""For tests of the client's protocol: both ends of its wire, with an arbiter that says what the test tells it to."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from clients import records as r
+from clients.protocol import ClientProtocol
+from schemas import wire
+
+SPEC = wire.LeaseSpec(
+    consumer="detector",
+    model_id="m",
+    ttl_s=9.0,
+    footprint=wire.Footprint(load_peak_bytes=5, steady_bytes=4, residue_bytes=1),
+).model_dump(mode="json")
+WELCOME = {"version": 1, "boot_id": "b", "server": "s", "role": "client", "heartbeat_s": 2.0, "grace_s": 5.0}
+
+
+def view(lease_id: str = "L1-1", token: list[int] | None = None, state: str = "loading") -> dict[str, Any]:
+    return {"lease_id": lease_id, "token": token, "state": state, "gpu": "GPU-1"}
+
+
+class Wire:
+    """Both ends: the protocol and an arbiter that says what the test tells it to. Every request must be valid on the wire."""
+
+    def __init__(self) -> None:
+        self.protocol = ClientProtocol(name="test", instance="1-a")
+        self.connection = self.protocol.connection
+        self.waits = self.protocol.waits
+        self.holdings = self.protocol.holdings
+        self.foreign_uses = self.protocol.foreign_uses
+        self.epoch = 1
+        self.now = 100.0
+
+    def sent(self) -> list[dict[str, Any]]:
+        messages = self.connection.take_outgoing()
+        for message in messages:
+            wire.REQUEST.validate_python(message)
+        return messages
+
+    def told(self) -> list[r.Event]:
+        return self.connection.take_events()
+
+    def one(self, op: str) -> dict[str, Any]:
+        (message,) = self.sent()
+        assert message["op"] == op
+        return message
+
+    def reply(self, request: Mapping[str, Any], **body: Any) -> None:
+        self.connection.receive({"re": request["id"], "epoch": self.epoch, "ok": True, **body}, self.now)
+
+    def refuse(self, request: Mapping[str, Any], code: str, **details: Any) -> None:
+        error = {"code": code, "message": "no", "hint": "", "details": details}
+        self.connection.receive(
+            {"re": request["id"], "epoch": self.epoch, "ok": False, "error": error}, self.now
+        )
+
+    def push(self, kind: str, **body: Any) -> None:
+        self.connection.receive({"push": kind, "seq": 1, "epoch": self.epoch, **body}, self.now)
+
+    def tick(self, seconds: float) -> None:
+        self.now += seconds
+        self.protocol.tick(self.now)
+
+    def greet(self) -> None:
+        """Hello until up, without leases to re-attach."""
+        self.connection.connected(self.now)
+        hello = self.one("hello")
+        self.reply(hello, **WELCOME)
+        assert r.Up(self.epoch) in self.told()
+
+    def grant(self, nonce: str = "n1", lease_id: str = "L1-1", serial: int = 2) -> r.LeaseRecord:
+        self.waits.acquire(nonce, SPEC, self.now)
+        self.reply(self.one("acquire"), state="loading", lease=view(lease_id, [1, serial]))
+        (granted,) = self.told()
+        assert isinstance(granted, r.Granted)
+        return granted.record
+
+    def hold(self, **names: Any) -> r.LeaseRecord:
+        record = self.grant(**names)
+        self.holdings.ready(record, 4, self.now)
+        self.reply(self.one("ready"))
+        self.told()
+        return record
+
+    def reconnect(self) -> dict[str, Any]:
+        """Lose contact, say hello again; returns the reattach request."""
+        self.connection.contact_lost("test")
+        assert self.told() == [r.ContactLost("test")]
+        self.connection.connected(self.now)
+        self.reply(self.one("hello"), **WELCOME)
+        return self.one("reattach")
+
+
+def evict(link: Wire, record: r.LeaseRecord, asleep: str = "standby", then: str | None = None) -> None:
+    """The holder is asked, lets go, and hears how the lease waits."""
+    link.push(
+        "revoke", lease_id=record.lease_id, token=list(record.token), reason="", wanted_by="", park=True
+    )
+    link.holdings.release(record, False, link.now, 5.0, asleep=asleep)
+    message = link.one("release")
+    assert message["parked"] == (asleep == "parked")
+    link.reply(message, state="verifying", next=asleep if then is None else then)
+    link.told()

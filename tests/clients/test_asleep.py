@@ -1,0 +1,109 @@
+"""Leases that leave and come back, in the client's protocol: standby, parked, wanted again."""
+
+from protocol_wire import Wire, evict, view
+
+from clients import records as r
+from clients.connection import REQUEST_TIMEOUT_S
+from schemas.errors import ArbiterUnreachable, LeaseLost, WaitTimeout
+
+
+def test_an_evicted_lease_comes_back_under_a_new_token(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record)
+    assert (record.asleep, link.holdings.held) == ("standby", {})
+    link.tick(60.0)
+    assert "renew" not in [message["op"] for message in link.sent()], (
+        "nothing is held, nothing is renewed or fenced"
+    )
+    link.push("granted", lease=view(token=[1, 9]))
+    assert link.told() == [r.Returned(record)]
+    assert (record.token, record.asleep, record.held, record.released) == ((1, 9), "", False, False)
+    assert link.holdings.held == {record.lease_id: record}
+
+
+def test_an_old_grant_said_again_is_no_return(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record)
+    link.push("granted", lease=view(token=list(record.token)))
+    assert link.told() == []
+
+
+def test_the_arbiter_decides_whether_a_lease_may_come_back(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record, "standby", then="released")
+    assert (record.asleep, link.holdings.asleep) == ("", {})
+    parked = link.hold(nonce="n2", lease_id="L1-5", serial=6)
+    evict(link, parked, "parked", then="standby")
+    assert parked.asleep == "standby"
+
+
+def test_who_does_not_want_to_come_back_says_so(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record, "", then="standby")
+    assert link.one("cancel")["lease_id"] == record.lease_id
+
+
+def test_a_lease_on_standby_is_attached_again_and_may_have_returned_meanwhile(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record, "parked")
+    request = link.reconnect()
+    assert [(item["lease_id"], item["state"]) for item in request["leases"]] == [(record.lease_id, "parked")]
+    kept = {"lease_id": record.lease_id, "kept": True, "lease": view(token=None, state="parked")}
+    link.reply(request, leases=[kept])
+    assert link.told() == [r.Up(1)]
+    assert record.asleep == "parked"
+    request = link.reconnect()
+    link.reply(request, leases=[{**kept, "lease": view(token=[2, 4])}])
+    assert link.told() == [r.Returned(record), r.Up(1)]
+
+
+def test_a_lease_that_is_lost_while_it_waits_ends(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record)
+    request = link.reconnect()
+    error = {"code": "lease_lost", "message": "gone", "hint": "", "details": {}}
+    link.reply(request, leases=[{"lease_id": record.lease_id, "kept": False, "error": error}])
+    gone, up = link.told()
+    assert isinstance(gone, r.Gone)
+    assert isinstance(gone.error, LeaseLost)
+    assert isinstance(up, r.Up)
+
+
+def test_reacquire_is_granted_at_once_or_later_or_never(link: Wire) -> None:
+    record = link.hold()
+    evict(link, record)
+    link.holdings.reacquire(record, 5.0, link.now)
+    link.reply(link.one("reacquire"), state="loading", lease=view(token=[1, 9]))
+    assert r.Returned(record) in link.told()
+    evict(link, record)
+    link.holdings.reacquire(record, 5.0, link.now)
+    link.reply(link.one("reacquire"), state="queued", lease=view(state="queued"))
+    link.told()
+    link.push(
+        "denied",
+        lease_id=record.lease_id,
+        error={"code": "wait_timeout", "message": "", "hint": "", "details": {}},
+    )
+    (gone,) = link.told()
+    assert isinstance(gone, r.Gone)
+    assert isinstance(gone.error, WaitTimeout)
+
+
+def test_one_requests_end_that_drops_another_does_not_stop_the_clock(link: Wire) -> None:
+    """Regression: the lease ended with its `reacquire`, its `use_end` was dropped and then failed too, and no tick came any more."""
+    record = link.hold()
+    evict(link, record)
+    link.holdings.reacquire(record, None, link.now)
+    link.reply(link.one("reacquire"), state="queued", lease=view(state="queued"))
+    link.told()
+    reattach = link.reconnect()
+    link.reply(reattach, leases=[{"lease_id": record.lease_id, "kept": True, "lease": view(state="queued")}])
+    link.one("reacquire")
+    link.connection.contact_lost("test")
+    link.told()
+    link.holdings.use_end(record, "u1", link.now)  # a use that was yielded
+    link.tick(REQUEST_TIMEOUT_S)
+    (gone,) = link.told()
+    assert isinstance(gone, r.Gone)
+    assert isinstance(gone.error, ArbiterUnreachable)
+    assert link.protocol.next_deadline() is None

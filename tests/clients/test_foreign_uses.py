@@ -1,0 +1,47 @@
+"""Uses of the client's protocol on leases of other processes."""
+
+from protocol_wire import Wire
+
+from clients import records as r
+from clients.connection import REQUEST_TIMEOUT_S
+
+
+def test_a_use_on_anothers_lease_is_begun_again_until_it_ends(link: Wire) -> None:
+    link.foreign_uses.begin("L9-1", (9, 2), "u1", "goal", link.now, REQUEST_TIMEOUT_S)
+    link.reply(link.one("use_begin"))
+    link.connection.contact_lost("test")
+    link.told()
+    link.greet()
+    again = link.one("use_begin")
+    assert (again["use_id"], again["token"]) == ("u1", [9, 2])
+    link.reply(again)
+    link.foreign_uses.end("L9-1", (9, 2), "u1", link.now)
+    link.reply(link.one("use_end"))
+    link.connection.contact_lost("test")
+    link.told()
+    link.greet()
+    assert link.sent() == []
+
+
+def test_a_use_that_cannot_be_begun_again_is_lost(link: Wire) -> None:
+    link.foreign_uses.begin("L9-1", (9, 2), "u1", "goal", link.now, REQUEST_TIMEOUT_S)
+    link.reply(link.one("use_begin"))
+    link.connection.contact_lost("test")
+    link.told()
+    link.greet()
+    link.refuse(link.one("use_begin"), "lease_lost")
+    (lost,) = link.told()
+    assert isinstance(lost, r.UseLost)
+    assert lost.use_id == "u1"
+
+
+def test_a_use_ended_before_its_begin_was_answered_stays_ended(link: Wire) -> None:
+    link.foreign_uses.begin("L9-1", (9, 2), "u1", "goal", link.now, REQUEST_TIMEOUT_S)
+    begin = link.one("use_begin")
+    link.foreign_uses.end("L9-1", (9, 2), "u1", link.now)
+    link.reply(link.one("use_end"))
+    link.reply(begin)
+    link.connection.contact_lost("test")
+    link.told()
+    link.greet()
+    assert link.sent() == []
