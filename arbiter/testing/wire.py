@@ -107,6 +107,16 @@ class WireClient:
         }
         return self.ask("acquire", spec=wanted, **fields)
 
+    def granted(self, consumer: str, load_peak_bytes: int, **spec: Any) -> dict[str, Any]:
+        """`acquire`, and wait for the grant, which a daemon that has just begun to read its card gives later; the lease."""
+        reply = self.acquire(consumer, load_peak_bytes, **spec)
+        assert reply["ok"], reply
+        lease: dict[str, Any] = reply["lease"]
+        if reply["state"] == "queued":
+            wanted = lease["lease_id"]
+            lease = self.push("granted", where=lambda push: push["lease"]["lease_id"] == wanted)["lease"]
+        return lease
+
     def close(self) -> None:
         self._socket.close()
         self._context.term()

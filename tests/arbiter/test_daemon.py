@@ -101,7 +101,7 @@ def test_a_second_daemon_on_the_socket_is_refused_and_the_first_serves_on(
     arbiter_daemon: ArbiterProcess, connect: Callable[..., WireClient]
 ) -> None:
     client = connect().hello()
-    lease = client.acquire("holder", GIB)["lease"]
+    lease = client.granted("holder", GIB)
     done = run(arbiter_daemon, "--gpu", "fake:8GiB", "--state-dir", str(arbiter_daemon.runtime / "other"))
     assert done.returncode == 3
     assert f"pid {arbiter_daemon.pid}" in done.stderr
@@ -217,7 +217,7 @@ def notes(reply: Mapping[str, object]) -> list[str]:
 def test_history_and_subscription_over_the_wire(connect: Callable[..., WireClient]) -> None:
     watcher, client = connect().hello("watcher", role="observer"), connect().hello()
     assert watcher.ask("subscribe")["ok"]
-    lease = client.acquire("detector", GIB)["lease"]
+    lease = client.granted("detector", GIB)
     event = watcher.push("event", where=lambda push: push["event"]["kind"] == "granted")["event"]
     assert event["lease_id"] == lease["lease_id"]
     history = client.ask("history", kinds=["started", "granted"])

@@ -111,10 +111,10 @@ def test_a_full_disk_blocks_grants_and_nothing_else(arbiter: ArbiterProcess, dis
     arbiter.start(BEAT)
     with WireClient(arbiter.endpoint) as client:
         client.hello().ask("subscribe")
-        held = [client.acquire(name, 200 << 20, ttl_s=600.0)["lease"] for name in ("stays",)]
+        held = [client.granted(name, 200 << 20, ttl_s=600.0) for name in ("stays",)]
         on = {"lease_id": held[0]["lease_id"], "token": held[0]["token"]}
         assert client.ask("ready", **on)["ok"]
-        goes = client.acquire("goes", 200 << 20, ttl_s=600.0)["lease"]
+        goes = client.granted("goes", 200 << 20, ttl_s=600.0)
         goes_on = {"lease_id": goes["lease_id"], "token": goes["token"]}
         assert client.ask("ready", **goes_on)["ok"]
         disk.fill()
@@ -166,7 +166,7 @@ def test_a_start_on_a_full_disk_says_so_and_is_worth_another_try(
 def test_a_restart_on_a_full_disk_loses_no_lease(arbiter: ArbiterProcess, tmpfs: Tmpfs) -> None:
     arbiter.start()
     with WireClient(arbiter.endpoint) as client:
-        held = client.hello().acquire("stays", 200 << 20, ttl_s=600.0)["lease"]
+        held = client.hello().granted("stays", 200 << 20, ttl_s=600.0)
     arbiter.kill()
     tmpfs.fill()
     with pytest.raises(RuntimeError, match="ended with 5"):

@@ -177,7 +177,7 @@ def test_a_measured_footprint_is_charged_after_a_restart_and_a_reboot(make_arbit
     database.close()
     arbiter.start()
     with WireClient(arbiter.endpoint) as client:
-        lease = client.hello().acquire("holder", GIB, nonce="again")["lease"]
+        lease = client.hello().granted("holder", GIB, nonce="again")
         assert lease["charge_bytes"] == 3 * GIB
     assert arbiter.stop() == 0
 

@@ -100,7 +100,7 @@ def test_a_stuck_part_stops_feeding_it_and_the_manager_learns_where(make_arbiter
     arbiter.start({"WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6))})
     arbiter.wait_for("WATCHDOG=1", PATIENCE_S)
     with WireClient(arbiter.endpoint) as holder, WireClient(arbiter.endpoint) as trigger:
-        kept = holder.hello("holder").acquire("holder", SMALL, ttl_s=60.0)["lease"]
+        kept = holder.hello("holder").granted("holder", SMALL, ttl_s=60.0)
         trigger.send("hello", version=1, name="trigger", instance="t")
         if defect is JOURNAL:
             spec = {

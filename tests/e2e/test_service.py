@@ -191,7 +191,7 @@ import os, sys
 from arbiter.testing.wire import WireClient
 os.setgroups([]); os.setresgid(65534, 65534, 65534); os.setresuid(65534, 65534, 65534)
 with WireClient(sys.argv[1]) as client:
-    lease = client.hello("stranger", role="operator").acquire("stranger", 1 << 30)["lease"]
+    lease = client.hello("stranger", role="operator").granted("stranger", 1 << 30)
     print(lease["lease_id"], flush=True)
     sys.stdin.read()
 """

@@ -32,9 +32,7 @@ def client(daemon: ArbiterProcess) -> Iterator[WireClient]:
 
 def granted(client: WireClient, name: str, size: int, **spec: Any) -> dict[str, Any]:
     """Acquire and wait for the grant."""
-    reply = client.acquire(name, size, ttl_s=60.0, **spec)
-    assert reply["ok"], reply
-    lease: dict[str, Any] = reply["lease"] if reply["state"] == "loading" else client.push("granted")["lease"]
+    lease = client.granted(name, size, ttl_s=60.0, **spec)
     return {"lease_id": lease["lease_id"], "token": lease["token"]}
 
 
