@@ -1,0 +1,190 @@
+"""What ends or changes a lease on standby: its holder, its process, an operator; several cards; its invariants."""
+
+import pytest
+
+from arbiter.core import invariants
+from arbiter.core.invariants import InvariantViolation
+from arbiter.core.lease import LeaseState
+from arbiter.testing.core_driver import CoreDriver, answer, refusal
+from arbiter.testing.scenes import held, order, sent_away
+from schemas import defaults as d
+
+GIB = d.GIB
+
+
+# -- ends ------------------------------------------------------------------------------------------------------------
+def test_giving_up_a_lease_on_standby() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _, _ = sent_away(driver)
+    assert answer(det.cancel(lease)) == {"state": "cancelled"}
+    assert answer(det.cancel(lease)) == {"state": "cancelled"}, "a repeat"
+    assert driver.state(lease) == "over"
+    assert f"lease:{lease}" not in driver.journal
+
+
+def test_a_repeat_of_the_release_does_not_end_it() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _, _ = sent_away(driver)
+    assert answer(det.release(lease))["state"] == "standby"
+    assert driver.state(lease) == "standby"
+
+
+def test_requests_that_make_no_sense_away_are_refused() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _, _ = sent_away(driver)
+    assert refusal(det.ready(lease)).code == "bad_state"
+    assert refusal(det.use_begin(lease)).code == "bad_state"
+    assert refusal(det.unloading(lease)).code == "bad_state"
+    assert refusal(det.oom(lease, 1)).code == "bad_state"
+    assert answer(det.ack(lease))["state"] == "standby"
+
+
+@pytest.mark.parametrize("reason", ["bye", "silent while connections were needed"])
+def test_it_ends_with_its_connection(reason: str) -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _, _ = sent_away(driver)
+    det.leave(reason)
+    assert driver.state(lease) == "over"
+    assert f"lease:{lease}" not in driver.journal
+
+
+def test_a_connection_that_ends_during_the_measurement_does_not_want_it_back() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease)
+    det.leave()
+    driver.until(lambda: driver.state(wanted) == "loading")
+    assert driver.state(lease) == "over"
+
+
+def test_it_ends_with_its_process() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _, _ = sent_away(driver)
+    det.die()
+    assert driver.state(lease) == "over"
+    assert driver.notes("lost")[-1]["lease_id"] == lease
+
+
+def test_a_process_that_dies_during_the_measurement_does_not_want_it_back() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease)
+    det.die()
+    driver.until(lambda: driver.state(wanted) == "loading")
+    assert driver.state(lease) == "over"
+
+
+# -- operators -------------------------------------------------------------------------------------------------------
+def test_whom_an_operator_evicts_does_not_come_back() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    order(driver, "evict", lease)
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    assert driver.journal == {}
+
+
+def test_an_operators_word_outweighs_the_engines() -> None:
+    """The engine asked it to leave, then an operator evicts it: at any step of its way out."""
+    for steps in range(3):
+        driver = CoreDriver(8 * GIB)
+        driver.card.lag_s = 0.3
+        det, lease = held(driver, "det", 5, standby=True)
+        policy = driver.consumer("policy")
+        wanted = policy.acquire(5 * GIB)
+        driver.until(lambda: driver.state(lease) == "revoking")  # noqa: B023  # reason: run at once
+        if steps > 0:
+            det.unload(lease)
+        if steps > 1:
+            driver.until(lambda: driver.state(wanted) == "loading")  # noqa: B023  # reason: run at once
+        order(driver, "evict", lease)
+        if steps == 0:
+            det.unload(lease)
+        driver.until(lambda: driver.state(lease) == "over")  # noqa: B023  # reason: run at once
+        assert f"lease:{lease}" not in driver.journal
+    assert driver.pushes("lost", lease)[-1]["error"]["code"] == "lease_lost"
+
+
+def test_evicting_one_that_leaves_by_itself_is_fine() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    det.unload(lease)
+    order(driver, "evict", lease)
+    driver.until(lambda: driver.state(lease) == "over")
+
+
+def test_an_operators_eviction_outlives_a_restart() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    token = det.token(lease)
+    order(driver, "evict", lease)
+    driver.restart()
+    det.connect()
+    det.reattach(lease, token)
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+
+
+def test_what_an_operator_evicted_and_its_holder_thinks_away_is_over() -> None:
+    driver = CoreDriver(8 * GIB)
+    other, resident = held(driver, "other", 1)
+    det, lease = held(driver, "det", 5, standby=True)
+    token, other_token = det.token(lease), other.token(resident)
+    order(driver, "evict", lease)
+    det.hold(0)
+    driver.restart()
+    other.connect()
+    other.reattach(resident, other_token)
+    det.connect()
+    det.reattach(lease, token, away=True)
+    driver.until(lambda: driver.state(lease) == "over")
+
+
+def test_a_pin_on_standby_holds_after_the_return() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver)
+    order(driver, "pin", lease)
+    assert driver.journal[f"lease:{lease}"]["pinned"] == ["ops", "test"]
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading")
+    det.load(lease)
+    assert refusal(policy.try_acquire(5 * GIB)).code == "vram_insufficient"
+
+
+# -- several cards, invariants ---------------------------------------------------------------------------------------
+def test_it_may_come_back_on_another_card() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    det, lease = held(driver, "det", 5, standby=True)
+    other, second = held(driver, "other", 5)
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(5 * GIB, gpu="0")
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease)
+    driver.until(lambda: driver.state(wanted) == "loading")
+    policy.load(wanted)
+    other.unload(second)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
+    view = driver.view(lease)
+    assert view is not None
+    assert view["gpu"] == "GPU-1", "beside nobody that it left for"
+
+
+def test_invariants_of_what_is_away() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease, _, _ = sent_away(driver)
+    core = driver.arbiter._core
+    core.granted.clear()
+    one = core.leases[lease]
+    one.state = LeaseState.HELD
+    with pytest.raises(InvariantViolation, match="counts as away"):
+        invariants.check(core)
+    one.state = LeaseState.STANDBY
+    one.gpu = next(iter(core.gpus))
+    with pytest.raises(InvariantViolation, match="it has a card"):
+        invariants.check(core)
