@@ -27,6 +27,7 @@ from clients import records as r
 from clients.connection import REQUEST_TIMEOUT_S
 from clients.lease import Callbacks, ForeignUse, Lease, OnLost, OnReturn, OnRevoke, SafePointEta, Unload
 from clients.protocol import ClientProtocol
+from clients.reach import START, obstacle
 from clients.transport import Transport
 from schemas.endpoints import arbiter_endpoint
 from schemas.errors import ArbiterUnreachable, VramError
@@ -103,11 +104,9 @@ class ArbiterClient:
             await asyncio.wait_for(self._greeted, self._connect_timeout_s)
         except TimeoutError:
             self._shut()
-            raise ArbiterUnreachable(
-                f"no arbiter answers at {self.endpoint} within {self._connect_timeout_s:g} s",
-                hint="start `vram-arbiter`, or set VRAM_ARBITER_ENDPOINT to where it serves",
-                details={"endpoint": self.endpoint},
-            ) from None
+            silent = f"no arbiter answers at {self.endpoint} within {self._connect_timeout_s:g} s"
+            message, hint = obstacle(self.endpoint) or (silent, START)
+            raise ArbiterUnreachable(message, hint=hint, details={"endpoint": self.endpoint}) from None
         except BaseException:
             self._shut()
             raise
@@ -432,8 +431,11 @@ class ArbiterClient:
                 else:
                     log.info("back in contact with the arbiter (epoch %s)", event.epoch)
             case r.ContactLost():
-                if not self._closing:  # said once, however often a reconnect fails
-                    level = logging.DEBUG if self._lost else logging.WARNING
+                if (
+                    not self._closing
+                ):  # said once, however often a reconnect fails; `connect` says it before the first contact
+                    greeting = self._greeted is not None and not self._greeted.done()
+                    level = logging.DEBUG if self._lost or greeting else logging.WARNING
                     log.log(level, "contact to the arbiter lost: %s", event.reason)
                 self._lost = True
                 asyncio.get_running_loop().call_later(REOPEN_S, self._reopen)

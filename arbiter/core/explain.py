@@ -16,6 +16,15 @@ NOTE_KINDS: tuple[str, ...] = (
 )  # fmt: skip
 """Every kind of `effects.Note`. `switch` comes with each `ready`; its field `switched` says whether anybody had to leave."""
 
+DAEMON_KINDS: tuple[str, ...] = (
+    "started",
+    "stopped",
+    "journal_put_aside",
+    "record_stopped",
+    "record_resumed",
+)
+"""What the daemon itself adds to the history: its starts and ends, and what is wrong with its own files."""
+
 
 # -- views -------------------------------------------------------------------------------------------------------------
 def view(core: Core, lease: Lease) -> dict[str, Any]:
@@ -149,8 +158,8 @@ def _best_position(core: Core, lease: Lease) -> int:
 
 # -- why ---------------------------------------------------------------------------------------------------------------
 def why(core: Core, consumer: str) -> dict[str, Any]:
-    """`schemas.wire.WhyReply`: why a consumer is not running, or that it is."""
-    mine = [lease for lease in core.leases.values() if lease.spec.consumer == consumer]
+    """`schemas.wire.WhyReply`: why a consumer is not running, or that it is. A lease's id stands for that lease."""
+    mine = [lease for lease in core.leases.values() if consumer in (lease.spec.consumer, lease.id)]
     return {"consumer": consumer, "leases": [_with_plan(core, lease) for lease in mine]}
 
 

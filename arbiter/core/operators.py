@@ -60,7 +60,8 @@ def find(core: Core, target: str) -> Lease:
         )
     ended = core.ended.get(LeaseId(target))
     if ended is not None:
-        raise ended_error(ended)
+        why = ended_error(ended)
+        raise Refused(why.code, why.message, "it is over; its story is in `vramctl history`", **why.details)
     raise Refused("unknown_lease", f"there is no lease or consumer {target!r}", "see `vramctl status`")
 
 
@@ -117,7 +118,9 @@ def unpin(core: Core, lease: Lease, order: Order) -> None:
     """Undo an operator's pin. What the holder itself asked for stands."""
     if lease.pinned is None:
         hint = (
-            "" if lease.spec.evictable else "its holder asked never to be evicted; that is its own to change"
+            "nothing to undo"
+            if lease.spec.evictable
+            else "its holder asked never to be evicted; that is its own to change"
         )
         raise Refused("bad_state", f"no operator pinned {lease.id}", hint, state=str(lease.state))
     lease.pinned = None
@@ -136,7 +139,7 @@ def release_dead(core: Core, lease: Lease, order: Order) -> None:
         raise Refused(
             "bad_state",
             f"the holder of {lease.id} was heard of {silent_s:.1f} s ago: it is not dead",
-            "evict it instead",
+            "evict it instead" if lease.may_leave else "end its program: it is pinned",
             state=str(lease.state),
             silent_s=silent_s,
         )

@@ -24,6 +24,7 @@ _POLICIES = (
     + "; ".join(f"{name}: {rules.summary}" for name, rules in SCHEDULING.items())
     + ". For comparison, rules of other programs: unmanaged (everybody loads at once), ollama_rules, llama_swap_rules."
 )
+_WHAT_TO_SIMULATE = "name a readable YAML file, or one that is shipped: desktop, find-navigate-grab, small-behind-large, two-thrashing"
 _EXIT = "exit codes: 0 identical or done \u00b7 1 a divergence, or an input that cannot be read \u00b7 2 wrong usage"
 
 
@@ -49,7 +50,7 @@ def parser() -> argparse.ArgumentParser:
     what.add_argument(
         "--timeline",
         metavar="N",
-        type=int,
+        type=_count,
         default=None,
         help=f"so many lines of decisions (default: {TIMELINE_LINES} for one policy, else 0)",
     )
@@ -64,6 +65,12 @@ def parser() -> argparse.ArgumentParser:
         )
         command.add_argument("--json", action="store_true", dest="as_json", help="print JSON")
     return made
+
+
+def _count(written: str) -> int:
+    if not written.isdecimal():
+        raise argparse.ArgumentTypeError(f"{written!r} is no number of lines")
+    return int(written)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -128,8 +135,10 @@ def simulate(path: Path, policies: Sequence[str], timeline: int | None, *, as_js
 
     try:
         scenario = load_scenario(path.read_text(), path.name)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: {error}", hint="name a readable YAML file") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}", hint=_WHAT_TO_SIMULATE) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not text", hint=_WHAT_TO_SIMULATE) from error
     settings = settings_of(scenario)
     outcomes = [compare.under(workload_of(scenario), settings, name) for name in policies]
     shown = (TIMELINE_LINES if len(outcomes) == 1 else 0) if timeline is None else timeline

@@ -138,7 +138,7 @@ def _header(path: Path, line: str) -> Header:
     try:
         data = json.loads(line)
         number = data.pop("log")
-    except (ValueError, AttributeError, TypeError, KeyError) as error:
+    except (ValueError, AttributeError, TypeError, KeyError, RecursionError) as error:
         raise LogError(f"{path}: no event log of an arbiter", hint="its first line says so") from error
     if number != FORMAT:
         raise LogError(
@@ -153,13 +153,21 @@ def _header(path: Path, line: str) -> Header:
 def _entries(path: Path, lines: Sequence[str]) -> Iterator[Entry]:
     for number, line in enumerate(lines, 2):
         try:
-            data = json.loads(line)
-            event = decode_event(data["event"], data["data"])
-            yield Entry(data["t"], event, data["effects"], data["digest"], number)
+            yield _entry(json.loads(line), number)
         except CodecError as error:
             raise _foreign(path, number, error, "") from error
-        except (ValueError, KeyError, TypeError) as error:
-            raise LogError(f"{path}:{number}: not a line of an event log: {error}", hint="") from error
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            whole = f"it is damaged; its first {number - 1} lines can be replayed: `head -n {number - 1}`"
+            raise LogError(f"{path}:{number}: not a line of an event log: {error}", hint=whole) from error
+
+
+def _entry(data: Any, number: int) -> Entry:
+    """Raises CodecError for an event of another version, and what `_entries` expects of a line that is none."""
+    event = decode_event(data["event"], data["data"])
+    now, effects, made = data["t"], data["effects"], data["digest"]
+    if type(now) not in (int, float) or type(effects) is not str or not (made is None or type(made) is str):
+        raise ValueError("`t` is a number, `effects` text, `digest` text or null")
+    return Entry(now, event, effects, made, number)
 
 
 def _foreign(path: Path, line: int, error: CodecError, version: str) -> LogError:

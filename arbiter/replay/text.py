@@ -32,6 +32,8 @@ def notices(found: Replayed) -> list[str]:
         f"note: the last line of {path.name} is torn (a crash or a full disk); replayed up to it"
         for path in found.torn
     ]
+    if not found.events:
+        lines.append("note: there is no event in it, so nothing was compared")
     if found.gaps:
         lines.append(
             f"note: the recording was interrupted; {found.gaps} new beginning(s), each with the whole state"

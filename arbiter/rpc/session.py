@@ -5,24 +5,33 @@ One `SessionTable` holds all of them. It runs on the thread of the event loop, n
 that the kernel named at its hello; every limit's breach is a typed reply; no input raises.
 """
 
-from collections.abc import Callable, Mapping
+import difflib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 from arbiter.core import events as ev
+from arbiter.core.explain import DAEMON_KINDS, NOTE_KINDS
 from arbiter.rpc import codec
 from arbiter.rpc.peer import Peer, Role, identify, is_operator
 from schemas import wire as w
 from schemas.defaults import WIRE_VERSION
-from schemas.errors import BadState, LimitExceeded, NotPermitted, UnknownSession, VersionMismatch, VramError
+from schemas.errors import (
+    BadRequest,
+    BadState,
+    LimitExceeded,
+    NotPermitted,
+    UnknownSession,
+    VersionMismatch,
+    VramError,
+)
 from schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
 
 SILENT_S = 10.0
 """At the limit of sessions a connection that never held anything and has been silent for so long makes room."""
 
 _READS = ("status", "why", "history", "subscribe", "ping", "bye")  # all that an observer may do
-
-
+_KINDS = frozenset((*NOTE_KINDS, *DAEMON_KINDS))
 _BY_HAND = ("evict", "pin", "unpin", "release_dead", "drain", "resume")  # operators only
 
 
@@ -215,7 +224,7 @@ class SessionTable:
         if hello.role == "operator" and not is_operator(peer.credentials, self._settings.operators_gid):  # 3
             raise NotPermitted(
                 "only the daemon's user, root and the operators' group may be operator",
-                hint="say hello as client or observer",
+                hint="use its user or root, or join the group (wire.operators_group); looking is open to observers",
                 details={"uid": peer.credentials.uid},
             )
         self._make_room(now)  # 4
@@ -349,6 +358,7 @@ class SessionTable:
             case w.Why():
                 self.reply(client, re, self._decisions.why(request.consumer))
             case w.History():
+                _check_kinds(request.kinds)
                 after = max(0, min(request.after, (1 << 63) - 1))
                 self._history(after, request.limit, request.kinds, lambda body: self.reply(client, re, body))
             case w.Subscribe():
@@ -448,6 +458,17 @@ def to_spec(spec: w.LeaseSpec) -> ev.Spec:
         independent=spec.independent,
         gang=None if spec.gang is None else (spec.gang.id, spec.gang.size),
     )
+
+
+def _check_kinds(kinds: Sequence[str]) -> None:
+    """A mistyped kind would look like a history in which nothing of the sort ever happened."""
+    for kind in kinds:
+        if kind not in _KINDS:
+            close = difflib.get_close_matches(kind, _KINDS, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(sorted(_KINDS))}"
+            raise BadRequest(
+                f"no event is of the kind {kind[:64]!r}", hint=hint, details={"known": sorted(_KINDS)}
+            )
 
 
 def _operator(session: Session) -> str:

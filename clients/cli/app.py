@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from clients.cli import quick
+from schemas.defaults import NAME_MAX_CHARS, REASON_MAX_CHARS
 from schemas.errors import ArbiterUnreachable, VramError
 
 _EPILOG = (
@@ -25,6 +26,20 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+
+def _one_line(most: int, *, needed: bool) -> Callable[[str], str]:
+    """A callback of typer's: text as the wire takes it, said in words of people and before anybody is asked."""
+
+    def check(written: str) -> str:
+        if needed and not written.strip():
+            raise typer.BadParameter("it must not be empty")
+        if len(written) > most or any(char < " " or char == "\x7f" for char in written):
+            raise typer.BadParameter(f"it must be one line of at most {most} characters")
+        return written
+
+    return check
+
+
 Endpoint = Annotated[
     str | None, typer.Option(help="Where the arbiter serves.", envvar="VRAM_ARBITER_ENDPOINT")
 ]
@@ -33,6 +48,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the reply as JSON (t
 
 def run_app(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code."""
+    as_json = "--json" in arguments and arguments[0] != "run"  # what follows `run` is another program's
     try:
         result = app(args=list(arguments), prog_name="vramctl", standalone_mode=False)
     except typer.Abort:
@@ -40,10 +56,10 @@ def run_app(arguments: Sequence[str]) -> int:
     except SystemExit as end:
         return int(end.code or 0)
     except ArbiterUnreachable as error:
-        quick.complain(error.to_wire(), as_json=False)
+        quick.complain(error.to_wire(), as_json=as_json)
         return quick.UNREACHABLE
     except VramError as error:
-        quick.complain(error.to_wire(), as_json=False)
+        quick.complain(error.to_wire(), as_json=as_json)
         return quick.NO
     except Exception as error:
         # click's own usage errors know how to show themselves; anything else is a defect and keeps its traceback
@@ -63,7 +79,13 @@ def status(as_json: AsJson = False, endpoint: Endpoint = None) -> None:
 
 @app.command()
 def why(
-    consumer: Annotated[str, typer.Argument(help="Name of the consumer, as `status` shows it.")],
+    consumer: Annotated[
+        str,
+        typer.Argument(
+            help="A consumer or a lease, as `status` shows it.",
+            callback=_one_line(NAME_MAX_CHARS, needed=True),
+        ),
+    ],
     as_json: AsJson = False,
     endpoint: Endpoint = None,
 ) -> None:
@@ -122,8 +144,31 @@ def watch(
     raise typer.Exit(asyncio.run(live(endpoint, events)))
 
 
-Target = Annotated[str, typer.Argument(help="A lease (L3-17), or a consumer that has exactly one.")]
-Because = Annotated[str, typer.Option("--reason", "-r", help="Why; kept in history with your name.")]
+Target = Annotated[
+    str,
+    typer.Argument(
+        help="A lease (L3-17), or a consumer that has exactly one.",
+        callback=_one_line(NAME_MAX_CHARS, needed=True),
+    ),
+]
+Because = Annotated[
+    str,
+    typer.Option(
+        "--reason",
+        "-r",
+        help="Why; kept in history with your name.",
+        callback=_one_line(REASON_MAX_CHARS, needed=True),
+    ),
+]
+Remark = Annotated[
+    str,
+    typer.Option(
+        "--reason",
+        "-r",
+        help="Why, if there is more to say; kept in history with your name.",
+        callback=_one_line(REASON_MAX_CHARS, needed=False),
+    ),
+]
 
 
 @app.command()
@@ -143,7 +188,7 @@ def pin(target: Target, reason: Because, as_json: AsJson = False, endpoint: Endp
 
 
 @app.command()
-def unpin(target: Target, reason: Because = "", as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+def unpin(target: Target, reason: Remark = "", as_json: AsJson = False, endpoint: Endpoint = None) -> None:
     """Undo an operator's pin. Operators only."""
     raise typer.Exit(
         quick.by_hand("unpin", {"target": target, "reason": reason}, as_json=as_json, endpoint=endpoint)
@@ -157,7 +202,7 @@ def drain(reason: Because, as_json: AsJson = False, endpoint: Endpoint = None) -
 
 
 @app.command()
-def resume(reason: Because = "", as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+def resume(reason: Remark = "", as_json: AsJson = False, endpoint: Endpoint = None) -> None:
     """Grant again after a drain. Operators only."""
     raise typer.Exit(quick.by_hand("resume", {"reason": reason}, as_json=as_json, endpoint=endpoint))
 

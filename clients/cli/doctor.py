@@ -92,7 +92,7 @@ def _arbiter(endpoint: str) -> tuple[bool, list[Finding]]:
     try:
         status = quick.ask("status", {}, endpoint)
     except quick.Unreachable as error:
-        return False, [Finding("daemon", False, f"{error}; start `vram-arbiter`")]
+        return False, [Finding("daemon", False, f"{error} ({error.hint})")]
     if not status.get("ok"):
         return True, [Finding("daemon", False, str(status["error"]["message"]))]
     about = [

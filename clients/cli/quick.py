@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 from clients.cli import text
+from clients.reach import START, obstacle
 from schemas.defaults import WIRE_VERSION
 from schemas.endpoints import arbiter_endpoint
 
@@ -20,13 +21,18 @@ OK, NO, USAGE, UNREACHABLE = 0, 1, 2, 3
 """Exit codes of `vramctl`: done; the answer is no, or an error; wrong usage; the arbiter cannot be reached."""
 
 TIMEOUT_S = 3.0
+HANGS = "something holds the socket and is silent: look at the arbiter's log, or set VRAM_ARBITER_ENDPOINT"
 ENVELOPE = frozenset({"re", "ok"})
 
 Message = dict[str, Any]
 
 
 class Unreachable(Exception):
-    """Nobody answers; the text says where."""
+    """Nobody answers; the text says where, `hint` what to do."""
+
+    def __init__(self, message: str, hint: str = START) -> None:
+        super().__init__(message)
+        self.hint = hint
 
 
 def ask(
@@ -41,8 +47,8 @@ def ask(
     import zmq
 
     where = endpoint or arbiter_endpoint(os.environ, os.getuid())
-    if where.startswith("ipc://") and not os.path.exists(where.removeprefix("ipc://")):
-        raise Unreachable(f"no arbiter at {where}: there is no such socket")
+    if found := obstacle(where):
+        raise Unreachable(*found)
     context = zmq.Context()
     socket = context.socket(zmq.DEALER)
     try:
@@ -65,7 +71,7 @@ def ask(
             reply: Message = msgpack.unpackb(socket.recv(), strict_map_key=False)
             if reply.get("re") == 2 or (reply.get("re") == 1 and not reply.get("ok")):
                 return reply
-        raise Unreachable(f"no arbiter answers at {where} within {timeout_s:g} s")
+        raise Unreachable(f"no arbiter answers at {where} within {timeout_s:g} s", HANGS)
     finally:
         socket.close()
         context.term()
@@ -88,7 +94,8 @@ def answer(
         problem = {
             "code": "arbiter_unreachable",
             "message": str(error),
-            "hint": "start `vram-arbiter`, or set VRAM_ARBITER_ENDPOINT",
+            "hint": error.hint,
+            "details": {},
         }
         complain(problem, as_json=as_json)
         return UNREACHABLE, {}
@@ -97,8 +104,8 @@ def answer(
         return NO, {}
     if as_json:
         print(json.dumps({key: value for key, value in reply.items() if key not in hidden}, indent=2))
-    else:
-        print("\n".join(lines(reply)))
+    elif said := lines(reply):
+        print("\n".join(said))
     return OK, reply
 
 
@@ -149,6 +156,8 @@ def try_run(arguments: Sequence[str]) -> int | None:
     command, *rest = arguments
     as_json = "--json" in rest
     names = [item for item in rest if item != "--json"]
-    if any(name.startswith("-") for name in names) or len(names) != (command == "why"):
+    if any(not name.isprintable() or name[:1] in ("", "-") for name in names) or len(names) != (
+        command == "why"
+    ):
         return None
     return status(as_json=as_json) if command == "status" else why(names[0], as_json=as_json)

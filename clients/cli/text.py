@@ -136,7 +136,10 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 def why_lines(why: Message) -> list[str]:
     """Who blocks a consumer, how many bytes, on which condition, what happens next, and when."""
     if not why["leases"]:
-        return [f"{why['consumer']} has no lease and waits for none"]
+        name = why["consumer"]
+        return [
+            f"{name} has no lease and waits for none (who has: `vramctl status`; what became of it: `vramctl history -c {name}`)"
+        ]
     lines: list[str] = []
     for lease in why["leases"]:
         lines += [lease["text"], *_why_details(lease)]

@@ -254,6 +254,14 @@ def test_a_load_without_eviction_is_a_record_too() -> None:
     assert "kind" not in record
 
 
+def test_a_lease_may_be_asked_about_by_its_id() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease = held(driver, "det", 5)
+    waiter = driver.consumer("vlm").acquire(5 * GIB)
+    assert driver.arbiter.why(waiter, driver.now)["leases"] == driver.arbiter.why("vlm", driver.now)["leases"]
+    assert [told["lease_id"] for told in driver.arbiter.why(lease, driver.now)["leases"]] == [lease]
+
+
 def test_every_note_that_is_ever_said_is_listed() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5)

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.effects import Effect, Note
+from arbiter.core.effects import Effect, Note, Refuse
 from arbiter.core.events import OperatorAsked
 from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
 from schemas import defaults as d
@@ -104,7 +104,25 @@ def test_nobody_and_the_dead_are_told_apart(driver: CoreDriver, ops: Consumer) -
     det, lease = held(driver, "det", 5 * GIB)
     det.die()
     assert refusal(ask(ops, "evict", "nobody")).code == "unknown_lease"
-    assert refusal(ask(ops, "evict", lease)).code == "lease_lost"
+    over = refusal(ask(ops, "evict", lease))
+    assert (over.code, "died" in over.message) == ("lease_lost", True)
+    assert over.hint == "it is over; its story is in `vramctl history`", (
+        "what a program would be told is no help here"
+    )
+
+
+@pytest.mark.parametrize("evictable", [True, False])
+def test_every_refusal_says_what_to_do(driver: CoreDriver, ops: Consumer, evictable: bool) -> None:
+    _, lease = held(driver, "det", 5 * GIB, evictable=evictable)
+    waiter = driver.consumer("w").acquire(5 * GIB) if evictable else lease
+    alive = refusal(ask(ops, "release_dead", lease))
+    assert alive.hint == ("evict it instead" if evictable else "end its program: it is pinned")
+    for action, target in (
+        ("unpin", lease), ("evict", waiter), ("release_dead", waiter), ("pin", "nobody"), ("unpin", "L9-9"),
+    ):  # fmt: skip
+        refused = [effect for effect in ask(ops, action, target) if isinstance(effect, Refuse)]
+        assert all(effect.message and effect.hint for effect in refused), action
+        assert len(refused) == 1, action
 
 
 # -- pins --------------------------------------------------------------------------------------------------------------
@@ -157,7 +175,7 @@ def test_only_an_operators_pin_is_undone(driver: CoreDriver, ops: Consumer) -> N
     _, mine = held(driver, "det", 1 * GIB, evictable=False)
     _, free = held(driver, "vlm", 1 * GIB)
     assert "own to change" in refusal(ask(ops, "unpin", mine)).hint
-    assert refusal(ask(ops, "unpin", free)).hint == ""
+    assert refusal(ask(ops, "unpin", free)).hint == "nothing to undo"
 
 
 def test_a_pin_outlives_the_daemon(driver: CoreDriver, ops: Consumer) -> None:

@@ -170,7 +170,17 @@ def test_simulate_prints_decisions_and_tables(capsys: pytest.CaptureFixture[str]
     assert main(["simulate", str(broken)]) == 1
     assert "broken.yaml" in capsys.readouterr().err
     assert main(["simulate", "/nonexistent"]) == 1
-    assert "name a readable YAML file" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "name a readable YAML file" in said
+    assert said.rstrip().endswith(
+        ", ".join(sorted(shipped.stem for shipped in SCENARIOS.glob("*.yaml"))) + ")"
+    )
+    broken.write_bytes(b"\xff\xfe")
+    assert main(["simulate", str(broken)]) == 1
+    assert "not text" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as end:
+        main(["simulate", path, "--timeline", "-3"])
+    assert end.value.code == 2
     with pytest.raises(SystemExit) as end:
         main(["simulate", path, "--policy", "best"])
     assert end.value.code == 2

@@ -105,6 +105,33 @@ def test_what_is_no_log_of_ours_is_told_with_its_file(log: Path, old: str, new: 
     assert log.name in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "garbage",
+        "[1, 2]",
+        "[" * 100_000,
+        '{"t": "late", "event": "Tick", "data": {}, "effects": "", "digest": null}',
+    ],
+)
+def test_a_damaged_line_is_named_with_what_can_be_replayed(log: Path, line: str) -> None:
+    lines = log.read_text().splitlines()
+    log.write_text("\n".join([*lines[:5], line, *lines[5:], ""]))
+    with pytest.raises(LogError, match=r":6: not a line of an event log.*head -n 5"):
+        runner.load(log)
+    log.write_text(line + "\n")
+    with pytest.raises(LogError, match="no event log of an arbiter"):
+        runner.load(log)
+
+
+def test_a_log_without_events_does_not_pass_for_a_proof(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log.write_text(log.read_text().splitlines()[0] + "\n")
+    assert main(["replay", str(log)]) == 0
+    assert "nothing was compared" in capsys.readouterr().out
+
+
 def test_an_empty_file_is_no_log(log: Path) -> None:
     log.write_text("")
     with pytest.raises(LogError, match="not even the first line is whole"):

@@ -268,6 +268,10 @@ def test_reads_are_answered_at_once(bench: Bench) -> None:
     assert bench.ask("why", consumer="c")["leases"] == []
     assert bench.ask("history", after=-5, limit=9, kinds=["granted"])["events"] == []
     bench.ask("history", after=(1 << 64) - 1)
+    for typed, hint in (("grant", "did you mean granted?"), ("?" * 99, "known: ")):
+        refused = bench.ask("history", kinds=["denied", typed])["error"]
+        assert (refused["code"], refused["hint"][: len(hint)]) == ("bad_request", hint)
+        assert len(refused["message"]) < 100
     assert bench.questions == [(0, 9, ("granted",)), ((1 << 63) - 1, 500, ())]
 
 

@@ -181,7 +181,9 @@ def test_why_somebody_runs_or_is_not_there() -> None:
         "detector: it is resident, idle",
         "  lease     L1-1, held",
     ]
-    assert text.why_lines({"consumer": "x", "leases": []}) == ["x has no lease and waits for none"]
+    (nobody,) = text.why_lines({"consumer": "x", "leases": []})
+    assert nobody.startswith("x has no lease and waits for none (")
+    assert "`vramctl history -c x`" in nobody
 
 
 def test_an_event() -> None:

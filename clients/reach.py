@@ -1,0 +1,57 @@
+"""What the kernel says at once about a socket that does not answer.
+
+libzmq connects in silence, again and again: to whom may not use the socket, or whose arbiter was killed, it looks like an arbiter that
+is slow. Imports nothing heavy: `vramctl status` asks here before everything else.
+"""
+
+import errno
+import grp
+import os
+import socket
+import stat
+from typing import Final
+
+IPC: Final = "ipc://"
+START: Final = "start `vram-arbiter`, or set VRAM_ARBITER_ENDPOINT"
+PATIENCE_S: Final = 1.0
+
+
+def obstacle(endpoint: str) -> tuple[str, str] | None:
+    """What is wrong with an endpoint and what to do; None if it can be connected to, or only trying can tell."""
+    path = endpoint.removeprefix(IPC)
+    if not endpoint.startswith(IPC) or path.startswith("@"):
+        return None
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(PATIENCE_S)
+        try:
+            probe.connect(path)
+        except FileNotFoundError:
+            return f"no arbiter at {endpoint}: there is no such socket", START
+        except PermissionError:
+            return f"{endpoint} may not be used by uid {os.geteuid()}: permission denied", _who_may(path)
+        except ConnectionRefusedError:
+            if stat.S_ISSOCK(os.stat(path).st_mode):
+                return f"no arbiter at {endpoint}: it was killed, its socket is left over", START
+            return f"{endpoint} is no socket", START
+        except TimeoutError:
+            return None  # its queue of connections is full: it lives
+        except OSError as error:
+            if error.errno == errno.EAGAIN:
+                return None
+            return f"{endpoint} is no endpoint: {error.strerror or error}", START
+    return None
+
+
+def _who_may(path: str) -> str:
+    """The group that may use it, where it can be seen from outside."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return "its folder is closed to you: use its user, or root"
+    try:
+        group = grp.getgrgid(found.st_gid).gr_name
+    except KeyError:
+        group = str(found.st_gid)
+    if stat.S_IMODE(found.st_mode) & stat.S_IWGRP:
+        return f"join the group {group} (log in again), or use root"
+    return "only its own user may: use it, or root; wire.operators_group opens it to a group"

@@ -1,0 +1,217 @@
+"""What an operator may mistype, meet or forget: one line that says what is wrong and what to do, and the documented exit code.
+
+Real daemon, real programs. The table of exit codes is in docs/operating.md.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from clients.reach import obstacle
+from clients.sync import SyncArbiterClient
+from schemas.errors import CODES
+from schemas.wire import LeaseSpec
+
+pytestmark = pytest.mark.e2e
+Spec = Callable[..., LeaseSpec]
+Finished = subprocess.CompletedProcess[str]
+PATIENCE_S = 30.0
+EVERY_ACTION = (
+    ("evict", "x", "-r", "why"), ("pin", "x", "-r", "why"), ("unpin", "x"), ("release-dead", "x", "-r", "why"),
+    ("drain", "-r", "why"), ("resume",),
+)  # fmt: skip
+STRANGER = """
+import os, sys
+import clients.aio, clients.cli.app, clients.cli.history, clients.cli.main, msgpack, zmq
+os.setgroups([]); os.setresgid(65534, 65534, 65534); os.setresuid(65534, 65534, 65534)
+clients.cli.main.main()
+"""
+
+
+def vramctl(
+    environ: dict[str, str], *arguments: str, program: tuple[str, ...] = ("-m", "clients")
+) -> Finished:
+    return subprocess.run(
+        [sys.executable, *program, *arguments],
+        env=environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+
+
+def one_line(done: Finished) -> str:
+    """What was said, if it is an error as errors are: one line on stderr, `vramctl: what is wrong (what to do)`."""
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("vramctl: ")
+    assert line.endswith(")"), f"no hint: {line}"
+    return line
+
+
+def typed(done: Finished) -> str:
+    """The code of the error that `--json` printed."""
+    error = json.loads(done.stdout)["error"]
+    assert set(error) == {"code", "message", "hint", "details"}
+    assert error["code"] in CODES
+    assert error["hint"]
+    return str(error["code"])
+
+
+@pytest.fixture
+def client(arbiter_daemon: ArbiterProcess) -> Iterator[SyncArbiterClient]:
+    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        yield client
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("evict", "", "-r", "why"), ("evict", "x", "-r", ""), ("evict", "x" * 129, "-r", "why"),
+        ("pin", "x", "-r", "  "), ("release-dead", "x", "-r", "two\nlines"), ("unpin", "x\x1b[2J"), ("unpin", "x", "-r", "y" * 513),
+        ("drain", "-r", " "), ("resume", "-r", "a\tb"), ("why", ""), ("why", "x\ny"),
+        ("history", "-n", "0"), ("history", "--since", "yesterday"), ("replay",), ("replay", "x", "--policy", "best"),
+        ("simulate", "desktop", "--timeline", "-3"),
+    ],
+)  # fmt: skip
+def test_2_what_is_mistyped_is_told_before_anybody_is_asked(command: tuple[str, ...], tmp_path: Path) -> None:
+    """There is no daemon: who asked one would end with 3."""
+    environ = {k: v for k, v in os.environ.items() if not k.startswith("VRAM_ARBITER_")}
+    done = vramctl({**environ, "VRAM_ARBITER_RUNTIME": str(tmp_path)}, *command)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "usage: vramctl" in done.stderr.lower()
+    assert "Traceback" not in done.stderr
+
+
+def test_1_for_what_cannot_be_done(
+    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    environ = arbiter_daemon.environ
+    for name in ("det", "twin", "twin"):
+        client.acquire(spec(name, 1)).ready()
+    ended = client.acquire(spec("gone", 1))
+    ended.release()
+    assert "no lease or consumer 'x'" in one_line(vramctl(environ, "evict", "x", "-r", "why"))
+    assert "name one of them: L" in one_line(vramctl(environ, "pin", "twin", "-r", "why"))
+    assert "nothing to undo" in one_line(vramctl(environ, "unpin", "det"))
+    assert "it is not dead (evict it instead)" in one_line(
+        vramctl(environ, "release-dead", "det", "-r", "why")
+    )
+    assert "vramctl history" in one_line(vramctl(environ, "evict", ended.lease_id, "-r", "why"))
+    assert "did you mean granted?" in one_line(vramctl(environ, "history", "--kind", "grant"))
+    codes = {
+        command: (done.returncode, typed(done))
+        for command in (("evict", "x", "-r", "y"), ("pin", "twin", "-r", "y"), ("unpin", "det"), ("history", "--kind", "grant"))
+        for done in (vramctl(environ, *command, "--json"),)
+    }  # fmt: skip
+    assert list(codes.values()) == [
+        (1, "unknown_lease"),
+        (1, "bad_request"),
+        (1, "bad_state"),
+        (1, "bad_request"),
+    ]
+    nobody = vramctl(environ, "why", "nobody")
+    assert (nobody.returncode, nobody.stdout.count("\n")) == (1, 1)
+    assert "`vramctl history -c nobody`" in nobody.stdout
+    assert vramctl(environ, "why", "L1-1").stdout.startswith("det: "), "a lease is named by its id as well"
+    empty = vramctl(environ, "history", "-c", "nobody")
+    assert (empty.returncode, empty.stdout) == (0, ""), "nothing is an answer, and no line"
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="needs root to become somebody else")
+def test_who_is_no_operator_may_look_and_is_told_who_may_act(
+    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    environ = arbiter_daemon.environ
+    lease = client.acquire(spec("det", 1))
+    lease.ready()
+    sock = arbiter_daemon.runtime / "arbiter.sock"
+    arbiter_daemon.runtime.chmod(0o755)
+    sock.chmod(0o666)
+    stranger = ("-c", STRANGER)
+    for action in EVERY_ACTION:
+        refused = vramctl(environ, *action, program=stranger)
+        assert (refused.returncode, "operators_group" in one_line(refused)) == (1, True), action
+    assert typed(vramctl(environ, "evict", "det", "-r", "why", "--json", program=stranger)) == "not_permitted"
+    assert vramctl(environ, "why", "det", program=stranger).returncode == 0
+    assert lease.state == "held"
+    sock.chmod(0o660)
+    os.chown(sock, -1, 0)
+    for command in (
+        ("status",),
+        ("evict", "det", "-r", "why"),
+        ("history", "--follow"),
+        ("run", "--vram", "1GiB", "true"),
+    ):
+        shut_out = vramctl(environ, *command, program=stranger)
+        assert (shut_out.returncode, "may not be used by uid 65534" in one_line(shut_out)) == (3, True), (
+            command
+        )
+    assert "join the group root" in shut_out.stderr
+    arbiter_daemon.runtime.chmod(0o700)
+    assert "its folder is closed to you" in one_line(vramctl(environ, "status", program=stranger))
+
+
+def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) -> None:
+    environ = arbiter_daemon.environ
+    os.kill(arbiter_daemon.pid, signal.SIGSTOP)
+    try:
+        assert "look at the arbiter's log" in one_line(vramctl(environ, "drain", "-r", "why"))
+    finally:
+        os.kill(arbiter_daemon.pid, signal.SIGCONT)
+    status = json.loads(vramctl(environ, "status", "--json").stdout)
+    assert status["drained"] == "", "what ended with 3 was not done afterwards"
+    arbiter_daemon.kill()
+    for action in (*EVERY_ACTION, ("history",), ("why", "x"), ("watch",), ("history", "-f")):
+        dead = vramctl(environ, *action)
+        assert (dead.returncode, "it was killed, its socket is left over" in one_line(dead)) == (3, True), (
+            action
+        )
+    for action in (("resume", "--json"), ("history", "-f", "--json")):
+        assert typed(vramctl(environ, *action)) == "arbiter_unreachable"
+    (arbiter_daemon.runtime / "arbiter.sock").unlink()
+    assert "there is no such socket" in one_line(vramctl(environ, "resume"))
+    (arbiter_daemon.runtime / "arbiter.sock").write_text("")
+    assert "is no socket" in one_line(vramctl(environ, "resume"))
+    assert "is no endpoint" in one_line(vramctl(environ, "resume", "--endpoint", f"ipc:///{'x' * 200}"))
+
+
+def test_a_look_at_the_socket_disturbs_nobody(
+    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess
+) -> None:
+    """`obstacle` connects and says nothing. Elsewhere than on a path it does not look at all."""
+    for _ in range(300):
+        assert obstacle(arbiter_daemon.endpoint) is None
+    assert obstacle("tcp://127.0.0.1:1") is None
+    assert obstacle("ipc://@abstract") is None
+    assert client.status()["clients"] == 1
+
+
+def test_an_empty_and_a_cut_log(arbiter_daemon: ArbiterProcess, tmp_path: Path) -> None:
+    environ = arbiter_daemon.environ
+    assert vramctl(environ, "drain", "-r", "so that there is an event").returncode == 0
+    assert vramctl(environ, "resume").returncode == 0
+    assert arbiter_daemon.stop() == 0
+    (whole,) = (arbiter_daemon.state / "record").glob("*.jsonl")
+    lines = whole.read_bytes().splitlines(keepends=True)
+    log = tmp_path / "log.jsonl"
+    for content, code, says in (
+        (b"", 1, "not even the first line is whole"),
+        (lines[0][:50], 1, "not even the first line is whole"),
+        (b"\0" * 4096 + b"\n", 1, "no event log of an arbiter"),
+        (lines[0], 0, "nothing was compared"),
+        (b"".join(lines)[:-10], 0, "is torn"),
+        (b"".join([*lines[:3], b"\0\0\n", *lines[3:]]), 1, "`head -n 3`"),
+        (b"".join(lines), 0, " identical ("),
+    ):
+        log.write_bytes(content)
+        done = vramctl(environ, "replay", str(log))
+        assert done.returncode == code, done.stderr
+        assert says in (done.stdout if code == 0 else one_line(done))
+    assert "no event log here" in one_line(vramctl(environ, "replay", str(tmp_path / "nothing")))
+    assert "one that is shipped: desktop" in one_line(vramctl(environ, "simulate", "nothing"))
+    assert json.loads(vramctl(environ, "replay", str(tmp_path / "nothing"), "--json").stdout)["error"]["hint"]
