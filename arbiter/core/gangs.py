@@ -12,6 +12,7 @@ from dataclasses import replace
 
 from arbiter.core import eviction, families, policy
 from arbiter.core.lease import Gang, Lease, LeaseState
+from arbiter.core.ledger import process_bytes
 from arbiter.core.state import Core, Gpu, Refused
 from schemas import defaults
 from schemas.ids import GpuId, LeaseId, ProcessKey
@@ -175,7 +176,7 @@ def _admit(core: Core, gang: Gang, placement: _Placement) -> None:
             for gpu_id in lease.gpus:
                 core.gpus[gpu_id].queue.discard(lease)
                 core.wake(core.gpus[gpu_id])
-            lease.gpus, lease.gpu = (gpu.info.id,), gpu.info.id
+            lease.gpus, lease.gpu, lease.reason = (gpu.info.id,), gpu.info.id, ""
             families.claim(core, gpu, lease.process)
             gpu.reserved.add(lease.id)
             gpu.ledger.charge(lease.id, lease.process, lease.steady_bytes, lease.steady_bytes, core.now)
@@ -212,9 +213,29 @@ def next_load(core: Core, gpu: Gpu, gang: Gang) -> Lease | None:
         if not going and not victims:
             _break(core, gang, "others hold more than they were granted, the rest no longer fits")
         return None
+    if not _is_free(core, gpu, gang, lease):
+        return None
     _set_headroom(core, gpu, gang, max(0, headroom - more))
     gpu.reserved.discard(lease.id)
     return lease
+
+
+def _is_free(core: Core, gpu: Gpu, gang: Gang, lease: Lease) -> bool:
+    """What the member before needed on top of its steady bytes is not free before it is measured, as any bytes."""
+    room = policy.measured_room_bytes(core, gpu)
+    resident = any(one.process == lease.process for one in gpu.residents.values())
+    held = None if resident or gpu.sample is None else process_bytes(gpu.sample, lease.process)
+    need = lease.load_peak_bytes - (held or 0)
+    if room is not None and room >= need:
+        return True
+    lease.reason = "waits for a fresh reading of the card"
+    if room is not None and not policy.sample_is_behind(gpu):
+        lease.reason = "its bytes are kept for it, but measured memory is not free yet"
+        if core.now - gpu.changed_at > core.settings.verify_timeout_s:
+            _break(core, gang, "measured memory did not come back, the rest no longer fits")
+            return False
+    core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
+    return False
 
 
 def settle(core: Core) -> None:
@@ -250,8 +271,6 @@ def _trim(core: Core, gpu: Gpu, gang: Gang) -> None:
 
 def _finish(core: Core, gang: Gang) -> None:
     _dissolve(core, gang)
-    for lease in gang.members:
-        core.record_lease(lease)
     core.note(
         "gang",
         gang=gang.name,
@@ -286,11 +305,14 @@ def _dissolve(core: Core, gang: Gang) -> None:
         for lease in gang.members:
             if lease.id in gpu.reserved:
                 gpu.reserved.discard(lease.id)
-                gpu.ledger.uncharge(lease.id, core.now)
+                gpu.ledger.withdraw(lease.id, core.now)
                 lease.gpu = None
         _set_headroom(core, gpu, gang, 0)
         gpu.gang = None
         core.wake(gpu)
+    for lease in gang.members:
+        if lease.state in (LeaseState.LOADING, LeaseState.HELD):
+            core.record_lease(lease)  # a restart must not wait for the rest of it
 
 
 # -- bytes -------------------------------------------------------------------------------------------------------------
@@ -338,7 +360,7 @@ def _approved(gpu: Gpu, lease_id: LeaseId) -> int:
 def _set_headroom(core: Core, gpu: Gpu, gang: Gang, count: int) -> None:
     """Bytes that are kept for whoever of the gang loads next, in the account of one of its processes here."""
     if gpu.ledger.charges(gang.headroom_id):
-        gpu.ledger.uncharge(gang.headroom_id, core.now)
+        gpu.ledger.withdraw(gang.headroom_id, core.now)
         gpu.reserved.discard(gang.headroom_id)
     if count:
         owner = next(one for one in gang.members if one.gpu == gpu.info.id)
@@ -388,7 +410,10 @@ def outlook(gang: Gang, lease: Lease) -> str:
     if gang.phase == "gathering":
         return f"waits for the rest of gang {gang.name}: {len(gang.members)} of {gang.size} have come"
     if gang.phase == "loading":
-        return f"its bytes are kept for it; it loads when those of gang {gang.name} before it are ready"
+        return (
+            lease.reason
+            or f"its bytes are kept for it; it loads when those of gang {gang.name} before it are ready"
+        )
     return f"waits as one of gang {gang.name}: {lease.reason or 'behind others'}"
 
 

@@ -230,14 +230,6 @@ class GpuLedger:
         """Raises KeyError if nothing is charged for it."""
         return self.accounts[self._owner[lease]].charges[lease]
 
-    def uncharge(self, lease: LeaseId, now: float) -> None:
-        """Take back a charge that was never filled. What its process keeps otherwise stays as it is."""
-        account = self.accounts[self._owner.pop(lease)]
-        self._charge(account, lease, None)
-        self.touched.add(lease)
-        self._changed(account, now)
-        self._close_if_empty(account)
-
     def to_debt(self, lease: LeaseId) -> None:
         """The lease is over; its bytes stay charged until measured gone."""
         self.accounts[self._owner[lease]].charges[lease].debt = True
@@ -259,7 +251,7 @@ class GpuLedger:
         return account.residue_bytes
 
     def withdraw(self, lease: LeaseId, now: float) -> None:
-        """Take a grant back that nobody has heard of: the account is as it was before."""
+        """Take a charge back that was never filled, or a grant that nobody has heard of: the account is as it was before."""
         account = self.accounts[self._owner.pop(lease)]
         self._charge(account, lease, None)
         self.touched.add(lease)
