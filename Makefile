@@ -17,7 +17,7 @@ CORE := .venv-core/bin
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core demo test test-core lint format chaos sim bench schemas install-units clean
+.PHONY: help setup setup-core demo test test-core nightly lint format chaos sim bench schemas install-units clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -37,6 +37,9 @@ test: setup ## the whole product; ARGS goes to pytest
 
 test-core: setup-core ## the base install alone, in seconds
 	$(CORE)/pytest -q -n $(WORKERS) --dist loadfile -m "not heavy and not e2e and not gpu" $(ARGS)
+
+nightly: setup ## the engine's rule machines, far and at random (half an hour); a failure prints how to see it again
+	$(BIN)/pytest -q -n $(WORKERS) -o timeout=7200 -o faulthandler_timeout=7000 --hypothesis-profile=nightly tests/arbiter/core/test_machine.py tests/arbiter/core/test_family_machine.py $(ARGS)
 
 lint: setup ## style, types and who may import whom
 	$(BIN)/ruff check .

@@ -3,9 +3,13 @@
 from collections.abc import Callable, Iterator
 
 import pytest
+from hypothesis import settings
 
+from arbiter.testing.machines import NIGHTLY
 from arbiter.testing.process import ArbiterProcess
 from arbiter.testing.wire import WireClient
+
+settings.register_profile(NIGHTLY)  # pytest --hypothesis-profile=nightly; see `arbiter.testing.machines`
 
 
 @pytest.fixture

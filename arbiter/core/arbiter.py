@@ -244,9 +244,7 @@ class Arbiter:
     def _keep_reading(self) -> None:
         core = self._core
         for gpu in core.gpus.values():
-            key = ("probe", gpu.info.id)
-            planned = core.timers.due(key)
-            peaks = gpu.sees_loads()
-            due = core.now + (core.settings.load_probe_s if peaks else core.settings.probe_period_s)
-            if (peaks and planned is not None and due < planned) or (planned is None and core.active(gpu)):
-                core.timers.set(key, due)
+            if gpu.sees_loads():
+                core.read_again(gpu, core.settings.load_probe_s)
+            elif ("probe", gpu.info.id) not in core.timers and core.active(gpu):
+                core.read_again(gpu, core.settings.probe_period_s)

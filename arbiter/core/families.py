@@ -26,14 +26,24 @@ def need_bytes(gpu: Gpu, parent: Lease, process: ProcessKey, peak_bytes: int) ->
 
 
 def left_bytes(gpu: Gpu, parent: Lease) -> int:
-    """What the parent can still carve out: its own charge, less what its own process is seen or said to hold."""
+    """What the parent can still carve out: its own charge, less what its own process is seen or said to hold.
+
+    One that is ready, and neither says nor shows how much it holds, holds all of it.
+    """
     charge = gpu.ledger.charge_of(parent.id)
     own = parent.measured_bytes or 0
     held = None if gpu.sample is None else process_bytes(gpu.sample, parent.process)
+    if held is None and parent.said_ready and parent.measured_bytes is None:
+        return 0
     if held is not None:
         others = gpu.ledger.accounts[parent.process].charged_bytes - charge.booked_bytes
         own = max(own, held - others)
     return max(0, min(charge.booked_bytes, charge.approved_bytes) - own)
+
+
+def unfilled_bytes(gpu: Gpu) -> int:
+    """What could be carved out on this card: charged, and on it only where somebody holds more than he says."""
+    return sum(left_bytes(gpu, parent) for parent in gpu.estates.values() if parent.state not in LEAVING)
 
 
 def holds_nothing(core: Core, gpu: Gpu, lease: Lease) -> bool:

@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from arbiter.core import eviction, families, policy
-from arbiter.core.lease import Gang, Lease, LeaseState
-from arbiter.core.ledger import process_bytes
+from arbiter.core.lease import EXPIRING, Gang, Lease, LeaseState
 from arbiter.core.state import Core, Gpu, Refused
 from schemas import defaults
 from schemas.ids import GpuId, LeaseId, ProcessKey
@@ -84,7 +83,7 @@ def _complete(core: Core, gang: Gang) -> None:
     """All have come. What can never fit is said at once, to all; else they stand in the queues as one."""
     waiting = gang.waiting()
     if not _place(core, waiting, lambda gpu, some: _ever(core, gpu, some)):
-        needed = sum(lease.load_peak_bytes for lease in waiting)
+        needed = sum(_needs(waiting).values())
         budgets = {gpu.info.id: gpu.ledger.budget_bytes for gpu in core.gpus.values()}
         _break(
             core,
@@ -135,8 +134,8 @@ def serve(core: Core, gpu: Gpu, gang: Gang) -> None:
 
 
 def _is_next(core: Core, gpu: Gpu, gang: Gang) -> bool:
-    head = gpu.queue.head()
-    return head is not None and head.gang is gang and not policy.blocked(core, gpu)
+    front = policy.front(core, gpu)
+    return front is not None and front.gang is gang and not policy.blocked(core, gpu)
 
 
 def _fits(gpu: Gpu, gang: Gang, some: list[Lease]) -> bool:
@@ -178,8 +177,7 @@ def _admit(core: Core, gang: Gang, placement: _Placement) -> None:
                 core.wake(core.gpus[gpu_id])
             lease.gpus, lease.gpu, lease.reason = (gpu.info.id,), gpu.info.id, ""
             families.claim(core, gpu, lease.process)
-            gpu.reserved.add(lease.id)
-            gpu.ledger.charge(lease.id, lease.process, lease.steady_bytes, lease.steady_bytes, core.now)
+            gpu.ledger.reserve(lease.id, lease.process, lease.steady_bytes, core.now)
         _set_headroom(core, gpu, gang, _headroom_bytes(some))
         here = [one.id for one in gang.members if one.gpu == gpu.info.id]
         gang.reserved_bytes[gpu.info.id] = sum(_approved(gpu, one) for one in [*here, gang.headroom_id])
@@ -216,25 +214,27 @@ def next_load(core: Core, gpu: Gpu, gang: Gang) -> Lease | None:
     if not _is_free(core, gpu, gang, lease):
         return None
     _set_headroom(core, gpu, gang, max(0, headroom - more))
-    gpu.reserved.discard(lease.id)
     return lease
 
 
 def _is_free(core: Core, gpu: Gpu, gang: Gang, lease: Lease) -> bool:
-    """What the member before needed on top of its steady bytes is not free before it is measured, as any bytes."""
+    """What the member before needed on top of its steady bytes is not free before it is measured, as any bytes.
+
+    Memory that does not come back in time breaks the gang: its other members must not hold a card for ever that nobody else may use.
+    """
     room = policy.measured_room_bytes(core, gpu)
-    resident = any(one.process == lease.process for one in gpu.residents.values())
-    held = None if resident or gpu.sample is None else process_bytes(gpu.sample, lease.process)
-    need = lease.load_peak_bytes - (held or 0)
-    if room is not None and room >= need:
+    if room is not None and room >= policy.measured_need_bytes(gpu, lease):
+        gang.short_since.pop(gpu.info.id, None)
         return True
-    lease.reason = "waits for a fresh reading of the card"
-    if room is not None and not policy.sample_is_behind(gpu):
-        lease.reason = "its bytes are kept for it, but measured memory is not free yet"
-        if core.now - gpu.changed_at > core.settings.verify_timeout_s:
-            _break(core, gang, "measured memory did not come back, the rest no longer fits")
-            return False
-    core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
+    if room is None or policy.sample_is_behind(gpu):
+        lease.reason = "waits for a fresh reading of the card"
+        core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
+        return False
+    lease.reason = "its bytes are kept for it, but measured memory is not free yet"
+    if core.now - gang.short_since.setdefault(gpu.info.id, core.now) > core.settings.verify_timeout_s:
+        _break(core, gang, "measured memory did not come back, the rest no longer fits")
+    else:
+        core.read_again(gpu, core.settings.load_probe_s)
     return False
 
 
@@ -303,15 +303,14 @@ def _dissolve(core: Core, gang: Gang) -> None:
     for gpu_id in gang.cards:
         gpu = core.gpus[gpu_id]
         for lease in gang.members:
-            if lease.id in gpu.reserved:
-                gpu.reserved.discard(lease.id)
+            if lease.id in gpu.ledger.reserved:
                 gpu.ledger.withdraw(lease.id, core.now)
                 lease.gpu = None
         _set_headroom(core, gpu, gang, 0)
         gpu.gang = None
         core.wake(gpu)
     for lease in gang.members:
-        if lease.state in (LeaseState.LOADING, LeaseState.HELD):
+        if lease.state in EXPIRING:
             core.record_lease(lease)  # a restart must not wait for the rest of it
 
 
@@ -361,11 +360,9 @@ def _set_headroom(core: Core, gpu: Gpu, gang: Gang, count: int) -> None:
     """Bytes that are kept for whoever of the gang loads next, in the account of one of its processes here."""
     if gpu.ledger.charges(gang.headroom_id):
         gpu.ledger.withdraw(gang.headroom_id, core.now)
-        gpu.reserved.discard(gang.headroom_id)
     if count:
         owner = next(one for one in gang.members if one.gpu == gpu.info.id)
-        gpu.reserved.add(gang.headroom_id)
-        gpu.ledger.charge(gang.headroom_id, owner.process, count, count, core.now)
+        gpu.ledger.reserve(gang.headroom_id, owner.process, count, core.now)
 
 
 # -- placing -----------------------------------------------------------------------------------------------------------

@@ -43,13 +43,15 @@ def _serve(core: Core, gpu: Gpu) -> None:
         if member is not None:
             grant(core, gpu, member)
         return
-    head = gpu.queue.head()
     if gpu.blocked:  # 2
         return
-    if head is None:  # 3
+    if gpu.queue.head() is None:  # 3
         back = standby.next_back(core, gpu)
         if back is not None:
             _grant_if_measured(core, gpu, back)
+        return
+    head = policy.front(core, gpu)
+    if head is None:
         return
     if head.gang is not None:  # 4
         gangs.serve(core, gpu, head.gang)
@@ -57,16 +59,6 @@ def _serve(core: Core, gpu: Gpu) -> None:
     if policy.fits(gpu, head):  # 5
         _grant_if_measured(core, gpu, head)
         return
-    here = next((lease for lease in gpu.queue if not _placed_elsewhere(core, gpu, lease)), None)
-    if here is None:
-        return
-    if here.gang is not None:  # 4
-        gangs.serve(core, gpu, here.gang)
-        return
-    if here is not head and policy.fits(gpu, here):  # 5
-        _grant_if_measured(core, gpu, here)
-        return
-    head = here
     leaving = policy.leaving(gpu)
     planned = policy.fits(gpu, head, leaving)
     if planned:
@@ -119,19 +111,6 @@ def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, in
     for gpu_id in head.gpus:
         core.wake(core.gpus[gpu_id])  # those behind it there are no longer behind it
     return True
-
-
-def _placed_elsewhere(core: Core, gpu: Gpu, lease: Lease) -> bool:
-    """Is another card being emptied for this waiter? Then it is nobody's head here, unless it fits as it is.
-
-    Not once a holder there has outstayed the deadline, or has left and it was not enough.
-    """
-    there = lease.planned_gpu
-    if there is None or there == gpu.info.id:
-        return False
-    return any(
-        e.wanted_by == lease.id and not e.verdict and not e.overdue for e in core.gpus[there].evictions
-    )
 
 
 def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int], *, planned: bool) -> None:

@@ -115,7 +115,7 @@ def _charges(gpu: Gpu) -> None:
     ]:
         gpu.debts.discard(lease_id)
     for lease_id in sorted(gpu.debts):
-        if lease_id not in gpu.verifications and lease_id not in gpu.reserved:
+        if lease_id not in gpu.verifications and lease_id not in gpu.ledger.reserved:
             raise InvariantViolation(4, f"the bytes of {lease_id} are charged for ever")
     for lease in residents.in_state(LeaseState.VERIFYING):
         if lease.id not in gpu.verifications:

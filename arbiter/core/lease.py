@@ -183,6 +183,7 @@ class Gang:
     planned: dict[GpuId, list["Lease"]] = field(default_factory=dict, repr=False)  # where room is being made
     cards: list[GpuId] = field(default_factory=list)  # loading: where its bytes are charged
     reserved_bytes: dict[GpuId, int] = field(default_factory=dict)  # what was admitted there
+    short_since: dict[GpuId, float] = field(default_factory=dict)  # cards that show less free than is kept
 
     def waiting(self) -> list["Lease"]:
         return [lease for lease in self.members if lease.state is LeaseState.QUEUED]

@@ -79,6 +79,7 @@ class GpuLedger:
         self.strangers: dict[ProcessKey, Stranger] = {}
         self.unnamed_bytes = 0  # used, but in nobody's list, beyond the fixed reserve
         self.overhead_bytes: int | None = None  # the driver's own; None: never seen
+        self.reserved: set[LeaseId] = set()  # charged for who is not granted yet: nobody holds these bytes
         self.touched: set[LeaseId] = set()  # charged or dropped since the invariants were checked last
         self._owner: dict[LeaseId, ProcessKey] = {}
         self._occupied_bytes = 0  # kept sums over accounts and strangers
@@ -154,21 +155,20 @@ class GpuLedger:
         account = self.accounts.get(process)
         if account is None:
             return 0
-        staying = self._staying(account, going)
+        staying = self._staying(account, going) - self._unfilled_bytes(account)
         if dead:
             return staying
         return max(staying, account.residue_floor_bytes, *going.values())
 
     def total_after_bytes(self, process: ProcessKey, going: Mapping[LeaseId, int], *, dead: bool) -> int:
         """Total bytes once these leases of one process are gone: what a verification expects at most."""
+        total = self.total_bytes()
+        for owner in {self._owner[lease] for lease in self.reserved}:
+            total -= self.accounts[owner].occupied_bytes() - self._filled(self.accounts[owner])
         account = self.accounts.get(process)
         if account is None:
-            return self.total_bytes()
-        return (
-            self.total_bytes()
-            - account.occupied_bytes()
-            + self.process_after_bytes(process, going, dead=dead)
-        )
+            return total
+        return total - self._filled(account) + self.process_after_bytes(process, going, dead=dead)
 
     def _after(self, account: Account, going: Mapping[LeaseId, int], more_bytes: int) -> int:
         if not going:
@@ -180,6 +180,18 @@ class GpuLedger:
         """What is booked for a process's leases but for these."""
         charges = account.charges
         return account.charged_bytes - sum(charges[lease].booked_bytes for lease in going if lease in charges)
+
+    def filled_bytes(self, process: ProcessKey) -> int:
+        """What is booked for a process without what is only kept for leases of it that are not granted yet."""
+        account = self.accounts[process]
+        return max(account.charged_bytes - self._unfilled_bytes(account), account.residue_bytes)
+
+    def _filled(self, account: Account) -> int:
+        return max(self.filled_bytes(account.process), account.measured_bytes)
+
+    def _unfilled_bytes(self, account: Account) -> int:
+        charges = account.charges
+        return sum(charges[lease].booked_bytes for lease in self.reserved if lease in charges)
 
     def disagreement(self) -> str:
         """Where the kept sums and the accounts disagree; "" if nowhere. Counts everything: for tests."""
@@ -204,11 +216,17 @@ class GpuLedger:
         self, lease: LeaseId, process: ProcessKey, booked_bytes: int, approved_bytes: int, now: float
     ) -> None:
         """Book a grant (or, after a restart, what somebody says he holds)."""
+        self.reserved.discard(lease)
         account = self._open(process, now)
         self._charge(account, lease, Charge(booked_bytes, approved_bytes))
         self._owner[lease] = process
         self.touched.add(lease)
         self._changed(account, now)
+
+    def reserve(self, lease: LeaseId, process: ProcessKey, count: int, now: float) -> None:
+        """Book bytes for who is granted later; `charge` makes it a grant, `withdraw` ends it."""
+        self.charge(lease, process, count, count, now)
+        self.reserved.add(lease)
 
     def recharge(self, lease: LeaseId, booked_bytes: int, now: float) -> None:
         """The holder is ready: book what it says it holds. What exceeds the grant was never approved."""
@@ -252,6 +270,7 @@ class GpuLedger:
 
     def withdraw(self, lease: LeaseId, now: float) -> None:
         """Take a charge back that was never filled, or a grant that nobody has heard of: the account is as it was before."""
+        self.reserved.discard(lease)
         account = self.accounts[self._owner.pop(lease)]
         self._charge(account, lease, None)
         self.touched.add(lease)

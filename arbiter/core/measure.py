@@ -247,6 +247,7 @@ def _weigh(core: Core, gpu: Gpu, verification: Verification, sample: MemorySampl
         gpu.ledger,
         sample,
         _grown_by_right(gpu, verification, sample),
+        families.unfilled_bytes(gpu) if sample.processes is None else 0,
         core.settings.verify_tolerance_bytes,
     )
     if judgement is None:

@@ -105,6 +105,27 @@ def largest_fold_bytes(gpu: Gpu) -> int:
     return max([*folded, *(stranger.used_bytes for stranger in ledger.strangers.values())], default=0)
 
 
+def placed_elsewhere(core: Core, gpu: Gpu, lease: Lease) -> bool:
+    """Is another card being emptied for this waiter? Then it is nobody's head here, unless it fits as it is.
+
+    Not once a holder there has outstayed the deadline, or has left and it was not enough.
+    """
+    there = lease.planned_gpu
+    if there is None or there == gpu.info.id:
+        return False
+    return any(
+        e.wanted_by == lease.id and not e.verdict and not e.overdue for e in core.gpus[there].evictions
+    )
+
+
+def front(core: Core, gpu: Gpu) -> Lease | None:
+    """Whose turn it is here: the head's, or of the first behind it for whom no other card is being emptied."""
+    head = gpu.queue.head()
+    if head is None or fits(gpu, head):
+        return head
+    return next((lease for lease in gpu.queue if not placed_elsewhere(core, gpu, lease)), None)
+
+
 # -- the measurement ---------------------------------------------------------------------------------------------------
 def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
     """Free bytes by the newest reading, less the leases that it cannot have seen. None: no reading young enough.
@@ -132,8 +153,8 @@ def measured_need_bytes(gpu: Gpu, lease: Lease) -> int:
 
 def _unheld_bytes(gpu: Gpu, process: ProcessKey, count: int) -> int:
     account = gpu.ledger.accounts.get(process)
-    if account is not None and account.charges:
-        return count
+    if account is not None and any(lease not in gpu.ledger.reserved for lease in account.charges):
+        return count  # what it holds is of leases; bytes that are kept for a gang's members nobody holds
     own = None if gpu.sample is None else process_bytes(gpu.sample, process)
     if own is None:
         own = account.residue_bytes if account is not None else 0

@@ -90,6 +90,7 @@ def _remembered(core: Core, record: Mapping[str, Any], state: LeaseState) -> Lea
         last_used_at=core.now,
         answered=True,
         exiting=bool(record["exiting"]),
+        said_ready=bool(record.get("said_ready", True)),
         pinned=None if record.get("pinned") is None else Order(*record["pinned"]),
         attached=False,
         dismissed=bool(record.get("dismissed", False)),
@@ -216,7 +217,8 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
             core.gpu_of(lease).residents.recent[lease.id] = lease
     if item.away:
         _believe_away(core, lease, item)
-    elif lease.state is LeaseState.LOADING and item.held:  # its `ready` was lost
+    elif lease.state is LeaseState.LOADING and item.held:  # its `ready` was lost, or a sub-lease's was heard
+        lease.said_ready = lease.estate is None or item.measured_bytes is not None
         become_held(core, lease, item.measured_bytes)
         core.record_line(lease)
     if lease.gpu is not None:
@@ -310,6 +312,7 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
         ready_at=core.now,
         last_used_at=core.now,
         answered=True,
+        said_ready=item.held,
         story=[(core.now, LeaseState.HELD, "adopted: the journal did not know it")],
     )
     core.add(lease)

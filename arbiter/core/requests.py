@@ -350,7 +350,12 @@ def on_wait_timeout(core: Core, lease_id: str) -> None:
 def ready(core: Core, event: ReadyReported) -> None:
     """Loaded: from now on the steady bytes are charged, or what the holder measured."""
     lease = own_lease(core, event.client, event.lease, event.token)
-    if lease.state is LeaseState.HELD:  # a repeat
+    reserved = not lease.said_ready and lease.estate is not None
+    if lease.state is LeaseState.HELD or (lease.state is LeaseState.REVOKING and reserved):  # a repeat, or
+        if not lease.said_ready:  # a sub-lease was ready before it: it is no mere reservation
+            lease.said_ready = True
+            _charge_held(core, lease, event.measured_bytes)
+            core.record_line(lease)
         core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
         return
     if lease.state is not LeaseState.LOADING:
@@ -375,20 +380,24 @@ def ready(core: Core, event: ReadyReported) -> None:
 
 def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> list[Lease]:
     """Loaded, and with it what it was carved out of, if that has not said so itself. Returns who became ready."""
-    gpu = core.gpu_of(lease)
     lease.move(LeaseState.HELD, core.now, "ready")
     lease.ready_at = lease.last_used_at = core.now
+    _charge_held(core, lease, measured_bytes)
+    core.host.drop(lease.id)
+    if lease.parent is not None and lease.parent.state is LeaseState.LOADING:
+        return [lease, *become_held(core, lease.parent, None)]
+    return [lease]
+
+
+def _charge_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
+    gpu = core.gpu_of(lease)
     lease.measured_bytes = measured_bytes
     drift.on_ready(core, lease, measured_bytes)
     steady = lease.steady_bytes if measured_bytes is None else max(measured_bytes, lease.spec.residue_bytes)
     families.recharge(core, gpu, lease, steady)
-    core.host.drop(lease.id)
     gpu.changed_at = core.now
     core.want_sample(gpu, core.now)  # what it holds now is what has to come back one day
     core.wake(gpu)
-    if lease.parent is not None and lease.parent.state is LeaseState.LOADING:
-        return [lease, *become_held(core, lease.parent, None)]
-    return [lease]
 
 
 def renew(core: Core, event: Renewed) -> None:

@@ -98,7 +98,6 @@ class Gpu:
     pressed: bool = False  # a pressure note is out
 
     gang: Gang | None = None  # it is loading here
-    reserved: set[LeaseId] = field(default_factory=set)  # charged for members of it that are not granted yet
     estates: dict[LeaseId, Lease] = field(default_factory=dict)  # leases that sub-leases were carved out of
     debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
 
@@ -196,6 +195,13 @@ class Core:
         if gpu.asked_at is None or gpu.asked_at < not_before:
             gpu.asked_at = self.now
             self.out.append(Sample(gpu.info.id))
+
+    def read_again(self, gpu: Gpu, after_s: float) -> None:
+        """The next background reading comes in `after_s` at the latest."""
+        key = ("probe", gpu.info.id)
+        planned, due = self.timers.due(key), self.now + after_s
+        if planned is None or due < planned:
+            self.timers.set(key, due)
 
     # -- bookkeeping -----------------------------------------------------------------------------------------------
     def voice_of(self, lease: Lease) -> ClientId:
@@ -357,6 +363,7 @@ class Core:
                 "load_peak_bytes": lease.load_peak_bytes,
                 "measured_bytes": lease.measured_bytes,
                 "exiting": lease.exiting,
+                "said_ready": lease.said_ready,
                 "parent": None if lease.parent is None else lease.parent.id,
                 "gang": None if lease.gang is None else [lease.gang.name, lease.gang.size],
                 "estate": None if lease.estate is None else _estate(lease.estate),

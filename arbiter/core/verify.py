@@ -74,9 +74,18 @@ class Verification:
 
 
 def judge(
-    v: Verification, ledger: GpuLedger, sample: MemorySampled, grown_bytes: int, tolerance_bytes: int
+    v: Verification,
+    ledger: GpuLedger,
+    sample: MemorySampled,
+    grown_bytes: int,
+    unfilled_bytes: int,
+    tolerance_bytes: int,
 ) -> Judgement | None:
-    """Judge a counting reading. None: not yet. `grown_bytes`: what others may have grown since the baseline, by right."""
+    """Judge a counting reading. None: not yet. `grown_bytes`: what others may have grown since the baseline, by right.
+
+    `unfilled_bytes` of the charges are reservations. Where nothing but the ledger bound can be checked they must not hide what is still
+    there: what comes back to a reservation is carved out again without another look.
+    """
     used = sample.used_bytes
     stable = v.last_used_bytes is not None and abs(used - v.last_used_bytes) <= tolerance_bytes
     v.last_used_bytes = used
@@ -85,6 +94,8 @@ def judge(
     overhead = ledger.info.reserve_bytes if ledger.overhead_bytes is None else ledger.overhead_bytes
     bound_a = ledger.total_after_bytes(v.process, v.going(), dead=v.vanishes) + overhead
     bound_b = _delta_bound(v, ledger, expected, grown_bytes)
+    if bound_b is None:
+        bound_a -= unfilled_bytes
     short_bytes = max(used - bound_a, 0 if bound_b is None else used - bound_b)
     evident = held is None or held <= expected + tolerance_bytes
     v.settling = short_bytes <= tolerance_bytes and evident and sample.taken_at >= v.not_before
@@ -102,7 +113,7 @@ def _delta_bound(v: Verification, ledger: GpuLedger, expected: int, grown_bytes:
     if held_then is None:
         if not v.baseline_comparable:
             return None
-        held_then = ledger.accounts[v.process].booked_bytes()
+        held_then = ledger.filled_bytes(v.process)
     return v.baseline.used_bytes - (held_then - expected) + grown_bytes
 
 

@@ -482,3 +482,16 @@ def test_an_idle_card_beside_a_busy_one_is_no_place_for_half_a_gang() -> None:
     assert driver.state(idle) == "held"
     busy.use_end(lease)
     assert (driver.state(idle), driver.state(lease)) == ("revoking", "revoking")
+
+
+def test_a_gang_goes_ahead_of_a_waiter_for_which_another_card_is_being_emptied() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    busy, lease = held(driver, "busy", 5, gpu="0", priority=90)
+    busy.use_begin(lease)
+    _, idle = held(driver, "idle", 5, gpu="1")
+    first = driver.consumer("first").acquire(7 * GIB)
+    assert (driver.state(idle), driver.state(first)) == ("revoking", "queued")
+    a, b = Member(driver, "a", 1, gpu="0"), Member(driver, "b", 1, gpu="0")
+    driver.advance(0.1)
+    assert states(a, b) == ["loading", "queued"]
+    assert driver.view(b.lease)["gang"] == "g: loading, 2 of 2"  # type: ignore[index]

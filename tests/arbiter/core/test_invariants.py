@@ -139,8 +139,7 @@ def half_a_gang(b: Broken) -> None:
     one = b.driver.consumer("one")
     lease = b.core.leases[one.acquire(GIB, gang=("g", 2))]
     lease.gpu = b.gpu.info.id
-    b.gpu.reserved.add(lease.id)
-    b.gpu.ledger.charge(lease.id, lease.process, 1, 1, 0.0)
+    b.gpu.ledger.reserve(lease.id, lease.process, 1, 0.0)
 
 
 @pytest.mark.parametrize(

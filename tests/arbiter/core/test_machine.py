@@ -4,12 +4,12 @@ they were granted and leave when asked, the card never overflows, tokens grow, a
 from typing import Any
 
 import hypothesis.strategies as st
-from hypothesis import HealthCheck, settings
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
 
 from arbiter.core import policy
 from arbiter.core.effects import Push, Reply
 from arbiter.testing.core_driver import Consumer, CoreDriver
+from arbiter.testing.machines import walk
 from schemas import defaults as d
 from schemas.ids import LeaseId, ProcessKey
 
@@ -264,10 +264,4 @@ class Leases(RuleBasedStateMachine):
 
 
 TestLeases = Leases.TestCase
-TestLeases.settings = settings(
-    max_examples=60,
-    stateful_step_count=40,
-    deadline=None,
-    suppress_health_check=list(HealthCheck),
-    derandomize=True,
-)
+TestLeases.settings = walk(60)
