@@ -1,0 +1,174 @@
+"""Random lives of leases that stand by, park, grow, shrink and are sent away, over restarts: bytes, host RAM and turns stay right."""
+
+import collections
+import random
+
+import pytest
+
+from arbiter.core.effects import Note
+from arbiter.core.events import OperatorAsked
+from arbiter.testing.core_driver import Consumer, CoreDriver
+from schemas import defaults as d
+from schemas.ids import LeaseId
+
+GIB, MIB = d.GIB, d.MIB
+CAPACITY = 8 * GIB
+
+
+class Crowd:
+    """Four processes with one lease each at a time, and what each holds on its card by its own doing."""
+
+    def __init__(self, seed: int) -> None:
+        self.draw = random.Random(seed)
+        settings = {"host_ram_budget_bytes": 6 * GIB, "thrash_hold_max_s": 3.0}
+        self.driver = CoreDriver(CAPACITY, cards=self.draw.choice([1, 2]), settings=settings)
+        for card in self.driver.cards.values():
+            card.lag_s = self.draw.choice([0.0, 0.1])
+        self.people = [self.driver.consumer(f"p{n}") for n in range(4)]
+        self.leases: dict[LeaseId, Consumer] = {}
+
+    def mine(self, person: Consumer) -> LeaseId | None:
+        found = [x for x, owner in self.leases.items() if owner is person and self.driver.state(x) != "over"]
+        return found[0] if found else None
+
+    def acquire(self, person: Consumer) -> None:
+        size = self.draw.choice([1, 2, 3, 5, 7]) * GIB
+        lease = person.acquire(
+            size,
+            standby=self.draw.random() < 0.6,
+            park_bytes=self.draw.choice([0, size]),
+            priority=self.draw.choice([40, 50, 60]),
+            min_residency_s=self.draw.choice([0.0, 0.5]),
+            residue_bytes=self.draw.choice([0, 100 * MIB]),
+        )
+        self.leases[lease] = person
+
+    def step(self, person: Consumer) -> None:
+        lease = self.mine(person)
+        if lease is None:
+            self.acquire(person)
+            return
+        view = self.driver.view(lease)
+        assert view is not None
+        chance = self.draw.random()
+        match view["state"]:
+            case "loading":
+                person.load(lease)
+            case "held" if view["uses"]:
+                person.use_end(lease)
+            case "held" if chance < 0.4:
+                person.use_begin(lease)
+            case "held" if chance < 0.5:
+                self.resize(person, lease, view["charge_bytes"])
+            case "held" if chance < 0.6:
+                person.unload(lease, parked=False)
+            case "revoking" if view["uses"]:
+                person.use_end(lease)
+            case "revoking":
+                person.unload(lease, parked="parked_bytes" in view)
+            case "standby" | "parked" if chance < 0.3:
+                person.reacquire(lease)
+            case "standby" | "parked" if chance < 0.4:
+                self.acquire(person)
+            case "standby" | "parked" | "queued" if chance < 0.45:
+                person.cancel(lease)
+            case _:
+                pass
+
+    def resize(self, person: Consumer, lease: LeaseId, charge: int) -> None:
+        size = charge + self.draw.choice([-GIB // 2, GIB // 2])
+        spec = person.specs[lease]
+        if size < max(spec.residue_bytes, GIB // 4):
+            return
+        gpu = self.driver.view(lease)
+        assert gpu is not None
+        if size < charge:
+            person.hold(size, gpu=gpu["gpu"])
+        person.resize(lease, size, residue_bytes=spec.residue_bytes)
+
+    def disturb(self) -> None:
+        chance = self.draw.random()
+        if chance < 0.03:
+            self.restart()
+        elif chance < 0.06:
+            number = self.draw.randrange(len(self.people))
+            self.people[number].die()
+            self.people[number] = self.driver.consumer(f"p{number}")
+        elif chance < 0.08:
+            lease = self.mine(self.draw.choice(self.people))
+            if lease is not None:
+                ops = self.driver.consumer("ops")
+                asked = OperatorAsked(ops.client, self.driver.next_request(), "evict", lease, "ops", "test")
+                self.driver.post(asked)
+        elif chance < 0.1:
+            card = self.draw.choice(list(self.driver.cards.values()))
+            card.failing = "" if card.failing else "probe died"
+
+    def restart(self) -> None:
+        known = {lease: (self.driver.view(lease), owner) for lease, owner in self.leases.items()}
+        tokens = {
+            lease: owner.token(lease)
+            for lease, (view, owner) in known.items()
+            if view is not None and view["token"] is not None
+        }
+        self.driver.restart(epoch=self.driver.settings.epoch + 1)
+        for person in self.people:
+            person.connect()
+        for lease, token in tokens.items():
+            view, owner = known[lease]
+            if view is None or owner not in self.people:
+                continue
+            state = view["state"]
+            away = state in ("standby", "parked", "queued")
+            parked = "parked_bytes" in view and state != "held"
+            if state != "verifying":
+                uses = ["u1"] if view["uses"] else []
+                owner.reattach(
+                    lease,
+                    token,
+                    held=state != "loading",
+                    away=away,
+                    parked=away and parked,
+                    uses=uses,
+                )
+
+    def check(self) -> None:
+        self.driver.arbiter.check_all()
+        for card in self.driver.cards.values():
+            assert sum(card.shown(self.driver.now).values()) <= CAPACITY
+        status = self.driver.arbiter.status(self.driver.now)
+        assert status["host_ram"]["parked_bytes"] == sum(v.get("parked_bytes", 0) for v in status["leases"])
+
+
+def live(seed: int, steps: int) -> tuple[Crowd, collections.Counter[str]]:
+    crowd = Crowd(seed)
+    for _ in range(steps):
+        crowd.disturb()
+        crowd.step(crowd.draw.choice(crowd.people))
+        crowd.driver.advance(crowd.draw.choice([0.01, 0.1, 0.6, 3.0]))
+        crowd.check()
+    for card in crowd.driver.cards.values():
+        card.failing = ""
+    for _ in range(600):
+        waiting = [x for x in crowd.leases if crowd.driver.state(x) == "queued"]
+        if not waiting:
+            break
+        for person in crowd.people:
+            lease = crowd.mine(person)
+            state = None if lease is None else crowd.driver.state(lease)
+            if state in ("loading", "revoking") or (state == "held" and crowd.driver.view(lease)["uses"]):  # type: ignore[arg-type,index]
+                crowd.step(person)
+        crowd.driver.advance(0.3)
+    assert not [x for x in crowd.leases if crowd.driver.state(x) == "queued"], crowd.driver.arbiter.status(
+        crowd.driver.now
+    )
+    kinds = collections.Counter(e.kind for e in crowd.driver.effects if isinstance(e, Note))
+    return crowd, kinds
+
+
+@pytest.mark.parametrize("block", range(4))
+def test_nothing_is_lost_or_granted_twice(block: int) -> None:
+    seen: collections.Counter[str] = collections.Counter()
+    for seed in range(block * 4, block * 4 + 4):
+        seen += live(seed, 120)[1]
+    assert all(seen[kind] for kind in ("standby", "parked", "resized", "granted", "revoke_asked")), seen
