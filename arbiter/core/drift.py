@@ -43,7 +43,7 @@ def on_evidence(core: Core, gpu: Gpu) -> None:
             continue
         if lease.state is LeaseState.LOADING:
             lease.peak_seen_bytes = max(lease.peak_seen_bytes, held)
-        elif lease.state in _RESIDENT:
+        elif lease.state in _RESIDENT and lease.shrink is None:  # else its bytes may still be on the way back
             lease.steady_seen_bytes = max(lease.steady_seen_bytes, held)
             if held > lease.spec.steady_bytes:
                 _note_drift(core, lease, "steady", held)
@@ -97,7 +97,7 @@ def held_bytes(gpu: Gpu, lease: Lease) -> int:
 
 def drift_bytes(core: Core, gpu: Gpu, lease: Lease) -> int:
     """How far a resident lease is above (below: negative) what it declared; within the tolerance it is 0, as where nobody can say."""
-    if lease.state not in _RESIDENT:
+    if lease.state not in _RESIDENT or lease.shrink is not None:
         return 0
     drift = (held_bytes(gpu, lease) or lease.spec.steady_bytes) - lease.spec.steady_bytes
     return drift if abs(drift) > core.settings.verify_tolerance_bytes else 0

@@ -84,6 +84,7 @@ def merge(core: Core, gpu: Gpu, growth: Lease) -> None:
 def begin_shrink(core: Core, gpu: Gpu, lease: Lease, target_bytes: int) -> None:
     """Only readings that begin from now on count: the holder says that the bytes are gone already."""
     lease.shrink = Shrink(target_bytes, core.now, core.now + core.settings.verify_timeout_s)
+    lease.steady_seen_bytes = 0  # what it held was declared then, and is no drift from what is declared now
     core.timers.set(("shrink", lease.id), core.now + core.settings.verify_poll_s[0])
     core.want_sample(gpu, core.now)
 
@@ -140,6 +141,8 @@ def _is_gone(core: Core, gpu: Gpu, lease: Lease, shrink: Shrink, sample: MemoryS
 
 def _tell(core: Core, gpu: Gpu, lease: Lease, changed_bytes: int) -> None:
     charge = gpu.ledger.charge_bytes(lease.id)
+    if lease.measured_bytes is not None:  # its own word, of before
+        lease.measured_bytes = max(0, lease.measured_bytes + changed_bytes)
     core.record_lease(lease)
     token = lease.token
     assert token is not None, f"{lease.id} is resident without a token"

@@ -179,6 +179,8 @@ def _take_over(
     lease.nonce = event.nonce
     core.nonces[lease.process, event.nonce] = lease.id
     lease.spec = spec
+    lease.load_peak_bytes, lease.steady_bytes = drift.expected_bytes(core, spec)
+    core.record_lease(lease)  # still away: if a restart ends the wait, it is this that comes back
     lease.traceparent = event.traceparent
     _call_back(core, lease, event.client, event.request, event.wait_timeout_s, gpus)
 

@@ -460,18 +460,27 @@ class Consumer:
         residue_bytes: int = 0,
         wait_timeout_s: float | None = None,
     ) -> list[Effect]:
-        return self.driver.post(
+        peak = max(load_peak_bytes, steady_bytes)
+        effects = self.driver.post(
             ResizeAsked(
                 self.client,
                 self.driver.next_request(),
                 lease,
                 self.token(lease),
-                max(load_peak_bytes, steady_bytes),
+                peak,
                 steady_bytes,
                 residue_bytes,
                 wait_timeout_s,
             )
         )
+        if any(isinstance(effect, Reply) for effect in effects):  # what it loads from now on
+            self.specs[lease] = replace(
+                self.specs[lease],
+                load_peak_bytes=peak,
+                steady_bytes=steady_bytes,
+                residue_bytes=residue_bytes,
+            )
+        return effects
 
     def oom(self, lease: LeaseId, requested_bytes: int, allocated_bytes: int | None = None) -> list[Effect]:
         return self.driver.post(

@@ -29,6 +29,12 @@ def charge(driver: CoreDriver, lease: LeaseId) -> int:
     return int(view["charge_bytes"])
 
 
+def shown(driver: CoreDriver, lease: LeaseId) -> dict[str, Any]:
+    view = driver.view(lease)
+    assert view is not None
+    return view
+
+
 # -- shrinking -------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("lists", [True, False])
 def test_a_shrink_is_believed_when_the_card_agrees(lists: bool) -> None:
@@ -90,6 +96,58 @@ def test_a_failing_probe_shrinks_nobody() -> None:
     driver.advance(20.0)
     assert charge(driver, lease) == 6 * GIB
     driver.post(MemorySampled(GpuId("nowhere"), driver.now, 0, 1, None))
+
+
+@pytest.mark.parametrize("lists", [True, False])
+def test_what_it_held_before_it_shrank_is_no_drift(lists: bool) -> None:
+    """Regression: it was compared with the new size, noted as drift, and the next load was charged the old one."""
+    driver = CoreDriver(8 * GIB)
+    driver.card.lists_processes = lists
+    driver.card.lag_s = 0.5
+    vlm = driver.consumer("vlm")
+    lease = vlm.acquire(6 * GIB)
+    vlm.load(lease, None if lists else 6 * GIB)
+    driver.advance(2.0)
+    vlm.hold(4 * GIB)
+    vlm.resize(lease, 4 * GIB)
+    driver.advance(0.1)  # a reading that still sees the old bytes
+    assert "drift_bytes" not in shown(driver, lease)
+    driver.until(lambda: charge(driver, lease) == 4 * GIB, limit_s=2.0)
+    driver.advance(2.0)
+    assert "drift_bytes" not in shown(driver, lease)
+    vlm.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    assert not driver.notes("drift")
+    steady = driver.arbiter._core.footprints.p95_bytes("vlm vlm-model", "steady")
+    assert steady in (0, 4 * GIB)
+
+
+def test_a_holder_that_keeps_what_it_said_to_give_back_drifts() -> None:
+    driver = CoreDriver(8 * GIB)
+    vlm, lease = held(driver, "vlm", 6)
+    vlm.resize(lease, 4 * GIB)
+    driver.advance(9.0)
+    assert not driver.notes("drift")
+    driver.advance(3.0)
+    (note,) = driver.notes("drift")
+    assert (note["declared_bytes"], note["measured_bytes"]) == (4 * GIB, 6 * GIB)
+    assert shown(driver, lease)["drift_bytes"] == 2 * GIB
+
+
+@pytest.mark.parametrize("residue", [0, 2 * GIB])
+def test_the_holders_own_word_follows_its_size(residue: int) -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lists_processes = False
+    vlm = driver.consumer("vlm")
+    lease = vlm.acquire(2 * GIB, residue_bytes=residue)
+    vlm.load(lease, GIB if residue else 2 * GIB)
+    driver.advance(2.0)
+    assert answer(vlm.resize(lease, 3 * GIB))["state"] == "growing"
+    assert driver.arbiter._core.leases[lease].measured_bytes == (2 if residue else 3) * GIB
+    vlm.hold(GIB // 2)
+    vlm.resize(lease, GIB // 2)
+    driver.until(lambda: charge(driver, lease) == GIB // 2, limit_s=2.0)
+    assert driver.arbiter._core.leases[lease].measured_bytes == (0 if residue else GIB // 2)
 
 
 def test_one_reading_that_agrees_is_not_enough() -> None:

@@ -389,6 +389,29 @@ def test_a_new_acquire_of_the_same_model_takes_the_lease_over() -> None:
     assert other["lease"]["lease_id"] != lease
 
 
+def test_a_lease_that_was_taken_over_comes_back_as_it_was_asked_for_last() -> None:
+    """Regression: the journal knew the spec of before, so after a restart 2 GiB were granted to a holder that loaded 6."""
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver, gib=2, policy_gib=7)
+    policy.use_begin(wanted)
+    assert det.acquire(6 * GIB, standby=True) == lease
+    assert driver.state(lease) == "queued"
+    away, held = det.token(lease), policy.token(wanted)
+    driver.restart()
+    det.connect()
+    policy.connect()
+    det.reattach(lease, away, away=True)
+    policy.reattach(wanted, held)
+    assert driver.state(lease) == "standby", "the wait ended with the daemon"
+    det.reacquire(lease)
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
+    view = driver.view(lease)
+    assert view is not None
+    assert view["charge_bytes"] == 6 * GIB
+
+
+
 def there_and_back(
     driver: CoreDriver, det: Consumer, lease: LeaseId, policy: Consumer, wanted: LeaseId, nonce: str
 ) -> LeaseId:

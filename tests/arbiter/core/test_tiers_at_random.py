@@ -13,6 +13,7 @@ from schemas.ids import LeaseId
 
 GIB, MIB = d.GIB, d.MIB
 CAPACITY = 8 * GIB
+BUDGET = CAPACITY - d.RESERVE_BYTES
 
 
 class Crowd:
@@ -52,8 +53,12 @@ class Crowd:
         assert view is not None
         chance = self.draw.random()
         match view["state"]:
+            case "loading" if chance < 0.2:  # killed or asked here, it has a part of its bytes already
+                person.hold(person.specs[lease].steady_bytes // 2, gpu=view["gpu"])
             case "loading":
                 person.load(lease)
+            case "held" if "resizing" not in view and self.has_grown(person, lease):
+                person.hold(person.specs[lease].steady_bytes, gpu=view["gpu"])
             case "held" if view["uses"]:
                 person.use_end(lease)
             case "held" if chance < 0.4:
@@ -75,15 +80,21 @@ class Crowd:
             case _:
                 pass
 
+    def has_grown(self, person: Consumer, lease: LeaseId) -> bool:
+        view = self.driver.view(lease)
+        assert view is not None
+        held = self.driver.cards[view["gpu"]].held[person.process]
+        return bool(view["charge_bytes"] >= person.specs[lease].steady_bytes > held)
+
     def resize(self, person: Consumer, lease: LeaseId, charge: int) -> None:
         size = charge + self.draw.choice([-GIB // 2, GIB // 2])
         spec = person.specs[lease]
         if size < max(spec.residue_bytes, GIB // 4):
             return
-        gpu = self.driver.view(lease)
-        assert gpu is not None
+        view = self.driver.view(lease)
+        assert view is not None
         if size < charge:
-            person.hold(size, gpu=gpu["gpu"])
+            person.hold(size, gpu=view["gpu"])
         person.resize(lease, size, residue_bytes=spec.residue_bytes)
 
     def disturb(self) -> None:
@@ -135,7 +146,7 @@ class Crowd:
     def check(self) -> None:
         self.driver.arbiter.check_all()
         for card in self.driver.cards.values():
-            assert sum(card.shown(self.driver.now).values()) <= CAPACITY
+            assert sum(card.shown(self.driver.now).values()) <= BUDGET
         status = self.driver.arbiter.status(self.driver.now)
         assert status["host_ram"]["parked_bytes"] == sum(v.get("parked_bytes", 0) for v in status["leases"])
 
