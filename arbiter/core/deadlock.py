@@ -107,7 +107,7 @@ class _Reduction:
         """May it be served while somebody before it cannot be? As `grants` backfills."""
         if head.spec.exclusive or not self.core.settings.scheduling.backfill:
             return False
-        spare = policy.spare_beside_bytes(gpu, head, everything, planned=True)
+        spare = policy.spare_beside_bytes(gpu, head, everything)
         return policy.added_bytes(gpu, waiter) <= spare
 
     def _blocked(self) -> frozenset[ProcessKey]:

@@ -8,7 +8,8 @@ Per card, in this order (the numbers stand in `_serve`):
   5. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a head for which another card is
      being emptied is passed over from here on
   6. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out already
-  7. backfill: the first waiter behind the head that fits, evicts nobody and cannot delay the head
+  7. backfill: the first waiter behind the head that fits, evicts nobody and cannot delay the head; behind one that waits for bytes
+     nobody can be asked for (a stowaway's), only who fits beside it on the day that they are gone, and may be asked itself
 """
 
 from collections.abc import Mapping
@@ -121,15 +122,27 @@ def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int],
         return
     if gpu.residents.any_in((LeaseState.UNLOADING, LeaseState.VERIFYING)):
         return  # the head's room is about to come; a load now would only be in its way
-    spare = policy.spare_beside_bytes(gpu, head, leaving, planned=planned)
+    if planned:
+        spare, stuck = policy.spare_beside_bytes(gpu, head, leaving), False
+    else:
+        spare, stuck = policy.spare_unplanned_bytes(
+            gpu, head, leaving, lambda lease: policy.passed(gpu, lease, head)
+        )
+        if stuck and policy.residue_under_measurement(gpu):
+            return
     if smallest > spare:
         return
     for lease in gpu.queue.behind_head():
-        if lease is head or lease.gang is not None:
+        if lease is head or lease.gang is not None or (stuck and not _may_be_asked(core, lease)):
             continue
         if policy.added_bytes(gpu, lease) <= spare and policy.fits(gpu, lease):
             _grant_if_measured(core, gpu, lease)
             return
+
+
+def _may_be_asked(core: Core, lease: Lease) -> bool:
+    """Could it be asked to leave once it is resident? If a stowaway gives back a part, the head may need what this one took."""
+    return (lease if lease.grows is None else core.leases[lease.grows]).evictable
 
 
 def grant(core: Core, gpu: Gpu, lease: Lease) -> None:

@@ -247,6 +247,7 @@ class Lease:
     left_for: str = ""  # the consumer that it left for last; it does not come back beside that one
     away_since: float = 0.0
     uncalled: bool = False  # it came back by itself and nobody has used it since
+    returned: bool = False  # it was granted because it came back by itself
     recalled: Recall | None = None  # its holder wants it back before it is gone
     grows: LeaseId | None = None  # it is no lease of its own: that one waits for so many bytes more
     growth: LeaseId | None = None  # who waits for its bytes

@@ -127,10 +127,14 @@ class GpuLedger:
         return account.occupied_bytes() - account.booked_bytes()
 
     def total_if(
-        self, leaving: Mapping[LeaseId, int] = NOTHING, joining: Mapping[ProcessKey, int] = NOBODY
+        self,
+        leaving: Mapping[LeaseId, int] = NOTHING,
+        joining: Mapping[ProcessKey, int] = NOBODY,
+        *,
+        stowaways: bool = True,
     ) -> int:
-        """Total bytes if some leases left (each keeping the residue given) and processes got so many more."""
-        total = self.total_bytes()
+        """Total bytes if some leases left (each keeping the residue given) and processes got so many more, beside stowaways or without."""
+        total = self.total_bytes() if stowaways else self._occupied_bytes
         if not leaving and not joining:
             return total
         by_process: dict[ProcessKey, dict[LeaseId, int]] = {}
@@ -144,7 +148,7 @@ class GpuLedger:
             more_bytes = joining.get(process, 0)
             account = self.accounts.get(process)
             if account is None:
-                stranger = self._stranger_of(process)
+                stranger = self._stranger_of(process) if stowaways else None
                 total += max(0, more_bytes - (stranger.used_bytes if stranger else 0))
                 continue
             total += self._after(account, going, more_bytes) - account.occupied_bytes()

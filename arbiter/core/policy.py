@@ -394,10 +394,42 @@ def _greedy(
     return plan
 
 
-def spare_beside_bytes(gpu: Gpu, head: Lease, going: Mapping[LeaseId, int], *, planned: bool) -> int:
-    """How much a waiter behind the head may take and stay without delaying it.
-
-    Counts what the head's plan frees (`planned`: `going` is enough for it); without a plan, everything that could ever be freed.
-    """
-    freed = going if planned else {**_leave(list(gpu.residents.values())), **going}
+def spare_beside_bytes(gpu: Gpu, head: Lease, freed: Mapping[LeaseId, int]) -> int:
+    """How much a waiter behind the head may take and stay without delaying it, when these leases leave for it and that is enough."""
     return gpu.ledger.budget_bytes - gpu.ledger.total_if(freed, joining(head))
+
+
+def spare_unplanned_bytes(
+    gpu: Gpu, head: Lease, going: Mapping[LeaseId, int], stays: Callable[[Lease], bool]
+) -> tuple[int, bool]:
+    """The same for a head that nothing is planned for; and: does it wait for bytes that nobody can be asked for?
+
+    Everything could leave some day, but for those that took their room while this one stood before them (`stays`). If it would not fit
+    even then, it is served when stowaways go; and if that is not enough either, when processes end that keep a residue. Only what is left
+    beside it on that day may be taken today.
+    """
+    ledger, joins = gpu.ledger, joining(head)
+    everything = _ever_freed(gpu, head, going, None)
+    day = ledger.total_if(everything, joins)
+    stay_bytes = ledger.total_if(_ever_freed(gpu, head, going, stays), joins) - day
+    stuck = day > ledger.budget_bytes
+    if day > ledger.budget_bytes:
+        day = ledger.total_if(everything, joins, stowaways=False)
+    if day > ledger.budget_bytes:
+        day = sum(joins.values())
+    return ledger.budget_bytes - day - stay_bytes, stuck
+
+
+def passed(gpu: Gpu, lease: Lease, head: Lease) -> bool:
+    """Was it granted, or did it grow, while this waiter stood before it?"""
+    overtook = lease.granted_at >= head.arrived_at and gpu.queue.precedes(head, lease)
+    return overtook or bool(lease.resized_at and lease.resized_at >= head.arrived_at)
+
+
+def _ever_freed(
+    gpu: Gpu, head: Lease, going: Mapping[LeaseId, int], stays: Callable[[Lease], bool] | None
+) -> dict[LeaseId, int]:
+    """All but the lease that it grows, and the trees that stay."""
+    roots = {lease.root.id: lease.root for lease in gpu.residents.values()}
+    leave = [lease for lease in roots.values() if lease.id != head.grows and not (stays and stays(lease))]
+    return {**_leave(leave), **going}

@@ -56,6 +56,10 @@ class WaitQueue:
         """Of a queue that is not empty."""
         return self._needs[0]
 
+    def precedes(self, first: Lease, second: Lease) -> bool:
+        """Is, or was, the one before the other? Neither has to wait still."""
+        return self._rank(first) < self._rank(second)
+
     def position(self, lease: Lease) -> int:
         """1 is the head."""
         return bisect_left(self._ranks, self._rank(lease)) + 1

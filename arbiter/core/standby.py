@@ -136,7 +136,7 @@ def queue_again(
 def taken_back(core: Core, lease: Lease) -> bool:
     """The lease is being granted. Did it come back by itself? Then it has waited for nothing, and has no claim to stay yet."""
     lease.comes_back = lease.parks = lease.asked_before = lease.dismissed = False
-    lease.uncalled = core.away.pop(lease.id, None) is not None
+    lease.uncalled = lease.returned = core.away.pop(lease.id, None) is not None
     if lease.uncalled:
         lease.arrived_at = core.now
     return lease.uncalled
@@ -160,7 +160,10 @@ def next_back(core: Core, gpu: Gpu) -> Lease | None:
             core.timers.set(("return", gpu.info.id), due_at)
             return None
         if ahead is None:
-            ahead, spare_bytes = lease, policy.spare_beside_bytes(gpu, lease, {}, planned=False)
+            ahead = lease
+            spare_bytes, _ = policy.spare_unplanned_bytes(
+                gpu, lease, {}, lambda other: _returned_since(ahead, other)
+            )
     return None
 
 
@@ -212,6 +215,11 @@ def _returning(core: Core, gpu: Gpu) -> Iterator[Lease]:
         and gpu.info.id in lease.gpus
         and not _left_for_is_here(gpu, lease)
     )
+
+
+def _returned_since(ahead: Lease, other: Lease) -> bool:
+    """Has it come back while this one was away? It would not be asked to make room for it."""
+    return other.returned and other.granted_at >= ahead.away_since
 
 
 def _left_for_is_here(gpu: Gpu, lease: Lease) -> bool:

@@ -1,0 +1,344 @@
+"""A head that waits for bytes nobody can be asked for (a stowaway's, a context's) holds back only those who would be in its way later."""
+
+import random
+from typing import Any
+
+import pytest
+
+from arbiter.testing.core_driver import Consumer, CoreDriver
+from schemas import defaults as d
+from schemas.ids import LeaseId, ProcessKey
+
+GIB, MIB = d.GIB, d.MIB
+STRANGER = ProcessKey(9, 9)
+
+
+def held(
+    driver: CoreDriver, name: str, gib: float, *, peak_gib: float = 0, **spec: Any
+) -> tuple[Consumer, LeaseId]:
+    person = driver.consumer(name)
+    lease = person.acquire(int(max(peak_gib, gib) * GIB), int(gib * GIB), **spec)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=3.0)
+    person.load(lease)
+    driver.advance(0.01)
+    return person, lease
+
+
+def stowaway(driver: CoreDriver, gib: float) -> None:
+    """Somebody without a lease holds this much from now on; the next background reading shows it."""
+    driver.card.set(STRANGER, int(gib * GIB), driver.now)
+    driver.advance(1.1)
+
+
+def stuck(gib: float = 5, by: float = 4, *, lists: bool = True) -> tuple[CoreDriver, LeaseId]:
+    """A card of 8 GiB (7.6 to give), a stowaway on it, and a head that would fit if it went."""
+    driver = CoreDriver(8 * GIB)
+    driver.card.lists_processes = lists
+    stowaway(driver, by)
+    head = driver.consumer("head").acquire(int(gib * GIB))
+    driver.advance(0.1)
+    assert driver.state(head) == "queued"
+    return driver, head
+
+
+# -- who passes ------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("lists", [True, False])
+def test_small_ones_pass_a_head_that_waits_for_a_stowaway(lists: bool) -> None:
+    """Regression: everybody behind it waited until the stowaway had gone, beside 3.6 GiB that were free."""
+    driver, head = stuck(lists=lists)
+    small, lease = held(driver, "small", 2)
+    small.use_begin(lease)
+    assert driver.state(head) == "queued"
+    stowaway(driver, 0)
+    driver.until(lambda: driver.state(head) == "loading", limit_s=1.0)
+    assert driver.state(lease) == "held", "both fit: nobody had to be asked"
+
+
+def test_what_the_head_will_need_is_kept_for_it() -> None:
+    """5 + 2.5 fit the 7.6 GiB, a second one of 2 GiB would not, though there are free bytes for it now."""
+    driver, head = stuck(by=3)
+    held(driver, "small", 2.5)
+    late = driver.consumer("late").acquire(2 * GIB)
+    driver.advance(5.0)
+    assert driver.state(late) == "queued"
+    stowaway(driver, 0)
+    driver.until(lambda: driver.state(head) == "loading", limit_s=1.0)
+
+
+def test_a_head_that_could_be_served_by_leaves_alone_keeps_its_room() -> None:
+    """It fits beside the stowaway once the holder has gone: what comes back of the stowaway is not counted on."""
+    driver = CoreDriver(8 * GIB)
+    busy, lease = held(driver, "busy", 4, priority=90)
+    busy.use_begin(lease)
+    stowaway(driver, 2)
+    head = driver.consumer("head").acquire(5 * GIB)
+    small = driver.consumer("small").acquire(1 * GIB)
+    driver.advance(5.0)
+    assert driver.state(small) == "queued", "2 + 5 + 1 do not fit"
+    busy.use_end(lease)
+    driver.until(lambda: driver.state(lease) == "revoking", limit_s=1.0)
+    busy.unload(lease)
+    driver.until(lambda: driver.state(head) == "loading", limit_s=1.0)
+
+
+def test_one_that_can_never_be_asked_to_leave_does_not_pass() -> None:
+    """The stowaway may give back a part: enough for the head alone, and then nobody could make room for it."""
+    driver, head = stuck()
+    pinned = driver.consumer("pinned").acquire(2 * GIB, evictable=False)
+    _, other = held(driver, "other", 1)
+    driver.advance(2.0)
+    assert (driver.state(pinned), driver.state(head)) == ("queued", "queued")
+    assert driver.state(other) == "held", "those behind it pass both"
+
+
+def test_a_growth_passes_if_its_lease_may_be_asked() -> None:
+    driver = CoreDriver(8 * GIB)
+    first, lease = held(driver, "first", 1)
+    second, pinned = held(driver, "second", 1, evictable=False)
+    stowaway(driver, 3)
+    head = driver.consumer("head").acquire(5 * GIB)
+    driver.advance(0.1)
+    assert driver.state(head) == "queued"
+    second.resize(pinned, int(1.2 * GIB))
+    first.resize(lease, int(1.2 * GIB))
+    driver.advance(1.0)
+    assert [len(driver.pushes("resized", one)) for one in (lease, pinned)] == [1, 0]
+
+
+def test_nobody_passes_an_exclusive_head_that_waits_for_a_stowaway() -> None:
+    driver = CoreDriver(8 * GIB)
+    stowaway(driver, 4)
+    head = driver.consumer("head").acquire(5 * GIB, exclusive=True)
+    small = driver.consumer("small").acquire(1 * GIB)
+    driver.advance(2.0)
+    assert (driver.state(head), driver.state(small)) == ("queued", "queued")
+
+
+def test_with_no_backfill_nobody_passes() -> None:
+    driver = CoreDriver(8 * GIB, settings={"policy": "no_backfill"})
+    stowaway(driver, 4)
+    driver.consumer("head").acquire(5 * GIB)
+    small = driver.consumer("small").acquire(1 * GIB)
+    driver.advance(2.0)
+    assert driver.state(small) == "queued"
+
+
+# -- the bound on the head's wait ------------------------------------------------------------------------------------
+def test_of_a_stowaway_that_gives_back_a_part_the_head_gets_it_all() -> None:
+    """It fits beside what is left of the stowaway, not beside who passed it: that one is asked."""
+    driver, head = stuck()
+    small, lease = held(driver, "small", 2)
+    stowaway(driver, 2)
+    driver.until(lambda: driver.state(lease) == "revoking", limit_s=1.0)
+    later = driver.consumer("later").acquire(GIB)
+    driver.advance(1.0)
+    assert driver.state(later) == "queued", "nobody passes it any more"
+    small.unload(lease)
+    driver.until(lambda: driver.state(head) == "loading", limit_s=1.0)
+
+
+def test_the_ageing_bound_holds_against_those_who_passed() -> None:
+    """In use and of a higher priority, it is asked when the head has aged to it, counted from the head's arrival."""
+    driver, head = stuck(gib=5)
+    asked_at = driver.now - 0.1 + 10 * driver.settings.ageing_s_per_point
+    late = driver.consumer("small", priority=60)
+    driver.advance(9.0 * driver.settings.ageing_s_per_point)
+    lease = late.acquire(2 * GIB)
+    assert driver.state(lease) == "loading", "it came too late to be before the head"
+    late.load(lease)
+    late.use_begin(lease)
+    stowaway(driver, 2)
+    assert driver.state(lease) == "held"
+    driver.until(lambda: driver.state(lease) == "revoking", limit_s=2 * driver.settings.ageing_s_per_point)
+    assert driver.now == pytest.approx(asked_at, abs=0.1)
+    late.use_end(lease)
+    late.unload(lease)
+    driver.until(lambda: driver.state(head) == "loading", limit_s=1.0)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_whoever_passed_is_in_nobodys_way_when_the_stowaway_is_gone(seed: int) -> None:
+    draw = random.Random(seed)
+    driver = CoreDriver(8 * GIB)
+    keeper, kept = held(driver, "keeper", 1, residue_bytes=draw.choice([0, 300 * MIB]))
+    if draw.random() < 0.5:
+        keeper.unload(kept)
+        driver.until(lambda: driver.state(kept) == "over")
+    stowaway(driver, draw.choice([2.5, 3, 4]))
+    head = driver.consumer("head").acquire(int(draw.choice([5, 5.5, 6]) * GIB), priority=draw.choice([50, 60]))
+    mine: dict[LeaseId, Consumer] = {}
+    for number in range(20):
+        person = driver.consumer(f"p{number}", priority=40)
+        mine[person.acquire(draw.choice([200 * MIB, GIB // 2, GIB, 2 * GIB]))] = person
+        driver.advance(0.3)
+        for lease, owner in mine.items():
+            if driver.state(lease) == "loading":
+                owner.load(lease)
+            elif driver.state(lease) == "held" and not driver.arbiter._core.leases[lease].uses:
+                owner.use_begin(lease)
+    asked = len(driver.notes("revoke_asked"))
+    stowaway(driver, 0)
+    driver.until(lambda: driver.state(head) != "queued" or driver.state(kept) == "revoking", limit_s=2.0)
+    if driver.state(kept) == "revoking":
+        keeper.unload(kept)
+        asked += 1
+    for lease, owner in mine.items():
+        if driver.state(lease) == "loading":
+            owner.load(lease)
+    driver.until(lambda: driver.state(head) == "loading", limit_s=2.0)
+    assert len(driver.notes("revoke_asked")) == asked, "of those who passed nobody is asked"
+    assert any(driver.state(lease) == "held" for lease in mine)
+
+
+# -- residues ----------------------------------------------------------------------------------------------------------
+def test_small_ones_pass_a_head_that_waits_for_a_context() -> None:
+    """7.4 GiB do not fit beside the context of a process that lives on; when it ends, both do."""
+    driver = CoreDriver(8 * GIB)
+    old, lease = held(driver, "old", 2, residue_bytes=500 * MIB)
+    old.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    head = driver.consumer("head").acquire(int(7.4 * GIB))
+    too_big = driver.consumer("big").acquire(GIB)
+    held(driver, "small", 0.2)
+    assert (driver.state(head), driver.state(too_big)) == ("queued", "queued")
+    old.die()
+    driver.until(lambda: driver.state(head) == "loading", limit_s=2.0)
+
+
+def test_while_a_dead_process_s_context_is_measured_nobody_passes() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = 1.0
+    old, lease = held(driver, "old", 2, residue_bytes=500 * MIB)
+    old.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    head = driver.consumer("head").acquire(int(7.4 * GIB))
+    old.die()
+    small = driver.consumer("small").acquire(200 * MIB)
+    driver.until(lambda: driver.state(head) == "loading", limit_s=3.0)
+    assert driver.state(small) == "queued"
+
+
+# -- whose bytes -------------------------------------------------------------------------------------------------------
+def test_bytes_that_the_head_s_own_process_holds_already_do_not_leave() -> None:
+    """It loaded 3 GiB before it asked: they are a part of its 6. Only the other one's bytes are counted on."""
+    driver = CoreDriver(8 * GIB)
+    eager = driver.consumer("eager")
+    eager.hold(3 * GIB)
+    stowaway(driver, 2)
+    head = eager.acquire(6 * GIB)
+    driver.advance(0.1)
+    assert driver.state(head) == "queued"
+    too_big = driver.consumer("big").acquire(2 * GIB)
+    _, small = held(driver, "small", 1.5)
+    driver.advance(1.0)
+    assert (driver.state(too_big), driver.state(small)) == ("queued", "held")
+    stowaway(driver, 0)
+    driver.until(lambda: driver.state(head) == "loading", limit_s=1.0)
+
+
+def test_a_growing_lease_does_not_free_itself() -> None:
+    """Regression: what a waiter behind a growth may take was counted as if the lease that grows left for it."""
+    driver = CoreDriver(8 * GIB)
+    a, grows = held(driver, "a", 3)
+    b, busy = held(driver, "b", 2, priority=90)
+    a.use_begin(grows)
+    b.use_begin(busy)
+    a.resize(grows, 6 * GIB)
+    small = driver.consumer("small").acquire(2 * GIB)
+    driver.advance(1.0)
+    assert driver.state(small) == "queued", "3 + 3 + 2 do not fit, whoever leaves"
+    b.use_end(busy)
+    driver.until(lambda: driver.state(busy) == "revoking", limit_s=1.0)
+    b.unload(busy)
+    driver.until(lambda: bool(driver.pushes("resized", grows)), limit_s=1.0)
+
+
+def away() -> tuple[CoreDriver, list[tuple[Consumer, LeaseId]]]:
+    """Three are on standby, the one that loads with 5 GiB left first, and a stowaway of 4 GiB came as the one went that they left for."""
+    driver = CoreDriver(8 * GIB)
+    people = [held(driver, "large", 4.5, peak_gib=5, standby=True)]
+    people += [held(driver, name, 1.5, standby=True) for name in ("small", "late")]
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(int(7.5 * GIB))
+    for person, lease in people:
+        driver.until(lambda lease=lease: driver.state(lease) == "revoking")  # type: ignore[misc]
+        person.unload(lease)
+        driver.until(lambda lease=lease: driver.state(lease) == "standby")  # type: ignore[misc]
+    driver.until(lambda: driver.state(wanted) == "loading")
+    policy.load(wanted)
+    driver.advance(0.1)
+    driver.card.set(STRANGER, 4 * GIB, driver.now)
+    policy.unload(wanted)  # contested: the stowaway's bytes came as its own went
+    driver.until(lambda: driver.state(wanted) == "over", limit_s=15.0)
+    return driver, people
+
+
+def test_standby_returns_beside_one_that_waits_for_a_stowaway() -> None:
+    """The largest left first. The next returns beside the room that it will have; the last would take that away, for good."""
+    driver, ((large, first), (small, second), (late, third)) = away()
+    driver.until(lambda: driver.state(second) == "loading", limit_s=2.0)
+    small.load(second)
+    small.use_begin(second)
+    driver.advance(3.0)
+    assert (driver.state(first), driver.state(third)) == ("standby", "standby")
+    stowaway(driver, 0)
+    driver.until(lambda: driver.state(first) == "loading", limit_s=2.0)
+    assert (large.driver, late.driver) == (driver, driver)
+
+
+# -- those who passed stay -----------------------------------------------------------------------------------------------
+def unplanned() -> tuple[CoreDriver, Consumer, LeaseId, LeaseId]:
+    """A head of 5 GiB that may not ask the only holder, of 3: in use, of a higher priority."""
+    driver = CoreDriver(8 * GIB)
+    busy, lease = held(driver, "busy", 3, priority=90)
+    busy.use_begin(lease)
+    head = driver.consumer("head").acquire(5 * GIB)
+    return driver, busy, lease, head
+
+
+def test_those_who_passed_are_no_room_for_the_next_to_pass() -> None:
+    """Regression: each fitted beside the head, both together did not, and the head had to ask them."""
+    driver, busy, lease, head = unplanned()
+    held(driver, "first", 2)
+    second = driver.consumer("second").acquire(2 * GIB)
+    driver.advance(3.0)
+    assert driver.state(second) == "queued", "5 + 2 + 2 do not fit"
+    busy.use_end(lease)
+    busy.unload(lease)
+    driver.until(lambda: driver.state(head) == "loading", limit_s=1.0)
+    assert {note["lease_id"] for note in driver.notes("revoke_asked")} == {lease}
+
+
+def test_one_that_was_there_before_the_head_did_not_pass_it() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, low = held(driver, "low", 2, priority=10, min_residency_s=10.0)
+    driver.advance(0.1)
+    head = driver.consumer("head").acquire(6 * GIB)
+    _, small = held(driver, "small", 1.5)
+    assert (driver.state(low), driver.state(head), driver.state(small)) == ("held", "queued", "held")
+
+
+def test_a_sub_lease_of_one_that_was_there_did_not_pass() -> None:
+    """It has its bytes from its parent, who was there before."""
+    driver = CoreDriver(8 * GIB)
+    runner = driver.consumer("runner", priority=90)
+    root = runner.acquire(3 * GIB)
+    runner.ready(root)  # a reservation: it holds nothing itself
+    runner.use_begin(root)
+    driver.advance(0.1)
+    head = driver.consumer("head").acquire(5 * GIB)
+    child = driver.consumer("child")
+    carved = child.acquire(2 * GIB, parent=(root, runner.token(root)))
+    child.load(carved)
+    _, small = held(driver, "small", 2)
+    assert (driver.state(head), driver.state(small)) == ("queued", "held")
+
+
+def test_what_grew_while_the_head_stood_before_it_stays() -> None:
+    driver, busy, lease, head = unplanned()
+    driver.advance(0.1)
+    busy.resize(lease, int(3.5 * GIB))
+    driver.until(lambda: bool(driver.pushes("resized", lease)), limit_s=1.0)
+    small = driver.consumer("small").acquire(GIB)
+    driver.advance(2.0)
+    assert (driver.state(small), driver.state(head)) == ("queued", "queued")
