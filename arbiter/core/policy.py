@@ -260,9 +260,14 @@ def is_best_place(core: Core, gpu: Gpu, waiter: Lease, plan: Sequence[Lease]) ->
     best, best_cost = gpu, _cost(plan, gpu.info.index)
     for gpu_id in waiter.gpus:
         other = core.gpus[gpu_id]
-        if other is gpu or other.queue.head() is not waiter or blocked(core, other):
+        if other is gpu or other.queue.head() is not waiter:
             continue
         going = leaving(other)
+        if (patience_ends_at := _load_ends_by(core, other)) > core.now and fits(other, waiter, going):
+            core.timers.set(("plan", gpu.info.id), patience_ends_at)
+            return False  # it is the next there, once somebody has loaded
+        if blocked(core, other):
+            continue
         if fits(other, waiter, going):
             return False  # room comes there anyway
         rival = choose_victims(core, other, waiter, going)
@@ -272,6 +277,14 @@ def is_best_place(core: Core, gpu: Gpu, waiter: Lease, plan: Sequence[Lease]) ->
         return True
     core.wake(best)
     return False
+
+
+def _load_ends_by(core: Core, gpu: Gpu) -> float:
+    """Until when a load is waited for, rather than emptying another card, if it is all that keeps this one from granting; else 0."""
+    loading = gpu.in_state(LeaseState.LOADING)
+    if not loading or gpu.failed_at is not None or gpu.sample is None or gpu.gang is not None or gpu.pressed:
+        return 0.0
+    return loading[0].granted_at + core.settings.revoke_deadline_s
 
 
 def _cost(plan: Sequence[Lease], index: int) -> tuple[int, int, int, int, int]:

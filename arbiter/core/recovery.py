@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from arbiter.core import drift, eviction, explain, families, gangs, operators, standby
+from arbiter.core import drift, eviction, explain, families, gangs, operators, placement, standby
 from arbiter.core.events import MemorySampled, Reattached, ReattachedLease, Recovered, Spec
 from arbiter.core.lease import AWAY, EXPIRING, Lease, LeaseState, Order, Use
 from arbiter.core.ledger import process_bytes
@@ -54,17 +54,16 @@ def on_recovered(core: Core, event: Recovered) -> None:
 def _restore_away(core: Core, record: Mapping[str, Any]) -> None:
     """A lease that is away holds nothing on a card: nobody waits for its holder, but it does not come back before him either."""
     lease = _remembered(core, record, LeaseState(str(record["state"])))
-    lease.gpus = tuple(gpu.info.id for gpu in _selected(core, lease.spec))
+    lease.gpus = tuple(gpu.info.id for gpu in placement.selected(core, lease.spec))
+    if not lease.gpus:  # the only card that it may come back to is gone
+        core.forget(f"lease:{lease.id}")
+        return
     core.add(lease)
     core.nonces[lease.process, lease.nonce] = lease.id
     lease.away_since = core.now
     core.away[lease.id] = lease
     core.host.find(lease.id, int(record.get("parked_bytes", 0)))
     core.timers.set(("ttl", lease.id), core.now + lease.spec.ttl_s + core.settings.fence_grace_s)
-
-
-def _selected(core: Core, spec: Spec) -> list[Gpu]:
-    return [gpu for gpu in core.gpus.values() if spec.gpu in ("any", gpu.info.id, str(gpu.info.index))]
 
 
 def _remembered(core: Core, record: Mapping[str, Any], state: LeaseState) -> Lease:
@@ -283,7 +282,7 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
     """The journal does not know this lease but its token is of an earlier epoch: its holder is believed while recovering."""
     if core.recovering is None or item.token.epoch >= core.settings.epoch:
         raise Refused("lease_lost", f"{item.lease} is not known", "unload, then acquire again")
-    gpus = _selected(core, item.spec)
+    gpus = placement.selected(core, item.spec)
     if not gpus:
         raise Refused("unknown_gpu", f"there is no GPU {item.spec.gpu!r}", "unload, then acquire again")
     gpu = max(gpus, key=lambda gpu: (_seen_bytes(gpu, client.process), -gpu.info.index))

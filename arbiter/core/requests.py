@@ -6,7 +6,7 @@ anyone who knows the exact token.
 
 from dataclasses import replace
 
-from arbiter.core import costs, drift, eviction, explain, families, gangs, growth, standby
+from arbiter.core import costs, drift, eviction, explain, families, gangs, growth, placement, standby
 from arbiter.core.events import (
     AcquireRequested,
     CancelRequested,
@@ -19,7 +19,7 @@ from arbiter.core.events import (
     Spec,
     UnloadStarted,
 )
-from arbiter.core.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState, Recall, Use
+from arbiter.core.lease import AWAY, EXPIRING, Lease, LeaseState, Recall, Use
 from arbiter.core.measure import begin_for_lease
 from arbiter.core.state import Client, Core, Ended, Refused
 from schemas.ids import ClientId, GpuId, LeaseId, RequestId, Token
@@ -107,7 +107,7 @@ def acquire(core: Core, event: AcquireRequested) -> None:
     if spec.gang is not None:
         gangs.check(core, *spec.gang)
     try:
-        gpus = _places(core, spec, load_peak)
+        gpus = placement.places(core, spec, load_peak)
     except Refused as refused:
         if spec.gang is not None:
             gangs.left_out(core, spec.gang[0], refused.message)
@@ -209,7 +209,7 @@ def reacquire(core: Core, event: Reacquired) -> None:
             "not_permitted", f"{lease.id} belongs to process {lease.process.pid}", "ask as its holder"
         )
     if lease.state in AWAY:
-        gpus = _places(core, lease.spec, drift.expected_bytes(core, lease.spec)[0])
+        gpus = placement.places(core, lease.spec, drift.expected_bytes(core, lease.spec)[0])
         check_waiters(core)
         _call_back(core, lease, event.client, event.request, event.wait_timeout_s, gpus)
         return
@@ -246,53 +246,6 @@ def find_again(core: Core, event: AcquireRequested, client: Client) -> bool:
     state = str(lease.state) if lease.state in (LeaseState.QUEUED, *AWAY) else "loading"
     core.reply(event.client, event.request, {"state": state, "lease": explain.view(core, lease)})
     return True
-
-
-def _places(core: Core, spec: Spec, load_peak: int) -> tuple[GpuId, ...]:
-    """The cards that this spec may ever be placed on."""
-    if spec.gpu == "any":
-        gpus = list(core.gpus.values())
-    else:
-        gpus = [gpu for gpu in core.gpus.values() if spec.gpu in (gpu.info.id, str(gpu.info.index))]
-    if not gpus:
-        raise Refused(
-            "unknown_gpu",
-            f"there is no GPU {spec.gpu!r}",
-            "give an uuid, an index or `any`",
-            known=[gpu.info.id for gpu in core.gpus.values()],
-        )
-    largest = max(gpus, key=lambda gpu: (gpu.ledger.budget_bytes, -gpu.info.index))
-    able: list[GpuId] = []
-    pinned: dict[str, list[dict[str, object]]] = {}
-    for gpu in gpus:
-        pinned_trees = {lease.root.id: lease.root for lease in gpu.residents.pinned.values()}
-        pins = [
-            lease for root in pinned_trees.values() for lease in root.tree() if lease.state not in LEAVING
-        ]
-        pinned[gpu.info.id] = [
-            {"lease_id": p.id, "consumer": p.spec.consumer, "bytes": gpu.ledger.charge_bytes(p.id)}
-            for p in pins
-        ]
-        fixed = sum(gpu.ledger.charge_bytes(lease.id) for lease in pins)
-        alone = not pins or not (spec.exclusive or any(lease.spec.exclusive for lease in pins))
-        if alone and load_peak + fixed <= gpu.ledger.budget_bytes:
-            able.append(gpu.info.id)
-    if not able:
-        raised = load_peak > max(spec.load_peak_bytes, spec.steady_bytes, spec.residue_bytes)
-        learnt = f" ({spec.load_peak_bytes} declared, more was measured)" if raised else ""
-        raise Refused(
-            "vram_insufficient",
-            f"{spec.consumer} needs {load_peak} bytes{learnt}; the card has {largest.info.capacity_bytes} "
-            f"less a reserve of {largest.info.reserve_bytes}"
-            + (", and pinned leases" if any(pinned.values()) else ""),
-            "use a smaller model or a lower precision, or unpin what is resident",
-            needed_bytes=load_peak,
-            declared_bytes=spec.load_peak_bytes,
-            capacity_bytes=largest.info.capacity_bytes,
-            reserve_bytes=largest.info.reserve_bytes,
-            pinned=pinned[largest.info.id],
-        )
-    return tuple(able)
 
 
 def cancel(core: Core, event: CancelRequested) -> None:

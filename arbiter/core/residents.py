@@ -22,6 +22,8 @@ class Residents(dict[LeaseId, Lease]):
         self.exclusive: dict[LeaseId, Lease] = {}
         self.pinned: dict[LeaseId, Lease] = {}
         """Never asked to leave, by their own wish or an operator's."""
+        self.unpinned = False
+        """A pin has ended, and nobody has looked whose place that makes this card (`placement`)."""
         self.recent: dict[LeaseId, Lease] = {}
         """All that were granted or became ready since the newest reading began, and perhaps some more."""
         self.touched: set[LeaseId] = set()
@@ -51,6 +53,7 @@ class Residents(dict[LeaseId, Lease]):
             return None
         super().__delitem__(lease_id)
         lease.roster = None
+        self.unpinned = self.unpinned or lease_id in self.pinned
         for table in (self._by_state[lease.state], self.exclusive, self.pinned, self.recent):
             table.pop(lease_id, None)
         self.touched.add(lease_id)
@@ -66,7 +69,7 @@ class Residents(dict[LeaseId, Lease]):
     def refresh(self, lease: Lease) -> None:
         """Whether it may be asked to leave has changed."""
         if lease.evictable:
-            self.pinned.pop(lease.id, None)
+            self.unpinned = self.pinned.pop(lease.id, None) is not None or self.unpinned
         else:
             self.pinned[lease.id] = lease
 

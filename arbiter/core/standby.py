@@ -7,8 +7,9 @@ Chooses who comes back; the grant itself is in `grants`. Must not know clients o
 """
 
 from collections.abc import Iterator
+from functools import partial
 
-from arbiter.core import drift, policy
+from arbiter.core import drift, placement, policy
 from arbiter.core.lease import AWAY, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 from schemas.ids import ClientId, ModelKey, ProcessKey, RequestId
@@ -46,6 +47,7 @@ def settle(core: Core, lease: Lease, verdict: str) -> None:
     lease.move(next_state(lease), core.now, verdict)
     lease.gpu = lease.baseline = lease.eviction = lease.measured_bytes = lease.request = None
     lease.load_peak_bytes, lease.steady_bytes = drift.expected_bytes(core, lease.spec)
+    lease.gpus = tuple(gpu.info.id for gpu in placement.selected(core, lease.spec))
     lease.evicted = []
     lease.answered = True
     enter(core, lease)
@@ -161,9 +163,7 @@ def next_back(core: Core, gpu: Gpu) -> Lease | None:
             return None
         if ahead is None:
             ahead = lease
-            spare_bytes, _ = policy.spare_unplanned_bytes(
-                gpu, lease, {}, lambda other: _returned_since(ahead, other)
-            )
+            spare_bytes, _ = policy.spare_unplanned_bytes(gpu, lease, {}, partial(_returned_since, lease))
     return None
 
 
@@ -213,6 +213,7 @@ def _returning(core: Core, gpu: Gpu) -> Iterator[Lease]:
         if lease.comes_back
         and lease.attached
         and gpu.info.id in lease.gpus
+        and lease.load_peak_bytes <= gpu.ledger.budget_bytes
         and not _left_for_is_here(gpu, lease)
     )
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from arbiter.core.events import ProcessDied
 from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
 from schemas import defaults as d
 from schemas.ids import GpuId, LeaseId
@@ -211,6 +212,200 @@ def test_a_leave_that_was_not_enough_frees_its_waiter_for_another_card() -> None
     assert driver.state(waiter) == "queued"
 
 
+# -- at once, and without asking -------------------------------------------------------------------------------------
+def test_what_fits_on_the_other_card_goes_there_and_nobody_is_asked() -> None:
+    """The first card could be emptied, its holder is idle; the second is free."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    _, idle = held(driver, "idle", 6, gpu="0", priority=1)
+    lease = driver.consumer("w").acquire(6 * GIB)
+    assert (driver.state(lease), card(driver, lease)) == ("loading", ONE)
+    assert driver.state(idle) == "held"
+    assert not driver.notes("revoke_asked")
+
+
+def test_while_somebody_loads_where_it_fits_nobody_is_asked_elsewhere() -> None:
+    """Regression: the idle holder of the first card was thrown out for the seconds that a load on the second took."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    _, idle = held(driver, "idle", 6, gpu="0")
+    loads = driver.consumer("loads")
+    loading = loads.acquire(1 * GIB, gpu="1")
+    lease = driver.consumer("w").acquire(6 * GIB)
+    driver.advance(5.0)
+    assert (driver.state(idle), driver.state(lease)) == ("held", "queued")
+    loads.load(loading)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
+    assert card(driver, lease) == ONE
+    assert not driver.notes("revoke_asked")
+
+
+def test_a_load_without_end_is_not_waited_for_for_ever() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    holder, idle = held(driver, "idle", 6, gpu="0")
+    stuck = driver.consumer("stuck").acquire(1 * GIB, gpu="1")
+    lease = driver.consumer("w").acquire(6 * GIB)
+    deadline_s = driver.settings.revoke_deadline_s
+    driver.until(lambda: driver.state(idle) == "revoking", limit_s=deadline_s + 0.1)
+    holder.unload(idle)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
+    assert (card(driver, lease), driver.state(stuck)) == (ZERO, "loading")
+
+
+def test_one_that_names_its_card_waits_for_it_beside_an_empty_one() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    busy, lease = held(driver, "busy", 6, gpu="1", priority=90)
+    busy.use_begin(lease)
+    waiter = driver.consumer("w").acquire(6 * GIB, gpu="GPU-1")
+    driver.advance(30.0)
+    assert (driver.state(waiter), driver.gpu(0)["charged_bytes"]) == ("queued", 0)
+    assert driver.view(waiter)["position"] == 1  # type: ignore[index]
+    busy.use_end(lease)
+    busy.unload(lease)
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
+    assert card(driver, waiter) == ONE
+
+
+# -- order and ageing ------------------------------------------------------------------------------------------------
+def test_whoever_came_first_is_first_on_every_card() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    people = [held(driver, f"busy{n}", 6, gpu=str(n), priority=90) for n in (0, 1)]
+    for person, lease in people:
+        person.use_begin(lease)
+    first = driver.consumer("first").acquire(6 * GIB)
+    second = driver.consumer("second").acquire(6 * GIB)
+    higher = driver.consumer("higher").acquire(6 * GIB, priority=60, gpu="1")
+    driver.advance(0.1)
+    assert [driver.view(lease)["position"] for lease in (first, second, higher)] == [1, 2, 1]  # type: ignore[index]
+    for person, lease in people:
+        person.use_end(lease)
+        person.unload(lease)
+    driver.until(lambda: "loading" in {driver.state(first), driver.state(second)}, limit_s=1.0)
+    driver.until(lambda: driver.state(higher) == "loading", limit_s=1.0)
+    assert (card(driver, first), card(driver, higher), driver.state(second)) == (ZERO, ONE, "queued")
+
+
+def test_a_waiter_for_any_card_ages_on_all_of_them() -> None:
+    """Both holders are in use and above it; it is let to ask the lower one first, when it has aged to that."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    leases = []
+    for index, priority in ((0, 56), (1, 54)):
+        person, lease = held(driver, f"busy{index}", 6, gpu=str(index), priority=priority)
+        person.use_begin(lease)
+        leases.append(lease)
+    waiter = driver.consumer("w").acquire(6 * GIB, priority=50)
+    step_s = driver.settings.ageing_s_per_point
+    driver.advance(4 * step_s - 0.1)
+    assert [driver.state(lease) for lease in leases] == ["held", "held"]
+    driver.advance(0.2)
+    assert [driver.state(lease) for lease in leases] == ["held", "revoking"]
+    driver.advance(3 * step_s)
+    assert [driver.state(lease) for lease in leases] == ["held", "revoking"], "one card is enough"
+    assert driver.state(waiter) == "queued"
+
+
+def test_a_newcomer_of_higher_priority_overtakes_on_its_card_only_until_the_other_has_aged() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    busy, lease = held(driver, "busy", 6, gpu="1", priority=99)
+    busy.use_begin(lease)
+    _, fills = held(driver, "fills", 6, gpu="0", evictable=False)
+    old = driver.consumer("old").acquire(5 * GIB, priority=50)
+    driver.advance(11 * driver.settings.ageing_s_per_point)
+    young = driver.consumer("young").acquire(5 * GIB, priority=60, gpu="1")
+    busy.use_end(lease)
+    busy.unload(lease)
+    driver.until(lambda: driver.state(old) == "loading", limit_s=1.0)
+    assert (card(driver, old), driver.state(young), driver.state(fills)) == (ONE, "queued", "held")
+
+
+# -- gangs -----------------------------------------------------------------------------------------------------------
+def test_a_gang_behind_a_head_that_is_placed_elsewhere_is_served() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    busy, lease = held(driver, "busy", 6, gpu="0", priority=10)
+    there, used = held(driver, "there", 3, gpu="1", priority=90)
+    there.use_begin(used)
+    busy.use_begin(lease)
+    head = driver.consumer("head").acquire(6 * GIB, gpu="any")
+    assert (driver.state(head), driver.state(lease)) == ("queued", "revoking")
+    members = [
+        driver.consumer(f"m{n}").acquire(2 * GIB, gpu="1", gang=("pair", 2), priority=40) for n in (0, 1)
+    ]
+    driver.until(lambda: driver.state(members[0]) == "loading", limit_s=1.0)
+    assert [card(driver, member) for member in members] == [ONE, ONE]
+
+
+def test_a_gang_over_two_cards_waits_for_both_of_which_one_cannot_be_read() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    driver.cards[ONE].failing = "NVML_ERROR_GPU_IS_LOST"
+    driver.advance(1.5)
+    members = [driver.consumer(f"m{n}").acquire(6 * GIB, gpu=str(n), gang=("pair", 2)) for n in (0, 1)]
+    driver.advance(10.0)
+    assert [driver.state(member) for member in members] == ["queued", "queued"]
+    assert driver.gpu(0)["charged_bytes"] == 0, "nothing is kept for half a gang"
+    driver.cards[ONE].failing = ""
+    driver.until(lambda: [driver.state(m) for m in members] == ["loading", "loading"], limit_s=2.0)
+
+
+# -- standby ---------------------------------------------------------------------------------------------------------
+def on_standby(driver: CoreDriver, selector: str) -> tuple[Consumer, LeaseId]:
+    """A detector that left card 0 for a policy which is there now; card 1 is in use, and by nobody who may be asked."""
+    filler, fills = held(driver, "filler", 6, gpu="1", evictable=False)
+    det, lease = held(driver, "det", 5, gpu=selector, standby=True)
+    assert card(driver, lease) == ZERO
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(5 * GIB, gpu="0")
+    det.unload(lease)
+    driver.until(lambda: driver.state(wanted) == "loading")
+    policy.load(wanted)
+    policy.use_begin(wanted)
+    driver.advance(1.0)
+    assert driver.state(lease) == "standby"
+    filler.unload(fills)
+    driver.until(lambda: driver.state(fills) == "over")
+    return det, lease
+
+
+@pytest.mark.parametrize(("selector", "wanted"), [("any", ONE), ("0", None), ("GPU-0", None)])
+def test_standby_returns_to_the_cards_that_its_selector_names(selector: str, wanted: GpuId | None) -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    det, lease = on_standby(driver, selector)
+    driver.advance(10.0)
+    assert card(driver, lease) == wanted
+    policy = next(iter(driver.arbiter._core.gpus[ZERO].residents.values()))
+    if wanted is None:
+        driver.post(ProcessDied(policy.process))
+        for one in driver.cards.values():
+            one.set(policy.process, 0, driver.now)
+        driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
+        assert card(driver, lease) == ZERO
+    det.load(lease)
+    assert driver.state(lease) == "held"
+
+
+def test_a_waiter_for_one_card_keeps_nobody_from_returning_to_another() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    _, lease = on_standby(driver, "any")
+    waiter = driver.consumer("w").acquire(5 * GIB, gpu="0", priority=10)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
+    assert (card(driver, lease), driver.state(waiter)) == (ONE, "queued")
+
+
+def test_standby_does_not_return_to_a_card_that_cannot_be_read() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    filler, fills = held(driver, "filler", 6, gpu="1", evictable=False)
+    det, lease = held(driver, "det", 5, standby=True)
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(5 * GIB, gpu="0")
+    det.unload(lease)
+    driver.until(lambda: driver.state(wanted) == "loading")
+    policy.load(wanted)
+    filler.unload(fills)
+    driver.cards[ONE].failing = "NVML_ERROR_GPU_IS_LOST"
+    driver.advance(20.0)
+    assert driver.state(lease) == "standby"
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
+    assert card(driver, lease) == ZERO
+
+
 # -- cards that fail, drains -----------------------------------------------------------------------------------------
 def test_a_card_that_cannot_be_read_blocks_itself_only() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
@@ -224,6 +419,33 @@ def test_a_card_that_cannot_be_read_blocks_itself_only() -> None:
     assert driver.state(there) == "queued"
     driver.cards[ZERO].failing = ""
     driver.until(lambda: driver.state(there) == "loading", limit_s=2.0)
+
+
+def test_a_card_whose_reading_hangs_blocks_itself_only() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    driver.cards[ONE].silent = True
+    driver.advance(5.0)
+    there = driver.consumer("there").acquire(5 * GIB, gpu="1")
+    here = driver.consumer("here").acquire(5 * GIB)
+    driver.advance(5.0)
+    assert (driver.state(there), driver.state(here), card(driver, here)) == ("queued", "loading", ZERO)
+
+
+def test_a_card_that_is_lost_keeps_its_leases_and_the_others_go_on() -> None:
+    """Unplugged in the middle: what was held there stays charged there, and whoever may go elsewhere does."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    _, b = held(driver, "b", 5, gpu="1")
+    a, freed = held(driver, "a", 5, gpu="0")
+    driver.cards[ONE].failing = "NVML_ERROR_GPU_IS_LOST"
+    driver.advance(1.5)
+    waiter = driver.consumer("w").acquire(5 * GIB)
+    assert (driver.state(freed), driver.state(b)) == ("revoking", "held"), (
+        "it is made room on the card that lives"
+    )
+    a.unload(freed)
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
+    assert card(driver, waiter) == ZERO
+    assert driver.gpu(1)["charged_bytes"] == 5 * GIB
 
 
 def test_pressure_on_one_card_asks_nobody_on_another() -> None:

@@ -411,7 +411,6 @@ def test_a_lease_that_was_taken_over_comes_back_as_it_was_asked_for_last() -> No
     assert view["charge_bytes"] == 6 * GIB
 
 
-
 def there_and_back(
     driver: CoreDriver, det: Consumer, lease: LeaseId, policy: Consumer, wanted: LeaseId, nonce: str
 ) -> LeaseId:

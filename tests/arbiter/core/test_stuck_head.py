@@ -165,7 +165,9 @@ def test_whoever_passed_is_in_nobodys_way_when_the_stowaway_is_gone(seed: int) -
         keeper.unload(kept)
         driver.until(lambda: driver.state(kept) == "over")
     stowaway(driver, draw.choice([2.5, 3, 4]))
-    head = driver.consumer("head").acquire(int(draw.choice([5, 5.5, 6]) * GIB), priority=draw.choice([50, 60]))
+    head = driver.consumer("head").acquire(
+        int(draw.choice([5, 5.5, 6]) * GIB), priority=draw.choice([50, 60])
+    )
     mine: dict[LeaseId, Consumer] = {}
     for number in range(20):
         person = driver.consumer(f"p{number}", priority=40)
