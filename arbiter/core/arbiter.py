@@ -13,6 +13,7 @@
 It must not know how effects are performed, nor that a wire exists.
 """
 
+from collections.abc import Set
 from typing import Any
 
 from arbiter.core import (
@@ -116,17 +117,17 @@ class Arbiter:
         """What models really took, in the shape of `Settings.footprints`."""
         return self._core.footprints.kept()
 
-    def owners(self, gpu: GpuId) -> frozenset[ProcessKey]:
+    def owners(self, gpu: GpuId) -> Set[ProcessKey]:
         """Processes with an account on a card: they hold a lease there, one of theirs is measured away, or they keep a residue.
 
-        Empty for an unknown card.
+        Empty for an unknown card. As it is at that moment: it changes with the next event.
         """
         known = self._core.gpus.get(gpu)
-        return frozenset() if known is None else frozenset(known.ledger.accounts)
+        return frozenset() if known is None else known.ledger.accounts.keys()
 
-    def clients(self) -> frozenset[ProcessKey]:
-        """Processes with a connection, observers too."""
-        return frozenset(client.process for client in self._core.clients.values())
+    def clients(self) -> Set[ProcessKey]:
+        """Processes with a connection, observers too. As it is at that moment."""
+        return self._core.connected.keys()
 
     def _happened(self, event: Event) -> None:
         core = self._core

@@ -16,8 +16,7 @@ from schemas.ids import LeaseId
 def abandon(core: Core, lease: Lease, why: str) -> None:
     """The resize under way is off: the lease leaves, or wants another size."""
     if lease.shrink is not None:
-        lease.shrink = None
-        core.timers.clear(("shrink", lease.id))
+        _shrinks_no_more(core, core.gpu_of(lease), lease)
     if lease.growth is not None:
         growth = core.leases[lease.growth]
         lease.growth = None
@@ -85,6 +84,7 @@ def begin_shrink(core: Core, gpu: Gpu, lease: Lease, target_bytes: int) -> None:
     """Only readings that begin from now on count: the holder says that the bytes are gone already."""
     lease.shrink = Shrink(target_bytes, core.now, core.now + core.settings.verify_timeout_s)
     lease.steady_seen_bytes = 0  # what it held was declared then, and is no drift from what is declared now
+    gpu.shrinking[lease.id] = lease
     core.timers.set(("shrink", lease.id), core.now + core.settings.verify_poll_s[0])
     core.want_sample(gpu, core.now)
 
@@ -96,7 +96,7 @@ def on_shrink_due(core: Core, lease_id: str) -> None:
     assert shrink is not None, f"{lease_id} has a timer and does not shrink"
     gpu = core.gpu_of(lease)
     if core.now >= shrink.deadline_at:
-        lease.shrink = None
+        _shrinks_no_more(core, gpu, lease)
         lease.steady_bytes = gpu.ledger.charge_bytes(lease.id)
         _tell(core, gpu, lease, 0)
         return
@@ -109,9 +109,10 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
     gpu = core.gpus.get(sample.gpu)
     if gpu is None or gpu.sample is not sample:
         return
-    for lease in gpu.in_state(LeaseState.HELD, LeaseState.REVOKING):
+    for lease in list(gpu.shrinking.values()):
         shrink = lease.shrink
-        if shrink is None or sample.taken_at <= shrink.asked_at:
+        assert shrink is not None, f"{lease.id} is listed and does not shrink"
+        if sample.taken_at <= shrink.asked_at:
             continue
         if not _is_gone(core, gpu, lease, shrink, sample):
             shrink.agreed = False
@@ -119,12 +120,17 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
             shrink.agreed = True
         else:
             before = gpu.ledger.charge_bytes(lease.id)
-            lease.shrink = None
-            core.timers.clear(("shrink", lease.id))
+            _shrinks_no_more(core, gpu, lease)
             gpu.ledger.recharge(lease.id, shrink.target_bytes, core.now)
             gpu.changed_at = core.now
             core.wake(gpu)
             _tell(core, gpu, lease, shrink.target_bytes - before)
+
+
+def _shrinks_no_more(core: Core, gpu: Gpu, lease: Lease) -> None:
+    lease.shrink = None
+    del gpu.shrinking[lease.id]
+    core.timers.clear(("shrink", lease.id))
 
 
 def _is_gone(core: Core, gpu: Gpu, lease: Lease, shrink: Shrink, sample: MemorySampled) -> bool:

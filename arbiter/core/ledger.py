@@ -42,6 +42,7 @@ class Account:
     charged_bytes: int = 0  # kept sums over the charges
     charged_approved_bytes: int = 0
     counted_bytes: int = 0  # what the ledger's own sums hold of this account
+    counted_booked_bytes: int = 0
     counted_approved_bytes: int = 0
 
     def booked_bytes(self) -> int:
@@ -83,6 +84,7 @@ class GpuLedger:
         self.touched: set[LeaseId] = set()  # charged or dropped since the invariants were checked last
         self._owner: dict[LeaseId, ProcessKey] = {}
         self._occupied_bytes = 0  # kept sums over accounts and strangers
+        self._booked_bytes = 0
         self._approved_bytes = 0
         self._strangers_bytes = 0
 
@@ -96,7 +98,7 @@ class GpuLedger:
 
     def booked_bytes(self) -> int:
         """Sum over processes of what was granted or is kept, without any evidence."""
-        return sum(account.booked_bytes() for account in self.accounts.values())
+        return self._booked_bytes
 
     def approved_bytes(self) -> int:
         """Sum of what fitted when it was granted."""
@@ -204,9 +206,10 @@ class GpuLedger:
             approved = sum(charge.approved_bytes for charge in account.charges.values())
             if (booked, approved) != (account.charged_bytes, account.charged_approved_bytes):
                 return f"{process} is charged {booked} ({approved}), kept as {account.charged_bytes} ({account.charged_approved_bytes})"
-        kept = (self._occupied_bytes, self._approved_bytes, self._strangers_bytes)
+        kept = (self._occupied_bytes, self._booked_bytes, self._approved_bytes, self._strangers_bytes)
         counted = (
             sum(account.occupied_bytes() for account in self.accounts.values()),
+            sum(account.booked_bytes() for account in self.accounts.values()),
             sum(account.approved_bytes() for account in self.accounts.values()),
             sum(stranger.used_bytes for stranger in self.strangers.values()),
         )
@@ -297,6 +300,8 @@ class GpuLedger:
     def observe(self, sample: MemorySampled, *, quiet: bool) -> None:
         """Take evidence from a reading. `quiet`: nobody loads or unloads, so the unexplained rest means something."""
         self._observe(sample, quiet=quiet)
+        if sample.processes is None:  # it says nothing of anybody
+            return
         for account in self.accounts.values():
             self._count(account)
         self._count_strangers()
@@ -377,10 +382,14 @@ class GpuLedger:
 
     def _count(self, account: Account) -> None:
         """Bring the ledger's sums up to date with one account."""
-        occupied, approved = account.occupied_bytes(), account.approved_bytes()
+        residue = account.residue_bytes
+        booked, approved = max(account.charged_bytes, residue), max(account.charged_approved_bytes, residue)
+        occupied = max(booked, account.measured_bytes)
         self._occupied_bytes += occupied - account.counted_bytes
+        self._booked_bytes += booked - account.counted_booked_bytes
         self._approved_bytes += approved - account.counted_approved_bytes
         account.counted_bytes, account.counted_approved_bytes = occupied, approved
+        account.counted_booked_bytes = booked
 
     def _count_strangers(self) -> None:
         self._strangers_bytes = sum(stranger.used_bytes for stranger in self.strangers.values())

@@ -33,8 +33,9 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
         core.note("probe_ok", gpu=gpu.info.id)
     known = {stranger.process: stranger.used_bytes for stranger in gpu.ledger.strangers.values()}
     gpu.ledger.observe(sample, quiet=gpu.quiet() and sample.taken_at > gpu.changed_at)
-    drift.on_evidence(core, gpu)
-    _note_stowaways(core, gpu, known)
+    if sample.processes is not None:
+        drift.on_evidence(core, gpu)
+        _note_stowaways(core, gpu, known)
     _shrink_residues(core, gpu, sample)
     for verification in list(gpu.verifications.values()):
         if sample.taken_at > verification.confirmed_at:
@@ -103,14 +104,13 @@ def _shrink_residues(core: Core, gpu: Gpu, sample: MemorySampled) -> None:
     if sample.processes is None:
         return
     tolerance = core.settings.verify_tolerance_bytes
-    connected = {client.process for client in core.clients.values()}
     waiting_for = {verification.process for verification in gpu.verifications.values()}
     for account in list(gpu.ledger.accounts.values()):
         process = account.process
         if account.charges or process in waiting_for or sample.taken_at <= account.changed_at:
             continue
         floor = account.residue_floor_bytes
-        if not account.measured_bytes and process not in connected and core.recovering is None:
+        if not account.measured_bytes and process not in core.connected and core.recovering is None:
             floor = 0
         target = max(floor, account.measured_bytes)
         if target + tolerance < account.residue_bytes:
@@ -279,9 +279,8 @@ def _grown_by_right(gpu: Gpu, verification: Verification, sample: MemorySampled)
         )
     return sum(
         gpu.ledger.charge_bytes(lease.id)
-        for lease in gpu.residents.values()
+        for lease in gpu.residents.filling(baseline.taken_at)
         if lease.process != verification.process
-        and (lease.state is LeaseState.LOADING or lease.ready_at > baseline.taken_at)
     )
 
 

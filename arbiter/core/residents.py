@@ -5,7 +5,7 @@ changes (`Lease.move` tells its `roster`), so that a decision and the invariants
 Knows nothing of bytes or order. Every change must come through `[id] = lease`, `del [id]` or `pop`; `disagreement` finds what did not.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 from arbiter.core.lease import Lease, LeaseState
 from schemas.ids import LeaseId
@@ -89,6 +89,17 @@ class Residents(dict[LeaseId, Lease]):
     def unseen(self, taken_at: float) -> list[Lease]:
         """Granted or become ready after a reading began (the newest, or one after it): it cannot have seen them."""
         return [lease for lease in self.recent.values() if _after(lease, taken_at)]
+
+    def filling(self, since: float) -> Iterator[Lease]:
+        """Who loads, or became ready after that moment. Leases are held in the order in which they became ready."""
+        for lease in reversed(self._by_state[LeaseState.HELD].values()):
+            if lease.ready_at <= since:
+                break
+            yield lease
+        yield from self._by_state[LeaseState.LOADING].values()
+        for lease in self.in_state(LeaseState.REVOKING, LeaseState.UNLOADING, LeaseState.VERIFYING):
+            if lease.ready_at > since:
+                yield lease
 
     def disagreement(self) -> str:
         """Where the sub-tables and the leases disagree; "" if nowhere. Looks at everybody: for tests."""

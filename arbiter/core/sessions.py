@@ -25,7 +25,7 @@ def on_connected(core: Core, event: ClientConnected) -> None:
     earlier = core.instances.get(instance)
     if earlier is not None:
         _take_over(core, earlier, event.client)
-    core.clients[event.client] = Client(event.client, event.process, event.name, event.instance)
+    core.join(Client(event.client, event.process, event.name, event.instance))
     core.instances[instance] = event.client
     core.last_client_at = core.now
     for gpu in core.gpus.values():
@@ -35,7 +35,7 @@ def on_connected(core: Core, event: ClientConnected) -> None:
 
 def _take_over(core: Core, earlier: ClientId, client: ClientId) -> None:
     """However often somebody reconnects, only its newest connection is remembered."""
-    del core.clients[earlier]
+    core.part(earlier)
     mine = core.leases_of_client(earlier)
     for lease in _concerned(core, mine):
         for table in (lease.uses, lease.yielded):
@@ -47,7 +47,7 @@ def _take_over(core: Core, earlier: ClientId, client: ClientId) -> None:
 
 
 def _forget(core: Core, client: Client) -> None:
-    del core.clients[client.id]
+    core.part(client.id)
     core.instances.pop((client.process, client.instance), None)
 
 

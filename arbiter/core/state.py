@@ -3,7 +3,7 @@
 Data and bookkeeping only: no decision is taken here.
 """
 
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass, field
 from statistics import median
@@ -100,6 +100,9 @@ class Gpu:
     gang: Gang | None = None  # it is loading here
     estates: dict[LeaseId, Lease] = field(default_factory=dict)  # leases that sub-leases were carved out of
     debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
+    shrinking: dict[LeaseId, Lease] = field(
+        default_factory=dict
+    )  # a measurement of theirs is awaited (`growth`)
 
     def in_state(self, *states: LeaseState) -> list[Lease]:
         return self.residents.in_state(*states)
@@ -135,6 +138,7 @@ class Core:
         self.host = HostRam(settings.host_ram_budget_bytes)
         self.nonces: dict[tuple[ProcessKey, str], LeaseId] = {}
         self.clients: dict[ClientId, Client] = {}
+        self.connected: dict[ProcessKey, int] = {}  # connections of each process
         self.instances: dict[tuple[ProcessKey, str], ClientId] = {}  # the connection of each client object
         self.ended: OrderedDict[LeaseId, Ended] = OrderedDict()
         self.timers = Timers()
@@ -233,6 +237,18 @@ class Core:
         """Something changed that a waiter of this card may have waited for."""
         gpu.dirty = True
 
+    def join(self, client: Client) -> None:
+        """A connection begins."""
+        self.clients[client.id] = client
+        self.connected[client.process] = self.connected.get(client.process, 0) + 1
+
+    def part(self, client: ClientId) -> None:
+        """A connection is over."""
+        process = self.clients.pop(client).process
+        self.connected[process] -= 1
+        if not self.connected[process]:
+            del self.connected[process]
+
     def add(self, lease: Lease) -> None:
         """A lease begins to live."""
         self.leases[lease.id] = lease
@@ -262,7 +278,13 @@ class Core:
                 lease.client,
             ):
                 return f"{lease.id} is not listed under its process and its client"
-        return f"{sorted({**by_process, **by_client})} are listed and gone" if by_process or by_client else ""
+        if by_process or by_client:
+            return f"{sorted({**by_process, **by_client})} are listed and gone"
+        shrinking = {lease.id for lease in self.leases.values() if lease.shrink is not None}
+        if shrinking != {lease_id for gpu in self.gpus.values() for lease_id in gpu.shrinking}:
+            return f"{sorted(shrinking)} shrink, others are listed"
+        counted = Counter(client.process for client in self.clients.values())
+        return "" if counted == self.connected else f"{counted} are connected, kept as {self.connected}"
 
     def leases_of(self, process: ProcessKey) -> list[Lease]:
         """Live leases of a process, oldest first."""
@@ -320,6 +342,7 @@ class Core:
         if lease.gpu is not None:
             gpu = self.gpus[lease.gpu]
             gpu.residents.pop(lease.id, None)
+            gpu.shrinking.pop(lease.id, None)
             self.wake(gpu)
         elif lease.token is not None:  # it was resident once: the journal knows it as away
             self.forget(f"lease:{lease.id}")

@@ -4,7 +4,7 @@ In two halves: `Lineages` reads ancestors from /proc and may block (a probe's th
 moment (the loop's thread). Must not decide anything about leases: it only says which process a reading's bytes belong to.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,8 +35,16 @@ Lineage = tuple[Kin, ...]
 class Known:
     """Who an arbiter knows of: processes with an account on the card in question, and processes with a connection."""
 
-    owners: frozenset[ProcessKey]
-    clients: frozenset[ProcessKey]
+    owners: Set[ProcessKey]
+    clients: Set[ProcessKey]
+
+    def independent(self, process: ProcessKey) -> bool:
+        """Does it keep its own bytes? One that is listed by its pid alone (start time 0) is whoever has that pid."""
+        if process in self.owners or process in self.clients:
+            return True
+        return process.start_ticks == 0 and any(
+            known.pid == process.pid for some in (self.owners, self.clients) for known in some
+        )
 
 
 NOBODY = Known(frozenset(), frozenset())
@@ -99,13 +107,9 @@ def on_owners(
     """
     booked: dict[ProcessKey, ProcessUse] = {}
     children: dict[ProcessKey, list[str]] = {}
-    independent = known.owners | known.clients
-    independent |= {
-        ProcessKey(process.pid, 0) for process in independent
-    }  # as who is only known by pid is listed
     for use in processes:
         owner = None
-        if use.process not in independent:
+        if not known.independent(use.process):
             owner = next((kin for kin in lineages.get(use.process, ()) if kin.process in known.owners), None)
         target = use if owner is None else ProcessUse(owner.process, owner.name, use.used_bytes)
         if owner is not None:

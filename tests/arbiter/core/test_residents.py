@@ -46,3 +46,19 @@ def test_a_reading_sees_what_happened_before_it_began() -> None:
     assert residents.unseen(5.0) == [two]
     residents.seen(5.0)
     assert list(residents.recent) == [two.id]
+
+
+def test_who_fills_the_card_since_a_moment() -> None:
+    """Loads now, or became ready later, whatever it does since; whoever was ready before is not even looked at."""
+    residents, (one, two, three, four) = crowd(4)
+    for at, lease in enumerate((one, two, three, four)):
+        lease.ready_at = float(at)
+    at = 1
+    three.move(LeaseState.REVOKING, at + 9.0, "asked")
+    one.move(LeaseState.REVOKING, at + 9.0, "asked")
+    assert [lease.id for lease in residents.filling(at)] == [four.id, three.id]
+    assert list(residents.filling(four.ready_at)) == []
+    assert {lease.id for lease in residents.filling(-1.0)} == {one.id, two.id, three.id, four.id}
+    four.state = LeaseState.LOADING
+    residents.moved(four, LeaseState.HELD)
+    assert list(residents.filling(four.ready_at)) == [four]

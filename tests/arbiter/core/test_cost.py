@@ -1,0 +1,109 @@
+"""What an event costs does not grow with those whom it does not concern: counted in instructions, which no neighbour disturbs."""
+
+import sys
+from types import FrameType
+from typing import Any
+
+import pytest
+
+from arbiter.core import events as ev
+from arbiter.core.arbiter import Arbiter
+from arbiter.core.effects import Effect, Reply
+from arbiter.core.settings import GpuInfo, Settings
+from schemas import defaults as d
+from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, RequestId, Token
+
+CARD = GpuId("GPU-0")
+FEW, MANY = 5, 500
+SIZE = 4096
+
+
+class Counted:
+    """A core with some leases and as many connections that nothing happens to, and the instructions that each event took."""
+
+    def __init__(self, leases: int, *, listed: bool) -> None:
+        gpu = GpuInfo(CARD, 0, "card", d.GIB, 0)
+        self.core = Arbiter(Settings(epoch=1, gpus=(gpu,), leases_per_client_max=MANY), 0.0)
+        self.listed = listed
+        self.now = 1.0
+        self.requests = 0
+        for number in range(leases):
+            self.hello(ClientId(f"idle{number}"), ProcessKey(100, 1), f"i{number}")
+        self.tell(self.reading())
+        for _ in range(leases):
+            self.load(self.acquire(ClientId("idle0")), ClientId("idle0"))
+        self.hello(ClientId("busy"), ProcessKey(200, 1), "busy")
+        self.count = 0
+
+    def tell(self, event: ev.Event) -> list[Effect]:
+        self.now += 0.01
+        return self.core.handle(event, self.now)
+
+    def counted(self, event: ev.Event) -> int:
+        self.count = 0
+        sys.settrace(self._trace)
+        try:
+            self.tell(event)
+        finally:
+            sys.settrace(None)
+        return self.count
+
+    def _trace(self, frame: FrameType, event: str, _: Any) -> Any:
+        frame.f_trace_opcodes = True
+        self.count += event == "opcode"
+        return self._trace
+
+    def request(self) -> RequestId:
+        self.requests += 1
+        return RequestId(self.requests)
+
+    def reading(self) -> ev.MemorySampled:
+        return ev.MemorySampled(CARD, self.now, 0, d.GIB, () if self.listed else None)
+
+    def hello(self, client: ClientId, process: ProcessKey, instance: str) -> None:
+        self.tell(ev.ClientConnected(client, process, 0, str(client), instance))
+
+    def asking(self, client: ClientId) -> ev.AcquireRequested:
+        spec = ev.Spec(
+            consumer="small", key=ModelKey("m"), gpu="any", exclusive=False, load_peak_bytes=SIZE, steady_bytes=SIZE,
+            residue_bytes=0, priority=50, evictable=True, ttl_s=1e9, min_residency_s=0.0, deny_on_deadline=False,
+        )  # fmt: skip
+        return ev.AcquireRequested(client, self.request(), f"n{self.requests}", spec, None)
+
+    def acquire(self, client: ClientId) -> tuple[LeaseId, Token]:
+        effects = self.tell(self.asking(client))
+        lease = next(effect for effect in effects if isinstance(effect, Reply)).body["lease"]
+        assert lease["state"] == "loading"
+        return LeaseId(lease["lease_id"]), Token(*lease["token"])
+
+    def load(self, lease: tuple[LeaseId, Token], client: ClientId) -> None:
+        self.tell(ev.ReadyReported(client, self.request(), *lease, None))
+        self.tell(self.reading())
+
+    def cycle(self) -> dict[str, int]:
+        """One client's lease from acquire to the verdict, and a quiet reading."""
+        client = ClientId("busy")
+        found = {"acquire": self.counted(self.asking(client))}
+        lease = max(self.core._core.leases.values(), key=lambda lease: lease.arrival)
+        assert lease.token is not None
+        one = (lease.id, lease.token)
+        found["ready"] = self.counted(ev.ReadyReported(client, self.request(), *one, None))
+        found["renew"] = self.counted(ev.Renewed(client, self.request(), (one,)))
+        found["release"] = self.counted(ev.ReleaseReported(client, self.request(), *one, exiting=False))
+        found["tick"] = self.counted(ev.Tick())
+        found["first reading"] = self.counted(self.reading())
+        self.tell(ev.Tick())
+        found["verdict"] = self.counted(self.reading())
+        assert lease.id not in self.core._core.leases
+        found["quiet reading"] = self.counted(self.reading())
+        return found
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_no_event_costs_more_beside_a_hundred_times_as_many_leases_and_connections(listed: bool) -> None:
+    few, many = Counted(FEW, listed=listed), Counted(MANY, listed=listed)
+    few.cycle()
+    many.cycle()
+    before, after = few.cycle(), many.cycle()
+    grown = {name: (before[name], after[name]) for name in before if after[name] > 1.1 * before[name]}
+    assert not grown, f"instructions with {FEW} and with {MANY}"
