@@ -5,6 +5,7 @@ from statistics import median
 from typing import Any
 
 from arbiter.core import drift, gangs, outlook, policy, standby
+from arbiter.core.blockers import ago, gib, named, uses, who_blocks
 from arbiter.core.lease import AWAY, LEAVING, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 
@@ -168,8 +169,7 @@ def _with_plan(core: Core, lease: Lease) -> dict[str, Any]:
     told = explain_lease(core, lease)
     told["plan"] = []
     if lease.state is LeaseState.QUEUED:
-        gpu = core.gpus[lease.planned_gpu or lease.gpus[0]]
-        told["plan"] = plan = outlook.steps(core, gpu, lease)
+        told["plan"] = plan = outlook.steps(core, _card(core, lease), lease)
         if told["eta_s"] is None and (eta := _eta_of_plan(core, lease, plan)) is not None:
             told["eta_s"], told["eta_source"] = eta, "learnt"
     return told
@@ -177,7 +177,7 @@ def _with_plan(core: Core, lease: Lease) -> dict[str, Any]:
 
 def _eta_of_plan(core: Core, waiter: Lease, plan: Sequence[dict[str, Any]]) -> float | None:
     """Seconds until it is loaded if everybody who is to be asked takes as long as usual. None: never seen, or nothing planned."""
-    load = core.learnt_s(waiter.spec.consumer, "load_s")
+    load = _load_s(core, _card(core, waiter), waiter)
     ends: list[float] = []
     for step in plan:
         if step["action"] == "ask":
@@ -191,21 +191,23 @@ def _eta_of_plan(core: Core, waiter: Lease, plan: Sequence[dict[str, Any]]) -> f
 
 def explain_lease(core: Core, lease: Lease) -> dict[str, Any]:
     """One lease: what it needs, who stands in its way on which condition, what happens next and when."""
-    gpu = core.gpus[lease.gpu or lease.planned_gpu or lease.gpus[0]]
+    gpu = _card(core, lease)
     free = gpu.ledger.budget_bytes - gpu.ledger.total_bytes()
     if lease.state is not LeaseState.QUEUED:
         return _explain_resident(core, gpu, lease, free)
-    added = policy.added_bytes(gpu, lease)
+    waiter, kept = gangs.as_waiter(gpu, lease), gangs.kept_bytes(gpu, lease)
+    free += kept
+    added = lease.load_peak_bytes if kept else policy.added_bytes(gpu, waiter)
     deficit = max(0, added - free)
-    blockers = _blockers(core, gpu, lease, deficit)
-    position = _best_position(core, lease)
+    blockers = who_blocks(core, gpu, waiter, deficit)
+    position = _place(core, lease)
     condition, then = _condition(core, gpu, lease, blockers, position)
-    eta = _eta(core, gpu, lease)
-    head = f"{lease.spec.consumer} needs {_gib(added)}, {_gib(max(0, free))} are free" + (
-        f", {_gib(deficit)} are missing" if deficit else ""
-    )
+    eta = _eta(core, gpu, lease, waiter)
+    together = f" with gang {lease.gang.name}" if lease.gang is not None and waiter.needs is not None else ""
+    head = f"{lease.spec.consumer}{together} needs {gib(added)}, {gib(max(0, free))} are free{' or kept for it' if kept else ''}"
+    head += f", {gib(deficit)} are missing" if deficit else ""
     if lease.load_peak_bytes > (declared := lease.spec.load_peak_bytes):
-        head += f" ({_gib(declared)} declared, {_gib(lease.load_peak_bytes)} learnt)"
+        head += f" ({gib(declared)} declared, {gib(lease.load_peak_bytes)} learnt)"
     return {
         "lease_id": lease.id,
         "state": str(lease.state),
@@ -223,30 +225,49 @@ def explain_lease(core: Core, lease: Lease) -> dict[str, Any]:
     }
 
 
+def _card(core: Core, lease: Lease) -> Gpu:
+    """Where it is, where room is made for it, or the first on which it may be placed."""
+    return core.gpus[lease.gpu or gangs.planned_on(lease) or lease.planned_gpu or lease.gpus[0]]
+
+
+def _place(core: Core, lease: Lease) -> int:
+    """Its place in the queue; a gang has the place of its foremost member."""
+    if lease.gang is None or lease.gang.phase != "waiting":
+        return _best_position(core, lease)
+    return min(_best_position(core, member) for member in lease.gang.waiting())
+
+
 def wait_reason(core: Core, lease: Lease) -> str:
     """Why a waiter waits, in words. Short for those who stand behind others: only the head has blockers of its own."""
-    position = _best_position(core, lease)
+    position = _place(core, lease)
     if position > 1:
         return _behind(core, lease, position)
     return str(explain_lease(core, lease)["text"])
 
 
 def _behind(core: Core, lease: Lease, position: int) -> str:
-    ahead = core.gpus[lease.planned_gpu or lease.gpus[0]].queue.ahead_of(lease)
-    return f"waits behind {core.waiting[ahead].spec.consumer if ahead else 'others'} as number {position}"
+    foremost, who = lease, "waits"
+    if lease.gang is not None:
+        foremost = min(lease.gang.waiting(), key=lambda member: _best_position(core, member))
+        who = f"waits as one of gang {lease.gang.name}"
+    ahead = _card(core, foremost).queue.ahead_of(foremost)
+    return f"{who} behind {core.waiting[ahead].spec.consumer if ahead else 'others'} as number {position}"
 
 
 def _explain_resident(core: Core, gpu: Gpu, lease: Lease, free: int) -> dict[str, Any]:
     says = {
         LeaseState.LOADING: "it was granted and is loading",
-        LeaseState.HELD: f"it is resident, {_uses(lease)}",
-        LeaseState.REVOKING: f"it was asked to leave for {_wanted_by(lease)}, {_uses(lease)}",
+        LeaseState.HELD: f"it is resident, {uses(lease)}",
+        LeaseState.REVOKING: f"it was asked to leave for {_wanted_by(lease)}, {uses(lease)}",
         LeaseState.UNLOADING: "it is unloading",
         LeaseState.VERIFYING: "it let go; its bytes are being measured",
     }.get(lease.state) or standby.outlook(core, lease)
+    says += _family(gpu, lease)
+    if lease.gang is not None:
+        says += f"; {gangs.unfinished(lease.gang, lease)}"
     if drift.drift_bytes(core, gpu, lease):
         held = drift.held_bytes(gpu, lease)
-        says += f"; it holds {_gib(held)}, {_gib(lease.spec.steady_bytes)} were declared"
+        says += f"; it holds {gib(held)}, {gib(lease.spec.steady_bytes)} were declared"
     return {
         "lease_id": lease.id,
         "state": str(lease.state),
@@ -264,78 +285,6 @@ def _explain_resident(core: Core, gpu: Gpu, lease: Lease, free: int) -> dict[str
     }
 
 
-def _blockers(core: Core, gpu: Gpu, waiter: Lease, deficit: int) -> list[dict[str, Any]]:
-    """Everybody who holds bytes that the waiter lacks, or holds the card alone."""
-    alone = waiter.spec.exclusive or any(lease.spec.exclusive for lease in gpu.residents.values())
-    if not deficit and not alone and not any(gpu.in_state(LeaseState.LOADING)):
-        return []
-    holders = [
-        {
-            "lease_id": lease.id,
-            "consumer": lease.spec.consumer,
-            "bytes": gpu.ledger.charge_bytes(lease.id),
-            "state": str(lease.state),
-            "uses": len(lease.uses),
-            "condition": _holder_condition(core, waiter, lease),
-        }
-        for lease in gpu.residents.values()
-    ]
-    return holders + _keepers(core, gpu, waiter)
-
-
-def _keepers(core: Core, gpu: Gpu, waiter: Lease) -> list[dict[str, Any]]:
-    """Processes without a resident lease that hold bytes all the same: contexts of live processes, debts, stowaways."""
-    keepers = {
-        account.process: account.booked_bytes()
-        for account in gpu.ledger.accounts.values()
-        if account.process != waiter.process and gpu.residents.keys().isdisjoint(account.charges)
-    }
-    names = {client.process: client.name for client in core.clients.values()} if keepers else {}
-    kept = [
-        (names.get(process, f"pid {process.pid}"), count, "residue", "keeps its context until it exits")
-        for process, count in keepers.items()
-    ]
-    kept += [
-        (s.name or f"pid {s.process.pid}", s.used_bytes, "stowaway", "holds bytes without a lease")
-        for s in gpu.ledger.strangers.values()
-        if s.process.pid != waiter.process.pid
-    ]
-    return [
-        {
-            "lease_id": None,
-            "consumer": name,
-            "bytes": count,
-            "state": state,
-            "uses": 0,
-            "condition": condition,
-        }
-        for name, count, state, condition in kept
-    ]
-
-
-def _holder_condition(core: Core, waiter: Lease, holder: Lease) -> str:
-    if holder.state is LeaseState.LOADING:
-        return "is loading"
-    if holder.state in LEAVING:
-        return {
-            LeaseState.REVOKING: f"was asked to leave {_ago(core, holder)}, {_uses(holder)}",
-            LeaseState.UNLOADING: "is unloading",
-            LeaseState.VERIFYING: "let go, its bytes are being measured",
-        }[holder.state]
-    if not holder.root.may_leave:
-        return f"is pinned by {holder.pinned}" if holder.pinned else "is pinned"
-    root = holder.root
-    ends_at = policy.residency_ends_at(core, root, waiter)
-    if ends_at > core.now:
-        stretched = ends_at > root.ready_at + root.spec.min_residency_s
-        why = "they keep throwing each other out" if stretched else "minimum residency"
-        return f"may stay {ends_at - core.now:.1f} s more ({why})"
-    priority = waiter.priority_at(core.now, core.settings.ageing_s_per_point)
-    if root.in_use and root.spec.priority > priority:
-        return f"is in use and has priority {root.spec.priority}, the waiter {priority}"
-    return "is in use" if root.in_use else "is idle and may be asked"
-
-
 def _condition(
     core: Core, gpu: Gpu, lease: Lease, blockers: Sequence[dict[str, Any]], position: int
 ) -> tuple[str, str]:
@@ -343,6 +292,7 @@ def _condition(
     if lease.gang is not None and position <= 1:
         return f"gang {lease.gang.phase}", gangs.outlook(lease.gang, lease)
     leaving = [other for other in gpu.residents.values() if other.state in LEAVING]
+    leaving.sort(key=lambda other: bool(other.children))
     if position > 1:
         return "queued", _behind(core, lease, position)
     if leaving and lease.planned_gpu == gpu.info.id:
@@ -361,23 +311,38 @@ def _condition(
 
 
 def _leaving_next(core: Core, gpu: Gpu, holder: Lease) -> str:
-    charge = _gib(gpu.ledger.charge_bytes(holder.id))
+    charge = gib(gpu.ledger.charge_bytes(holder.id))
     name = holder.spec.consumer
+    if holder.state is LeaseState.REVOKING and holder.children:
+        return f"then {name} leaves with {charge}, once {named(holder.children)} has"
     if holder.state is LeaseState.REVOKING and holder.busy_uses():
         running = holder.busy_uses()
         plural = "use" if running == 1 else "uses"
         return (
-            f"waits for {name} to finish {running} {plural} (asked {_ago(core, holder)}), "
+            f"waits for {name} to finish {running} {plural} (asked {ago(core, holder)}), "
             f"then it unloads and {charge} are verified"
         )
     if holder.state is LeaseState.REVOKING:
-        return f"waits for {name} to unload (asked {_ago(core, holder)}), then {charge} are verified"
+        return f"waits for {name} to unload (asked {ago(core, holder)}), then {charge} are verified"
     if holder.state is LeaseState.UNLOADING:
         return f"{name} unloads, then {charge} are verified"
     return f"{charge} of {name} are being verified"
 
 
-def _eta(core: Core, gpu: Gpu, lease: Lease) -> float | None:
+def _load_s(core: Core, gpu: Gpu, lease: Lease) -> float | None:
+    """How long its load usually takes; of a gang's member with those who load before it on its card. None: never seen, or not all have come."""
+    first = [lease]
+    if lease.gang is not None:
+        if lease.gang.phase == "gathering":
+            return None
+        mine = [one for one in lease.gang.members if one.state is not LeaseState.HELD]
+        first = [one for one in mine[: mine.index(lease) + 1] if _card(core, one) is gpu]
+    times = [core.learnt_s(one.spec.consumer, "load_s") for one in first]
+    known = [seconds for seconds in times if seconds is not None]
+    return sum(known) if len(known) == len(times) else None
+
+
+def _eta(core: Core, gpu: Gpu, lease: Lease, waiter: Lease) -> float | None:
     """Seconds until it is loaded, from learnt medians. None if anything on the way was never seen."""
     slowest = 0.0
     for holder in gpu.residents.values():
@@ -393,8 +358,9 @@ def _eta(core: Core, gpu: Gpu, lease: Lease) -> float | None:
         if len(known) < len(times):
             return None
         slowest = max(slowest, sum(known) - (core.now - holder.since))
-    load = core.learnt_s(lease.spec.consumer, "load_s")
-    if load is None or (not slowest and not policy.fits(gpu, lease)):
+    load = _load_s(core, gpu, lease)
+    kept = lease.id in gpu.ledger.reserved
+    if load is None or (not slowest and not kept and not policy.fits(gpu, waiter)):
         return None
     return max(0.0, slowest) + load
 
@@ -407,25 +373,24 @@ def medians(core: Core) -> dict[str, dict[str, float]]:
     }
 
 
-def _uses(lease: Lease) -> str:
-    paused = f", {len(lease.yielded)} paused" if lease.yielded else ""
-    running = f"{len(lease.uses)} use{'' if len(lease.uses) == 1 else 's'} running" if lease.uses else "idle"
-    return running + paused
+def _family(gpu: Gpu, lease: Lease) -> str:
+    """What it was carved out of and what it lends, in words."""
+    says = ""
+    if lease.parent is not None:
+        says += f"; it was carved out of {named([lease.parent])}"
+        if lease.state is LeaseState.VERIFYING and lease.parent.state not in LEAVING:
+            says += ", which has its bytes back then"
+    if lease.children:
+        lent = sum(gpu.ledger.charge_bytes(member.id) for member in lease.tree() if member is not lease)
+        says += f"; it lends {gib(lent)} to {named(lease.children)}"
+        says += ", who leave first" if lease.state in LEAVING else ""
+    return says
 
 
 def _wanted_by(lease: Lease) -> str:
     if lease.departing:
         return "its own wish, once its sub-leases have left"
     return (lease.eviction.wanted_consumer if lease.eviction else "") or "relief of pressure"
-
-
-def _ago(core: Core, holder: Lease) -> str:
-    asked_at = holder.eviction.asked_at if holder.eviction else holder.since
-    return f"{core.now - asked_at:.1f} s ago"
-
-
-def _gib(count: int) -> str:
-    return f"{count / 2**30:.2f} GiB"
 
 
 # -- switch --------------------------------------------------------------------------------------------------------------

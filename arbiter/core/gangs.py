@@ -402,6 +402,31 @@ def _say(some: Iterable[Lease], reason: str) -> None:
         lease.reason = reason
 
 
+# -- telling -----------------------------------------------------------------------------------------------------------
+def planned_on(lease: Lease) -> GpuId | None:
+    """The card on which room is being made for this member."""
+    planned = {} if lease.gang is None else lease.gang.planned
+    return next((gpu_id for gpu_id, some in planned.items() if lease in some), None)
+
+
+def as_waiter(gpu: Gpu, lease: Lease) -> Lease:
+    """Itself; of a gang that waits, all that are to come to this card, or may come to no other, as one."""
+    gang = lease.gang
+    if gang is None or gang.phase != "waiting":
+        return lease
+    planned = gang.planned.get(gpu.info.id, [])
+    some = [one for one in gang.waiting() if one in planned]
+    alone = (gpu.info.id,)
+    return _bundle(gang, some or [one for one in gang.waiting() if one is lease or one.gpus == alone])
+
+
+def kept_bytes(gpu: Gpu, lease: Lease) -> int:
+    """What is charged already for a member that waits for its turn, with the headroom of who loads next."""
+    if lease.gang is None or lease.id not in gpu.ledger.reserved:
+        return 0
+    return _approved(gpu, lease.id) + _approved(gpu, lease.gang.headroom_id)
+
+
 def outlook(gang: Gang, lease: Lease) -> str:
     """What a member waits for, in words."""
     if gang.phase == "gathering":
@@ -412,6 +437,17 @@ def outlook(gang: Gang, lease: Lease) -> str:
             or f"its bytes are kept for it; it loads when those of gang {gang.name} before it are ready"
         )
     return f"waits as one of gang {gang.name}: {lease.reason or 'behind others'}"
+
+
+def unfinished(gang: Gang, lease: Lease) -> str:
+    """What a granted member's gang still lacks, in words."""
+    others = [one for one in gang.members if one is not lease and one.state is not LeaseState.HELD]
+    lacks = [f"{one.spec.consumer} ({one.id}) is {one.state}" for one in others]
+    missing = gang.size - len(gang.members)
+    lacks += [f"{missing} of {gang.size} have to come back"] if missing else []
+    return f"gang {gang.name} is complete once {'all are' if lacks else 'it is'} held" + (
+        f": {', '.join(lacks)}" if lacks else ""
+    )
 
 
 def unsound(core: Core) -> str:

@@ -6,8 +6,8 @@ Not on the path of a decision: looking ahead costs a search for victims per inst
 
 from typing import Any
 
-from arbiter.core import policy
-from arbiter.core.lease import LEAVING, Lease, LeaseState
+from arbiter.core import gangs, policy
+from arbiter.core.lease import LEAVING, Gang, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 
 LOOKED_AT_MAX = 16
@@ -18,12 +18,41 @@ type Step = dict[str, Any]
 
 def steps(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
     """For a queued lease, the nearest first; what has no instant comes last."""
-    alone = waiter.gang is None and gpu.queue.position(waiter) == 1  # a gang is told by its own phase
-    found = _of_head(core, gpu, waiter) if alone else []
+    gang = waiter.gang
+    if gang is not None and gang.phase != "waiting":
+        found = _of_gang(core, gpu, gang)
+    else:
+        foremost = gangs.as_waiter(gpu, waiter)
+        first = policy.front(core, gpu)
+        mine = first is not None and (first is waiter or (gang is not None and first.gang is gang))
+        found = _of_head(core, gpu, foremost) if mine else []
     if waiter.wait_timeout_s is not None:
         at = waiter.arrived_at + waiter.wait_timeout_s
         found.append(_step(core, "give_up", waiter, at, "gives up", "when its wait timeout is over"))
     return sorted(found, key=lambda step: float("inf") if step["in_s"] is None else step["in_s"])
+
+
+def _of_gang(core: Core, gpu: Gpu, gang: Gang) -> list[Step]:
+    """While it gathers or loads. Its members wait for each other, and for the memory of the one before."""
+    if gang.phase == "gathering":
+        ends_at = core.timers.at(("gang", gang.name))
+        return [] if ends_at is None else [_given_up(core, gang, ends_at, "if the rest has not come back")]
+    found = [_load_ends(core, lease) for lease in gpu.in_state(LeaseState.LOADING)]
+    if not found:
+        found.append(_next_reading(core, gpu, "its bytes are kept for it, the card has to show them"))
+    if (since := gang.short_since.get(gpu.info.id)) is not None:
+        at = since + core.settings.verify_timeout_s
+        found.append(_given_up(core, gang, at, "if its memory is not free then"))
+    return found
+
+
+def _given_up(core: Core, gang: Gang, at: float, because: str) -> Step:
+    return _step(core, "break", None, at, f"gives gang {gang.name} up", because)
+
+
+def _load_ends(core: Core, lease: Lease) -> Step:
+    what = f"lets {lease.spec.consumer} finish loading"
+    return _step(core, "loaded", lease, _learnt_end(core, lease), what, "one loads at a time")
 
 
 def _of_head(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
@@ -37,17 +66,7 @@ def _of_head(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
         ]
     if gpu.failed_at is not None or gpu.sample is None:
         return [_next_reading(core, gpu, "nothing is granted on a card that cannot be read")]
-    found = [
-        _step(
-            core,
-            "loaded",
-            lease,
-            _learnt_end(core, lease),
-            f"lets {lease.spec.consumer} finish loading",
-            "one loads at a time",
-        )
-        for lease in gpu.in_state(LeaseState.LOADING)
-    ]
+    found = [_load_ends(core, lease) for lease in gpu.in_state(LeaseState.LOADING)]
     found += [_leaving(core, gpu, waiter, lease) for lease in gpu.in_state(*LEAVING)]
     going = policy.leaving(gpu)
     if found or policy.blocked(core, gpu):
@@ -105,6 +124,8 @@ def _leaving(core: Core, gpu: Gpu, waiter: Lease, holder: Lease) -> Step:
         return _step(
             core, "measure", holder, verification.next_poll_at, f"measures {name}'s bytes again", because
         )
+    if holder.children:
+        return _step(core, "wait", holder, None, f"lets {name} go", "once its sub-leases have left")
     eviction = holder.eviction
     if eviction is None or holder.state is LeaseState.UNLOADING or eviction.overdue:
         return _step(core, "wait", holder, None, f"waits for {name} to let go", "it is on its way out")

@@ -219,7 +219,9 @@ def test_nobody_of_a_gang_is_backfilled_alone(driver: CoreDriver) -> None:
     a, b = Member(driver, "a", 1), Member(driver, "b", 0.5)
     driver.advance(2.0)
     assert states(a, b) == ["queued", "queued"]
-    assert "waits behind" in driver.arbiter.why("b", driver.now)["leases"][0]["text"]
+    assert (
+        "as one of gang g behind big as number 2" in driver.arbiter.why("b", driver.now)["leases"][0]["text"]
+    )
 
 
 def test_measured_memory_that_is_not_there_keeps_a_gang_waiting(driver: CoreDriver) -> None:

@@ -1,0 +1,141 @@
+"""Who stands in a waiter's way: how many bytes each holds, and on which condition they come free. Reads only; for `explain`.
+
+Whoever is charged on the card is named: holders, members of a gang that wait for their turn, contexts, debts and stowaways.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from arbiter.core import gangs, policy
+from arbiter.core.lease import LEAVING, Lease, LeaseState
+from arbiter.core.state import Core, Gpu
+
+NAMED_MAX = 3
+"""Leases that are listed by name in a sentence; the others are counted."""
+
+type Blocker = dict[str, Any]
+
+
+def who_blocks(core: Core, gpu: Gpu, waiter: Lease, deficit: int) -> list[Blocker]:
+    """Everybody who holds bytes that the waiter lacks, or holds the card alone. `waiter`: a gang's members on one card count as one."""
+    if waiter.id in gpu.ledger.reserved:  # it has its bytes, and waits for its turn
+        return [_holder(core, gpu, waiter, lease) for lease in gpu.in_state(LeaseState.LOADING)]
+    alone = waiter.spec.exclusive or any(lease.spec.exclusive for lease in gpu.residents.values())
+    if not deficit and not alone and not gpu.in_state(LeaseState.LOADING):
+        return []
+    holders = [_holder(core, gpu, waiter, lease) for lease in gpu.residents.values()]
+    return [*holders, *_members(gpu), *_keepers(core, gpu, waiter)]
+
+
+def _holder(core: Core, gpu: Gpu, waiter: Lease, lease: Lease) -> Blocker:
+    return {
+        "lease_id": lease.id,
+        "consumer": lease.spec.consumer,
+        "bytes": gpu.ledger.charge_bytes(lease.id),
+        "state": str(lease.state),
+        "uses": len(lease.uses),
+        "condition": _holder_condition(core, waiter, lease),
+    }
+
+
+def _members(gpu: Gpu) -> list[Blocker]:
+    """Of a gang that loads here: those who wait for their turn. The next one to load has the headroom."""
+    waiting = [] if gpu.gang is None else [one for one in gpu.gang.waiting() if one.gpu == gpu.info.id]
+    return [
+        {
+            "lease_id": lease.id,
+            "consumer": lease.spec.consumer,
+            "bytes": gangs.kept_bytes(gpu, lease) if index == 0 else gpu.ledger.charge_bytes(lease.id),
+            "state": str(lease.state),
+            "uses": 0,
+            "condition": f"has its bytes kept for its turn in gang {lease.gang.name if lease.gang else ''}",
+        }
+        for index, lease in enumerate(waiting)
+    ]
+
+
+def _keepers(core: Core, gpu: Gpu, waiter: Lease) -> list[Blocker]:
+    """Processes without a resident lease that hold bytes all the same: contexts of live processes, debts, stowaways."""
+    ledger = gpu.ledger
+    names = {client.process: client.name for client in core.clients.values()}
+    kept: list[tuple[str, int, str, str]] = []
+    for process, account in ledger.accounts.items():
+        count = ledger.filled_bytes(process)
+        if process == waiter.process or not count or not gpu.residents.keys().isdisjoint(account.charges):
+            continue
+        owed = any(lease not in ledger.reserved for lease in account.charges)
+        state, condition = (
+            ("debt", "is over, its bytes are being measured")
+            if owed
+            else ("residue", "keeps its context until it exits")
+        )
+        kept.append((names.get(process, f"pid {process.pid}"), count, state, condition))
+    kept += [
+        (s.name or f"pid {s.process.pid}", s.used_bytes, "stowaway", "holds bytes without a lease")
+        for s in ledger.strangers.values()
+        if s.process.pid != waiter.process.pid
+    ]
+    return [
+        {
+            "lease_id": None,
+            "consumer": name,
+            "bytes": count,
+            "state": state,
+            "uses": 0,
+            "condition": condition,
+        }
+        for name, count, state, condition in kept
+    ]
+
+
+def _holder_condition(core: Core, waiter: Lease, holder: Lease) -> str:
+    if holder.state is LeaseState.LOADING:
+        return "is loading"
+    if holder.state is LeaseState.REVOKING and holder.children:
+        asked = "leaves by itself" if holder.departing else f"was asked to leave {ago(core, holder)}"
+        return f"{asked}, goes after {named(holder.children)}"
+    if holder.state in LEAVING:
+        return {
+            LeaseState.REVOKING: f"was asked to leave {ago(core, holder)}, {uses(holder)}",
+            LeaseState.UNLOADING: "is unloading",
+            LeaseState.VERIFYING: "let go, its bytes are being measured",
+        }[holder.state]
+    root = holder.root
+    if root is not holder:
+        return f"belongs to {named([root])}, which {_holder_condition(core, waiter, root)}"
+    if holder.gang is not None:
+        return f"belongs to gang {holder.gang.name}, which is not complete"
+    if not root.may_leave:
+        return f"is pinned by {holder.pinned}" if holder.pinned else "is pinned"
+    ends_at = policy.residency_ends_at(core, root, waiter)
+    if ends_at > core.now:
+        stretched = ends_at > root.ready_at + root.spec.min_residency_s
+        why = "they keep throwing each other out" if stretched else "minimum residency"
+        return f"may stay {ends_at - core.now:.1f} s more ({why})"
+    priority = waiter.priority_at(core.now, core.settings.ageing_s_per_point)
+    if root.in_use and root.spec.priority > priority:
+        return f"is in use and has priority {root.spec.priority}, the waiter {priority}"
+    return "is in use" if root.in_use else "is idle and may be asked"
+
+
+# -- words -------------------------------------------------------------------------------------------------------------
+def named(leases: Sequence[Lease]) -> str:
+    """`policy (L1-3), reward (L1-4)`, at most so many."""
+    shown = [f"{lease.spec.consumer} ({lease.id})" for lease in leases[:NAMED_MAX]]
+    more = len(leases) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more else "")
+
+
+def uses(lease: Lease) -> str:
+    paused = f", {len(lease.yielded)} paused" if lease.yielded else ""
+    running = f"{len(lease.uses)} use{'' if len(lease.uses) == 1 else 's'} running" if lease.uses else "idle"
+    return running + paused
+
+
+def ago(core: Core, holder: Lease) -> str:
+    asked_at = holder.eviction.asked_at if holder.eviction else holder.since
+    return f"{core.now - asked_at:.1f} s ago"
+
+
+def gib(count: int) -> str:
+    return f"{count / 2**30:.2f} GiB"
