@@ -145,6 +145,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         flags.config = flags.config or config_of_service(os.environ)
         config = effective_config(flags)
         from arbiter.daemon import Daemon, find_places  # late: --help and --version need none of it
+        from arbiter.host.loop import new_loop
         from arbiter.telemetry import set_up_logging
 
         places = find_places(config, os.environ, os.getuid())
@@ -158,7 +159,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         async def serve() -> int:
             return await Daemon(config, os.environ, version()).run()
 
-        return asyncio.run(serve())
+        with asyncio.Runner(loop_factory=new_loop) as runner:
+            return runner.run(serve())
     except VramError as error:
         print(f"vram-arbiter: {error}", file=sys.stderr)
         return exit_code_of(error)

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 HELD_UP_S = 1.0
 """A daemon that wakes up so late did not run meanwhile (stopped, swapped out, a paused virtual machine). It has heard nobody, so nobody's
 silence counts: the core is told that it slept."""
-TIMER_FLOOR_S = 0.001
+TIMER_FLOOR_S = 0.0002
 """A deadline that has passed is served this soon, and not in a busy loop."""
 
 

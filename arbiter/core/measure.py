@@ -252,7 +252,7 @@ def _weigh(core: Core, gpu: Gpu, verification: Verification, sample: MemorySampl
     )
     if judgement is None:
         if verification.settling:
-            verification.next_poll_at = core.now + core.settings.verify_confirm_s
+            verification.next_poll_at = max(core.now, sample.taken_at + core.settings.verify_confirm_s)
             _set_poll(core, gpu)
         return
     _announce(core, gpu, verification, judgement, sample)

@@ -9,7 +9,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
-from harness import GIB, Peer, Suite, arbiter
+from harness import GIB, WIDE, Peer, Suite, arbiter
 
 from arbiter.host.gpu.fake import locked
 from arbiter.testing.process import ArbiterProcess
@@ -17,11 +17,13 @@ from schemas import fakegpu
 from schemas.ids import ProcessKey
 
 LAG_S = 0.15
+NO_HOLD = "scheduling:\n  thrash_hold_max_s: 0\n"
+"""Two that throw each other out without pause are what the arbiter slows down on purpose; it is asked not to, as with `min_residency_s`."""
 
 
 def run(suite: Suite) -> None:
     with ExitStack() as stack:
-        daemon = stack.enter_context(arbiter())
+        daemon = stack.enter_context(arbiter(WIDE + NO_HOLD))
         peers = [Peer(daemon.endpoint, name).hello() for name in ("one", "two")]
         for peer in peers:
             stack.callback(peer.close)

@@ -40,7 +40,9 @@ def test_two_equal_readings_after_the_release_are_enough() -> None:
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
     det.unload(lease)
     took = driver.until(lambda: driver.state(lease) == "over", step_s=0.001)
-    assert took == pytest.approx(0.007, abs=0.0015), "read after 2 ms, and 2 ms after that reading was good"
+    assert took == pytest.approx(0.005, abs=0.0005), (
+        "readings begin 2 ms apart, and the second one takes 1 ms"
+    )
     (note,) = driver.notes("verified")
     assert (note["verdict"], note["before_bytes"], note["after_bytes"]) == ("verified", 5 * GIB, 450 * MIB)
     assert driver.gpu()["charged_bytes"] == 450 * MIB
@@ -74,7 +76,7 @@ def test_readings_are_dense_while_memory_usually_comes_back_and_rarer_later() ->
     assert (seen[0], set(seen[1:390])) == (2.0, {5.0}), "for 2 s"
     assert set(seen[405:545]) == {20.0}, "for 3 s more"
     assert set(seen[560:-1]) == {50.0}, "then until the verdict"
-    assert seen[-1] == pytest.approx(3.0), "but for the second reading that has to agree"
+    assert seen[-1] == pytest.approx(2.0), "but for the second reading that has to agree"
     assert len(seen) < 620
 
 
