@@ -13,6 +13,9 @@ from arbiter.core.state import Core, Gpu
 NAMED_MAX = 3
 """Leases that are listed by name in a sentence; the others are counted."""
 
+LONG_LOAD_S = 10.0
+"""From then on it is said how far a load is, and for how long its bytes have not grown."""
+
 type Blocker = dict[str, Any]
 
 
@@ -90,14 +93,14 @@ def _keepers(core: Core, gpu: Gpu, waiter: Lease) -> list[Blocker]:
 
 def _holder_condition(core: Core, waiter: Lease, holder: Lease) -> str:
     if holder.state is LeaseState.LOADING:
-        return "is loading"
+        return loading(core, holder)
     if holder.state is LeaseState.REVOKING and holder.children:
         asked = "leaves by itself" if holder.departing else f"was asked to leave {ago(core, holder)}"
         return f"{asked}, goes after {named(holder.children)}"
     if holder.state in LEAVING:
         return {
             LeaseState.REVOKING: f"was asked to leave {ago(core, holder)}, {uses(holder)}",
-            LeaseState.UNLOADING: "is unloading",
+            LeaseState.UNLOADING: unloading(core, holder),
             LeaseState.VERIFYING: "let go, its bytes are being measured",
         }[holder.state]
     root = holder.root
@@ -124,6 +127,23 @@ def named(leases: Sequence[Lease]) -> str:
     shown = [f"{lease.spec.consumer} ({lease.id})" for lease in leases[:NAMED_MAX]]
     more = len(leases) - len(shown)
     return ", ".join(shown) + (f" and {more} more" if more else "")
+
+
+def loading(core: Core, lease: Lease) -> str:
+    """How far a load is, as readings show it: nobody can know how long it may take, but everybody can see that nothing moves."""
+    took_s = core.now - lease.granted_at
+    if took_s < LONG_LOAD_S:
+        return "is loading"
+    told = f"is loading for {took_s:.0f} s, {gib(lease.peak_seen_bytes)} so far"
+    quiet_s = core.now - max(lease.grew_at, lease.granted_at)
+    return told if quiet_s < LONG_LOAD_S else f"{told}, nothing new for {quiet_s:.0f} s"
+
+
+def unloading(core: Core, lease: Lease) -> str:
+    """One that hangs is nobody's hope any more, but its bytes are charged until they are gone or its process is."""
+    if not lease.hangs:
+        return "is unloading"
+    return f"is unloading for {core.now - lease.since:.0f} s and may hang: end its process (pid {lease.process.pid})"
 
 
 def uses(lease: Lease) -> str:

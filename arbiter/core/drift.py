@@ -42,7 +42,8 @@ def on_evidence(core: Core, gpu: Gpu) -> None:
         if lease is None or not (held := measured_bytes(gpu, lease)):
             continue
         if lease.state is LeaseState.LOADING:
-            lease.peak_seen_bytes = max(lease.peak_seen_bytes, held)
+            if held > lease.peak_seen_bytes:
+                lease.peak_seen_bytes, lease.grew_at = held, core.now
         elif lease.state in _RESIDENT and lease.shrink is None:  # else its bytes may still be on the way back
             lease.steady_seen_bytes = max(lease.steady_seen_bytes, held)
             if held > lease.spec.steady_bytes:

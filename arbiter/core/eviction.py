@@ -116,9 +116,12 @@ def ask_again(core: Core, holder: Lease) -> None:
 
 
 def on_ladder_due(core: Core, lease_id: str) -> None:
-    """A step of the ladder. Steps are for holders that have not begun to unload."""
+    """A step of the ladder. Who has begun to unload is asked nothing more, and has a whole deadline for it."""
     holder = core.leases[LeaseId(lease_id)]
     eviction = holder.eviction
+    if holder.state is LeaseState.UNLOADING:
+        _unload_hangs(core, holder)
+        return
     if eviction is None or holder.state is not LeaseState.REVOKING:
         return
     settings = core.settings
@@ -135,11 +138,24 @@ def on_ladder_due(core: Core, lease_id: str) -> None:
     _set_timer(core, holder, eviction)
 
 
-def _deadline(core: Core, holder: Lease, eviction: Eviction) -> None:
+def _unload_hangs(core: Core, holder: Lease) -> None:
+    """It unloads, and has not ended within a deadline. Others are asked in its place, and the card is not kept free for its bytes."""
+    due_at = holder.since + core.settings.revoke_deadline_s
+    if due_at > core.now:  # a timer of the steps before
+        core.timers.set(("revoke", holder.id), due_at)
+        return
+    holder.hangs = True
+    if holder.eviction is not None:
+        holder.eviction.overdue = True
+    _deadline(core, holder, holder.eviction)
+
+
+def _deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None:
     """The holder outstayed. Its waiter is denied if that is its wish; the `revoke` stands in any case."""
-    core.note("deadline_passed", holder, uses=holder.busy_uses(), wanted_by=eviction.wanted_consumer)
+    wanted_by, consumer = (eviction.wanted_by, eviction.wanted_consumer) if eviction else (None, "")
+    core.note("deadline_passed", holder, uses=holder.busy_uses(), wanted_by=consumer)
     core.wake(core.gpu_of(holder))
-    waiter = core.waiting.get(eviction.wanted_by) if eviction.wanted_by is not None else None
+    waiter = core.waiting.get(wanted_by) if wanted_by is not None else None
     for gpu_id in () if waiter is None else waiter.gpus:
         core.wake(core.gpus[gpu_id])  # it may be served on another card now
     if waiter is None or not waiter.spec.deny_on_deadline:

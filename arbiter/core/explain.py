@@ -5,7 +5,7 @@ from statistics import median
 from typing import Any
 
 from arbiter.core import drift, gangs, outlook, policy, standby
-from arbiter.core.blockers import ago, gib, named, uses, who_blocks
+from arbiter.core.blockers import ago, gib, loading, named, unloading, uses, who_blocks
 from arbiter.core.lease import AWAY, LEAVING, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
 
@@ -256,10 +256,10 @@ def _behind(core: Core, lease: Lease, position: int) -> str:
 
 def _explain_resident(core: Core, gpu: Gpu, lease: Lease, free: int) -> dict[str, Any]:
     says = {
-        LeaseState.LOADING: "it was granted and is loading",
+        LeaseState.LOADING: f"it was granted and {loading(core, lease)}",
         LeaseState.HELD: f"it is resident, {uses(lease)}",
         LeaseState.REVOKING: f"it was asked to leave for {_wanted_by(lease)}, {uses(lease)}",
-        LeaseState.UNLOADING: "it is unloading",
+        LeaseState.UNLOADING: f"it {unloading(core, lease)}",
         LeaseState.VERIFYING: "it let go; its bytes are being measured",
     }.get(lease.state) or standby.outlook(core, lease)
     says += _family(gpu, lease)
@@ -299,7 +299,8 @@ def _condition(
         return "room is being made", "; ".join(_leaving_next(core, gpu, other) for other in leaving)
     blocked = policy.blocked(core, gpu)
     if blocked:
-        return "blocked", f"waits: {blocked}"
+        loads = [f"{one.spec.consumer} {loading(core, one)}" for one in gpu.in_state(LeaseState.LOADING)[:1]]
+        return "blocked", f"waits: {loads[0] if loads and loads[0].startswith(blocked) else blocked}"
     if leaving:
         return "room is being made", "; ".join(_leaving_next(core, gpu, other) for other in leaving)
     if gpu.verifications:
@@ -325,7 +326,7 @@ def _leaving_next(core: Core, gpu: Gpu, holder: Lease) -> str:
     if holder.state is LeaseState.REVOKING:
         return f"waits for {name} to unload (asked {ago(core, holder)}), then {charge} are verified"
     if holder.state is LeaseState.UNLOADING:
-        return f"{name} unloads, then {charge} are verified"
+        return f"{name} {unloading(core, holder) if holder.hangs else 'unloads'}, then {charge} are verified"
     return f"{charge} of {name} are being verified"
 
 

@@ -122,7 +122,7 @@ def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int],
     smallest = gpu.queue.smallest_need_bytes() - policy.largest_fold_bytes(gpu)
     if smallest > gpu.ledger.budget_bytes - gpu.ledger.total_bytes():
         return
-    if gpu.residents.any_in((LeaseState.UNLOADING, LeaseState.VERIFYING)):
+    if policy.room_is_coming(gpu):
         return  # the head's room is about to come; a load now would only be in its way
     if planned:
         spare, stuck = policy.spare_beside_bytes(gpu, head, leaving), False

@@ -219,6 +219,7 @@ class Lease:
     gpu: GpuId | None = None
     measured_bytes: int | None = None
     peak_seen_bytes: int = 0  # largest reading while it loaded
+    grew_at: float = 0.0  # when that last rose
     steady_seen_bytes: int = 0  # largest reading, or the holder's word, since it is ready
     drifted: set[str] = field(default_factory=set)  # parts of the footprint that a note was said about
     uses: dict[tuple[ProcessKey, UseId], Use] = field(default_factory=dict)  # busy ones
@@ -242,6 +243,7 @@ class Lease:
     pinned: Order | None = None  # by an operator
     parks: bool = False  # it let go with its weights kept in host RAM
     comes_back: bool = False  # by itself, once its bytes are measured gone and there is room
+    hangs: bool = False  # its unloading has taken a whole deadline: nobody counts on it any more
     asked_before: bool = False  # to leave, by a daemon that has ended since; its holder may be acting on it
     dismissed: bool = False  # an operator sent it away: it does not come back by itself
     left_for: str = ""  # the consumer that it left for last; it does not come back beside that one

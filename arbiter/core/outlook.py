@@ -127,9 +127,12 @@ def _leaving(core: Core, gpu: Gpu, waiter: Lease, holder: Lease) -> Step:
     if holder.children:
         return _step(core, "wait", holder, None, f"lets {name} go", "once its sub-leases have left")
     eviction = holder.eviction
-    if eviction is None or holder.state is LeaseState.UNLOADING or eviction.overdue:
-        return _step(core, "wait", holder, None, f"waits for {name} to let go", "it is on its way out")
-    at = eviction.asked_at + core.settings.revoke_deadline_s
+    if eviction is None or eviction.overdue:
+        because = "its unloading may hang" if holder.hangs else "it is on its way out"
+        return _step(core, "wait", holder, None, f"waits for {name} to let go", because)
+    at = (
+        holder.since if holder.state is LeaseState.UNLOADING else eviction.asked_at
+    ) + core.settings.revoke_deadline_s
     then = "is denied" if waiter.spec.deny_on_deadline else "waits on, and the holder's own rule applies"
     return _step(
         core,

@@ -49,7 +49,8 @@ def leaving(gpu: Gpu) -> dict[LeaseId, int]:
         if lease.parent is not None and lease.parent.state not in LEAVING:
             continue  # its bytes are its parent's again
         verification = gpu.verifications.get(lease.id)
-        late = verification.overdue if verification else bool(lease.eviction and lease.eviction.overdue)
+        overdue = lease.hangs or bool(lease.eviction and lease.eviction.overdue)
+        late = verification.overdue if verification else overdue
         if not late:
             going[lease.id] = lease.residue_bytes
     staying = [parent for parent in gpu.estates.values() if parent.state not in LEAVING]
@@ -62,6 +63,15 @@ def leaving(gpu: Gpu) -> dict[LeaseId, int]:
         ):
             going[verification.lease] = verification.kept_bytes
     return going
+
+
+def room_is_coming(gpu: Gpu) -> bool:
+    """Does anybody unload, or is anybody measured, who is not late with it?"""
+    for lease in gpu.in_state(LeaseState.UNLOADING, LeaseState.VERIFYING):
+        verification = gpu.verifications.get(lease.id)
+        if not (verification.overdue if verification else lease.hangs):
+            return True
+    return False
 
 
 def residue_under_measurement(gpu: Gpu) -> bool:

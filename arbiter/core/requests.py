@@ -399,6 +399,8 @@ def unloading(core: Core, event: UnloadStarted) -> None:
     end_uses(core, lease, "unloaded while it paused")
     growth.abandon(core, lease, "it unloads")
     lease.move(LeaseState.UNLOADING, core.now, "at its safe point")
+    lease.hangs = False
+    core.timers.set(("revoke", lease.id), core.now + core.settings.revoke_deadline_s)
     lease.baseline = gpu.sample
     if lease.eviction is not None:
         lease.eviction.unloading_at = core.now

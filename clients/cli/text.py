@@ -59,15 +59,15 @@ def status_lines(status: Message) -> list[str]:
 
 
 def _gpu_lines(gpu: Message) -> list[str]:
-    size = format_bytes
+    size, known = format_bytes, gpu["measured_used_bytes"] is not None
     room = gpu["capacity_bytes"] - gpu["reserve_bytes"] - gpu["charged_bytes"] - gpu["stowaway_bytes"]
     lines = [
         f"GPU {gpu['index']} {gpu['name']} ({gpu['gpu']})",
-        f"  capacity {size(gpu['capacity_bytes'])} = reserve {size(gpu['reserve_bytes'])} + charged {size(gpu['charged_bytes'])}"
+        f"  capacity {size(gpu['capacity_bytes'])}{' =' if known else ':'} reserve {size(gpu['reserve_bytes'])} + charged {size(gpu['charged_bytes'])}"
         + (f" + stowaways {size(gpu['stowaway_bytes'])}" if gpu["stowaway_bytes"] else "")
-        + f" + free {size(max(0, room))}",
+        + (f" + free {size(max(0, room))}" if known else ""),
     ]
-    if gpu["measured_used_bytes"] is None:
+    if not known:
         lines.append("  measured: unknown (the probe fails), so nothing is granted")
     else:
         lines.append(

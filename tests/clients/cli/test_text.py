@@ -86,7 +86,7 @@ def test_status_of_a_card_in_trouble() -> None:
         "  after a restart nothing is granted until every lease is accounted for",
         "",
         "GPU 0 Simulated GPU (GPU-1)",
-        "  capacity 8 GiB = reserve 300 MiB + charged 5 GiB + stowaways 200 MiB + free 2.51 GiB",
+        "  capacity 8 GiB: reserve 300 MiB + charged 5 GiB + stowaways 200 MiB",
         "  measured: unknown (the probe fails), so nothing is granted",
         "  pressure: 1 GiB more than was granted",
         "  no grants now: the probe failed",

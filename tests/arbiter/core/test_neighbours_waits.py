@@ -1,0 +1,295 @@
+"""What users of the neighbours complain about: waiting, turns, loads without an end and models nobody wanted gone. Numbers are those of the list."""
+
+from typing import Any
+
+import pytest
+
+from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
+from schemas import defaults as d
+from schemas.ids import LeaseId
+
+GIB, MIB = d.GIB, d.MIB
+
+
+def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
+    person = driver.consumer(name)
+    lease = person.acquire(int(gib * GIB), **spec)
+    driver.until(lambda: driver.state(lease) == "loading")
+    person.load(lease)
+    driver.advance(0.01)
+    return person, lease
+
+
+# -- 3: stuck for ever -------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("asked", [True, False])
+def test_3_an_unload_that_hangs_holds_up_nobody_who_can_be_served_without_it(asked: bool) -> None:
+    """ollama#7606, #12179, #7779: "Stopping…" for ever, and everything behind it waits too."""
+    driver = CoreDriver(8 * GIB)
+    stuck, lease = held(driver, "stuck", 4, ttl_s=3600.0)
+    _, idle = held(driver, "idle", 3, ttl_s=3600.0)
+    if not asked:
+        stuck.unloading(lease)  # of its own will
+    waiter = driver.consumer("w").acquire(int(4.5 * GIB))
+    if asked:
+        driver.until(lambda: driver.state(lease) == "revoking")
+        stuck.unloading(lease)
+    driver.advance(1.0)
+    tiny = driver.consumer("small")
+    small = tiny.acquire(512 * MIB)
+    driver.advance(28.0)
+    assert (driver.state(waiter), driver.state(small), driver.state(idle)) == ("queued", "queued", "held")
+    assert not driver.notes("deadline_passed"), "a whole deadline is its own"
+    driver.advance(2.0)
+    (note,) = driver.notes("deadline_passed")
+    assert note["consumer"] == "stuck"
+    assert driver.state(small) == "loading", "its bytes are not waited for any more"
+    told = driver.arbiter.why("w", driver.now)["leases"][0]
+    assert "'is unloading for 31 s and may hang: end its process (pid" in str(told["blockers"])
+    assert "waits for stuck to let go, its unloading may hang" in [step["text"] for step in told["plan"]]
+    assert driver.gpu()["charged_bytes"] >= 7 * GIB, "but they are charged until they are gone"
+    tiny.load(small)
+    stuck.hold(0)
+    stuck.die()
+    driver.until(lambda: driver.state(waiter) == "loading" or driver.state(idle) == "revoking", limit_s=5.0)
+
+
+def test_3_a_waiter_that_wants_an_answer_gets_one_although_the_holder_says_that_it_unloads() -> None:
+    """ollama#10831. `on_deadline: deny` is a typed error after the deadline, whatever the holder says that it is doing."""
+    driver = CoreDriver(8 * GIB)
+    stuck, lease = held(driver, "stuck", 5, ttl_s=3600.0)
+    waiter = driver.consumer("w").acquire(5 * GIB, deny_on_deadline=True)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    driver.advance(20.0)
+    stuck.unloading(lease)
+    driver.advance(29.0)
+    (step,) = (
+        step
+        for step in driver.arbiter.why("w", driver.now)["leases"][0]["plan"]
+        if step["action"] == "deadline"
+    )
+    assert step["in_s"] == pytest.approx(1.0, abs=0.1)
+    driver.advance(1.5)
+    assert driver.state(waiter) == "over"
+    (push,) = driver.pushes("denied", waiter)
+    assert push["error"]["code"] == "holder_busy"
+    assert "hang" in driver.arbiter.why("stuck", driver.now)["leases"][0]["text"]
+    stuck.hold(0)
+    stuck.release(lease)
+    driver.until(lambda: driver.state(lease) == "over", limit_s=2.0)
+
+
+# -- 4: thrash and starvation ------------------------------------------------------------------------------------------
+def test_4_a_job_that_runs_is_finished_before_the_swap() -> None:
+    """llama-swap#19, #611: the swap comes in the middle of the answer. Also a waiter of the highest priority waits for its end."""
+    driver = CoreDriver(8 * GIB)
+    writer, lease = held(driver, "writer", 5, priority=10)
+    writer.use_begin(lease, "answer")
+    waiter = driver.consumer("w").acquire(5 * GIB, priority=100)
+    driver.advance(20.0)
+    assert (driver.state(lease), driver.state(waiter)) == ("revoking", "queued")
+    assert refusal(writer.use_begin(lease, "the next answer")).code == "lease_revoking", (
+        "and no new one begins"
+    )
+    writer.use_end(lease, "answer")
+    writer.unload(lease)
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
+
+
+def test_4_whoever_waits_long_enough_is_next() -> None:
+    """llama-swap#784, ageing: "future" there. An endless stream of more important ones does not starve a background job."""
+    driver = CoreDriver(8 * GIB)
+    people = {name: driver.consumer(name) for name in ("a", "b")}
+    leases = {
+        name: person.acquire(5 * GIB, priority=60, min_residency_s=0.0) for name, person in people.items()
+    }
+    low, began = driver.consumer("low").acquire(5 * GIB, priority=50), driver.now
+    while driver.state(low) == "queued" and driver.now - began < 200.0:
+        for name, person in people.items():
+            state = driver.state(leases[name])
+            if state == "loading":
+                person.load(leases[name])
+            elif state == "revoking":
+                person.unload(leases[name])
+            elif state == "over":
+                leases[name] = person.acquire(5 * GIB, priority=60, min_residency_s=0.0)
+        driver.advance(0.1)
+    assert driver.state(low) == "loading"
+    assert driver.now - began < 10 * d.AGEING_S_PER_POINT + 5.0, (
+        "ten points of priority are worth ten times the ageing"
+    )
+
+
+def test_4_six_that_fit_do_not_wait_for_one_that_idles() -> None:
+    """aprender#3986: one lock for the whole card, held for 25 minutes at 97 % idle, six waiters. Bytes are leased, not the card."""
+    driver = CoreDriver(8 * GIB)
+    _, idle = held(driver, "idle", 1)
+    people = [driver.consumer(f"w{n}") for n in range(6)]
+    waiters = [person.acquire(1 * GIB) for person in people]
+    for person, lease in zip(people, waiters, strict=True):
+        driver.until(lambda lease=lease: driver.state(lease) == "loading", limit_s=0.5)  # type: ignore[misc]
+        person.load(lease)
+    assert [driver.state(lease) for lease in (idle, *waiters)] == ["held"] * 7
+
+
+def test_4_a_slow_stop_and_the_next_load_do_not_race() -> None:
+    """Ordo-AI-Stack PR#69: the stop takes 30 s, the load does not wait for it, both run out of memory and restart each other."""
+    driver = CoreDriver(8 * GIB)
+    slow, lease = held(driver, "slow", 5)
+    waiter = driver.consumer("w").acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    slow.unloading(lease)
+    driver.advance(30.0)
+    assert (driver.state(lease), driver.state(waiter)) == ("unloading", "queued")
+    slow.hold(0)
+    slow.release(lease)
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
+
+
+# -- 6: VRAM-aware swap ------------------------------------------------------------------------------------------------
+def test_6_what_fits_together_stays_together_without_groups() -> None:
+    """llama-swap#158, #315, #319: nobody writes down who may run beside whom; a newcomer costs as few as the bytes need."""
+    driver = CoreDriver(16 * GIB)
+    leases = [held(driver, f"m{n}", gib)[1] for n, gib in enumerate((4, 6, 3))]
+    _, small = held(driver, "small", 2)
+    assert [driver.state(lease) for lease in (*leases, small)] == ["held"] * 4
+    driver.consumer("large").acquire(6 * GIB)
+    assert [driver.state(lease) for lease in (*leases, small)] == ["held", "revoking", "held", "held"]
+
+
+def test_6_of_equals_the_least_recently_used_leaves() -> None:
+    """llama-swap#1118."""
+    driver = CoreDriver(8 * GIB)
+    people = {name: held(driver, name, 3.5) for name in ("older", "newer")}
+    for name in ("newer", "older"):
+        person, lease = people[name]
+        person.use_begin(lease)
+        driver.advance(0.5)
+        person.use_end(lease)
+    driver.advance(5.0)
+    driver.consumer("w").acquire(3 * GIB)
+    assert {name: driver.state(lease) for name, (_, lease) in people.items()} == {
+        "older": "held", "newer": "revoking",
+    }  # fmt: skip
+
+
+# -- 7: estimates are wrong --------------------------------------------------------------------------------------------
+def test_7_what_is_measured_when_it_is_loaded_is_charged() -> None:
+    """ollama#6160: 22 GB expected, 16 taken, and the model is put on the CPU although it fits."""
+    driver = CoreDriver(24 * GIB)
+    vlm = driver.consumer("vlm")
+    lease = vlm.acquire(22 * GIB, evictable=False)
+    vlm.load(lease, 16 * GIB)
+    driver.advance(0.1)
+    assert driver.gpu()["charged_bytes"] == 16 * GIB
+    assert driver.state(driver.consumer("x").acquire(7 * GIB)) == "loading"
+
+
+# -- 8: two loads at once ----------------------------------------------------------------------------------------------
+def test_8_memory_that_comes_back_during_a_load_confuses_neither() -> None:
+    """vLLM#56830: asserts if free memory grows while it measures itself. A sibling gives its bytes back in the middle of a load."""
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = 0.5
+    leaver, going = held(driver, "leaver", 3)
+    loader = driver.consumer("loader")
+    loading = loader.acquire(4 * GIB)
+    loader.hold(1 * GIB)
+    leaver.unload(going)
+    driver.advance(0.2)
+    loader.hold(3 * GIB)
+    driver.until(lambda: driver.state(going) == "over", limit_s=2.0)
+    (verified,) = driver.notes("verified")
+    assert (verified["verdict"], verified["consumer"]) == ("verified", "leaver")
+    loader.load(loading)
+    driver.advance(0.1)
+    assert driver.gpu()["charged_bytes"] == 4 * GIB
+    assert driver.gpu()["stowaway_bytes"] == 0
+
+
+# -- 9: evicts a busy model --------------------------------------------------------------------------------------------
+def test_9_idle_is_what_its_holder_says_and_never_a_guess() -> None:
+    """LLMKube#516: where the idle check gets no answer, it must not count as idle. Whoever uses and is silent is not unloaded for others."""
+    driver = CoreDriver(8 * GIB)
+    silent, lease = held(driver, "silent", 5, ttl_s=3600.0)
+    silent.use_begin(lease)
+    waiter = driver.consumer("w").acquire(5 * GIB)
+    driver.advance(600.0)
+    assert (driver.state(lease), driver.state(waiter)) == ("revoking", "queued")
+    assert driver.gpu()["charged_bytes"] == 5 * GIB
+
+
+# -- 21: manual recipes ------------------------------------------------------------------------------------------------
+def test_21_an_idle_model_stays_until_somebody_needs_its_room() -> None:
+    """ServerlessLLM#306: lazy unload. No keep-alive to tune, no call to free the memory by hand (ComfyUI#3192, comfy-mcp#116)."""
+    driver = CoreDriver(8 * GIB)
+    first, lease = held(driver, "first", 5, ttl_s=3600.0)
+    driver.advance(3000.0)
+    _, beside = held(driver, "beside", 2)
+    assert (driver.state(lease), driver.state(beside)) == ("held", "held")
+    driver.consumer("w").acquire(5 * GIB)
+    assert driver.state(lease) == "revoking"
+    assert first.driver.state(beside) == "held"
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 0.015])
+def test_21_a_detector_that_starts_again_at_once_waits_behind_the_policy(pause_s: float) -> None:
+    """OpenRAL ADR-0050: about 15 ms after it was deactivated, autostart activates it again, into the memory that was made free."""
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = 0.2
+    detector, lease = held(driver, "detector", 5)
+    policy = driver.consumer("policy").acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    detector.unload(lease)
+    driver.advance(pause_s)
+    again = detector.acquire(5 * GIB)
+    driver.until(lambda: driver.state(policy) == "loading", limit_s=1.0)
+    assert driver.state(again) == "queued"
+
+
+# -- 22: timeouts are guesses ------------------------------------------------------------------------------------------
+def test_22_a_load_may_take_as_long_as_it_takes() -> None:
+    """ollama's load timeout, llama-swap's health check: a large model on a slow disk is killed at 99 %. Whoever is heard of is left alone."""
+    driver = CoreDriver(8 * GIB)
+    vlm = driver.consumer("vlm")
+    lease = vlm.acquire(5 * GIB, ttl_s=10.0)
+    waiter = driver.consumer("w").acquire(5 * GIB)
+    for n in range(500):  # half an hour
+        vlm.hold(n * 10 * MIB)
+        answer(vlm.renew((lease, vlm.token(lease))))
+        driver.advance(3.5)
+    assert (driver.state(lease), driver.state(waiter)) == ("loading", "queued")
+    vlm.load(lease)
+    assert [note["consumer"] for note in driver.notes("ready")] == ["vlm"]
+
+
+def test_22_and_whoever_is_not_heard_of_is_given_up_within_its_ttl_however_short_its_load_was() -> None:
+    """Silence is what is measured, not the length of the load."""
+    driver = CoreDriver(8 * GIB)
+    hung = driver.consumer("hung")
+    lease = hung.acquire(5 * GIB, ttl_s=10.0)
+    hung.hold(1 * GIB)
+    driver.advance(10.1)
+    assert driver.state(lease) == "over"
+    (note,) = driver.notes("expired")
+    assert note["consumer"] == "hung"
+
+
+def test_22_a_load_without_progress_is_named_with_its_bytes() -> None:
+    """LM Studio#831: people want to know that nothing moves any more, not that 120 s are over."""
+    driver = CoreDriver(8 * GIB)
+    vlm = driver.consumer("vlm")
+    lease = vlm.acquire(5 * GIB, ttl_s=3600.0)
+    driver.consumer("w").acquire(5 * GIB)
+    for gib in (1, 2):
+        vlm.hold(gib * GIB)
+        driver.advance(20.0)
+    moving = driver.arbiter.why("w", driver.now)["leases"][0]
+    assert "is loading for 40 s, 2.00 GiB so far" in moving["blockers"][0]["condition"]
+    assert "nothing new for 20 s" in moving["blockers"][0]["condition"]
+    driver.advance(70.0)
+    (stalled,) = driver.arbiter.why("w", driver.now)["leases"]
+    assert "nothing new for 90 s" in stalled["text"]
+    assert "nothing new for 90 s" in driver.arbiter.why("vlm", driver.now)["leases"][0]["text"]
+    vlm.hold(3 * GIB)
+    driver.advance(2.0)
+    assert "nothing new for" not in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
+    assert driver.state(lease) == "loading", "said, and nothing is done to it"

@@ -1,0 +1,73 @@
+"""A consumer with the habits that users of the neighbours complain about. Not a test module; run by `arbiter.testing.forkserver`.
+
+Arguments: NAME BYTES CARD_FOLDER HABITS (JSON). It says `waiting`, `loading`, `ready`, `unloading`, `gone`. Habits: `slow` loads when it is told
+`go`, `stuck` never ends its unloading, `deaf` ignores SIGTERM, `again` asks for its lease again in the very moment it has lost it,
+`spec` goes into its lease.
+"""
+
+import asyncio
+import json
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from clients.aio import ArbiterClient
+from schemas.wire import Footprint, LeaseSpec
+from sidecars.device.fake import FakeMemory
+from sidecars.device.memory import Block
+
+RESIDUE = 256 << 20
+
+
+def say(event: str, **facts: object) -> None:
+    print(json.dumps({"event": event, **facts}), flush=True)
+
+
+async def live(name: str, size: int, card: Path, habits: dict[str, Any]) -> None:
+    reader = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(
+        lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
+    )
+    memory = FakeMemory(card, name, RESIDUE)
+    blocks: list[Block] = []
+
+    async def unload() -> None:
+        say("unloading")
+        if habits.get("stuck"):
+            await asyncio.Event().wait()
+        for block in blocks:
+            memory.free(block)
+        blocks.clear()
+        memory.empty_cache()
+
+    footprint = Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=RESIDUE)
+    spec = LeaseSpec(
+        consumer=name,
+        model_id=name,
+        footprint=footprint,
+        **({"min_residency_s": 0.0} | habits.get("spec", {})),
+    )
+    async with ArbiterClient(name=name, connect_timeout_s=30.0) as client:
+        for _ in range(2 if habits.get("again") else 1):
+            say("waiting")
+            lease = await client.acquire(spec, unload=unload)
+            say("loading")
+            if habits.get("slow"):
+                await reader.readline()
+            blocks.append(memory.allocate(name, size - RESIDUE))
+            await lease.ready(memory.used_bytes())
+            say("ready")
+            await lease.wait_gone()
+            say("gone")
+        while await reader.readline():
+            pass
+
+
+def main(arguments: Sequence[str]) -> None:
+    name, size, card, habits = arguments
+    wanted = json.loads(habits)
+    if wanted.get("deaf"):
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    asyncio.run(live(name, int(size), Path(card), wanted))

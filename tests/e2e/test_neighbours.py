@@ -1,0 +1,261 @@
+"""What users of the neighbours complain about, where the complaint is about processes, cards and what an operator is shown: a real daemon, real
+programs, a simulated card. Numbers are those of the list of complaints; docs/neighbours.md is the table.
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arbiter.testing.fakegpu_check import check_log
+from arbiter.testing.forkserver import Child, ForkServer
+from arbiter.testing.process import ArbiterProcess
+from arbiter.testing.wire import WireClient
+from schemas import fakegpu
+
+pytestmark = pytest.mark.e2e
+GIB, MIB = 1 << 30, 1 << 20
+RESIDUE = 256 * MIB
+PATIENCE_S = 30.0
+CONFIG = """
+probe: {period_s: 0.1}
+verify: {timeout_s: 1, slow_poll_s: 0.1}
+revoke: {deadline_s: 0.5, terminate_grace_s: 0.3}
+"""
+GAME = """
+import sys
+from pathlib import Path
+from sidecars.device.fake import FakeMemory
+FakeMemory(Path(sys.argv[1]), "game", 0).allocate("textures", int(sys.argv[2]))
+print("up", flush=True)
+sys.stdin.readline()
+"""
+
+
+class Stage:
+    """One daemon, one card and one fork server for all tests of this file."""
+
+    def __init__(self) -> None:
+        self.arbiter = ArbiterProcess(config=CONFIG).start()
+        self.configure(release_lag_s=0.15)
+        program = Path(__file__).with_name("neighbour.py")
+        self.forks = ForkServer(program, self.arbiter.environ, self.arbiter.runtime / "errors.log")
+        self.children: list[Child] = []
+        self.watcher: WireClient | None = None
+
+    def configure(self, **changes: Any) -> None:
+        path = self.arbiter.card / fakegpu.CARD_FILE
+        config = fakegpu.parse_config(path.read_text()).model_copy(update=changes)
+        temporary = path.with_name(".new")
+        temporary.write_text(fakegpu.dump_config(config))
+        temporary.rename(path)
+
+    def watch(self) -> WireClient:
+        """A fresh subscriber: its first events are those from now on."""
+        if self.watcher is not None:
+            self.watcher.close()
+        self.watcher = WireClient(self.arbiter.endpoint).hello("watcher", role="observer")
+        assert self.watcher.ask("subscribe")["ok"]
+        return self.watcher
+
+    def event(self, kind: str, **facts: Any) -> dict[str, Any]:
+        assert self.watcher is not None
+        push = self.watcher.push(
+            "event", PATIENCE_S,
+            lambda p: p["event"]["kind"] == kind and facts.items() <= p["event"].items(),
+        )  # fmt: skip
+        event: dict[str, Any] = push["event"]
+        return event
+
+    def spawn(self, name: str, gib: float, **habits: Any) -> Child:
+        child = self.forks.spawn(
+            name, str(int(gib * GIB)), str(self.arbiter.card), json.dumps(habits), name=name
+        )
+        self.children.append(child)
+        return child
+
+    def vramctl(self, *arguments: str) -> str:
+        """What an operator sees."""
+        done = subprocess.run(
+            [sys.executable, "-m", "clients", *arguments],
+            env=self.arbiter.environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+        )  # fmt: skip
+        return done.stdout + done.stderr
+
+    def used_when(self, name: str) -> int:
+        """Bytes on the card, of everybody, in the moment before `name` touched it first."""
+        used = 0
+        for line in map(json.loads, (self.arbiter.card / fakegpu.LOG_FILE).read_text().splitlines()):
+            if line["name"] == name:
+                return used
+            used = line["used_after"]
+        raise AssertionError(f"{name} never touched the card")
+
+    def end_case(self) -> None:
+        """Everybody dies; nothing of them stays with the daemon."""
+        for child in self.children:
+            child.close()
+        self.children.clear()
+        self.configure(faults=fakegpu.Faults())
+        watcher = self.watch()
+        while (status := watcher.ask("status"))["leases"] or status["gpus"][0]["charged_bytes"]:
+            watcher.receive(0.02)  # the next event; the card is being read meanwhile
+        assert watcher.ask("status")["gpus"][0]["stowaway_bytes"] == 0
+
+    def close(self) -> str:
+        if self.watcher is not None:
+            self.watcher.close()
+        self.forks.close()
+        log = (self.arbiter.card / fakegpu.LOG_FILE).read_text()
+        self.arbiter.close()
+        return log
+
+
+@pytest.fixture(scope="module")
+def all_cases() -> Iterator[Stage]:
+    made = Stage()
+    yield made
+    report = check_log(made.close())
+    assert not report.problems
+    assert report.oom_events == 0, "nobody ran out of memory in any of these"
+    assert report.peak_bytes <= 8 * GIB
+
+
+@pytest.fixture
+def stage(all_cases: Stage) -> Iterator[Stage]:
+    all_cases.watch()
+    yield all_cases
+    all_cases.end_case()
+
+
+def until(ask: Callable[[], str], word: str) -> str:
+    """What an operator sees once it says so. Every answer of the program paces the questions."""
+    for _ in range(60):
+        if word in (said := ask()):
+            return said
+    raise AssertionError(f"never {word!r}: {said}")
+
+
+def test_1_the_next_one_loads_when_the_memory_is_back_and_nothing_stays_failed(stage: Stage) -> None:
+    """llama-swap#97: it starts too early, fails, and the failed state then stays."""
+    stage.configure(release_lag_s=0.6)
+    first = stage.spawn("first-1", 5)
+    first.until("ready")
+    second = stage.spawn("second-1", 5)
+    second.until("ready")
+    assert stage.used_when("second-1") == RESIDUE, "nothing but the context that the first one keeps"
+    assert stage.event("verified", consumer="first-1")["verdict"] == "verified"
+    stage.configure(release_lag_s=0.15)
+
+
+def test_1_while_the_card_cannot_be_read_no_figure_of_it_is_printed(stage: Stage) -> None:
+    """comfyui-mcp#2050: "1205 MB free", and 24 GB a moment later. A failed poll must print nothing."""
+    assert "free 7.71 GiB" in stage.vramctl("status")
+    stage.configure(faults=fakegpu.Faults(probe="fail"))
+    stage.event("probe_failed")
+    shown = stage.vramctl("status")
+    assert "measured: unknown" in shown
+    assert "free" not in shown
+    waiter = stage.spawn("waiter-1", 1)
+    stage.event("queued", consumer="waiter-1")
+    assert "the card cannot be read" in stage.vramctl("why", "waiter-1")
+    stage.configure(faults=fakegpu.Faults())
+    waiter.until("ready")
+
+
+def test_2_an_unload_that_does_not_unload_is_named_until_its_process_ends(stage: Stage) -> None:
+    """Triton#2023, vLLM#47654, IsaacLab-Arena#670: +8358 MiB over the baseline after "cleanup"."""
+    stage.configure(faults=fakegpu.Faults(leak_bytes=4 * GIB))
+    leaky = stage.spawn("leaky", 5)
+    leaky.until("ready")
+    waiter = stage.spawn("waiter-2", 5)
+    leaky.until("gone")
+    verdict = stage.event("verified", consumer="leaky")
+    assert verdict["verdict"] == "residue"
+    assert [culprit["pid"] for culprit in verdict["culprits"]] == [leaky.pid]
+    assert f"residue of pid {leaky.pid}" in stage.vramctl("status")
+    assert "leaky" in (why := stage.vramctl("why", "waiter-2")), why
+    assert "keeps its context until it exits" in why
+    leaky.kill()
+    waiter.until("ready")
+
+
+def test_3_a_holder_that_is_stopping_for_ever_is_named_and_ended_only_where_it_agreed(stage: Stage) -> None:
+    """ollama#7606 and others "Stopping…"; llama-swap#125, #138: only SIGKILL helped, and children stayed behind."""
+    patient = stage.spawn("patient", 5, stuck=True)
+    patient.until("ready")
+    first = stage.spawn("first-3", 5)
+    patient.until("unloading")
+    stage.event("deadline_passed", consumer="patient")
+    assert "patient" in stage.vramctl("why", "first-3")
+    assert patient.alive, "by default nothing is done to what may move a robot"
+    patient.kill()
+    first.until("ready")
+    first.kill()
+    agreed = stage.spawn("agreed", 5, stuck=True, deaf=True, spec={"on_overstay": "kill"})
+    agreed.until("ready")
+    second = stage.spawn("second-3", 5)
+    assert [stage.event("signalled")["signal"] for _ in range(2)] == ["term", "kill"]
+    agreed.wait()
+    second.until("ready")
+
+
+def test_8_of_two_that_come_at_once_one_loads_after_the_other(stage: Stage) -> None:
+    """vLLM#55827, ollama#13235: two loads at once mis-size each other, although both fit."""
+    both = {name: stage.spawn(name, 2, slow=True) for name in ("loader-a", "loader-b")}
+    first = both.pop(stage.event("granted")["consumer"])
+    (second,) = both.values()
+    stage.event("queued", consumer=second.name)
+    first.until("loading")
+    assert "is loading" in stage.vramctl("why", second.name)
+    first.tell("go")
+    second.until("loading")
+    second.tell("go")
+    second.until("ready")
+    assert stage.used_when(second.name) == 2 * GIB, "the first one was there in full"
+
+
+def test_11_a_game_that_starts_is_seen_named_and_makes_idle_models_leave(stage: Stage) -> None:
+    """gpu-arbiter's whole purpose; Berth's stowaways; Castwright#1976: what was missing was a name."""
+    idle = stage.spawn("idle-11", 5)
+    idle.until("ready")
+    with subprocess.Popen(
+        [sys.executable, "-c", GAME, str(stage.arbiter.card), str(int(2.9 * GIB))],
+        env=stage.arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    ) as game:  # fmt: skip
+        seen = stage.event("stowaway", pid=game.pid)
+        assert (seen["name"], seen["used_bytes"]) == ("game", int(2.9 * GIB))
+        assert f"stowaway pid {game.pid} game: 2.9 GiB without a lease" in stage.vramctl("status")
+        idle.until("gone")
+        waiter = stage.spawn("waiter-11", 6)
+        stage.event("queued", consumer="waiter-11")
+        assert "game (holds bytes without a lease)" in stage.vramctl("why", "waiter-11")
+        game.communicate("\n", PATIENCE_S)
+    waiter.until("ready")
+
+
+def test_12_the_running_manager_has_no_bytes_on_the_card_and_no_cuda_in_it(stage: Stage) -> None:
+    """llama.cpp#20582, #21692: 120-550 MB of every card, for a router that only asked how much is free."""
+    stage.spawn("user-12", 1).until("ready")
+    maps = Path(f"/proc/{stage.arbiter.pid}/maps").read_text()
+    assert not [word for word in ("libcuda", "libcudart", "libtorch", "libnvrtc") if word in maps]
+    assert stage.watcher is not None
+    processes = stage.watcher.ask("status")["gpus"][0]["processes"]
+    assert stage.arbiter.pid not in [process["pid"] for process in processes]
+
+
+def test_21_whoever_was_made_to_leave_and_starts_again_at_once_does_not_get_in_between(stage: Stage) -> None:
+    """OpenRAL ADR-0050: within 15 ms an autostarted node activates again and takes the memory that was made free."""
+    detector = stage.spawn("detector-21", 5, again=True)
+    detector.until("ready")
+    policy = stage.spawn("policy-21", 5)
+    detector.until("gone")
+    detector.until("waiting")
+    policy.until("ready")
+    assert stage.used_when("policy-21") == RESIDUE
+    detector.until("ready")
+    policy.until("gone")
