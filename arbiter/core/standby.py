@@ -125,6 +125,8 @@ def queue_again(
     """From away into the queues, as somebody who came at `asked_at`. Without a request it is told by push."""
     del core.away[lease.id]
     lease.move(LeaseState.QUEUED, core.now, "wanted again")
+    core.timers.clear(("ttl", lease.id))  # after a restart: whoever asks has come back
+    lease.attached = True
     core.hand_to(lease, client)
     lease.request = request
     lease.answered = request is None

@@ -44,6 +44,26 @@ def test_a_holder_that_does_not_come_back_loses_it() -> None:
     assert f"lease:{lease}" not in driver.journal
 
 
+def test_who_asks_for_it_anew_before_re_attaching_has_come_back() -> None:
+    """After a restart it asks for the model again, and waits for longer than a holder has time to come back."""
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver, ttl_s=10.0)
+    policy_token = policy.token(wanted)
+    driver.restart()
+    policy.connect()
+    policy.reattach(wanted, policy_token)
+    policy.use_begin(wanted)
+    det.connect()
+    assert det.acquire(5 * GIB, standby=True, ttl_s=10.0) == lease
+    for _ in range(10):
+        policy.renew((wanted, policy.token(wanted)))
+        driver.advance(2.5)
+    assert driver.state(lease) == "queued"
+    policy.use_end(wanted)
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
+
+
 def test_only_leases_on_standby_in_the_journal_hold_up_nobody() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease, policy, wanted = sent_away(driver)
