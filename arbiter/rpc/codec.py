@@ -45,8 +45,7 @@ def decode(payload: bytes | memoryview, size_max: int) -> Request:
         raise Undecodable(
             BadFrame(f"a request is a msgpack map, not {kind}", hint='{"op": …, "id": n, …}'), None
         )
-    raw_id = message.get("id")
-    request_id = raw_id if type(raw_id) is int and 0 <= raw_id < 1 << 53 else None
+    request_id = _id(message)
     op = message.get("op")
     if not isinstance(op, str):
         problem = BadRequest(
@@ -59,6 +58,22 @@ def decode(payload: bytes | memoryview, size_max: int) -> Request:
         return REQUEST.validate_python(message)
     except ValidationError as error:
         raise Undecodable(_bad_request(op, error), request_id) from error
+
+
+def id_of(payload: bytes | memoryview, size_max: int) -> int | None:
+    """The id that a request is answered to, without looking at the rest of it; None where none can be read."""
+    if len(payload) > size_max:
+        return None
+    try:
+        message = msgpack.unpackb(payload, raw=False, strict_map_key=True)
+    except (ValueError, msgpack.UnpackException, RecursionError):
+        return None
+    return _id(message) if isinstance(message, dict) else None
+
+
+def _id(message: Mapping[Any, Any]) -> int | None:
+    found = message.get("id")
+    return found if type(found) is int and 0 <= found < 1 << 53 else None
 
 
 def _bad_request(op: str, error: ValidationError) -> BadRequest:

@@ -31,8 +31,13 @@ SELF_TEST_S = 2.0
 LINGER_MS = 200
 """At shutdown answers under way get so long to leave."""
 
-OnFrame = Callable[[bytes, bool, str | None, bytes], None]
-"""`on_frame(routing_id, delimiter, peer_address, payload)`"""
+FLOOD = 8
+"""Messages over their sender's rate in one drain; then the socket rests. libzmq hands over messages of its peers in turns, so nobody
+waits for more than one of a flooder's, but answering a flood as fast as it comes takes the processor from everybody."""
+FLOOD_REST_S = 0.0003
+
+OnFrame = Callable[[bytes, bool, str | None, bytes], bool]
+"""`on_frame(routing_id, delimiter, peer_address, payload)`; False: its sender is over its rate."""
 
 
 def socket_path(endpoint: str) -> Path:
@@ -86,6 +91,7 @@ class RouterServer:
         self._on_frame: OnFrame | None = None
         self._draining = False
         self._drain_scheduled = False
+        self._resting: asyncio.TimerHandle | None = None
         self._early: deque[list[zmq.Frame]] = deque()
         self.dropped = 0
 
@@ -160,6 +166,9 @@ class RouterServer:
         if self._loop is not None:
             self._loop.remove_reader(self._socket.fileno())
             self._on_frame = None
+        if self._resting is not None:
+            self._resting.cancel()
+            self._resting = None
 
     def close(self) -> None:
         """Shutdown, second half. The socket's file goes away; the lock is still held by the caller."""
@@ -171,16 +180,30 @@ class RouterServer:
             self._path.unlink()
 
     def _schedule_drain(self) -> None:
-        if self._loop is not None and not self._draining and not self._drain_scheduled:
-            self._drain_scheduled = True
-            self._loop.call_soon(self._drain)
+        if self._loop is None or self._draining or self._drain_scheduled or self._resting is not None:
+            return
+        self._drain_scheduled = True
+        self._loop.call_soon(self._drain)
+
+    def _rest(self) -> None:
+        """Leave a flood where it is for a moment: what is queued in libzmq slows its sender down."""
+        if self._loop is not None and self._on_frame is not None:
+            self._loop.remove_reader(self._socket.fileno())
+            self._resting = self._loop.call_later(FLOOD_REST_S, self._rested)
+
+    def _rested(self) -> None:
+        self._resting = None
+        if self._loop is not None:
+            self._loop.add_reader(self._socket.fileno(), self._drain)
+            self._drain()
 
     def _drain(self) -> None:
-        """Read until empty, or until `DRAIN_MAX`, and then again after others had their turn."""
+        """Read until empty, or until `DRAIN_MAX`, and then again after others had their turn; in a flood after a rest."""
         self._drain_scheduled = False
-        if self._draining or self._on_frame is None:
+        if self._draining or self._on_frame is None or self._resting is not None:
             return
         self._draining = True
+        too_fast = 0
         try:
             for _ in range(DRAIN_MAX):
                 if self._on_frame is None:
@@ -190,9 +213,12 @@ class RouterServer:
                 except zmq.Again:
                     return
                 try:
-                    self._deliver(frames)
+                    too_fast += not self._deliver(frames)
                 except Exception:  # outermost: one bad message must not cost the others their wake-up
                     log.exception("a message could not be handled")
+                if too_fast >= FLOOD:
+                    self._rest()
+                    return
         finally:
             self._draining = False
         self._schedule_drain()
@@ -201,14 +227,14 @@ class RouterServer:
         """Raises zmq.Again where nothing is there."""
         return self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
 
-    def _deliver(self, frames: list[zmq.Frame]) -> None:
+    def _deliver(self, frames: list[zmq.Frame]) -> bool:
         """`[id, payload]` from a DEALER, `[id, "", payload]` from a REQ; any other count of frames is no message of ours."""
         assert self._on_frame is not None
         routing_id = frames[0].bytes
         delimiter = len(frames) == 3 and len(frames[1]) == 0
         # anything else goes on as an empty payload, which the codec answers with BadFrame
         payload = frames[-1].bytes if len(frames) == 2 or delimiter else b""
-        self._on_frame(routing_id, delimiter, _peer_address(frames[-1]), payload)
+        return self._on_frame(routing_id, delimiter, _peer_address(frames[-1]), payload)
 
 
 def _peer_address(frame: zmq.Frame) -> str | None:

@@ -123,33 +123,40 @@ class SessionTable:
         ] = {}  # the connection that each instance had before → the one that it has
         self._strangers_budget = float(settings.rate_per_s)
         self._strangers_at = clock()
+        self._too_fast = LimitExceeded(
+            f"more than {settings.rate_per_s} requests a second",
+            hint="send less often",
+            details={"limit": "rate_per_client_per_s", "value": settings.rate_per_s},
+        ).to_wire()
 
     # -- in ----------------------------------------------------------------------------------------------------
-    def receive(self, routing_id: bytes, delimiter: bool, address: str | None, payload: bytes) -> None:
-        """One frame from the socket. Never raises for anything that a peer can send.
+    def receive(self, routing_id: bytes, delimiter: bool, address: str | None, payload: bytes) -> bool:
+        """One frame from the socket. Never raises for anything that a peer can send. False: its sender is over its rate.
 
-        1. Charge the rate; over it: LimitExceeded. 2. Decode and validate. 3. No session: hello or UnknownSession.
+        1. Charge the rate; over it: LimitExceeded, and nothing more is looked at. 2. Decode and validate. 3. No session: hello or UnknownSession.
         4. The frame's process is not the session's: NotPermitted. 5. Role. 6. Dispatch.
         """
         session = self._sessions.get(ClientId(routing_id.hex()))
         now = self._clock()
-        within_rate = self._charge_rate(session, now)  # 1
+        if not self._charge_rate(session, now):  # 1
+            request_id = codec.id_of(payload, self._settings.message_max_bytes)
+            self._wire.send(
+                routing_id, delimiter, codec.refusal(request_id, self._settings.epoch, self._too_fast)
+            )
+            return False
         try:
             request = codec.decode(payload, self._settings.message_max_bytes)  # 2
         except codec.Undecodable as bad:
-            error = bad.error if within_rate else self._rate_exceeded()
-            self._refuse_raw(routing_id, delimiter, bad.request_id, error)
-            return
+            self._refuse_raw(routing_id, delimiter, bad.request_id, bad.error)
+            return True
         try:
-            if not within_rate:
-                raise self._rate_exceeded()
             if session is None:  # 3
                 if not isinstance(request, w.Hello):
                     raise UnknownSession(
                         f"{request.op} before hello", hint="say hello first, then re-attach your leases"
                     )
                 self._hello(routing_id, delimiter, address, request, now)
-                return
+                return True
             if address != session.address:  # 4
                 raise NotPermitted(
                     "this connection belongs to another process", hint="open a connection of your own"
@@ -162,6 +169,7 @@ class SessionTable:
             self._dispatch(session, request)  # 6
         except VramError as error:
             self._refuse_raw(routing_id, delimiter, request.id, error)
+        return True
 
     def process_died(self, process: ProcessKey) -> None:
         """The kernel said so: forget its connections. The core hears it from whoever watches."""
@@ -206,14 +214,6 @@ class SessionTable:
             return False
         session.budget -= 1
         return True
-
-    def _rate_exceeded(self) -> LimitExceeded:
-        rate = self._settings.rate_per_s
-        return LimitExceeded(
-            f"more than {rate} requests a second",
-            hint="send less often",
-            details={"limit": "rate_per_client_per_s", "value": rate},
-        )
 
     def _hello(
         self, routing_id: bytes, delimiter: bool, address: str | None, hello: w.Hello, now: float

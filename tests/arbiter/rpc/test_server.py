@@ -15,7 +15,7 @@ import msgpack
 import pytest
 import zmq
 
-from arbiter.rpc.server import RouterServer, make_private_folder, socket_path
+from arbiter.rpc.server import FLOOD, RouterServer, make_private_folder, socket_path
 from arbiter.testing.wire import WireClient
 from schemas.errors import ConfigError
 
@@ -30,6 +30,8 @@ class Serving:
     loop: asyncio.AbstractEventLoop = field(default_factory=asyncio.new_event_loop)
     seen: list[tuple[bytes, bool, str | None, int]] = field(default_factory=list)
     fail_once: bool = False
+    too_fast: bytes | None = None  # payloads that are over their sender's rate
+    rests: int = 0
 
     def __post_init__(self) -> None:
         self.server = RouterServer(self.path, LIMIT, None)
@@ -44,13 +46,14 @@ class Serving:
         self.server.close()
         self.loop.close()
 
-    def _on_frame(self, routing_id: bytes, delimiter: bool, address: str | None, payload: bytes) -> None:
+    def _on_frame(self, routing_id: bytes, delimiter: bool, address: str | None, payload: bytes) -> bool:
         self.seen.append((routing_id, delimiter, address, len(payload)))
         if self.fail_once:
             self.fail_once = False
             raise RuntimeError("a defect of ours")
         answer = {"re": len(self.seen), "address": address, "size": len(payload), "delimiter": delimiter}
         self.server.send(routing_id, delimiter, msgpack.packb(answer))
+        return payload != self.too_fast
 
     def call(self, function: Callable[[], object]) -> object:
         """Run something on the server's loop and return its result."""
@@ -214,6 +217,43 @@ def test_a_reader_that_does_not_read_costs_only_itself(serving: Serving, client:
         assert sent < 20_000, "beyond its queue messages are dropped, not kept"
         client.send_raw(b"x")
         assert client.receive() is not None
+
+
+def test_a_flood_is_answered_in_portions_and_costs_nobody_a_wake_up(
+    serving: Serving, client: WireClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rest = serving.server._rest
+
+    def counted() -> None:
+        serving.rests += 1
+        rest()
+
+    monkeypatch.setattr(serving.server, "_rest", counted)
+    serving.too_fast = b"flood"
+    with WireClient(f"ipc://{serving.path}") as flooder:
+        for _ in range(50):
+            for _ in range(2 * FLOOD):
+                flooder.send_raw(b"flood")
+            client.send_raw(b"calm")
+            reply = client.receive()
+            assert reply is not None
+            assert reply["size"] == len(b"calm")
+        answers = [flooder.receive() for _ in range(100 * FLOOD)]
+        assert None not in answers, "each is answered"
+    assert 50 < serving.rests <= 100
+    client.send_raw(b"calm")
+    assert client.receive() is not None, "after the last rest the socket is read as before"
+
+
+def test_a_server_that_rests_can_be_stopped(serving: Serving, client: WireClient) -> None:
+    serving.too_fast = b"flood"
+    for _ in range(10 * FLOOD):
+        client.send_raw(b"flood")
+    assert client.receive() is not None
+    assert serving.call(lambda: (serving.server._rest(), serving.server.stop_receiving())) == (None, None)
+    assert serving.server._resting is None
+    assert serving.call(serving.server._rest) is None, "nothing is read any more, so nobody rests"
+    assert serving.server._resting is None
 
 
 def test_many_clients_at_once(serving: Serving) -> None:

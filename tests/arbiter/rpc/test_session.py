@@ -335,6 +335,25 @@ def test_the_rate_is_limited_per_session_and_refills(bench: Bench) -> None:
     assert sum(bench.ask("ping")["ok"] for _ in range(60)) == 50
 
 
+def test_who_is_over_the_rate_is_told_so_whatever_it_sent(bench: Bench) -> None:
+    """Each is answered to its id, and nothing of it is looked at but that."""
+    bench.hello(b"a")
+    receive = bench.table.receive
+    assert [receive(b"a", False, ME, msgpack.packb({"op": "ping", "id": n})) for n in range(100)] == [
+        *[True] * 99, False
+    ]  # fmt: skip
+    for payload, request in (
+        (msgpack.packb({"op": "acquire", "id": 7, "spec": 3}), 7),
+        (msgpack.packb({"op": "no such", "id": -1}), None),
+        (msgpack.packb({"id": True}), None),
+        (msgpack.packb([7]), None),
+        (b"\xc1", None),
+        (msgpack.packb({"op": "ping", "id": 8, "pad": "x" * 5000}), None),
+    ):
+        reply = bench.raw(payload)
+        assert (code(reply), reply["re"]) == ("limit_exceeded", request)
+
+
 def test_strangers_share_one_budget(bench: Bench) -> None:
     for _ in range(100):
         bench.raw(b"junk", b"z")
