@@ -39,6 +39,8 @@ def on_recovered(core: Core, event: Recovered) -> None:
             residue_bytes = min(int(record["residue_bytes"]), _room_bytes(gpu))
             floor_bytes = min(int(record.get("floor_bytes", residue_bytes)), residue_bytes)
             gpu.ledger.set_residue(process, residue_bytes, core.now, floor_bytes)
+            if not residue_bytes:  # stale leases fill the card: nobody would ever take the record out
+                core.forget(key)
         else:
             _restore(core, gpu, record)
     parents = {LeaseId(str(r["lease_id"])): str(r["parent"]) for r in held.values() if r.get("parent")}

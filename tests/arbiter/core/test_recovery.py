@@ -297,6 +297,8 @@ def test_records_that_a_full_disk_kept_may_say_more_than_the_card_has() -> None:
     records[f"residue:{other.process}:GPU-0"] = {**stale, "residue_bytes": 4 * GIB}
     records["lease:L1-9"] = {**records[f"lease:{lease}"], "lease_id": "L1-9", "token": [1, 10], "nonce": "n9"}
     again = CoreDriver(8 * GIB, start=False)
+    again.journal = dict(records)
     again.post(Recovered(records))
+    assert not [key for key in again.journal if key.startswith("residue:")], "nobody would ever take it out"
     assert {lease, "L1-9"} <= {view["lease_id"] for view in again.arbiter.status(again.now)["leases"]}
     assert again.gpu()["pressure_bytes"] > 0, "what was never approved is pressure"
