@@ -85,6 +85,10 @@ class HostRamInsufficient(TransientError):
     code = "host_ram_insufficient"  # no room to park: details.needed_bytes, budget_bytes, booked_bytes
 
 
+class LoadFailing(TransientError):
+    code = "load_failing"  # it died in its load several times in a row, and somebody would have to leave: details.retry_in_s, cause
+
+
 class GangBroken(TransientError):
     code = (
         "gang_broken"  # another member was denied, lost or gave up before all were granted: details.gang, why

@@ -125,6 +125,15 @@ class Eviction:
     order: Order | None = None  # an operator wanted it
 
 
+@dataclass(frozen=True, slots=True)
+class Failures:
+    """Loads of one consumer with one model that failed in a row (`crashes`)."""
+
+    count: int
+    last_at: float
+    cause: str  # of the last
+
+
 class Roster(Protocol):
     """A table that is kept by state (`residents`)."""
 

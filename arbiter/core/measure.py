@@ -6,7 +6,7 @@ Starts, polls and ends verifications; the judgement itself is in `verify`. A fai
 from collections.abc import Mapping
 from typing import Any
 
-from arbiter.core import costs, drift, eviction, families, growth, standby
+from arbiter.core import costs, crashes, drift, eviction, families, growth, standby
 from arbiter.core.events import MemorySampled, ProbeFailed
 from arbiter.core.lease import AWAY, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
@@ -351,6 +351,7 @@ def lose(
 ) -> None:
     """A resident lease is over (expired or lost); its bytes become a debt and are measured away."""
     gpu = core.gpu_of(lease)
+    crashes.failed(core, lease, str(error["message"]))
     for use in list(lease.uses.values()):
         core.unmark(lease, use)
     lease.yielded.clear()

@@ -4,7 +4,7 @@ Nothing here changes anything but one timer (`wake_when_evictable`).
 """
 
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import combinations
 
 from arbiter.core import costs
@@ -16,6 +16,7 @@ from schemas.ids import LeaseId, ProcessKey
 EXACT_SEARCH_MAX = 12  # candidates; beyond that the search is greedy
 _WAKE_SLACK_S = 0.001  # so that a wake-up for an ageing step does not come a rounding error too early
 
+MISSING_NAMED = 3
 _LEAVING = (LeaseState.REVOKING, LeaseState.UNLOADING, LeaseState.VERIFYING)  # in a fixed order
 
 type _Covers = Callable[[Mapping[LeaseId, int]], bool]
@@ -26,7 +27,7 @@ type _Choice = Callable[[Core, Sequence[Lease], _Covers, Mapping[LeaseId, int]],
 def blocked(core: Core, gpu: Gpu) -> str:
     """Why nothing can be granted on this card now, whoever asks; "" if grants are possible."""
     if core.recovering is not None:
-        return "recovering after a restart: holders have to come back first"
+        return f"recovering after a restart: {_missing(core, core.recovering)} must come back first"
     if core.drain is not None:
         return f"drained by {core.drain}"
     if gpu.failed_at is not None:
@@ -40,6 +41,15 @@ def blocked(core: Core, gpu: Gpu) -> str:
     if gpu.pressed:
         return f"pressure: {gpu.ledger.pressure_bytes()} bytes more than the budget are held"
     return ""
+
+
+def _missing(core: Core, missing: Collection[LeaseId]) -> str:
+    """Who has not come back since a restart, by name. They live: whoever died meanwhile was lost at once."""
+    holders = [core.leases[lease_id] for lease_id in sorted(missing) if lease_id in core.leases]
+    if not holders:
+        return "holders"
+    names = ", ".join(f"{lease.spec.consumer} (pid {lease.process.pid})" for lease in holders[:MISSING_NAMED])
+    return names if len(holders) <= MISSING_NAMED else f"{names} and {len(holders) - MISSING_NAMED} more"
 
 
 def leaving(gpu: Gpu) -> dict[LeaseId, int]:

@@ -6,7 +6,7 @@ anyone who knows the exact token.
 
 from dataclasses import replace
 
-from arbiter.core import costs, drift, eviction, explain, families, gangs, growth, placement, standby
+from arbiter.core import costs, crashes, drift, eviction, explain, families, gangs, growth, placement, standby
 from arbiter.core.events import (
     AcquireRequested,
     CancelRequested,
@@ -117,6 +117,8 @@ def acquire(core: Core, event: AcquireRequested) -> None:
     if away is not None:
         _take_over(core, event, away, spec, gpus)
         return
+    if spec.gang is None:
+        crashes.check(core, spec, load_peak, gpus)
     lease = new_lease(core, event, client, spec, load_peak, steady, gpus)
     core.unanswered.append(lease)
     if spec.gang is None:
@@ -348,6 +350,7 @@ def _charge_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     gpu = core.gpu_of(lease)
     lease.measured_bytes = measured_bytes
     drift.on_ready(core, lease, measured_bytes)
+    crashes.succeeded(core, lease)
     steady = lease.steady_bytes if measured_bytes is None else max(measured_bytes, lease.spec.residue_bytes)
     families.recharge(core, gpu, lease, steady)
     gpu.changed_at = core.now

@@ -12,7 +12,7 @@ from typing import Any
 from arbiter.core.effects import Effect, JournalDelete, JournalPut, Note, Push, Refuse, Reply, Sample
 from arbiter.core.events import MemorySampled
 from arbiter.core.footprints import Footprints
-from arbiter.core.lease import LEAVING, Estate, Eviction, Gang, Lease, LeaseState, Order, Use
+from arbiter.core.lease import LEAVING, Estate, Eviction, Failures, Gang, Lease, LeaseState, Order, Use
 from arbiter.core.ledger import GpuLedger
 from arbiter.core.parking import HostRam
 from arbiter.core.queue import WaitQueue
@@ -162,6 +162,7 @@ class Core:
         self.footprints = Footprints()
         self.footprints.restore(settings.footprints)
         self.reuse: dict[str, Reuse] = {}  # by consumer
+        self.crashes: dict[str, Failures] = {}  # by model, the latest last
         self.switches: dict[tuple[str, str], float] = {}  # (who left, for whom) → when last
         self.durations: dict[str, dict[str, deque[float]]] = {}
         for consumer, medians in sorted(settings.learnt.items()):

@@ -3,6 +3,7 @@ programs, a simulated card. Numbers are those of the list of complaints; docs/ne
 """
 
 import json
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -246,6 +247,56 @@ def test_12_the_running_manager_has_no_bytes_on_the_card_and_no_cuda_in_it(stage
     assert stage.watcher is not None
     processes = stage.watcher.ask("status")["gpus"][0]["processes"]
     assert stage.arbiter.pid not in [process["pid"] for process in processes]
+
+
+def test_13_a_second_authority_on_the_same_card_does_not_give_away_what_the_first_one_gave(
+    stage: Stage,
+) -> None:
+    """taOS#859: two VRAM authorities. Each arbiter sees the other's holders: bytes without a lease of its own."""
+    holder = stage.spawn("holder-13", 5)
+    holder.until("ready")
+    other = ArbiterProcess(gpu=f"fake:{stage.arbiter.card}", config=CONFIG).start()
+    try:
+        with WireClient(other.endpoint) as client:
+            assert client.hello("elsewhere").ask("status")["gpus"][0]["stowaway_bytes"] == 5 * GIB
+            assert client.acquire("elsewhere", 5 * GIB)["state"] == "queued"
+    finally:
+        other.close()
+
+
+def test_14_after_a_restart_it_is_said_who_lives_and_who_has_exited(stage: Stage) -> None:
+    """Berth 0.5.1-rc.1: an engine without a lease after the daemon's restart, and nobody says whether its wrapper is alive."""
+    silent, exits = stage.spawn("silent-14", 2), stage.spawn("exits-14", 2)
+    silent.until("ready")
+    exits.until("ready")
+    silent.signal(signal.SIGSTOP)
+    stage.arbiter.kill()
+    exits.kill()
+    stage.arbiter.start()
+    stage.watch()
+    assert f"silent-14 (pid {silent.pid}) must come back first" in stage.vramctl("status")
+    told = stage.vramctl("history", "--kind", "lost", "-c", "exits-14")
+    assert f"process {exits.pid} died" in told
+    waiter = stage.spawn("waiter-14", 1)
+    stage.event("queued", consumer="waiter-14")
+    silent.signal(signal.SIGCONT)
+    waiter.until("ready")
+
+
+def test_17_a_program_that_crashes_in_its_load_does_not_empty_the_card_for_each_start(stage: Stage) -> None:
+    """A supervisor starts it again at once, every time. The model that works stays, and the program is told the cause."""
+    for _ in range(3):
+        start = stage.spawn("crashes", 5, slow=True)
+        start.until("loading")
+        start.kill()
+        stage.event("verified", consumer="crashes")
+    working = stage.spawn("working", 5)
+    working.until("ready")
+    again = stage.spawn("crashes", 5)
+    again.wait()
+    assert "LoadFailing" in (stage.arbiter.runtime / "errors.log").read_text()
+    assert working.alive
+    assert "held, idle" in stage.vramctl("status")
 
 
 def test_21_whoever_was_made_to_leave_and_starts_again_at_once_does_not_get_in_between(stage: Stage) -> None:

@@ -121,6 +121,20 @@ def test_a_holder_that_never_comes_back_expires_and_is_measured_away() -> None:
     assert driver.journal.keys() == {f"lease:{waiter}"}
 
 
+def test_whoever_has_not_come_back_is_named() -> None:
+    driver = CoreDriver(8 * GIB)
+    for n in range(5):
+        held(driver, f"m{n}", 1)
+    driver.restart()
+    told = str(driver.gpu()["blocked"])
+    assert told.startswith("recovering after a restart: m0 (pid ")
+    assert told.endswith(") and 2 more must come back first")
+    driver = CoreDriver(8 * GIB)
+    driver.card.set(driver.consumer("x").process, 1 * GIB, driver.now)
+    driver.post(Recovered({}))
+    assert "holders must come back first" in str(driver.gpu()["blocked"])
+
+
 def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease, _ = held(driver, "det", 5)
