@@ -38,7 +38,7 @@ test: setup ## the whole product; ARGS goes to pytest
 test-core: setup-core ## the base install alone, in seconds
 	$(CORE)/pytest -q -n $(WORKERS) --dist loadfile -m "not heavy and not e2e and not gpu" $(ARGS)
 
-nightly: setup ## the engine's rule machines, far and at random (half an hour); a failure prints how to see it again
+nightly: setup ## the engine's rule machines, far and at random (ten minutes); a failure prints how to see it again
 	$(BIN)/pytest -q -n $(WORKERS) -o timeout=7200 -o faulthandler_timeout=7000 --hypothesis-profile=nightly tests/arbiter/core/test_machine.py tests/arbiter/core/test_family_machine.py $(ARGS)
 
 lint: setup ## style, types and who may import whom

@@ -140,10 +140,6 @@ def on_ladder_due(core: Core, lease_id: str) -> None:
 
 def _unload_hangs(core: Core, holder: Lease) -> None:
     """It unloads, and has not ended within a deadline. Others are asked in its place, and the card is not kept free for its bytes."""
-    due_at = holder.since + core.settings.revoke_deadline_s
-    if due_at > core.now:  # a timer of the steps before
-        core.timers.set(("revoke", holder.id), due_at)
-        return
     holder.hangs = True
     if holder.eviction is not None:
         holder.eviction.overdue = True

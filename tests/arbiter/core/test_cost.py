@@ -41,11 +41,12 @@ class Counted:
 
     def counted(self, event: ev.Event) -> int:
         self.count = 0
+        before = sys.gettrace()  # that of a coverage run
         sys.settrace(self._trace)
         try:
             self.tell(event)
         finally:
-            sys.settrace(None)
+            sys.settrace(before)
         return self.count
 
     def _trace(self, frame: FrameType, event: str, _: Any) -> Any:
