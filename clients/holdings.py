@@ -23,7 +23,7 @@ from clients.records import (
     token_of,
 )  # fmt: skip
 from schemas import defaults as d
-from schemas.errors import LeaseLost, VramError, WaitTimeout, from_wire
+from schemas.errors import LeaseLost, LeaseRevoking, VramError, WaitTimeout, from_wire
 
 GONE_CODES = frozenset({"lease_lost", "lease_expired", "unknown_lease", "stale_token"})
 """Replies that say that the lease is no longer ours."""
@@ -70,16 +70,9 @@ class Holdings:
     ) -> int:
         """Hold more, or less. The reply says `held` when it is done; else its end comes as `Resized`."""
 
-        def accepted(_: Message, __: float) -> None:
-            record.spec = {**record.spec, "footprint": footprint}
-
-        message = {
-            "op": "resize",
-            **record.ref(),
-            "footprint": footprint,
-            "wait_timeout_s": wait_timeout_s,
-        }
-        return self._ask(record, message, now, on_reply=accepted)
+        record.resizing = footprint
+        record.resizing_until = None if wait_timeout_s is None else now + wait_timeout_s
+        return self._send_resize(record, footprint, now)
 
     def oom(self, record: LeaseRecord, requested_bytes: int, allocated_bytes: int | None, now: float) -> int:
         message = {
@@ -106,6 +99,9 @@ class Holdings:
         """
         record.released = True
         self.held.pop(record.lease_id, None)
+        if record.resizing is not None:  # the arbiter drops it too, and says nothing of it
+            left = f"{record.lease_id} left the card before it had the size that was asked for"
+            self._resized(record, LeaseRevoking(left, hint="ask again when it is granted again"))
         if asleep:
             record.asleep = asleep
             self.asleep[record.lease_id] = record
@@ -160,13 +156,13 @@ class Holdings:
     def denied(self, lease_id: str, error: VramError) -> None:
         """A wait that ended without a grant: of a resize, or of a lease that wanted to come back."""
         if record := self.held.get(lease_id):
-            self._connection.tell(Resized(record, error))
+            self._resized(record, error)
         elif record := self.asleep.get(lease_id):
             self._gone(record, error)
 
     def resized(self, lease_id: str) -> None:
         if record := self.held.get(lease_id):
-            self._connection.tell(Resized(record))
+            self._resized(record)
 
     def revoked(self, push: Message) -> None:
         record = self.held.get(push["lease_id"])
@@ -198,10 +194,13 @@ class Holdings:
                 self._gone(record, _why_gone(entry))
 
     def say_again(self, now: float) -> None:
-        """A new daemon knows from the re-attachment that a lease is away, not that it is wanted."""
+        """A new daemon knows from the re-attachment that a lease is away or held, not that it is wanted, or at another size."""
         for record in self.asleep.values():
             if record.wanted and not self._connection.awaits(record.reacquire_id):
                 self._send_reacquire(record, now, quiet=True)
+        for record in self.held.values():
+            if record.resizing is not None and not self._connection.awaits(record.resize_id):
+                self._send_resize(record, record.resizing, now, quiet=True)
 
     # -- time --------------------------------------------------------------------------------------------------------
     def deadlines(self) -> Iterator[float]:
@@ -282,6 +281,32 @@ class Holdings:
             message, now, on_reply=replied, on_error=refused, quiet=quiet
         )
         return record.reacquire_id
+
+    def _send_resize(
+        self, record: LeaseRecord, footprint: Message, now: float, *, quiet: bool = False
+    ) -> int:
+        """`quiet`: said again by ourselves, so that its end is told whatever it is."""
+
+        def replied(reply: Message, _: float) -> None:
+            record.spec = {**record.spec, "footprint": footprint}
+            if reply["state"] == "held" and quiet:
+                self._resized(record)
+            elif reply["state"] == "held":
+                record.resizing = None
+
+        def refused(error: VramError, _: float) -> None:
+            record.resizing = None
+            if quiet:
+                self._resized(record, error)
+
+        left_s = None if record.resizing_until is None else max(0.0, record.resizing_until - now)
+        message = {"op": "resize", **record.ref(), "footprint": footprint, "wait_timeout_s": left_s}
+        record.resize_id = self._ask(record, message, now, on_reply=replied, on_error=refused, quiet=quiet)
+        return record.resize_id
+
+    def _resized(self, record: LeaseRecord, error: VramError | None = None) -> None:
+        record.resizing = None
+        self._connection.tell(Resized(record, error))
 
     def _cancel(self, record: LeaseRecord, now: float) -> None:
         self._connection.ask({"op": "cancel", "lease_id": record.lease_id}, now, quiet=True)

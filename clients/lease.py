@@ -211,7 +211,7 @@ class Lease:
     async def resize(self, footprint: Footprint, wait_timeout_s: float | None = None) -> None:
         """Hold more (returns once there is room for it: allocate then) or less (free first; returns once it is measured gone).
 
-        Raises VramInsufficient, WaitTimeout, WouldDeadlock, LeaseLost; the lease then keeps the size that it had.
+        Raises VramInsufficient, WaitTimeout, WouldDeadlock, LeaseLost; the lease then keeps the size that it had. LeaseRevoking: it left meanwhile.
         """
         self._raise_if_leaving()
         self._resize_error = None

@@ -150,6 +150,9 @@ class LeaseRecord:
     wanted: bool = False  # asleep, and its owner waits for its return
     wanted_until: float | None = None  # None: for ever
     reacquire_id: int | None = None  # the newest request that asked for it
+    resizing: Message | None = None  # the footprint that its owner waits for
+    resizing_until: float | None = None  # None: for ever
+    resize_id: int | None = None  # the newest request that asked for it
 
     @property
     def ttl_s(self) -> float:

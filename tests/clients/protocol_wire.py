@@ -46,6 +46,9 @@ class Wire:
         assert message["op"] == op
         return message
 
+    def said(self, op: str) -> list[dict[str, Any]]:
+        return [message for message in self.sent() if message["op"] == op]
+
     def reply(self, request: Mapping[str, Any], **body: Any) -> None:
         self.connection.receive({"re": request["id"], "epoch": self.epoch, "ok": True, **body}, self.now)
 

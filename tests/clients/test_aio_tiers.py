@@ -203,6 +203,60 @@ async def test_a_lease_grows_and_shrinks(arbiter_daemon: ArbiterProcess, spec: S
         assert (cache.state, cache.spec.footprint.steady_bytes) == ("held", 1 * GIB)
 
 
+def five_gib() -> Footprint:
+    return Footprint(load_peak_bytes=5 * GIB, steady_bytes=5 * GIB, residue_bytes=0)
+
+
+async def test_a_resize_ends_with_the_stay_on_the_card(
+    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
+) -> None:
+    """Regression: what a lease that was asked to leave had waited for was dropped, and its `resize` never returned."""
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        cache = await client.acquire(spec("cache", 2, standby=True))
+        await cache.ready()
+        busy = await client.acquire(spec("busy", 3, priority=90), 20.0)
+        await busy.ready()
+        async with ArbiterClient(arbiter_daemon.endpoint, name="u") as other, busy.use():
+            growing = asyncio.create_task(cache.resize(five_gib()))
+            await until_growing(client)
+            policy = await other.acquire(spec("policy", 4, priority=95), 20.0)
+            with pytest.raises(LeaseRevoking):
+                await growing
+            assert cache.state == "standby"
+            await policy.release()
+
+
+async def test_a_resize_that_waits_outlives_the_daemon(
+    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
+) -> None:
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        cache = await client.acquire(spec("cache", 2))
+        memory = FakeMemory(arbiter_daemon.card, "t", 0)
+        memory.allocate("cache", 2 * GIB)
+        await cache.ready()
+        busy = await client.acquire(spec("busy", 3, priority=90), 20.0)
+        block = memory.allocate("busy", 3 * GIB)
+        await busy.ready()
+        async with busy.use():
+            growing = asyncio.create_task(cache.resize(five_gib()))
+            await until_growing(client)
+            arbiter_daemon.kill()
+            arbiter_daemon.start()
+            await until(lambda: client.connected)
+            await until_growing(client)
+        memory.free(block)
+        memory.empty_cache()
+        await busy.give_up()
+        await asyncio.wait_for(growing, 20.0)
+        assert cache.spec.footprint.steady_bytes == 5 * GIB
+
+
+async def until_growing(client: ArbiterClient) -> None:
+    async with asyncio.timeout(20.0):
+        while not any(lease.get("resizing") for lease in (await client.status())["leases"]):
+            await asyncio.sleep(0.02)
+
+
 async def test_a_sub_lease_is_carved_out_of_its_parents(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
 ) -> None:
