@@ -1,7 +1,7 @@
 """What the kernel says at once about a socket that does not answer.
 
 libzmq connects in silence, again and again: to whom may not use the socket, or whose arbiter was killed, it looks like an arbiter that
-is slow. Imports nothing heavy: `vramctl status` asks here before everything else.
+is slow.
 """
 
 import errno

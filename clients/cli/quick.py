@@ -13,7 +13,6 @@ from functools import partial
 from typing import Any
 
 from clients.cli import text
-from clients.reach import START, obstacle
 from schemas.defaults import WIRE_VERSION
 from schemas.endpoints import arbiter_endpoint
 
@@ -21,6 +20,8 @@ OK, NO, USAGE, UNREACHABLE = 0, 1, 2, 3
 """Exit codes of `vramctl`: done; the answer is no, or an error; wrong usage; the arbiter cannot be reached."""
 
 TIMEOUT_S = 3.0
+DOUBT_MS = 200
+"""An arbiter answers within a few; after so long it is looked whether there is one."""
 HANGS = "something holds the socket and is silent: look at the arbiter's log, or set VRAM_ARBITER_ENDPOINT"
 ENVELOPE = frozenset({"re", "ok"})
 
@@ -30,7 +31,7 @@ Message = dict[str, Any]
 class Unreachable(Exception):
     """Nobody answers; the text says where, `hint` what to do."""
 
-    def __init__(self, message: str, hint: str = START) -> None:
+    def __init__(self, message: str, hint: str) -> None:
         super().__init__(message)
         self.hint = hint
 
@@ -47,8 +48,8 @@ def ask(
     import zmq
 
     where = endpoint or arbiter_endpoint(os.environ, os.getuid())
-    if found := obstacle(where):
-        raise Unreachable(*found)
+    if where.startswith("ipc://") and not os.path.exists(where.removeprefix("ipc://")):
+        _look(where)
     context = zmq.Context()
     socket = context.socket(zmq.DEALER)
     try:
@@ -56,7 +57,11 @@ def ask(
         try:
             socket.connect(where)
         except zmq.ZMQError as error:
-            raise Unreachable(f"{where} is no endpoint: {error.strerror}") from error
+            _look(where)
+            hint = (
+                "set VRAM_ARBITER_ENDPOINT to where it serves, such as ipc:///run/vram-arbiter/arbiter.sock"
+            )
+            raise Unreachable(f"{where} is no endpoint: {error.strerror}", hint) from error
         hello = {
             "op": "hello",
             "id": 1,
@@ -67,6 +72,8 @@ def ask(
         for message in (hello | {"role": role}, {"op": op, "id": 2, **fields}):
             socket.send(msgpack.packb(message))
         deadline = time.monotonic() + timeout_s
+        if not socket.poll(min(DOUBT_MS, int(1000 * timeout_s))):
+            _look(where)
         while socket.poll(max(0, int(1000 * (deadline - time.monotonic())))):
             reply: Message = msgpack.unpackb(socket.recv(), strict_map_key=False)
             if reply.get("re") == 2 or (reply.get("re") == 1 and not reply.get("ok")):
@@ -75,6 +82,14 @@ def ask(
     finally:
         socket.close()
         context.term()
+
+
+def _look(where: str) -> None:
+    """Raises Unreachable if the kernel knows at once why nobody answers."""
+    from clients.reach import obstacle
+
+    if found := obstacle(where):
+        raise Unreachable(*found)
 
 
 def answer(

@@ -103,9 +103,13 @@ class Stage:
         self.children.clear()
         self.configure(faults=fakegpu.Faults())
         watcher = self.watch()
-        while (status := watcher.ask("status"))["leases"] or status["gpus"][0]["charged_bytes"]:
+        while not self._clean(watcher.ask("status")):
             watcher.receive(0.02)  # the next event; the card is being read meanwhile
-        assert watcher.ask("status")["gpus"][0]["stowaway_bytes"] == 0
+
+    @staticmethod
+    def _clean(status: dict[str, Any]) -> bool:
+        (gpu,) = status["gpus"]
+        return not (status["leases"] or gpu["charged_bytes"] or gpu["stowaway_bytes"])
 
     def close(self) -> str:
         if self.watcher is not None:

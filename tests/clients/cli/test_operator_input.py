@@ -178,6 +178,7 @@ def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) 
     (arbiter_daemon.runtime / "arbiter.sock").write_text("")
     assert "is no socket" in one_line(vramctl(environ, "resume"))
     assert "is no endpoint" in one_line(vramctl(environ, "resume", "--endpoint", f"ipc:///{'x' * 200}"))
+    assert "garbage is no endpoint" in one_line(vramctl(environ, "resume", "--endpoint", "garbage"))
 
 
 def test_a_look_at_the_socket_disturbs_nobody(
