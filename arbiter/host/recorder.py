@@ -204,6 +204,7 @@ class _Files:
         self._max_bytes = max_bytes
         self._file_bytes = min(file_bytes, max_bytes // 2)
         self._file: int | None = None
+        self._full_bytes = self._file_bytes  # the file that is written is full then
         self._size = 0
         self._segment = 0
 
@@ -241,17 +242,24 @@ class _Files:
         )
         line = header_line(header)
         path = self.folder / file_name(self._started_wall_s, self._settings.epoch, begin.segment)
-        self._make_room(len(line))
+        half_bytes = self._max_bytes // 2
+        if len(line) > half_bytes:
+            raise ValueError(
+                f"the engine's state alone takes {len(line)} bytes, more than half of record.max_bytes ({self._max_bytes})"
+            )
+        # A state is copied while everybody waits: as much as it takes must be written before it is copied again.
+        self._full_bytes = max(self._file_bytes, min(2 * len(line), half_bytes))
+        self._make_room(self._full_bytes)
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         self._size, self._segment = 0, begin.segment
         return line
 
-    def _make_room(self, more_bytes: int) -> None:
+    def _make_room(self, file_bytes: int) -> None:
         """Oldest files go until a whole new one fits the bound."""
         files = [(path, path.stat().st_size) for path in sorted(self.folder.glob(f"*{SUFFIX}"))]
         total = sum(size for _, size in files)
         for path, size in files:
-            if total + max(self._file_bytes, more_bytes) <= self._max_bytes:
+            if total + file_bytes <= self._max_bytes:
                 return
             path.unlink()
             total -= size
@@ -268,7 +276,7 @@ class _Files:
             os.ftruncate(self._file, self._size)  # what is there stays whole
             raise
         self._size += len(data)
-        if self._size >= self._file_bytes:
+        if self._size >= self._full_bytes:
             self.full_segment = self._segment
 
 

@@ -12,7 +12,7 @@ from arbiter.core.arbiter import Arbiter
 from arbiter.host import recorder as module
 from arbiter.host.recorder import Recorder, freezer
 from arbiter.replay import runner
-from arbiter.replay.logfile import FOLDER, LogError
+from arbiter.replay.logfile import FOLDER, LogError, header_line
 from arbiter.testing.core_driver import START_S, CoreDriver
 from schemas import defaults as d
 
@@ -132,6 +132,54 @@ def test_the_folder_stays_within_its_bound(busy: CoreDriver, tmp_path: Path) -> 
         recorded.recorder.close()
         assert not recorded.files()[0].name.startswith("1970")
         assert recorded.replayed().identical
+
+    recording(test)
+
+
+def test_a_state_that_is_larger_than_a_file_does_not_begin_a_new_one_at_every_event(
+    busy: CoreDriver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file that began with it was full at once: the engine was copied again and again, a quarter of a second each time."""
+    monkeypatch.setattr(
+        module, "header_line", lambda header: header_line(header)[:-1] + " " * 100 * KIB + "\n"
+    )
+
+    async def test() -> None:
+        recorded = Recorded(busy, tmp_path, file_bytes=64 * KIB, max_bytes=1024 * KIB)
+        count = len(recorded.events)
+        sizes: list[int] = []
+        while recorded.events:
+            recorded.go(min(5, len(recorded.events)))
+            await recorded.written()
+            sizes.append(sum(path.stat().st_size for path in recorded.files()))
+        recorded.recorder.close()
+        files = recorded.files()
+        assert 2 < len(files) < count / 20
+        assert all(path.stat().st_size >= 200 * KIB for path in files[:-1]), "as much again as the state took"
+        assert max(sizes) <= 1024 * KIB
+        assert recorded.replayed().identical
+
+    recording(test)
+
+
+def test_a_state_that_is_too_large_for_the_bound_stops_the_recording(
+    busy: CoreDriver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        module, "header_line", lambda header: header_line(header)[:-1] + " " * 100 * KIB + "\n"
+    )
+
+    async def test() -> None:
+        recorded = Recorded(busy, tmp_path, file_bytes=64 * KIB, max_bytes=128 * KIB)
+        recorded.go(5)
+        await recorded.written()
+        async with asyncio.timeout(PATIENCE_S):
+            await recorded.noted.wait()
+        recorded.recorder.close()
+        [(kind, facts)] = recorded.notes
+        assert kind == "record_stopped"
+        assert "record.max_bytes" in str(facts["reason"])
+        assert not recorded.files(), "nothing was begun that could not be ended"
 
     recording(test)
 
