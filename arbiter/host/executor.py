@@ -15,6 +15,9 @@ from schemas.ids import ClientId, GpuId, ProcessKey, RequestId
 
 log = logging.getLogger(__name__)
 
+_RECORDS = (fx.JournalPut, fx.JournalDelete)
+_NOTHING: Mapping[str, JournalUnavailable] = {}
+
 
 class Outbox(Protocol):
     """The way to the clients (`rpc.session.SessionTable`)."""
@@ -64,46 +67,31 @@ class Executor:
         """Records still to be deleted: the disk was full when they ended. The next write does it."""
 
     def perform(self, effects: Sequence[fx.Effect]) -> None:
-        """One batch. A grant is on disk before its holder hears of it: consecutive journal effects are one transaction, and if that
-        fails, what the batch still has to say about leases granted in it is not said (the waiting request is refused instead).
+        """One batch. Its records are written first, all in one transaction, so a grant is on disk before its holder hears of it. If that
+        fails, what the batch says about a lease after it was granted is not said (the waiting request is refused instead).
 
         Whoever waits for an answer has it first: facts are written down after all answers, and readings are begun last of all, since
         their thread takes the interpreter from this one.
         """
+        records = [effect for effect in effects if isinstance(effect, _RECORDS)]
+        failed = self._write(records) if records else _NOTHING
+        refused: dict[str, JournalUnavailable] = {}  # lease id → why
         notes: list[fx.Note] = []
         samples: list[fx.Sample] = []
-        refused: dict[str, JournalUnavailable] = {}  # lease id → why
-        index = 0
-        while index < len(effects):
-            effect = effects[index]
-            if isinstance(effect, fx.JournalPut | fx.JournalDelete):
-                run = []
-                while index < len(effects) and isinstance(
-                    found := effects[index], fx.JournalPut | fx.JournalDelete
-                ):
-                    run.append(found)
-                    index += 1
-                self._write(run, refused)
-                continue
-            index += 1
-            if refused and (why := refused.get(_lease_of(effect) or "")) is not None:
-                if isinstance(effect, fx.Reply):
-                    self._outbox.refuse(effect.client, effect.request, why.to_wire())
-                continue
-            match effect:
-                case fx.Reply(client, request, body):
-                    self._outbox.reply(client, request, body)
-                case fx.Push(client, body):
-                    self._outbox.push(client, body)
-                case fx.Note():
-                    notes.append(effect)
-                case fx.Sample():
-                    samples.append(effect)
-                case fx.Signal(process, kind):
-                    self._signal(process, kind)
-                case fx.Refuse(client, request, code, message, hint, details):
-                    error = {"code": code, "message": message, "hint": hint, "details": dict(details)}
-                    self._outbox.refuse(client, request, error)
+        for effect in effects:
+            if failed:
+                if isinstance(effect, fx.JournalPut) and (why := failed.get(effect.key)) is not None:
+                    refused[effect.key.removeprefix("lease:")] = why
+                if (why := refused.get(_lease_of(effect) or "")) is not None:
+                    if isinstance(effect, fx.Reply):
+                        self._outbox.refuse(effect.client, effect.request, why.to_wire())
+                    continue
+            if isinstance(effect, fx.Note):
+                notes.append(effect)
+            elif isinstance(effect, fx.Sample):
+                samples.append(effect)
+            elif not isinstance(effect, _RECORDS):
+                self._say(effect)
         for note in notes:
             event = self._history.append(note.kind, note.data)
             self._log_event(event)
@@ -111,33 +99,47 @@ class Executor:
         for sample in samples:
             self._sample(sample.gpu)
 
+    def _say(self, effect: fx.Effect) -> None:
+        match effect:
+            case fx.Reply(client, request, body):
+                self._outbox.reply(client, request, body)
+            case fx.Push(client, body):
+                self._outbox.push(client, body)
+            case fx.Signal(process, kind):
+                self._signal(process, kind)
+            case fx.Refuse(client, request, code, message, hint, details):
+                error = {"code": code, "message": message, "hint": hint, "details": dict(details)}
+                self._outbox.refuse(client, request, error)
+
     def settle(self) -> None:
         """Try again to delete what could not be deleted, if anything is left of that."""
         if self.owed:
-            self._write((), {})
+            self._write(())
 
-    def _write(
-        self, run: Sequence[fx.JournalPut | fx.JournalDelete], refused: dict[str, JournalUnavailable]
-    ) -> None:
-        changes = [(e.key, e.record if isinstance(e, fx.JournalPut) else None) for e in run]
-        gates = {e.key for e in run if isinstance(e, fx.JournalPut) and e.gates}
-        named = {key for key, _ in changes}
-        owed: list[tuple[str, Mapping[str, Any] | None]] = [
-            (key, None) for key in self.owed if key not in named
-        ]
+    def _write(self, records: Sequence[fx.JournalPut | fx.JournalDelete]) -> Mapping[str, JournalUnavailable]:
+        """Write records, and delete what is owed. Keys of grants that could not be written, with the reason."""
+        changes = [(e.key, e.record if isinstance(e, fx.JournalPut) else None) for e in records]
+        owed: list[tuple[str, Mapping[str, Any] | None]] = []
+        if self.owed:
+            named = {key for key, _ in changes}
+            owed = [(key, None) for key in self.owed if key not in named]
         try:
             self._journal.apply([*owed, *changes])
             self.owed.clear()
+            return _NOTHING
         except JournalUnavailable as error:
             log.error("journal: %s", error)
+            failed: dict[str, JournalUnavailable] = {}
+            gates = {e.key for e in records if isinstance(e, fx.JournalPut) and e.gates}
             for key, record in changes:
                 if record is None:
                     self.owed[key] = None
                     continue
                 self.owed.pop(key, None)
                 if key in gates:
-                    refused[key.removeprefix("lease:")] = error
+                    failed[key] = error
                 self._post(ev.JournalFailed(key, error.message, key in gates))
+            return failed
 
 
 def _lease_of(effect: fx.Effect) -> str | None:

@@ -76,11 +76,10 @@ def test_answers_go_out_in_order_then_facts_then_readings() -> None:
         ]
     )
     assert recorder.done == [
-        ("journal", ("lease:L1-1", {"a": 1}), ("lease:L1-0", None)),
+        ("journal", ("lease:L1-1", {"a": 1}), ("lease:L1-0", None), ("lease:L1-1", None)),
         ("reply", A, ONE, {"lease": LEASE}),
         ("push", A, {"push": "revoke"}),
         ("refuse", A, ONE, "bad_state"),
-        ("journal", ("lease:L1-1", None)),
         ("history", "granted"),
         ("log", "granted"),
         ("broadcast", "granted"),
@@ -106,6 +105,27 @@ def test_a_grant_that_cannot_be_written_is_not_sent() -> None:
         ("refuse", A, ONE, "journal_unavailable"),
         ("push", A, {"push": "revoke", "lease_id": "L1-9"}),
         ("sample", GPU),
+    ]
+
+
+def test_what_was_said_of_a_lease_before_its_grant_is_said_though_that_cannot_be_written() -> None:
+    """Records are written first, for all that the batch says; it still waits for what came after the grant only."""
+    recorder = Recorder()
+    recorder.disk_full = True
+    recorder.executor.perform(
+        [
+            fx.JournalPut("lease:L1-0", {"state": "verifying"}),
+            fx.Reply(A, RequestId(2), {"state": "verifying"}),
+            fx.Push(A, {"push": "queued", "lease_id": "L1-1"}),
+            fx.JournalPut("lease:L1-1", {"a": 1}, gates=True),
+            fx.Push(A, {"push": "granted", "lease": LEASE}),
+        ]
+    )
+    assert recorder.done == [
+        ("post", ev.JournalFailed("lease:L1-0", "disk full", gates=False)),
+        ("post", ev.JournalFailed("lease:L1-1", "disk full")),
+        ("reply", A, RequestId(2), {"state": "verifying"}),
+        ("push", A, {"push": "queued", "lease_id": "L1-1"}),
     ]
 
 

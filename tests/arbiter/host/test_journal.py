@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.host.journal import Journal
+from arbiter.host.journal import AT_ONCE_MAX, Journal
 from schemas.errors import ConfigError, JournalUnavailable
 
 RECORDS = {"lease:L1-1": {"token": [1, 2], "state": "held"}, "residue:7@9:GPU-1": {"residue_bytes": 5}}
@@ -201,3 +201,21 @@ def test_a_folder_that_cannot_be_used_is_a_config_error(tmp_path: Path) -> None:
     (tmp_path / "journal.sqlite").mkdir()
     with pytest.raises(ConfigError, match="state folder"):
         Journal.open(tmp_path, "boot-1")
+
+
+@pytest.mark.parametrize("count", [1, 2, AT_ONCE_MAX, AT_ONCE_MAX + 1, 40])
+def test_batches_of_any_size_and_kind_are_written_whole(tmp_path: Path, count: int) -> None:
+    journal = Journal.open(tmp_path, "boot")
+    keys = [f"lease:L{n:02d}" for n in range(count)]
+    journal.apply([(key, {"n": 1}) for key in keys])
+    journal.apply([("residue", {"n": 2}), (keys[0], None)])
+    journal.apply([(keys[0], {"n": 3}), (keys[0], {"n": 4})])
+    journal.close()
+    journal = Journal.open(tmp_path, "boot")
+    expected = {key: {"n": 1} for key in keys} | {keys[0]: {"n": 4}, "residue": {"n": 2}}
+    assert journal.opened.records == expected
+    journal.apply([(key, None) for key in [*keys, "nobody"]])
+    journal.close()
+    journal = Journal.open(tmp_path, "boot")
+    assert journal.opened.records == {"residue": {"n": 2}}
+    journal.close()
