@@ -24,6 +24,8 @@ HINT = (
 
 def resolve(core: Core) -> None:
     """Deny waiters until no circle is left. Each is answered like any request that is refused, or by push if it waited already."""
+    if not core.suspects:
+        return
     suspects, core.suspects = core.suspects, set()
     while any(core.users.get(process) and _waits_of(core, process) for process in suspects):
         cycle = find(core)

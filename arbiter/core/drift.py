@@ -26,10 +26,12 @@ def model_name(spec: Spec) -> str:
 # -- what a request is charged -----------------------------------------------------------------------------------------
 def expected_bytes(core: Core, spec: Spec) -> tuple[int, int]:
     """(load peak, steady): the larger of declared and learnt. Learnt bytes alone never exceed the largest card's budget."""
-    most = max(gpu.ledger.budget_bytes for gpu in core.gpus.values())
     name = model_name(spec)
-    steady_learnt = min(core.footprints.p95_bytes(name, "steady"), most)
-    peak_learnt = min(core.footprints.p95_bytes(name, "load_peak"), most)
+    steady_learnt = core.footprints.p95_bytes(name, "steady")
+    peak_learnt = core.footprints.p95_bytes(name, "load_peak")
+    if steady_learnt or peak_learnt:
+        most = max(gpu.ledger.budget_bytes for gpu in core.gpus.values())
+        steady_learnt, peak_learnt = min(steady_learnt, most), min(peak_learnt, most)
     steady = max(spec.steady_bytes, spec.residue_bytes, steady_learnt)
     return max(spec.load_peak_bytes, steady, peak_learnt), steady
 
@@ -64,12 +66,11 @@ def on_ready(core: Core, lease: Lease, measured: int | None) -> None:
 
 def on_leaving(core: Core, lease: Lease) -> None:
     """It lets go, was lost, or expired: what it took at most is one life's figure. A load that was cut off says only if it was too much."""
-    name = model_name(lease.spec)
     if lease.steady_seen_bytes:
-        core.footprints.measured(name, "steady", lease.steady_seen_bytes)
+        core.footprints.measured(model_name(lease.spec), "steady", lease.steady_seen_bytes)
         _note_drift(core, lease, "steady", lease.steady_seen_bytes)
     elif lease.peak_seen_bytes > lease.load_peak_bytes:
-        core.footprints.measured(name, "load_peak", lease.peak_seen_bytes)
+        core.footprints.measured(model_name(lease.spec), "load_peak", lease.peak_seen_bytes)
         _note_drift(core, lease, "load_peak", lease.peak_seen_bytes)
     lease.peak_seen_bytes = lease.steady_seen_bytes = 0  # it may come back from standby and load again
 

@@ -36,12 +36,14 @@ class InvariantViolation(Exception):
 def check(core: Core) -> None:
     """Raise InvariantViolation unless everything holds that the last event can have broken."""
     for gpu in core.gpus.values():
-        _bytes(core, gpu)
-        _residents(core, gpu)
+        granted = bool(core.granted) and _granted_on(core, gpu)
+        _bytes(gpu, granted=granted)
+        _residents(gpu, granted=granted)
         _charges(gpu)
-    _tokens(core)
+    if core.granted:
+        _tokens(core)
     _waiters(core)
-    if problem := gangs.unsound(core):
+    if core.gangs and (problem := gangs.unsound(core)):
         raise InvariantViolation(7, problem)
     _away(core)
 
@@ -60,13 +62,13 @@ def check_all(core: Core) -> None:
     check(core)
 
 
-def _bytes(core: Core, gpu: Gpu) -> None:
+def _bytes(gpu: Gpu, *, granted: bool) -> None:
     approved = gpu.ledger.approved_bytes()
     if approved > gpu.ledger.budget_bytes:
         raise InvariantViolation(
             1, f"{approved} bytes approved on {gpu.info.id}, budget {gpu.ledger.budget_bytes}"
         )
-    if _granted_on(core, gpu) and gpu.ledger.total_bytes() > gpu.ledger.budget_bytes:
+    if granted and gpu.ledger.total_bytes() > gpu.ledger.budget_bytes:
         raise InvariantViolation(
             1, f"granted on {gpu.info.id}, which now has {gpu.ledger.total_bytes()} bytes to bear"
         )
@@ -77,9 +79,9 @@ def _granted_on(core: Core, gpu: Gpu) -> bool:
     return any(gpu_id == gpu.info.id for _, gpu_id in core.granted)
 
 
-def _residents(core: Core, gpu: Gpu) -> None:
+def _residents(gpu: Gpu, *, granted: bool) -> None:
     residents = gpu.residents
-    if _granted_on(core, gpu):
+    if granted:
         alone = next(iter(residents.exclusive.values()), None)
         if alone is not None and any(lease.root is not alone for lease in residents.values()):
             raise InvariantViolation(
@@ -105,29 +107,30 @@ def _unused(lease: Lease) -> None:
 def _charges(gpu: Gpu) -> None:
     """Whoever came, went, was charged or was dropped since the last time is looked at; who stayed stays sound."""
     ledger, residents = gpu.ledger, gpu.residents
-    touched = ledger.touched | residents.touched
-    for lease_id in sorted(touched):
-        if lease_id in residents and not ledger.charges(lease_id):
-            raise InvariantViolation(4, f"{lease_id} is {residents[lease_id].state} and not charged")
-    gpu.debts |= touched
+    if ledger.touched or residents.touched:
+        touched = ledger.touched | residents.touched
+        for lease_id in sorted(touched):
+            if lease_id in residents and not ledger.charges(lease_id):
+                raise InvariantViolation(4, f"{lease_id} is {residents[lease_id].state} and not charged")
+        gpu.debts |= touched
+        ledger.touched.clear()
+        residents.touched.clear()
     for lease_id in [
         lease_id for lease_id in gpu.debts if lease_id in residents or not ledger.charges(lease_id)
     ]:
         gpu.debts.discard(lease_id)
-    for lease_id in sorted(gpu.debts):
+    for lease_id in sorted(gpu.debts) if gpu.debts else ():
         if lease_id not in gpu.verifications and lease_id not in gpu.ledger.reserved:
             raise InvariantViolation(4, f"the bytes of {lease_id} are charged for ever")
     for lease in residents.in_state(LeaseState.VERIFYING):
         if lease.id not in gpu.verifications:
             raise InvariantViolation(4, f"{lease.id} waits for a verdict that nobody works on")
-    if problem := families.unshared(gpu):
+    if gpu.estates and (problem := families.unshared(gpu)):
         raise InvariantViolation(4, problem)
-    ledger.touched.clear()
-    residents.touched.clear()
 
 
 def _away(core: Core) -> None:
-    parked = core.host.granted_bytes()
+    parked = core.host.granted_bytes() if core.host.booked else 0
     if parked > core.host.budget_bytes:
         raise InvariantViolation(4, f"{parked} bytes are parked, the budget is {core.host.budget_bytes}")
     for lease in core.away.values():
@@ -146,9 +149,13 @@ def _tokens(core: Core) -> None:
 
 
 def _waiters(core: Core) -> None:
-    queued = sum(len(gpu.queue) for gpu in core.gpus.values())
-    aside = sum(len(gang.waiting()) for gang in core.gangs.values() if gang.phase != "waiting")
-    waiting = len(core.waiting) - aside
+    queued = 0
+    for gpu in core.gpus.values():
+        queued += len(gpu.queue)
+    waiting = len(core.waiting)
+    for gang in core.gangs.values():
+        if gang.phase != "waiting":
+            waiting -= len(gang.waiting())
     if queued < waiting or (len(core.gpus) == 1 and queued != waiting):
         raise InvariantViolation(6, f"{waiting} leases wait, {queued} are in queues")
     for gpu in core.gpus.values():

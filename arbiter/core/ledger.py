@@ -139,13 +139,11 @@ class GpuLedger:
         total = self.total_bytes() if stowaways else self._occupied_bytes
         if not leaving and not joining:
             return total
-        by_process: dict[ProcessKey, dict[LeaseId, int]] = {}
+        by_process: dict[ProcessKey, dict[LeaseId, int]] = {process: {} for process in joining}
         for lease, residue_bytes in leaving.items():
             owner = self._owner.get(lease)
             if owner is not None:
                 by_process.setdefault(owner, {})[lease] = residue_bytes
-        for process in joining:
-            by_process.setdefault(process, {})
         for process, going in by_process.items():
             more_bytes = joining.get(process, 0)
             account = self.accounts.get(process)

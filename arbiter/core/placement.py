@@ -61,6 +61,8 @@ def reconsider(core: Core, gpu: Gpu) -> None:
 
 
 def _is_able(gpu: Gpu, spec: Spec, load_peak: int) -> bool:
+    if not gpu.residents.pinned:
+        return load_peak <= gpu.ledger.budget_bytes
     pins = _pins(gpu)
     alone = not pins or not (spec.exclusive or any(lease.spec.exclusive for lease in pins))
     fixed = sum(gpu.ledger.charge_bytes(lease.id) for lease in pins)

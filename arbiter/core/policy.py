@@ -99,9 +99,11 @@ def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool
     if lease.spec.exclusive:
         if any(other not in going for other in gpu.ledger.leases()):
             return False
-    elif any(other not in going and other != lease.grows for other in gpu.residents.exclusive):
+    elif gpu.residents.exclusive and any(
+        other not in going and other != lease.grows for other in gpu.residents.exclusive
+    ):
         return False
-    elif any(v.exclusive and v.lease not in going for v in gpu.verifications.values()):
+    elif gpu.verifications and any(v.exclusive and v.lease not in going for v in gpu.verifications.values()):
         return False  # it died or expired, and still has the card to itself until it is measured gone
     return gpu.ledger.total_if(going, joining(lease)) <= gpu.ledger.budget_bytes
 
@@ -141,7 +143,7 @@ def placed_elsewhere(core: Core, gpu: Gpu, lease: Lease) -> bool:
 def front(core: Core, gpu: Gpu) -> Lease | None:
     """Whose turn it is here: the head's, or of the first behind it for whom no other card is being emptied."""
     head = gpu.queue.head()
-    if head is None or fits(gpu, head):
+    if head is None or not placed_elsewhere(core, gpu, head) or fits(gpu, head):
         return head
     return next((lease for lease in gpu.queue if not placed_elsewhere(core, gpu, lease)), None)
 
@@ -168,7 +170,9 @@ def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
 
 def measured_need_bytes(gpu: Gpu, lease: Lease) -> int:
     """What the reading must have free: what a grant charges, less what the processes already hold (their contexts)."""
-    return sum(_unheld_bytes(gpu, process, count) for process, count in joining(lease).items())
+    if lease.needs is None:
+        return _unheld_bytes(gpu, lease.process, lease.load_peak_bytes)
+    return sum(_unheld_bytes(gpu, process, count) for process, count in lease.needs.items())
 
 
 def _unheld_bytes(gpu: Gpu, process: ProcessKey, count: int) -> int:

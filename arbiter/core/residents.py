@@ -84,7 +84,11 @@ class Residents(dict[LeaseId, Lease]):
         return [lease for state in states for lease in self._by_state[state].values()]
 
     def any_in(self, states: Iterable[LeaseState]) -> bool:
-        return any(self._by_state[state] for state in states)
+        by_state = self._by_state
+        for state in states:  # noqa: SIM110 - asked with every event, and a generator costs more than the answer
+            if by_state[state]:
+                return True
+        return False
 
     def unseen(self, taken_at: float) -> list[Lease]:
         """Granted or become ready after a reading began (the newest, or one after it): it cannot have seen them."""

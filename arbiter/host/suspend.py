@@ -6,13 +6,13 @@ that the night was there. Must not know what is done about it.
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 NOTICED_S = 1.0
 """A shorter sleep changes nothing that a reading of the card would show."""
 
 
-def _boottime() -> float:
-    return time.clock_gettime(time.CLOCK_BOOTTIME)
+_boottime = partial(time.clock_gettime, time.CLOCK_BOOTTIME)
 
 
 class SuspendWatch:
