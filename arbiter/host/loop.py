@@ -7,6 +7,7 @@ the epoll descriptor itself waits to the microsecond. Must not know what the tim
 import asyncio
 import select
 import selectors
+import time
 
 FINE_BELOW_S = 0.05
 """Longer waits do not notice a millisecond."""
@@ -15,13 +16,18 @@ SELECT_FD_MAX = 1023
 
 
 class FineSelector(selectors.EpollSelector):
-    """Waits first for anything or for the exact time, then asks what there is."""
+    """Waits for whole milliseconds as ever; only what is left then takes a call more."""
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        if timeout is not None and 0 < timeout < FINE_BELOW_S and self.fileno() <= SELECT_FD_MAX:
-            select.select((self.fileno(),), (), (), timeout)
-            timeout = 0
-        return super().select(timeout)
+        if timeout is None or not 0 < timeout < FINE_BELOW_S or self.fileno() > SELECT_FD_MAX:
+            return super().select(timeout)
+        until = time.monotonic() + timeout
+        if timeout >= 0.001:
+            ready = super().select((int(timeout * 1e3) - 0.5) / 1e3)  # it rounds up
+            if ready:
+                return ready
+        select.select((self.fileno(),), (), (), max(0.0, until - time.monotonic()))
+        return super().select(0)
 
 
 def new_loop() -> asyncio.AbstractEventLoop:
