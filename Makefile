@@ -33,7 +33,7 @@ demo: setup ## find, navigate, grab in 8 GiB: SEED=0 ARBITER=on|off GPU=fake:8Gi
 
 test: setup ## the whole product; ARGS goes to pytest
 	$(BIN)/pytest -q -n $(WORKERS) --dist loadfile -m "not e2e" $(ARGS)
-	$(BIN)/pytest -q -m e2e $(ARGS)
+	$(BIN)/pytest -q -n $(WORKERS) --dist loadfile -m e2e $(ARGS)
 
 test-core: setup-core ## the base install alone, in seconds
 	$(CORE)/pytest -q -n $(WORKERS) --dist loadfile -m "not heavy and not e2e and not gpu" $(ARGS)
