@@ -10,6 +10,11 @@ ARGS ?=
 QUICK ?=
 # How long `make chaos` storms.
 SECONDS ?= 300
+# How many histories `make nightly` walks, of all machines together; one machine alone.
+HISTORIES ?= 100000
+MACHINE ?=
+# How many mutants `make mutation` tries; 0: all.
+SAMPLE ?= 300
 
 BIN := .venv/bin
 CORE := .venv-core/bin
@@ -17,7 +22,7 @@ CORE := .venv-core/bin
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core demo test test-core nightly lint format chaos sim bench schemas install-units clean
+.PHONY: help setup setup-core demo test test-core nightly mutation lint format chaos sim bench schemas install-units clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -38,8 +43,11 @@ test: setup ## the whole product; ARGS goes to pytest
 test-core: setup-core ## the base install alone, in seconds
 	$(CORE)/pytest -q -n $(WORKERS) --dist loadfile -m "not heavy and not e2e and not gpu" $(ARGS)
 
-nightly: setup ## the engine's rule machines, far and at random (ten minutes); a failure prints how to see it again
-	$(BIN)/pytest -q -n $(WORKERS) -o timeout=7200 -o faulthandler_timeout=7000 --hypothesis-profile=nightly tests/arbiter/core/test_machine.py tests/arbiter/core/test_family_machine.py $(ARGS)
+nightly: setup ## the engine's rule machines, far and at random, on all cores: HISTORIES=100000 MACHINE=leases SEED=n
+	$(BIN)/python tests/nightly/nightly_run.py --histories $(HISTORIES) $(if $(MACHINE),--machine $(MACHINE)) $(if $(filter-out 0,$(SEED)),--seed $(SEED)) $(ARGS)
+
+mutation: setup ## small changes in arbiter/core that no test of the core sees: SAMPLE=300 of them by chance, SEED=n
+	$(BIN)/python tests/mutation/mutation_run.py --sample $(SAMPLE) --seed $(SEED) $(ARGS)
 
 lint: setup ## style, types and who may import whom
 	$(BIN)/ruff check .

@@ -1,15 +1,14 @@
-"""Fixtures for every test of the product: a real arbiter daemon in a folder of its own."""
+"""For every test of the product: a real arbiter daemon in a folder of its own, and Hypothesis's nightly profile."""
 
 from collections.abc import Callable, Iterator
 
 import pytest
-from hypothesis import settings
 
-from arbiter.testing.machines import NIGHTLY
+from arbiter.testing import machines
 from arbiter.testing.process import ArbiterProcess
 from arbiter.testing.wire import WireClient
 
-settings.register_profile(NIGHTLY)  # pytest --hypothesis-profile=nightly; see `arbiter.testing.machines`
+machines.register()
 
 
 @pytest.fixture

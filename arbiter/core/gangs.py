@@ -211,19 +211,21 @@ def next_load(core: Core, gpu: Gpu, gang: Gang) -> Lease | None:
         if not going and not victims:
             _break(core, gang, "others hold more than they were granted, the rest no longer fits")
         return None
-    if not _is_free(core, gpu, gang, lease):
+    moved = min(headroom, more)  # it is booked on one of them, and may cover what he still shows of his peak
+    total = gpu.ledger.total_if_moved(gang.headroom_id, moved, lease.process) if moved else 0
+    if not _is_free(core, gpu, gang, lease, crowded=total + extra > gpu.ledger.budget_bytes):
         return None
     _set_headroom(core, gpu, gang, max(0, headroom - more))
     return lease
 
 
-def _is_free(core: Core, gpu: Gpu, gang: Gang, lease: Lease) -> bool:
+def _is_free(core: Core, gpu: Gpu, gang: Gang, lease: Lease, *, crowded: bool) -> bool:
     """What the member before needed on top of its steady bytes is not free before it is measured, as any bytes.
 
     Memory that does not come back in time breaks the gang: its other members must not hold a card for ever that nobody else may use.
     """
     room = policy.measured_room_bytes(core, gpu)
-    if room is not None and room >= policy.measured_need_bytes(gpu, lease):
+    if not crowded and room is not None and room >= policy.measured_need_bytes(gpu, lease):
         gang.short_since.pop(gpu.info.id, None)
         return True
     if room is None or policy.sample_is_behind(gpu):

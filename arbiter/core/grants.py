@@ -81,19 +81,18 @@ def _relieve(core: Core, gpu: Gpu) -> None:
     policy.wake_when_evictable(core, gpu, None)
 
 
-def _grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> bool:
+def _grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> None:
     room = policy.measured_room_bytes(core, gpu)
     need = policy.measured_need_bytes(gpu, lease)
     if room is None or (room < need and policy.sample_is_behind(gpu)):
         lease.reason = "waits for a fresh reading of the card"
         core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
-        return False
+        return
     if room < need:
         lease.reason = "the ledger has room, the card does not: measured memory is not free yet"
         gpu.blocked = lease.reason
-        return False
+        return
     grant(core, gpu, lease)
-    return True
 
 
 def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int]) -> bool:

@@ -154,6 +154,15 @@ class GpuLedger:
             total += self._after(account, going, more_bytes) - account.occupied_bytes()
         return total
 
+    def total_if_moved(self, lease: LeaseId, count: int, to: ProcessKey) -> int:
+        """Total bytes if so much of a charge were booked on another process: evidence that it covered counts from then on."""
+        owner = self._owner[lease]
+        if owner == to:
+            return self.total_bytes()
+        account = self.accounts[owner]
+        left = max(account.charged_bytes - count, account.residue_bytes, account.measured_bytes)
+        return self.total_bytes() + left - account.occupied_bytes() + count
+
     def process_after_bytes(self, process: ProcessKey, going: Mapping[LeaseId, int], *, dead: bool) -> int:
         """What a process may still hold once these leases are gone. A dead one without other debts: nothing."""
         account = self.accounts.get(process)

@@ -161,6 +161,12 @@ def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
         or core.now - sample.taken_at > core.settings.sample_max_age_s
     ):
         return None
+    if any(
+        debt.confirmed_at > sample.taken_at and not debt.baseline_comparable
+        for debt in gpu.verifications.values()
+        if debt.lease not in gpu.residents
+    ):
+        return None  # who came and died since may still be on the card, with its load peak
     unseen = sum(
         max(gpu.ledger.charge_bytes(lease.id), lease.load_peak_bytes)
         for lease in gpu.residents.unseen(sample.taken_at)

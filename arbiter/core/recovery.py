@@ -368,8 +368,8 @@ def void_at_baseline(core: Core, sample: MemorySampled) -> None:
     for lease in list(gpu.residents.values()):
         if lease.attached or lease.state not in EXPIRING - {LeaseState.LOADING} or lease.estate is not None:
             continue  # a reservation shows on no card
-        if gpu.ledger.charge_bytes(lease.id) <= noise_bytes:
-            continue
+        if min(gpu.ledger.charge_bytes(lease.id), lease.steady_bytes) <= noise_bytes:
+            continue  # charged more: it shrank, and nothing had been measured yet
         parks = lease.id in core.host.booked
         if lease.asked_before:  # it left as it was asked to
             let_go(

@@ -55,6 +55,7 @@ def resize(core: Core, event: ResizeAsked) -> None:
         residue_bytes=event.residue_bytes,
     )
     lease.load_peak_bytes, lease.steady_bytes = max(lease.load_peak_bytes, peak), target
+    core.record_lease(lease)  # a restart must not take who gave bytes back for gone
     state = "growing" if lease.growth else "shrinking" if lease.shrink else "held"
     core.reply(event.client, event.request, {"state": state, "lease": explain.view(core, lease)})
 

@@ -44,6 +44,7 @@ from arbiter.core.events import (
     UseEnded,
     UseYielded,
 )
+from arbiter.core.explain import NOTE_KINDS
 from arbiter.core.settings import GpuInfo, Settings
 from schemas import defaults as d
 from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
@@ -141,6 +142,7 @@ class CoreDriver:
         self._readings: list[tuple[float, MemorySampled | ProbeFailed]] = []
         self._requests = 0
         self._pids = 100
+        self.after_event: Callable[[], None] | None = None  # a test's own invariants
         if start:
             self.advance(0.01)  # the first reading
 
@@ -155,6 +157,7 @@ class CoreDriver:
         self.events.append((self.now, event))
         effects = self.arbiter.handle(event, self.now)
         self.arbiter.check_all()
+        _well_formed(effects)
         failed: list[JournalPut] = []
         held_back: list[JournalPut] = []
         performed: list[Effect] = []
@@ -192,6 +195,8 @@ class CoreDriver:
         self.effects += performed
         for put in failed:
             self.post(JournalFailed(put.key, self.journal_failing, put.gates))
+        if self.after_event is not None:
+            self.after_event()
         return effects
 
     def advance(self, seconds: float) -> None:
@@ -558,6 +563,15 @@ def answer(effects: Sequence[Effect]) -> Mapping[str, Any]:
     if len(found) != 1:
         raise AssertionError(f"{len(found)} replies in {list(effects)}")
     return found[0].body
+
+
+def _well_formed(effects: Sequence[Effect]) -> None:
+    """Answers name their request, and the history has only kinds that clients can ask for. Raises AssertionError."""
+    for effect in effects:
+        if isinstance(effect, Reply | Refuse) and not isinstance(effect.request, int):
+            raise AssertionError(f"an answer to nothing: {effect}")
+        if isinstance(effect, Note) and effect.kind not in NOTE_KINDS:
+            raise AssertionError(f"a kind that nobody knows: {effect}")
 
 
 def _names(effect: Effect, lease: str) -> bool:

@@ -1,20 +1,42 @@
-"""How long the rule machines of the core walk: a little in every test run, always the same way; far and at random with
-`--hypothesis-profile=nightly` (`make nightly`). The profile is registered in `tests/conftest.py`."""
+"""How long the rule machines of the core walk: a little in every test run, always the same way; far and at random in the profile `nightly`.
 
-from hypothesis import HealthCheck, settings
+HYPOTHESIS_PROFILE or pytest's `--hypothesis-profile` chooses it; `make nightly` splits its histories over the cores (`tests/nightly`). A
+machine takes part with `TestThis.settings = walk(60)`, and in the night with a line in `tests/nightly/nightly_run.py`.
+"""
+
+import os
+
+from hypothesis import HealthCheck, Phase, settings
 
 NIGHTLY = "nightly"
-NIGHTLY_EXAMPLES = 2000
+NIGHTLY_EXAMPLES = 100_000
 
 
-def walk(examples: int) -> settings:
-    """Settings of one machine. `examples`: in a usual test run, so that it takes less than 15 s there."""
+def register(nightly_examples: int = NIGHTLY_EXAMPLES) -> None:
+    """Make the nightly profile known, and load the profile that HYPOTHESIS_PROFILE names."""
+    settings.register_profile(
+        NIGHTLY,
+        max_examples=nightly_examples,
+        derandomize=False,
+        database=None,  # a night is told again by its seeds
+        deadline=None,
+        print_blob=True,
+    )
+    if chosen := os.environ.get("HYPOTHESIS_PROFILE"):
+        settings.load_profile(chosen)
+
+
+def walk(examples: int, *, nightly_share: float = 1.0) -> settings:
+    """Settings of one machine. `examples`: in a usual test run, so that it takes less than 15 s there. `nightly_share`: of the histories
+    that the nightly profile says."""
     nightly = settings.get_current_profile_name() == NIGHTLY
     return settings(
-        max_examples=NIGHTLY_EXAMPLES if nightly else examples,
+        max_examples=max(1, round(nightly_share * settings().max_examples)) if nightly else examples,
         stateful_step_count=40,
         deadline=None,
         suppress_health_check=list(HealthCheck),
         derandomize=not nightly,
-        print_blob=nightly,
+        print_blob=True,
+        # shrinking takes minutes: a usual run tells what it found as it found it
+        phases=[Phase.generate, Phase.shrink] if nightly else [Phase.generate],
     )

@@ -4,6 +4,7 @@ import pytest
 
 from arbiter.core.effects import Sample
 from arbiter.testing.core_driver import Consumer, CoreDriver, answer
+from arbiter.testing.scenes import held
 from schemas import defaults as d
 from schemas.ids import LeaseId, ProcessKey
 
@@ -174,3 +175,43 @@ def test_a_gang_that_broke_is_not_waited_for_after_a_restart(asked: bool) -> Non
     a.connect()
     answer(a.reattach(first, token))
     assert not driver.arbiter._core.gangs
+
+
+def test_bytes_kept_for_the_next_member_hide_no_context_of_the_one_before() -> None:
+    driver = card(lag_s=0.8)
+    first, lease = held(driver, "first", 1, residue_bytes=GIB)
+    first.unload(lease)  # its context stays
+    driver.until(lambda: driver.state(lease) == "over")
+    other = driver.consumer("other")
+    loaded = other.acquire(3 * GIB, int(1.5 * GIB))
+    driver.until(lambda: driver.state(loaded) == "loading")
+    other.hold(3 * GIB)
+    driver.advance(0.1)
+    other.load(loaded)  # the card shows its peak for a moment more
+    began = driver.now
+    one = member(first, 0.5, 0.5)
+    last = driver.consumer("last")
+    two = member(last, 4, 2)
+    driver.until(lambda: driver.state(one) == "loading")
+    first.ready(one)
+    driver.until(lambda: driver.state(two) == "loading")
+    assert driver.now - began >= 0.8, "with the peak of the other one it would be more than the budget"
+
+
+def test_who_came_and_died_since_the_reading_may_still_be_on_the_card() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lists_processes = False
+    driver.card.lag_s = 0.03
+    driver.card.reading_s = 0.5  # one from before may still count
+    short = driver.consumer("short")
+    lease = short.acquire(5 * GIB, 1 * GIB)
+    assert driver.state(lease) == "loading"
+    short.hold(5 * GIB)
+    short.load(lease)
+    short.die()
+    wanted = driver.consumer("next").acquire(6 * GIB)
+    shown = sum(driver.card.shown(driver.now).values())
+    assert shown == 5 * GIB
+    assert driver.state(wanted) == "queued"
+    driver.until(lambda: driver.state(wanted) == "loading")
+    assert not driver.card.shown(driver.now)

@@ -1,0 +1,421 @@
+"""What is told, word for word: views, records, notes and refusals are what clients, a restart and the history stand on."""
+
+from dataclasses import astuple, replace
+from typing import Any
+
+import pytest
+
+from arbiter.core.events import OperatorAsked
+from arbiter.core.lease import Lease
+from arbiter.core.recovery import spec_from_record
+from arbiter.testing.core_driver import CoreDriver, answer, refusal
+from arbiter.testing.scenes import Tree, held, order, sent_away
+from schemas import defaults as d
+from schemas.ids import LeaseId, ProcessKey, Token
+
+GIB, MIB = d.GIB, d.MIB
+
+
+def core_lease(driver: CoreDriver, lease: LeaseId) -> Lease:
+    return driver.arbiter._core.leases[lease]
+
+
+def only(found: list[Any]) -> Any:
+    (one,) = found
+    return one
+
+
+# -- views -----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("exclusive", "mode"), [(True, "exclusive"), (False, "shared")])
+def test_a_lease_as_it_is_shown(exclusive: bool, mode: str) -> None:
+    driver = CoreDriver(8 * GIB)
+    person, lease = held(driver, "det", 2, exclusive=exclusive)
+    view = driver.view(lease)
+    assert view is not None
+    assert {key: view[key] for key in ("mode", "consumer", "model", "priority", "evictable", "uses")} == {
+        "mode": mode,
+        "consumer": "det",
+        "model": "det-model",
+        "priority": d.PRIORITY,
+        "evictable": True,
+        "uses": 0,
+    }
+    assert (view["charge_bytes"], view["pid"]) == (2 * GIB, person.process.pid)
+
+
+def test_a_card_as_it_is_shown() -> None:
+    driver = CoreDriver(8 * GIB)
+    held(driver, "det", 2)
+    shown = driver.gpu()
+    shown.pop("sample_age_s")
+    (process,) = shown.pop("processes")
+    assert shown == {
+        "gpu": "GPU-0",
+        "index": 0,
+        "name": "simulated 0",
+        "source": "",
+        "capacity_bytes": 8 * GIB,
+        "reserve_bytes": d.RESERVE_BYTES,
+        "charged_bytes": 2 * GIB,
+        "stowaway_bytes": 0,
+        "measured_used_bytes": 2 * GIB,
+        "pressure_bytes": 0,
+        "blocked": "",
+    }
+    assert (process["name"], process["used_bytes"], process["charged_bytes"]) == ("det", 2 * GIB, 2 * GIB)
+
+
+def test_why_of_a_resident_lease_asks_for_nothing() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease = held(driver, "det", 2)
+    told = only(driver.arbiter.why("det", driver.now)["leases"])
+    told.pop("footprint")
+    assert told == {
+        "lease_id": lease,
+        "state": "held",
+        "position": 0,
+        "needed_bytes": 0,
+        "free_bytes": 6 * GIB - d.RESERVE_BYTES,
+        "deficit_bytes": 0,
+        "condition": "held",
+        "blockers": [],
+        "next": "it is resident, idle",
+        "eta_s": None,
+        "eta_source": "none",
+        "plan": [],
+        "text": "det: it is resident, idle",
+    }
+
+
+def test_an_estimate_says_that_it_was_learnt() -> None:
+    driver = CoreDriver(8 * GIB, settings={"learnt": {"vlm": {"load_s": 2.0}}})
+    loader = driver.consumer("loader")
+    loader.acquire(2 * GIB)
+    vlm = driver.consumer("vlm")
+    waiting = vlm.acquire(2 * GIB)  # fits; only the other one's load is in the way
+    assert driver.state(waiting) == "queued"
+    told = only(driver.arbiter.why("vlm", driver.now)["leases"])
+    assert (told["eta_s"], told["eta_source"]) == (2.0, "learnt")
+
+
+def test_a_circle_names_its_leases_with_their_states() -> None:
+    driver = CoreDriver(8 * GIB)
+    job, lease = held(driver, "job", 5)
+    job.use_begin(lease)
+    (link,) = refusal(job.try_acquire(5 * GIB)).details["cycle"]
+    assert link["holds"] == [{"lease_id": lease, "consumer": "job", "state": "held"}]
+
+
+# -- answers ---------------------------------------------------------------------------------------------------------
+def test_an_acquire_said_again_after_the_load_is_answered_as_granted() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    lease = det.acquire(2 * GIB, nonce="n")
+    det.load(lease)
+    again = answer(det.try_acquire(2 * GIB, nonce="n"))
+    assert (again["state"], again["lease"]["state"]) == ("loading", "held")
+
+
+def test_what_never_fits_beside_a_pin_says_the_ways_out() -> None:
+    driver = CoreDriver(8 * GIB)
+    held(driver, "pinned", 5, evictable=False)
+    refused = refusal(driver.consumer("big").try_acquire(5 * GIB))
+    assert refused.code == "vram_insufficient"
+    assert refused.hint == "use a smaller model or a lower precision, or unpin what is resident"
+
+
+def test_refusals_of_operators_say_why() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease = held(driver, "det", 5)
+    waiting = driver.consumer("vlm").acquire(5 * GIB)
+    ops = driver.consumer("ops")
+
+    def told(action: Any, target: LeaseId) -> str:
+        return refusal(
+            driver.post(OperatorAsked(ops.client, driver.next_request(), action, target, "ops", "test"))
+        ).message
+
+    assert told("release_dead", waiting) == f"{waiting} is queued: nobody holds it"
+    other = CoreDriver(8 * GIB)
+    _, lease = held(other, "det", 5)
+    order(other, "pin", lease)
+    ops = other.consumer("ops")
+    evict = OperatorAsked(ops.client, other.next_request(), "evict", lease, "ops", "test")
+    assert refusal(other.post(evict)).message == f"{lease} is pinned: an operator pinned it"
+
+
+def test_refusals_about_sub_leases_say_why() -> None:
+    tree = Tree().held()
+    refused = refusal(tree.runner.resize(tree.root, 4 * GIB))
+    assert refused.message.endswith(
+        "a lease with sub-leases, or one of them, keeps its size: carve or release instead"
+    )
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    det.hold(4 * GIB)
+    det.resize(lease, 4 * GIB)
+    child = driver.consumer("child").try_acquire(1 * GIB, parent=(lease, det.token(lease)))
+    assert refusal(child).message.endswith("it changes its size; carve when it has the new one")
+
+
+def test_a_line_of_sub_leases_that_is_too_long_says_which_number_it_would_be() -> None:
+    driver = CoreDriver(8 * GIB)
+    lease, token = None, None
+    for n in range(d.SUBLEASE_DEPTH_MAX + 1):
+        person = driver.consumer(f"p{n}")
+        effects = person.try_acquire((7 - n) * GIB, parent=None if lease is None else (lease, token))
+        if n == d.SUBLEASE_DEPTH_MAX:
+            assert refusal(effects).message == f"a sub-lease of {lease} would be number {n + 1} of its line"
+            return
+        lease = LeaseId(answer(effects)["lease"]["lease_id"])
+        token = Token(*answer(effects)["lease"]["token"])
+
+
+def test_a_parent_that_was_asked_to_leave_says_its_state() -> None:
+    tree = Tree().held()
+    tree.policy.use_begin(tree.leaf)
+    tree.driver.consumer("other").acquire(6 * GIB)
+    tree.driver.until(lambda: tree.state(tree.root) == "revoking")
+    refused = refusal(tree.driver.consumer("late").try_acquire(GIB // 2, parent=(tree.root, tree.token)))
+    assert (refused.code, refused.details["state"]) == ("lease_revoking", "revoking")
+
+
+# -- the history -----------------------------------------------------------------------------------------------------
+def test_a_load_is_noted_with_what_it_took() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    lease = det.acquire(3 * GIB, 2 * GIB)
+    driver.advance(0.5)
+    det.hold(1 * GIB)
+    det.ready(lease, 1 * GIB)
+    note = only(driver.notes("ready"))
+    assert (note["charge_bytes"], note["declared_bytes"], note["measured_bytes"]) == (
+        1 * GIB,
+        2 * GIB,
+        1 * GIB,
+    )
+    assert note["load_ms"] == pytest.approx(500)
+
+
+def test_a_switch_is_noted_with_what_each_victim_held() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    vlm = driver.consumer("vlm")
+    wanted = vlm.acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease)
+    driver.until(lambda: driver.state(wanted) == "loading")
+    vlm.load(wanted)
+    (evicted,) = driver.notes("switch")[-1]["evicted"]
+    assert evicted == {
+        "consumer": "det",
+        "lease_id": lease,
+        "verdict": "verified",
+        "charge_bytes": 5 * GIB,
+    }
+
+
+def test_a_denial_is_noted_with_its_reason() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    det.use_begin(lease)
+    vlm = driver.consumer("vlm")
+    wanted = vlm.acquire(5 * GIB, wait_timeout_s=1.0)
+    driver.advance(1.1)
+    (push,) = driver.pushes("denied", wanted)
+    note = only(driver.notes("denied"))
+    assert (note["code"], note["reason"]) == ("wait_timeout", push["error"]["message"])
+
+
+def test_pressure_and_outages_are_noted_with_their_card() -> None:
+    driver = CoreDriver(8 * GIB)
+    held(driver, "det", 5)
+    driver.card.set(ProcessKey(9, 9), 3 * GIB, driver.now)
+    driver.advance(2.0)
+    assert driver.notes("pressure")[0]["gpu"] == "GPU-0"
+    driver.card.failing = "the driver is gone"
+    driver.advance(2.0)
+    note = only(driver.notes("probe_failed"))
+    assert (note["gpu"], note["reason"]) == ("GPU-0", "the driver is gone")
+
+
+def test_orders_are_noted_by_their_name() -> None:
+    driver = CoreDriver(8 * GIB)
+    ops = driver.consumer("ops")
+    for action in ("drain", "resume"):
+        driver.post(OperatorAsked(ops.client, driver.next_request(), action, "", "ops", "test"))
+    assert [note["action"] for note in driver.notes("operator")] == ["drain", "resume"]
+
+
+def test_who_is_parked_is_noted_with_its_host_ram() -> None:
+    driver = CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": 3 * GIB})
+    det, lease = held(driver, "det", 5, park_bytes=2 * GIB)
+    driver.consumer("vlm").acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease, parked=True)
+    driver.until(lambda: driver.state(lease) == "parked")
+    assert only(driver.notes("parked"))["parked_bytes"] == 2 * GIB
+
+
+def test_a_reservation_that_ends_by_itself_says_why() -> None:
+    tree = Tree().held()
+    tree.driver.consumer("other").acquire(6 * GIB)
+    tree.driver.until(lambda: tree.state(tree.leaf) == "revoking")
+    tree.policy.unload(tree.leaf)
+    tree.driver.until(lambda: bool(tree.driver.pushes("lost", tree.root)))
+    (push,) = tree.driver.pushes("lost", tree.root)
+    assert push["error"]["message"] == f"{tree.root}: it was asked to leave and its last sub-lease has left"
+
+
+# -- who grows -------------------------------------------------------------------------------------------------------
+def test_a_growth_waits_for_its_bytes_alone() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(
+        driver, "det", 3, exclusive=False, residue_bytes=450 * MIB, standby=True, park_bytes=GIB
+    )
+    other, busy = held(driver, "other", 4)
+    other.use_begin(busy)
+    answer(det.resize(lease, 5 * GIB, residue_bytes=450 * MIB))
+    waiting = LeaseId(
+        only([note for note in driver.notes("queued") if "grows by" in note["reason"]])["lease_id"]
+    )
+    note = driver.notes("queued")[-1]
+    assert (note["lease_id"], note["position"]) == (waiting, 1)
+    assert note["reason"] == f"{lease} grows by {2 * GIB}"
+    growth = core_lease(driver, waiting)
+    assert growth.spec == replace(
+        core_lease(driver, lease).spec,
+        evictable=False,
+        standby=False,
+        park_bytes=0,
+        load_peak_bytes=2 * GIB,
+        steady_bytes=2 * GIB,
+        residue_bytes=0,
+    )
+
+
+# -- the journal -----------------------------------------------------------------------------------------------------
+def test_a_record_holds_all_that_was_asked_for() -> None:
+    driver = CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": 3 * GIB})
+    det = driver.consumer("det")
+    wishes: dict[str, Any] = {
+        "residue_bytes": 450 * MIB,
+        "exclusive": True,
+        "priority": 60,
+        "evictable": False,
+        "gpu": "0",
+        "ttl_s": 77.0,
+        "min_residency_s": 1.5,
+        "deny_on_deadline": True,
+        "on_overstay": "kill",
+        "standby": True,
+        "park_bytes": GIB,
+        "key": "grasp",
+        "independent": True,
+    }
+    spec = det.spec(3 * GIB, 2 * GIB, **wishes)
+    same = sum(a == b for a, b in zip(astuple(spec), astuple(det.spec(1 * GIB, GIB // 2)), strict=True))
+    assert same == 3, "all differ from what they are by default but the consumer's name, parent and gang"
+    lease = det.acquire(3 * GIB, 2 * GIB, **wishes)
+    det.load(lease)
+    record = driver.journal[f"lease:{lease}"]
+    assert spec_from_record(record["spec"]) == spec
+    rest = {key: value for key, value in record.items() if key != "spec"}
+    assert rest == {
+        "lease_id": lease,
+        "token": [1, 2],
+        "state": "held",
+        "gpu": "GPU-0",
+        "pid": det.process.pid,
+        "start_ticks": det.process.start_ticks,
+        "nonce": "n1",
+        "charge_bytes": 2 * GIB,
+        "load_peak_bytes": 3 * GIB,
+        "measured_bytes": None,
+        "exiting": False,
+        "said_ready": True,
+        "parent": None,
+        "gang": None,
+        "estate": None,
+        "pinned": None,
+        "comes_back": False,
+        "parks": False,
+        "parked_bytes": 0,
+        "left_for": "",
+        "dismissed": False,
+    }
+
+
+def test_a_record_of_who_is_away_says_how_it_comes_back() -> None:
+    driver = CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": 3 * GIB})
+    _, lease, _, _ = sent_away(driver)
+    record = driver.journal[f"lease:{lease}"]
+    assert (record["state"], record["comes_back"], record["parks"]) == ("standby", True, False)
+    assert (record["left_for"], record["gpu"], record["charge_bytes"]) == ("policy", None, 0)
+
+
+def test_a_debt_keeps_the_context_of_a_living_process_over_a_restart() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 3, residue_bytes=450 * MIB, ttl_s=5.0)
+    driver.advance(6.0)  # it expired; its process lives
+    assert driver.state(lease) == "over"
+    driver.restart()
+    det.connect()
+    det.hold(450 * MIB)
+    driver.advance(20.0)
+    note = driver.notes("verified")[-1]
+    assert (note["lease_id"], note["verdict"], note["residue_bytes"]) == (lease, "verified", 450 * MIB)
+    assert driver.gpu()["charged_bytes"] == 450 * MIB
+
+
+def test_an_adopted_lease_says_where_it_comes_from() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 3)
+    token = det.token(lease)
+    driver.restart(keep_journal=False)
+    det.connect()
+    det.reattach(lease, token)
+    assert core_lease(driver, lease).story[0][2] == "adopted: the journal did not know it"
+
+
+# -- waiting beside what nobody owns -----------------------------------------------------------------------------------
+def test_a_small_one_may_pass_where_nobody_has_an_account() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lists_processes = False
+    driver.card.set(ProcessKey(9, 9), 4 * GIB, driver.now)
+    driver.advance(2.0)
+    large = driver.consumer("large").acquire(6 * GIB)
+    small = driver.consumer("small").acquire(1 * GIB)
+    assert driver.state(large) == "queued"
+    driver.advance(1.0)
+    assert driver.state(small) in ("queued", "loading")
+
+
+def test_the_head_says_what_keeps_the_engine_from_asking() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    det.use_begin(lease)
+    waiting = driver.consumer("vlm").acquire(5 * GIB, priority=d.PRIORITY - 10)
+    assert core_lease(driver, waiting).reason == "nobody who could make room may be asked now"
+
+
+def test_nobody_is_asked_while_a_dead_process_may_still_make_room() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = 0.5
+    gone, left = held(driver, "gone", 3, residue_bytes=450 * MIB)
+    gone.unload(left)
+    driver.until(lambda: driver.state(left) == "over")
+    _, lease = held(driver, "det", 5)
+    gone.die()
+    waiting = driver.consumer("vlm").acquire(3 * GIB)
+    assert core_lease(driver, waiting).reason == "a dead process's memory is being measured"
+    assert driver.state(lease) == "held"
+
+
+def test_a_gang_that_can_never_fit_beside_a_pin_is_told_so() -> None:
+    driver = CoreDriver(8 * GIB)
+    held(driver, "pinned", 4, evictable=False)
+    first = driver.consumer("policy").acquire(2 * GIB, gang=("grasp", 2))
+    last = driver.consumer("reward").try_acquire(2 * GIB, gang=("grasp", 2))
+    assert refusal(last).code == "vram_insufficient"
+    assert driver.pushes("denied", first)

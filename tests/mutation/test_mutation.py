@@ -1,0 +1,85 @@
+"""The mutation check itself: a mutant takes its function's place, and what is judged to mean the same does not count."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+SOURCE = '''
+class Gate:
+    def __init__(self, width: int) -> None:
+        self.width = width
+
+    @property
+    def wide(self) -> bool:
+        return self.width > 3
+
+def fits(gate: Gate, size: int) -> bool:
+    """Words for people stay."""
+    return size <= gate.width
+'''
+
+
+def load(path: Path) -> Any:
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def run() -> Any:
+    return load(Path(__file__).with_name("mutation_run.py"))
+
+
+@pytest.fixture
+def gates(tmp_path: Path) -> ModuleType:
+    path = tmp_path / "gates.py"
+    path.write_text(SOURCE)
+    return load(path)
+
+
+def test_whoever_imported_the_function_has_the_mutant(run: Any, gates: Any) -> None:
+    fits, gate = gates.fits, gates.Gate(4)
+    assert run.swap(gates, SOURCE.replace("<=", "<")) == 1
+    assert not fits(gate, 4)
+    assert run.swap(gates, SOURCE.replace("> 3", "> 4")) == 2, "and the other one is as it was"
+    assert fits(gate, 4)
+    assert not gate.wide
+
+
+def test_a_change_that_changes_no_bytecode_has_no_effect(run: Any, gates: Any) -> None:
+    assert run.swap(gates, "\n" + SOURCE) == 0
+
+
+def test_mutants_have_names_lines_and_diffs(run: Any, tmp_path: Path) -> None:
+    pytest.importorskip("mutmut", reason="make mutation installs it")
+    (tmp_path / "gates.py").write_text(SOURCE)
+    existing, mutants = run.choose(0, 0, {}, tmp_path)
+    assert existing == len(mutants) == 2, "decorated functions stay as they are"
+    found = next(mutant for mutant in mutants if "size < gate.width" in mutant.diff)
+    assert found.where == "gates.fits"
+    assert 12 in found.lines
+    assert not any("XX" in mutant.diff for mutant in mutants)
+    _, again = run.choose(0, 0, {"gates.fits:99": found.diff, "gates.gone:1": ""}, tmp_path)
+    assert [mutant.diff for mutant in again] == [found.diff]
+    assert run.choose(2, 5, {}, tmp_path)[1] == run.choose(2, 5, {}, tmp_path)[1]
+
+
+def test_only_the_very_change_that_was_judged_counts_as_equivalent(run: Any) -> None:
+    def tried(diff: str, outcome: str) -> Any:
+        return run.Mutant("gates.fits:1", "gates", [12], diff, "", outcome)
+
+    known = [{"where": "gates.fits", "diff": "-a\n+b", "why": "they are the same"}]
+    report = run.summary(
+        9, [tried("-a\n+b", "survived"), tried("-a\n+c", "survived"), tried("-a", "killed")], known
+    )
+    assert (report["killed"], report["survived"], report["equivalent"]) == (1, 1, 1)
+    assert report["score"] == 0.5
+    assert [survivor["diff"] for survivor in report["survivors"]] == ["-a\n+c"]

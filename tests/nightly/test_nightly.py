@@ -1,0 +1,71 @@
+"""The night's walk itself: it counts, it tells a failure with the line that walks it again, and the same seed finds it again."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Any
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis.stateful import RuleBasedStateMachine, rule
+
+from arbiter.testing.machines import walk
+
+
+class Sound(RuleBasedStateMachine):
+    @rule(n=st.integers())
+    def step(self, n: int) -> None:
+        assert n == n
+
+
+class Broken(RuleBasedStateMachine):
+    @rule(n=st.integers(0, 100))
+    def step(self, n: int) -> None:
+        assert n < 50
+
+
+Sound.TestCase.settings = Broken.TestCase.settings = walk(5)
+
+
+@pytest.fixture
+def run() -> Any:
+    path = Path(__file__).with_name("nightly_run.py")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_histories_are_split_evenly_under_seeds_of_their_own(run: Any) -> None:
+    todo = run.portions(["a", "b"], 5000, 70)
+    assert sum(portion.wanted for portion in todo) == 5000
+    assert {machine: sum(p.wanted for p in todo if p.machine == machine) for machine in "ab"} == {
+        "a": 2500,
+        "b": 2500,
+    }
+    assert [portion.seed for portion in todo] == list(range(70, 70 + len(todo)))
+
+
+def test_every_machine_is_there(run: Any) -> None:
+    for machine in run.MACHINES:
+        assert issubclass(run.load(machine), RuleBasedStateMachine)
+
+
+def test_a_sound_machine_is_counted(run: Any) -> None:
+    done = run.walk(run.Portion("sound", 1, 20), Sound)
+    assert not done.failure
+    assert done.histories >= 20
+    report = run.summary([done], 1.0)
+    assert report["histories"] == done.histories
+    assert not report["failures"]
+
+
+def test_a_failure_is_told_shrunk_and_found_again(run: Any) -> None:
+    done = run.walk(run.Portion("broken", 3, 20), Broken)
+    assert "state.step(n=50)" in done.failure
+    (failure,) = run.summary([done], 1.0)["failures"]
+    assert failure["again"].endswith("--machine broken --seed 3 --histories 20")
+    assert run.walk(run.Portion("broken", 3, 20), Broken).failure == done.failure
