@@ -419,3 +419,15 @@ def test_a_gang_that_can_never_fit_beside_a_pin_is_told_so() -> None:
     last = driver.consumer("reward").try_acquire(2 * GIB, gang=("grasp", 2))
     assert refusal(last).code == "vram_insufficient"
     assert driver.pushes("denied", first)
+
+
+def test_a_gang_that_has_asked_on_one_card_asks_nobody_on_the_other_as_well() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    _, stays = held(driver, "stays", 5, gpu="0", min_residency_s=5.0)
+    leaves, asked = held(driver, "leaves", 5, gpu="1")
+    leaves.use_begin(asked)
+    driver.consumer("policy").acquire(3 * GIB, gang=("grasp", 2))
+    driver.consumer("reward").acquire(3 * GIB, gang=("grasp", 2))
+    driver.until(lambda: driver.state(asked) == "revoking")
+    driver.advance(6.0)  # the other one might be asked now too
+    assert driver.state(stays) == "held"
