@@ -431,3 +431,40 @@ def test_a_gang_that_has_asked_on_one_card_asks_nobody_on_the_other_as_well() ->
     driver.until(lambda: driver.state(asked) == "revoking")
     driver.advance(6.0)  # the other one might be asked now too
     assert driver.state(stays) == "held"
+
+
+def test_an_answer_to_revoke_is_noted_with_its_lease() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    driver.consumer("vlm").acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.ack(lease, eta_s=0.5)
+    note = only(driver.notes("revoke_acked"))
+    assert (note["lease_id"], note["safe_point_eta_s"], note["uses"]) == (lease, 0.5, 0)
+
+
+def test_what_is_not_kept_after_a_restart_is_told_by_its_name_and_why() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 3)
+    token = det.token(lease)
+    driver.restart()
+    thief = driver.consumer("thief")
+    (told,) = answer(thief.reattach(lease, token, spec=det.specs[lease]))["leases"]
+    assert (told["lease_id"], told["kept"]) == (lease, False)
+    assert (told["error"]["code"], told["error"]["hint"]) == ("not_permitted", "ask as its holder")
+
+
+def test_a_use_of_a_lease_that_was_asked_to_leave_is_told_to_wait() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    driver.consumer("vlm").acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    assert refusal(det.use_begin(lease)).hint == "wait until it is granted again"
+
+
+def test_a_record_of_before_the_ladder_waits() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease = held(driver, "det", 3)
+    record = dict(driver.journal[f"lease:{lease}"]["spec"])
+    del record["on_overstay"]
+    assert spec_from_record(record).on_overstay == "wait"
