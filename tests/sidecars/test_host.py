@@ -265,7 +265,8 @@ def test_two_sidecars_cannot_serve_one_socket(lone_box):
 def test_without_the_arbiter_that_it_needs_it_says_so_and_ends(lone_box):
     sidecar = lone_box.spawn("detector")
     assert sidecar.process.wait(PATIENCE_S) == 1
-    assert "no arbiter answers at" in sidecar.log
+    assert "no arbiter at" in sidecar.log
+    assert "start `vram-arbiter`" in sidecar.log
 
 
 def edit(card, **changes):

@@ -15,6 +15,7 @@ from arbiter.testing.wire import WireClient
 pytestmark = pytest.mark.e2e
 pytest.importorskip("pynvml")
 ME = os.getpid()
+PATIENCE_S = 20.0
 CONFIG = "probe: {deadline_s: 0.4, period_s: 0.1}\nverify: {timeout_s: 3.0, slow_poll_s: 0.1}\n"
 Make = Callable[..., ArbiterProcess]
 
@@ -42,12 +43,22 @@ def held(client: WireClient, nvml: NvmlStub, size: int) -> dict[str, Any]:
     nvml.card(size)
     nvml.write(f"process 0 compute {ME} {size}")
     assert client.ask("ready", **on, measured_bytes=size)["ok"]
-    client.ask("ping")
+    seen(client, size)
     return on
 
 
-def let_go(client: WireClient, on: dict[str, Any]) -> None:
+def seen(client: WireClient, used: int) -> None:
+    """Until the daemon has read so much: what a release is compared with."""
+    deadline = time.monotonic() + PATIENCE_S
+    while client.ask("status")["gpus"][0]["measured_used_bytes"] != used:
+        assert time.monotonic() < deadline, "the card is not read"
+
+
+def let_go(client: WireClient, nvml: NvmlStub, on: dict[str, Any], left: int, *lines: str) -> None:
+    """As holders do: say so first, so that no reading of what is half gone is taken for the state before; give back; release."""
     assert client.ask("unloading", **on)["ok"]
+    nvml.card(left)
+    nvml.write(*lines)
     assert client.ask("release", **on)["ok"]
 
 
@@ -66,12 +77,10 @@ def test_a_cycle_with_release_lag(client: WireClient, daemon: ArbiterProcess, nv
     assert card["capacity_bytes"] == 8 * GIB - 256 * MIB, "less what the driver keeps"
     assert client.ask("subscribe")["ok"]
     on = held(client, nvml, 5 * GIB)
-    until = (
-        time.monotonic() + 1.5
-    )  # long enough for a slow machine to ask meanwhile, within the time of a verdict
-    nvml.card(0)
-    nvml.write(f"late 0 {5 * GIB} {until}", f"process 0 compute {ME} {5 * GIB} {until}")
-    let_go(client, on)
+    # long enough for a slow machine to ask meanwhile, within the time of a verdict
+    until = time.monotonic() + 1.5
+    late = (f"late 0 {5 * GIB} {until}", f"process 0 compute {ME} {5 * GIB} {until}")
+    let_go(client, nvml, on, 0, *late)
     waiter = client.acquire("next", 5 * GIB, nonce="next")
     assert waiter["state"] == "queued", "released is not free"
     client.push("granted")
@@ -84,9 +93,7 @@ def test_a_cycle_with_release_lag(client: WireClient, daemon: ArbiterProcess, nv
 def test_a_call_that_hangs_is_unknown_blocks_and_recovers(client: WireClient, nvml: NvmlStub) -> None:
     assert client.ask("subscribe")["ok"]
     on = held(client, nvml, 5 * GIB)
-    nvml.card(0)
-    nvml.write("hang memory")
-    let_go(client, on)
+    let_go(client, nvml, on, 0, "hang memory")
     assert "no answer within 0.4 s" in event(client, "probe_failed")["reason"]
     assert event(client, "verified")["verdict"] == "stale"
     waiter = client.acquire("next", GIB, nonce="next")
@@ -120,9 +127,7 @@ def test_bytes_that_stay_are_charged_to_the_process_that_holds_them(
 ) -> None:
     assert client.ask("subscribe")["ok"]
     on = held(client, nvml, 5 * GIB)
-    nvml.card(2 * GIB)
-    nvml.write(f"process 0 compute {ME} {2 * GIB}")
-    let_go(client, on)
+    let_go(client, nvml, on, 2 * GIB, f"process 0 compute {ME} {2 * GIB}")
     verdict = event(client, "verified")
     assert (verdict["verdict"], verdict["culprits"][0]["pid"]) == ("residue", ME)
     assert client.ask("status")["gpus"][0]["charged_bytes"] == 2 * GIB
@@ -138,11 +143,8 @@ def test_where_bytes_per_process_are_na_the_total_decides(
     nvml.card(5 * GIB)
     nvml.write(f"process 0 compute {ME} na")
     assert client.ask("ready", **on)["ok"]
-    client.ask("ping")
-    event(client, "ready")
-    nvml.card(left)
-    nvml.write(f"process 0 compute {ME} na")
-    let_go(client, on)
+    seen(client, 5 * GIB)
+    let_go(client, nvml, on, left, f"process 0 compute {ME} na")
     said = event(client, "verified")
     assert (said["verdict"], said["culprits"]) == (verdict, [])
     assert client.ask("status")["gpus"][0]["charged_bytes"] == left
