@@ -28,7 +28,8 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
     gpu.sample = sample
     gpu.residents.seen(sample.taken_at)
     gpu.reading_s = max(0.0, core.now - sample.taken_at)
-    if gpu.failed_at is not None:
+    answers_again = gpu.failed_at is not None
+    if answers_again:
         gpu.failed_at, gpu.failure = None, ""
         core.note("probe_ok", gpu=gpu.info.id)
     known = {stranger.process: stranger.used_bytes for stranger in gpu.ledger.strangers.values()}
@@ -39,6 +40,8 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
     _shrink_residues(core, gpu, sample)
     for verification in list(gpu.verifications.values()):
         if sample.taken_at > verification.confirmed_at:
+            if answers_again or verification.verdict is Verdict.STALE:
+                _wait_anew(core, gpu, verification)
             _weigh(core, gpu, verification, sample)
     note_pressure(core, gpu)
     core.wake(gpu)
@@ -184,12 +187,17 @@ def bereave(core: Core, gpu: Gpu, verification: Verification) -> None:
 def begin_again(core: Core, gpu: Gpu, verification: Verification) -> None:
     """What was read so far tells nothing any more, and neither does the time that it took."""
     verification.confirmed_at = core.now
-    verification.paced_from = max(core.now, verification.not_before)
-    verification.deadline_at = verification.paced_from + core.settings.verify_timeout_s
     verification.settling = False
     verification.last_used_bytes = None
-    verification.verdict = None
+    _wait_anew(core, gpu, verification)
+
+
+def _wait_anew(core: Core, gpu: Gpu, verification: Verification) -> None:
+    """Nobody could look for a while: that time says nothing about when the memory comes back."""
+    verification.paced_from = max(core.now, verification.not_before)
+    verification.deadline_at = verification.paced_from + core.settings.verify_timeout_s
     verification.overdue = False
+    verification.verdict = None
     _read_soon(core, gpu, verification)
 
 

@@ -15,6 +15,9 @@ from arbiter.core.events import MemorySampled
 from arbiter.core.ledger import GpuLedger, process_bytes
 from schemas.ids import LeaseId, ProcessKey
 
+DYING_S = 60.0
+"""Longer than any driver takes to free what a dead process held; what is still there then belongs to somebody who cannot be listed."""
+
 
 class Verdict(StrEnum):
     VERIFIED = "verified"
@@ -138,7 +141,12 @@ def _late(
             if v.alive:
                 return Judgement(Verdict.RESIDUE, True, held, culprits)
             return Judgement(Verdict.CONTESTED, False, held, culprits)
-        return Judgement(Verdict.CONTESTED, True, v.kept_bytes, grown_since(v, ledger, sample))
+        grown = grown_since(v, ledger, sample)
+        taken_bytes = sum(count for _, _, count in grown)
+        # a driver leaves a dying process out of its list before it has freed its bytes: what nobody has taken may be on its way still
+        freeing = not v.alive and sample.taken_at < v.deadline_at + DYING_S
+        resolved = not freeing or short_bytes <= taken_bytes + tolerance_bytes
+        return Judgement(Verdict.CONTESTED, resolved, v.kept_bytes, grown)
     if bound_b is None:
         return Judgement(Verdict.UNVERIFIABLE, False, v.kept_bytes)
     if v.alive:

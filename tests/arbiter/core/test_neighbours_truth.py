@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from arbiter.core.events import MemorySampled, ProbeFailed
+from arbiter.core.verify import DYING_S
 from arbiter.testing.core_driver import READING_S, Consumer, CoreDriver, refusal
 from schemas import defaults as d
 from schemas.ids import LeaseId, ProcessKey
@@ -72,6 +73,42 @@ def test_1_a_dying_process_leaves_the_list_before_its_bytes_leave_the_card() -> 
     assert 0.5 < took <= 0.51 + 2 * READING_S
     (note,) = (note for note in driver.notes("verified") if note["lease_id"] == lease)
     assert (note["verdict"], note["after_bytes"]) == ("verified", 0)
+
+
+@pytest.mark.parametrize("outage_s", [0.0, 2.0])
+def test_1_a_dead_holders_bytes_are_waited_for_longer_than_a_verdict_takes(outage_s: float) -> None:
+    """The driver no longer lists it, its bytes come back late, and meanwhile the card may not be readable: none of that frees them."""
+    driver = CoreDriver(8 * GIB, settings={"verify_timeout_s": 1.0})
+    det, lease = held(driver, "det", 4, min_residency_s=60.0)
+    waiter = driver.consumer("vlm").acquire(1 * GIB, exclusive=True)
+    driver.card.unlisted.add(det.process)
+    driver.card.lag_s = 2.5
+    driver.card.failing = "lost" if outage_s else ""
+    det.hold(0)
+    det.die()
+    driver.advance(outage_s)
+    driver.card.failing = ""
+    took = outage_s + driver.until(lambda: driver.state(waiter) == "loading", step_s=0.001)
+    assert took >= 2.5
+    last = [note for note in driver.notes("verified") if note["lease_id"] == lease][-1]
+    assert (last["verdict"], last["after_bytes"]) == ("verified", 0)
+
+
+def test_1_what_nobody_lists_long_after_a_death_is_a_stowaways() -> None:
+    driver = CoreDriver(8 * GIB, settings={"verify_timeout_s": 1.0})
+    det, lease = held(driver, "det", 4, min_residency_s=60.0)
+    waiter = driver.consumer("vlm").acquire(1 * GIB, exclusive=True)
+    driver.card.unlisted |= {det.process, BROWSER}
+    driver.card.set(BROWSER, 4 * GIB, driver.now)
+    det.hold(0)
+    det.die()
+    took = driver.until(lambda: driver.state(waiter) == "loading", limit_s=90.0)
+    assert DYING_S < took < DYING_S + 3
+    verdicts = [note for note in driver.notes("verified") if note["lease_id"] == lease]
+    assert [(note["verdict"], note["resolved"]) for note in verdicts] == [
+        ("contested", False),
+        ("contested", True),
+    ]
 
 
 def test_1_a_holder_that_the_driver_cannot_list_is_not_charged_twice() -> None:
