@@ -187,6 +187,15 @@ def _take_over(
     _call_back(core, lease, event.client, event.request, event.wait_timeout_s, gpus)
 
 
+def _want_back(
+    core: Core, lease: Lease, client: ClientId, request: RequestId, wait_timeout_s: float | None
+) -> None:
+    """A lease that is away becomes a waiter, as it was last asked for."""
+    gpus = placement.places(core, lease.spec, drift.expected_bytes(core, lease.spec)[0])
+    check_waiters(core)
+    _call_back(core, lease, client, request, wait_timeout_s, gpus)
+
+
 def _call_back(
     core: Core,
     lease: Lease,
@@ -211,9 +220,7 @@ def reacquire(core: Core, event: Reacquired) -> None:
             "not_permitted", f"{lease.id} belongs to process {lease.process.pid}", "ask as its holder"
         )
     if lease.state in AWAY:
-        gpus = placement.places(core, lease.spec, drift.expected_bytes(core, lease.spec)[0])
-        check_waiters(core)
-        _call_back(core, lease, event.client, event.request, event.wait_timeout_s, gpus)
+        _want_back(core, lease, event.client, event.request, event.wait_timeout_s)
         return
     if lease.state is LeaseState.VERIFYING and (lease.comes_back or lease.parks):
         lease.recalled = lease.recalled or Recall(core.now, event.wait_timeout_s)
@@ -244,10 +251,19 @@ def find_again(core: Core, event: AcquireRequested, client: Client) -> bool:
     lease = core.leases.get(lease_id)
     if lease is None:
         raise ended_error(core.ended[lease_id])
+    if lease.state in AWAY and _still_waits(lease, event):
+        _want_back(core, lease, event.client, event.request, event.wait_timeout_s)
+        return True
     core.hand_to(lease, event.client)  # the newest connection of the process is the one that listens
     state = str(lease.state) if lease.state in (LeaseState.QUEUED, *AWAY) else "loading"
     core.reply(event.client, event.request, {"state": state, "lease": explain.view(core, lease)})
     return True
+
+
+def _still_waits(lease: Lease, event: AcquireRequested) -> bool:
+    """Does the newest acquire of a lease that is away wait still? A restart ended its wait: what came back from the journal was, as far as
+    anybody knows, not granted since it was asked for. A late repeat of one that waited and was granted means nothing."""
+    return event.nonce == lease.nonce and lease.granted_at <= lease.arrived_at
 
 
 def cancel(core: Core, event: CancelRequested) -> None:

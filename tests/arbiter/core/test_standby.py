@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import pytest
+
 from arbiter.core.events import ProcessDied
 from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
 from arbiter.testing.scenes import held, sent_away
@@ -409,6 +411,29 @@ def test_a_lease_that_was_taken_over_comes_back_as_it_was_asked_for_last() -> No
     view = driver.view(lease)
     assert view is not None
     assert view["charge_bytes"] == 6 * GIB
+
+
+@pytest.mark.parametrize("reattaches", [True, False])
+def test_whoever_asks_on_for_a_lease_that_he_took_over_waits_again(reattaches: bool) -> None:
+    """Regression: a restart had ended the wait, and the repeat was told "standby", which its client took for a place in the queue."""
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver)
+    policy.use_begin(wanted)
+    det.try_acquire(4 * GIB, nonce="again", standby=True)
+    assert driver.state(lease) == "queued"
+    away, held = det.token(lease), policy.token(wanted)
+    driver.restart()
+    det.connect()
+    policy.connect()
+    policy.reattach(wanted, held)
+    if reattaches:
+        det.reattach(lease, away, away=True)
+    assert driver.state(lease) == "standby"
+    assert answer(det.try_acquire(4 * GIB, nonce="again", standby=True))["state"] == "queued"
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=5.0)
+    det.load(lease)
+    assert answer(det.try_acquire(4 * GIB, nonce="again", standby=True))["state"] == "loading"
 
 
 def there_and_back(
