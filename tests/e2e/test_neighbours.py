@@ -236,6 +236,7 @@ def test_11_a_game_that_starts_is_seen_named_and_makes_idle_models_leave(stage: 
         assert (seen["name"], seen["used_bytes"]) == ("game", int(2.9 * GIB))
         assert f"stowaway pid {game.pid} game: 2.9 GiB without a lease" in stage.vramctl("status")
         idle.until("gone")
+        stage.event("verified", consumer="idle-11")
         waiter = stage.spawn("waiter-11", 6)
         stage.event("queued", consumer="waiter-11")
         assert "game (holds bytes without a lease)" in stage.vramctl("why", "waiter-11")
