@@ -18,6 +18,7 @@ Rules (their names stand in `Finding.rule`):
 
 import bisect
 import json
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,6 +33,7 @@ UNSEEN_S = 2.5
 NOISE_BYTES = RESERVE_BYTES + VERIFY_TOLERANCE_BYTES
 """So much may be the driver's own, as far as a reading can tell: who has no more than that on its way back is not seen to be there."""
 STUCK_S = 60.0
+_LEASE_ID = re.compile(r"L(\d+)-\d+")
 
 type Line = Mapping[str, Any]
 
@@ -165,8 +167,14 @@ def _check_history(
     loading: dict[str, dict[str, str]] = defaultdict(dict)  # card → lease → consumer
     uses: dict[str, set[str]] = defaultdict(set)  # as far as they began since the daemon did
     newest = (0, 0)
+    epoch = 0
     for event, t in zip(events, times, strict=True):
         kind, lease, gpu = event["kind"], str(event.get("lease_id")), str(event.get("gpu"))
+        begun = max(_epoch(lease), _epoch(str(event.get("wanted_by_lease"))))
+        if begun > epoch:  # a start that a full disk kept out of the history
+            epoch = begun
+            loading.clear()
+            uses.clear()
         match kind:
             case "started" | "recovered":  # what was under way is told again by those who come back
                 loading.clear()
@@ -205,6 +213,12 @@ def _check_history(
                 uses[lease].add(event["use_id"])
             case "use_ended":
                 uses[lease].discard(event["use_id"])
+
+
+def _epoch(lease: str) -> int:
+    """Which start of the daemon named a lease; 0 for no lease's id."""
+    found = _LEASE_ID.fullmatch(lease)
+    return int(found.group(1)) if found else 0
 
 
 def _hindered(hindrances: Sequence[Hindrance], pid: int, t: float, back_s: float = 10.0) -> bool:

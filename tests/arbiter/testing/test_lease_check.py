@@ -241,3 +241,20 @@ def test_a_killed_waiter_is_not_stuck() -> None:
     scene.t += 100.0
     scene.trace(B, "done")
     assert not scene.judge().findings
+
+
+def test_a_start_that_a_full_disk_kept_out_of_the_history_is_seen_by_the_names_of_leases() -> None:
+    """Regression: a use whose end the killed daemon did not write down counted on in the next one's life."""
+
+    def story(wanted_by: str) -> list[str]:
+        scene = Scene()
+        scene.born(A)
+        lease = scene.grant(A, 4)
+        scene.event("use_began", lease_id=lease, consumer="pA", use_id="u1")
+        scene.event("revoke_asked", lease_id=lease, consumer="pA", wanted_by_lease=wanted_by)
+        scene.event("unloading", lease_id=lease, consumer="pA")
+        scene.over(A, lease)
+        return [finding.rule for finding in scene.judge().findings]
+
+    assert story("L1-9") == ["in_use"]
+    assert story("L2-1") == []
