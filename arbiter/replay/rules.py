@@ -10,6 +10,7 @@ They hear the same events and answer with the same effects as the engine, but de
 All of them start and end model processes, so nothing stays on the card after an unload. None knows priorities, pins or load peaks.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -60,7 +61,7 @@ class _Model:
     wanted_by: "_Model | None" = None  # it is to leave, and hears so when it owes nothing
 
 
-class Rules:
+class Rules(ABC):
     """What the ports share: bookkeeping. `_serve` decides."""
 
     holders_exit = True
@@ -170,9 +171,9 @@ class Rules:
     def _gone(self, lease: LeaseId) -> None:
         self._models.pop(lease, None)
 
+    @abstractmethod
     def _serve(self) -> None:
         """Decide who loads and who is asked to leave."""
-        raise NotImplementedError
 
 
 class Unmanaged(Rules):

@@ -23,6 +23,39 @@ def held(
     return person, lease
 
 
+def hidden_card(*, lists: bool = True, lag_s: float = 0.0) -> CoreDriver:
+    """A card of 8 GiB as it is from the first reading on: with or without a list of processes, late by so much."""
+    driver = CoreDriver(8 * GIB, start=False)
+    driver.card.lists_processes = lists
+    driver.card.lag_s = lag_s
+    driver.advance(0.01)
+    return driver
+
+
+def shown(driver: CoreDriver, lease: LeaseId) -> dict[str, Any]:
+    """A lease that is there, as `status` shows it."""
+    view = driver.view(lease)
+    assert view is not None
+    return view
+
+
+def charge(driver: CoreDriver, lease: LeaseId) -> int:
+    return int(shown(driver, lease)["charge_bytes"])
+
+
+def place(driver: CoreDriver, lease: LeaseId) -> str | None:
+    """The card that it is on."""
+    gpu: str | None = shown(driver, lease)["gpu"]
+    return gpu
+
+
+def why(driver: CoreDriver, consumer: str) -> dict[str, Any]:
+    """What `why` says of a consumer with one lease."""
+    found: dict[str, Any]
+    (found,) = driver.arbiter.why(consumer, driver.now)["leases"]
+    return found
+
+
 def sent_away(
     driver: CoreDriver, gib: float = 5, policy_gib: float = 5, **spec: Any
 ) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:

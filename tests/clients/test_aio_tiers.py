@@ -51,6 +51,15 @@ async def lend(use: Use, work: Awaitable[object]) -> None:
         await work
 
 
+async def on_standby(client: ArbiterClient, spec: Spec, model: Model) -> Lease:
+    """A detector that is resident, and comes back when it was sent away."""
+    detector = await client.acquire(
+        spec("detector", 5, standby=True), unload=model.unload, on_return=model.load
+    )
+    await detector.ready()
+    return detector
+
+
 async def states(client: ArbiterClient) -> dict[str, str]:
     return {lease["consumer"]: lease["state"] for lease in (await client.status())["leases"]}
 
@@ -60,10 +69,7 @@ async def test_a_standby_lease_returns_by_itself_when_there_is_room(
 ) -> None:
     model = Model()
     async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
-        detector = await client.acquire(
-            spec("detector", 5, standby=True), unload=model.unload, on_return=model.load
-        )
-        await detector.ready()
+        detector = await on_standby(client, spec, model)
         first = detector.token
         policy = await client.acquire(spec("policy", 4), 20.0)
         await policy.ready()
@@ -86,10 +92,7 @@ async def test_a_standby_lease_survives_the_daemon(
 ) -> None:
     model = Model()
     async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
-        detector = await client.acquire(
-            spec("detector", 5, standby=True), unload=model.unload, on_return=model.load
-        )
-        await detector.ready()
+        detector = await on_standby(client, spec, model)
         memory = FakeMemory(arbiter_daemon.card, "t", 0)
         policy = await client.acquire(spec("policy", 4), 20.0)
         block = memory.allocate("policy", 4 * GIB)
@@ -109,10 +112,7 @@ async def test_a_standby_lease_can_ask_to_come_back_or_be_given_up(
 ) -> None:
     model = Model()
     async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
-        detector = await client.acquire(
-            spec("detector", 5, standby=True), unload=model.unload, on_return=model.load
-        )
-        await detector.ready()
+        detector = await on_standby(client, spec, model)
         other = Model()
         policy = await client.acquire(spec("policy", 4), 20.0, unload=other.unload)
         await policy.ready()

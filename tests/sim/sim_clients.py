@@ -6,6 +6,7 @@ wait is remembered, so that in the end nobody may still be waiting.
 """
 
 import asyncio
+from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -175,7 +176,7 @@ class Cast:
         ]
 
 
-class Program:
+class Program(ABC):
     """One simulated program: its process, its client, its life as a coroutine."""
 
     role = "client"
@@ -208,8 +209,9 @@ class Program:
         self.done = True
         self.world.clock.after(0.001, lambda: self.world.kill(self.process))
 
+    @abstractmethod
     async def life(self) -> None:
-        raise NotImplementedError
+        """What it does between its hello and its end."""
 
     async def pause(self, longest_s: float) -> None:
         await asyncio.sleep(self.random.random() * longest_s)

@@ -6,19 +6,11 @@ import pytest
 
 from arbiter.core import costs
 from arbiter.testing.core_driver import Consumer, CoreDriver
+from arbiter.testing.scenes import held
 from schemas import defaults as d
 from schemas.ids import LeaseId
 
 GIB = d.GIB
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
 
 
 def asked(driver: CoreDriver, leases: dict[str, LeaseId]) -> list[str]:

@@ -120,9 +120,11 @@ def test_a_voluntary_release_while_asked_is_as_good() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
+    assert driver.state(lease) == "revoking"
     det.hold(0)
     det.release(lease)
     driver.until(lambda: driver.state(waiter) == "loading")
+    assert driver.state(lease) == "over"
 
 
 def test_death_while_asked_counts_as_leaving() -> None:

@@ -1,33 +1,18 @@
 """Views, `status`, `why` and the record of a switch."""
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
 from arbiter.core.effects import Note
 from arbiter.core.events import AcquireRequested
 from arbiter.core.explain import NOTE_KINDS
-from arbiter.testing.core_driver import Consumer, CoreDriver
+from arbiter.testing.core_driver import CoreDriver
+from arbiter.testing.scenes import held, why
 from schemas import defaults as d
-from schemas.ids import GpuId, LeaseId, ProcessKey
+from schemas.ids import GpuId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
-
-
-def why(driver: CoreDriver, consumer: str) -> dict[str, Any]:
-    (lease,) = driver.arbiter.why(consumer, driver.now)["leases"]
-    found: dict[str, Any] = lease
-    return found
 
 
 def test_status_shows_holders_first_then_the_queue_in_order() -> None:

@@ -5,25 +5,11 @@ from typing import Any
 import pytest
 
 from arbiter.testing.core_driver import Consumer, CoreDriver, answer
+from arbiter.testing.scenes import held, why
 from schemas import defaults as d
 from schemas.ids import LeaseId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
-
-
-def why(driver: CoreDriver, consumer: str) -> dict[str, Any]:
-    (lease,) = driver.arbiter.why(consumer, driver.now)["leases"]
-    found: dict[str, Any] = lease
-    return found
 
 
 def blockers(driver: CoreDriver, consumer: str) -> list[tuple[Any, ...]]:

@@ -4,7 +4,7 @@ import pytest
 
 from arbiter.core.effects import Sample
 from arbiter.testing.core_driver import Consumer, CoreDriver, answer
-from arbiter.testing.scenes import held
+from arbiter.testing.scenes import held, hidden_card
 from schemas import defaults as d
 from schemas.ids import LeaseId, ProcessKey
 
@@ -12,14 +12,6 @@ GIB = d.GIB
 MIB = d.MIB
 MOMENT_S = 0.0001
 SOMEBODY = ProcessKey(9, 9)
-
-
-def card(*, lists: bool = True, lag_s: float = 0.0) -> CoreDriver:
-    driver = CoreDriver(8 * GIB, start=False)
-    driver.card.lists_processes = lists
-    driver.card.lag_s = lag_s
-    driver.advance(0.01)
-    return driver
 
 
 def member(who: Consumer, peak: float, steady: float, **spec: object) -> LeaseId:
@@ -44,7 +36,7 @@ def say(driver: CoreDriver, lease: LeaseId) -> str:
 
 @pytest.mark.parametrize("lists", [True, False])
 def test_a_member_does_not_load_into_the_peak_of_the_one_before(lists: bool) -> None:
-    driver = card(lists=lists, lag_s=0.8)
+    driver = hidden_card(lists=lists, lag_s=0.8)
     a, b = driver.consumer("a"), driver.consumer("b")
     first, second = member(a, 5, 2.5), member(b, 4.5, 2.5)
     to_peak_and_down(a, first)
@@ -58,7 +50,7 @@ def test_a_member_does_not_load_into_the_peak_of_the_one_before(lists: bool) -> 
 
 
 def test_while_a_member_waits_for_its_memory_the_card_is_not_read_without_pause() -> None:
-    driver = card(lag_s=5.0)
+    driver = hidden_card(lag_s=5.0)
     a, b = driver.consumer("a"), driver.consumer("b")
     first, second = member(a, 5, 2.5), member(b, 4.5, 2.5)
     to_peak_and_down(a, first)
@@ -70,7 +62,7 @@ def test_while_a_member_waits_for_its_memory_the_card_is_not_read_without_pause(
 
 def test_memory_that_does_not_come_back_breaks_the_gang_in_time() -> None:
     """It counts from when the card first showed too little, not from the last thing that happened on it."""
-    driver = card(lists=False)
+    driver = hidden_card(lists=False)
     a, b = driver.consumer("a"), driver.consumer("b")
     first, second = member(a, 3, 3), member(b, 4, 4)
     driver.card.set(SOMEBODY, 2 * GIB, driver.now)  # hidden behind what is kept for the second one
@@ -91,7 +83,7 @@ def test_memory_that_does_not_come_back_breaks_the_gang_in_time() -> None:
 
 
 def test_a_shortage_that_is_over_is_forgotten() -> None:
-    driver = card(lists=False)
+    driver = hidden_card(lists=False)
     a, b, c = (driver.consumer(name) for name in "abc")
     first = member(a, 2, 2, gang=("g", 3))
     second = member(b, 2, 2, gang=("g", 3))
@@ -108,7 +100,7 @@ def test_a_shortage_that_is_over_is_forgotten() -> None:
 
 def test_what_a_process_keeps_is_part_of_what_its_member_needs() -> None:
     """Where readings do not list processes, the residue that the ledger knows is not asked for twice."""
-    driver = card(lists=False)
+    driver = hidden_card(lists=False)
     who = driver.consumer("who")
     before = who.acquire(GIB, residue_bytes=GIB)
     who.load(before)
@@ -124,7 +116,7 @@ def test_what_a_process_keeps_is_part_of_what_its_member_needs() -> None:
 
 def test_bytes_kept_for_a_gang_do_not_verify_what_its_process_gives_back() -> None:
     """A process lets go of a lease while it waits for its turn in a gang: what it still holds is not its member's."""
-    driver = card(lag_s=0.8)
+    driver = hidden_card(lag_s=0.8)
     a, b = driver.consumer("a"), driver.consumer("b")
     own = b.acquire(GIB)
     b.load(own)
@@ -143,7 +135,7 @@ def test_bytes_kept_for_a_gang_do_not_verify_what_its_process_gives_back() -> No
 
 def test_a_member_whose_process_is_still_giving_back_needs_all_its_bytes() -> None:
     """What its process holds of a lease that is over is no context of the next one."""
-    driver = card(lag_s=0.8)
+    driver = hidden_card(lag_s=0.8)
     a, b = driver.consumer("a"), driver.consumer("b")
     own = b.acquire(2 * GIB)
     b.load(own)
@@ -161,7 +153,7 @@ def test_a_member_whose_process_is_still_giving_back_needs_all_its_bytes() -> No
 
 @pytest.mark.parametrize("asked", [False, True])
 def test_a_gang_that_broke_is_not_waited_for_after_a_restart(asked: bool) -> None:
-    driver = card()
+    driver = hidden_card()
     a, b = driver.consumer("a"), driver.consumer("b")
     first, second = member(a, 3, 3), member(b, 4, 4)
     a.load(first)
@@ -178,7 +170,7 @@ def test_a_gang_that_broke_is_not_waited_for_after_a_restart(asked: bool) -> Non
 
 
 def test_bytes_kept_for_the_next_member_hide_no_context_of_the_one_before() -> None:
-    driver = card(lag_s=0.8)
+    driver = hidden_card(lag_s=0.8)
     first, lease = held(driver, "first", 1, residue_bytes=GIB)
     first.unload(lease)  # its context stays
     driver.until(lambda: driver.state(lease) == "over")

@@ -6,7 +6,8 @@ import pytest
 
 from arbiter.core import gangs
 from arbiter.core.effects import Effect, Refuse
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
+from arbiter.testing.core_driver import CoreDriver, answer, refusal
+from arbiter.testing.scenes import held
 from schemas import defaults as d
 from schemas.ids import LeaseId, ProcessKey
 
@@ -40,15 +41,6 @@ class Member:
 
 def pair(driver: CoreDriver, **spec: Any) -> tuple[Member, Member]:
     return Member(driver, "policy", 4, 3, **spec), Member(driver, "reward", 3, 2, **spec)
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
 
 
 def states(*members: Member) -> list[str]:

@@ -1,26 +1,16 @@
 """Who gets the card next: serial loads, head and backfill, the measurement as second gate, pressure, several cards."""
 
-from typing import Any
-
 import pytest
 
 from arbiter.core.effects import Sample
 from arbiter.core.events import MemorySampled
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer
+from arbiter.testing.core_driver import CoreDriver, answer
+from arbiter.testing.scenes import held
 from schemas import defaults as d
 from schemas.ids import GpuId, LeaseId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 STRANGER = ProcessKey(9, 9)
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
 
 
 # -- order and backfill --------------------------------------------------------------------------------------------------

@@ -1,12 +1,12 @@
 """Several cards: a lease is placed on one of them and never split, every card has its own queue, and no card waits for another's sake."""
 
 import random
-from typing import Any
 
 import pytest
 
 from arbiter.core.events import ProcessDied
 from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
+from arbiter.testing.scenes import held, place
 from schemas import defaults as d
 from schemas.ids import GpuId, LeaseId
 
@@ -14,27 +14,12 @@ GIB = d.GIB
 ZERO, ONE = GpuId("GPU-0"), GpuId("GPU-1")
 
 
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
-
-
-def card(driver: CoreDriver, lease: LeaseId) -> str | None:
-    view = driver.view(lease)
-    assert view is not None
-    return None if view["gpu"] is None else str(view["gpu"])
-
-
 # -- selector and placement ------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(("selector", "wanted"), [("1", ONE), ("GPU-1", ONE), ("0", ZERO), ("any", ZERO)])
 def test_a_selector_is_an_uuid_an_index_or_any(selector: str, wanted: GpuId) -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     _, lease = held(driver, "a", 5, gpu=selector)
-    assert card(driver, lease) == wanted
+    assert place(driver, lease) == wanted
     assert [driver.gpu(n)["charged_bytes"] for n in (0, 1)] == [
         5 * GIB if wanted is gpu else 0 for gpu in (ZERO, ONE)
     ]
@@ -53,7 +38,7 @@ def test_a_lease_is_never_split() -> None:
     _, lease = held(driver, "b", 7)
     assert sum(1 for n in (0, 1) if driver.gpu(n)["charged_bytes"]) == 1
     _, other = held(driver, "c", 7)
-    assert {card(driver, lease), card(driver, other)} == {ZERO, ONE}
+    assert {place(driver, lease), place(driver, other)} == {ZERO, ONE}
 
 
 def test_a_model_over_two_cards_is_two_leases_of_one_process() -> None:
@@ -80,14 +65,14 @@ def test_pins_count_for_their_own_card_only() -> None:
         refusal(driver.consumer("a").try_acquire(5 * GIB, gpu="0")).details["pinned"][0]["lease_id"] == pinned
     )
     _, lease = held(driver, "b", 5)
-    assert card(driver, lease) == ONE
+    assert place(driver, lease) == ONE
 
 
 def test_exclusive_means_alone_on_its_card() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     _, alone = held(driver, "alone", 2, exclusive=True, evictable=False)
     _, other = held(driver, "other", 2)
-    assert (card(driver, alone), card(driver, other)) == (ZERO, ONE)
+    assert (place(driver, alone), place(driver, other)) == (ZERO, ONE)
 
 
 # -- queues ----------------------------------------------------------------------------------------------------------
@@ -97,7 +82,7 @@ def test_a_waiter_for_one_card_does_not_hold_up_another() -> None:
     busy.use_begin(lease)
     waits = driver.consumer("w").acquire(6 * GIB, gpu="0", priority=90)
     _, free = held(driver, "free", 6, gpu="1")
-    assert (driver.state(waits), card(driver, free)) == ("queued", ONE)
+    assert (driver.state(waits), place(driver, free)) == ("queued", ONE)
 
 
 def test_whoever_waits_for_any_takes_the_first_card_that_is_free_and_leaves_both_queues() -> None:
@@ -111,7 +96,7 @@ def test_whoever_waits_for_any_takes_the_first_card_that_is_free_and_leaves_both
     people[1][0].use_end(people[1][1])
     people[1][0].unload(people[1][1])
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)
-    assert card(driver, waiter) == ONE
+    assert place(driver, waiter) == ONE
     assert driver.state(people[0][1]) == "held", "nobody is asked in vain on the other card"
     assert all(len(gpu.queue) == 0 for gpu in driver.arbiter._core.gpus.values())
 
@@ -126,7 +111,7 @@ def test_while_one_card_is_emptied_for_the_head_the_next_one_is_served_on_the_ot
     assert driver.state(used) == "revoking"
     anywhere = driver.consumer("anywhere").acquire(int(1.5 * GIB), gpu="1")
     driver.until(lambda: driver.state(anywhere) == "loading", limit_s=1.0)
-    assert (card(driver, anywhere), driver.state(head)) == (ONE, "queued")
+    assert (place(driver, anywhere), driver.state(head)) == (ONE, "queued")
     assert driver.state(unused) == "held"
     assert idle.driver is driver
 
@@ -146,7 +131,7 @@ def test_the_head_that_is_placed_elsewhere_does_not_keep_a_card_from_the_next() 
     second.unload(b)
     driver.until(lambda: "loading" in (driver.state(other), driver.state(head)), limit_s=1.0)
     placed = head if driver.state(head) == "loading" else other
-    assert card(driver, placed) == ONE, "whoever it is, the free card is used at once"
+    assert place(driver, placed) == ONE, "whoever it is, the free card is used at once"
 
 
 def test_what_fits_beside_the_head_that_is_placed_elsewhere_is_granted() -> None:
@@ -160,7 +145,7 @@ def test_what_fits_beside_the_head_that_is_placed_elsewhere_is_granted() -> None
     assert driver.state(a) == "revoking"
     other = driver.consumer("other").acquire(int(3.5 * GIB), gpu="1")
     driver.until(lambda: driver.state(other) == "loading", limit_s=1.0)
-    assert (card(driver, other), driver.state(head)) == (ONE, "queued")
+    assert (place(driver, other), driver.state(head)) == (ONE, "queued")
 
 
 def test_two_heads_that_are_placed_elsewhere_leave_the_card_to_nobody() -> None:
@@ -196,7 +181,7 @@ def test_a_holder_that_outstays_on_one_card_frees_its_waiter_for_another() -> No
     driver.until(lambda: driver.state(b) == "revoking", limit_s=15.0)
     later.unload(b)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
-    assert card(driver, waiter) == ONE
+    assert place(driver, waiter) == ONE
 
 
 def test_a_leave_that_was_not_enough_frees_its_waiter_for_another_card() -> None:
@@ -218,7 +203,7 @@ def test_what_fits_on_the_other_card_goes_there_and_nobody_is_asked() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     _, idle = held(driver, "idle", 6, gpu="0", priority=1)
     lease = driver.consumer("w").acquire(6 * GIB)
-    assert (driver.state(lease), card(driver, lease)) == ("loading", ONE)
+    assert (driver.state(lease), place(driver, lease)) == ("loading", ONE)
     assert driver.state(idle) == "held"
     assert not driver.notes("revoke_asked")
 
@@ -234,7 +219,7 @@ def test_while_somebody_loads_where_it_fits_nobody_is_asked_elsewhere() -> None:
     assert (driver.state(idle), driver.state(lease)) == ("held", "queued")
     loads.load(loading)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
-    assert card(driver, lease) == ONE
+    assert place(driver, lease) == ONE
     assert not driver.notes("revoke_asked")
 
 
@@ -247,7 +232,7 @@ def test_a_load_without_end_is_not_waited_for_for_ever() -> None:
     driver.until(lambda: driver.state(idle) == "revoking", limit_s=deadline_s + 0.1)
     holder.unload(idle)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
-    assert (card(driver, lease), driver.state(stuck)) == (ZERO, "loading")
+    assert (place(driver, lease), driver.state(stuck)) == (ZERO, "loading")
 
 
 def test_one_that_names_its_card_waits_for_it_beside_an_empty_one() -> None:
@@ -261,7 +246,7 @@ def test_one_that_names_its_card_waits_for_it_beside_an_empty_one() -> None:
     busy.use_end(lease)
     busy.unload(lease)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
-    assert card(driver, waiter) == ONE
+    assert place(driver, waiter) == ONE
 
 
 # -- order and ageing ------------------------------------------------------------------------------------------------
@@ -280,7 +265,7 @@ def test_whoever_came_first_is_first_on_every_card() -> None:
         person.unload(lease)
     driver.until(lambda: "loading" in {driver.state(first), driver.state(second)}, limit_s=1.0)
     driver.until(lambda: driver.state(higher) == "loading", limit_s=1.0)
-    assert (card(driver, first), card(driver, higher), driver.state(second)) == (ZERO, ONE, "queued")
+    assert (place(driver, first), place(driver, higher), driver.state(second)) == (ZERO, ONE, "queued")
 
 
 def test_a_waiter_for_any_card_ages_on_all_of_them() -> None:
@@ -313,7 +298,7 @@ def test_a_newcomer_of_higher_priority_overtakes_on_its_card_only_until_the_othe
     busy.use_end(lease)
     busy.unload(lease)
     driver.until(lambda: driver.state(old) == "loading", limit_s=1.0)
-    assert (card(driver, old), driver.state(young), driver.state(fills)) == (ONE, "queued", "held")
+    assert (place(driver, old), driver.state(young), driver.state(fills)) == (ONE, "queued", "held")
 
 
 # -- gangs -----------------------------------------------------------------------------------------------------------
@@ -329,7 +314,7 @@ def test_a_gang_behind_a_head_that_is_placed_elsewhere_is_served() -> None:
         driver.consumer(f"m{n}").acquire(2 * GIB, gpu="1", gang=("pair", 2), priority=40) for n in (0, 1)
     ]
     driver.until(lambda: driver.state(members[0]) == "loading", limit_s=1.0)
-    assert [card(driver, member) for member in members] == [ONE, ONE]
+    assert [place(driver, member) for member in members] == [ONE, ONE]
 
 
 def test_a_gang_over_two_cards_waits_for_both_of_which_one_cannot_be_read() -> None:
@@ -349,7 +334,7 @@ def on_standby(driver: CoreDriver, selector: str) -> tuple[Consumer, LeaseId]:
     """A detector that left card 0 for a policy which is there now; card 1 is in use, and by nobody who may be asked."""
     filler, fills = held(driver, "filler", 6, gpu="1", evictable=False)
     det, lease = held(driver, "det", 5, gpu=selector, standby=True)
-    assert card(driver, lease) == ZERO
+    assert place(driver, lease) == ZERO
     policy = driver.consumer("policy")
     wanted = policy.acquire(5 * GIB, gpu="0")
     det.unload(lease)
@@ -368,14 +353,14 @@ def test_standby_returns_to_the_cards_that_its_selector_names(selector: str, wan
     driver = CoreDriver(8 * GIB, cards=2)
     det, lease = on_standby(driver, selector)
     driver.advance(10.0)
-    assert card(driver, lease) == wanted
+    assert place(driver, lease) == wanted
     policy = next(iter(driver.arbiter._core.gpus[ZERO].residents.values()))
     if wanted is None:
         driver.post(ProcessDied(policy.process))
         for one in driver.cards.values():
             one.set(policy.process, 0, driver.now)
         driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
-        assert card(driver, lease) == ZERO
+        assert place(driver, lease) == ZERO
     det.load(lease)
     assert driver.state(lease) == "held"
 
@@ -385,7 +370,7 @@ def test_a_waiter_for_one_card_keeps_nobody_from_returning_to_another() -> None:
     _, lease = on_standby(driver, "any")
     waiter = driver.consumer("w").acquire(5 * GIB, gpu="0", priority=10)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
-    assert (card(driver, lease), driver.state(waiter)) == (ONE, "queued")
+    assert (place(driver, lease), driver.state(waiter)) == (ONE, "queued")
 
 
 def test_standby_does_not_return_to_a_card_that_cannot_be_read() -> None:
@@ -403,7 +388,7 @@ def test_standby_does_not_return_to_a_card_that_cannot_be_read() -> None:
     assert driver.state(lease) == "standby"
     policy.unload(wanted)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
-    assert card(driver, lease) == ZERO
+    assert place(driver, lease) == ZERO
 
 
 # -- cards that fail, drains -----------------------------------------------------------------------------------------
@@ -413,7 +398,7 @@ def test_a_card_that_cannot_be_read_blocks_itself_only() -> None:
     driver.advance(1.5)
     anywhere = driver.consumer("a").acquire(5 * GIB)
     driver.until(lambda: driver.state(anywhere) == "loading", limit_s=1.0)
-    assert card(driver, anywhere) == ONE
+    assert place(driver, anywhere) == ONE
     there = driver.consumer("b").acquire(5 * GIB, gpu="0")
     driver.advance(10.0)
     assert driver.state(there) == "queued"
@@ -428,7 +413,7 @@ def test_a_card_whose_reading_hangs_blocks_itself_only() -> None:
     there = driver.consumer("there").acquire(5 * GIB, gpu="1")
     here = driver.consumer("here").acquire(5 * GIB)
     driver.advance(5.0)
-    assert (driver.state(there), driver.state(here), card(driver, here)) == ("queued", "loading", ZERO)
+    assert (driver.state(there), driver.state(here), place(driver, here)) == ("queued", "loading", ZERO)
 
 
 def test_a_card_that_is_lost_keeps_its_leases_and_the_others_go_on() -> None:
@@ -444,7 +429,7 @@ def test_a_card_that_is_lost_keeps_its_leases_and_the_others_go_on() -> None:
     )
     a.unload(freed)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
-    assert card(driver, waiter) == ZERO
+    assert place(driver, waiter) == ZERO
     assert driver.gpu(1)["charged_bytes"] == 5 * GIB
 
 
@@ -484,7 +469,7 @@ def test_a_restart_keeps_every_lease_on_its_card() -> None:
     for (person, lease), token in zip(people, tokens, strict=True):
         person.connect()
         answer(person.reattach(lease, token))
-    assert [card(driver, lease) for _, lease in people] == [ZERO, ONE]
+    assert [place(driver, lease) for _, lease in people] == [ZERO, ONE]
 
 
 @pytest.mark.parametrize("lists", [True, False])
@@ -493,7 +478,7 @@ def test_without_a_journal_a_lease_is_found_on_the_card_that_shows_its_process(l
     driver = CoreDriver(8 * GIB, cards=2)
     held(driver, "first", 5, gpu="0")
     person, lease = held(driver, "second", 5)
-    assert card(driver, lease) == ONE
+    assert place(driver, lease) == ONE
     token = person.token(lease)
     for one in driver.cards.values():
         one.lists_processes = lists
@@ -501,7 +486,7 @@ def test_without_a_journal_a_lease_is_found_on_the_card_that_shows_its_process(l
     person.connect()
     (kept,) = answer(person.reattach(lease, token))["leases"]
     assert kept["kept"] is True
-    assert card(driver, lease) == (ONE if lists else ZERO), "without a list nobody can say"
+    assert place(driver, lease) == (ONE if lists else ZERO), "without a list nobody can say"
 
 
 # -- at random -------------------------------------------------------------------------------------------------------

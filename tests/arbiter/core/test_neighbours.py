@@ -1,21 +1,10 @@
 """What users of other arbiters and model servers complain about, as tests. Numbers are those of the list of complaints."""
 
-from typing import Any
-
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
+from arbiter.testing.core_driver import CoreDriver, answer, refusal
+from arbiter.testing.scenes import held
 from schemas import defaults as d
-from schemas.ids import LeaseId
 
 GIB = d.GIB
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
 
 
 def test_1_freed_is_not_free_yet() -> None:

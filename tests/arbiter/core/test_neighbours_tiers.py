@@ -1,30 +1,14 @@
 """What users of other arbiters suffer from, where leases park, stand by, grow and switch. Numbers are those of the list of complaints."""
 
-from typing import Any
-
 import pytest
 
 from arbiter.core.effects import Signal
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
+from arbiter.testing.core_driver import CoreDriver, answer, refusal
+from arbiter.testing.scenes import charge, held
 from schemas import defaults as d
 from schemas.ids import LeaseId
 
 GIB, MIB = d.GIB, d.MIB
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
-
-
-def charge(driver: CoreDriver, lease: LeaseId) -> int:
-    view = driver.view(lease)
-    assert view is not None
-    return int(view["charge_bytes"])
 
 
 def alternate(driver: CoreDriver, seconds: float) -> int:
@@ -113,7 +97,9 @@ def test_7_a_footprint_that_was_wrong_is_said_and_charged() -> None:
     vlm.hold(16 * GIB)
     vlm.resize(lease, 16 * GIB)
     driver.until(lambda: charge(driver, lease) == 16 * GIB, limit_s=1.0)
-    driver.until(lambda: driver.state(driver.consumer("x").acquire(6 * GIB)) == "loading", limit_s=1.0)
+    other = driver.consumer("x").acquire(6 * GIB)
+    driver.until(lambda: driver.state(other) == "loading", limit_s=1.0)
+    assert charge(driver, other) == 6 * GIB
 
 
 def test_8_a_growth_is_not_granted_while_somebody_loads() -> None:

@@ -42,6 +42,7 @@ def test_3_the_end_of_a_ttl_and_an_unload_do_not_block_each_other() -> None:
         if parent_first:
             policy.release(leaf)
         driver.until(lambda: driver.state(waiter) == "loading", limit_s=20.0)  # noqa: B023 - called at once
+        assert (driver.state(root), driver.state(leaf)) == ("over", "over")
 
 
 def test_15_a_job_that_calls_a_model_in_its_middle_has_room_for_it_in_a_sub_lease() -> None:

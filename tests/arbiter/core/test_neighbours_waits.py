@@ -1,23 +1,12 @@
 """What users of the neighbours complain about: waiting, turns, loads without an end and models nobody wanted gone. Numbers are those of the list."""
 
-from typing import Any
-
 import pytest
 
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
+from arbiter.testing.core_driver import CoreDriver, answer, refusal
+from arbiter.testing.scenes import held
 from schemas import defaults as d
-from schemas.ids import LeaseId
 
 GIB, MIB = d.GIB, d.MIB
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
 
 
 # -- 3: stuck for ever -------------------------------------------------------------------------------------------------

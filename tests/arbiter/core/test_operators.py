@@ -265,3 +265,5 @@ def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
     ask(ops, "release_dead", lease, "it was a crash")
     det.hold(0)
     driver.until(lambda: driver.arbiter.status(driver.now)["phase"] == "serving")
+    assert driver.state(lease) == "over"
+    assert f"lease:{lease}" not in driver.journal

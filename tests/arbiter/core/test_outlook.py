@@ -4,20 +4,12 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.core_driver import Consumer, CoreDriver
+from arbiter.testing.core_driver import CoreDriver
+from arbiter.testing.scenes import held
 from schemas import defaults as d
-from schemas.ids import LeaseId, ProcessKey
+from schemas.ids import ProcessKey
 
 GIB = d.GIB
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
 
 
 def plan(driver: CoreDriver, consumer: str = "w") -> list[dict[str, Any]]:

@@ -10,6 +10,7 @@ from arbiter.core.events import OperatorAsked
 from arbiter.core.invariants import InvariantViolation
 from arbiter.core.parking import HostRam
 from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
+from arbiter.testing.scenes import held
 from schemas import defaults as d
 from schemas.ids import LeaseId
 
@@ -19,15 +20,6 @@ RESIDUE = 450 * MIB
 
 def driver_with(budget_gib: float = 16, **more: Any) -> CoreDriver:
     return CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": int(budget_gib * GIB)}, **more)
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
 
 
 def asked(

@@ -7,6 +7,7 @@ import pytest
 
 from arbiter.core.events import OperatorAsked
 from arbiter.testing.core_driver import Consumer, CoreDriver, answer
+from arbiter.testing.scenes import held, place
 from schemas import defaults as d
 from schemas.ids import GpuId, LeaseId
 
@@ -17,21 +18,6 @@ ZERO, ONE = GpuId("GPU-0"), GpuId("GPU-1")
 @pytest.fixture
 def driver() -> CoreDriver:
     return CoreDriver(8 * GIB, cards=2)
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
-
-
-def card(driver: CoreDriver, lease: LeaseId) -> str | None:
-    view = driver.view(lease)
-    assert view is not None
-    return None if view["gpu"] is None else str(view["gpu"])
 
 
 def busy_and_pinned(driver: CoreDriver) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
@@ -64,7 +50,7 @@ def test_a_card_whose_pin_ended_is_a_place_for_who_waits(driver: CoreDriver, end
         keeper.unload(pinned)
     late = driver.consumer("late").acquire(5 * GIB, gpu="1") if end != "unpin" else None
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)
-    assert card(driver, waiter) == ONE
+    assert place(driver, waiter) == ONE
     assert late is None or driver.state(late) == "queued", "who came first is first there too"
 
 
@@ -88,7 +74,7 @@ def test_whoever_names_another_card_or_does_not_fit_stays_where_it_waits(driver:
 def test_a_growth_stays_on_its_card(driver: CoreDriver) -> None:
     _, _, keeper, pinned = busy_and_pinned(driver)
     small, lease = held(driver, "small", 1)
-    assert card(driver, lease) == ZERO
+    assert place(driver, lease) == ZERO
     small.use_begin(lease)
     assert answer(small.resize(lease, 3 * GIB))["state"] == "growing"
     keeper.unload(pinned)
@@ -138,7 +124,7 @@ def test_a_card_that_was_pinned_when_it_asked_is_one_to_come_back_to(driver: Cor
     assert driver.state(lease) == "standby"
     keeper.unload(pinned)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
-    assert card(driver, lease) == ONE
+    assert place(driver, lease) == ONE
 
 
 def test_after_a_restart_it_comes_back_to_any_card_still(driver: CoreDriver) -> None:
@@ -159,7 +145,7 @@ def test_after_a_restart_it_comes_back_to_any_card_still(driver: CoreDriver) -> 
     policy.use_begin(wanted)
     other.unload(fills)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
-    assert card(driver, lease) == ONE
+    assert place(driver, lease) == ONE
 
 
 def test_a_lease_that_is_away_from_a_card_that_is_gone_ends(driver: CoreDriver) -> None:
@@ -176,7 +162,7 @@ def test_a_lease_that_is_away_from_a_card_that_is_gone_ends(driver: CoreDriver) 
     assert (told["kept"], told["error"]["code"]) == (False, "lease_lost")
     assert (driver.arbiter.why("det", driver.now)["leases"], driver.state(wanted)) == ([], "over")
     _, other = held(driver, "other", 5)
-    assert card(driver, other) == ONE, "the daemon grants"
+    assert place(driver, other) == ONE, "the daemon grants"
 
 
 def test_one_that_is_too_large_for_a_card_keeps_nobody_from_returning_to_it(driver: CoreDriver) -> None:
@@ -203,4 +189,4 @@ def test_one_that_is_too_large_for_a_card_keeps_nobody_from_returning_to_it(driv
         person.connect()
         person.reattach(lease, token, away=driver.state(lease) == "standby")
     driver.until(lambda: driver.state(second) == "loading", limit_s=20.0)
-    assert (card(driver, second), driver.state(first)) == (ONE, "standby")
+    assert (place(driver, second), driver.state(first)) == (ONE, "standby")

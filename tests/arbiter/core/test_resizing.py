@@ -8,6 +8,7 @@ from arbiter.core import invariants
 from arbiter.core.events import MemorySampled
 from arbiter.core.invariants import InvariantViolation
 from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
+from arbiter.testing.scenes import charge, shown
 from schemas import defaults as d
 from schemas.ids import GpuId, LeaseId
 
@@ -21,18 +22,6 @@ def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consum
     person.load(lease)
     driver.advance(0.05)
     return person, lease
-
-
-def charge(driver: CoreDriver, lease: LeaseId) -> int:
-    view = driver.view(lease)
-    assert view is not None
-    return int(view["charge_bytes"])
-
-
-def shown(driver: CoreDriver, lease: LeaseId) -> dict[str, Any]:
-    view = driver.view(lease)
-    assert view is not None
-    return view
 
 
 # -- shrinking -------------------------------------------------------------------------------------------------------
@@ -241,6 +230,9 @@ def test_an_exclusive_lease_grows_alone() -> None:
     vlm, lease = held(driver, "vlm", 4, exclusive=True)
     vlm.resize(lease, 7 * GIB)
     driver.until(lambda: charge(driver, lease) == 7 * GIB, limit_s=0.1)
+    assert shown(driver, lease)["state"] == "held"
+    small = driver.consumer("small").acquire(100 * MIB)
+    assert driver.state(small) == "queued", "it is exclusive still"
 
 
 def test_what_can_never_fit_is_refused_at_once() -> None:

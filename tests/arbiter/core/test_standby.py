@@ -250,6 +250,7 @@ def test_who_exits_does_not_come_back() -> None:
     det.hold(0)
     det.release(lease, exiting=True)
     driver.until(lambda: driver.state(lease) == "over")
+    assert f"lease:{lease}" not in driver.journal
 
 
 def test_pressure_sends_on_standby_too_and_lets_back_when_it_is_over() -> None:

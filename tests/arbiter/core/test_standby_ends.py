@@ -1,11 +1,13 @@
 """What ends or changes a lease on standby: its holder, its process, an operator; several cards; its invariants."""
 
+from collections.abc import Callable
+
 import pytest
 
 from arbiter.core import invariants
 from arbiter.core.invariants import InvariantViolation
 from arbiter.core.lease import LeaseState
-from arbiter.testing.core_driver import CoreDriver, answer, refusal
+from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
 from arbiter.testing.scenes import held, order, sent_away
 from schemas import defaults as d
 
@@ -48,14 +50,15 @@ def test_it_ends_with_its_connection(reason: str) -> None:
     assert f"lease:{lease}" not in driver.journal
 
 
-def test_a_connection_that_ends_during_the_measurement_does_not_want_it_back() -> None:
+@pytest.mark.parametrize("end", [Consumer.leave, Consumer.die], ids=["connection", "process"])
+def test_who_ends_during_the_measurement_does_not_want_it_back(end: Callable[[Consumer], object]) -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, standby=True)
     policy = driver.consumer("policy")
     wanted = policy.acquire(5 * GIB)
     driver.until(lambda: driver.state(lease) == "revoking")
     det.unload(lease)
-    det.leave()
+    end(det)
     driver.until(lambda: driver.state(wanted) == "loading")
     assert driver.state(lease) == "over"
 
@@ -66,18 +69,6 @@ def test_it_ends_with_its_process() -> None:
     det.die()
     assert driver.state(lease) == "over"
     assert driver.notes("lost")[-1]["lease_id"] == lease
-
-
-def test_a_process_that_dies_during_the_measurement_does_not_want_it_back() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5, standby=True)
-    policy = driver.consumer("policy")
-    wanted = policy.acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
-    det.unload(lease)
-    det.die()
-    driver.until(lambda: driver.state(wanted) == "loading")
-    assert driver.state(lease) == "over"
 
 
 # -- operators -------------------------------------------------------------------------------------------------------
@@ -117,6 +108,7 @@ def test_evicting_one_that_leaves_by_itself_is_fine() -> None:
     det.unload(lease)
     order(driver, "evict", lease)
     driver.until(lambda: driver.state(lease) == "over")
+    assert f"lease:{lease}" not in driver.journal
 
 
 def test_an_operators_eviction_outlives_a_restart() -> None:
@@ -129,6 +121,7 @@ def test_an_operators_eviction_outlives_a_restart() -> None:
     det.reattach(lease, token)
     det.unload(lease)
     driver.until(lambda: driver.state(lease) == "over")
+    assert f"lease:{lease}" not in driver.journal
 
 
 def test_what_an_operator_evicted_and_its_holder_thinks_away_is_over() -> None:
@@ -144,6 +137,7 @@ def test_what_an_operator_evicted_and_its_holder_thinks_away_is_over() -> None:
     det.connect()
     det.reattach(lease, token, away=True)
     driver.until(lambda: driver.state(lease) == "over")
+    assert f"lease:{lease}" not in driver.journal
 
 
 def test_a_pin_on_standby_holds_after_the_return() -> None:

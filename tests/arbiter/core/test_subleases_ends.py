@@ -332,6 +332,7 @@ def test_without_process_lists_a_reservation_is_released_by_the_totals(tree: Tre
     tree.policy.unload(tree.leaf)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)
     driver.until(lambda: tree.state(tree.root) == "over", limit_s=0.2)
+    assert (tree.state(tree.leaf), tree.total()) == ("over", 5 * GIB)
 
 
 def test_without_process_lists_a_parent_that_said_ready_has_to_release_itself() -> None:

@@ -3,25 +3,18 @@ loads beside its sub-leases is no mere reservation."""
 
 import pytest
 
-from arbiter.testing.core_driver import CoreDriver, answer, refusal
+from arbiter.testing.core_driver import answer, refusal
+from arbiter.testing.scenes import hidden_card
 from schemas import defaults as d
 
 GIB = d.GIB
 MIB = d.MIB
 
 
-def card(*, lists: bool = True, lag_s: float = 0.0) -> CoreDriver:
-    driver = CoreDriver(8 * GIB, start=False)
-    driver.card.lists_processes = lists
-    driver.card.lag_s = lag_s
-    driver.advance(0.01)
-    return driver
-
-
 @pytest.mark.parametrize("of_its_own", [True, False])
 def test_without_process_lists_bytes_are_lent_again_only_once_they_are_gone(of_its_own: bool) -> None:
     """No reading was taken while the sub-lease was ready: the ledger bound is all there is, and the reservation must not hide it."""
-    driver = card(lists=False, lag_s=0.8)
+    driver = hidden_card(lists=False, lag_s=0.8)
     runner, policy = driver.consumer("runner"), driver.consumer("policy")
     root = runner.acquire(7 * GIB)
     token = runner.token(root)
@@ -39,7 +32,7 @@ def test_without_process_lists_bytes_are_lent_again_only_once_they_are_gone(of_i
 
 
 def test_without_process_lists_a_parent_that_is_ready_without_a_figure_lends_nothing() -> None:
-    driver = card(lists=False)
+    driver = hidden_card(lists=False)
     runner, policy = driver.consumer("runner"), driver.consumer("policy")
     root = runner.acquire(5 * GIB, 4 * GIB)
     runner.load(root)
@@ -54,7 +47,7 @@ def test_without_process_lists_a_parent_that_is_ready_without_a_figure_lends_not
 @pytest.mark.parametrize("lists", [True, False])
 @pytest.mark.parametrize("asked", [False, True])
 def test_a_parent_that_is_ready_after_its_sub_lease_is_no_mere_reservation(lists: bool, asked: bool) -> None:
-    driver = card(lists=lists)
+    driver = hidden_card(lists=lists)
     runner, policy = driver.consumer("runner"), driver.consumer("policy")
     root = runner.acquire(5 * GIB)
     leaf = policy.acquire(2 * GIB, parent=(root, runner.token(root)))
@@ -78,7 +71,7 @@ def test_a_parent_that_is_ready_after_its_sub_lease_is_no_mere_reservation(lists
 
 
 def test_a_parent_that_said_ready_is_no_mere_reservation_after_a_restart_either() -> None:
-    driver = card(lists=False)
+    driver = hidden_card(lists=False)
     runner, policy = driver.consumer("runner"), driver.consumer("policy")
     root = runner.acquire(5 * GIB)
     leaf = policy.acquire(2 * GIB, parent=(root, runner.token(root)))
@@ -98,7 +91,7 @@ def test_a_parent_that_said_ready_is_no_mere_reservation_after_a_restart_either(
 
 
 def test_a_ready_that_the_daemon_missed_counts_as_said() -> None:
-    driver = card(lists=False)
+    driver = hidden_card(lists=False)
     runner = driver.consumer("runner")
     root = runner.acquire(5 * GIB, 4 * GIB)
     token = runner.token(root)

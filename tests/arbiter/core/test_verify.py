@@ -1,28 +1,19 @@
 """Verdicts. The bytes of a lease stay charged until a reading says that they came back, or whose they are."""
 
 import itertools
-from typing import Any
 
 import pytest
 
 from arbiter.core.effects import Sample
 from arbiter.core.events import MemorySampled, ProbeFailed, Tick
-from arbiter.testing.core_driver import READING_S, Consumer, CoreDriver
+from arbiter.testing.core_driver import READING_S, CoreDriver
+from arbiter.testing.scenes import held
 from schemas import defaults as d
-from schemas.ids import GpuId, LeaseId, ProcessKey
+from schemas.ids import GpuId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 STRANGER = ProcessKey(9, 9)
 GPU = GpuId("GPU-0")
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
 
 
 def verdicts(driver: CoreDriver) -> list[tuple[str, bool]]:

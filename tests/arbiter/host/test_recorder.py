@@ -96,6 +96,8 @@ def test_events_reach_the_disk_by_themselves(busy: CoreDriver, tmp_path: Path) -
             while sum(len(path.read_text().splitlines()) for path in recorded.folder.glob("*")) < 4:
                 await asyncio.sleep(module.FLUSH_S / 4)
         recorded.recorder.close()
+        found = recorded.replayed()
+        assert (found.identical, found.events) == (True, 3)
 
     recording(test)
 

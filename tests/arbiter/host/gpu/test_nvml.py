@@ -180,9 +180,11 @@ def test_a_list_whose_pids_mean_nothing_here_is_no_evidence(tmp_path):
 
 
 def test_closing_twice_is_harmless():
-    probe = NvmlProbe(Driver(card()))
+    driver = Driver(card())
+    probe = NvmlProbe(driver)
     probe.close()
     probe.close()
+    assert driver.shutdowns == 2, "the library says that it is shut down already, and that is no error"
 
 
 def test_the_real_library_says_no_gpu_where_there_is_no_driver():
