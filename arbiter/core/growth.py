@@ -141,8 +141,10 @@ def _is_gone(core: Core, gpu: Gpu, lease: Lease, shrink: Shrink, sample: MemoryS
     held = process_bytes(sample, lease.process)
     if held is not None and held > account.booked_bytes() - less + tolerance:
         return False
-    overhead = gpu.info.reserve_bytes if ledger.overhead_bytes is None else ledger.overhead_bytes
-    return sample.used_bytes <= ledger.booked_bytes() - less + ledger.stowaway_bytes() + overhead + tolerance
+    return (
+        sample.used_bytes
+        <= ledger.booked_bytes() - less + ledger.stowaway_bytes() + ledger.driver_bytes() + tolerance
+    )
 
 
 def _tell(core: Core, gpu: Gpu, lease: Lease, changed_bytes: int) -> None:

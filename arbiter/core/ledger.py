@@ -109,6 +109,10 @@ class GpuLedger:
         over = self.total_bytes() - self.budget_bytes
         return over if over > self._tolerance_bytes else 0
 
+    def driver_bytes(self) -> int:
+        """What a reading may show that nobody is charged: the driver's own bytes, or the whole reserve while those were never seen."""
+        return self.info.reserve_bytes if self.overhead_bytes is None else self.overhead_bytes
+
     def charge_bytes(self, lease: LeaseId) -> int:
         owner = self._owner.get(lease)
         return 0 if owner is None else self.accounts[owner].charges[lease].booked_bytes

@@ -94,8 +94,7 @@ def judge(
     v.last_used_bytes = used
     expected = ledger.process_after_bytes(v.process, v.going(), dead=v.vanishes)
     held = process_bytes(sample, v.process)
-    overhead = ledger.info.reserve_bytes if ledger.overhead_bytes is None else ledger.overhead_bytes
-    bound_a = ledger.total_after_bytes(v.process, v.going(), dead=v.vanishes) + overhead
+    bound_a = ledger.total_after_bytes(v.process, v.going(), dead=v.vanishes) + ledger.driver_bytes()
     bound_b = _delta_bound(v, ledger, expected, grown_bytes)
     if bound_b is None:
         bound_a -= unfilled_bytes
