@@ -56,7 +56,11 @@ def parse_yaml(text: str, name: str) -> YamlText:
 
     Raises ConfigError (details.fields: line, field, problem) on broken YAML, unsafe tags and keys given twice.
     """
-    loader = yaml.SafeLoader(text)
+    try:
+        loader = yaml.SafeLoader(text)
+    except yaml.reader.ReaderError as error:  # a control character
+        line = text.count("\n", 0, error.position) + 1
+        raise config_error(name, [Problem(line, "", f"not valid YAML: {error.reason}")]) from error
     try:
         root = loader.get_single_node()
         lines: dict[Path, int] = {(): 1}

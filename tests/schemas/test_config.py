@@ -112,6 +112,7 @@ def test_a_wrong_list_item_is_named_by_its_place() -> None:
         ("gpu: {}\ngpu: {}\n", 2, "key given twice; first in line 1"),
         ("gpu: !!python/object/apply:os.getcwd []\n", 1, "not valid YAML"),
         ("gpu:\n\treserve_bytes: 1\n", 2, "not valid YAML"),
+        ("gpu:\n  source: \x08nvml\n", 2, "not valid YAML"),
         ("- 1\n", 1, "valid dictionary"),
         ("42", 1, "valid dictionary"),
         ("wire:\n  endpoint: tcp://0.0.0.0:5555\n", 2, "without CURVE keys"),
