@@ -296,11 +296,15 @@ class Storm:
             os.kill(self._arbiter.pid, signal.SIGCONT)
 
     async def _start_daemon(self) -> None:
-        """A full disk may forbid a start, and it says so; then it is emptied first, as an operator would."""
+        """A full disk may forbid a start, and it says so; then it is emptied first, as an operator would.
+
+        It may be empty again by the time that the start has failed: what counts is how the start found it.
+        """
+        found_full = self._disk_is_full
         try:
             await asyncio.to_thread(self._arbiter.start)
         except RuntimeError:
-            if not self._disk_is_full:
+            if not found_full:
                 raise
             self._empty_disk()
             await asyncio.to_thread(self._arbiter.start)
