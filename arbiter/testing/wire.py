@@ -10,7 +10,10 @@ from typing import Any, Self
 import msgpack
 import zmq
 
-REPLY_S = 10.0
+REPLY_S = 30.0
+"""Every wait here is for something that comes; a busy machine may take its time over it."""
+TTL_S = 600.0
+"""A bare client renews nothing: what it holds is to outlive its test, however slowly that runs."""
 
 
 class WireClient:
@@ -103,6 +106,7 @@ class WireClient:
             "consumer": consumer,
             "model_id": spec.pop("model_id", consumer),
             "footprint": footprint,
+            "ttl_s": TTL_S,
             **spec,
         }
         return self.ask("acquire", spec=wanted, **fields)

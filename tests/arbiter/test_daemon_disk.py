@@ -7,6 +7,7 @@ import contextlib
 import os
 import resource
 import shutil
+import sqlite3
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -98,6 +99,12 @@ def consumers(client: WireClient) -> list[str]:
     return [lease["consumer"] for lease in client.ask("status")["leases"]]
 
 
+def kinds_on_disk(arbiter: ArbiterProcess) -> set[str]:
+    """What a kill would leave of the history; it is written a little after it happened."""
+    with contextlib.closing(sqlite3.connect(arbiter.state / "history.sqlite")) as database:
+        return {kind for (kind,) in database.execute("SELECT DISTINCT kind FROM events")}
+
+
 def wait_until(client: WireClient, good: Callable[[], bool]) -> None:
     """Look again with every event, and at every beat of the wire at the latest."""
     for _ in range(int(PATIENCE_S / 0.1)):
@@ -131,11 +138,10 @@ def test_a_full_disk_blocks_grants_and_nothing_else(arbiter: ArbiterProcess, dis
 
         disk.free()
         wait_until(client, lambda: client.ask("status")["problems"] == [])
-        later = client.acquire("later", 200 << 20, ttl_s=600.0)
-        if later["state"] == "queued":
-            client.push("granted")
+        client.granted("later", 200 << 20, ttl_s=600.0)
         kinds = {event["kind"] for event in client.ask("history", limit=1000)["events"]}
         assert {"journal_failed", "released", "granted"} <= kinds, sorted(kinds)
+        wait_until(client, lambda: "journal_failed" in kinds_on_disk(arbiter))
     arbiter.kill()
     arbiter.start()
     with WireClient(arbiter.endpoint) as client:

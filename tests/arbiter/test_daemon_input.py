@@ -22,8 +22,7 @@ Connect = Callable[..., WireClient]
 def holder(connect: Connect) -> WireClient:
     """A client with one lease that everything else must leave alone."""
     client = connect().hello("holder")
-    if client.acquire("holder", GIB)["state"] == "queued":  # the daemon has not read its card yet
-        assert client.push("granted")["lease"]["state"] == "loading"
+    assert client.granted("holder", GIB)["state"] == "loading"
     return client
 
 
@@ -118,13 +117,17 @@ def test_a_forged_token_is_stale(holder: WireClient) -> None:
     assert still_held(holder)
 
 
-def test_a_flood_is_limited_and_others_are_served(holder: WireClient, connect: Connect) -> None:
-    flooder = connect().hello("flooder")
-    ids = [flooder.send("ping") for _ in range(5000)]
-    codes = [reply["error"]["code"] if not (reply := flooder.reply(id_))["ok"] else "ok" for id_ in ids]
-    assert "limit_exceeded" in codes
-    assert codes[0] == "ok"
-    assert still_held(holder)
+def test_a_flood_is_limited_and_others_are_served(make_arbiter: Callable[..., ArbiterProcess]) -> None:
+    """The limit is low, so that a machine too busy to flood a daemon exceeds it all the same."""
+    arbiter = make_arbiter(config="limits: {rate_per_client_per_s: 50}\n").start()
+    with WireClient(arbiter.endpoint) as holder, WireClient(arbiter.endpoint) as flooder:
+        holder.hello("holder").granted("holder", GIB)
+        flooder.hello("flooder")
+        ids = [flooder.send("ping") for _ in range(5000)]
+        codes = [reply["error"]["code"] if not (reply := flooder.reply(id_))["ok"] else "ok" for id_ in ids]
+        assert "limit_exceeded" in codes
+        assert codes[0] == "ok"
+        assert still_held(holder)
 
 
 def test_a_req_client_is_served(arbiter_daemon: ArbiterProcess) -> None:

@@ -20,7 +20,7 @@ INSIDE = """
 import os, sys
 from arbiter.testing.wire import WireClient
 with WireClient(sys.argv[1]) as client:
-    client.hello("inside").acquire("inside", 1 << 30)
+    client.hello("inside").granted("inside", 1 << 30)
     print(os.getpid(), flush=True)
     sys.stdin.read()
 """

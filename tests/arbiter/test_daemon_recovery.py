@@ -10,7 +10,7 @@ import pytest
 
 from arbiter.rpc.peer import start_ticks
 from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from arbiter.testing.wire import TTL_S, WireClient
 from schemas import fakegpu
 from schemas.ids import ProcessKey
 
@@ -34,8 +34,7 @@ def occupy(arbiter: ArbiterProcess, size: int) -> None:
 
 def hold(client: WireClient, arbiter: ArbiterProcess, name: str, size: int) -> dict[str, Any]:
     """Acquire, load, ready: the lease's id and token."""
-    reply = client.acquire(name, size, ttl_s=60.0)
-    lease = reply["lease"] if reply["state"] == "loading" else client.push("granted")["lease"]
+    lease = client.granted(name, size)
     occupy(arbiter, size)
     on = {"lease_id": lease["lease_id"], "token": lease["token"]}
     assert client.ask("ready", **on, measured_bytes=size)["ok"]
@@ -44,7 +43,7 @@ def hold(client: WireClient, arbiter: ArbiterProcess, name: str, size: int) -> d
 
 
 def reattach(client: WireClient, on: dict[str, Any], name: str, size: int) -> dict[str, Any]:
-    spec = {"consumer": name, "model_id": name, "ttl_s": 60.0,
+    spec = {"consumer": name, "model_id": name, "ttl_s": TTL_S,
             "footprint": {"load_peak_bytes": size, "steady_bytes": size, "residue_bytes": 0}}  # fmt: skip
     reply = client.ask("reattach", leases=[{**on, "spec": spec, "state": "held", "measured_bytes": size}])
     assert reply["ok"], reply
@@ -98,12 +97,7 @@ def test_leases_survive_an_orderly_restart_and_go_with_their_dead_holder(make_ar
         file.unlink()
     arbiter.start()
     with WireClient(arbiter.endpoint) as client:
-        client.hello()
-        assert client.acquire("next", 7 * GIB)["ok"]
-        lease = client.ask("status")["leases"][-1]
-        if lease["state"] == "queued":
-            lease = client.push("granted")["lease"]
-        assert lease["consumer"] == "next"
+        assert client.hello().granted("next", 7 * GIB)["state"] == "loading"
 
 
 @pytest.mark.parametrize("damage", ["garbage", "records"])
@@ -143,7 +137,8 @@ def test_a_grant_that_cannot_be_written_is_refused_and_not_charged(make_arbiter:
         client.hello()
         blocker = sqlite3.connect(arbiter.state / "journal.sqlite", isolation_level=None)
         blocker.execute("BEGIN IMMEDIATE")
-        refused = client.acquire("first", 5 * GIB)
+        answer = client.acquire("first", 5 * GIB)
+        refused = answer if not answer["ok"] else client.push("denied")  # it waited for a reading of the card
         assert refused["error"]["code"] == "journal_unavailable"
         blocker.execute("ROLLBACK")
         blocker.close()

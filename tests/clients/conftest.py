@@ -14,7 +14,9 @@ sys.path.insert(0, str(Path(__file__).parent))  # for the helpers beside it
 
 from protocol_wire import Wire
 
-DEADLINE_S = 20.0
+DEADLINE_S = 60.0
+TTL_S = 120.0
+"""A daemon that is started again on a busy machine is away for seconds: nobody is to fence himself meanwhile."""
 
 
 @pytest.fixture
@@ -44,6 +46,7 @@ def spec() -> Callable[..., LeaseSpec]:
                 "model_id": consumer,
                 "footprint": footprint,
                 "min_residency_s": 0.0,
+                "ttl_s": TTL_S,
                 **fields,
             }
         )
@@ -53,7 +56,7 @@ def spec() -> Callable[..., LeaseSpec]:
 
 @pytest.fixture
 def until() -> Callable[..., object]:
-    """`await until(lambda: …)`: poll on the loop until it is true; fails after 20 s."""
+    """`await until(lambda: …)`: poll on the loop until it is true; fails after a minute."""
 
     async def wait(condition: Callable[[], bool]) -> None:
         async with asyncio.timeout(DEADLINE_S):

@@ -17,6 +17,7 @@ from schemas.wire import Footprint, LeaseSpec
 from sidecars.device.fake import FakeMemory
 from sidecars.device.memory import Block
 
+TTL_S = 120.0  # a daemon that is started again on a busy machine is away for seconds, and nobody is to fence himself
 PAUSE = frozenset(os.environ.get("VRAM_TEST_PAUSE", "").split(","))
 
 
@@ -53,7 +54,7 @@ async def main(name: str, size: int, card: Path, residue: int) -> None:
         say("lost", error=str(error))
 
     spec = LeaseSpec(
-        consumer=name, model_id=name, ttl_s=3.0, min_residency_s=0.0,
+        consumer=name, model_id=name, ttl_s=TTL_S, min_residency_s=0.0,
         footprint=Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=residue),
     )  # fmt: skip
     reader = await commands()

@@ -19,6 +19,7 @@ from sidecars.device.fake import FakeMemory
 from sidecars.device.memory import Block
 
 RESIDUE = 256 << 20
+TTL_S = 120.0  # one that is stopped for a while, on a busy machine, has its lease still
 
 
 def say(event: str, **facts: object) -> None:
@@ -47,7 +48,7 @@ async def live(name: str, size: int, card: Path, habits: dict[str, Any]) -> None
         consumer=name,
         model_id=name,
         footprint=footprint,
-        **({"min_residency_s": 0.0} | habits.get("spec", {})),
+        **({"min_residency_s": 0.0, "ttl_s": TTL_S} | habits.get("spec", {})),
     )
     async with ArbiterClient(name=name, connect_timeout_s=30.0) as client:
         for _ in range(2 if habits.get("again") else 1):

@@ -14,7 +14,7 @@ from clients.aio import ArbiterClient
 from schemas.wire import Footprint, LeaseSpec
 from sidecars.device.fake import FakeMemory
 
-TTL_S = 5.0
+TTL_S = 120.0  # a daemon that is started again on a busy machine is away for seconds, and nobody is to fence himself
 
 
 def say(event: str, **facts: object) -> None:

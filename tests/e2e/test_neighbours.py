@@ -24,7 +24,7 @@ RESIDUE = 256 * MIB
 PATIENCE_S = 30.0
 CONFIG = """
 probe: {period_s: 0.1}
-verify: {timeout_s: 1, slow_poll_s: 0.1}
+verify: {timeout_s: 5, slow_poll_s: 0.1}
 revoke: {deadline_s: 0.5, terminate_grace_s: 0.3}
 """
 GAME = """
@@ -109,7 +109,9 @@ class Stage:
     @staticmethod
     def _clean(status: dict[str, Any]) -> bool:
         (gpu,) = status["gpus"]
-        return not (status["leases"] or gpu["charged_bytes"] or gpu["stowaway_bytes"])
+        return status["leases"] == [] and all(
+            gpu[what] == 0 for what in ("charged_bytes", "stowaway_bytes", "measured_used_bytes")
+        )
 
     def close(self) -> str:
         if self.watcher is not None:
@@ -159,11 +161,9 @@ def test_1_the_next_one_loads_when_the_memory_is_back_and_nothing_stays_failed(s
 
 def test_1_while_the_card_cannot_be_read_no_figure_of_it_is_printed(stage: Stage) -> None:
     """comfyui-mcp#2050: "1205 MB free", and 24 GB a moment later. A failed poll must print nothing."""
-    assert "free 7.71 GiB" in stage.vramctl("status")
+    until(lambda: stage.vramctl("status"), "free 7.71 GiB")
     stage.configure(faults=fakegpu.Faults(probe="fail"))
-    stage.event("probe_failed")
-    shown = stage.vramctl("status")
-    assert "measured: unknown" in shown
+    shown = until(lambda: stage.vramctl("status"), "measured: unknown")
     assert "free" not in shown
     waiter = stage.spawn("waiter-1", 1)
     stage.event("queued", consumer="waiter-1")
@@ -283,8 +283,7 @@ def test_14_after_a_restart_it_is_said_who_lives_and_who_has_exited(stage: Stage
     stage.arbiter.start()
     stage.watch()
     assert f"silent-14 (pid {silent.pid}) must come back first" in stage.vramctl("status")
-    told = stage.vramctl("history", "--kind", "lost", "-c", "exits-14")
-    assert f"process {exits.pid} died" in told
+    until(lambda: stage.vramctl("history", "--kind", "lost", "-c", "exits-14"), f"process {exits.pid} died")
     waiter = stage.spawn("waiter-14", 1)
     stage.event("queued", consumer="waiter-14")
     silent.signal(signal.SIGCONT)

@@ -20,6 +20,7 @@ from arbiter.testing.wire import WireClient
 from schemas.errors import ConfigError
 
 LIMIT = 1 << 16
+PATIENCE_S = 60.0
 
 
 @dataclass
@@ -61,11 +62,11 @@ class Serving:
         async def run() -> object:
             return function()
 
-        return asyncio.run_coroutine_threadsafe(run(), self.loop).result(10)
+        return asyncio.run_coroutine_threadsafe(run(), self.loop).result(PATIENCE_S)
 
     def stop(self) -> None:
         self.loop.call_soon_threadsafe(self.loop.stop)
-        self.thread.join(10)
+        self.thread.join(PATIENCE_S)
         assert not self.thread.is_alive()
 
 
@@ -104,9 +105,11 @@ def test_every_frame_names_its_process(serving: Serving, client: WireClient) -> 
 def test_another_process_has_another_pid(serving: Serving) -> None:
     script = (
         "import sys, zmq, msgpack, os; s = zmq.Context().socket(zmq.DEALER); s.connect(sys.argv[1]); s.send(b'x');"
-        "assert s.poll(10000); assert msgpack.unpackb(s.recv())['address'].endswith(f':{os.getpid()}')"
+        "assert s.poll(50000); assert msgpack.unpackb(s.recv())['address'].endswith(f':{os.getpid()}')"
     )
-    done = subprocess.run([sys.executable, "-c", script, f"ipc://{serving.path}"], timeout=30, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", script, f"ipc://{serving.path}"], timeout=PATIENCE_S, check=False
+    )
     assert done.returncode == 0
 
 
@@ -116,7 +119,7 @@ def test_a_client_that_is_back_before_the_self_test_is_answered(folder: Path) ->
     server.bind()
     with WireClient(f"ipc://{folder / 'a.sock'}") as client:
         client.send_raw(b"early")
-        assert server._socket.poll(10_000)
+        assert server._socket.poll(int(PATIENCE_S * 1000))
         server._self_test()
         heard: list[bytes] = []
 
@@ -128,7 +131,7 @@ def test_a_client_that_is_back_before_the_self_test_is_answered(folder: Path) ->
                 done.set()
 
             server.start(asyncio.get_running_loop(), on_frame)
-            async with asyncio.timeout(10.0):
+            async with asyncio.timeout(PATIENCE_S):
                 await done.wait()
             server.close()
 
@@ -198,7 +201,7 @@ def test_no_wake_up_is_lost_among_sends_from_outside_the_drain(serving: Serving,
         )
         replies = 0
         while replies < 1:
-            message = client.receive(5)
+            message = client.receive()
             assert message is not None, f"lost at {number}"
             replies += "re" in message
 
@@ -222,25 +225,33 @@ def test_a_reader_that_does_not_read_costs_only_itself(serving: Serving, client:
 def test_a_flood_is_answered_in_portions_and_costs_nobody_a_wake_up(
     serving: Serving, client: WireClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rest = serving.server._rest
+    """The flood is handed to the server as if it had come at once: how much of it really does is the machine's doing."""
+    server, rest = serving.server, serving.server._rest
 
     def counted() -> None:
         serving.rests += 1
         rest()
 
-    monkeypatch.setattr(serving.server, "_rest", counted)
+    monkeypatch.setattr(server, "_rest", counted)
     serving.too_fast = b"flood"
     with WireClient(f"ipc://{serving.path}") as flooder:
+        flooder.send_raw(b"x")
+        assert flooder.receive() is not None
+        frames = [zmq.Frame(serving.seen[0][0]), zmq.Frame(b"flood")]
+
+        def flood() -> None:
+            server._early.extend([frames] * (2 * FLOOD))
+            server._schedule_drain()
+
         for _ in range(50):
-            for _ in range(2 * FLOOD):
-                flooder.send_raw(b"flood")
+            serving.call(flood)
             client.send_raw(b"calm")
             reply = client.receive()
             assert reply is not None
             assert reply["size"] == len(b"calm")
         answers = [flooder.receive() for _ in range(100 * FLOOD)]
         assert None not in answers, "each is answered"
-    assert 50 < serving.rests <= 100
+    assert serving.rests == 100
     client.send_raw(b"calm")
     assert client.receive() is not None, "after the last rest the socket is read as before"
 
@@ -283,7 +294,7 @@ def test_a_second_connection_under_a_living_routing_id_gets_nothing(serving: Ser
 def test_a_stale_socket_is_replaced_and_close_removes_it(folder: Path) -> None:
     path = folder / "a.sock"
     script = "import os, sys, zmq; s = zmq.Context().socket(zmq.ROUTER); s.bind('ipc://' + sys.argv[1]); os._exit(9)"
-    subprocess.run([sys.executable, "-c", script, str(path)], timeout=30, check=False)
+    subprocess.run([sys.executable, "-c", script, str(path)], timeout=PATIENCE_S, check=False)
     assert path.exists()
     serving = Serving(path)
     with WireClient(f"ipc://{path}") as client:
