@@ -9,6 +9,7 @@ from typing import Any
 from arbiter.core import costs, crashes, drift, eviction, families, growth, standby
 from arbiter.core.events import MemorySampled, ProbeFailed
 from arbiter.core.lease import AWAY, Lease, LeaseState
+from arbiter.core.ledger import process_bytes
 from arbiter.core.state import Core, Gpu
 from arbiter.core.verify import Judgement, Verdict, Verification, judge
 from schemas.defaults import VERIFY_READING_SHARE
@@ -112,10 +113,14 @@ def _shrink_residues(core: Core, gpu: Gpu, sample: MemorySampled) -> None:
         process = account.process
         if account.charges or process in waiting_for or sample.taken_at <= account.changed_at:
             continue
-        floor = account.residue_floor_bytes
-        if not account.measured_bytes and process not in core.connected and core.recovering is None:
+        floor, held_bytes = account.residue_floor_bytes, account.measured_bytes
+        if (
+            process_bytes(sample, process) is None
+        ):  # listed without its bytes: no more than all that is on the card
+            held_bytes = sample.used_bytes
+        elif not held_bytes and process not in core.connected and core.recovering is None:
             floor = 0
-        target = max(floor, account.measured_bytes)
+        target = max(floor, held_bytes)
         if target + tolerance < account.residue_bytes:
             gpu.ledger.set_residue(process, target, core.now)
             families.residue_fell(core, gpu, process)

@@ -383,6 +383,27 @@ def test_the_residue_of_a_process_that_left_unseen_is_forgotten() -> None:
     assert driver.gpu()["charged_bytes"] == 0
 
 
+def test_a_residue_of_a_process_that_is_listed_without_its_bytes_stays_until_the_card_shows_it_gone() -> None:
+    """Regression: WSL2 lists processes without their bytes, and the next reading after the verdict took that for none."""
+    driver = CoreDriver(8 * GIB)
+    driver.card.knows_bytes = False
+    det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
+    det.unloading(lease)
+    det.hold(2 * GIB)
+    det.release(lease)
+    driver.advance(d.VERIFY_TIMEOUT_S + 0.1)
+    assert verdicts(driver) == [("residue", True)]
+    driver.advance(10.0)
+    gpu = driver.gpu()
+    assert (gpu["charged_bytes"], gpu["stowaway_bytes"]) == (2 * GIB, 0), "charged once, to who let go"
+    det.hold(GIB)
+    driver.advance(2.0)
+    assert driver.gpu()["charged_bytes"] == GIB, "what came back later is free"
+    det.hold(0)
+    driver.advance(2.0)
+    assert driver.gpu()["charged_bytes"] == 450 * MIB, "connected: it may use its context again"
+
+
 def test_two_debts_of_one_dead_process_are_measured_together() -> None:
     driver = CoreDriver(8 * GIB)
     det = driver.consumer("det")
