@@ -24,6 +24,7 @@ from sidecars.device.fake import FakeMemory
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
 GIB = 1 << 30
+WAIT_S = 60.0
 Spec = Callable[..., LeaseSpec]
 Until = Callable[[Callable[[], bool]], Awaitable[None]]
 
@@ -71,7 +72,7 @@ async def test_a_standby_lease_returns_by_itself_when_there_is_room(
     async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
         detector = await on_standby(client, spec, model)
         first = detector.token
-        policy = await client.acquire(spec("policy", 4), 20.0)
+        policy = await client.acquire(spec("policy", 4), WAIT_S)
         await policy.ready()
         assert detector.state == "standby"
         with pytest.raises(LeaseRevoking):
@@ -94,7 +95,7 @@ async def test_a_standby_lease_survives_the_daemon(
     async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
         detector = await on_standby(client, spec, model)
         memory = FakeMemory(arbiter_daemon.card, "t", 0)
-        policy = await client.acquire(spec("policy", 4), 20.0)
+        policy = await client.acquire(spec("policy", 4), WAIT_S)
         block = memory.allocate("policy", 4 * GIB)
         await policy.ready()
         arbiter_daemon.kill()
@@ -114,12 +115,12 @@ async def test_a_standby_lease_can_ask_to_come_back_or_be_given_up(
     async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
         detector = await on_standby(client, spec, model)
         other = Model()
-        policy = await client.acquire(spec("policy", 4), 20.0, unload=other.unload)
+        policy = await client.acquire(spec("policy", 4), WAIT_S, unload=other.unload)
         await policy.ready()
-        await detector.reacquire(20.0)
+        await detector.reacquire(WAIT_S)
         await until(lambda: detector.state == "held")
         assert (other.did, policy.state) == (["unload"], "gone")
-        policy = await client.acquire(spec("policy", 4), 20.0)
+        policy = await client.acquire(spec("policy", 4), WAIT_S)
         assert detector.state == "standby"
         await detector.give_up()
         assert detector.state == "gone"
@@ -139,10 +140,10 @@ async def test_weights_are_parked_where_the_budget_has_room(
             on_return=model.load,
         )
         await detector.ready()
-        policy = await client.acquire(spec("policy", 4, park_bytes=5 * GIB), 20.0, unload=model.unload)
+        policy = await client.acquire(spec("policy", 4, park_bytes=5 * GIB), WAIT_S, unload=model.unload)
         await policy.ready()
         assert (detector.state, model.did) == ("parked", ["park"])
-        await detector.reacquire(20.0)
+        await detector.reacquire(WAIT_S)
         await until(lambda: detector.state == "held")
         assert model.did == ["park", "unload", "load"]
         await detector.park()
@@ -165,7 +166,7 @@ async def test_a_yielded_use_lets_the_holder_go_and_says_so_at_its_end(
                 assert (await client.status())["leases"][0]["uses"] == 0
             assert (await client.status())["leases"][0]["uses"] == 1
             with pytest.raises(VramError):
-                await lend(use, client.acquire(spec("llm", 5), 20.0))
+                await lend(use, client.acquire(spec("llm", 5), WAIT_S))
         assert model.did == ["unload"]
 
 
@@ -174,13 +175,13 @@ async def test_a_gang_is_granted_together_one_load_after_the_other(
 ) -> None:
     async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
         held: list[Lease] = []
-        async for _, lease in client.gang([spec("policy", 4), spec("reward", 3)], 20.0):
+        async for _, lease in client.gang([spec("policy", 4), spec("reward", 3)], WAIT_S):
             assert [other.state for other in held] == ["held"] * len(held)
             await lease.ready()
             held.append(lease)
         assert sorted(lease.spec.consumer for lease in held) == ["policy", "reward"]
         with pytest.raises((VramInsufficient, GangBroken)):
-            await anext(client.gang([spec("a", 5), spec("b", 5)], 20.0))
+            await anext(client.gang([spec("a", 5), spec("b", 5)], WAIT_S))
         assert set(await states(client)) == {"policy", "reward"}
 
 
@@ -194,7 +195,7 @@ async def test_a_lease_grows_and_shrinks(arbiter_daemon: ArbiterProcess, spec: S
     async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
         cache = await client.acquire(spec("cache", 2))
         await cache.ready()
-        await cache.resize(size(4), 20.0)
+        await cache.resize(size(4), WAIT_S)
         assert await charged(client) == 4 * GIB
         await cache.resize(size(1))
         assert await charged(client) == 1 * GIB
@@ -214,12 +215,12 @@ async def test_a_resize_ends_with_the_stay_on_the_card(
     async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
         cache = await client.acquire(spec("cache", 2, standby=True))
         await cache.ready()
-        busy = await client.acquire(spec("busy", 3, priority=90), 20.0)
+        busy = await client.acquire(spec("busy", 3, priority=90), WAIT_S)
         await busy.ready()
         async with ArbiterClient(arbiter_daemon.endpoint, name="u") as other, busy.use():
             growing = asyncio.create_task(cache.resize(five_gib()))
             await until_growing(client)
-            policy = await other.acquire(spec("policy", 4, priority=95), 20.0)
+            policy = await other.acquire(spec("policy", 4, priority=95), WAIT_S)
             with pytest.raises(LeaseRevoking):
                 await growing
             assert cache.state == "standby"
@@ -234,7 +235,7 @@ async def test_a_resize_that_waits_outlives_the_daemon(
         memory = FakeMemory(arbiter_daemon.card, "t", 0)
         memory.allocate("cache", 2 * GIB)
         await cache.ready()
-        busy = await client.acquire(spec("busy", 3, priority=90), 20.0)
+        busy = await client.acquire(spec("busy", 3, priority=90), WAIT_S)
         block = memory.allocate("busy", 3 * GIB)
         await busy.ready()
         async with busy.use():
@@ -247,12 +248,12 @@ async def test_a_resize_that_waits_outlives_the_daemon(
         memory.free(block)
         memory.empty_cache()
         await busy.give_up()
-        await asyncio.wait_for(growing, 20.0)
+        await asyncio.wait_for(growing, WAIT_S)
         assert cache.spec.footprint.steady_bytes == 5 * GIB
 
 
 async def until_growing(client: ArbiterClient) -> None:
-    async with asyncio.timeout(20.0):
+    async with asyncio.timeout(WAIT_S):
         while not any(lease.get("resizing") for lease in (await client.status())["leases"]):
             await asyncio.sleep(0.02)
 
@@ -282,7 +283,7 @@ async def test_a_sub_lease_is_carved_out_of_its_parents(
         async with root.use("grab"):
             # one process plays all three: the goal does not wait for the detector
             wanted = spec("detector", 5, independent=True)
-            waiting = asyncio.ensure_future(other.acquire(wanted, 20.0))
+            waiting = asyncio.ensure_future(other.acquire(wanted, WAIT_S))
             await until(lambda: sorted(asked) == ["goal", "policy"])
             assert leaf.state == "revoking"
             assert model.did == [], "the tree is in use"
@@ -305,7 +306,7 @@ async def test_a_job_that_waits_for_its_own_room_is_told(arbiter_daemon: Arbiter
                 await client.acquire(spec("llm", 5))
             assert [link["consumer"] for link in told.value.details["cycle"]] == ["llm"]
             assert "job" in str(told.value)
-            prefetch = asyncio.ensure_future(client.acquire(spec("next", 5, independent=True), 20.0))
+            prefetch = asyncio.ensure_future(client.acquire(spec("next", 5, independent=True), WAIT_S))
         await job.give_up()
         assert (await beside).state == "loading"
         await (await beside).give_up()
@@ -314,4 +315,4 @@ async def test_a_job_that_waits_for_its_own_room_is_told(arbiter_daemon: Arbiter
 
 async def asked_when(happens: asyncio.Event, client: ArbiterClient, spec: LeaseSpec) -> Lease:
     await happens.wait()
-    return await client.acquire(spec, 20.0)
+    return await client.acquire(spec, WAIT_S)

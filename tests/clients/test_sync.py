@@ -15,7 +15,7 @@ from schemas.wire import LeaseSpec
 pytestmark = pytest.mark.e2e
 
 Spec = Callable[..., LeaseSpec]
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 @pytest.fixture

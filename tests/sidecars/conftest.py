@@ -16,7 +16,7 @@ from arbiter.testing.fakegpu_check import check_log
 from arbiter.testing.wire import WireClient
 
 PNG = b"\x89PNG\r\n\x1a\n"  # the echo does not look at it
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 MANIFEST = """
 name: test/{name}
 version: 0.1.0

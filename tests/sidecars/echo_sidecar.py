@@ -1,6 +1,6 @@
 """A whole sidecar process around a model without weights: `python echo_sidecar.py FOLDER [flags of vram-sidecar]`.
 
-FOLDER tells it what to do: a file `fail_prepare` or `fail_load` makes that step fail, `slow_prepare` makes it last. The query tells `run`: `hold NAME` waits until the
+FOLDER tells it what to do: a file `fail_prepare` or `fail_load` makes that step fail, `slow_prepare` or `slow_load` makes it last. The query tells `run`: `hold NAME` waits until the
 file NAME appears there, `fail` raises; anything else is echoed.
 """
 
@@ -24,12 +24,16 @@ class EchoAdapter:
         if (self._folder / f"fail_{step}").exists():
             raise RuntimeError(f"{step} fails as told")
 
-    def prepare(self) -> None:
-        while (self._folder / "slow_prepare").exists():
+    def _last(self, step: str) -> None:
+        while (self._folder / f"slow_{step}").exists():
             threading.Event().wait(0.005)
+
+    def prepare(self) -> None:
+        self._last("prepare")
         self._fail("prepare")
 
     def load(self, device: str) -> None:
+        self._last("load")
         self._fail("load")
         self._model = device
 

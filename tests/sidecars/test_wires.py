@@ -274,8 +274,11 @@ def test_a_real_sidecar_survives_what_strangers_send(lone_box):
         assert reply["ok"] is False, payload
     sidecar.client.send_frames([b"one", b"two", b"three"])
     sidecar.client.send_raw(msgpack.packb({"op": "detect", "image": bytes(17 * 2**20), "query": "x"}))
-    codes = {reply["code"] for reply in iter(lambda: sidecar.client.receive(2.0), None)}
-    assert "message_too_large" in codes
+    codes = set()
+    while "message_too_large" not in codes:
+        reply = sidecar.client.receive()
+        assert reply is not None, codes
+        codes.add(reply["code"])
     assert sidecar.detect()["ok"]
 
 
@@ -284,7 +287,7 @@ def test_req_clients_of_the_field_are_answered(lone_box):
     lone_box.start("detector", "--no-arbiter", device="none")
     socket = zmq.Context.instance().socket(zmq.REQ)
     socket.setsockopt(zmq.LINGER, 0)
-    socket.setsockopt(zmq.RCVTIMEO, 10_000)
+    socket.setsockopt(zmq.RCVTIMEO, 60_000)
     try:
         socket.connect(f"ipc://{lone_box.runtime}/detector.sock")
         for message in (

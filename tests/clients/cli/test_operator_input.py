@@ -22,7 +22,7 @@ from schemas.wire import LeaseSpec
 pytestmark = pytest.mark.e2e
 Spec = Callable[..., LeaseSpec]
 Finished = subprocess.CompletedProcess[str]
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 EVERY_ACTION = (
     ("evict", "x", "-r", "why"), ("pin", "x", "-r", "why"), ("unpin", "x"), ("release-dead", "x", "-r", "why"),
     ("drain", "-r", "why"), ("resume",),

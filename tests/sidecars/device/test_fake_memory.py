@@ -78,7 +78,7 @@ def used(folder):
     return probe.sample(probe.cards()[0].id).used_bytes
 
 
-def until(condition, deadline_s=5.0):
+def until(condition, deadline_s=60.0):
     """Wait until a condition on the card's files holds; returns how long it took."""
     began, pause = time.monotonic(), threading.Event()
     while not condition():
