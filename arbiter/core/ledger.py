@@ -308,22 +308,23 @@ class GpuLedger:
         """The process died: it is not expected to keep anything. What is charged stays until measured gone."""
         self.accounts[process].residue_floor_bytes = 0
 
-    def observe(self, sample: MemorySampled, *, quiet: bool) -> None:
-        """Take evidence from a reading. `quiet`: nobody loads or unloads, so the unexplained rest means something."""
-        self._observe(sample, quiet=quiet)
+    def observe(self, sample: MemorySampled, *, quiet: bool, returning_bytes: int = 0) -> None:
+        """Take evidence from a reading. `quiet`: nobody loads or unloads, so the unexplained rest means something.
+
+        So many bytes of that rest may be on their way back, and mean nothing new.
+        """
+        self._observe(sample, returning_bytes, quiet=quiet)
         if sample.processes is None:  # it says nothing of anybody
             return
         for account in self.accounts.values():
             self._count(account)
         self._count_strangers()
 
-    def _observe(self, sample: MemorySampled, *, quiet: bool) -> None:
+    def _observe(self, sample: MemorySampled, returning_bytes: int, *, quiet: bool) -> None:
         if sample.processes is None:
             if quiet:
-                booked = self.booked_bytes()
-                self.unnamed_bytes = max(0, sample.used_bytes - booked - self.info.reserve_bytes)
-                if not self.accounts:
-                    self.overhead_bytes = min(sample.used_bytes, self.info.reserve_bytes)
+                rest_bytes = max(0, sample.used_bytes - self.booked_bytes())
+                self._take_rest(rest_bytes, returning_bytes, complete=not self.accounts)
             return
         named_bytes = 0
         strangers: dict[ProcessKey, Stranger] = {}
@@ -356,10 +357,21 @@ class GpuLedger:
                 account.measured_bytes = 0
         self.strangers = strangers
         if quiet:
-            rest_bytes = max(0, sample.used_bytes - named_bytes)
-            self.unnamed_bytes = max(0, rest_bytes - self.info.reserve_bytes)
-            if complete:
-                self.overhead_bytes = min(rest_bytes, self.info.reserve_bytes)
+            self._take_rest(max(0, sample.used_bytes - named_bytes), returning_bytes, complete=complete)
+
+    def _take_rest(self, rest_bytes: int, returning_bytes: int, *, complete: bool) -> None:
+        """What nobody explains: the driver's own up to the reserve, somebody's beyond it. What may be going is neither, if it is new."""
+        reserve = self.info.reserve_bytes
+        stays_bytes = max(0, rest_bytes - returning_bytes)
+        least, most = max(0, stays_bytes - reserve), max(0, rest_bytes - reserve)
+        self.unnamed_bytes = min(max(self.unnamed_bytes, least), most)
+        if not complete:
+            return
+        least, most = min(stays_bytes, reserve), min(rest_bytes, reserve)
+        if self.overhead_bytes is not None:
+            self.overhead_bytes = min(max(self.overhead_bytes, least), most)
+        elif least == most:
+            self.overhead_bytes = most
 
     def _open(self, process: ProcessKey, now: float) -> Account:
         account = self.accounts.get(process)

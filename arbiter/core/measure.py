@@ -26,6 +26,7 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
         return
     if gpu.asked_at is not None and sample.taken_at >= gpu.asked_at:
         gpu.asked_at = None
+    _watch_returning(gpu, sample)
     gpu.sample = sample
     gpu.residents.seen(sample.taken_at)
     gpu.reading_s = max(0.0, core.now - sample.taken_at)
@@ -34,7 +35,11 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
         gpu.failed_at, gpu.failure = None, ""
         core.note("probe_ok", gpu=gpu.info.id)
     known = {stranger.process: stranger.used_bytes for stranger in gpu.ledger.strangers.values()}
-    gpu.ledger.observe(sample, quiet=gpu.quiet() and sample.taken_at > gpu.changed_at)
+    gpu.ledger.observe(
+        sample,
+        quiet=gpu.quiet() and sample.taken_at > gpu.changed_at,
+        returning_bytes=gpu.returning.since(sample.taken_at - core.settings.verify_timeout_s),
+    )
     if sample.processes is not None:
         drift.on_evidence(core, gpu)
         _note_stowaways(core, gpu, known)
@@ -46,6 +51,18 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
             _weigh(core, gpu, verification, sample)
     note_pressure(core, gpu)
     core.wake(gpu)
+
+
+def _watch_returning(gpu: Gpu, sample: MemorySampled) -> None:
+    leaving = {verification.process for verification in gpu.verifications.values()}
+    leaving.update(lease.process for lease in gpu.in_state(LeaseState.UNLOADING))
+    accounts = gpu.ledger.accounts
+    gpu.returning.watch(
+        gpu.sample,
+        sample,
+        leaving,
+        lambda process: accounts[process].booked_bytes() if process in accounts else 0,
+    )
 
 
 def on_probe_failed(core: Core, event: ProbeFailed) -> None:

@@ -136,6 +136,7 @@ def _place(core: Core, gpu: Gpu, lease: Lease, charge_bytes: int) -> None:
     """Charge what is there anyway. What the budget does not hold was never approved: it is pressure."""
     approved_bytes = min(charge_bytes, _room_bytes(gpu))
     gpu.ledger.charge(lease.id, lease.process, charge_bytes, approved_bytes, core.now)
+    gpu.returning.give_up(lease.process, max(0, lease.load_peak_bytes - charge_bytes), core.now)
     gpu.changed_at = core.now
 
 

@@ -368,6 +368,8 @@ def _charge_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     drift.on_ready(core, lease, measured_bytes)
     crashes.succeeded(core, lease)
     steady = lease.steady_bytes if measured_bytes is None else max(measured_bytes, lease.spec.residue_bytes)
+    peak = max(lease.load_peak_bytes, lease.peak_seen_bytes)
+    gpu.returning.give_up(lease.process, max(0, peak - steady), core.now)
     families.recharge(core, gpu, lease, steady)
     gpu.changed_at = core.now
     core.want_sample(gpu, core.now)  # what it holds now is what has to come back one day

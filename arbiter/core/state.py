@@ -17,6 +17,7 @@ from arbiter.core.ledger import GpuLedger
 from arbiter.core.parking import HostRam
 from arbiter.core.queue import WaitQueue
 from arbiter.core.residents import Residents
+from arbiter.core.returning import Returning
 from arbiter.core.settings import GpuInfo, Settings
 from arbiter.core.timers import Timers
 from arbiter.core.verify import Verification
@@ -86,6 +87,7 @@ class Gpu:
     residents: Residents = field(default_factory=Residents)
     verifications: dict[str, Verification] = field(default_factory=dict)
     evictions: list[Eviction] = field(default_factory=list)  # not yet counted to a grant
+    returning: Returning = field(default_factory=Returning)
     sample: MemorySampled | None = None
     reading_s: float = 0.0  # how long the newest reading took
     failed_at: float | None = None  # last failed reading, None after a good one

@@ -1,0 +1,123 @@
+"""What was given up a moment ago is still on the card, and is nobody's: it must not hide what the next one gives back."""
+
+import pytest
+
+from arbiter.core.events import MemorySampled, ProcessUse
+from arbiter.core.ledger import GpuLedger
+from arbiter.core.returning import Returning
+from arbiter.core.settings import GpuInfo
+from arbiter.testing.core_driver import CoreDriver
+from arbiter.testing.scenes import held, hidden_card
+from schemas import defaults as d
+from schemas.ids import GpuId, ProcessKey
+
+GIB, MIB = d.GIB, d.MIB
+GPU = GpuId("GPU-0")
+A, B = ProcessKey(1, 7), ProcessKey(2, 14)
+STRANGER = ProcessKey(9, 9)
+
+
+def reading(at: float, used: int, *uses: tuple[ProcessKey, int | None]) -> MemorySampled:
+    listed = tuple(ProcessUse(process, "", count) for process, count in uses)
+    return MemorySampled(GPU, at, used, 1000, listed)
+
+
+# -- what is watched -----------------------------------------------------------------------------------------------------
+def test_what_was_given_up_counts_for_as_long_as_it_is_asked_for() -> None:
+    returning = Returning()
+    returning.give_up(A, 300, 10.0)
+    returning.give_up(B, 50, 12.0)
+    assert returning.since(9.0) == 350
+    assert returning.since(10.0) == 50
+    assert returning.since(9.0) == 50, "what is over is forgotten"
+
+
+def test_what_a_process_takes_again_is_not_on_its_way() -> None:
+    returning = Returning()
+    returning.give_up(A, 300, 10.0)
+    returning.give_up(A, -100, 11.0)
+    returning.give_up(B, -100, 11.0)
+    assert returning.since(9.0) == 200
+    assert returning.since(10.5) == 0, "it was given up at 10"
+    returning.give_up(A, 300, 10.0)
+    returning.give_up(A, -300, 11.0)
+    assert returning.since(9.0) == 0
+
+
+def test_two_readings_say_what_was_given_up_between_them() -> None:
+    returning = Returning()
+    before = reading(1.0, 900, (A, 500), (B, 300), (STRANGER, 100))
+    returning.watch(None, before, (), lambda _: 0)
+    returning.watch(before, reading(2.0, 900, (A, 400), (B, 200)), {B}, lambda _: 0)
+    assert returning.since(1.0) == 200, "100 of A's and the stranger's; B is being measured"
+    hidden = MemorySampled(GPU, 3.0, 900, 1000, None)
+    returning.watch(before, hidden, (), lambda _: 0)
+    returning.watch(hidden, before, (), lambda _: 0)
+    assert returning.since(1.0) == 200, "such a reading says nothing of anybody"
+
+
+def test_a_holder_that_leaves_the_list_still_explains_what_it_is_booked() -> None:
+    returning = Returning()
+    returning.watch(reading(1.0, 500, (A, 500)), reading(2.0, 500), (), {A: 450}.__getitem__)
+    assert returning.since(1.0) == 50
+
+
+# -- what it means for the rest that nobody explains -----------------------------------------------------------------------
+@pytest.mark.parametrize("lists", [True, False])
+def test_a_rest_that_may_be_going_is_believed_as_far_as_it_was_there_before(lists: bool) -> None:
+    books = GpuLedger(GpuInfo(GPU, 0, "card", 1000, 100), 10)
+
+    def observe(at: float, used: int, returning_bytes: int) -> tuple[int, int | None]:
+        sample = reading(at, used) if lists else MemorySampled(GPU, at, used, 1000, None)
+        books.observe(sample, quiet=True, returning_bytes=returning_bytes)
+        return books.unnamed_bytes, books.overhead_bytes
+
+    assert observe(1.0, 400, 400) == (0, None), "all of it may be going, and the driver's own was never seen"
+    assert observe(2.0, 400, 250) == (50, 100), "150 stay"
+    assert observe(3.0, 400, 400) == (50, 100)
+    assert observe(4.0, 120, 400) == (20, 100), "more than there is cannot be anybody's"
+    assert observe(5.0, 30, 10) == (0, 30)
+    assert observe(6.0, 60, 40) == (0, 30)
+    assert observe(7.0, 400, 0) == (300, 100)
+
+
+# -- verdicts --------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("restarts", [False, True])
+def test_a_load_peak_on_its_way_back_hides_nobodys_bytes(restarts: bool) -> None:
+    """Regression (storm, seed 7): a release counted as measured while all its bytes were on the card, behind a peak that had ended."""
+    driver = hidden_card(lists=False)
+    small, lease = held(driver, "small", 0.7)
+    driver.advance(2.0)
+    big = driver.consumer("big")
+    other = big.acquire(4 * GIB, 3 * GIB)
+    driver.until(lambda: driver.state(other) == "loading")
+    driver.card.lag_s = 2.0
+    big.hold(4 * GIB)
+    big.hold(3 * GIB)
+    big.ready(other)
+    if restarts:
+        tokens = small.token(lease), big.token(other)
+        driver.restart()
+        for person, mine, token in zip((small, big), (lease, other), tokens, strict=True):
+            person.connect()
+            person.reattach(mine, token)
+    driver.advance(1.5)  # readings while nobody loads or leaves
+    driver.card.lag_s = 5.0
+    small.unload(lease)
+    assert driver.until(lambda: driver.state(lease) == "over") == pytest.approx(5.0, abs=0.1)
+    assert driver.gpu()["stowaway_bytes"] == 0
+
+
+def test_a_stowaway_that_has_gone_hides_nobodys_bytes() -> None:
+    """Its process is off the list before its bytes are off the card, which then nobody in the list explains."""
+    driver = CoreDriver(8 * GIB)
+    small, lease = held(driver, "small", 1)
+    driver.card.set(STRANGER, 2 * GIB, driver.now)
+    driver.advance(2.0)
+    driver.card.unlisted.add(STRANGER)
+    driver.advance(1.5)
+    assert driver.gpu()["stowaway_bytes"] == 0
+    driver.card.lag_s = 3.0
+    small.unload(lease)
+    driver.card.set(STRANGER, 0, driver.now - 2.9)
+    assert driver.until(lambda: driver.state(lease) == "over") == pytest.approx(3.0, abs=0.1)
