@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 START_S = 60.0
-STOP_S = 20.0
+STOP_S = 60.0
 _ROOT = Path(__file__).parents[2]
 
 

@@ -10,7 +10,7 @@ from typing import Any, Self
 import msgpack
 import zmq
 
-REPLY_S = 30.0
+REPLY_S = 60.0
 """Every wait here is for something that comes; a busy machine may take its time over it."""
 TTL_S = 600.0
 """A bare client renews nothing: what it holds is to outlive its test, however slowly that runs."""

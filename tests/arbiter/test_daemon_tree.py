@@ -15,7 +15,7 @@ from arbiter.testing.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 GIB = 1 << 30
-PATIENCE_S = 40.0
+PATIENCE_S = 60.0
 
 CHILD = """
 import os, sys
@@ -29,9 +29,10 @@ sys.stdin.readline()
 
 
 @pytest.fixture
-def arbiter(make_arbiter: Callable[..., ArbiterProcess]) -> ArbiterProcess:
-    """Reads its card ten times a second, and gives its verdict after two seconds."""
-    return make_arbiter(config="probe:\n  period_s: 0.1\nverify:\n  timeout_s: 2\n").start()
+def arbiter(make_arbiter: Callable[..., ArbiterProcess], request: pytest.FixtureRequest) -> ArbiterProcess:
+    """Reads its card ten times a second, and waits for bytes for a minute, or as long as `indirect` parametrization says."""
+    timeout_s = getattr(request, "param", 60)
+    return make_arbiter(config=f"probe: {{period_s: 0.1}}\nverify: {{timeout_s: {timeout_s}}}\n").start()
 
 
 @pytest.fixture
@@ -102,6 +103,7 @@ def test_the_bytes_of_a_child_are_those_of_the_lease(
     assert vramctl.returncode == 0
 
 
+@pytest.mark.parametrize("arbiter", [2], indirect=True)
 def test_the_child_of_a_killed_owner_is_a_stowaway_and_contests_its_debt(
     arbiter: ArbiterProcess, observer: WireClient
 ) -> None:

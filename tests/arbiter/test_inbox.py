@@ -10,7 +10,7 @@ from arbiter.core.events import ClientLeft, Event, Resumed, Tick
 from arbiter.inbox import Inbox
 from schemas.ids import ClientId
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 def left(name: str) -> ClientLeft:

@@ -28,7 +28,7 @@ GIB = 1 << 30
 CAPACITY = 8 * GIB
 RESIDUE = GIB // 2
 LAG_S = 0.4
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 CONSUMER = Path(__file__).with_name("consumer.py")
 
 

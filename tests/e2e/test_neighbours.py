@@ -21,7 +21,7 @@ from schemas import fakegpu
 pytestmark = pytest.mark.e2e
 GIB, MIB = 1 << 30, 1 << 20
 RESIDUE = 256 * MIB
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 CONFIG = """
 probe: {period_s: 0.1}
 verify: {timeout_s: 5, slow_poll_s: 0.1}

@@ -50,7 +50,7 @@ class Stage:
         assert self.watcher is not None
         push = self.watcher.push(
             "event",
-            30.0,
+            60.0,
             where=lambda p: p["event"]["kind"] == kind and p["event"].get("consumer") == consumer,
         )
         event: dict[str, Any] = push["event"]

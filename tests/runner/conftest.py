@@ -134,11 +134,11 @@ def endpoint(tmp_path: Path) -> str:
 
 @pytest.fixture
 def run_async() -> Callable[[Any], Any]:
-    """Runs a coroutine to its end, at most 20 s."""
+    """Runs a coroutine to its end, at most a minute."""
 
     def run(coroutine: Any) -> Any:
         async def bounded() -> Any:
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(60):
                 return await coroutine
 
         return asyncio.run(bounded())

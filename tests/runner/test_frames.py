@@ -27,12 +27,12 @@ def test_the_first_camera_is_the_default(make_runner: Make, run_async: Run) -> N
         runner = make_runner(rate_hz=200.0, cameras=("front", "wrist"))
         async with ControlThread(runner) as control:
             for camera, encoding, magic in (("", "png", b"\x89PNG"), ("wrist", "jpeg", b"\xff\xd8")):
-                reply = await frames.fetch(control, runner, SystemClock(), camera, 2000.0, encoding)
+                reply = await frames.fetch(control, runner, SystemClock(), camera, 60_000.0, encoding)
                 assert reply["camera"] == (camera or "front")
                 assert reply["data"].startswith(magic)
                 picture = cv2.imdecode(np.frombuffer(reply["data"], dtype=np.uint8), cv2.IMREAD_COLOR)
                 assert picture.shape == (24, 32, 3) == (reply["height"], reply["width"], 3)
-                assert 0 <= reply["age_ms"] <= 2000
+                assert 0 <= reply["age_ms"] <= 60_000
                 CameraModel.model_validate(reply["camera_model"])
             with pytest.raises(BadRequest, match="front, wrist"):
                 await frames.fetch(control, runner, SystemClock(), "rear", 500.0, "png")
@@ -57,13 +57,13 @@ def test_a_control_loop_that_hangs_gives_no_picture(
 
     def hang() -> None:
         hung.set()
-        released.wait(10)
+        released.wait(60)
 
     async def scenario() -> None:
         runner = make_runner(rate_hz=200.0, cameras=("front",))
         async with ControlThread(runner) as control:
             hanging = asyncio.create_task(control.call(hang))
-            await asyncio.to_thread(hung.wait, 5)
+            await asyncio.to_thread(hung.wait, 60)
             try:
                 with pytest.raises(FrameStale, match="has given no frame"):
                     await frames.fetch(control, runner, SystemClock(), "front", 20.0, "png")

@@ -105,7 +105,7 @@ async def scenario(arbiter: ArbiterProcess, programs: Programs) -> None:
         result = await grab.result(60)
         assert result["status"] == "succeeded", result
         assert result["data"]["withheld"] == 0
-        lease = await asyncio.wait_for(waiting, 30)
+        lease = await asyncio.wait_for(waiting, 60)
         assert leases(await rival.status(), "grab") == []
         truth = await runner.ground_truth()
         assert truth["held"] == target  # evicting the policy does not open the gripper

@@ -57,7 +57,7 @@ def test_a_signal_ends_it_in_order_and_the_video_is_whole(
     async def use() -> None:
         async with RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=60.0) as client:
             assert (await client.call("ping"))["pid"] == process.pid
-            frame = await client.call("frame", {"encoding": "png", "max_age_ms": 2000.0})
+            frame = await client.call("frame", {"encoding": "png", "max_age_ms": 60_000.0})
             assert frame["data"].startswith(b"\x89PNG")
             truth = await client.ground_truth()
             assert truth["target"] in truth["objects"]
@@ -67,10 +67,10 @@ def test_a_signal_ends_it_in_order_and_the_video_is_whole(
                 if feedback["tick_idx"] > 5:
                     break
             process.send_signal(how)
-            assert (await goal.result(15))["status"] == "canceled"
+            assert (await goal.result(60))["status"] == "canceled"
 
     run_async_long(use)
-    assert process.wait(30) == 0
+    assert process.wait(60) == 0
     assert imageio_ffmpeg.count_frames_and_secs(str(video))[0] > 0
 
 
@@ -78,7 +78,7 @@ def run_async_long(coroutine: Callable[[], Any]) -> None:
     import asyncio
 
     async def bounded() -> None:
-        async with asyncio.timeout(90):
+        async with asyncio.timeout(200):
             await coroutine()
 
     asyncio.run(bounded())

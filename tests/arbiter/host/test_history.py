@@ -9,7 +9,7 @@ from typing import Any
 from arbiter.host import history as module
 from arbiter.host.history import CLEAN_END, RING_EVENTS, SKIPPED_AFTER_CRASH, History
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 def with_history(

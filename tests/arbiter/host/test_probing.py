@@ -17,7 +17,7 @@ from schemas.errors import NoGpu, ProbeFailed
 from schemas.ids import GpuId, ProcessKey
 
 GPU = GpuId("GPU-1")
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 class ScriptedProbe:

@@ -16,7 +16,7 @@ from arbiter.replay.logfile import FOLDER, LogError, header_line
 from arbiter.testing.core_driver import START_S, CoreDriver
 from schemas import defaults as d
 
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 KIB = d.KIB
 
 

@@ -13,7 +13,7 @@ from arbiter.host.watch import ProcessWatch
 from arbiter.rpc.peer import start_ticks
 from schemas.ids import ProcessKey
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 @pytest.fixture
