@@ -143,7 +143,7 @@ class Arbiter:
             case MemorySampled():
                 measure.on_sample(core, event)
                 growth.on_sample(core, event)
-                recovery.void_at_baseline(core, event)
+                recovery.account_for_the_empty(core, event)
             case ProbeFailed():
                 measure.on_probe_failed(core, event)
             case JournalFailed():

@@ -9,6 +9,7 @@ from typing import Any
 from arbiter.core import gangs, policy
 from arbiter.core.lease import LEAVING, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
+from schemas.ids import ProcessKey
 
 NAMED_MAX = 3
 """Leases that are listed by name in a sentence; the others are counted."""
@@ -68,9 +69,7 @@ def _keepers(core: Core, gpu: Gpu, waiter: Lease) -> list[Blocker]:
             continue
         owed = any(lease not in ledger.reserved for lease in account.charges)
         state, condition = (
-            ("debt", "is over, its bytes are being measured")
-            if owed
-            else ("residue", "keeps its context until it exits")
+            ("debt", _debt_condition(gpu, process)) if owed else ("residue", _residue_condition(gpu, process))
         )
         kept.append((names.get(process, f"pid {process.pid}"), count, state, condition))
     kept += [
@@ -91,6 +90,21 @@ def _keepers(core: Core, gpu: Gpu, waiter: Lease) -> list[Blocker]:
     ]
 
 
+def _residue_condition(gpu: Gpu, process: ProcessKey) -> str:
+    account = gpu.ledger.accounts[process]
+    if account.residue_bytes <= account.residue_floor_bytes:
+        return "keeps its context until it exits"
+    return f"keeps more than its context until its process (pid {process.pid}) gives it back or ends"
+
+
+def _debt_condition(gpu: Gpu, process: ProcessKey) -> str:
+    """Bytes that are not measured gone although there was time enough are no matter of patience any more."""
+    for verification in gpu.verifications.values():
+        if verification.process == process and verification.overdue and verification.alive:
+            return f"is over, and its process (pid {process.pid}) keeps its bytes until it lets go or ends"
+    return "is over, its bytes are being measured"
+
+
 def _holder_condition(core: Core, waiter: Lease, holder: Lease) -> str:
     if holder.state is LeaseState.LOADING:
         return loading(core, holder)
@@ -103,11 +117,16 @@ def _holder_condition(core: Core, waiter: Lease, holder: Lease) -> str:
             LeaseState.UNLOADING: unloading(core, holder),
             LeaseState.VERIFYING: "let go, its bytes are being measured",
         }[holder.state]
+    if not holder.attached:
+        left_s = holder.expires_at - core.now
+        return f"has not come back since the restart, is given up in {left_s:.1f} s"
     root = holder.root
     if root is not holder:
         return f"belongs to {named([root])}, which {_holder_condition(core, waiter, root)}"
     if holder.gang is not None:
         return f"belongs to gang {holder.gang.name}, which is not complete"
+    if missing := [lease for lease in root.tree() if not lease.attached]:
+        return f"waits for {named(missing)} to come back since the restart, or to be given up"
     if not root.may_leave:
         return f"is pinned by {holder.pinned}" if holder.pinned else "is pinned"
     ends_at = policy.residency_ends_at(core, root, waiter)

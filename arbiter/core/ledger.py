@@ -12,7 +12,7 @@ Sums are kept as accounts change, never counted again: a decision must not cost 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from arbiter.core.events import MemorySampled
+from arbiter.core.events import MemorySampled, ProcessUse
 from arbiter.core.settings import GpuInfo
 from schemas.ids import LeaseId, ProcessKey
 
@@ -100,6 +100,13 @@ class GpuLedger:
         """Sum over processes of what was granted or is kept, without any evidence."""
         return self._booked_bytes
 
+    def booked_by(self, process: ProcessKey) -> int:
+        """What one process is booked; it may be known by its pid alone, as in a reading."""
+        account = self.accounts.get(process)
+        if account is None and not process.start_ticks:
+            account = next((one for key, one in self.accounts.items() if key.pid == process.pid), None)
+        return 0 if account is None else account.booked_bytes()
+
     def approved_bytes(self) -> int:
         """Sum of what fitted when it was granted."""
         return self._approved_bytes
@@ -112,6 +119,16 @@ class GpuLedger:
     def driver_bytes(self) -> int:
         """What a reading may show that nobody is charged: the driver's own bytes, or the whole reserve while those were never seen."""
         return self.info.reserve_bytes if self.overhead_bytes is None else self.overhead_bytes
+
+    def hidden_bytes(self, sample: MemorySampled) -> int | None:
+        """The most that processes which the list leaves out hold together. None: the reading cannot say.
+
+        The total leaves nobody out, so what the list explains, and what is known to be the driver's, is none of theirs.
+        """
+        if sample.processes is None or any(use.used_bytes is None for use in sample.processes):
+            return None
+        listed = sum(use.used_bytes or 0 for use in sample.processes)
+        return max(0, sample.used_bytes - listed - (self.overhead_bytes or 0))
 
     def charge_bytes(self, lease: LeaseId) -> int:
         owner = self._owner.get(lease)
@@ -419,10 +436,23 @@ class GpuLedger:
 
 
 def process_bytes(sample: MemorySampled, process: ProcessKey) -> int | None:
-    """Bytes of a process in a reading: 0 if it is not listed, None if the reading cannot say."""
+    """Bytes of a process in a reading: 0 if it is not listed, None if the reading cannot say.
+
+    Not being listed is no proof of holding nothing (`is_hidden`): only the total can tell, or the end of the process.
+    """
     if sample.processes is None:
         return None
-    for use in sample.processes:
+    use = _use_of(sample.processes, process)
+    return 0 if use is None else use.used_bytes
+
+
+def is_hidden(sample: MemorySampled, process: ProcessKey) -> bool:
+    """Is there a list that leaves this process out? It holds nothing, or lives where the driver cannot name it (another container)."""
+    return sample.processes is not None and _use_of(sample.processes, process) is None
+
+
+def _use_of(processes: Iterable[ProcessUse], process: ProcessKey) -> ProcessUse | None:
+    for use in processes:
         if use.process == process or (use.process.start_ticks == 0 and use.process.pid == process.pid):
-            return use.used_bytes
-    return 0
+            return use
+    return None

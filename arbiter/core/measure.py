@@ -9,7 +9,7 @@ from typing import Any
 from arbiter.core import costs, crashes, drift, eviction, families, growth, standby
 from arbiter.core.events import MemorySampled, ProbeFailed
 from arbiter.core.lease import AWAY, Lease, LeaseState
-from arbiter.core.ledger import process_bytes
+from arbiter.core.ledger import is_hidden, process_bytes
 from arbiter.core.state import Core, Gpu
 from arbiter.core.verify import Judgement, Verdict, Verification, judge
 from schemas.defaults import VERIFY_READING_SHARE
@@ -137,6 +137,9 @@ def _shrink_residues(core: Core, gpu: Gpu, sample: MemorySampled) -> None:
             held_bytes = sample.used_bytes
         elif not held_bytes and process not in core.connected and core.recovering is None:
             floor = 0
+        if is_hidden(sample, process):  # only the total can tell
+            hidden_bytes = gpu.ledger.hidden_bytes(sample)
+            held_bytes = account.residue_bytes if hidden_bytes is None else hidden_bytes
         target = max(floor, held_bytes)
         if target + tolerance < account.residue_bytes:
             gpu.ledger.set_residue(process, target, core.now)
@@ -145,7 +148,9 @@ def _shrink_residues(core: Core, gpu: Gpu, sample: MemorySampled) -> None:
 
 
 # -- verifications -------------------------------------------------------------------------------------------------
-def begin_for_lease(core: Core, gpu: Gpu, lease: Lease, *, alive: bool, grace_s: float = 0.0) -> None:
+def begin_for_lease(
+    core: Core, gpu: Gpu, lease: Lease, *, alive: bool, grace_s: float = 0.0, fenced_at: float = 0.0
+) -> None:
     """Measure a lease's bytes away. Its charge is in the ledger and stays there until the verdict."""
     baseline = lease.baseline or gpu.sample
     drift.on_leaving(core, lease)
@@ -164,6 +169,7 @@ def begin_for_lease(core: Core, gpu: Gpu, lease: Lease, *, alive: bool, grace_s:
         confirmed_at=core.now,
         not_before=core.now + grace_s,
         deadline_at=core.now + grace_s + core.settings.verify_timeout_s,
+        fenced_at=fenced_at,
         paced_from=core.now + grace_s,
         alive=alive,
         exiting=lease.exiting,
@@ -295,23 +301,26 @@ def _grown_by_right(gpu: Gpu, verification: Verification, sample: MemorySampled)
     baseline = verification.baseline
     if baseline is None:
         return 0
-    if baseline.processes is not None and sample.processes is not None:
-        then = {use.process.pid: use.used_bytes or 0 for use in baseline.processes}
-        now = {use.process.pid: use.used_bytes or 0 for use in sample.processes}
-        return sum(
-            max(
-                0,
-                min(now.get(account.process.pid, 0), account.booked_bytes())
-                - then.get(account.process.pid, 0),
-            )
-            for account in gpu.ledger.accounts.values()
-            if account.process != verification.process
-        )
-    return sum(
-        gpu.ledger.charge_bytes(lease.id)
-        for lease in gpu.residents.filling(baseline.taken_at)
-        if lease.process != verification.process
-    )
+    filling: dict[ProcessKey, int] = {}
+    for lease in gpu.residents.filling(baseline.taken_at):
+        filling[lease.process] = filling.get(lease.process, 0) + gpu.ledger.charge_bytes(lease.id)
+    if baseline.processes is None or sample.processes is None:
+        return sum(count for process, count in filling.items() if process != verification.process)
+    then = {use.process.pid: use.used_bytes or 0 for use in baseline.processes}
+    now = {use.process.pid: use.used_bytes or 0 for use in sample.processes}
+    hidden_bytes = gpu.ledger.hidden_bytes(baseline) or 0
+    grown = 0
+    for process, account in gpu.ledger.accounts.items():
+        if process == verification.process:
+            continue
+        booked = account.booked_bytes()
+        if process.pid in now:
+            # one that came onto the list may have been on the card before, as far as somebody was whom the list left out
+            before = 0 if process in filling else min(booked, hidden_bytes)
+            grown += max(0, min(now[process.pid], booked) - then.get(process.pid, before))
+        elif process.pid not in then:
+            grown += filling.get(process, 0)
+    return grown
 
 
 def _announce(
@@ -377,7 +386,14 @@ def _close_eviction(core: Core, gpu: Gpu, verification: Verification, judgement:
 
 # -- leases that end without their holder's word ---------------------------------------------------------------------
 def lose(
-    core: Core, lease: Lease, to: LeaseState, error: Mapping[str, Any], *, alive: bool, grace_s: float
+    core: Core,
+    lease: Lease,
+    to: LeaseState,
+    error: Mapping[str, Any],
+    *,
+    alive: bool,
+    grace_s: float = 0.0,
+    fenced_at: float = 0.0,
 ) -> None:
     """A resident lease is over (expired or lost); its bytes become a debt and are measured away."""
     gpu = core.gpu_of(lease)
@@ -391,7 +407,7 @@ def lose(
     if lease.eviction is not None:
         lease.eviction.released_at = core.now
         lease.eviction.unloading_at = lease.eviction.unloading_at or core.now
-    begin_for_lease(core, gpu, lease, alive=alive, grace_s=grace_s)
+    begin_for_lease(core, gpu, lease, alive=alive, grace_s=grace_s, fenced_at=fenced_at)
     eviction.part(core, gpu, lease)
     lease.move(to, core.now, str(error["message"]))
     core.end(lease, error)
@@ -407,7 +423,8 @@ def on_expiry_due(core: Core, lease_id: str) -> None:
 
 
 def expire(core: Core, lease: Lease, why: str) -> None:
-    """The lease is over for good. Its holder may still be loading until it fences itself, so no verdict before that."""
+    """The lease is over for good, perhaps before its time (an operator's word). Its holder may still be loading until it fences itself,
+    so no verdict before that; one that is loaded has to be measured gone, or to have fenced itself."""
     error = {
         "code": "lease_expired",
         "message": why,
@@ -421,7 +438,13 @@ def expire(core: Core, lease: Lease, why: str) -> None:
         lease,
         {"push": "lost", "lease_id": lease.id, "token": [token.epoch, token.serial], "error": error},
     )
-    grace_s = (
-        core.settings.fence_grace_s if lease.attached else 0.0
-    )  # a restart's deadline has the grace in it
-    lose(core, lease, LeaseState.EXPIRED, error, alive=True, grace_s=grace_s)
+    # a restart's deadline has the grace in it
+    grace_s = core.settings.fence_grace_s if lease.attached else 0.0
+    fenced_at = lease.expires_at + grace_s
+    if lease.state is LeaseState.LOADING:
+        grace_s = max(0.0, fenced_at - core.now)
+    if (
+        core.recovering is not None
+    ):  # its bytes stay charged: nobody who fits beside them has to wait for the verdict
+        core.recovering.discard(lease.id)
+    lose(core, lease, LeaseState.EXPIRED, error, alive=True, grace_s=grace_s, fenced_at=fenced_at)

@@ -87,6 +87,10 @@ def _asking(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
             _step(core, "ask", victim, at, f"asks {victim.spec.consumer}", _because(core, waiter, victim, at))
             for victim in victims
         ]
+    if missing := [lease for lease in gpu.in_state(LeaseState.HELD) if not lease.attached]:
+        last = max(missing, key=lambda lease: lease.expires_at)
+        what, because = f"gives {last.spec.consumer} up", "unless it comes back before that"
+        return [_step(core, "wait", last, last.expires_at, what, because)]
     return [
         _step(
             core,

@@ -243,13 +243,14 @@ def choose_relief(core: Core, gpu: Gpu, going: Mapping[LeaseId, int], over_bytes
 
 
 def may_ask(lease: Lease) -> bool:
-    """Of a tree only the root is asked, and not while any of it loads."""
+    """Of a tree only the root is asked, and not while any of it loads. Nor is anybody of whom nothing was heard since a restart: who uses
+    it may be on the way back."""
     if lease.gang is not None:
         return False  # not before all of it is held
     if lease.estate is None:
-        return lease.evictable and lease.parent is None
-    loading = any(member.state is LeaseState.LOADING for member in lease.tree())
-    return lease.may_leave and lease.parent is None and not loading
+        return lease.evictable and lease.parent is None and lease.attached
+    settled = all(member.state is not LeaseState.LOADING and member.attached for member in lease.tree())
+    return lease.may_leave and lease.parent is None and settled
 
 
 def residency_ends_at(core: Core, lease: Lease, waiter: Lease | None) -> float:

@@ -1,7 +1,7 @@
 """After a restart of the daemon alone: the journal says who held what, the holders come back or do not.
 
-Until every recovered lease is accounted for (re-attached, its process dead, or expired and measured gone, or the card is read
-at baseline) nothing is granted. Recovered bytes are charged from the first moment.
+Until every recovered lease is accounted for (re-attached, given up, its process dead, or the card is read at baseline) nothing is
+granted. Recovered bytes are charged from the first moment, until their holder says that they are gone, dies, or its time is over.
 """
 
 from collections.abc import Mapping
@@ -113,7 +113,9 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
     core.nonces[process, lease.nonce] = lease_id
     if state == "debt":
         gpu.ledger.to_debt(lease_id)
-        begin_for_lease(core, gpu, lease, alive=True, grace_s=core.settings.fence_grace_s)
+        grace_s = core.settings.fence_grace_s
+        fenced_at = core.now + spec.ttl_s + grace_s
+        begin_for_lease(core, gpu, lease, alive=True, grace_s=grace_s, fenced_at=fenced_at)
         core.remember(Ended(lease_id, process, lease.nonce, token, LeaseState.LOST, lost_error(lease_id)))
         return
     core.add(lease)
@@ -355,10 +357,11 @@ def on_recover_due(core: Core, subject: str) -> None:
     account_for(core, LeaseId(subject))
 
 
-def void_at_baseline(core: Core, sample: MemorySampled) -> None:
-    """The card is read as good as empty: recovered leases that were resident there cannot be.
+def account_for_the_empty(core: Core, sample: MemorySampled) -> None:
+    """The card is read as good as empty: nobody has to be waited for there.
 
-    A loading lease may not have begun, and one that is smaller than what cannot be told from nothing stays.
+    The holders that have not come back live, and they alone can say that a lease is over, or their time: a model may sleep in host RAM,
+    and a reading may lie. Their bytes stay charged, and nobody asks them to leave before they are heard of.
     """
     gpu = core.gpus.get(sample.gpu)
     if gpu is None or core.recovering is None or sample.taken_at < core.started_at:
@@ -366,30 +369,8 @@ def void_at_baseline(core: Core, sample: MemorySampled) -> None:
     noise_bytes = gpu.info.reserve_bytes + core.settings.verify_tolerance_bytes
     if sample.used_bytes > noise_bytes:
         return
-    for lease in list(gpu.residents.values()):
-        if lease.attached or lease.state not in EXPIRING - {LeaseState.LOADING} or lease.estate is not None:
-            continue  # a reservation shows on no card
-        if min(gpu.ledger.charge_bytes(lease.id), lease.steady_bytes) <= noise_bytes:
-            continue  # charged more: it shrank, and nothing had been measured yet
-        parks = lease.id in core.host.booked
-        if lease.asked_before:  # it left as it was asked to
-            let_go(
-                core,
-                lease,
-                exiting=False,
-                why="the card is empty",
-                comes_back=standby.stays_on(lease),
-                parks=parks,
-            )
-            continue
-        gpu.ledger.drop(lease.id, 0, 0, core.now)
-        families.gone(core, gpu, lease.id, lease.process)
-        core.forget(f"lease:{lease.id}")
-        error = lost_error(lease.id)
-        core.note("lost", lease, reason="the card is empty: its bytes are gone")
-        lease.move(LeaseState.LOST, core.now, "the card is empty")
-        account_for(core, lease.id)
-        core.end(lease, error)
+    for lease_id in gpu.residents:
+        account_for(core, lease_id)
     if all(g.sample is not None and g.sample.used_bytes <= noise_bytes for g in core.gpus.values()):
         account_for(core, EMPTY_JOURNAL)
 

@@ -120,7 +120,7 @@ def _bereave(core: Core, lease: Lease) -> None:
         message = f"{lease.id}: process {lease.process.pid} died"
         core.note("lost", lease, reason=message)
         error = {"code": "lease_lost", "message": message, "hint": "acquire again", "details": {}}
-        lose(core, lease, LeaseState.LOST, error, alive=False, grace_s=0.0)
+        lose(core, lease, LeaseState.LOST, error, alive=False)
     else:  # a lease under verification goes on: only its residue is no longer expected
         standby.renounce(core, lease)
 

@@ -4,7 +4,8 @@ A released lease stays charged until a verdict. Targets (all that can be checked
   a. ledger bound: the card shows no more than everything else is charged;
   b. delta bound: it shows less than before by what the lease held;
   c. evidence: its process shows no more than it may keep.
-The device total decides; per-process figures are evidence and name the culprit. No reading means unknown, never free.
+The device total decides; per-process figures are evidence and name the culprit. No reading means unknown, never free, and so does
+a list that leaves a living process out: what such a one did not give back by the total is charged to it.
 """
 
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from arbiter.core.events import MemorySampled
-from arbiter.core.ledger import GpuLedger, process_bytes
+from arbiter.core.ledger import GpuLedger, is_hidden, process_bytes
 from schemas.ids import LeaseId, ProcessKey
 
 DYING_S = 60.0
@@ -58,6 +59,9 @@ class Verification:
     alive: bool = True
     exiting: bool = False
     exclusive: bool = False  # nobody else may come before these bytes are gone, whatever would fit
+    fenced_at: float = (
+        0.0  # until then a living holder may believe in its lease: what it keeps is no mere residue
+    )
     last_used_bytes: int | None = None  # of the newest counting reading
     verdict: Verdict | None = None  # announced, but not resolved
     overdue: bool = False
@@ -112,11 +116,17 @@ def _delta_bound(v: Verification, ledger: GpuLedger, expected: int, grown_bytes:
     if v.baseline is None:
         return None
     held_then = process_bytes(v.baseline, v.process)
-    if held_then is None:
+    if held_then is None or is_hidden(v.baseline, v.process):
         if not v.baseline_comparable:
             return None
-        held_then = ledger.filled_bytes(v.process)
+        held_then = _may_hold(v, ledger, v.baseline)
     return v.baseline.used_bytes - (held_then - expected) + grown_bytes
+
+
+def _may_hold(v: Verification, ledger: GpuLedger, sample: MemorySampled) -> int:
+    """A process that the reading does not name: what it is charged, as far as the total has bytes that nobody in the list explains."""
+    filled, hidden = ledger.filled_bytes(v.process), ledger.hidden_bytes(sample)
+    return filled if hidden is None else min(filled, hidden)
 
 
 def _late(
@@ -138,20 +148,46 @@ def _late(
         if held > expected + tolerance_bytes:
             culprits = ((v.process.pid, name, held),)
             if v.alive:
-                return Judgement(Verdict.RESIDUE, True, held, culprits)
+                return _residue(v, sample, held, culprits)
             return Judgement(Verdict.CONTESTED, False, held, culprits)
         grown = grown_since(v, ledger, sample)
-        taken_bytes = sum(count for _, _, count in grown)
+        missing = _missing_bytes(v, ledger, sample, bound_a, bound_b)
+        if v.alive and is_hidden(sample, v.process):
+            stays = _may_hold(v, ledger, sample)
+            if bound_b is not None:
+                stays = min(stays, expected + missing)
+            if stays > expected + tolerance_bytes:
+                return _residue(v, sample, stays)
         # a driver leaves a dying process out of its list before it has freed its bytes: what nobody has taken may be on its way still
         freeing = not v.alive and sample.taken_at < v.deadline_at + DYING_S
-        resolved = not freeing or short_bytes <= taken_bytes + tolerance_bytes
-        return Judgement(Verdict.CONTESTED, resolved, v.kept_bytes, grown)
+        return Judgement(Verdict.CONTESTED, not freeing or missing <= tolerance_bytes, v.kept_bytes, grown)
     if bound_b is None:
         return Judgement(Verdict.UNVERIFIABLE, False, v.kept_bytes)
     if v.alive:
-        return Judgement(Verdict.RESIDUE, True, expected + short_bytes)
+        return _residue(v, sample, expected + short_bytes)
     # a dead process holds nothing for ever: if the ledger explains the card, what is left belongs to others
     return Judgement(Verdict.CONTESTED, sample.used_bytes <= bound_a + tolerance_bytes, 0)
+
+
+def _residue(
+    v: Verification, sample: MemorySampled, stays: int, culprits: tuple[tuple[int, str, int], ...] = ()
+) -> Judgement:
+    """A living process keeps more than it may. Until it has fenced itself these bytes are not left over: its lease is still in force for it."""
+    return Judgement(Verdict.RESIDUE, sample.taken_at >= v.fenced_at, stays, culprits)
+
+
+def _missing_bytes(
+    v: Verification, ledger: GpuLedger, sample: MemorySampled, bound_a: int, bound_b: int | None
+) -> int:
+    """What did not come back, less what others visibly took beyond what they are charged; up to that they may grow, and were allowed for."""
+    if bound_b is None or v.baseline is None:
+        return sample.used_bytes - bound_a
+    taken = 0
+    for use in sample.processes or ():
+        if use.process.pid != v.process.pid:
+            then = process_bytes(v.baseline, use.process) or 0
+            taken += max(0, (use.used_bytes or 0) - max(then, ledger.booked_by(use.process)))
+    return max(sample.used_bytes - bound_a, sample.used_bytes - bound_b - taken)
 
 
 def grown_since(

@@ -263,7 +263,50 @@ def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
     driver.restart()
     ops.connect()
     ask(ops, "release_dead", lease, "it was a crash")
+    assert driver.arbiter.status(driver.now)["phase"] == "serving", (
+        "its bytes are a debt: others wait for nothing"
+    )
+    assert (driver.state(lease), driver.gpu()["charged_bytes"]) == ("over", 5 * GIB)
     det.hold(0)
-    driver.until(lambda: driver.arbiter.status(driver.now)["phase"] == "serving")
-    assert driver.state(lease) == "over"
+    driver.until(lambda: driver.gpu()["charged_bytes"] == 0, limit_s=0.1)
     assert f"lease:{lease}" not in driver.journal
+
+
+@pytest.mark.parametrize("restarts", [1, 2])
+def test_who_is_given_up_and_keeps_its_bytes_has_its_lease_until_it_fences_itself(restarts: int) -> None:
+    """A frozen process wakes up and goes on for as long as it believes in its lease; what it keeps until then is no mere residue."""
+    driver = CoreDriver(8 * GIB)
+    ops = driver.consumer("ops")
+    det, lease = held(driver, "det", 5 * GIB, ttl_s=30.0)
+    driver.restart()
+    ops.connect()
+    ask(ops, "release_dead", lease, "frozen")
+    if restarts == 2:
+        driver.restart(epoch=3)
+    waiter = driver.consumer("policy").acquire(1 * GIB, exclusive=True)
+    other = driver.consumer("vlm").acquire(1 * GIB)
+    driver.until(lambda: bool(driver.notes("verified")), limit_s=16.0)
+    assert [(note["verdict"], note["resolved"]) for note in driver.notes("verified")] == [("residue", False)]
+    (blocker,) = driver.arbiter.why("policy", driver.now)["leases"][0]["blockers"]
+    assert (
+        blocker["condition"]
+        == f"is over, and its process (pid {det.process.pid}) keeps its bytes until it lets go or ends"
+    )
+    assert driver.state(waiter) == "queued"
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=26.0)
+    assert driver.notes("verified")[-1]["resolved"] is True
+    assert driver.gpu()["charged_bytes"] == 6 * GIB
+    assert driver.state(other) == "queued"
+
+
+def test_who_is_given_up_while_it_loads_may_load_on_until_it_fences_itself(
+    driver: CoreDriver, ops: Consumer
+) -> None:
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB, ttl_s=60.0)
+    driver.until(lambda: driver.state(lease) == "loading")
+    driver.advance(45.0)
+    ask(ops, "release_dead", lease, "frozen")
+    given_up = driver.now
+    driver.until(lambda: driver.gpu()["charged_bytes"] == 0)
+    assert 20.0 <= driver.now - given_up <= 20.2, "15 s of its time, 5 s of grace"

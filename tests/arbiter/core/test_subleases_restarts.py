@@ -81,13 +81,25 @@ def test_an_empty_card_does_not_void_a_reservation(tree: Tree) -> None:
     assert tree.state(tree.root) == "held"
 
 
-def test_a_child_that_the_empty_card_voids_gives_its_bytes_back(tree: Tree) -> None:
-    tree.held()
+def test_a_child_that_does_not_come_back_to_an_empty_card_gives_its_bytes_back_in_time() -> None:
+    tree = Tree(ttl_s=10.0).held()
     tree.driver.card.held.clear()
     tree.driver.restart()
-    tree.driver.advance(0.1)
-    assert tree.state(tree.leaf) == "over"
-    assert tree.charges(tree.root) == [5 * GIB]
+    tree.runner.connect()
+    answer(tree.runner.reattach(tree.root, tree.token))
+    waiter = tree.driver.consumer("w")
+    wanted = waiter.acquire(5 * GIB)
+    tree.driver.advance(14.0)
+    assert tree.driver.arbiter.status(tree.driver.now)["phase"] == "serving"
+    states = (tree.state(tree.root), tree.state(tree.leaf))
+    assert states == ("held", "held"), "a tree is not asked before all of it is heard of"
+    (one,) = tree.driver.arbiter.why("w", tree.driver.now)["leases"]
+    told = {blocker["lease_id"]: blocker["condition"] for blocker in one["blockers"]}
+    assert f"waits for policy ({tree.leaf}) to come back" in told[tree.root]
+    assert told[tree.leaf].startswith("has not come back since the restart")
+    tree.driver.until(lambda: tree.state(tree.leaf) == "over", limit_s=2.0)
+    tree.driver.until(lambda: tree.state(wanted) == "loading", limit_s=1.0)
+    assert tree.state(tree.root) == "over", "a reservation and no more: nobody has to unload it"
 
 
 def test_an_eviction_under_way_begins_anew_after_a_restart_for_the_whole_tree(tree: Tree) -> None:

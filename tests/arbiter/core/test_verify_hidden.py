@@ -1,0 +1,190 @@
+"""Holders that live and that the driver's list leaves out: another container's, or all of them for a moment. Only the total can tell what
+they gave back, and what nobody showed to be gone is nobody else's."""
+
+from dataclasses import replace
+
+import pytest
+
+from arbiter.core.events import MemorySampled, ProcessUse
+from arbiter.testing.core_driver import CoreDriver
+from arbiter.testing.scenes import held
+from schemas import defaults as d
+from schemas.ids import ProcessKey
+
+GIB, MIB = d.GIB, d.MIB
+BROWSER = ProcessKey(9, 9)
+
+
+def verdicts(driver: CoreDriver) -> list[tuple[str, bool]]:
+    return [(note["verdict"], note["resolved"]) for note in driver.notes("verified")]
+
+
+@pytest.mark.parametrize("since", ["always", "late"])
+def test_a_living_holder_that_nobody_lists_is_charged_for_what_it_did_not_give_back(since: str) -> None:
+    driver = CoreDriver(8 * GIB)
+    if since == "always":
+        driver.card.unlisted.add(ProcessKey(101, 707))
+    det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
+    driver.advance(1.5)
+    waiter = driver.consumer("w").acquire(6 * GIB)
+    driver.card.unlisted.add(det.process)
+    det.unloading(lease)
+    det.release(lease)
+    driver.advance(11.0)
+    assert verdicts(driver) == [("residue", True)]
+    driver.advance(100.0)
+    assert driver.gpu()["charged_bytes"] == 5 * GIB, "its absence from the list never frees it"
+    assert driver.state(waiter) == "queued"
+    assert (
+        f"keeps more than its context until its process (pid {det.process.pid})"
+        in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
+    )
+    det.hold(450 * MIB)
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
+    assert driver.gpu()["charged_bytes"] == 6 * GIB + 450 * MIB, "the total showed that it came back"
+
+
+def test_its_death_frees_what_it_kept() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    waiter = driver.consumer("w").acquire(6 * GIB, exclusive=True)
+    driver.card.unlisted.add(det.process)
+    det.unloading(lease)
+    det.release(lease)
+    driver.advance(30.0)
+    assert driver.state(waiter) == "queued"
+    det.hold(0)
+    det.die()
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=0.1)
+
+
+def test_what_it_gave_back_and_somebody_else_took_is_that_ones() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.unlisted.add(ProcessKey(101, 707))
+    det, lease = held(driver, "det", 5)
+    det.unloading(lease)
+    det.hold(0)
+    driver.card.set(BROWSER, GIB, driver.now)
+    det.release(lease)
+    driver.advance(11.0)
+    assert verdicts(driver) == [("contested", True)]
+    assert [one["pid"] for one in driver.notes("verified")[0]["culprits"]] == [BROWSER.pid]
+    assert (driver.gpu()["charged_bytes"], driver.gpu()["stowaway_bytes"]) == (0, GIB)
+
+
+def test_less_is_charged_where_a_part_of_it_was_visibly_taken() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.unlisted.add(ProcessKey(101, 707))
+    det, lease = held(driver, "det", 5)
+    det.unloading(lease)
+    det.hold(2 * GIB)
+    driver.card.set(BROWSER, GIB, driver.now)
+    det.release(lease)
+    driver.advance(11.0)
+    assert verdicts(driver) == [("residue", True)]
+    assert (driver.gpu()["charged_bytes"], driver.gpu()["stowaway_bytes"]) == (2 * GIB, GIB)
+
+
+def test_one_that_expired_in_its_load_is_charged_for_what_nobody_explains() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.unlisted.add(ProcessKey(101, 707))
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB, ttl_s=10.0)
+    driver.until(lambda: driver.state(lease) == "loading")
+    det.hold(3 * GIB)
+    driver.card.set(BROWSER, GIB, driver.now)
+    driver.advance(30.0)
+    assert verdicts(driver) == [("residue", True)]
+    assert driver.gpu()["charged_bytes"] == 3 * GIB
+
+
+def test_where_the_list_has_no_bytes_all_of_it_stays_charged() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.unlisted.add(ProcessKey(101, 707))
+    driver.card.knows_bytes = False
+    driver.card.set(BROWSER, GIB, driver.now)
+    driver.advance(1.5)
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB, ttl_s=10.0)
+    driver.until(lambda: driver.state(lease) == "loading")
+    det.hold(5 * GIB)
+    driver.advance(30.0)
+    assert verdicts(driver) == [("residue", True)]
+    assert driver.gpu()["charged_bytes"] == 5 * GIB
+    driver.advance(30.0)
+    assert driver.gpu()["charged_bytes"] == 5 * GIB, "nor does it shrink by readings that cannot say"
+
+
+def test_two_that_nobody_lists_change_places() -> None:
+    """What the one loads while the other leaves is not the other's; what it held before is no growth of its."""
+    driver = CoreDriver(10 * GIB)
+    driver.card.unlisted |= {ProcessKey(pid, 7 * pid) for pid in (101, 102, 103)}
+    held(driver, "stays", 2)
+    det, lease = held(driver, "det", 4)
+    vlm = driver.consumer("vlm")
+    load = vlm.acquire(3 * GIB)
+    driver.until(lambda: driver.state(load) == "loading")
+    det.unloading(lease)
+    vlm.load(load)
+    det.hold(0)
+    det.release(lease)
+    driver.until(lambda: driver.state(lease) == "over", limit_s=0.1)
+    assert verdicts(driver) == [("verified", True)]
+
+
+def test_one_that_comes_onto_the_list_has_not_grown() -> None:
+    """Its bytes were on the card before, so they do not make up for what another one keeps."""
+    driver = CoreDriver(8 * GIB)
+    driver.card.unlisted |= {ProcessKey(101, 707), ProcessKey(102, 714)}
+    held(driver, "other", 3)
+    det, lease = held(driver, "det", 3)
+    driver.advance(1.5)
+    det.unloading(lease)
+    driver.card.unlisted.discard(ProcessKey(101, 707))
+    det.release(lease)
+    driver.advance(11.0)
+    assert verdicts(driver) == [("residue", True)]
+    assert driver.gpu()["charged_bytes"] == 6 * GIB
+
+
+def test_one_that_comes_onto_the_list_by_its_load_has_grown() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 3)
+    vlm = driver.consumer("vlm")
+    load = vlm.acquire(3 * GIB)
+    driver.until(lambda: driver.state(load) == "loading")
+    det.unloading(lease)
+    vlm.load(load)
+    det.hold(0)
+    det.release(lease)
+    driver.until(lambda: driver.state(lease) == "over", limit_s=0.1)
+    assert verdicts(driver) == [("verified", True)]
+
+
+def test_what_another_holder_grew_by_right_hides_no_dead_one() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lag_s = 15.0
+    other, _ = held(driver, "other", 4)
+    other.hold(2 * GIB)
+    driver.advance(20.0)
+    other.hold(2 * GIB)
+    det, _ = held(driver, "det", 2)
+    driver.card.unlisted.add(det.process)
+    det.die()
+    other.hold(4 * GIB)
+    driver.advance(14.0)
+    assert verdicts(driver) == [("contested", False)], "up to its charge it may grow: that was allowed for"
+    driver.advance(2.0)
+    assert verdicts(driver)[-1] == ("verified", True)
+
+
+def test_a_process_that_is_known_by_its_pid_alone_is_no_stranger() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, _ = held(driver, "det", 3)
+    ledger = driver.arbiter._core.gpus[driver.card.gpu].ledger
+    assert ledger.booked_by(ProcessKey(det.process.pid, 0)) == ledger.booked_by(det.process) == 3 * GIB
+    assert ledger.booked_by(BROWSER) == 0
+    reading = driver.card.read(driver.now)
+    assert isinstance(reading, MemorySampled)
+    assert ledger.hidden_bytes(reading) == 0
+    assert ledger.hidden_bytes(replace(reading, processes=(ProcessUse(det.process, "det", None),))) is None
