@@ -189,6 +189,22 @@ def test_who_does_not_come_back_to_an_empty_card_is_given_up_in_time() -> None:
     assert driver.state(lease) == "over"
 
 
+def test_who_lets_go_after_a_restart_without_coming_back_is_waited_for_no_longer() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, token = held(driver, "det", 5)
+    vlm, other, _ = held(driver, "vlm", 2)
+    driver.restart()
+    det.connect()
+    det.reattach(lease, token)
+    vlm.connect()
+    vlm.unloading(other)
+    vlm.release(other)
+    assert driver.arbiter.status(driver.now)["phase"] == "recovering"
+    vlm.hold(0)
+    driver.until(lambda: driver.arbiter.status(driver.now)["phase"] == "serving", limit_s=0.1)
+    assert (driver.state(lease), driver.state(other)) == ("held", "over")
+
+
 def test_verifications_and_debts_go_on_after_the_restart() -> None:
     driver = CoreDriver(8 * GIB)
     driver.card.lag_s = 3.0
