@@ -19,7 +19,7 @@ Rules (their names stand in `Finding.rule`):
 import bisect
 import json
 import re
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -31,11 +31,16 @@ SLACK_S = 0.005
 UNSEEN_S = 2.5
 """A stowaway younger than the oldest reading that may carry a grant cannot have been seen."""
 NOISE_BYTES = RESERVE_BYTES + VERIFY_TOLERANCE_BYTES
-"""So much may be the driver's own, as far as a reading can tell: who has no more than that on its way back is not seen to be there."""
+"""So much may be the driver's own, as far as a reading can tell: who has no more than that on its way back is not seen to be there.
+
+Where readings do not list processes, what a living process is charged for its context, and does not hold, hides as many bytes more."""
 STUCK_S = 60.0
 _LEASE_ID = re.compile(r"L(\d+)-\d+")
+_PROCESS = re.compile(r"(\d+)@\d+")
 
 type Line = Mapping[str, Any]
+type Span = tuple[float, float]
+"""From when until when, monotonic seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +74,7 @@ class Claim:
     since: float
     until: float = float("inf")
     expired_at: float = float("inf")  # by the arbiter's word
+    residue_bytes: int = 0  # declared: its context
 
 
 @dataclass(slots=True)
@@ -107,19 +113,23 @@ def check_leases(
     traces: Sequence[Line],
     hindrances: Sequence[Hindrance] = (),
     *,
+    outages: Sequence[Span] = (),
     wall_minus_monotonic_s: float = 0.0,
     stuck_s: float = STUCK_S,
 ) -> Story:
-    """Judge one card's log with the history of its arbiter and the traces of its consumers."""
+    """Judge one card's log with the history of its arbiter and the traces of its consumers.
+
+    `outages`: when the test itself had killed or stopped the arbiter, until it ran again.
+    """
     story = Story()
     events = sorted(history, key=lambda event: (float(event["at_wall_s"]), int(event["seq"])))
     times = [float(event["at_wall_s"]) - wall_minus_monotonic_s for event in events]
     claims = _claims(traces, events, times)
     known = {claim.lease_id: claim for mine in claims.values() for claim in mine}
     _check_history(story, events, times, known, hindrances)
-    _check_card(story, read_lines([log]), claims, traces, hindrances)
+    _check_card(story, read_lines([log]), claims, traces, hindrances, _kept(events, times, known))
     _check_uses(story, read_lines([log]), traces)
-    _check_waits(story, traces, hindrances, stuck_s)
+    _check_waits(story, traces, hindrances, outages, stuck_s)
     return story
 
 
@@ -143,11 +153,32 @@ def _claims(traces: Sequence[Line], events: Sequence[Line], times: Sequence[floa
                 token=(line["token"][0], line["token"][1]),
                 since=line["t"],
                 expired_at=expired.get(lease_id, float("inf")),
+                residue_bytes=line.get("residue_bytes", 0),
             )
             found[claim.pid].append(claim)
             by_lease[claim.lease_id] = claim
         elif line["event"] in ("over", "lost") and lease_id in by_lease:
             by_lease[lease_id].until = min(by_lease[lease_id].until, line["t"])
+    return found
+
+
+def _kept(
+    events: Sequence[Line], times: Sequence[float], claims: Mapping[str, Claim]
+) -> list[tuple[float, int, int]]:
+    """(when, pid, bytes): what the arbiter charged to a process outside its leases from then on, by its verdicts, for its context.
+
+    What it found there beyond that counts for nothing here: it would be excused by the arbiter's own finding.
+    """
+    found = []
+    for event, t in zip(events, times, strict=True):
+        if event["kind"] != "verified" or not event["resolved"]:
+            continue
+        claim = claims.get(str(event.get("lease_id")))
+        process = _PROCESS.fullmatch(str(event["consumer"])) if event.get("lease_id") is None else None
+        if claim is not None:
+            found.append((t, claim.pid, min(int(event["residue_bytes"]), claim.residue_bytes)))
+        elif process is not None:
+            found.append((t, int(process.group(1)), 0))
     return found
 
 
@@ -248,13 +279,21 @@ def _check_card(
     claims: Mapping[int, Sequence[Claim]],
     traces: Sequence[Line],
     hindrances: Sequence[Hindrance],
+    kept: Sequence[tuple[float, int, int]],
 ) -> None:
     strangers = {line["pid"] for line in traces if line["event"] == "born" and line["kind"] == "stowaway"}
     consumers = {line["pid"] for line in traces if line["event"] == "born" and line["kind"] == "consumer"}
     held: dict[int, _Held] = defaultdict(_Held)
     late: set[int] = set()  # processes that put bytes there after their lease had expired
+    dead = {h.pid: h.since for h in hindrances if h.until == float("inf")}
+    dead |= {line["pid"]: line["t"] for line in traces if line["event"] == "done"}
+    grants = deque(sorted((c for mine in claims.values() for c in mine), key=lambda claim: claim.since))
+    hidden: dict[str, int] = {}  # by lease: what a reading could not tell when it was granted
     for line in lines:
         pid, t, op = line["pid"], line["t"], line["op"]
+        while grants and grants[0].since <= t:
+            granted = grants.popleft()
+            hidden[granted.lease_id] = _unfilled_bytes(kept, held, dead, granted.since)
         mine = held[pid]
         if op == "context":
             mine.floor += line["bytes"]
@@ -281,7 +320,15 @@ def _check_card(
             _check_refusal(story, line, claim, held, strangers | late)
         else:
             story.allocations += 1
-            _check_alone(story, line, claim, held, claims)
+            _check_alone(story, line, claim, held, claims, NOISE_BYTES + hidden[claim.lease_id])
+
+
+def _unfilled_bytes(
+    kept: Sequence[tuple[float, int, int]], held: Mapping[int, _Held], dead: Mapping[int, float], at: float
+) -> int:
+    """What living processes were charged outside their leases at that time and did not have on the card."""
+    charged = {pid: count for t, pid, count in kept if t <= at and dead.get(pid, at) >= at}
+    return sum(max(0, count - (held[pid].on_card if pid in held else 0)) for pid, count in charged.items())
 
 
 def _check_refusal(
@@ -313,10 +360,11 @@ def _check_alone(
     claim: Claim,
     held: Mapping[int, _Held],
     claims: Mapping[int, Sequence[Claim]],
+    unseen_bytes: int,
 ) -> None:
     t = line["t"]
     for pid, other in held.items():
-        if pid == claim.pid or other.own <= NOISE_BYTES:
+        if pid == claim.pid or other.own <= unseen_bytes:
             continue
         theirs = next((c for c in reversed(claims.get(pid, ())) if c.since <= t), None)
         if theirs is None or theirs.expired_at < t:  # a stowaway, or a holder that time took the lease from
@@ -354,19 +402,20 @@ def _check_uses(story: Story, lines: Sequence[Line], traces: Sequence[Line]) -> 
 
 
 def _check_waits(
-    story: Story, traces: Sequence[Line], hindrances: Sequence[Hindrance], stuck_s: float
+    story: Story,
+    traces: Sequence[Line],
+    hindrances: Sequence[Hindrance],
+    outages: Sequence[Span],
+    stuck_s: float,
 ) -> None:
+    """Time in which the test kept the waiter or the arbiter from running is no wait."""
     asked: dict[int, Line] = {}
     ended = max((line["t"] for line in traces), default=0.0)
     killed = {h.pid: h.since for h in hindrances if h.until == float("inf")}
 
     def waited(line: Line, until: float) -> float:
-        stopped = sum(
-            max(0.0, min(h.until, until) - max(h.since, line["t"]))
-            for h in hindrances
-            if h.pid == line["pid"] and h.until != float("inf")
-        )
-        return float(until - line["t"] - stopped)
+        stops = [(h.since, h.until) for h in hindrances if h.pid == line["pid"] and h.until != float("inf")]
+        return float(until - line["t"] - _covered_s([*stops, *outages], line["t"], until))
 
     for line in traces:
         match line["event"]:
@@ -381,3 +430,14 @@ def _check_waits(
     for pid, line in asked.items():
         if pid not in killed and waited(line, ended) > stuck_s:
             story.bad("stuck", ended, f"{line['name']} waits since {waited(line, ended):.1f} s")
+
+
+def _covered_s(spans: Iterable[Span], since: float, until: float) -> float:
+    """How much of the time between the two lies in any of the spans; what several of them cover counts once."""
+    covered_s, seen_until = 0.0, since
+    for begin, end in sorted(spans):
+        begin, end = max(begin, seen_until), min(end, until)
+        if end > begin:
+            covered_s += end - begin
+            seen_until = end
+    return covered_s

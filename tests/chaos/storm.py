@@ -21,7 +21,7 @@ import subprocess
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -100,6 +100,7 @@ class Storm:
         self._queued: dict[str, str] = {}  # lease → consumer
         self._tasks: set[asyncio.Task[None]] = set()
         self._hindrances: list[Hindrance] = []
+        self._outages: list[tuple[float, float]] = []  # of the daemon
         self._stopped: dict[int, Callable[[], None]] = {}  # by pid: how to let it go on
         self._tally = Tally()
         self._daemon_busy = asyncio.Lock()
@@ -161,6 +162,7 @@ class Storm:
         lines = read_lines(path.read_text() for path in self._traces.iterdir())
         (kept / "traces.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         (kept / "hindrances.json").write_text(json.dumps([asdict(found) for found in self._hindrances]))
+        (kept / "outages.json").write_text(json.dumps(self._outages))
 
     def _finding(self, rule: str, text: str) -> None:
         self._findings.append(Finding(rule, time.monotonic(), text))
@@ -283,7 +285,7 @@ class Storm:
     async def _strike_daemon(self, step: str, how: str) -> None:
         if self._daemon_busy.locked():
             return
-        async with self._daemon_busy:
+        async with self._daemon_busy, self._daemon_is_out():
             if how == "kill":
                 self._tally.count("SIGKILL daemon", step)
                 await asyncio.to_thread(self._arbiter.kill)
@@ -294,6 +296,12 @@ class Storm:
             os.kill(self._arbiter.pid, signal.SIGSTOP)
             await asyncio.sleep(self._random.choice([0.1, 0.2, 0.5, 0.5, 4.0]))
             os.kill(self._arbiter.pid, signal.SIGCONT)
+
+    @contextlib.asynccontextmanager
+    async def _daemon_is_out(self) -> AsyncIterator[None]:
+        since = time.monotonic()
+        yield
+        self._outages.append((since, time.monotonic()))
 
     async def _start_daemon(self) -> None:
         """A full disk may forbid a start, and it says so; then it is emptied first, as an operator would.
@@ -317,7 +325,7 @@ class Storm:
                 if self._daemon_busy.locked():
                     return
                 self._tally.count(fault)
-                async with self._daemon_busy:
+                async with self._daemon_busy, self._daemon_is_out():
                     if (code := await asyncio.to_thread(self._arbiter.stop)) != 0:
                         self._finding("daemon", f"the daemon ended with {code} at a restart")
                     await self._start_daemon()
@@ -455,6 +463,7 @@ class Storm:
             self._whole_history(),
             traces,
             self._hindrances,
+            outages=self._outages,
             wall_minus_monotonic_s=self._wall_minus_monotonic_s,
         )
         found = [

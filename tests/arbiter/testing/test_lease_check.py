@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.lease_check import Hindrance, Story, check_leases
+from arbiter.testing.lease_check import NOISE_BYTES, Hindrance, Story, check_leases
 
 GIB = 1 << 30
-A, B, STRANGER = 11, 12, 99
+A, B, IDLE, STRANGER = 11, 12, 13, 99
 FOREVER = float("inf")
 
 
@@ -23,6 +23,7 @@ class Scene:
     history: list[dict[str, Any]] = field(default_factory=list)
     traces: list[dict[str, Any]] = field(default_factory=list)
     hindrances: list[Hindrance] = field(default_factory=list)
+    outages: list[tuple[float, float]] = field(default_factory=list)
     held: dict[int, int] = field(default_factory=dict)
     serial: int = 0
 
@@ -65,7 +66,7 @@ class Scene:
 
     def judge(self) -> Story:
         log = "".join(json.dumps(line) + "\n" for line in self.card)
-        return check_leases(log, self.history, self.traces, self.hindrances)
+        return check_leases(log, self.history, self.traces, self.hindrances, outages=self.outages)
 
 
 def sound() -> Scene:
@@ -241,6 +242,79 @@ def test_a_killed_waiter_is_not_stuck() -> None:
     scene.t += 100.0
     scene.trace(B, "done")
     assert not scene.judge().findings
+
+
+def beside_what_is_on_its_way(
+    left_gib: float, *, charged_gib: float, declared_gib: float = 0.25, ended: str = ""
+) -> list[str]:
+    """B is granted a card to itself when this much of A's is still there, and IDLE is charged a context that it never put there."""
+    scene = Scene()
+    for pid in (A, B, IDLE):
+        scene.born(pid)
+    residue_bytes = int(declared_gib * GIB)
+    facts = {"bytes": GIB, "exclusive": False, "token": [1, 1], "residue_bytes": residue_bytes}
+    scene.trace(IDLE, "granted", lease_id="L1-1", **facts)
+    scene.trace(IDLE, "over", lease_id="L1-1")
+    charged_bytes = int(charged_gib * GIB)
+    scene.event("verified", lease_id="L1-1", consumer="c", resolved=False, residue_bytes=9 * GIB)
+    scene.event("verified", lease_id="L1-1", consumer="c", resolved=True, residue_bytes=charged_bytes)
+    scene.serial = 1
+    lease = scene.grant(A, left_gib)
+    scene.op(A, "free", left_gib, 0)
+    scene.event("released", lease_id=lease, consumer="pA")
+    scene.event("verified", lease_id=lease, consumer="pA", resolved=True, residue_bytes=0)
+    scene.trace(A, "over", lease_id=lease)
+    match ended:
+        case "killed":
+            scene.hindrances.append(Hindrance(IDLE, scene.t, FOREVER))
+        case "exited":
+            scene.trace(IDLE, "done")
+        case "measured gone":
+            scene.event("verified", lease_id=None, consumer=f"{IDLE}@5", resolved=True, residue_bytes=0)
+    scene.grant(B, 1, exclusive=True)
+    return [finding.rule for finding in scene.judge().findings]
+
+
+MOST_GIB = NOISE_BYTES / GIB
+
+
+@pytest.mark.parametrize("charged_gib", [0.0, 0.25])
+def test_what_no_reading_can_tell_may_be_beside_an_exclusive_lease_and_no_byte_more(
+    charged_gib: float,
+) -> None:
+    """Without process lists, what a process is charged and does not hold cannot be told from what another still has."""
+    assert beside_what_is_on_its_way(MOST_GIB + charged_gib, charged_gib=charged_gib) == []
+    assert beside_what_is_on_its_way(MOST_GIB + charged_gib + 1 / GIB, charged_gib=charged_gib) == [
+        "exclusive"
+    ]
+
+
+@pytest.mark.parametrize("ended", ["killed", "exited", "measured gone"])
+def test_a_process_that_has_ended_hides_nothing(ended: str) -> None:
+    assert beside_what_is_on_its_way(MOST_GIB + 1 / GIB, charged_gib=0.25, ended=ended) == ["exclusive"]
+
+
+def test_what_the_arbiter_found_beyond_a_context_hides_nothing() -> None:
+    assert beside_what_is_on_its_way(MOST_GIB + 0.25 + 1 / GIB, charged_gib=2) == ["exclusive"]
+    assert beside_what_is_on_its_way(MOST_GIB + 1 / GIB, charged_gib=2, declared_gib=0) == ["exclusive"]
+
+
+@pytest.mark.parametrize(("outages", "stuck"), [([], True), ([(0.0, 30.0)], True), ([(0.0, 50.0)], False)])
+def test_time_without_an_arbiter_is_no_wait(outages: list[tuple[float, float]], stuck: bool) -> None:
+    """Regression (storm, seed 7): killed and stopped again and again, the daemon had answered for 29 s of 70."""
+    scene = sound()
+    scene.trace(A, "asked", bytes=1, exclusive=False)
+    asked_at = scene.t
+    scene.hindrances.append(Hindrance(A, asked_at + 20.0, asked_at + 40.0))
+    scene.outages = [(asked_at + since, asked_at + until) for since, until in outages]
+    scene.t += 108.0
+    scene.trace(A, "denied", code="wait_timeout")
+    story = scene.judge()
+    assert [finding.rule for finding in story.findings] == ["stuck"] * stuck
+    if outages:
+        assert story.waits[-1] == pytest.approx(109.0 - max(40.0, outages[0][1])), (
+            "what both cover counts once"
+        )
 
 
 def test_a_start_that_a_full_disk_kept_out_of_the_history_is_seen_by_the_names_of_leases() -> None:
