@@ -152,7 +152,7 @@ def begin_for_lease(
     core: Core, gpu: Gpu, lease: Lease, *, alive: bool, grace_s: float = 0.0, fenced_at: float = 0.0
 ) -> None:
     """Measure a lease's bytes away. Its charge is in the ledger and stays there until the verdict."""
-    baseline = lease.baseline or gpu.sample
+    baseline = lease.baseline or gpu.sample or gpu.before_sleep
     drift.on_leaving(core, lease)
     if lease.estate is not None and (baseline is None or baseline.processes is None):
         baseline = None  # how much of a reservation was ever filled, a total cannot say
@@ -180,6 +180,7 @@ def begin_for_lease(
 
 def begin_for_residue(core: Core, gpu: Gpu, process: ProcessKey) -> None:
     """The process died and had only a residue here: measure that away too."""
+    baseline = gpu.sample or gpu.before_sleep
     verification = Verification(
         key=f"residue:{process}",
         process=process,
@@ -187,9 +188,9 @@ def begin_for_residue(core: Core, gpu: Gpu, process: ProcessKey) -> None:
         consumer=str(process),
         model="",
         residue_bytes=0,
-        baseline=gpu.sample,
-        baseline_comparable=gpu.sample is not None
-        and gpu.sample.taken_at > gpu.ledger.accounts[process].changed_at,
+        baseline=baseline,
+        baseline_comparable=baseline is not None
+        and baseline.taken_at > gpu.ledger.accounts[process].changed_at,
         confirmed_at=core.now,
         not_before=core.now,
         deadline_at=core.now + core.settings.verify_timeout_s,

@@ -27,6 +27,7 @@ def on_resumed(core: Core, event: Resumed) -> None:
 
 
 def _measure_anew(core: Core, gpu: Gpu) -> None:
+    gpu.before_sleep = gpu.sample or gpu.before_sleep
     gpu.sample = None
     gpu.read_from = core.now
     core.want_sample(gpu, core.now)

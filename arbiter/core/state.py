@@ -89,6 +89,7 @@ class Gpu:
     evictions: list[Eviction] = field(default_factory=list)  # not yet counted to a grant
     returning: Returning = field(default_factory=Returning)
     sample: MemorySampled | None = None
+    before_sleep: MemorySampled | None = None  # says nothing of now, but what was there then
     reading_s: float = 0.0  # how long the newest reading took
     failed_at: float | None = None  # last failed reading, None after a good one
     failure: str = ""

@@ -74,7 +74,6 @@ class Claim:
     since: float
     until: float = float("inf")
     expired_at: float = float("inf")  # by the arbiter's word
-    residue_bytes: int = 0  # declared: its context
 
 
 @dataclass(slots=True)
@@ -127,7 +126,7 @@ def check_leases(
     claims = _claims(traces, events, times)
     known = {claim.lease_id: claim for mine in claims.values() for claim in mine}
     _check_history(story, events, times, known, hindrances)
-    _check_card(story, read_lines([log]), claims, traces, hindrances, _kept(events, times, known))
+    _check_card(story, read_lines([log]), claims, traces, hindrances, _kept(events, times, traces))
     _check_uses(story, read_lines([log]), traces)
     _check_waits(story, traces, hindrances, outages, stuck_s)
     return story
@@ -153,7 +152,6 @@ def _claims(traces: Sequence[Line], events: Sequence[Line], times: Sequence[floa
                 token=(line["token"][0], line["token"][1]),
                 since=line["t"],
                 expired_at=expired.get(lease_id, float("inf")),
-                residue_bytes=line.get("residue_bytes", 0),
             )
             found[claim.pid].append(claim)
             by_lease[claim.lease_id] = claim
@@ -163,22 +161,25 @@ def _claims(traces: Sequence[Line], events: Sequence[Line], times: Sequence[floa
 
 
 def _kept(
-    events: Sequence[Line], times: Sequence[float], claims: Mapping[str, Claim]
+    events: Sequence[Line], times: Sequence[float], traces: Sequence[Line]
 ) -> list[tuple[float, int, int]]:
     """(when, pid, bytes): what the arbiter charged to a process outside its leases from then on, by its verdicts, for its context.
 
-    What it found there beyond that counts for nothing here: it would be excused by the arbiter's own finding.
+    What it found there beyond what the process declared counts for nothing here: it would be excused by the arbiter's own finding.
     """
+    declared = {
+        line["name"]: (line["pid"], line["residue_bytes"]) for line in traces if "residue_bytes" in line
+    }
     found = []
     for event, t in zip(events, times, strict=True):
         if event["kind"] != "verified" or not event["resolved"]:
             continue
-        claim = claims.get(str(event.get("lease_id")))
         process = _PROCESS.fullmatch(str(event["consumer"])) if event.get("lease_id") is None else None
-        if claim is not None:
-            found.append((t, claim.pid, min(int(event["residue_bytes"]), claim.residue_bytes)))
-        elif process is not None:
+        if process is not None:
             found.append((t, int(process.group(1)), 0))
+        elif event["consumer"] in declared:
+            pid, most = declared[event["consumer"]]
+            found.append((t, pid, min(int(event["residue_bytes"]), most)))
     return found
 
 
@@ -198,8 +199,14 @@ def _check_history(
     loading: dict[str, dict[str, str]] = defaultdict(dict)  # card → lease → consumer
     uses: dict[str, set[str]] = defaultdict(set)  # as far as they began since the daemon did
     newest = (0, 0)
-    epoch = 0
+    epoch = seq = 0
     for event, t in zip(events, times, strict=True):
+        if (
+            event["seq"] > seq + 1
+        ):  # a full disk, and a kill before there was room: nobody knows what ended meanwhile
+            loading.clear()
+            uses.clear()
+        seq = int(event["seq"])
         kind, lease, gpu = event["kind"], str(event.get("lease_id")), str(event.get("gpu"))
         begun = max(_epoch(lease), _epoch(str(event.get("wanted_by_lease"))))
         if begun > epoch:  # a start that a full disk kept out of the history

@@ -94,7 +94,12 @@ class Consumer:
             say("lost", lease_id=lease.lease_id, code=error.code)
 
         lease_id = ""
-        say("asked", bytes=spec.footprint.load_peak_bytes, exclusive=spec.mode == "exclusive")
+        say(
+            "asked",
+            bytes=spec.footprint.load_peak_bytes,
+            exclusive=spec.mode == "exclusive",
+            residue_bytes=self._residue,
+        )
         try:
             lease = await self._unless_stopping(
                 client.acquire(
@@ -115,7 +120,6 @@ class Consumer:
             token=list(lease.token),
             exclusive=spec.mode == "exclusive",
             bytes=spec.footprint.load_peak_bytes,
-            residue_bytes=self._residue,
         )
         try:
             await self._load(lease, spec, blocks)

@@ -131,3 +131,23 @@ def test_waiters_and_leases_on_their_way_out_keep_their_place() -> None:
     holder.use_end(lease)
     holder.unload(lease)
     driver.until(lambda: driver.state(waiter) == "loading")
+
+
+def test_what_was_there_before_the_night_has_to_come_back_before_a_dead_holder_is_gone() -> None:
+    """Regression (storm, seed 11): nobody had read the card since, so a context that another had never made hid what the dead one left."""
+    driver = CoreDriver(8 * GIB, start=False)
+    driver.card.lists_processes = False
+    driver.advance(0.01)
+    idle = driver.consumer("idle")
+    unused = idle.acquire(GIB, residue_bytes=450 * d.MIB)
+    idle.release(unused)
+    driver.until(lambda: driver.state(unused) == "over")
+    person, lease = held(driver, "a", 0.4)
+    driver.advance(1.5)
+    driver.card.lag_s = 3.0
+    driver.card.set(person.process, 0, driver.now)
+    driver.post(Resumed(NIGHT_S))
+    driver.post(ProcessDied(person.process))
+    waiter = driver.consumer("b").acquire(GIB, exclusive=True)
+    assert driver.until(lambda: driver.state(waiter) == "loading") > 2.9
+    assert [note["verdict"] for note in driver.notes("verified") if note["lease_id"] == lease] == ["verified"]

@@ -251,13 +251,14 @@ def beside_what_is_on_its_way(
     scene = Scene()
     for pid in (A, B, IDLE):
         scene.born(pid)
-    residue_bytes = int(declared_gib * GIB)
-    facts = {"bytes": GIB, "exclusive": False, "token": [1, 1], "residue_bytes": residue_bytes}
-    scene.trace(IDLE, "granted", lease_id="L1-1", **facts)
-    scene.trace(IDLE, "over", lease_id="L1-1")
-    charged_bytes = int(charged_gib * GIB)
-    scene.event("verified", lease_id="L1-1", consumer="c", resolved=False, residue_bytes=9 * GIB)
-    scene.event("verified", lease_id="L1-1", consumer="c", resolved=True, residue_bytes=charged_bytes)
+    scene.trace(IDLE, "asked", bytes=GIB, exclusive=False, residue_bytes=int(declared_gib * GIB))
+    verdict = {
+        "lease_id": "L1-1",
+        "consumer": f"p{IDLE}",
+    }  # granted while its process was stopped: it never heard of it
+    scene.event("verified", **verdict, resolved=False, residue_bytes=9 * GIB)
+    scene.event("verified", **verdict, resolved=True, residue_bytes=int(charged_gib * GIB))
+    scene.trace(IDLE, "denied", code="lease_lost")
     scene.serial = 1
     lease = scene.grant(A, left_gib)
     scene.op(A, "free", left_gib, 0)
@@ -315,6 +316,36 @@ def test_time_without_an_arbiter_is_no_wait(outages: list[tuple[float, float]], 
         assert story.waits[-1] == pytest.approx(109.0 - max(40.0, outages[0][1])), (
             "what both cover counts once"
         )
+
+
+def test_what_ended_in_a_part_of_the_history_that_was_lost_is_not_missed() -> None:
+    """Regression (storm, seed 7): the end of a use was never written, the disk being full until the daemon was killed."""
+
+    def story(lost: int) -> list[str]:
+        scene = Scene()
+        scene.born(A)
+        lease = scene.grant(A, 4)
+        scene.event("use_began", lease_id=lease, consumer="pA", use_id="u1")
+        scene.event("granted", lease_id="L1-8", consumer="c8", token=[1, 8])
+        scene.event("use_ended", lease_id=lease, consumer="pA", use_id="u1")
+        scene.event("ready", lease_id="L1-8", consumer="c8")
+        del scene.history[len(scene.history) - lost :]
+        for event in (
+            {"kind": "granted", "lease_id": "L1-9", "consumer": "c9", "token": [1, 9]},
+            {"kind": "unloading", "lease_id": lease, "consumer": "pA"},
+        ):
+            scene.event(**event)
+            scene.history[-1]["seq"] += lost
+        return sorted(finding.rule for finding in scene.judge().findings)
+
+    assert story(0) == []
+    assert story(2) == []
+    whole = Scene()
+    whole.born(A)
+    lease = whole.grant(A, 4)
+    whole.event("use_began", lease_id=lease, consumer="pA", use_id="u1")
+    whole.event("unloading", lease_id=lease, consumer="pA")
+    assert [finding.rule for finding in whole.judge().findings] == ["in_use"]
 
 
 def test_a_start_that_a_full_disk_kept_out_of_the_history_is_seen_by_the_names_of_leases() -> None:
