@@ -188,9 +188,7 @@ def set_fault(arbiter: ArbiterProcess, probe: str) -> None:
 
 @pytest.mark.parametrize("fault", ["fail", "hang"])
 def test_a_card_that_cannot_be_read_blocks_and_comes_back(make_arbiter: Make, fault: str) -> None:
-    arbiter = make_arbiter(
-        config="probe:\n  deadline_s: 0.2\n  period_s: 0.1\n  sample_max_age_s: 0.1\n"
-    ).start()
+    arbiter = make_arbiter(config="probe: {deadline_s: 0.5, period_s: 0.1}\n").start()
     with WireClient(arbiter.endpoint) as watcher, WireClient(arbiter.endpoint) as client:
         watcher.hello("watcher").ask("subscribe")
         set_fault(arbiter, fault)

@@ -270,7 +270,7 @@ async def test_subscribers_see_events_in_order(arbiter_daemon: ArbiterProcess, s
     async def follow(client: ArbiterClient, started: asyncio.Event) -> None:
         events = client.subscribe()
         first = asyncio.ensure_future(anext(events))
-        await client.ping()
+        await client.ping(timeout_s=WAIT_S)
         started.set()
         kinds.append((await first)["kind"])
         async for event in events:

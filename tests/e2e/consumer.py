@@ -58,7 +58,9 @@ async def main(name: str, size: int, card: Path, residue: int) -> None:
         footprint=Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=residue),
     )  # fmt: skip
     reader = await commands()
-    async with ArbiterClient(name=name) as client:
+    async with ArbiterClient(
+        name=name, connect_timeout_s=60.0
+    ) as client:  # the arbiter may be starting still
         say("waiting", pid=os.getpid())
         lease = await client.acquire(spec, unload=unload, on_lost=lost)
         say("granted", lease_id=lease.lease_id, token=list(lease.token))

@@ -51,7 +51,7 @@ async def live(name: str, size: int, card: Path, residue: int) -> None:
         consumer=name, model_id=name, ttl_s=TTL_S, min_residency_s=0.0,
         footprint=Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=residue),
     )  # fmt: skip
-    async with ArbiterClient(name=name, connect_timeout_s=30.0) as client:
+    async with ArbiterClient(name=name, connect_timeout_s=60.0) as client:
         say("waiting")
         lease = await client.acquire(spec, unload=unload)
         say("loading", token=list(lease.token))

@@ -50,7 +50,7 @@ def foreign(endpoint: str) -> Iterator[Callable[[], subprocess.Popen[bytes]]]:
 
 @pytest.fixture
 async def detector(endpoint: str) -> AsyncIterator[DetectorClient]:
-    async with DetectorClient(endpoint, spawn=SpawnSpec(command(endpoint)), timeout_s=20.0) as client:
+    async with DetectorClient(endpoint, spawn=SpawnSpec(command(endpoint)), timeout_s=60.0) as client:
         yield client
 
 
@@ -82,7 +82,9 @@ async def test_an_adopted_sidecar_is_used_and_left_running(
     endpoint: str, foreign: Callable[[], subprocess.Popen[bytes]]
 ) -> None:
     process = foreign()
-    async with SidecarClient(endpoint) as waiting:  # without a spawn spec it waits for the start
+    async with SidecarClient(
+        endpoint, connect_timeout_s=60.0
+    ) as waiting:  # without a spawn spec it waits for the start
         await waiting.call("load")
     async with DetectorClient(endpoint, spawn=SpawnSpec(command(endpoint))) as client:
         await client.detect(PNG, "x")
@@ -161,10 +163,10 @@ async def test_a_timeout_gives_a_fresh_socket(detector: DetectorClient) -> None:
 
 
 async def test_calls_do_not_wait_for_each_other(detector: DetectorClient) -> None:
-    hanging = asyncio.create_task(detector.detect(PNG, "hang", timeout_s=10.0))
+    hanging = asyncio.create_task(detector.detect(PNG, "hang", timeout_s=60.0))
     assert await detector.detect(PNG, "x")
     hanging.cancel()
-    assert (await detector.ping())["state"] == "resident"
+    assert (await detector.ping(timeout_s=60.0))["state"] == "resident"
 
 
 # -- errors and shapes -----------------------------------------------------------------------------------------------
@@ -187,7 +189,7 @@ async def test_a_failure_without_a_code_is_a_model_error(detector: DetectorClien
 async def test_the_token_travels_with_the_call(endpoint: str) -> None:
     async with SceneVlmClient(endpoint, spawn=SpawnSpec(command(endpoint))) as client:
         assert await client.query(PNG, "held?", token=(3, 7)) == "held? [3, 7]"
-        loaded = await client.load(timeout_s=5.0)
+        loaded = await client.load(timeout_s=60.0)
         assert (loaded["lease_id"], loaded["token"]) == ("L1-1", [1, 2])
 
 
