@@ -1,0 +1,151 @@
+"""A deployment: which robot, which cameras, which skill, at which rate. The YAML file that `vram-runner deploy` reads.
+
+Pure: `load_robot(text, name)` takes the text of a file. Field names are those of the field's `RobotEnvironment` files, so that they load
+unchanged. Nothing is guessed: what an adapter or a reader needs beyond these fields stands in `transport`, `params` and `backend_params`
+and is checked by that adapter, before anything moves.
+"""
+
+from collections.abc import Collection, Mapping
+from enum import StrEnum
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from schemas.manifest.contracts import SafetyEnvelope
+from schemas.yamltext import Path, config_error, parse_yaml, problems_of
+
+RATE_HZ_MAX = 1000.0
+MAX_AGE_MS = 100.0
+
+Text = Annotated[str, Field(min_length=1, max_length=256)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class SensorBackend(StrEnum):
+    """How the frames of a camera come in."""
+
+    OPENCV_THREAD = "opencv_thread"
+    ROS2_IMAGE = "ros2_image"
+    GSTREAMER = "gstreamer"
+    HOLOSCAN = "holoscan"
+
+
+class SensorReaderConfig(_Section):
+    """One camera."""
+
+    sensor_id: Text
+    """Name under which its frames appear in the world state; a skill's manifest refers to it."""
+    backend: SensorBackend = SensorBackend.OPENCV_THREAD
+    """`holoscan` is reserved: it is refused when the runner starts."""
+    backend_params: dict[str, Any] = {}
+    """What this backend needs: a device, a URL, a topic, a pipeline."""
+    max_age_ms: Positive = MAX_AGE_MS
+    """An older frame is stale: it is not shown to the skill."""
+    publish_to_ros: bool = False
+    """Publish the frames on a ROS 2 topic as well, for recorders and viewers."""
+    publish_topic: Text | None = None
+    publish_rate_hz: Positive | None = None
+    """At most so many frames a second are published; null: all."""
+
+    @model_validator(mode="after")
+    def _topic_goes_with_publishing(self) -> Self:
+        if self.publish_to_ros != (self.publish_topic is not None):
+            raise ValueError("publish_to_ros and publish_topic go together: give both or neither")
+        if self.publish_rate_hz is not None and not self.publish_to_ros:
+            raise ValueError("publish_rate_hz without publish_to_ros publishes nothing")
+        return self
+
+
+class HalConfig(_Section):
+    """The robot's hardware adapter."""
+
+    adapter: Text
+    """`so101_mujoco`, `so101_kinematic` or `lerobot:TYPE`."""
+    transport: dict[str, Any] = {}
+    """Port, ids, calibration: how the hardware is reached."""
+    params: dict[str, Any] = {}
+
+
+class TaskSpec(_Section):
+    """What the robot is to do when nobody sends goals."""
+
+    id: Text
+    scene_id: str = ""
+    instruction: Annotated[str, Field(max_length=2000)] = ""
+    max_steps: Annotated[int, Field(gt=0)] | None = None
+    success_key: str | None = None
+    metadata: dict[str, Any] = {}
+
+
+class VlaSpec(_Section):
+    """The skill that runs the task: an installed rSkill by name, without a scheme."""
+
+    id: Text
+    weights_uri: str = ""
+    device: str = "auto"
+    runtime: str | None = None
+    quantization: str | None = None
+    deterministic: bool = False
+    extra: dict[str, Any] = {}
+
+    @model_validator(mode="after")
+    def _bare_reference(self) -> Self:
+        if "://" in self.id:
+            raise ValueError(f"{self.id!r}: write the skill's name, OWNER/REPOSITORY, without a scheme")
+        return self
+
+
+class RobotEnvironment(_Section):
+    """One robot as it is deployed."""
+
+    robot_id: Text
+    hal: HalConfig
+    sensors: tuple[SensorReaderConfig, ...] = ()
+    task: TaskSpec | None = None
+    vla: VlaSpec | None = None
+    safety: SafetyEnvelope | None = None
+    """Tightens the robot's own limits; it can never widen them."""
+    rate_hz: Annotated[float, Field(gt=0, le=RATE_HZ_MAX, allow_inf_nan=False)] = 30.0
+    thumbnail_hz: Positive = 25.0
+    deadline_overrun_policy: Literal["warn", "drop", "raise"] = "warn"
+    max_ticks: Annotated[int, Field(gt=0)] | None = None
+    save_dir: str | None = None
+    """Folder of the recorded dataset; null: nothing is recorded."""
+    metadata: dict[str, Any] = {}
+
+    @model_validator(mode="after")
+    def _names_are_unique(self) -> Self:
+        names = [sensor.sensor_id for sensor in self.sensors]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"sensor_id must be unique; given twice: {', '.join(twice)}")
+        if (self.vla is None) != (self.task is None):
+            raise ValueError("task and vla go together: give both, or neither to serve goals only")
+        return self
+
+
+def known_keys() -> Mapping[Path, Collection[str]]:
+    """The keys of each section, for suggestions."""
+    return {
+        (): list(RobotEnvironment.model_fields),
+        ("hal",): list(HalConfig.model_fields),
+        ("task",): list(TaskSpec.model_fields),
+        ("vla",): list(VlaSpec.model_fields),
+        ("safety",): list(SafetyEnvelope.model_fields),
+        **{("sensors", index): list(SensorReaderConfig.model_fields) for index in range(64)},
+    }
+
+
+def load_robot(text: str, name: str) -> RobotEnvironment:
+    """Read the text of a deployment file; `name` is how errors call it.
+
+    Raises ConfigError with every mistake and its line: `robot.yaml:7: sensors[0].bakend: unknown key; did you mean backend?`
+    """
+    source = parse_yaml(text, name)
+    try:
+        return RobotEnvironment.model_validate(source.data)
+    except ValidationError as error:
+        raise config_error(name, problems_of(error, source, known_keys())) from error
