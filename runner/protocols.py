@@ -9,17 +9,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, NoReturn, Protocol, runtime_checkable
 
-from schemas.errors import TransientError, VramError
+from schemas.errors import CallerError, TransientError, VramError
 from schemas.manifest import RSkillManifest
-from schemas.world import Action, RunResult, TickResult, WorldState
+from schemas.world import Action, JointState, RunResult, SensorFrame, TickResult, WorldState
 
 
 class DeadlineMissed(TransientError):
     """A tick took longer than its slot under the policy RAISE. Stays inside the runner's process."""
 
     code: ClassVar[str] = "deadline_missed"
+
+
+class EstopRequested(CallerError):
+    """The emergency stop is latched: nothing moves until the runner is started again by a person."""
+
+    code: ClassVar[str] = "estop_requested"
 
 
 class DeadlinePolicy(StrEnum):
@@ -157,3 +163,68 @@ class SafetyGate(Protocol):
     def check(self, action: Action, world: WorldState) -> tuple[Action | None, tuple[str, ...]]:
         """The action to apply (possibly clamped within the tolerance) or None, and what was wrong with it."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """One joint of a robot: its range (rad) and the greatest speed that its motor makes (rad/s)."""
+
+    name: str
+    lower_rad: float
+    upper_rad: float
+    max_speed_rad_s: float
+    gripper: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RobotDescription:
+    """What a skill and the safety gate must know of a robot. Joints in the order in which the robot names them."""
+
+    name: str
+    joints: tuple[Joint, ...]
+    rest_pose_rad: Mapping[str, float]
+    simulated: bool = False
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return tuple(joint.name for joint in self.joints)
+
+
+class Hal(Protocol):
+    """One robot's hardware, or its twin. All calls on the control thread; joint units are rad, whatever the hardware speaks.
+
+    `send_action` takes one-step joint-position actions that have passed the safety gate. `estop` stops the motors as fast as this
+    hardware can, latches, and always raises EstopRequested; from then on `send_action` raises it too.
+    """
+
+    description: RobotDescription
+
+    def connect(self) -> None: ...
+
+    def disconnect(self) -> None: ...
+
+    def read_state(self) -> JointState: ...
+
+    def send_action(self, action: Action) -> None: ...
+
+    def estop(self, reason: str) -> NoReturn: ...
+
+
+# -- cameras ------------------------------------------------------------------------------------------------------
+class SensorReader(Protocol):
+    """One camera. `start` and `stop` on one thread, the reads on any.
+
+    `read_latest` gives the newest frame without waiting; FrameStale when there is none, or it is older than `max_age_ms` (None: the
+    configured age). `read_synced` waits for the first frame taken after the call, until the monotonic `deadline_ns`; then FrameStale.
+    A source that ended or broke raises FrameStale with the reason in its message: its last frame is never served again.
+    """
+
+    sensor_id: str
+
+    def start(self) -> None: ...
+
+    def read_latest(self, max_age_ms: float | None = None) -> SensorFrame: ...
+
+    def read_synced(self, deadline_ns: int) -> SensorFrame: ...
+
+    def stop(self) -> None: ...

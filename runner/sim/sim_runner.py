@@ -8,9 +8,7 @@ A run of n episodes has n reset ticks: the last episode ends the run by itself, 
 
 from __future__ import annotations
 
-import logging
 import math
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -19,20 +17,16 @@ from pydantic import ValidationError
 
 from runner import telemetry
 from runner.clock import Clock
-from runner.control import Mailbox
 from runner.frames import Snapshot
-from runner.loop import Applied, Decision, RunnerBase
-from runner.protocols import Act, DeadlinePolicy, Done, Goal, Hold, Progress, Skill, SkillEnded
+from runner.loop import Applied, Decision
+from runner.protocols import DeadlinePolicy, SkillEnded
 from runner.recorder import Recorder
 from runner.safety import Envelope
+from runner.skill_runner import SkillRunner
 from schemas.control import ControlMode
-from schemas.errors import InternalError, ModelError, VramError
+from schemas.errors import InternalError
 from schemas.world import Action, CameraModel, FrameEncoding, JointState, Pose, SensorFrame, WorldState
 
-log = logging.getLogger(__name__)
-
-VIOLATIONS_KEPT = 256
-WITHHELD_IN_A_ROW_MAX = 15  # half a second of refused actions: the policy is lost, the goal fails
 STILL_AFTER_TICKS = 20  # without a skill nothing moves: the video repeats its last picture
 FRAME_REUSE_S = 0.1  # observation cameras are rendered on demand, at most at 10 Hz
 
@@ -74,19 +68,7 @@ class Episode:
     truncated: bool
 
 
-@dataclass(slots=True)
-class _Active:
-    skill: Skill
-    goal: Goal
-    on_end: Callable[[SkillEnded], None]
-    began_tick: int
-    withheld: int = 0
-    withheld_in_a_row: int = 0
-    clamped: int = 0
-    detail: str = ""
-
-
-class SimRunner(RunnerBase):
+class SimRunner(SkillRunner):
     """`seed + i` seeds episode i. `episodes` None plays one endless episode (the live runner). `judge` ends an episode when it
     returns True; `max_steps` truncates it."""
 
@@ -117,22 +99,15 @@ class SimRunner(RunnerBase):
         self._video_camera = video_camera
         self._video_every = video_every
         self._video_picture: Any = None
-        self._mailbox = Mailbox()
         self._env: Environment | None = None
         self._envelope: Envelope | None = None
-        self._active: _Active | None = None
         self._targets: dict[str, float] = {}  # last joint targets, rad
         self._idle_ticks = 0
-        self._stopping = False
         self._reset_due = True
         self._episode_idx = 0
         self._step_idx = 0
         self._snapshots: dict[str, Snapshot] = {}
-        self.world: WorldState | None = None  # the newest; replaced, never changed
         self.episodes: list[Episode] = []
-        self.violations: deque[str] = deque(maxlen=VIOLATIONS_KEPT)
-        self.progress = Progress(0.0, "idle")  # replaced whole: the event loop may read it any time
-        self.caption: tuple[str, ...] = ()
 
     # -- life --------------------------------------------------------------------------------------------------------
     def activate(self) -> None:
@@ -145,47 +120,11 @@ class SimRunner(RunnerBase):
             self._env.close()
             self._env = None
 
-    def request_stop(self) -> None:
-        """Any thread: the run ends before its next tick."""
-        self._stopping = True
-
-    @property
-    def mailbox(self) -> Mailbox:
-        return self._mailbox
-
     @property
     def env(self) -> Environment:
         if self._env is None:
             raise InternalError("the simulator is not active")
         return self._env
-
-    # -- the skill that has the arm --------------------------------------------------------------------------------------
-    def begin_skill(self, skill: Skill, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
-        """Control thread. Raises InternalError when another skill has the arm."""
-        if self._active is not None:
-            raise InternalError("another skill has the arm")
-        self._active = _Active(skill, goal, on_end, self.tick_idx)
-        self.traceparent = goal.traceparent
-        self.progress = Progress(0.0, "running")
-
-    def end_skill(self) -> None:
-        """Control thread: take the arm back without a word to anybody; it holds. Repeatable."""
-        self._active = None
-        self.traceparent = None
-        self.progress = Progress(0.0, "idle")
-
-    def _end(self, ended: SkillEnded) -> None:
-        if (active := self._active) is None:
-            return
-        self._active = None
-        self.traceparent = None
-        self.progress = Progress(1.0 if ended.error is None else self.progress.fraction, "ended")
-        ticks = {
-            "ticks": self.tick_idx - active.began_tick,
-            "withheld": active.withheld,
-            "clamped": active.clamped,
-        }
-        active.on_end(SkillEnded({**ticks, **ended.data}, ended.error))
 
     # -- pictures -----------------------------------------------------------------------------------------------------
     def camera_names(self) -> tuple[str, ...]:
@@ -208,9 +147,8 @@ class SimRunner(RunnerBase):
 
     # -- one tick -----------------------------------------------------------------------------------------------------
     def _finished(self) -> bool:
-        return self._stopping or (
-            self._episodes_wanted is not None and len(self.episodes) >= self._episodes_wanted
-        )
+        played = len(self.episodes)
+        return super()._finished() or (self._episodes_wanted is not None and played >= self._episodes_wanted)
 
     def _success(self) -> bool | None:
         judged = [episode.success for episode in self.episodes if episode.success is not None]
@@ -245,67 +183,10 @@ class SimRunner(RunnerBase):
             self._ask_skill(active, world, decision)  # 5, 6
         return decision
 
-    def _ask_skill(self, active: _Active, world: WorldState, decision: Decision) -> None:
-        asked_s = self.clock.now_s()
-        try:
-            with telemetry.span(telemetry.SPAN_INFERENCE):
-                outcome = active.skill.step(world)
-        except VramError as error:
-            decision.safety_violations = (f"{error.code}: {error.message}",)
-            self.violations.append(decision.safety_violations[0])
-            self._end(SkillEnded({}, error))
-            return
-        except Exception as error:
-            log.exception("skill %s failed", active.goal.rskill_id)
-            self._end(SkillEnded({}, InternalError(f"the skill failed: {type(error).__name__}: {error}")))
-            return
-        decision.inference_ms = (self.clock.now_s() - asked_s) * 1e3
-        match outcome:
-            case Act(action=action, chunk_index=chunk_index):
-                decision.chunk_index = chunk_index
-                self._check(active, action, world, decision)
-            case Hold(reason=reason):
-                active.detail = reason
-            case Done(data=data):
-                self._end(SkillEnded(dict(data)))
-                return
-        if self._active is active:
-            self.progress = Progress(
-                min(max(active.skill.fraction, 0.0), 1.0),
-                "running",
-                self.tick_idx - active.began_tick,
-                active.detail,
-            )
-
-    def _check(self, active: _Active, action: Action, world: WorldState, decision: Decision) -> None:
-        checked_s = self.clock.now_s()
+    def _safety_gate(self) -> Envelope:
         if self._envelope is None:
             self._envelope = Envelope(self.env.joint_limits())
-        with telemetry.span(telemetry.SPAN_SAFETY):
-            allowed, problems = self._envelope.check(action, world)
-        decision.safety_ms = (self.clock.now_s() - checked_s) * 1e3
-        decision.safety_violations = problems
-        decision.action = allowed
-        self.violations.extend(problems)
-        if allowed is not None:
-            active.withheld_in_a_row = 0
-            active.clamped += bool(problems)
-            active.detail = ""
-            return
-        telemetry.event(telemetry.EVENT_ACTION_WITHHELD, reason=problems[0])
-        active.withheld += 1
-        active.withheld_in_a_row += 1
-        active.detail = f"withheld: {problems[0]}"
-        if active.withheld_in_a_row >= WITHHELD_IN_A_ROW_MAX:
-            self._end(
-                SkillEnded(
-                    {},
-                    ModelError(
-                        f"{active.withheld_in_a_row} actions in a row were withheld: {problems[0]}",
-                        hint="the skill commands what this robot's envelope forbids",
-                    ),
-                )
-            )
+        return self._envelope
 
     def _apply(self, decision: Decision) -> Applied:
         if decision.reset:

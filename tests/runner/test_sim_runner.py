@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from runner.protocols import Act, DeadlinePolicy, Done, Goal, Hold, SkillEnded, SkillKey, StepOutcome
-from runner.sim.sim_runner import WITHHELD_IN_A_ROW_MAX
+from runner.skill_runner import WITHHELD_IN_A_ROW_MAX
 from schemas.control import ControlMode
 from schemas.errors import Evicted, InternalError, ModelError
 from schemas.world import Action, WorldState

@@ -1,0 +1,163 @@
+"""`SkillRunner`: a control loop that gives the robot to at most one skill, and holds when there is none.
+
+What a simulator and a real robot have in common: work posted from the event loop between two ticks, the skill that has the arm, the
+safety gate that every action passes, progress and violations for whoever asks. Subclasses sense and apply. Everything runs on the
+control thread, but for what the event loop may read at any time (`progress`, `world`, `caption`: replaced whole, never changed).
+"""
+
+from __future__ import annotations
+
+import logging
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from runner import telemetry
+from runner.clock import Clock
+from runner.control import Mailbox
+from runner.loop import Decision, RunnerBase
+from runner.protocols import Act, DeadlinePolicy, Done, Goal, Hold, Progress, SafetyGate, Skill, SkillEnded
+from schemas.errors import InternalError, ModelError, VramError
+from schemas.world import Action, WorldState
+
+log = logging.getLogger(__name__)
+
+VIOLATIONS_KEPT = 256
+WITHHELD_IN_A_ROW_MAX = 15  # half a second of refused actions: the policy is lost, the goal fails
+
+
+@dataclass(slots=True)
+class _Active:
+    skill: Skill
+    goal: Goal
+    on_end: Callable[[SkillEnded], None]
+    began_tick: int
+    withheld: int = 0
+    withheld_in_a_row: int = 0
+    clamped: int = 0
+    detail: str = ""
+
+
+class SkillRunner(RunnerBase):
+    """A subclass provides `activate`, `_decide` (which calls `_ask_skill`), `_apply` and `_safety_gate`."""
+
+    def __init__(
+        self,
+        *,
+        rate_hz: float = 30.0,
+        deadline_policy: DeadlinePolicy = DeadlinePolicy.WARN,
+        clock: Clock | None = None,
+    ) -> None:
+        super().__init__(rate_hz=rate_hz, deadline_policy=deadline_policy, clock=clock)
+        self._mailbox = Mailbox()
+        self._active: _Active | None = None
+        self._stopping = False
+        self.world: WorldState | None = None  # the newest; replaced, never changed
+        self.violations: deque[str] = deque(maxlen=VIOLATIONS_KEPT)
+        self.progress = Progress(0.0, "idle")  # replaced whole: the event loop may read it any time
+        self.caption: tuple[str, ...] = ()
+
+    @abstractmethod
+    def _safety_gate(self) -> SafetyGate:
+        """What every action passes before it reaches a motor."""
+
+    def request_stop(self) -> None:
+        """Any thread: the run ends before its next tick."""
+        self._stopping = True
+
+    @property
+    def mailbox(self) -> Mailbox:
+        return self._mailbox
+
+    def _finished(self) -> bool:
+        return self._stopping
+
+    # -- the skill that has the arm --------------------------------------------------------------------------------------
+    def begin_skill(self, skill: Skill, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
+        """Control thread. Raises InternalError when another skill has the arm."""
+        if self._active is not None:
+            raise InternalError("another skill has the arm")
+        self._active = _Active(skill, goal, on_end, self.tick_idx)
+        self.traceparent = goal.traceparent
+        self.progress = Progress(0.0, "running")
+
+    def end_skill(self) -> None:
+        """Control thread: take the arm back without a word to anybody; it holds. Repeatable."""
+        self._active = None
+        self.traceparent = None
+        self.progress = Progress(0.0, "idle")
+
+    def _end(self, ended: SkillEnded) -> None:
+        if (active := self._active) is None:
+            return
+        self._active = None
+        self.traceparent = None
+        self.progress = Progress(1.0 if ended.error is None else self.progress.fraction, "ended")
+        ticks = {
+            "ticks": self.tick_idx - active.began_tick,
+            "withheld": active.withheld,
+            "clamped": active.clamped,
+        }
+        active.on_end(SkillEnded({**ticks, **ended.data}, ended.error))
+
+    # -- one tick ------------------------------------------------------------------------------------------------------
+    def _ask_skill(self, active: _Active, world: WorldState, decision: Decision) -> None:
+        asked_s = self.clock.now_s()
+        try:
+            with telemetry.span(telemetry.SPAN_INFERENCE):
+                outcome = active.skill.step(world)
+        except VramError as error:
+            decision.safety_violations = (f"{error.code}: {error.message}",)
+            self.violations.append(decision.safety_violations[0])
+            self._end(SkillEnded({}, error))
+            return
+        except Exception as error:
+            log.exception("skill %s failed", active.goal.rskill_id)
+            self._end(SkillEnded({}, InternalError(f"the skill failed: {type(error).__name__}: {error}")))
+            return
+        decision.inference_ms = (self.clock.now_s() - asked_s) * 1e3
+        match outcome:
+            case Act(action=action, chunk_index=chunk_index):
+                decision.chunk_index = chunk_index
+                self._check(active, action, world, decision)
+            case Hold(reason=reason):
+                active.detail = reason
+            case Done(data=data):
+                self._end(SkillEnded(dict(data)))
+                return
+        if self._active is active:
+            self.progress = Progress(
+                min(max(active.skill.fraction, 0.0), 1.0),
+                "running",
+                self.tick_idx - active.began_tick,
+                active.detail,
+            )
+
+    def _check(self, active: _Active, action: Action, world: WorldState, decision: Decision) -> None:
+        checked_s = self.clock.now_s()
+        with telemetry.span(telemetry.SPAN_SAFETY):
+            allowed, problems = self._safety_gate().check(action, world)
+        decision.safety_ms = (self.clock.now_s() - checked_s) * 1e3
+        decision.safety_violations = problems
+        decision.action = allowed
+        self.violations.extend(problems)
+        if allowed is not None:
+            active.withheld_in_a_row = 0
+            active.clamped += bool(problems)
+            active.detail = ""
+            return
+        telemetry.event(telemetry.EVENT_ACTION_WITHHELD, reason=problems[0])
+        active.withheld += 1
+        active.withheld_in_a_row += 1
+        active.detail = f"withheld: {problems[0]}"
+        if active.withheld_in_a_row >= WITHHELD_IN_A_ROW_MAX:
+            self._end(
+                SkillEnded(
+                    {},
+                    ModelError(
+                        f"{active.withheld_in_a_row} actions in a row were withheld: {problems[0]}",
+                        hint="the skill commands what this robot's envelope forbids",
+                    ),
+                )
+            )
