@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, ClassVar, NoReturn, Protocol, runtime_checkable
 
-from schemas.errors import CallerError, TransientError, VramError
+from schemas.errors import TransientError, VramError
 from schemas.manifest import RSkillManifest
 from schemas.world import Action, JointState, RunResult, SensorFrame, TickResult, WorldState
 
@@ -20,12 +20,6 @@ class DeadlineMissed(TransientError):
     """A tick took longer than its slot under the policy RAISE. Stays inside the runner's process."""
 
     code: ClassVar[str] = "deadline_missed"
-
-
-class EstopRequested(CallerError):
-    """The emergency stop is latched: nothing moves until the runner is started again by a person."""
-
-    code: ClassVar[str] = "estop_requested"
 
 
 class DeadlinePolicy(StrEnum):
@@ -194,7 +188,7 @@ class Hal(Protocol):
     """One robot's hardware, or its twin. All calls on the control thread; joint units are rad, whatever the hardware speaks.
 
     `send_action` takes one-step joint-position actions that have passed the safety gate. `estop` stops the motors as fast as this
-    hardware can, latches, and always raises EstopRequested; from then on `send_action` raises it too.
+    hardware can, latches, and always raises `schemas.errors.EstopRequested`; from then on `send_action` raises it too.
     """
 
     description: RobotDescription

@@ -202,6 +202,10 @@ class GoalRejected(CallerError):
     code = "goal_rejected"
 
 
+class EstopRequested(OperatorError):
+    code = "estop_requested"  # the emergency stop is latched: a person looks, then starts the runner again
+
+
 class FrameStale(TransientError):
     code = "frame_stale"  # no frame young enough: fail closed
 

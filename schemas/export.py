@@ -17,6 +17,7 @@ import schemas
 ROOTS: dict[str, str] = {
     "rskill": "schemas.manifest:RSkillManifest",
     "arbiter": "schemas.config:ArbiterConfig",
+    "robot": "schemas.robot:RobotEnvironment",
 }
 """Documents with a single root: name → `module:class`."""
 
