@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from clients.runner import RunnerClient, RunnerUnreachable
-from runner.__main__ import main, parse, sidecar_endpoint, sidecars_given
+from runner.__main__ import main, parse
+from runner.cli_common import sidecar_endpoint, sidecars_given
 from schemas.errors import ConfigError
 
 Run = Callable[[Any], Any]

@@ -1,0 +1,110 @@
+"""What the commands of `vram-runner` share: where the arbiter, the sidecars and the skills are, and how a signal ends a command."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import logging
+import os
+import signal
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from clients.configs import configs_folder
+from runner import frames
+from schemas.endpoints import program_endpoint
+from schemas.errors import ArbiterUnreachable, ConfigError
+
+log = logging.getLogger("runner")
+
+
+def positive(text: str) -> float:
+    """An argument that must be a positive number of seconds."""
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not positive")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """An argument that must be 0 or more."""
+    value = float(text)
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not 0 or more")
+    return value
+
+
+def add_serving_flags(parser: argparse.ArgumentParser) -> None:
+    """Flags of every command that serves goals."""
+    parser.add_argument(
+        "--skills", type=Path, nargs="+", action="extend", help="rskill.yaml files or folders of them"
+    )
+    parser.add_argument("--endpoint", help="where goals are served; default ipc://RUNTIME/runner.sock")
+    parser.add_argument("--arbiter", help="the arbiter's endpoint")
+    parser.add_argument("--no-arbiter", action="store_true", help="nobody arbitrates: mark no uses")
+    parser.add_argument(
+        "--sidecar", action="append", default=[], metavar="RSKILL=ENDPOINT",
+        help="where a policy's sidecar is; default ipc://RUNTIME/NAME.sock, NAME being what follows the first - of the skill's name",
+    )  # fmt: skip
+    parser.add_argument("--max-seconds", type=positive, help="stop by itself after so many seconds")
+
+
+def sidecar_endpoint(rskill_id: str, given: Mapping[str, str], environ: Mapping[str, str]) -> str:
+    """Where the policy of a skill is served: as given, else by its name, `OWNER/so101-grab` → `grab`."""
+    repository = rskill_id.rpartition("/")[2]
+    _, dash, rest = repository.partition("-")
+    return given.get(rskill_id) or program_endpoint(rest if dash else repository, environ, os.getuid())
+
+
+def sidecars_given(flags: list[str]) -> dict[str, str]:
+    """`RSKILL=ENDPOINT` flags as a map. Raises ConfigError."""
+    pairs = [flag.partition("=") for flag in flags]
+    if wrong := [flag for flag, (name, _, where) in zip(flags, pairs, strict=True) if not name or not where]:
+        raise ConfigError(f"--sidecar {wrong[0]} is not of the form RSKILL=ENDPOINT")
+    return {name: where for name, _, where in pairs}
+
+
+def warm_up() -> None:
+    """The first picture would otherwise wait for OpenCV's import."""
+    import cv2
+    import numpy as np
+
+    cv2.setNumThreads(1)
+    frames.encode(np.zeros((8, 8, 3), dtype=np.uint8), "png")
+
+
+async def connect_arbiter(endpoint: str | None, stack: contextlib.AsyncExitStack) -> Any:
+    """A plain client of the arbiter. A robot does not start half-safe: an arbiter that is missing is an error, said at once."""
+    from clients.aio import ArbiterClient
+
+    try:
+        return await stack.enter_async_context(ArbiterClient(endpoint, name="runner"))
+    except ArbiterUnreachable as error:
+        raise ArbiterUnreachable(
+            error.message, hint="start `vram-arbiter` first, or run with --no-arbiter", details=error.details
+        ) from error
+
+
+def default_skills() -> Path:
+    """Folder of the shipped manifests. Raises ConfigError where there is none."""
+    folder = configs_folder(os.environ) / "rskills"
+    if not folder.is_dir():
+        raise ConfigError(
+            f"no skills in {folder}", hint="name some with --skills, or set VRAM_ARBITER_CONFIGS"
+        )
+    return folder
+
+
+def install_signals(stopping: asyncio.Event) -> None:
+    """The first SIGTERM or SIGINT ends in order (the video is finished); a second one ends at once."""
+    loop = asyncio.get_running_loop()
+
+    def stop(number: signal.Signals) -> None:
+        log.info("%s: ending", number.name)
+        loop.remove_signal_handler(number)
+        stopping.set()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop, number)
