@@ -206,6 +206,10 @@ class EstopRequested(OperatorError):
     code = "estop_requested"  # the emergency stop is latched: a person looks, then starts the runner again
 
 
+class RobotFault(OperatorError):
+    code = "robot_fault"  # the robot's hardware does not answer, or answers nonsense: cables, power, calibration
+
+
 class FrameStale(TransientError):
     code = "frame_stale"  # no frame young enough: fail closed
 

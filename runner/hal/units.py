@@ -1,0 +1,52 @@
+"""The units that lerobot's robots speak, joint by joint, and rad. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class JointUnit(StrEnum):
+    """What one number of a robot means. The last two run from one end of the joint's calibrated range to the other."""
+
+    DEG = "deg"
+    RAD = "rad"
+    PERCENT = "0..100"
+    SIGNED_PERCENT = "-100..100"
+
+
+@dataclass(frozen=True, slots=True)
+class JointScale:
+    """One joint's numbers ↔ rad. `sign` -1 turns the direction round; `offset_rad` is added to angles (never to percentages)."""
+
+    unit: JointUnit
+    lower_rad: float
+    upper_rad: float
+    sign: int = 1
+    offset_rad: float = 0.0
+
+    def to_rad(self, value: float) -> float:
+        """What the robot says, in rad. Not clipped: a joint beyond its range is told as such."""
+        match self.unit:
+            case JointUnit.DEG:
+                return self.sign * math.radians(value) + self.offset_rad
+            case JointUnit.RAD:
+                return self.sign * value + self.offset_rad
+            case JointUnit.PERCENT:
+                share = value / 100.0
+            case JointUnit.SIGNED_PERCENT:
+                share = (value + 100.0) / 200.0
+        return self.lower_rad + (share if self.sign > 0 else 1.0 - share) * (self.upper_rad - self.lower_rad)
+
+    def from_rad(self, angle_rad: float) -> float:
+        """What to send for a target in rad."""
+        match self.unit:
+            case JointUnit.DEG:
+                return math.degrees((angle_rad - self.offset_rad) * self.sign)
+            case JointUnit.RAD:
+                return (angle_rad - self.offset_rad) * self.sign
+            case _:
+                share = (angle_rad - self.lower_rad) / (self.upper_rad - self.lower_rad)
+                share = share if self.sign > 0 else 1.0 - share
+                return 100.0 * share if self.unit is JointUnit.PERCENT else 200.0 * share - 100.0
