@@ -1,0 +1,32 @@
+"""From the description of a camera to its reader. Nothing is opened here; what can be wrong in the description is said here.
+
+A backend is a module with `make(config, clock, tee) -> SlotReader`, imported when a camera asks for it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+
+from runner.clock import Clock
+from runner.sensors.params import refuse_field
+from runner.sensors.slot import FrameTee, SlotReader
+from schemas.robot import SensorBackend, SensorReaderConfig
+
+BACKENDS: Mapping[SensorBackend, str] = {
+    SensorBackend.OPENCV_THREAD: "runner.sensors.opencv_thread",
+}
+"""Backend → module."""
+
+
+def make_reader(config: SensorReaderConfig, clock: Clock) -> SlotReader:
+    """The reader of one camera, not started. Raises ConfigError: backend not there, packages missing, parameters unknown or not needed."""
+    module = BACKENDS.get(config.backend)
+    if module is None:
+        known = ", ".join(BACKENDS)
+        raise refuse_field(config, "backend", f"{config.backend} is reserved; choose from {known}")
+    if config.publish_to_ros:
+        raise refuse_field(config, "publish_to_ros", "publishing is not there in this version")
+    tee: FrameTee | None = None
+    reader: SlotReader = importlib.import_module(module).make(config, clock, tee)
+    return reader

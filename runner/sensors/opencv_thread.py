@@ -1,0 +1,253 @@
+"""Cameras by OpenCV: a device of this machine, a video file, or a stream by URL (RTSP). One thread a camera.
+
+OpenCV works with one thread inside (`cv2.setNumThreads(1)`): the cores belong to the control loop and the models. A device or a stream that breaks
+off is opened again, a bounded number of times and ever more slowly; a file is paced at its own rate and ends.
+"""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+from urllib.parse import urlsplit, urlunsplit
+
+from pydantic import Field, model_validator
+
+from runner.clock import Clock
+from runner.sensors.params import BackendParams, read_params, refuse, require_module
+from runner.sensors.slot import Feed, FrameTee, SlotReader
+from schemas.robot import SensorReaderConfig
+from schemas.world import FrameEncoding, SensorFrame
+
+FPS_MAX = 1000.0
+RECONNECT_MAX_S = 8.0  # the pause between two tries doubles up to this
+STOP_S = 2.0  # how long `stop` waits for a driver; its thread then ends by itself, deaf
+URL_SCHEMES = ("rtsp", "rtsps")
+
+Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
+Pixels = Annotated[int, Field(gt=0, le=16_384)]
+
+
+class OpenCvParams(BackendParams):
+    """`backend_params` of `opencv_thread`: one of `device`, `path` and `url`, and what goes with it."""
+
+    device: Annotated[int, Field(ge=0, le=255)] | None = None
+    """Number of a camera of this machine: 0 is /dev/video0."""
+    path: Annotated[str, Field(min_length=1)] | None = None
+    """A video file, played at its own rate."""
+    url: Annotated[str, Field(min_length=1)] | None = None
+    """A stream: rtsp:// or rtsps://. A user and password in it never show up in messages."""
+    encoding: Literal["bgr8", "rgb8", "mono8"] = "bgr8"
+    width: Pixels | None = None
+    """Devices: ask for this size; what the camera really gives is what the frames say."""
+    height: Pixels | None = None
+    fps: Annotated[float, Field(gt=0, le=FPS_MAX, allow_inf_nan=False)] | None = None
+    """Devices: ask for this rate. Files: play at this one instead of the file's own."""
+    fourcc: Annotated[str, Field(min_length=4, max_length=4)] | None = None
+    """Devices: ask for this format, such as MJPG."""
+    loop: bool = False
+    """Files: begin again at the end."""
+    reconnect_tries: Annotated[int, Field(ge=0, le=100_000)] = 10
+    """Devices and URLs: so many failures in a row end the camera."""
+    reconnect_s: Seconds = 0.25
+    """Devices and URLs: pause before the first new try."""
+    timeout_s: Seconds = 5.0
+    """URLs: the longest that opening, or waiting for a picture, may take."""
+
+    @model_validator(mode="after")
+    def _fits_the_source(self) -> Self:
+        given = [name for name in ("device", "path", "url") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"give one of device, path and url, not {' and '.join(given) or 'none'}")
+        unneeded = self.model_fields_set - _NEEDED[given[0]] - {given[0], "encoding"}
+        if unneeded:
+            raise ValueError(f"not for a {given[0]}: {', '.join(sorted(unneeded))}")
+        if (self.width is None) != (self.height is None):
+            raise ValueError("width and height go together")
+        if self.url is not None and urlsplit(self.url).scheme not in URL_SCHEMES:
+            raise ValueError(f"url begins with one of {', '.join(f'{name}://' for name in URL_SCHEMES)}")
+        return self
+
+    @property
+    def label(self) -> str:
+        """How messages call the source."""
+        if self.device is not None:
+            return f"device {self.device}"
+        return self.path if self.path is not None else without_credentials(self.url or "")
+
+
+_NEEDED = {
+    "device": {"width", "height", "fps", "fourcc", "reconnect_tries", "reconnect_s"},
+    "path": {"fps", "loop"},
+    "url": {"reconnect_tries", "reconnect_s", "timeout_s"},
+}
+
+
+def without_credentials(url: str) -> str:
+    """The URL as it may stand in a log: without user, password and query."""
+    parts = urlsplit(url)
+    return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
+
+
+def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> SlotReader:
+    """A reader, not started. Raises ConfigError: parameters, a file that is not there, OpenCV not installed."""
+    params = read_params(config, OpenCvParams)
+    require_module(config, "cv2", "OpenCV", "runner")
+    if params.path is not None and not Path(params.path).is_file():
+        raise refuse(config, "path", f"there is no file {params.path}")
+    return OpenCvReader(config.sensor_id, config.max_age_ms, params, clock, tee)
+
+
+class OpenCvReader(SlotReader):
+    """One camera on a thread of its own, which alone touches its `cv2.VideoCapture`."""
+
+    def __init__(
+        self,
+        sensor_id: str,
+        max_age_ms: float,
+        params: OpenCvParams,
+        clock: Clock,
+        tee: FrameTee | None = None,
+    ) -> None:
+        super().__init__(sensor_id, max_age_ms, clock, tee)
+        self._params = params
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def _run_begins(self, feed: Feed) -> None:
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(
+            target=self._run, args=(feed, self._stopping), name=f"camera-{self.sensor_id}", daemon=True
+        )
+        self._thread.start()
+
+    def _run_ends(self) -> None:
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join(STOP_S)
+            self._thread = None
+
+    # -- on the camera's thread ---------------------------------------------------------------------------------
+    def _run(self, feed: Feed, stopping: threading.Event) -> None:
+        import cv2
+
+        cv2.setNumThreads(1)
+        try:
+            if self._params.path is not None:
+                self._play(cv2, feed, stopping)
+            else:
+                self._watch(cv2, feed, stopping)
+        finally:
+            feed.end(
+                "the thread of its reader broke down; its log says why"
+            )  # if nothing else was said before
+
+    def _watch(self, cv2: Any, feed: Feed, stopping: threading.Event) -> None:
+        """A device or a stream: read until it breaks off, open it again."""
+        params, failures = self._params, 0
+        while True:
+            capture = self._open(cv2)
+            opened, taken = capture.isOpened(), 0
+            try:
+                while opened and not stopping.is_set() and (frame := self._take(cv2, capture)) is not None:
+                    self.deliver(feed, frame)
+                    taken += 1
+            finally:
+                capture.release()
+            if stopping.is_set():
+                return
+            failures = 1 if taken else failures + 1
+            problem = "broke off" if taken else "gives no picture" if opened else "cannot be opened"
+            if failures > params.reconnect_tries:
+                feed.end(f"{params.label} {problem}, given up after {params.reconnect_tries} new tries")
+                return
+            feed.interrupt(f"{params.label} {problem}, new try {failures} of {params.reconnect_tries}")
+            if stopping.wait(min(params.reconnect_s * 2 ** min(failures - 1, 16), RECONNECT_MAX_S)):
+                return
+
+    def _play(self, cv2: Any, feed: Feed, stopping: threading.Event) -> None:
+        """A file: each picture at its time, as at the camera that took it. A late picture shifts the rest, nothing is caught up in a burst."""
+        params = self._params
+        while True:
+            capture = self._open(cv2)
+            taken = 0
+            try:
+                if not capture.isOpened():
+                    feed.end(f"{params.label} cannot be read as a video")
+                    return
+                fps = params.fps if params.fps is not None else float(capture.get(cv2.CAP_PROP_FPS))
+                if not 0 < fps <= FPS_MAX:
+                    feed.end(f"{params.label} names no rate to play it at; give fps")
+                    return
+                due_s = self.clock.now_s()
+                while not stopping.is_set() and (frame := self._take(cv2, capture)) is not None:
+                    self.deliver(feed, frame)
+                    taken += 1
+                    due_s = max(due_s + 1 / fps, self.clock.now_s())
+                    stopping.wait(due_s - self.clock.now_s())  # the last picture, too, stays for its time
+            finally:
+                capture.release()
+            if stopping.is_set():
+                return
+            if not taken or not params.loop:
+                feed.end(f"{params.label} is over after {taken} pictures")
+                return
+
+    def _open(self, cv2: Any) -> Any:
+        params = self._params
+        capture = cv2.VideoCapture()
+        if params.device is not None:
+            if capture.open(params.device):
+                self._ask(cv2, capture)
+        elif params.path is not None:
+            capture.open(params.path)
+        else:
+            timeout_ms = round(params.timeout_s * 1e3)
+            capture.open(
+                params.url,
+                cv2.CAP_FFMPEG,
+                [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, timeout_ms],
+            )
+        return capture
+
+    def _ask(self, cv2: Any, capture: Any) -> None:
+        params = self._params
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # a driver's queue only makes pictures older
+        if params.fourcc is not None:
+            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter_fourcc(*params.fourcc))
+        if params.width is not None and params.height is not None:
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, params.width)
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, params.height)
+        if params.fps is not None:
+            capture.set(cv2.CAP_PROP_FPS, params.fps)
+
+    def _take(self, cv2: Any, capture: Any) -> SensorFrame | None:
+        """The next picture, stamped when it arrived and before it is decoded; None if there is none."""
+        if not capture.grab():
+            return None
+        stamp_ns, wall_ns = self.clock.now_ns(), self.clock.wall_ns()
+        done, image = capture.retrieve()
+        if not done or image is None or not image.size:
+            return None
+        image = as_encoding(cv2, image, self._params.encoding)
+        height, width = image.shape[:2]
+        return SensorFrame(
+            sensor_id=self.sensor_id,
+            stamp_monotonic_ns=stamp_ns,
+            stamp_wall_ns=wall_ns,
+            encoding=FrameEncoding(self._params.encoding),
+            width=int(width),
+            height=int(height),
+            channels=1 if image.ndim == 2 else int(image.shape[2]),
+            data=image.tobytes(),
+        )
+
+
+def as_encoding(cv2: Any, image: Any, encoding: Literal["bgr8", "rgb8", "mono8"]) -> Any:
+    """An 8-bit picture of OpenCV (grey, or blue-green-red) in the layout of `encoding`."""
+    grey = image.ndim == 2 or image.shape[2] == 1
+    if encoding == "mono8":
+        return image.reshape(image.shape[:2]) if grey else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    if grey:
+        return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    return image if encoding == "bgr8" else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

@@ -1,0 +1,63 @@
+"""`backend_params` of a deployment file: read by the backend that they are for, refused with the name of the field otherwise.
+
+Everything here happens while a reader is made, before any device is opened.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from schemas.errors import ConfigError
+from schemas.robot import SensorReaderConfig
+from schemas.yamltext import Problem, config_error, parse_yaml, problems_of
+
+
+class BackendParams(BaseModel):
+    """Base of each backend's parameters. Strict: the text "0" is no device number."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True)
+
+
+def read_params[P: BackendParams](config: SensorReaderConfig, model: type[P]) -> P:
+    """The parameters of one camera. Raises ConfigError with every unknown, unneeded, missing or wrong one."""
+    try:
+        return model.model_validate(dict(config.backend_params))
+    except ValidationError as error:
+        empty = parse_yaml("", "")  # no text here, so no lines: who read the file knows them
+        known: Mapping[tuple[str | int, ...], list[str]] = {(): list(model.model_fields)}
+        found = [(p.field, p.problem) for p in problems_of(error, empty, known)]
+        raise _error(config, found) from error
+
+
+def refuse(config: SensorReaderConfig, field: str, problem: str) -> ConfigError:
+    """An error about one parameter, by its name below `backend_params` ("" for all of them)."""
+    return _error(config, [(field, problem)])
+
+
+def refuse_field(config: SensorReaderConfig, field: str, problem: str) -> ConfigError:
+    """An error about one field of the camera itself."""
+    return _named(config, [Problem(0, field, problem)])
+
+
+def require_module(config: SensorReaderConfig, module: str, distribution: str, extra: str) -> None:
+    """Raise ConfigError unless `module` can be imported; does not import it (heavy packages wait until they are used)."""
+    if importlib.util.find_spec(module) is None:
+        problem = f"{config.backend} needs {distribution}: pip install 'vram-arbiter[{extra}]'"
+        raise refuse_field(config, "backend", problem)
+
+
+def _error(config: SensorReaderConfig, found: list[tuple[str, str]]) -> ConfigError:
+    return _named(
+        config,
+        [Problem(0, f"backend_params.{field}" if field else "backend_params", text) for field, text in found],
+    )
+
+
+def _named(config: SensorReaderConfig, problems: list[Problem]) -> ConfigError:
+    error = config_error(f"sensor {config.sensor_id}", problems)
+    details: dict[str, Any] = {**error.details, "sensor_id": config.sensor_id}
+    return ConfigError(error.message, details=details)

@@ -1,0 +1,59 @@
+"""What machine this is, as far as decoding pictures goes: Tegra, a PC with an NVIDIA card, or a CPU alone.
+
+Looks at files that drivers and boards put there; loads no driver library, needs no permission and never fails. It says what the machine
+is, not whether a certain decoder is installed: whoever builds a pipeline checks that element by element.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+TEGRA_RELEASE = "etc/nv_tegra_release"
+BOARD = "proc/device-tree/compatible"  # NUL-separated texts, such as nvidia,p3737-0000 and nvidia,tegra234
+DRIVER = "proc/driver/nvidia/version"
+CARDS = "dev/nvidia[0-9]*"
+
+
+class Platform(StrEnum):
+    """Which family of decoders and converters fits."""
+
+    TEGRA = "tegra"
+    """Jetson: nvv4l2decoder and nvvidconv on NVMM memory."""
+    NVIDIA_DESKTOP = "nvidia_desktop"
+    """A PC or server with an NVIDIA card: nvh264dec and the like, plain videoconvert behind them."""
+    CPU_ONLY = "cpu_only"
+    """No NVIDIA device that this process can reach: software decoders."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlatformReport:
+    """The platform and the evidence for it, for people."""
+
+    platform: Platform
+    evidence: str
+
+
+def probe_platform(root: Path = Path("/")) -> PlatformReport:
+    """Look at the machine whose file system begins at `root`. Tegra is asked first: new Jetsons show a PC's device files as well."""
+    if (root / TEGRA_RELEASE).exists():
+        return PlatformReport(Platform.TEGRA, f"/{TEGRA_RELEASE} exists")
+    if board := next((text for text in _texts(root / BOARD) if text.startswith("nvidia,tegra")), None):
+        return PlatformReport(Platform.TEGRA, f"the board is {board}")
+    cards = sorted(path.name for path in root.glob(CARDS))
+    if cards:
+        return PlatformReport(Platform.NVIDIA_DESKTOP, f"/dev/{cards[0]} exists")
+    if (root / DRIVER).exists():
+        return PlatformReport(
+            Platform.CPU_ONLY, "the NVIDIA driver is loaded, but no card is visible to this process"
+        )
+    return PlatformReport(Platform.CPU_ONLY, "no NVIDIA device")
+
+
+def _texts(path: Path) -> tuple[str, ...]:
+    try:
+        raw = path.read_bytes()
+    except OSError:
+        return ()
+    return tuple(part.decode("ascii", "replace") for part in raw.split(b"\0") if part)
