@@ -102,12 +102,13 @@ class RunnerClient:
         prompt: str = "",
         goal_params: Mapping[str, Any] | None = None,
         deadline_s: float = 0.0,
+        max_ticks: int | None = None,
         goal_id: str | None = None,
         traceparent: str | None = None,
     ) -> Goal:
-        """Start a skill; returns once it is accepted. `deadline_s` 0 takes the manifest's.
+        """Start a skill; returns once it is accepted. `deadline_s` 0 takes the manifest's; `max_ticks` None sets no limit in ticks.
 
-        Raises GoalRejected (another goal runs), UnknownSkill, RunnerUnreachable.
+        Raises GoalRejected (another goal runs), EstopRequested, UnknownSkill, RunnerUnreachable.
         """
         name = goal_id or f"goal-{uuid.uuid4().hex[:12]}"
         if name in self._goals:
@@ -121,6 +122,8 @@ class RunnerClient:
             "goal_params": dict(goal_params or {}),
             "deadline_s": deadline_s,
         }
+        if max_ticks is not None:
+            fields["max_ticks"] = max_ticks
         if traceparent:
             fields["traceparent"] = traceparent
         try:
@@ -159,6 +162,10 @@ class RunnerClient:
 
     async def ping(self, *, timeout_s: float = 1.0) -> Message:
         return await self._exchange("ping", {}, timeout_s)
+
+    async def estop(self, reason: str = "") -> Message:
+        """Emergency stop. Returns once the motors have been told; raises InternalError when nobody knows whether they have."""
+        return await self._exchange("estop", {"reason": reason}, self._timeout_s)
 
     async def shutdown(self) -> None:
         await self._exchange("shutdown", {}, self._timeout_s)

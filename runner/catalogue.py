@@ -43,10 +43,18 @@ def read_manifests(paths: Iterable[Path]) -> list[RSkillManifest]:
 
 
 class Catalogue:
-    """`makers` says how a skill of a kind is made; kinds without a maker are listed but not executed."""
+    """`makers` says how a skill of a kind is made; kinds without a maker are listed but not executed. `refused` names what is installed
+    but not offered here, and why."""
 
-    def __init__(self, manifests: Iterable[RSkillManifest], makers: Mapping[Kind, Maker]) -> None:
+    def __init__(
+        self,
+        manifests: Iterable[RSkillManifest],
+        makers: Mapping[Kind, Maker],
+        *,
+        refused: Mapping[str, str] | None = None,
+    ) -> None:
         self._manifests = {manifest.name: manifest for manifest in manifests}
+        self._refused = dict(refused or {})
         self._makers = {kind: maker for kind, maker in makers.items() if kind in EXECUTABLE}
 
     def find(
@@ -55,6 +63,8 @@ class Catalogue:
         """Key, maker and manifest of an executable skill. Raises UnknownSkill, which says what there is."""
         manifest = self._manifests.get(rskill_id)
         runnable = [m.name for m in self._manifests.values() if m.kind in self._makers]
+        if (why := self._refused.get(rskill_id)) is not None:
+            raise UnknownSkill(f"{rskill_id} is not offered here: {why}")
         if manifest is None:
             raise UnknownSkill(
                 f"no skill {rskill_id!r} is installed", hint=f"choose from {', '.join(runnable)}"
@@ -72,6 +82,14 @@ class Catalogue:
     def deadline_s(self, manifest: RSkillManifest, asked_s: float) -> float:
         """Seconds a goal may take in all, from acceptance: as asked, else the manifest's time of motion and 90 s to get there."""
         return asked_s or (manifest.latency_budget.max_execution_s or MOTION_S) + START_S
+
+    def summary(self) -> list[str]:
+        """A line a skill, for people: name, version, licence, and whether a goal may execute it."""
+        lines = []
+        for manifest in self._manifests.values():
+            kind = "" if manifest.kind in self._makers else f", a {manifest.kind}: listed, not executed"
+            lines.append(f"{manifest.name} {manifest.version} ({manifest.license}){kind}")
+        return lines + [f"{name} is not offered: {why}" for name, why in self._refused.items()]
 
     def as_wire(self) -> list[dict[str, Any]]:
         """All manifests as plain maps, for a reasoner's palette."""

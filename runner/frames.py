@@ -34,12 +34,25 @@ class Snapshot:
     model: CameraModel | None = None
 
 
+class Picture(Protocol):
+    """What `Snapshot` is; its colours may be made late."""
+
+    @property
+    def rgb(self) -> Any: ...
+
+    @property
+    def stamp_ns(self) -> int: ...
+
+    @property
+    def model(self) -> CameraModel | None: ...
+
+
 class FrameSource(Protocol):
     """What the control thread offers; both are called on it."""
 
     def camera_names(self) -> tuple[str, ...]: ...
 
-    def snapshot(self, camera: str, max_age_s: float) -> Snapshot: ...
+    def snapshot(self, camera: str, max_age_s: float) -> Picture: ...
 
 
 def encode(rgb: Any, encoding: Encoding) -> bytes:
@@ -78,7 +91,7 @@ async def fetch(
             f"camera {name} has given no frame for {max(max_age_s, FIRST_FRAME_GRACE_S):.1f} s",
             hint="the control loop hangs or is overloaded",
         ) from None
-    data = await asyncio.to_thread(encode, taken.rgb, encoding)
+    data = await asyncio.to_thread(lambda: encode(taken.rgb, encoding))
     age_ms = (clock.now_ns() - taken.stamp_ns) / 1e6
     if age_ms > max_age_ms:
         raise FrameStale(

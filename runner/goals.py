@@ -26,10 +26,19 @@ from runner.clock import Clock
 from runner.control import ControlThread
 from runner.protocols import Goal, Progress, Skill, SkillEnded
 from runner.skills.residency import Residency
-from schemas.errors import BadRequest, BadState, GoalRejected, InternalError, UnknownOp, VramError
+from schemas.errors import (
+    BadRequest,
+    BadState,
+    EstopRequested,
+    GoalRejected,
+    InternalError,
+    UnknownOp,
+    VramError,
+)
 from schemas.goals import (
     RUNNER_REQUEST,
     CancelGoal,
+    EstopRunner,
     FeedbackPush,
     GetFrame,
     GetGroundTruth,
@@ -47,8 +56,9 @@ log = logging.getLogger(__name__)
 
 RESULTS_KEPT = 64
 FEEDBACK_PERIOD_S = 0.2  # at most five a second
+ESTOP_S = 1.0  # a control loop that has not obeyed by then hangs
 FEEDBACK_QUIET_S = 1.0  # said again after this long even if nothing changed
-OPS = ("goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "ping", "shutdown")
+OPS = ("goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "ping", "estop", "shutdown")
 
 Status = Literal["succeeded", "failed", "canceled", "deadline"]
 
@@ -62,6 +72,11 @@ class Robot(frames.FrameSource, Protocol):
     rate_hz: float
     tick_idx: int
     deadline_misses: int
+    estop: EstopRequested | None
+
+    def request_estop(self, reason: str) -> None: ...
+
+    def obey_estop(self) -> EstopRequested | None: ...
 
 
 @dataclass(slots=True)
@@ -72,6 +87,7 @@ class _Running:
     task: asyncio.Task[None] | None = None
     begun: bool = False
     canceled: bool = False
+    stopped_by: VramError | None = None
     skill: Skill | None = None
     phase: str = "acquiring"
     began_s: float = 0.0
@@ -93,6 +109,7 @@ class GoalServer:
         ground_truth: Callable[[], dict[str, Any]] | None = None,
         identity: dict[str, Any] | None = None,
         on_bound: Callable[[], None] | None = None,
+        stopping: asyncio.Event | None = None,
     ) -> None:
         self._endpoint = endpoint
         self._control = control
@@ -106,7 +123,7 @@ class GoalServer:
         self._running: _Running | None = None
         self._results: OrderedDict[str, ResultPush] = OrderedDict()
         self._server: RouterServer | None = None
-        self.stopping = asyncio.Event()
+        self.stopping = stopping or asyncio.Event()
         self.bound = asyncio.Event()
 
     async def serve(self) -> None:
@@ -129,6 +146,10 @@ class GoalServer:
                 await asyncio.gather(serving, stopping, ended, return_exceptions=True)
             if serving.done() and not serving.cancelled() and (error := serving.exception()) is not None:
                 raise error
+
+    def result_of(self, goal_id: str) -> ResultPush | None:
+        """How a goal ended; None while it has not, or if it never was accepted."""
+        return self._results.get(goal_id)
 
     # -- requests ------------------------------------------------------------------------------------------------------
     async def _handle(self, peer: Peer, message: Message) -> None:
@@ -179,11 +200,33 @@ class GoalServer:
                     "pid": os.getpid(),
                     "goal_id": self._running.goal.goal_id if self._running else None,
                 } | (self._identity)
+            case EstopRunner():
+                return await self._estop(request.reason or "on request")
             case ShutdownRunner():
                 return {}
         raise UnknownOp("unknown request", details={"known": [*OPS]})
 
+    async def _estop(self, reason: str) -> Message:
+        """Latched before anything else. Raises InternalError when the control loop does not say that it has obeyed."""
+        log.critical("emergency stop: %s", reason)
+        self._robot.request_estop(reason)
+        error = self._robot.estop
+        if (running := self._running) is not None and error is not None:
+            running.stopped_by = error
+            self._stop(running)
+        try:
+            async with asyncio.timeout(ESTOP_S):
+                error = await self._control.call(self._robot.obey_estop)
+        except TimeoutError:
+            raise InternalError(
+                f"the control loop has not obeyed the emergency stop within {ESTOP_S:.0f} s",
+                hint="cut the robot's power; the loop hangs, and moves nothing if it comes back",
+            ) from None
+        return {"reason": reason, "message": error.message if error is not None else ""}
+
     def _accept(self, peer: Peer, request: SendGoal) -> Message:
+        if self._robot.estop is not None:
+            raise self._robot.estop
         if (running := self._running) is not None:
             if running.goal.goal_id == request.goal_id and running.key == _identity(request):
                 if all(peer.identity != known.identity for known in running.peers):
@@ -208,6 +251,7 @@ class GoalServer:
             prompt=request.prompt,
             params=request.goal_params,
             deadline_s=self._catalogue.deadline_s(manifest, request.deadline_s),
+            max_ticks=request.max_ticks,
             traceparent=request.traceparent,
         )
         running = _Running(goal, _identity(request), [peer], began_s=self._clock.now_s())
@@ -250,6 +294,7 @@ class GoalServer:
             "rate_hz": robot.rate_hz,
             "ticks": robot.tick_idx,
             "deadline_misses": robot.deadline_misses,
+            "estop": robot.estop.message if robot.estop is not None else None,
             "cameras": list(robot.camera_names()),
         }
 
@@ -275,7 +320,7 @@ class GoalServer:
         except VramError as raised:
             error = raised
         except asyncio.CancelledError:  # our own cancel, or the server's end: the result still goes out
-            status = "canceled"
+            status, error = ("failed", running.stopped_by) if running.stopped_by else ("canceled", None)
         except Exception as raised:
             log.exception("goal %s failed", goal.goal_id)
             error = InternalError(f"{type(raised).__name__}: {raised}", hint="see the runner's log")

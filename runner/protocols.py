@@ -59,7 +59,7 @@ class SkillKey:
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """One accepted goal. `deadline_s` is already resolved (seconds from acceptance)."""
+    """One accepted goal. `deadline_s` is already resolved (seconds from acceptance); `max_ticks` counts ticks with the arm."""
 
     goal_id: str
     rskill_id: str
@@ -67,6 +67,7 @@ class Goal:
     prompt: str = ""
     params: Mapping[str, Any] = field(default_factory=dict)
     deadline_s: float = 0.0
+    max_ticks: int | None = None
     traceparent: str | None = None
 
 

@@ -18,7 +18,7 @@ from runner.clock import Clock
 from runner.control import Mailbox
 from runner.loop import Decision, RunnerBase
 from runner.protocols import Act, DeadlinePolicy, Done, Goal, Hold, Progress, SafetyGate, Skill, SkillEnded
-from schemas.errors import InternalError, ModelError, VramError
+from schemas.errors import EstopRequested, InternalError, LimitExceeded, ModelError, VramError
 from schemas.world import Action, WorldState
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ WITHHELD_IN_A_ROW_MAX = 15  # half a second of refused actions: the policy is lo
 
 
 @dataclass(slots=True)
-class _Active:
+class Active:
     skill: Skill
     goal: Goal
     on_end: Callable[[SkillEnded], None]
@@ -51,12 +51,13 @@ class SkillRunner(RunnerBase):
     ) -> None:
         super().__init__(rate_hz=rate_hz, deadline_policy=deadline_policy, clock=clock)
         self._mailbox = Mailbox()
-        self._active: _Active | None = None
+        self._active: Active | None = None
         self._stopping = False
         self.world: WorldState | None = None  # the newest; replaced, never changed
         self.violations: deque[str] = deque(maxlen=VIOLATIONS_KEPT)
         self.progress = Progress(0.0, "idle")  # replaced whole: the event loop may read it any time
         self.caption: tuple[str, ...] = ()
+        self.estop: EstopRequested | None = None  # latched for the life of the process
 
     @abstractmethod
     def _safety_gate(self) -> SafetyGate:
@@ -65,6 +66,21 @@ class SkillRunner(RunnerBase):
     def request_stop(self) -> None:
         """Any thread: the run ends before its next tick."""
         self._stopping = True
+
+    def request_estop(self, reason: str) -> None:
+        """Any thread: latch the emergency stop. The first reason stays. The control thread obeys before it moves anything again."""
+        if self.estop is None:
+            self.estop = EstopRequested(
+                f"emergency stop: {reason}",
+                hint="look at the robot, then start the runner again",
+                details={"reason": reason},
+            )
+
+    def obey_estop(self) -> EstopRequested | None:
+        """Control thread: end the skill and stop what moves, if the stop is latched; repeatable. Says what was done."""
+        if self.estop is not None:
+            self._end(SkillEnded({}, self.estop))
+        return self.estop
 
     @property
     def mailbox(self) -> Mailbox:
@@ -75,10 +91,12 @@ class SkillRunner(RunnerBase):
 
     # -- the skill that has the arm --------------------------------------------------------------------------------------
     def begin_skill(self, skill: Skill, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
-        """Control thread. Raises InternalError when another skill has the arm."""
+        """Control thread. Raises InternalError when another skill has the arm, EstopRequested when the stop is latched."""
+        if self.estop is not None:
+            raise self.estop
         if self._active is not None:
             raise InternalError("another skill has the arm")
-        self._active = _Active(skill, goal, on_end, self.tick_idx)
+        self._active = Active(skill, goal, on_end, self.tick_idx)
         self.traceparent = goal.traceparent
         self.progress = Progress(0.0, "running")
 
@@ -102,7 +120,14 @@ class SkillRunner(RunnerBase):
         active.on_end(SkillEnded({**ticks, **ended.data}, ended.error))
 
     # -- one tick ------------------------------------------------------------------------------------------------------
-    def _ask_skill(self, active: _Active, world: WorldState, decision: Decision) -> None:
+    def _ask_skill(self, active: Active, world: WorldState, decision: Decision) -> None:
+        if self.obey_estop() is not None:
+            return
+        limit = active.goal.max_ticks
+        if limit is not None and self.tick_idx - active.began_tick >= limit:
+            problem = f"not done within {limit} ticks"
+            self._end(SkillEnded({"truncated": True}, LimitExceeded(problem, details={"limit": "max_ticks"})))
+            return
         asked_s = self.clock.now_s()
         try:
             with telemetry.span(telemetry.SPAN_INFERENCE):
@@ -134,7 +159,7 @@ class SkillRunner(RunnerBase):
                 active.detail,
             )
 
-    def _check(self, active: _Active, action: Action, world: WorldState, decision: Decision) -> None:
+    def _check(self, active: Active, action: Action, world: WorldState, decision: Decision) -> None:
         checked_s = self.clock.now_s()
         with telemetry.span(telemetry.SPAN_SAFETY):
             allowed, problems = self._safety_gate().check(action, world)
@@ -147,10 +172,8 @@ class SkillRunner(RunnerBase):
             active.clamped += bool(problems)
             active.detail = ""
             return
-        telemetry.event(telemetry.EVENT_ACTION_WITHHELD, reason=problems[0])
-        active.withheld += 1
+        self._withheld(active, problems[0])
         active.withheld_in_a_row += 1
-        active.detail = f"withheld: {problems[0]}"
         if active.withheld_in_a_row >= WITHHELD_IN_A_ROW_MAX:
             self._end(
                 SkillEnded(
@@ -161,3 +184,9 @@ class SkillRunner(RunnerBase):
                     ),
                 )
             )
+
+    def _withheld(self, active: Active, reason: str) -> None:
+        """Note that nothing reaches the motors in this tick, and why."""
+        telemetry.event(telemetry.EVENT_ACTION_WITHHELD, reason=reason)
+        active.withheld += 1
+        active.detail = f"withheld: {reason}"

@@ -14,6 +14,8 @@ SPAN_INFERENCE = "inference"
 SPAN_SAFETY = "safety.check"
 SPAN_SEND = "hal.send_action"
 EVENT_DEADLINE_MISSED = "vram.event.deadline_missed"
+EVENT_ESTOP = "vram.event.estop_requested"
+EVENT_STALE = "vram.event.staleness_latched"
 EVENT_ACTION_WITHHELD = "vram.event.action_withheld"
 
 

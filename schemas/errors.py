@@ -207,11 +207,17 @@ class EstopRequested(OperatorError):
 
 
 class RobotFault(OperatorError):
-    code = "robot_fault"  # the robot's hardware does not answer, or answers nonsense: cables, power, calibration
+    code = (
+        "robot_fault"  # the robot's hardware does not answer, or answers nonsense: cables, power, calibration
+    )
 
 
 class FrameStale(TransientError):
     code = "frame_stale"  # no frame young enough: fail closed
+
+
+class StateStale(TransientError):
+    code = "state_stale"  # the robot does not say, or no longer, where its joints are: fail closed
 
 
 class UnknownSkill(CallerError):

@@ -27,6 +27,9 @@ class SendGoal(_Call):
     prompt: Annotated[str, Field(max_length=2000)] = ""
     goal_params: dict[str, Any] = Field(default_factory=dict)
     deadline_s: Seconds = 0.0
+    max_ticks: Annotated[int, Field(gt=0)] | None = (
+        None  # of motion; then it has failed with `limit_exceeded`
+    )
 
 
 class CancelGoal(_Call):
@@ -68,6 +71,13 @@ class PingRunner(_Call):
     op: Literal["ping"]
 
 
+class EstopRunner(_Call):
+    """Emergency stop: the motors stop, the goal fails with `estop_requested`, and no goal is accepted until the runner is started again."""
+
+    op: Literal["estop"]
+    reason: Annotated[str, Field(max_length=500)] = ""
+
+
 class ShutdownRunner(_Call):
     op: Literal["shutdown"]
 
@@ -81,6 +91,7 @@ RunnerRequest = Annotated[
     | GetSkills
     | GetGroundTruth
     | PingRunner
+    | EstopRunner
     | ShutdownRunner,
     Field(discriminator="op"),
 ]

@@ -19,6 +19,7 @@ from typing import Any, Protocol
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from clients.sidecar.policy import PolicyClient
+from runner.pictures import as_rgb
 from runner.protocols import Act, Done, Goal, Hold, StepOutcome
 from runner.skills.base import SkillBase
 from runner.skills.chunks import ChunkPlayer, Row
@@ -322,7 +323,7 @@ def _picture(frame: SensorFrame, view: View | None) -> Any:
     """RGB uint8, height × width × 3, cropped and averaged down as the policy was trained."""
     import numpy as np
 
-    picture = np.frombuffer(frame.data or b"", dtype=np.uint8).reshape(frame.height, frame.width, 3)
+    picture = as_rgb(frame)
     if view is None:
         return picture
     x0, y0, x1, y1 = view.crop

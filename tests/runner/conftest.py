@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import pytest
 from runner.protocols import DeadlinePolicy
 from runner.sim.sim_runner import SimRunner
 from schemas.world import CameraModel
+
+sys.path.insert(0, str(Path(__file__).parent))  # for the helpers beside it
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 

@@ -1,0 +1,25 @@
+"""`vram-runner estop`: the emergency stop of a running runner. Exits 0 only when the motors have been told."""
+
+from __future__ import annotations
+
+import argparse
+
+from clients.runner import RunnerClient
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
+    """The flags of `vram-runner estop`."""
+    estop = commands.add_parser(
+        "estop", help="stop a robot's motors; its runner refuses goals until it is started again"
+    )
+    estop.add_argument("--reason", default="", help="kept in the log and in every refusal")
+    estop.add_argument("--endpoint", help="the runner's endpoint; default ipc://RUNTIME/runner.sock")
+    return estop
+
+
+async def run(args: argparse.Namespace) -> int:
+    """Raises RunnerUnreachable when no runner answers, InternalError when its control loop does not."""
+    async with RunnerClient(args.endpoint) as runner:
+        reply = await runner.estop(args.reason)
+    print(reply["message"])
+    return 0

@@ -1,0 +1,163 @@
+"""What the robot knows of itself and its surroundings right now: joint state and camera frames, each fresh or said to be stale.
+
+Fails closed. A component that is older than it may be is `stale` in `diagnostics`, a camera's frame is gone from `image_frames`, and both
+stay so (latched) until RECOVERY_UPDATES fresh values have come in a row: a camera that flickers does not make the arm jerk. Nothing
+is ever filled in: without a single joint state there is no world state. Knows no sensor and no robot; any thread may call it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from schemas.errors import StateStale
+from schemas.world import Diagnostic, JointState, SensorFrame, WorldState
+
+JOINT_STATE = "joint_state"  # its name among the components; no camera may be called so
+RATE_HZ = 30.0
+JOINT_MAX_AGE_MS = 100.0
+RECOVERY_UPDATES = 3
+FUTURE_TOLERANCE_MS = 5.0  # a stamp further ahead is of another clock, and its age unknown
+EARLY = 0.25  # share of a period by which a caller may come early and still be on the cadence: ticks jitter
+
+
+@dataclass(slots=True)
+class _Component:
+    max_age_ns: int
+    stamp_ns: int | None = None
+    latched: bool = False
+    fresh_in_a_row: int = 0
+    why: str = "nothing has come from it yet"
+    note: str = ""  # why its last update failed, while it lives on the value before
+
+    def judge(self, now_ns: int) -> None:
+        """Latch it if its newest value is too old."""
+        if self.stamp_ns is None or (age_ns := now_ns - self.stamp_ns) <= self.max_age_ns:
+            return
+        if self.latched:  # the first reason says more than its growing age
+            self.fresh_in_a_row = 0
+            return
+        ages = f"{age_ns / 1e6:.0f} ms old, {self.max_age_ns / 1e6:.0f} ms are accepted"
+        self.latch(f"{self.note} ({ages})" if self.note else ages)
+
+    def latch(self, why: str) -> None:
+        self.latched, self.fresh_in_a_row, self.why = True, 0, why
+
+    def update(self, stamp_ns: int, now_ns: int) -> bool:
+        """Whether the value of this stamp is news that may be kept. A pause between two updates is judged by who looked meanwhile: a slow
+        loop asks rarely, and what it then measures is fresh."""
+        if stamp_ns - now_ns > FUTURE_TOLERANCE_MS * 1e6:
+            ahead_ms = (stamp_ns - now_ns) / 1e6
+            self.latch(
+                f"stamped {ahead_ms:.0f} ms in the future; stamps must be of this machine's monotonic clock"
+            )
+            return False
+        if self.stamp_ns is not None and stamp_ns <= self.stamp_ns:
+            return False  # the same value once more, or one that was overtaken
+        self.stamp_ns = stamp_ns
+        if now_ns - stamp_ns > self.max_age_ns:
+            self.judge(now_ns)
+            return True
+        self.note = ""
+        if self.latched:
+            self.fresh_in_a_row += 1
+            self.latched = self.fresh_in_a_row < RECOVERY_UPDATES
+        return True
+
+    @property
+    def stale(self) -> bool:
+        return self.latched or self.stamp_ns is None
+
+
+class WorldStateAggregator:
+    """`max_age_ms` names the cameras and how old their frames may get; `topics` says where cameras are published as well.
+
+    It has a cadence of its own: `due` says when cameras are to be read again, so that a loop of 200 Hz does not copy pictures 200 times a
+    second. Ages are judged at every snapshot, whatever the cadence.
+    """
+
+    def __init__(
+        self,
+        max_age_ms: Mapping[str, float],
+        *,
+        joint_max_age_ms: float = JOINT_MAX_AGE_MS,
+        topics: Mapping[str, str] | None = None,
+        rate_hz: float = RATE_HZ,
+    ) -> None:
+        if JOINT_STATE in max_age_ms:
+            raise ValueError(f"no camera may be called {JOINT_STATE}")
+        self._components = {name: _Component(round(age * 1e6)) for name, age in max_age_ms.items()}
+        self._joints = self._components[JOINT_STATE] = _Component(round(joint_max_age_ms * 1e6))
+        self._topics = dict(topics or {})
+        self._period_ns = round(1e9 / rate_hz)
+        self._next_ns: int | None = None
+        self._joint_state: JointState | None = None
+        self._frames: dict[str, SensorFrame] = {}
+        self._lock = threading.Lock()
+
+    def due(self, now_ns: int) -> bool:
+        """Whether the cadence wants the cameras read now; says yes once per slot, and skips slots that have passed."""
+        early_ns = round(self._period_ns * EARLY)
+        with self._lock:
+            if self._next_ns is None:
+                self._next_ns = now_ns
+            if now_ns < self._next_ns - early_ns:
+                return False
+            missed = max(0, now_ns - self._next_ns) // self._period_ns
+            self._next_ns += (missed + 1) * self._period_ns
+            return True
+
+    # -- what comes in ---------------------------------------------------------------------------------------------------
+    def update_joint_state(self, state: JointState, now_ns: int) -> None:
+        """A measurement, by its own stamp: a bus that repeats its last answer does not look alive."""
+        with self._lock:
+            if self._joints.update(state.stamp_ns, now_ns):
+                self._joint_state = state
+
+    def update_image_frame(self, frame: SensorFrame, now_ns: int) -> None:
+        """A frame of a known camera. Raises KeyError for another one: a camera without a known age cannot be judged."""
+        with self._lock:
+            if self._components[frame.sensor_id].update(frame.stamp_monotonic_ns, now_ns):
+                self._frames[frame.sensor_id] = frame
+
+    def lose(self, name: str, why: str) -> None:
+        """The source says that it has nothing that may be used: stale from now on, whatever its last value's age."""
+        with self._lock:
+            self._components[name].latch(why)
+
+    def note(self, name: str, why: str) -> None:
+        """An update failed. Its last value stands until it is too old; then this is why."""
+        with self._lock:
+            component = self._components[name]
+            component.note = why
+            if component.stamp_ns is None:
+                component.why = why
+
+    # -- what comes out --------------------------------------------------------------------------------------------------
+    def snapshot(self, now_ns: int) -> WorldState:
+        """Everything as of now. Raises StateStale when no joint state has ever come."""
+        with self._lock:
+            if self._joint_state is None:
+                raise StateStale(
+                    f"the robot has not said where its joints are: {self._joints.why}",
+                    hint="look at the robot's cables and power",
+                )
+            diagnostics: dict[str, Diagnostic] = {}
+            for name, component in self._components.items():
+                component.judge(now_ns)
+                diagnostics[name] = "stale" if component.stale else "ok"
+                if component.stale:
+                    self._frames.pop(name, None)
+            return WorldState(
+                stamp_ns=now_ns,
+                joint_state=self._joint_state,
+                images=self._topics,
+                image_frames=dict(self._frames),
+                diagnostics=diagnostics,
+            )
+
+    def why(self, name: str) -> str:
+        """Why a component is stale, or was last."""
+        with self._lock:
+            return self._components[name].why

@@ -1,0 +1,139 @@
+"""Real small parts of a robot for tests: a camera that shows what the test feeds it, a twin whose bus can fail, a skill that nods."""
+
+import asyncio
+from collections.abc import Callable
+
+from runner.clock import Clock
+from runner.hal.kinematic import KinematicTwin
+from runner.hal.so101 import so101
+from runner.protocols import Act, Done, Goal, StepOutcome
+from runner.sensors import Feed, SlotReader
+from runner.skills.base import SkillBase
+from schemas.control import ControlMode
+from schemas.errors import RobotFault
+from schemas.manifest import RSkillManifest
+from schemas.world import Action, FrameEncoding, JointState, SensorFrame, WorldState
+
+
+class FedCamera(SlotReader):
+    """Its source is the test: `show` is the camera's thread. With `always` it shows a new picture whenever it is looked at."""
+
+    def __init__(
+        self, sensor_id: str, clock: Clock, max_age_ms: float = 100.0, *, always: bool = True
+    ) -> None:
+        super().__init__(sensor_id, max_age_ms, clock)
+        self.always = always
+        self.feed: Feed | None = None
+
+    def _run_begins(self, feed: Feed) -> None:
+        self.feed = feed
+        self.show()
+
+    def _run_ends(self) -> None:
+        self.feed = None
+
+    def show(self) -> None:
+        assert self.feed is not None
+        self.deliver(
+            self.feed,
+            SensorFrame(
+                sensor_id=self.sensor_id,
+                stamp_monotonic_ns=self.clock.now_ns(),
+                stamp_wall_ns=self.clock.wall_ns(),
+                encoding=FrameEncoding.BGR8,
+                width=2,
+                height=1,
+                data=bytes([255, 0, 0, 0, 0, 255]),  # blue, then red
+            ),
+        )
+
+    def read_latest(self, max_age_ms: float | None = None) -> SensorFrame:
+        if self.always and self.feed is not None:
+            self.show()
+        return super().read_latest(max_age_ms)
+
+    def read_synced(self, deadline_ns: int) -> SensorFrame:
+        if self.always:
+            return self.read_latest()
+        return super().read_synced(deadline_ns)
+
+
+class Twin(KinematicTwin):
+    """The kinematic SO-101 on a bus that can be cut, with a list of what was sent."""
+
+    def __init__(self, clock: Clock) -> None:
+        super().__init__(so101(simulated=True), clock=clock)
+        self.silent = False
+        self.deaf = False
+        self.answers_lost = 0
+        self.sent: list[Action] = []
+        self.story: list[str] = []
+
+    def _open(self) -> None:
+        super()._open()
+        self.story.append("connect")
+
+    def _close(self) -> None:
+        super()._close()
+        self.story.append("disconnect")
+
+    def _halt(self) -> str:
+        self.story.append("halt")
+        return super()._halt()
+
+    def _read(self) -> JointState:
+        self.answers_lost -= 1
+        if self.silent or self.answers_lost >= 0:
+            raise RobotFault("no answer from motor 3", hint="look at the cable")
+        return super()._read()
+
+    def send_action(self, action: Action) -> None:
+        if self.deaf:
+            raise RobotFault("motor 2 takes nothing", hint="look at the cable")
+        super().send_action(action)
+        self.sent.append(action)
+
+
+class Nod(SkillBase):
+    """Moves the wrist a little with every step; ends after `steps`. `on_step` is asked first, with the world that the skill sees."""
+
+    def __init__(
+        self,
+        manifest: RSkillManifest,
+        *,
+        cameras: tuple[str, ...] = (),
+        steps: int | None = None,
+        on_step: Callable[[WorldState], None] | None = None,
+    ) -> None:
+        super().__init__(manifest)
+        self.cameras = cameras
+        self.steps = steps
+        self.on_step = on_step
+        self.taken = 0
+        self.begun = asyncio.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    async def _start(self, goal: Goal) -> None:
+        self.taken = 0
+        self.begun.clear()
+        self._loop = asyncio.get_running_loop()
+
+    def _step(self, world: WorldState) -> StepOutcome:
+        if self.on_step is not None:
+            self.on_step(world)
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self.begun.set)
+        self.taken += 1
+        if self.steps is not None:
+            self.fraction = min(1.0, self.taken / self.steps)
+            if self.taken > self.steps:
+                return Done({"nods": self.steps})
+        wrist = world.joint_state.position[world.joint_state.name.index("wrist_flex")]
+        return Act(
+            Action(
+                control_mode=ControlMode.JOINT_POSITION,
+                joint_targets=((wrist + (0.01 if self.taken % 2 else -0.01),),),
+                joint_names=("wrist_flex",),
+                stamp_ns=world.stamp_ns,
+            )
+        )

@@ -1,0 +1,187 @@
+"""Goals on a robot over a real socket: the emergency stop, cancels, pictures. Control thread and server as `vram-runner deploy` has them."""
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from small_robots import FedCamera, Nod, Twin
+
+from clients.runner import RunnerClient
+from runner.__main__ import main
+from runner.catalogue import Catalogue
+from runner.clock import SystemClock
+from runner.control import ControlThread
+from runner.goals import GoalServer
+from runner.hardware import HardwareRunner
+from runner.protocols import Goal
+from runner.safety import Envelope
+from schemas.errors import EstopRequested, FrameStale, InternalError
+from schemas.manifest import Kind, RSkillManifest, load_manifest
+from schemas.world import WorldState
+
+Run = Callable[[Any], Any]
+RSKILL = "vram-arbiter/so101-navigate"
+
+
+class Told(Nod):
+    """A nod that hangs in its start or in its step when the prompt says so."""
+
+    def __init__(self, manifest: RSkillManifest) -> None:
+        super().__init__(manifest, on_step=self._wait)
+        self.go_on = threading.Event()
+
+    async def _start(self, goal: Goal) -> None:
+        await super()._start(goal)
+        self.prompt = goal.prompt
+        if goal.prompt == "hang in the start":
+            self.begun.set()
+            await asyncio.Event().wait()
+
+    def _wait(self, world: WorldState) -> None:
+        if self.prompt == "hang in the step":
+            assert self._loop is not None
+            self._loop.call_soon_threadsafe(self.begun.set)
+            self.go_on.wait(60)
+
+
+class Bench:
+    def __init__(self, twin: Twin, camera: FedCamera, skill: Told, runner: HardwareRunner) -> None:
+        self.twin, self.camera, self.skill, self.runner = twin, camera, skill, runner
+
+
+@pytest.fixture
+def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
+    @asynccontextmanager
+    async def serving() -> AsyncIterator[tuple[Bench, RunnerClient]]:
+        clock = SystemClock()
+        twin, camera, skill = Twin(clock), FedCamera("front", clock), Told(load_manifest(navigate_manifest))
+        limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
+        runner = HardwareRunner(
+            twin,
+            [(camera, 100.0)],
+            lambda description, envelope: Envelope(limits),
+            rate_hz=200.0,
+            clock=clock,
+        )
+        catalogue = Catalogue([skill.manifest], {Kind.ROS_ACTION: lambda manifest: skill})
+        async with ControlThread(runner) as control:
+            server = GoalServer(endpoint, control, runner, catalogue, clock)
+            task = asyncio.create_task(server.serve())
+            await server.bound.wait()
+            try:
+                async with RunnerClient(endpoint) as client:
+                    yield Bench(twin, camera, skill, runner), client
+            finally:
+                skill.go_on.set()
+                server.stopping.set()
+                await task
+        assert twin.story[-1] == "disconnect"
+
+    return serving
+
+
+def play(run_async: Run, bench: Callable[..., Any], body: Callable[[Bench, RunnerClient], Any]) -> None:
+    async def scenario() -> None:
+        async with bench() as (b, client):
+            await body(b, client)
+
+    run_async(scenario())
+
+
+@pytest.mark.parametrize("prompt", ["nod", "hang in the start"])
+def test_the_stop_fails_the_goal_and_refuses_new_ones(bench: Any, run_async: Run, prompt: str) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt=prompt)
+        await b.skill.begun.wait()
+        reply = await client.estop("a hand is in the way")
+        assert "a hand is in the way; all joints stand still" in reply["message"]
+        assert b.twin.story == ["connect", "halt"]
+        sent = len(b.twin.sent)
+        result = await goal.result(60)
+        assert (result["status"], result["success"], result["code"]) == ("failed", False, "estop_requested")
+        with pytest.raises(EstopRequested, match="a hand is in the way"):
+            await client.send_goal(RSKILL, prompt="nod")
+        state = await client.state()
+        assert "a hand is in the way" in state["estop"]
+        assert state["world"]["diagnostics"] == {
+            "front": "ok",
+            "joint_state": "ok",
+        }  # it can still be looked at
+        again = await client.estop("once more")
+        assert "a hand is in the way" in again["message"]
+        assert len(b.twin.sent) == sent
+
+    play(run_async, bench, body)
+
+
+def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(bench: Any, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        await client.send_goal(RSKILL, prompt="hang in the step")
+        await b.skill.begun.wait()
+        with pytest.raises(InternalError, match="cut the robot's power"):
+            await client.estop("it hangs")
+        with pytest.raises(EstopRequested):
+            await client.send_goal(RSKILL)
+        b.skill.go_on.set()
+        assert "stand still" in (await client.estop())["message"]
+        assert b.twin.sent == []  # what the step came back with was not sent
+
+    play(run_async, bench, body)
+
+
+def test_the_command_line_stops_the_robot(
+    bench: Any, run_async: Run, endpoint: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        argv = ["estop", "--reason", "smoke", "--endpoint", endpoint]
+        assert await asyncio.to_thread(main, argv) == 0
+        assert b.runner.estop is not None
+        assert b.twin.story == ["connect", "halt"]
+
+    play(run_async, bench, body)
+    assert "emergency stop: smoke; all joints stand still" in capfd.readouterr().out
+
+
+def test_a_canceled_goal_leaves_the_arm_where_it_was_sent(bench: Any, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="nod")
+        await b.skill.begun.wait()
+        await goal.cancel()
+        assert (await goal.result(60))["status"] == "canceled"
+        sent = len(b.twin.sent)
+        ticks = (await client.state())["ticks"]
+        while (await client.state())["ticks"] < ticks + 5:
+            pass
+        assert len(b.twin.sent) == sent
+        assert (await client.state())["estop"] is None
+
+    play(run_async, bench, body)
+
+
+def test_a_goal_is_limited_in_ticks(bench: Any, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="nod", max_ticks=4)
+        result = await goal.result(60)
+        assert (result["status"], result["code"], result["data"]["ticks"]) == ("failed", "limit_exceeded", 4)
+
+    play(run_async, bench, body)
+
+
+@pytest.mark.heavy
+def test_pictures_go_out_in_their_colours_and_a_dead_camera_gives_none(bench: Any, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        import cv2
+        import numpy as np
+
+        reply = await client.frame("front", encoding="png")
+        picture = cv2.imdecode(np.frombuffer(reply["data"], dtype=np.uint8), cv2.IMREAD_COLOR)
+        assert picture.tolist() == [[[255, 0, 0], [0, 0, 255]]]
+        b.camera.stop()
+        with pytest.raises(FrameStale, match="stopped"):
+            await client.frame("front", max_age_ms=60_000)
+
+    play(run_async, bench, body)
