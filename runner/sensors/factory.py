@@ -15,6 +15,7 @@ from schemas.robot import SensorBackend, SensorReaderConfig
 
 BACKENDS: Mapping[SensorBackend, str] = {
     SensorBackend.OPENCV_THREAD: "runner.sensors.opencv_thread",
+    SensorBackend.GSTREAMER: "runner.sensors.gstreamer",
 }
 """Backend → module."""
 

@@ -102,3 +102,81 @@ def test_python_can_be_chosen(project: Path) -> None:
     (project / "bin" / "python3.13").symlink_to(sys.executable)
     result = set_up(project, "core", PYTHON=os.path.realpath(sys.executable))
     assert f"making .venv-core with {os.path.realpath(sys.executable)}" in result.stderr
+
+
+@pytest.fixture
+def full(project: Path) -> Path:
+    """`.ci/setup full` gets as far as the packages here: its uv makes an environment and keeps a log, nothing is installed."""
+    log = project / "log"
+    script(
+        project,
+        "uv",
+        f'[ "$1" = --version ] && exit 0; echo "uv $*" >>{log}; case "$*" in *,gstreamer*) [ ! -e {project}/unbuildable ] || exit 1 ;; esac; '
+        f'[ "$1" != venv ] || {{ mkdir -p "${{@: -1}}/bin"; ln -s {sys.executable} "${{@: -1}}/bin/python"; }}',
+    )
+    for tool in ("mkdir", "ln", "touch"):
+        (project / "bin" / tool).symlink_to(str(shutil.which(tool)))
+    (project / "bin" / "python3.12").symlink_to(sys.executable)
+    script(project, "id", f"echo $(<{project}/uid)")
+    (project / "uid").write_text("1000\n", encoding="utf-8")
+    script(project, "pkg-config", f"[ -e {project}/headers ]")
+    script(project, "dpkg", f"[ -e {project}/headers ]")
+    script(
+        project,
+        "apt-get",
+        f'echo "apt-get $*" >>{log}; [ ! -e {project}/offline ] || exit 100; touch {project}/headers',
+    )
+    return project
+
+
+def installed(project: Path) -> list[str]:
+    lines = (project / "log").read_text(encoding="utf-8").splitlines()
+    return [line.rpartition(" ")[2] for line in lines if line.startswith("uv pip")]
+
+
+def test_without_gstreamer_everything_else_is_installed_and_what_is_missing_is_said(full: Path) -> None:
+    result = set_up(full, "full")
+    assert result.returncode == 0, result.stderr
+    assert "cameras through GStreamer are left out" in result.stderr
+    assert "sudo apt-get install gcc libc6-dev pkg-config libgirepository1.0-dev" in result.stderr
+    assert installed(full) == [".[all,dev]"]
+    assert "apt-get" not in (full / "log").read_text(encoding="utf-8"), "only root may"
+
+
+def test_libraries_that_came_later_are_a_reason_to_begin_again(full: Path) -> None:
+    assert set_up(full, "full").returncode == 0
+    assert set_up(full, "full").returncode == 0
+    assert installed(full) == [".[all,dev]"]
+    (full / "headers").touch()
+    result = set_up(full, "full")
+    assert result.returncode == 0, result.stderr
+    assert installed(full) == [".[all,dev]", ".[all,dev,gstreamer]"]
+    assert set_up(full, "full").returncode == 0
+    assert len(installed(full)) == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="apt is Linux's")
+def test_root_gets_the_libraries_by_apt(full: Path) -> None:
+    (full / "uid").write_text("0\n", encoding="utf-8")
+    result = set_up(full, "full")
+    assert result.returncode == 0, result.stderr
+    assert "left out" not in result.stderr
+    first, second = [
+        line for line in (full / "log").read_text(encoding="utf-8").splitlines() if line.startswith("apt-get")
+    ][:2]
+    assert first == "apt-get update -qq"
+    assert second.startswith("apt-get install -y -qq")
+    assert "gstreamer1.0-plugins-good" in second
+    assert installed(full) == [".[all,dev,gstreamer]"]
+
+
+@pytest.mark.parametrize("trouble", ["offline", "unbuildable"])
+def test_trouble_with_gstreamer_stops_nothing_else(full: Path, trouble: str) -> None:
+    (full / "uid").write_text("0\n", encoding="utf-8")
+    (full / trouble).touch()
+    result = set_up(full, "full")
+    if trouble == "offline" and "installing EGL" in result.stderr:
+        pytest.skip("this machine lacks EGL, too, and that is wanted")
+    assert result.returncode == 0, result.stderr
+    assert "cameras through GStreamer are left out" in result.stderr
+    assert installed(full)[-1] == ".[all,dev]"

@@ -1,0 +1,25 @@
+"""Where GStreamer's binding is not installed, a camera that wants it is refused with what to install."""
+
+import subprocess
+import sys
+
+CODE = """
+import sys
+sys.modules["gi"] = None  # what an import finds where it is not installed
+from runner.clock import SystemClock
+from runner.sensors.gstreamer import make
+from schemas.errors import ConfigError
+from schemas.robot import SensorReaderConfig
+try:
+    make(SensorReaderConfig(sensor_id="wrist", backend="gstreamer", backend_params={"source": "test"}), SystemClock(), None)
+except ConfigError as error:
+    print(error.message)
+"""
+
+
+def test_it_says_what_to_install() -> None:
+    result = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+    assert "sensor wrist" in result.stdout
+    assert "GStreamer cannot be used here" in result.stdout
+    assert "vram-arbiter[gstreamer]" in result.stdout
