@@ -1,7 +1,8 @@
 """The gate before the motors: joint limits, base speeds, finite numbers. Every action passes it, whoever made it.
 
 A small excess (a learnt policy aims at a stop) is clamped and said; a large one is withheld. Knows joint names and limits, not
-robots or skills.
+robots or skills, nor who holds which memory of a card: no eviction weakens it. `Envelope` is the simulator's gate; a robot's is
+`runner.robot_gate.RobotGate`, which looks at speed, workspace and effort as well.
 """
 
 from __future__ import annotations

@@ -1,0 +1,226 @@
+"""What one robot may do now: its own limits, tightened by the deployment file's `safety` and by the skill's `envelope`.
+
+Pure. Envelopes are intersected: of two numbers the smaller counts, of two boxes what both contain, of zones all. None of them can widen
+what the robot itself allows. What an envelope asks for and this runner cannot keep is either refused (a workspace without kinematics) or
+listed in `unkept`, for the operator to read before the robot moves; it is never dropped in silence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Protocol
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from runner.protocols import RobotDescription
+from schemas.errors import ConfigError
+from schemas.manifest.contracts import SafetyEnvelope
+from schemas.yamltext import Problem, config_error
+
+Vector3 = tuple[float, float, float]
+EVERYWHERE: tuple[Vector3, Vector3] = ((-math.inf, -math.inf, -math.inf), (math.inf, math.inf, math.inf))
+
+POSITIVE = (
+    "max_ee_speed_m_s",
+    "max_joint_speed_factor",
+    "max_force_n",
+    "max_torque_nm",
+    "contact_force_threshold_n",
+    "max_cartesian_step_m",
+)
+"""Fields that the gate keeps; a NaN or a zero among them would switch a check off or stop everything."""
+NEEDS_KINEMATICS = (
+    "workspace_box_min_xyz",
+    "workspace_box_max_xyz",
+    "no_go_zones",
+    "max_ee_speed_m_s",
+    "max_cartesian_step_m",
+)
+KEPT_ELSEWHERE = ("e_stop_topic", "e_stop_qos")  # `vram-runner estop` instead of a topic
+NO_BASE = ("max_base_linear_speed_m_s", "max_base_angular_speed_rad_s")  # base motion is refused altogether
+
+
+class Kinematics(Protocol):
+    """Where an arm's parts are. Joints in rad by name, points in metres in the arm's base frame."""
+
+    gripper_lever_m: float
+    """From the gripper's axis to its pads: torque over this is the force at the pads."""
+
+    def points(self, joints: Mapping[str, float]) -> Mapping[str, Vector3]:
+        """`tool` (between the fingers) and further points along the arm that must keep out of no-go zones."""
+        ...
+
+
+# -- zones ----------------------------------------------------------------------------------------------------------------
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Zone(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    name: str = ""
+
+
+class BoxZone(_Zone):
+    """A box along the axes of the arm's base frame, in metres."""
+
+    min_xyz: tuple[Finite, Finite, Finite]
+    max_xyz: tuple[Finite, Finite, Finite]
+
+    def depth_m(self, point: Vector3) -> float:
+        """How far inside; negative or 0 outside."""
+        sides = zip(point, self.min_xyz, self.max_xyz, strict=True)
+        return min(min(value - low, high - value) for value, low, high in sides)
+
+
+class BallZone(_Zone):
+    """A ball in the arm's base frame, in metres."""
+
+    center_xyz: tuple[Finite, Finite, Finite]
+    radius_m: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+    def depth_m(self, point: Vector3) -> float:
+        return self.radius_m - math.dist(point, self.center_xyz)
+
+
+Zone = BoxZone | BallZone
+_ZONE: TypeAdapter[Zone] = TypeAdapter(Zone)
+
+
+def outside_m(box: tuple[Vector3, Vector3], point: Vector3) -> float:
+    """How far a point is outside a box; 0 inside."""
+    sides = zip(point, *box, strict=True)
+    return math.hypot(*(max(low - value, value - high, 0.0) for value, low, high in sides))
+
+
+# -- limits ---------------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Radians, metres, seconds, newtons. Infinite: nobody limits it."""
+
+    joints_rad: Mapping[str, tuple[float, float]]
+    speeds_rad_s: Mapping[str, float]
+    box: tuple[Vector3, Vector3] = EVERYWHERE
+    zones: tuple[Zone, ...] = ()
+    ee_speed_m_s: float = math.inf
+    ee_step_m: float = math.inf
+    torque_nm: float = math.inf
+    force_n: float = math.inf
+    contact_force_n: float = math.inf
+    unkept: tuple[str, ...] = field(default=())
+
+    @property
+    def needs_kinematics(self) -> bool:
+        return self.box != EVERYWHERE or bool(self.zones) or min(self.ee_speed_m_s, self.ee_step_m) < math.inf
+
+
+def own_limits(robot: RobotDescription) -> Limits:
+    """What the robot itself allows."""
+    return Limits(
+        joints_rad={joint.name: (joint.lower_rad, joint.upper_rad) for joint in robot.joints},
+        speeds_rad_s={joint.name: joint.max_speed_rad_s for joint in robot.joints},
+    )
+
+
+def tighten(
+    limits: Limits,
+    robot: RobotDescription,
+    envelope: SafetyEnvelope,
+    name: str,
+    kinematics: Kinematics | None,
+) -> Limits:
+    """`limits` and `envelope`, both. `name` says whose envelope it is, for errors: `safety`, `envelope of lerobot/grab`.
+
+    Raises ConfigError for numbers that limit nothing, an empty workspace, a zone that nobody can read, and a workspace, zone or tool
+    speed that was asked for where the robot has no kinematics.
+    """
+    _refuse_what_is_wrong(limits, envelope, name, kinematics)
+    box = _intersection(limits.box, envelope)
+    factor = min(envelope.max_joint_speed_factor, 1.0)
+    tightened = replace(
+        limits,
+        speeds_rad_s={
+            joint.name: min(limits.speeds_rad_s[joint.name], joint.max_speed_rad_s * factor)
+            for joint in robot.joints
+        },
+        torque_nm=min(limits.torque_nm, envelope.max_torque_nm),
+        force_n=min(limits.force_n, envelope.max_force_n),
+        contact_force_n=min(limits.contact_force_n, envelope.contact_force_threshold_n),
+        unkept=(*limits.unkept, *_unkept(envelope, name, kinematics)),
+    )
+    if kinematics is None:
+        return tightened
+    return replace(
+        tightened,
+        box=box,
+        zones=(*limits.zones, *(_ZONE.validate_python(zone) for zone in envelope.no_go_zones)),
+        ee_speed_m_s=min(limits.ee_speed_m_s, envelope.max_ee_speed_m_s),
+        ee_step_m=min(limits.ee_step_m, envelope.max_cartesian_step_m or math.inf),
+    )
+
+
+def _refuse_what_is_wrong(
+    limits: Limits, envelope: SafetyEnvelope, name: str, kinematics: Kinematics | None
+) -> None:
+    problems = []
+    for key in POSITIVE:
+        value = getattr(envelope, key)
+        if value is not None and not value > 0:  # NaN too
+            problems.append(Problem(0, f"{name}.{key}", f"must be above 0, not {value}"))
+    low, high = _intersection(limits.box, envelope)
+    for axis, least, most in zip("xyz", low, high, strict=True):
+        if least > most:
+            problems.append(
+                Problem(
+                    0, f"{name}.workspace_box_min_xyz", f"the workspace is empty: {axis} {least} > {most}"
+                )
+            )
+    for index, zone in enumerate(envelope.no_go_zones):
+        try:
+            _ZONE.validate_python(zone)
+        except ValidationError:
+            problems.append(
+                Problem(
+                    0, f"{name}.no_go_zones[{index}]", "give min_xyz and max_xyz, or center_xyz and radius_m"
+                )
+            )
+    if kinematics is None:
+        asked = [key for key in NEEDS_KINEMATICS if key in envelope.model_fields_set]
+        problems += [
+            Problem(0, f"{name}.{key}", "this robot has no kinematics, so this cannot be kept")
+            for key in asked
+            if getattr(envelope, key)
+        ]
+    if problems:
+        raise error_of(problems)
+
+
+def error_of(problems: list[Problem]) -> ConfigError:
+    return config_error("safety", problems)
+
+
+def _intersection(box: tuple[Vector3, Vector3], envelope: SafetyEnvelope) -> tuple[Vector3, Vector3]:
+    low = envelope.workspace_box_min_xyz or EVERYWHERE[0]
+    high = envelope.workspace_box_max_xyz or EVERYWHERE[1]
+    return _vector(map(max, box[0], low)), _vector(map(min, box[1], high))
+
+
+def _vector(values: Iterable[float]) -> Vector3:
+    x, y, z = values
+    return x, y, z
+
+
+def _unkept(envelope: SafetyEnvelope, name: str, kinematics: Kinematics | None) -> Sequence[str]:
+    """Fields that somebody wrote down and that this gate does not keep."""
+    kept = {*POSITIVE, *NEEDS_KINEMATICS, *KEPT_ELSEWHERE, *NO_BASE}
+    found = [
+        f"{name}.{key}"
+        for key in SafetyEnvelope.model_fields
+        if key in envelope.model_fields_set and key not in kept and getattr(envelope, key)
+    ]
+    if kinematics is None:
+        found.append(f"{name}.max_ee_speed_m_s (no kinematics of this robot)")
+        if "max_force_n" in envelope.model_fields_set:
+            found.append(f"{name}.max_force_n (no kinematics of this robot)")
+    return found

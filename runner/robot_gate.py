@@ -1,0 +1,317 @@
+"""A robot's gate: what `runner.safety` checks, and joint speed, workspace, no-go zones, tool speed, effort, and how fresh the state is.
+
+Every action passes it, whoever made it. What is a little too much is shortened and said, what is far too much is withheld: the robot
+then keeps its last targets. It judges by the measured state; where that is stale or incomplete nothing moves. `Action.safety_overrides`
+is not read: nobody who makes actions can switch a check off. Knows no skills, and nothing of the card's memory: no eviction weakens it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from runner.limits import EVERYWHERE, Kinematics, Limits, Vector3, outside_m, own_limits, tighten
+from runner.protocols import RobotDescription
+from runner.safety import CLAMP_TOLERANCE_RAD, Envelope
+from schemas.control import ControlMode
+from schemas.manifest.contracts import SafetyEnvelope
+from schemas.world import Action, WorldState
+
+MAX_STATE_AGE_S = 0.2  # an older joint state is not the robot's any more
+REFERENCE_AGE_S = (
+    0.2  # steps are measured from the last target while it is so young, else from where the robot is
+)
+LATE_MAX = 1.5  # a late tick's step may be so much longer, no more: the servo makes it as fast as it can
+MAX_FOLLOWING_ERROR_RAD = 0.8  # a joint so far behind its target is blocked; servos lag by 0.1 s at most
+OVERSPEED = 1.5  # a measured speed of so many times the limit is a fault, not a servo's overshoot
+EASE_FROM = 0.8  # from this share of an effort limit on, a joint is not told to push harder
+SHORTENED_MIN = 0.5  # a tool step that would have to shrink to less than this share is withheld
+SHORTENINGS_MAX = 20
+EPSILON = 1e-9
+
+Targets = dict[str, float]
+Verdict = tuple[Action | None, tuple[str, ...]]
+
+
+@dataclass(slots=True)
+class _Memory:
+    """What all gates of one robot share: the last targets that passed (rad, stamp) and the latch."""
+
+    last: dict[str, tuple[float, int]] = field(default_factory=dict)
+    tripped: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """One step in judgement. Joints in rad by name."""
+
+    measured: Mapping[str, float]
+    start: Mapping[str, float]  # where each commanded joint's step begins
+    elapsed_s: float
+    yielding: frozenset[str]
+
+
+class _Withheld(Exception):
+    """The one reason why nothing of an action is applied."""
+
+
+class RobotGate:
+    """`envelopes` by the name that errors use for them; each only tightens the robot's own limits (see `runner.limits`).
+
+    `needs` are the components of the world state that must be fresh, beside the joint state; None: all that are in it. Raises
+    ConfigError for envelopes that cannot be kept. `check` on the control thread, `trip` on any.
+    """
+
+    def __init__(
+        self,
+        robot: RobotDescription,
+        *,
+        rate_hz: float,
+        kinematics: Kinematics | None = None,
+        envelopes: Mapping[str, SafetyEnvelope | None] | None = None,
+        needs: frozenset[str] | None = None,
+        _base: tuple[Limits, _Memory] | None = None,
+    ) -> None:
+        self._robot = robot
+        self._period_s = 1.0 / rate_hz
+        self._kinematics = kinematics
+        self._needs = needs
+        limits, self._memory = _base or (own_limits(robot), _Memory())
+        for name, envelope in (envelopes or {}).items():
+            if envelope is not None:
+                limits = tighten(limits, robot, envelope, name, kinematics)
+        self.limits = limits
+        self._ranges = Envelope(limits.joints_rad)
+
+    def tightened(
+        self, name: str, envelope: SafetyEnvelope | None, needs: frozenset[str] | None = None
+    ) -> RobotGate:
+        """The gate for one goal: this one and the skill's envelope. Latch and last targets stay shared."""
+        return RobotGate(
+            self._robot,
+            rate_hz=1.0 / self._period_s,
+            kinematics=self._kinematics,
+            envelopes={name: envelope},
+            needs=self._needs if needs is None else needs,
+            _base=(self.limits, self._memory),
+        )
+
+    @property
+    def unkept(self) -> tuple[str, ...]:
+        """What the envelopes ask for and this gate does not keep: to be shown before the robot moves."""
+        return self.limits.unkept
+
+    def trip(self, reason: str) -> None:
+        """Latch: from now on nothing passes, until the program is started again."""
+        self._memory.tripped = self._memory.tripped or reason
+
+    # -- one action --------------------------------------------------------------------------------------------------------
+    def check(self, action: Action, world: WorldState) -> Verdict:
+        """The action to apply, possibly shortened, or None; and what was wrong with it."""
+        problems: list[str] = []
+        try:
+            allowed = self._judge(action, world, problems)
+        except _Withheld as reason:
+            return None, (str(reason), *problems)
+        return allowed, tuple(problems)
+
+    def _judge(self, action: Action, world: WorldState, problems: list[str]) -> Action:
+        """1. latch, freshness 2. form 3. ranges 4. measured state 5. efforts 6. joint speed 7. tool speed 8. workspace."""
+        if self._memory.tripped:
+            raise _Withheld(f"the emergency stop is latched: {self._memory.tripped}")
+        self._fresh(world)
+        names = self._form(action)
+        allowed, found = self._ranges.check(action, world)
+        problems += found
+        if allowed is None:
+            raise _Withheld(problems.pop(0))
+        measured = dict(zip(world.joint_state.name, world.joint_state.position, strict=True))
+        if missing := [name for name in self.limits.joints_rad if name not in measured]:
+            raise _Withheld(f"the state of {', '.join(missing)} is not measured")
+        self._speed_is_sound(world)
+        targets = dict(zip(names, allowed.rows[0], strict=True))
+        yielding = self._yield(targets, measured, world, problems)
+        motion = self._motion(targets, measured, yielding, world.stamp_ns)
+        self._joint_speed(targets, motion, problems)
+        self._tool_speed(targets, motion, problems)
+        self._workspace(targets, motion, problems)
+        for name, value in targets.items():
+            self._memory.last[name] = (value, world.stamp_ns)
+        row = tuple(targets[name] for name in names)
+        if row == action.rows[0]:
+            return action
+        return allowed.model_copy(update={"joint_targets": (row,)})
+
+    def _fresh(self, world: WorldState) -> None:
+        stale = [
+            name
+            for name in world.stale
+            if name == "joint_state" or self._needs is None or name in self._needs
+        ]
+        if stale:
+            raise _Withheld(f"stale: {', '.join(stale)}")
+        age_s = (world.stamp_ns - world.joint_state.stamp_ns) / 1e9
+        if age_s > MAX_STATE_AGE_S:
+            raise _Withheld(f"the joint state is stale: {age_s:.2f} s old")
+
+    def _form(self, action: Action) -> tuple[str, ...]:
+        if action.control_mode is ControlMode.BODY_TWIST:
+            raise _Withheld(f"{self._robot.name} has no base to drive")
+        if action.horizon != 1:
+            raise _Withheld(f"{action.horizon} steps at once: the gate passes one at a time")
+        names = action.joint_names or self._robot.joint_names
+        if len(set(names)) != len(names):
+            raise _Withheld("a joint is commanded twice")
+        return names
+
+    def _speed_is_sound(self, world: WorldState) -> None:
+        for name, speed in zip(world.joint_state.name, world.joint_state.velocity, strict=False):
+            limit = self.limits.speeds_rad_s.get(name, math.inf)
+            if abs(speed) > OVERSPEED * limit:
+                raise _Withheld(f"{name} moves at {speed:.2f} rad/s, the limit is {limit:.2f}")
+        for place, force in world.contact_forces.items():
+            if math.hypot(*force) > self.limits.contact_force_n:
+                raise _Withheld(
+                    f"{place}: {math.hypot(*force):.1f} N of contact, the limit is {self.limits.contact_force_n:g}"
+                )
+
+    # -- efforts -----------------------------------------------------------------------------------------------------------
+    def _yield(
+        self, targets: Targets, measured: Mapping[str, float], world: WorldState, problems: list[str]
+    ) -> frozenset[str]:
+        """Joints that push too hard get a target nearer to where they are. Withholding would keep up the pressure: targets stay."""
+        yielding = set()
+        for name, effort in zip(world.joint_state.name, world.joint_state.effort, strict=False):
+            limit = self._effort_limit_nm(name)
+            target = targets.get(name)
+            if target is None or abs(effort) <= EASE_FROM * limit:
+                continue
+            # what made this effort is the last target's distance; with less distance there is less effort
+            share = min(1.0, limit / abs(effort))
+            last = self._memory.last.get(name, (measured[name], 0))[0]
+            most = measured[name] + share * (last - measured[name])
+            if (target - most) * effort <= 0:
+                continue
+            low, high = self.limits.joints_rad[name]
+            targets[name] = min(max(most, low), high)
+            yielding.add(name)
+            problems.append(f"{name} pushes with {abs(effort):.2f} N·m, the limit is {limit:.2f}: it yields")
+        return frozenset(yielding)
+
+    def _effort_limit_nm(self, name: str) -> float:
+        gripper = any(joint.gripper for joint in self._robot.joints if joint.name == name)
+        if gripper and self._kinematics is not None:
+            return min(self.limits.torque_nm, self.limits.force_n * self._kinematics.gripper_lever_m)
+        return self.limits.torque_nm
+
+    # -- speeds ------------------------------------------------------------------------------------------------------------
+    def _motion(
+        self, targets: Targets, measured: Mapping[str, float], yielding: frozenset[str], now_ns: int
+    ) -> _Motion:
+        start, elapsed_s = {}, self._period_s
+        for name in targets:
+            last = self._memory.last.get(name)
+            if last is not None and 0 <= now_ns - last[1] <= REFERENCE_AGE_S * 1e9:
+                start[name] = last[0]
+                late_s = (now_ns - last[1]) / 1e9
+                elapsed_s = max(elapsed_s, min(late_s, LATE_MAX * self._period_s))
+            else:
+                start[name] = measured[name]
+        for name in yielding:
+            start[name] = targets[name]
+        return _Motion(measured, start, elapsed_s, yielding)
+
+    def _joint_speed(self, targets: Targets, motion: _Motion, problems: list[str]) -> None:
+        grippers = {joint.name for joint in self._robot.joints if joint.gripper}
+        for name, value in targets.items():
+            if name in motion.yielding:
+                continue
+            step = value - motion.start[name]
+            longest = self.limits.speeds_rad_s[name] * motion.elapsed_s
+            excess = abs(step) - longest
+            if excess > EPSILON:
+                said = (
+                    f"{name}: {abs(step) / motion.elapsed_s:.2f} rad/s is beyond "
+                    f"{self.limits.speeds_rad_s[name]:.2f} rad/s"
+                )
+                if excess > CLAMP_TOLERANCE_RAD and name not in grippers:  # a gripper just closes more slowly
+                    raise _Withheld(said)
+                problems.append(said)
+                low, high = self.limits.joints_rad[name]
+                targets[name] = min(max(motion.start[name] + math.copysign(longest, step), low), high)
+            behind = abs(targets[name] - motion.measured[name])
+            if behind > MAX_FOLLOWING_ERROR_RAD and name not in grippers:  # a grasp is meant to block
+                raise _Withheld(f"{name} is {behind:.2f} rad behind its target: it does not follow")
+
+    def _tool_speed(self, targets: Targets, motion: _Motion, problems: list[str]) -> None:
+        longest = min(self.limits.ee_speed_m_s * motion.elapsed_s, self.limits.ee_step_m)
+        if self._kinematics is None or longest == math.inf:
+            return
+        begin = self._tool({**motion.measured, **motion.start})
+        way = math.dist(begin, self._tool({**motion.measured, **targets}))
+        if way <= longest + EPSILON:
+            return
+        said = f"the tool would move {way * 1e3:.0f} mm in {motion.elapsed_s * 1e3:.0f} ms, the limit is {longest * 1e3:.0f} mm"
+        share = longest / way
+        if share < SHORTENED_MIN:
+            raise _Withheld(said)
+        problems.append(said)
+        shorter: Targets = {}
+        for _ in range(SHORTENINGS_MAX):  # an arc is longer than its chord: shorten until it fits
+            shorter = {
+                name: motion.start[name] + share * (value - motion.start[name])
+                for name, value in targets.items()
+            }
+            way = math.dist(begin, self._tool({**motion.measured, **shorter}))
+            if way <= longest + EPSILON:
+                break
+            share *= 0.999 * longest / way
+        else:
+            raise _Withheld(said)
+        for name, value in shorter.items():
+            low, high = self.limits.joints_rad[name]
+            targets[name] = min(max(value, low), high)
+
+    # -- places ------------------------------------------------------------------------------------------------------------
+    def _workspace(self, targets: Targets, motion: _Motion, problems: list[str]) -> None:
+        """The target and the way half there. A robot that is already outside may come back in."""
+        if self._kinematics is None or (self.limits.box == EVERYWHERE and not self.limits.zones):
+            return
+        now = self._kinematics.points(motion.measured)
+        half = {name: (motion.start[name] + value) / 2 for name, value in targets.items()}
+        for pose in (half, targets):
+            points = self._kinematics.points({**motion.measured, **pose})
+            self._tool_is_inside(points["tool"], now["tool"], problems)
+            self._zones_are_free(points, now, problems)
+
+    def _tool_is_inside(self, tool: Vector3, now: Vector3, problems: list[str]) -> None:
+        outside = outside_m(self.limits.box, tool)
+        if outside <= EPSILON:
+            return
+        said = f"the tool at {_place(tool)} m is {outside * 1e3:.0f} mm outside the workspace"
+        if outside >= outside_m(self.limits.box, now) - EPSILON:
+            raise _Withheld(said)
+        problems.append(f"{said}, on its way back")
+
+    def _zones_are_free(
+        self, points: Mapping[str, Vector3], now: Mapping[str, Vector3], problems: list[str]
+    ) -> None:
+        for index, zone in enumerate(self.limits.zones):
+            for name, point in points.items():
+                depth = zone.depth_m(point)
+                if depth <= EPSILON:
+                    continue
+                said = f"the {name} at {_place(point)} m is inside the no-go zone {zone.name or index}"
+                if depth >= zone.depth_m(now[name]) - EPSILON:
+                    raise _Withheld(said)
+                problems.append(f"{said}, on its way out")
+
+    def _tool(self, joints: Mapping[str, float]) -> Vector3:
+        if self._kinematics is None:
+            raise _Withheld("this robot has no kinematics")
+        return self._kinematics.points(joints)["tool"]
+
+
+def _place(point: Vector3) -> str:
+    return "(" + ", ".join(f"{value:.3f}" for value in point) + ")"

@@ -1,0 +1,419 @@
+"""A robot's gate: speed, workspace, zones, effort, freshness; envelopes only tighten; nothing switches it off."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runner.limits import Vector3
+from runner.protocols import Joint, RobotDescription
+from runner.robot_gate import LATE_MAX, MAX_FOLLOWING_ERROR_RAD, RobotGate
+from runner.safety import CLAMP_TOLERANCE_RAD
+from schemas.control import ControlMode
+from schemas.errors import ConfigError
+from schemas.manifest.contracts import SafetyEnvelope
+from schemas.world import Action, JointState, WorldState
+
+ROBOT = RobotDescription(
+    "planar",
+    (
+        Joint("turn", -3.0, 3.0, 3.0),
+        Joint("reach", 0.0, 2.0, 3.0),
+        Joint("grip", 0.0, 1.0, 6.0, gripper=True),
+    ),
+    {},
+)
+NAMES = ROBOT.joint_names
+STEP = 3.0 / 30  # rad a tick at 30 Hz
+
+
+class Planar:
+    """An arm that turns about the vertical and reaches out: the tool at `reach` metres in the direction of `turn`."""
+
+    gripper_lever_m = 0.1
+
+    def points(self, joints: Mapping[str, float]) -> Mapping[str, Vector3]:
+        turn, reach = joints["turn"], joints["reach"]
+        tool = (reach * math.cos(turn), reach * math.sin(turn), 0.0)
+        return {"tool": tool, "elbow": (tool[0] / 2, tool[1] / 2, 0.0)}
+
+
+def gate(needs: frozenset[str] | None = None, kinematic: bool = True, **envelope: Any) -> RobotGate:
+    wide = {"max_ee_speed_m_s": 1e9, "max_joint_speed_factor": 1.0} if kinematic and envelope else {}
+    return RobotGate(
+        ROBOT,
+        rate_hz=30.0,
+        kinematics=Planar() if kinematic else None,
+        envelopes={"safety": SafetyEnvelope(**{**wide, **envelope}) if envelope else None},
+        needs=needs,
+    )
+
+
+def at(*position: float, ms: float = 1000.0, age_ms: float = 0.0, **more: Any) -> WorldState:
+    state = {key: more.pop(key) for key in ("velocity", "effort") if key in more}
+    stamp_ns = int(ms * 1e6)
+    joints = JointState(name=NAMES, position=position, stamp_ns=stamp_ns - int(age_ms * 1e6), **state)
+    return WorldState(stamp_ns=stamp_ns, joint_state=joints, **more)
+
+
+def to(*row: float, **more: Any) -> Action:
+    more.setdefault("joint_names", NAMES)
+    return Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), **more)
+
+
+def row_of(verdict: tuple[Action | None, tuple[str, ...]]) -> tuple[float, ...]:
+    assert verdict[0] is not None, verdict[1]
+    row: tuple[float, ...] = verdict[0].rows[0]
+    return row
+
+
+HERE = (0.0, 1.0, 0.5)
+
+
+# -- what passes and what does not ---------------------------------------------------------------------------------------
+@pytest.mark.parametrize("names", [NAMES, None])
+def test_what_is_inside_passes_unchanged(names: tuple[str, ...] | None) -> None:
+    action = to(0.05, 1.05, 0.6, joint_names=names)
+    assert gate().check(action, at(*HERE)) == (action, ())
+
+
+def test_ranges_are_still_checked() -> None:
+    assert row_of(gate().check(to(1.95 + 0.1, joint_names=("reach",)), at(0.0, 1.95, 0.5))) == (2.0,)
+    assert gate().check(to(2.5, joint_names=("reach",)), at(0.0, 1.95, 0.5))[0] is None
+
+
+@pytest.mark.parametrize(
+    ("action", "said"),
+    [
+        (Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.0,) * 6,)), "no base"),
+        (Action(control_mode=ControlMode.GRIPPER_POSITION, gripper=(0.5,)), "not supported"),
+        (
+            Action(control_mode=ControlMode.JOINT_POSITION, horizon=2, joint_targets=(HERE, HERE)),
+            "2 steps at once",
+        ),
+        (to(0.0, 0.1, joint_names=("turn", "turn")), "commanded twice"),
+        (to(0.0, joint_names=("tail",)), "no joint tail"),
+    ],
+)
+def test_forms_that_are_not_one_step_of_joints_are_withheld(action: Action, said: str) -> None:
+    allowed, problems = gate().check(action, at(*HERE))
+    assert allowed is None
+    assert said in problems[0]
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_a_state_or_target_that_is_no_number_cannot_be_built(value: float) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        to(value, 0.0, 0.0)
+    with pytest.raises(ValueError, match="finite"):
+        at(value, 0.0, 0.0)
+
+
+# -- freshness ---------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("state", ["stale", "error"])
+@pytest.mark.parametrize(
+    ("component", "needs", "stops"),
+    [
+        ("joint_state", None, True),
+        ("joint_state", frozenset(), True),  # whatever is asked for: without joints nothing moves
+        ("front", None, True),
+        ("front", frozenset({"front"}), True),
+        ("front", frozenset({"wrist"}), False),
+    ],
+)
+def test_a_stale_world_stops(state: Any, component: str, needs: frozenset[str] | None, stops: bool) -> None:
+    world = at(*HERE, diagnostics={component: state})
+    allowed, problems = gate(needs).check(to(*HERE), world)
+    assert (allowed is None) is stops
+    assert not stops or component in problems[0]
+
+
+def test_an_old_joint_state_stops_even_when_nobody_says_so() -> None:
+    assert gate().check(to(*HERE), at(*HERE, age_ms=150))[0] is not None
+    allowed, problems = gate().check(to(*HERE), at(*HERE, age_ms=250))
+    assert allowed is None
+    assert "0.25 s old" in problems[0]
+
+
+def test_a_joint_that_is_not_measured_stops() -> None:
+    partial = WorldState(stamp_ns=1, joint_state=JointState(name=NAMES[:2], position=(0.0, 1.0), stamp_ns=1))
+    allowed, problems = gate().check(to(0.0, joint_names=("turn",)), partial)
+    assert allowed is None
+    assert "grip" in problems[0]
+
+
+# -- speed ---------------------------------------------------------------------------------------------------------------
+def test_a_step_a_little_too_long_is_shortened_and_said() -> None:
+    verdict = gate().check(to(STEP + 0.9 * CLAMP_TOLERANCE_RAD, 1.0, 0.5), at(*HERE))
+    assert row_of(verdict) == pytest.approx((STEP, 1.0, 0.5))
+    assert "turn: 7.05 rad/s is beyond 3.00 rad/s" in verdict[1][0]
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_step_far_too_long_is_withheld(direction: int) -> None:
+    allowed, problems = gate().check(to(direction * (STEP + 1.1 * CLAMP_TOLERANCE_RAD), 1.0, 0.5), at(*HERE))
+    assert allowed is None
+    assert "turn" in problems[0]
+
+
+def test_a_gripper_that_jumps_closes_at_its_own_speed() -> None:
+    assert row_of(gate().check(to(0.0, 1.0, 0.0), at(0.0, 1.0, 0.9))) == pytest.approx((0.0, 1.0, 0.7))
+
+
+def test_steps_are_measured_from_the_last_target_while_it_is_young() -> None:
+    checked = gate()
+    row_of(checked.check(to(0.1, 1.0, 0.5), at(*HERE, ms=1000)))
+    # the servo lags at 0.02; the next target is a step from the last one, not from there
+    assert row_of(checked.check(to(0.2, 1.0, 0.5), at(0.02, 1.0, 0.5, ms=1033))) == (0.2, 1.0, 0.5)
+    # after a late tick the way may be half as long again, and no more however late it is
+    assert row_of(checked.check(to(0.4, 1.0, 0.5), at(0.1, 1.0, 0.5, ms=1150)))[0] == pytest.approx(0.35)
+    # much later only where it is counts
+    allowed = row_of(checked.check(to(0.4, 1.0, 0.5), at(0.2, 1.0, 0.5, ms=5000)))
+    assert allowed == pytest.approx((0.3, 1.0, 0.5))
+
+
+def test_a_withheld_step_is_no_reference_for_the_next_one() -> None:
+    checked = gate()
+    for tick in range(20):  # a lost policy does not get to its far target by repeating it
+        assert checked.check(to(2.0, 1.0, 0.5), at(*HERE, ms=1000 + 33 * tick))[0] is None
+
+
+def test_a_joint_that_does_not_follow_is_not_pushed_further() -> None:
+    checked, turn, allowed = gate(), 0.0, True
+    for tick in range(30):  # blocked at 0: measured never changes
+        allowed = checked.check(to(turn + STEP, 1.0, 0.5), at(*HERE, ms=1000 + 100 * tick / 3))[0] is not None
+        if not allowed:
+            break
+        turn += STEP
+    assert not allowed
+    assert turn == pytest.approx(MAX_FOLLOWING_ERROR_RAD, abs=STEP)
+
+
+def test_a_measured_speed_beyond_all_limits_stops() -> None:
+    assert gate().check(to(*HERE), at(*HERE, velocity=(4.0, 0.0, 0.0)))[0] is not None
+    allowed, problems = gate().check(to(*HERE), at(*HERE, velocity=(-4.6, 0.0, 0.0)))
+    assert allowed is None
+    assert "turn moves at -4.60 rad/s" in problems[0]
+
+
+def test_the_tool_keeps_its_speed() -> None:
+    slow = gate(max_ee_speed_m_s=1.5)  # 50 mm a tick; turning 0.08 rad at 1 m would be 80 mm
+    verdict = slow.check(to(0.08, 1.0, 0.5), at(*HERE))
+    assert row_of(verdict)[0] == pytest.approx(0.05, abs=0.002)
+    assert "80 mm" in verdict[1][0]
+    allowed, _ = gate(max_cartesian_step_m=0.02).check(to(0.08, 1.0, 0.5), at(*HERE))
+    assert allowed is None  # a quarter of what was asked is not what was asked
+
+
+# -- places ----------------------------------------------------------------------------------------------------------------
+BOX = {"workspace_box_min_xyz": (0.2, -0.5, -0.1), "workspace_box_max_xyz": (1.05, 0.5, 0.5)}
+
+
+def test_the_tool_stays_in_the_workspace() -> None:
+    assert gate(**BOX).check(to(0.0, 1.04, 0.5), at(*HERE))[0] is not None
+    allowed, problems = gate(**BOX).check(to(0.0, 1.07, 0.5), at(*HERE))
+    assert allowed is None
+    assert "20 mm outside the workspace" in problems[0]
+
+
+def test_a_tool_that_is_outside_may_only_come_back() -> None:
+    outside = at(0.0, 1.2, 0.5)
+    verdict = gate(**BOX).check(to(0.0, 1.12, 0.5), outside)
+    assert row_of(verdict) == (0.0, 1.12, 0.5)
+    assert "on its way back" in verdict[1][0]
+    for reach in (1.2, 1.25):
+        assert gate(**BOX).check(to(0.0, reach, 0.5), outside)[0] is None
+
+
+def test_an_open_side_of_the_workspace_is_open() -> None:
+    half = {"workspace_box_max_xyz": (1.05, 9.0, 9.0)}
+    assert gate(**half).check(to(0.0, 0.95, 0.5), at(*HERE))[0] is not None
+    assert gate(**half).check(to(0.0, 1.07, 0.5), at(*HERE))[0] is None
+
+
+@pytest.mark.parametrize(
+    "zone",
+    [
+        {"name": "bin", "min_xyz": (1.05, -0.1, -0.1), "max_xyz": (1.2, 0.1, 0.1)},
+        {"name": "bin", "center_xyz": (1.15, 0.0, 0.0), "radius_m": 0.1},
+        {"name": "bin", "center_xyz": (0.5375, 0.0, 0.0), "radius_m": 0.02},  # in the elbow's way
+    ],
+)
+def test_no_point_of_the_arm_enters_a_zone(zone: dict[str, Any]) -> None:
+    allowed, problems = gate(no_go_zones=(zone,)).check(to(0.0, 1.07, 0.5), at(*HERE))
+    assert allowed is None
+    assert "no-go zone bin" in problems[0]
+    assert gate(no_go_zones=(zone,)).check(to(0.0, 0.95, 0.5), at(*HERE))[0] is not None
+
+
+def test_a_thin_zone_is_not_stepped_over() -> None:
+    wall = {"min_xyz": (1.04, -1.0, -1.0), "max_xyz": (1.06, 1.0, 1.0)}
+    assert gate(no_go_zones=(wall,)).check(to(0.0, 1.1, 0.5), at(*HERE))[0] is None
+
+
+# -- effort ----------------------------------------------------------------------------------------------------------------
+def test_a_grip_eases_to_its_limit_and_keeps_it() -> None:
+    """A servo with 10 N·m/rad against a thing of 0.5 rad: 10 N at 0.1 m are 1 N·m, so 0.1 rad of squeeze."""
+    checked = gate(max_force_n=10.0, max_torque_nm=100.0)
+    target, efforts = 0.5, []
+    for tick in range(40):
+        effort = 10.0 * (target - 0.5)
+        efforts.append(abs(effort))
+        world = at(0.0, 1.0, 0.5, ms=1000 + 100 * tick / 3, effort=(0.0, 0.0, effort))
+        target = row_of(checked.check(to(0.0, 1.0, 0.0), world))[2]
+    assert max(efforts[:5]) > 1.0  # it was seen only after it happened
+    assert efforts[-10:] == pytest.approx([1.0] * 10, abs=0.01)
+
+
+def test_an_easing_joint_is_said_and_opening_is_free() -> None:
+    checked = gate(max_force_n=10.0)
+    pressed = at(0.0, 1.0, 0.5, effort=(0.0, 0.0, -2.0))
+    verdict = checked.check(to(0.0, 1.0, 0.2), pressed)
+    assert row_of(verdict)[2] == 0.5
+    assert "grip pushes with 2.00 N·m, the limit is 1.00: it yields" in verdict[1]
+    assert row_of(checked.check(to(0.0, 1.0, 0.6), pressed))[2] == 0.6
+
+
+def test_an_arm_joint_keeps_its_torque() -> None:
+    checked = gate(max_torque_nm=2.0)
+    verdict = checked.check(to(0.05, 1.0, 0.5), at(*HERE, effort=(3.0, 0.0, 0.0)))
+    assert row_of(verdict)[0] == 0.0
+
+
+def test_a_collision_stops() -> None:
+    hit = at(*HERE, contact_forces={"wrist": (0.0, 30.0, 40.0)})
+    assert gate().check(to(*HERE), hit)[0] is not None  # nobody set a limit
+    allowed, problems = gate(contact_force_threshold_n=40.0).check(to(*HERE), hit)
+    assert allowed is None
+    assert "wrist: 50.0 N" in problems[0]
+
+
+# -- envelopes ---------------------------------------------------------------------------------------------------------------
+def test_envelopes_only_tighten() -> None:
+    wide = SafetyEnvelope(
+        max_joint_speed_factor=9.0,
+        max_ee_speed_m_s=100.0,
+        workspace_box_min_xyz=(-9.0, -9.0, -9.0),
+        workspace_box_max_xyz=(9.0, 9.0, 9.0),
+    )
+    base = gate(**BOX, max_ee_speed_m_s=0.4, max_force_n=5.0)
+    tighter = base.tightened("skill", wide).limits
+    assert tighter.box == base.limits.box
+    assert tighter.speeds_rad_s == {"turn": 3.0, "reach": 3.0, "grip": 6.0}
+    assert (tighter.ee_speed_m_s, tighter.force_n) == (0.4, 5.0)
+    slow = base.tightened("skill", SafetyEnvelope(max_joint_speed_factor=0.5, max_force_n=3.0)).limits
+    assert slow.speeds_rad_s == {"turn": 1.5, "reach": 1.5, "grip": 3.0}
+    assert slow.force_n == 3.0
+    assert base.limits.speeds_rad_s["turn"] == 3.0  # the base gate is as it was
+
+
+@pytest.mark.parametrize(
+    ("envelope", "field", "said"),
+    [
+        ({"max_joint_speed_factor": float("nan")}, "max_joint_speed_factor", "above 0"),
+        ({"max_force_n": 0.0}, "max_force_n", "above 0"),
+        ({"max_cartesian_step_m": -1.0}, "max_cartesian_step_m", "above 0"),
+        (
+            {"workspace_box_min_xyz": (0, 0, 1), "workspace_box_max_xyz": (1, 1, 0)},
+            "workspace_box_min_xyz",
+            "z 1.0 > 0.0",
+        ),
+        ({"no_go_zones": ({"around": "table"},)}, "no_go_zones[0]", "center_xyz"),
+        (
+            {"no_go_zones": ({"min_xyz": (0, 0, float("nan")), "max_xyz": (1, 1, 1)},)},
+            "no_go_zones[0]",
+            "min_xyz",
+        ),
+    ],
+)
+def test_an_envelope_that_limits_nothing_is_refused(envelope: Any, field: str, said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        gate(**envelope)
+    found = caught.value.details["fields"][0]
+    assert found["field"] == f"safety.{field}"
+    assert said in found["problem"]
+
+
+def test_two_workspaces_without_a_common_place_are_refused() -> None:
+    elsewhere = SafetyEnvelope(workspace_box_min_xyz=(2.0, 0.0, 0.0), workspace_box_max_xyz=(3.0, 1.0, 1.0))
+    with pytest.raises(ConfigError, match=r"skill\.workspace_box_min_xyz: the workspace is empty"):
+        gate(**BOX).tightened("skill", elsewhere)
+
+
+@pytest.mark.parametrize(
+    "envelope",
+    [{"max_ee_speed_m_s": 0.1}, {"workspace_box_min_xyz": (0, 0, 0)}, {"max_cartesian_step_m": 0.1}],
+)
+def test_what_needs_kinematics_is_refused_without(envelope: Any) -> None:
+    with pytest.raises(ConfigError, match="no kinematics"):
+        gate(kinematic=False, **envelope)
+
+
+def test_what_is_asked_for_and_not_kept_is_told() -> None:
+    told = gate(
+        kinematic=False, deadman_required=True, human_in_loop_required=("cut",), max_force_n=3.0
+    ).unkept
+    assert {line.split(" ")[0] for line in told} == {
+        "safety.deadman_required",
+        "safety.human_in_loop_required",
+        "safety.max_ee_speed_m_s",
+        "safety.max_force_n",
+    }
+    assert gate(max_force_n=3.0, deadman_required=False).unkept == ()
+
+
+def test_an_action_cannot_switch_a_check_off() -> None:
+    overrides = {"max_joint_speed_factor": 100.0, "workspace_box_max_xyz": (9, 9, 9), "disable": True}
+    allowed, _ = gate(**BOX).check(to(0.0, 1.07, 0.5, safety_overrides=overrides), at(*HERE))
+    assert allowed is None
+
+
+def test_a_latched_stop_holds_for_every_gate_of_the_robot() -> None:
+    base = gate()
+    goal = base.tightened("skill", SafetyEnvelope())
+    goal.trip("hand in the way")
+    goal.trip("second reason")
+    for checked in (base, goal, base.tightened("next", None)):
+        allowed, problems = checked.check(to(*HERE), at(*HERE))
+        assert allowed is None
+        assert "hand in the way" in problems[0]
+
+
+Angles = st.tuples(
+    st.floats(-3.5, 3.5, allow_nan=False), st.floats(-0.5, 2.5, allow_nan=False), st.floats(-0.5, 1.5)
+)
+Inside = st.tuples(st.floats(-3.0, 3.0), st.floats(0.0, 2.0), st.floats(0.0, 1.0))
+
+
+@given(
+    start=Inside,
+    targets=st.lists(Angles, min_size=1, max_size=6),
+    factor=st.floats(0.1, 1.0),
+    ee_speed=st.floats(0.1, 5.0),
+)
+def test_whatever_is_asked_for_what_passes_is_inside(
+    start: tuple[float, float, float],
+    targets: list[tuple[float, float, float]],
+    factor: float,
+    ee_speed: float,
+) -> None:
+    """The robot follows exactly. Ranges, joint speeds and tool speed hold for whatever passes."""
+    checked = gate(max_joint_speed_factor=factor, max_ee_speed_m_s=ee_speed)
+    arm = Planar()
+    here = start
+    for tick, target in enumerate(targets):
+        allowed, problems = checked.check(to(*target), at(*here, ms=1000 + 100 * tick / 3))
+        if allowed is None:
+            assert problems
+            continue
+        row = allowed.rows[0]
+        assert (row == target) is (problems == ())
+        for joint, value, before in zip(ROBOT.joints, row, here, strict=True):
+            assert joint.lower_rad <= value <= joint.upper_rad
+            assert abs(value - before) <= joint.max_speed_rad_s * factor * LATE_MAX / 30 + 1e-6
+        tools = [arm.points(dict(zip(NAMES, pose, strict=True)))["tool"] for pose in (here, row)]
+        assert math.dist(*tools) <= ee_speed * LATE_MAX / 30 + 1e-6
+        here = row
