@@ -22,7 +22,6 @@ from runner.protocols import (
     DeadlinePolicy,
     Goal,
     Hal,
-    RobotDescription,
     SafetyGate,
     SensorReader,
     Skill,
@@ -39,7 +38,6 @@ from schemas.errors import (
     StateStale,
     VramError,
 )
-from schemas.manifest.contracts import SafetyEnvelope
 
 log = logging.getLogger(__name__)
 
@@ -48,12 +46,15 @@ FIRST_DATA_SLICE_S = 0.2  # how late a request to stop is noticed while waiting 
 FIRST_STATE_TRIES = 5  # a bus may lose its first answers
 STALE_FAIL_S = 1.0
 
-MakeGate = Callable[[RobotDescription, SafetyEnvelope | None], SafetyGate]
-"""The gate for a skill's own envelope, which can only tighten the robot's."""
+MakeGate = Callable[[Skill], SafetyGate]
+"""The gate for one goal: the robot's own, tightened by the skill's envelope."""
 
 
 class HardwareRunner(SkillRunner):
-    """`readers` with the greatest age of their frames (ms); `topics` names those that are published as well."""
+    """`readers` with the greatest age of their frames (ms); `topics` names those that are published as well.
+
+    `on_estop` hears of an emergency stop at once, on the thread that asks for it: the gate, which then passes nothing any more.
+    """
 
     def __init__(
         self,
@@ -65,6 +66,7 @@ class HardwareRunner(SkillRunner):
         deadline_policy: DeadlinePolicy = DeadlinePolicy.WARN,
         clock: Clock | None = None,
         topics: Mapping[str, str] | None = None,
+        on_estop: Callable[[str], None] | None = None,
         first_data_s: float = FIRST_DATA_S,
     ) -> None:
         super().__init__(rate_hz=rate_hz, deadline_policy=deadline_policy, clock=clock)
@@ -72,6 +74,7 @@ class HardwareRunner(SkillRunner):
         self._readers = {reader.sensor_id: reader for reader, _ in readers}
         self._make_gate = make_gate
         self._gate: SafetyGate | None = None
+        self._on_estop = on_estop
         self._first_data_s = first_data_s
         self.aggregator = WorldStateAggregator(
             {reader.sensor_id: age_ms for reader, age_ms in readers}, topics=topics
@@ -115,6 +118,8 @@ class HardwareRunner(SkillRunner):
             self.hal.disconnect()
         except VramError as error:
             log.error("the robot did not disconnect cleanly: %s", error)
+        else:
+            log.info("%s is disconnected", self.hal.description.name)
         finally:
             for reader in self._readers.values():
                 reader.stop()
@@ -124,10 +129,15 @@ class HardwareRunner(SkillRunner):
         super().begin_skill(skill, goal, on_end)
         self._stale_since_s = None
         try:
-            self._gate = self._make_gate(self.hal.description, skill.manifest.envelope)
+            self._gate = self._make_gate(skill)
         except BaseException:
             self.end_skill()
             raise
+
+    def request_estop(self, reason: str) -> None:
+        super().request_estop(reason)
+        if self._on_estop is not None:
+            self._on_estop(reason)
 
     def obey_estop(self) -> EstopRequested | None:
         if self.estop is not None and not self._halted:

@@ -6,8 +6,9 @@ from typing import Any
 import pytest
 from small_robots import FedCamera, Nod, Twin
 
+from runner.hal.so101 import so101
 from runner.hardware import FIRST_STATE_TRIES, HardwareRunner
-from runner.protocols import DeadlinePolicy, Goal, RobotDescription, SafetyGate, SkillEnded
+from runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded
 from runner.safety import Envelope
 from runner.skills.base import SkillState
 from schemas.errors import (
@@ -20,15 +21,16 @@ from schemas.errors import (
     StateStale,
 )
 from schemas.manifest import load_manifest
-from schemas.manifest.contracts import SafetyEnvelope
 from schemas.world import WorldState
 
 PERIOD_S = 1 / 30
 MakeRunner = Callable[..., HardwareRunner]
 
 
-def gate(description: RobotDescription, envelope: SafetyEnvelope | None) -> SafetyGate:
-    return Envelope({joint.name: (joint.lower_rad, joint.upper_rad) for joint in description.joints})
+def gate(skill: Skill) -> SafetyGate:
+    return Envelope(
+        {joint.name: (joint.lower_rad, joint.upper_rad) for joint in so101(simulated=True).joints}
+    )
 
 
 @pytest.fixture
@@ -187,10 +189,10 @@ def test_what_cannot_be_sent_fails_the_goal(make: MakeRunner, twin: Twin, nod: A
 def test_the_gate_is_made_for_the_skill_and_what_it_refuses_is_not_sent(
     make: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
-    asked: list[SafetyEnvelope | None] = []
+    asked: list[Skill] = []
 
-    def narrow(description: RobotDescription, envelope: SafetyEnvelope | None) -> SafetyGate:
-        asked.append(envelope)
+    def narrow(skill: Skill) -> SafetyGate:
+        asked.append(skill)
         return Envelope({"wrist_flex": (-0.1, 0.1)})
 
     runner = make(make_gate=narrow)
@@ -198,14 +200,14 @@ def test_the_gate_is_made_for_the_skill_and_what_it_refuses_is_not_sent(
     skill = nod()
     begin(runner, skill)
     result = tick(runner, clock)
-    assert asked == [skill.manifest.envelope]
+    assert asked == [skill]
     assert not result.action_applied
     assert "wrist_flex" in result.safety_violations[0]
     assert not twin.sent
 
 
 def test_a_gate_that_cannot_be_made_gives_nobody_the_arm(make: MakeRunner, nod: Any) -> None:
-    def broken(description: RobotDescription, envelope: SafetyEnvelope | None) -> SafetyGate:
+    def broken(skill: Skill) -> SafetyGate:
         raise LimitExceeded("the envelope is empty")
 
     runner = make(make_gate=broken)
@@ -219,13 +221,15 @@ def test_a_gate_that_cannot_be_made_gives_nobody_the_arm(make: MakeRunner, nod: 
 def test_the_emergency_stop_comes_before_anything_else(
     make: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
-    runner = make()
+    told: list[str] = []
+    runner = make(on_estop=told.append)
     runner.activate()
     skill = nod(on_step=lambda world: runner.request_estop("a hand is in the way"))
     ended = begin(runner, skill)
     assert not tick(runner, clock).action_applied  # the step that was under way is not sent any more
     assert not twin.sent
     assert twin.story == ["connect", "halt"]
+    assert told == ["a hand is in the way"]
     assert isinstance(ended[0].error, EstopRequested)
     assert "a hand is in the way; all joints stand still" in ended[0].error.message
     tick(runner, clock, 3)

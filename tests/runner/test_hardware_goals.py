@@ -63,7 +63,7 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
         runner = HardwareRunner(
             twin,
             [(camera, 100.0)],
-            lambda description, envelope: Envelope(limits),
+            lambda _: Envelope(limits),
             rate_hz=200.0,
             clock=clock,
         )

@@ -1,0 +1,279 @@
+"""`vram-runner deploy --config FILE`: owns a robot, its cameras and safety, serves goals or does the file's one task.
+
+Puts its parts together, and nothing else. A signal ends it in order: the goal is canceled, the arm holds, the robot is disconnected.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import fcntl
+import logging
+import os
+import re
+from collections.abc import AsyncIterator, Callable, Mapping
+from pathlib import Path
+
+from clients.runner import RunnerClient
+from runner.catalogue import Catalogue, Maker, read_manifests
+from runner.cli_common import (
+    add_serving_flags,
+    connect_arbiter,
+    default_skills,
+    install_signals,
+    sidecar_endpoint,
+    sidecars_given,
+)
+from runner.clock import SystemClock
+from runner.control import ControlThread
+from runner.deployment import (
+    DeploymentFile,
+    Parts,
+    goal_gate,
+    make_parts,
+    offered,
+    plan,
+    read_deployment,
+    unused,
+)
+from runner.goals import GoalServer
+from runner.hardware import HardwareRunner
+from runner.protocols import DeadlinePolicy, Hal, Skill
+from runner.skills.sidecar_policy import Arbiter
+from schemas.endpoints import program_endpoint, runtime_dir
+from schemas.errors import AlreadyRunning, RunnerUnreachable, VramError
+from schemas.goals import ResultPush
+from schemas.manifest import Kind, RSkillManifest
+from schemas.world import RunResult
+
+log = logging.getLogger("runner")
+
+OWN_GOAL = "task"  # goal id of the file's own task
+
+MakeMakers = Callable[[Hal, Arbiter | None], Mapping[Kind, Maker]]
+"""How skills of each kind are made for this robot, with or without an arbiter."""
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
+    """The flags of `vram-runner deploy`."""
+    deploy = commands.add_parser("deploy", help="a robot, as a deployment file describes it")
+    deploy.add_argument("--config", type=Path, required=True, help="deployment file (docs/runner.md)")
+    deploy.add_argument(
+        "--dry-run", action="store_true", help="check everything, print what would run, open nothing"
+    )
+    deploy.add_argument(
+        "--allow-noncommercial",
+        action="store_true",
+        help="run skills whose licence forbids commercial use, too",
+    )
+    add_serving_flags(deploy)
+    return deploy
+
+
+async def run(args: argparse.Namespace) -> int:
+    """`vram-runner deploy`. 0: ended on request, or the task succeeded; 1: it failed; 2: the file or a flag is wrong."""
+    file = read_deployment(args.config)
+    return await Deploy(args, file, policy_makers(args, file)).run()
+
+
+def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
+    """Learnt policies, each in its sidecar."""
+    given = sidecars_given(args.sidecar)
+
+    def make_makers(hal: Hal, arbiter: Arbiter | None) -> Mapping[Kind, Maker]:
+        def make_policy(manifest: RSkillManifest) -> Skill:
+            from clients.sidecar.policy import PolicyClient
+            from runner.skills.sidecar_policy import SidecarPolicy, wire_up
+
+            joints, rest = hal.description.joint_names, hal.description.rest_pose_rad
+            client = PolicyClient(sidecar_endpoint(manifest.name, given, os.environ))
+            period_s = 1.0 / file.robot.rate_hz
+            return SidecarPolicy(
+                manifest, wire_up(manifest, joints, rest), client, arbiter, period_s=period_s
+            )
+
+        return {Kind.VLA: make_policy}
+
+    return make_makers
+
+
+class Deploy:
+    """One run of the command. `make_makers` decides which kinds of skills there are."""
+
+    def __init__(self, args: argparse.Namespace, file: DeploymentFile, make_makers: MakeMakers) -> None:
+        self._args = args
+        self._file = file
+        self._make_makers = make_makers
+        self._clock = SystemClock()
+        self._endpoint: str = args.endpoint or program_endpoint("runner", os.environ, os.getuid())
+        self._stopping = asyncio.Event()
+
+    async def run(self) -> int:
+        """Check, then print the plan or carry it out."""
+        parts = make_parts(self._file, self._clock)
+        manifests = read_manifests(self._args.skills or [default_skills()])
+        check = self._offered(parts, manifests, None)
+        if self._args.dry_run:
+            print(plan(self._file, parts, check, self._facts()))
+            print("dry run: nothing was opened")
+            return 0
+        for text in (*parts.gate.unkept, *unused(self._file.robot)):
+            log.warning("%s is not kept", text)
+        install_signals(self._stopping)
+        async with contextlib.AsyncExitStack() as stack:
+            claim(self._file.robot.robot_id, stack)
+            arbiter = None if self._args.no_arbiter else await connect_arbiter(self._args.arbiter, stack)
+            runner = self._runner(parts)
+            control = await self._start(runner, stack)
+            if control is None:
+                return 0
+            catalogue = self._offered(parts, manifests, arbiter)
+            server = GoalServer(
+                self._endpoint,
+                control,
+                runner,
+                catalogue,
+                self._clock,
+                identity=self._identity(parts, arbiter),
+                stopping=self._stopping,
+            )
+            ended = await self._serve(server)
+        failed = control.ended.exception() is not None
+        return self._conclude(runner, ended, failed)
+
+    # -- steps -------------------------------------------------------------------------------------------------------
+    def _offered(self, parts: Parts, manifests: list[RSkillManifest], arbiter: Arbiter | None) -> Catalogue:
+        makers = self._make_makers(parts.hal, arbiter)
+        return offered(self._file, parts, manifests, makers, self._args.allow_noncommercial)
+
+    def _facts(self) -> dict[str, str]:
+        arbiter = "none" if self._args.no_arbiter else self._args.arbiter or "the machine's own"
+        return {"goals": f"served on {self._endpoint}", "arbiter": arbiter}
+
+    def _identity(self, parts: Parts, arbiter: Arbiter | None) -> dict[str, object]:
+        return {
+            "robot": self._file.robot.robot_id,
+            "simulated": parts.hal.description.simulated,
+            "arbiter": arbiter is not None,
+        }
+
+    def _runner(self, parts: Parts) -> HardwareRunner:
+        robot = self._file.robot
+        ages = {sensor.sensor_id: sensor.max_age_ms for sensor in robot.sensors}
+        return HardwareRunner(
+            parts.hal,
+            [(reader, ages[reader.sensor_id]) for reader in parts.readers],
+            lambda skill: goal_gate(parts.gate, skill.manifest, skill.cameras),
+            rate_hz=robot.rate_hz,
+            deadline_policy=DeadlinePolicy(robot.deadline_overrun_policy),
+            clock=self._clock,
+            topics={s.sensor_id: s.publish_topic for s in robot.sensors if s.publish_topic},
+            on_estop=parts.gate.trip,
+        )
+
+    async def _start(self, runner: HardwareRunner, stack: contextlib.AsyncExitStack) -> ControlThread | None:
+        """The control thread with robot and cameras at work; None when a signal came first."""
+        async with _stop_on(self._stopping, runner):
+            try:
+                return await stack.enter_async_context(
+                    ControlThread(runner, max_ticks=self._file.robot.max_ticks)
+                )
+            except VramError:
+                if self._stopping.is_set():
+                    log.info("stopped before anything moved")
+                    return None
+                raise
+
+    async def _serve(self, server: GoalServer) -> ResultPush | None:
+        """Until a signal, `shutdown`, the end of the time, or of the file's task, whose result is returned."""
+        own = asyncio.create_task(self._own_task(server)) if self._file.robot.task is not None else None
+        try:
+            async with asyncio.timeout(self._args.max_seconds):
+                await server.serve()
+        except TimeoutError:
+            log.info("ending after %.0f s, as asked", self._args.max_seconds)
+        finally:
+            if own is not None and not own.done():
+                own.cancel()
+                await asyncio.gather(own, return_exceptions=True)
+        if own is not None and not own.cancelled():
+            own.result()  # raises what kept the task from being a goal at all
+        return server.result_of(OWN_GOAL)
+
+    async def _own_task(self, server: GoalServer) -> None:
+        """The file's task, as a goal like any other; its end is the end of the program."""
+        robot = self._file.robot
+        if robot.task is None or robot.vla is None:
+            return
+        await server.bound.wait()
+        try:
+            async with RunnerClient(self._endpoint) as client:
+                goal = await client.send_goal(
+                    robot.vla.id,
+                    prompt=robot.task.instruction,
+                    max_ticks=robot.task.max_steps,
+                    goal_id=OWN_GOAL,
+                )
+                await goal.result()
+        except RunnerUnreachable:
+            if not server.stopping.is_set():
+                raise
+        finally:
+            server.stopping.set()
+
+    def _conclude(self, runner: HardwareRunner, ended: ResultPush | None, failed: bool) -> int:
+        robot = self._file.robot
+        result = runner.result()
+        success: bool | None = None
+        if ended is not None and ended["status"] != "canceled":
+            key = robot.task.success_key if robot.task is not None else None
+            success = ended["success"] and (key is None or ended["data"].get(key) is True)
+            log.info("task %s %s", "done:" if success else "not done:", ended["message"] or ended["data"])
+        print(summary(result, runner, success, robot.robot_id))
+        return 1 if failed or success is False else 0
+
+
+def claim(robot_id: str, stack: contextlib.AsyncExitStack) -> None:
+    """One robot, one runner. Raises AlreadyRunning before a second one touches the motors of the first."""
+    folder = Path(runtime_dir(os.environ, os.getuid()))
+    folder.mkdir(mode=0o750, parents=True, exist_ok=True)
+    path = folder / f"robot-{re.sub(r'[^A-Za-z0-9._-]', '_', robot_id)}.lock"
+    lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660)
+    stack.callback(os.close, lock)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        owner = os.pread(lock, 32, 0).decode(errors="replace").strip()
+        raise AlreadyRunning(
+            f"robot {robot_id} belongs to process {owner or '?'}", hint="stop it first"
+        ) from None
+    os.ftruncate(lock, 0)
+    os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
+
+
+def summary(result: RunResult, runner: HardwareRunner, success: bool | None, robot_id: str) -> str:
+    """The run as one line of JSON."""
+    facts = {
+        "robot": robot_id,
+        "estop": runner.estop.message if runner.estop else None,
+        "violations": list(runner.violations)[-8:],
+    }
+    full = result.model_copy(update={"success": success, "metadata": {**result.metadata, **facts}})
+    return full.model_dump_json()
+
+
+@contextlib.asynccontextmanager
+async def _stop_on(stopping: asyncio.Event, runner: HardwareRunner) -> AsyncIterator[None]:
+    """While inside, a signal makes the runner give up what it waits for."""
+
+    async def forward() -> None:
+        await stopping.wait()
+        runner.request_stop()
+
+    task = asyncio.create_task(forward())
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)

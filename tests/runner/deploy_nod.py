@@ -1,0 +1,40 @@
+"""`vram-runner deploy` with skills of this process instead of sidecars: `python deploy_nod.py deploy --config …`."""
+
+import asyncio
+import logging
+import os
+import sys
+from collections.abc import Mapping
+
+from small_robots import Nod
+
+from runner.__main__ import parse
+from runner.catalogue import Maker
+from runner.cli_deploy import Deploy
+from runner.deployment import read_deployment
+from runner.protocols import Hal
+from runner.skills.sidecar_policy import Arbiter
+from schemas.errors import ConfigError, VramError
+from schemas.manifest import Kind
+
+STEPS = os.environ.get("NOD_STEPS")
+CAMERAS = tuple(filter(None, os.environ.get("NOD_CAMERAS", "").split(",")))
+
+
+def makers(hal: Hal, arbiter: Arbiter | None) -> Mapping[Kind, Maker]:
+    steps = int(STEPS) if STEPS else None
+    return {Kind.ROS_ACTION: lambda manifest: Nod(manifest, cameras=CAMERAS, steps=steps)}
+
+
+def main() -> int:
+    logging.basicConfig(level="INFO", stream=sys.stderr)
+    args = parse(None)
+    try:
+        return asyncio.run(Deploy(args, read_deployment(args.config), makers).run())
+    except VramError as error:
+        print(error, file=sys.stderr)
+        return 2 if isinstance(error, ConfigError) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,233 @@
+"""`vram-runner deploy` as a process: MuJoCo's twin, a camera that plays a file, goals over a socket, signals, the emergency stop."""
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clients.runner import RunnerClient
+from schemas.errors import EstopRequested, UnknownSkill
+
+pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
+
+ROOT = Path(__file__).parents[2]
+PROGRAM = Path(__file__).parent / "deploy_nod.py"
+RSKILL = "vram-arbiter/so101-navigate"
+FPS, WIDTH, HEIGHT = 30, 64, 48
+TASK = f"task: {{id: nod, instruction: nod, max_steps: 400}}\nvla: {{id: {RSKILL}}}\n"
+
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One second of red pictures."""
+    import cv2
+    import numpy as np
+
+    path = tmp_path_factory.mktemp("video") / "red.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), FPS, (WIDTH, HEIGHT))
+    assert writer.isOpened()
+    for _ in range(FPS):
+        writer.write(np.full((HEIGHT, WIDTH, 3), (0, 0, 250), dtype=np.uint8))
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def start(tmp_path: Path, video: Path) -> Iterator[Start]:
+    started: list[subprocess.Popen[str]] = []
+
+    def begin(
+        *flags: str, more: str = "", loop: bool = True, steps: str = "", cameras: str = "front"
+    ) -> subprocess.Popen[str]:
+        config = tmp_path / "robot.yaml"
+        config.write_text(
+            "robot_id: bench\nhal: {adapter: so101_mujoco}\n"
+            f"sensors:\n  - {{sensor_id: front, max_age_ms: 2000, backend_params: {{path: {video}, loop: {str(loop).lower()}}}}}\n"
+            + more
+        )
+        environ = os.environ | {
+            "VRAM_ARBITER_RUNTIME": str(tmp_path),
+            "OMP_NUM_THREADS": "1",
+            "NOD_STEPS": steps,
+            "NOD_CAMERAS": cameras,
+        }
+        skills = str(ROOT / "configs/rskills/so101-navigate")
+        argv = [sys.executable, str(PROGRAM), "deploy", "--config", str(config), "--skills", skills]
+        process = subprocess.Popen(
+            [*argv, "--no-arbiter", *flags],
+            cwd=tmp_path,
+            env=environ,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        return process
+
+    yield begin
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def play(tmp_path: Path, body: Callable[[RunnerClient], Any]) -> None:
+    async def bounded() -> None:
+        async with (
+            asyncio.timeout(120),
+            RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=60.0) as client,
+        ):
+            await body(client)
+
+    asyncio.run(bounded())
+
+
+async def under_way(client: RunnerClient, ticks: int = 5) -> Any:
+    """A goal that has moved the arm for so many ticks."""
+    goal = await client.send_goal(RSKILL, prompt="nod")
+    async for feedback in goal.feedback():
+        if feedback["tick_idx"] >= ticks:
+            return goal
+    raise AssertionError(await goal.result(1))
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_cancels_the_goal_and_ends_in_order(
+    start: Start, tmp_path: Path, how: signal.Signals
+) -> None:
+    process = start()
+
+    async def body(client: RunnerClient) -> None:
+        assert (await client.call("ping"))["robot"] == "bench"
+        picture = await client.frame(max_age_ms=5000, encoding="png")
+        assert (picture["camera"], picture["width"], picture["height"]) == ("front", WIDTH, HEIGHT)
+        goal = await under_way(client)
+        state = await client.state()
+        assert state["world"]["diagnostics"] == {"front": "ok", "joint_state": "ok"}
+        process.send_signal(how)
+        assert (await goal.result(60))["status"] == "canceled"
+
+    play(tmp_path, body)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert "so101 is disconnected" in err
+    result = json.loads(out)
+    assert result["n_ticks"] > 5
+    assert result["success"] is None
+    assert result["metadata"]["robot"] == "bench"
+
+
+def test_the_files_own_task_ends_the_program(start: Start) -> None:
+    process = start(more=TASK, steps="20")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    result = json.loads(out)
+    assert result["success"] is True
+    assert result["n_ticks"] > 20
+    assert result["p99_tick_ms"] > 0
+
+
+def test_a_task_that_is_not_done_in_its_ticks_has_failed(start: Start) -> None:
+    process = start(more=TASK.replace("400", "10"))
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 1, err
+    assert json.loads(out)["success"] is False
+    assert "not done within 10 ticks" in err
+
+
+def test_the_end_of_a_run_that_is_limited_in_ticks_leaves_its_task_undone(start: Start) -> None:
+    process = start(more=TASK + "max_ticks: 30\n")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 1, err
+    assert json.loads(out)["n_ticks"] == 30
+
+
+def test_a_run_without_a_task_ends_after_its_ticks(start: Start) -> None:
+    process = start(more="max_ticks: 30\n")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert json.loads(out)["n_ticks"] == 30
+
+
+def test_a_camera_file_that_ends_withholds_and_fails_the_goal(start: Start, tmp_path: Path) -> None:
+    start(loop=False)
+
+    async def body(client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="nod")
+        result = await goal.result(60)
+        assert (result["status"], result["code"]) == ("failed", "frame_stale")
+        assert result["data"]["withheld"] > 0
+        assert (await client.state())["world"]["diagnostics"]["front"] == "stale"
+
+    play(tmp_path, body)
+
+
+def test_the_emergency_stop_of_a_real_process(start: Start, tmp_path: Path) -> None:
+    process = start()
+
+    async def body(client: RunnerClient) -> None:
+        goal = await under_way(client)
+        argv = [sys.executable, "-m", "runner", "estop", "--reason", "test", "--endpoint", client.endpoint]
+        stopped = await asyncio.create_subprocess_exec(*argv, cwd=ROOT, stdout=subprocess.PIPE)
+        said, _ = await stopped.communicate()
+        assert stopped.returncode == 0
+        assert b"emergency stop: test; the servos hold the present pose" in said
+        assert (await goal.result(60))["code"] == "estop_requested"
+        with pytest.raises(EstopRequested):
+            await client.send_goal(RSKILL)
+        process.send_signal(signal.SIGTERM)
+
+    play(tmp_path, body)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert "emergency stop: test" in json.loads(out)["metadata"]["estop"]
+
+
+def test_a_robot_has_one_runner(start: Start, tmp_path: Path) -> None:
+    first = start()
+
+    async def body(client: RunnerClient) -> None:
+        await client.ping(timeout_s=60)
+        second = start("--endpoint", f"ipc://{tmp_path}/second.sock")
+        _, err = await asyncio.to_thread(second.communicate, timeout=60)
+        assert second.returncode == 1
+        assert f"robot bench belongs to process {first.pid}" in err
+
+    play(tmp_path, body)
+
+
+def test_a_signal_while_it_waits_for_a_camera_ends_it_at_once(start: Start, tmp_path: Path) -> None:
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:  # accepts, and never says a word
+        port = listening.getsockname()[1]
+        more = (
+            f"  - {{sensor_id: silent, backend_params: {{url: 'rtsp://127.0.0.1:{port}/', timeout_s: 60}}}}\n"
+        )
+        process = start(more=more)
+        listening.settimeout(60)
+        connection, _ = listening.accept()  # it waits for a picture now
+        with connection:
+            process.send_signal(signal.SIGTERM)
+            _, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert "stopped before anything moved" in err
+
+
+def test_what_the_robot_does_not_offer_is_refused(start: Start, tmp_path: Path) -> None:
+    start()
+
+    async def body(client: RunnerClient) -> None:
+        with pytest.raises(UnknownSkill, match="so101-navigate"):
+            await client.send_goal("no/such")
+
+    play(tmp_path, body)

@@ -1,0 +1,199 @@
+"""`vram-runner deploy` before anything is opened: every mistake by line and field, licences, what fits the robot, the dry run."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from runner.__main__ import main, parse
+
+pytestmark = pytest.mark.heavy  # the SO-101's kinematics
+
+ROOT = Path(__file__).parents[2]
+NAVIGATE = ROOT / "configs/rskills/so101-navigate/rskill.yaml"
+GRAB = ROOT / "configs/rskills/so101-grab/rskill.yaml"
+TWIN = "robot_id: bench\nhal: {adapter: so101_kinematic}\n"
+GRAB_TASK = "task: {id: grab, instruction: grab it}\nvla: {id: vram-arbiter/so101-grab}\n"
+
+DryRun = Callable[..., tuple[int, str, str]]
+
+
+def test_the_shipped_twin_passes(capsys: pytest.CaptureFixture[str]) -> None:
+    file = ROOT / "configs/robots/so101-twin.yaml"
+    assert main(["deploy", "--config", str(file), "--dry-run"]) == 0
+    assert "safety    workspace_box_min_xyz" in capsys.readouterr().out
+
+
+@pytest.fixture
+def dry_run(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> DryRun:
+    """Exit code, stdout and stderr of a dry run of this text; fails when it leaves anything behind."""
+    runtime = tmp_path / "runtime"
+    monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(runtime))
+
+    def run(text: str, *flags: str, skills: Path = NAVIGATE) -> tuple[int, str, str]:
+        file = tmp_path / "robot.yaml"
+        file.write_text(text, encoding="utf-8")
+        code = main(["deploy", "--config", str(file), "--dry-run", "--skills", str(skills), *flags])
+        assert not runtime.exists()  # no socket, no lock
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return run
+
+
+def licensed(tmp_path: Path, licence: str, manifest: Path = NAVIGATE) -> Path:
+    folder = tmp_path / "skills" / licence
+    folder.mkdir(parents=True)
+    text = re.sub(r'license: "[^"]+"', f'license: "{licence}"', manifest.read_text(encoding="utf-8"))
+    (folder / "rskill.yaml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def test_the_dry_run_says_what_would_run_and_opens_nothing(dry_run: DryRun) -> None:
+    text = TWIN + (
+        "rate_hz: 50\ndeadline_overrun_policy: drop\nmax_ticks: 900\nthumbnail_hz: 5\n"
+        "safety: {max_joint_speed_factor: 0.5, deadman_required: true}\n"
+    )
+    code, out, err = dry_run(text)
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[0] == "robot     bench: so101 by so101_kinematic, simulated"
+    assert sum(line.startswith("joint ") for line in lines) == 6
+    assert "rate      50 Hz; late actions: drop" in lines
+    assert "end       after 900 ticks" in lines
+    assert any(line.startswith("goals ") and "runner.sock" in line for line in lines)
+    assert "NOT KEPT  safety.deadman_required" in lines
+    assert any(line.startswith("unused    thumbnail_hz") for line in lines)
+    assert any("so101-navigate" in line and "listed, not executed" in line for line in lines)
+    assert lines[-1] == "dry run: nothing was opened"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "robot_id: bench\nhal: {adaptor: x}\n",
+            r"robot\.yaml:2: hal\.adaptor: unknown key; did you mean adapter",
+        ),
+        (
+            "robot_id: bench\nhal:\n  adapter: so100\n",
+            r"robot\.yaml:3: hal\.adapter: unknown adapter 'so100'",
+        ),
+        (
+            "robot_id: bench\nhal:\n  adapter: so101_kinematic\n  params:\n    start_pose_rad: {elbow: 1}\n",
+            r"robot\.yaml:5: hal\.params\.start_pose_rad\.elbow: no such joint",
+        ),
+        (
+            TWIN + "safety:\n  max_joint_speed_factor: -1\n",
+            r"robot\.yaml:4: safety\.max_joint_speed_factor: must be above 0",
+        ),
+        (TWIN + "save_dir: out\n", r"robot\.yaml:3: save_dir: this version does not record"),
+        (TWIN + "rate_hz: 0\n", r"robot\.yaml:3: rate_hz: "),
+        (
+            TWIN + "task: {id: t}\nvla:\n  id: no/such\n",
+            r"robot\.yaml:5: vla\.id: no skill 'no/such' is installed",
+        ),
+        (
+            TWIN + "task: {id: t}\nvla:\n  id: vram-arbiter/so101-navigate\n",
+            r"robot\.yaml:5: vla\.id: .* is a ros_action and cannot be executed",
+        ),
+    ],
+)
+def test_mistakes_are_named_by_line_and_field(dry_run: DryRun, text: str, said: str) -> None:
+    code, out, err = dry_run(text)
+    assert (code, out) == (2, "")
+    assert re.search(said, err), err
+
+
+def test_mistakes_of_all_sections_are_named_at_once(dry_run: DryRun) -> None:
+    text = (
+        "robot_id: bench\n"
+        "hal:\n"
+        "  adapter: so101_kinematic\n"
+        "  transport: {port: /dev/ttyACM0}\n"
+        "sensors:\n"
+        "  - sensor_id: front\n"
+        "    backend_params:\n"
+        "      devise: 0\n"
+        "  - {sensor_id: wrist, backend: holoscan}\n"
+    )
+    code, _, err = dry_run(text)
+    assert code == 2
+    assert re.search(r"robot\.yaml:4: hal\.transport\.port: ", err), err
+    assert re.search(r"robot\.yaml:8: sensors\[0\]\.backend_params\.devise: unknown key", err), err
+    assert re.search(r"robot\.yaml:9: sensors\[1\]\.backend: ", err), err
+
+
+def test_a_file_that_is_not_there_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["deploy", "--config", "none.yaml", "--dry-run"]) == 2
+    assert "none.yaml" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        parse(["deploy"])
+
+
+def test_a_task_needs_the_cameras_that_its_skill_looks_at(dry_run: DryRun) -> None:
+    code, _, err = dry_run(
+        TWIN + "sensors:\n  - {sensor_id: front, backend_params: {device: 0}}\n" + GRAB_TASK, skills=GRAB
+    )
+    assert code == 2
+    assert re.search(
+        r"robot\.yaml:3: sensors: vram-arbiter/so101-grab looks at wrist; there is front", err
+    ), err
+
+
+def test_a_task_that_fits_passes(dry_run: DryRun) -> None:
+    cameras = "".join(
+        f"  - {{sensor_id: {name}, backend_params: {{device: 0}}}}\n" for name in ("front", "wrist")
+    )
+    code, out, err = dry_run(TWIN + "sensors:\n" + cameras + GRAB_TASK, skills=GRAB)
+    assert code == 0, err
+    assert "task      grab: vram-arbiter/so101-grab 'grab it'" in out
+    assert "camera    front by opencv_thread, at most 100 ms old" in out
+
+
+@pytest.mark.parametrize(
+    "field", ["weights_uri: 'hf://other/weights'", "runtime: onnx", "quantization: int4"]
+)
+def test_the_file_cannot_ask_for_other_weights_than_are_installed(dry_run: DryRun, field: str) -> None:
+    cameras = "".join(
+        f"  - {{sensor_id: {name}, backend_params: {{device: 0}}}}\n" for name in ("front", "wrist")
+    )
+    task = f"task: {{id: grab}}\nvla:\n  id: vram-arbiter/so101-grab\n  {field}\n"
+    code, _, err = dry_run(TWIN + "sensors:\n" + cameras + task, skills=GRAB)
+    assert code == 2
+    assert re.search(rf"robot\.yaml:9: vla\.{field.partition(':')[0]}: .* is not what", err), err
+
+
+@pytest.mark.parametrize(
+    "licence", ["nvidia_non_commercial", "proprietary", "unknown", "permissive_research"]
+)
+def test_a_licence_that_forbids_commercial_use_stops_the_task(
+    dry_run: DryRun, tmp_path: Path, licence: str
+) -> None:
+    skills = licensed(tmp_path, licence, GRAB)
+    code, _, err = dry_run(TWIN + GRAB_TASK, skills=skills)
+    assert code == 2
+    assert re.search(rf"robot\.yaml:4: vla\.id: .*{licence}.*--allow-noncommercial", err), err
+
+
+def test_a_licence_may_be_overruled_by_a_flag(dry_run: DryRun, tmp_path: Path) -> None:
+    cameras = "".join(
+        f"  - {{sensor_id: {name}, backend_params: {{device: 0}}}}\n" for name in ("front", "wrist")
+    )
+    text = TWIN + "sensors:\n" + cameras + GRAB_TASK
+    skills = licensed(tmp_path, "nvidia_non_commercial", GRAB)
+    code, out, _ = dry_run(text, "--allow-noncommercial", skills=skills)
+    assert code == 0
+    assert "so101-grab 0.1.0 (nvidia_non_commercial)" in out
+
+
+def test_serving_goals_offers_only_what_is_licensed_and_fits(dry_run: DryRun, tmp_path: Path) -> None:
+    code, out, _ = dry_run(TWIN, skills=licensed(tmp_path, "unknown"))
+    assert code == 0
+    assert re.search(r"skill +vram-arbiter/so101-navigate is not offered: its licence, unknown", out), out
+    code, out, _ = dry_run(TWIN, skills=GRAB)
+    assert code == 0
+    assert re.search(
+        r"skill +vram-arbiter/so101-grab is not offered: .*looks at front, wrist; there is none", out
+    ), out
