@@ -188,7 +188,11 @@ def _refuse_what_is_wrong(
     if kinematics is None:
         asked = [key for key in NEEDS_KINEMATICS if key in envelope.model_fields_set]
         problems += [
-            Problem(0, f"{name}.{key}", "this robot has no kinematics, so this cannot be kept")
+            Problem(
+                0,
+                f"{name}.{key}",
+                "this cannot be kept: there are no kinematics of this robot (those of the SO-101 need MuJoCo)",
+            )
             for key in asked
             if getattr(envelope, key)
         ]

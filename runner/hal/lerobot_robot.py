@@ -22,6 +22,7 @@ from schemas.world import JointState
 
 log = logging.getLogger(__name__)
 
+CONNECT_TRIES = 4  # lerobot asks each motor dozens of things and gives up when one answer is lost
 POSITION = ".pos"  # lerobot's features of joint positions: `elbow_flex.pos`
 Estop = Literal["hold", "torque_off"]
 
@@ -51,8 +52,17 @@ class LerobotHal(HalBase):
 
     def _open(self) -> None:
         robot = self._robot
-        with self._faults("connect"):
-            robot.connect(calibrate=False)
+        for tries_left in reversed(range(CONNECT_TRIES)):
+            try:
+                with self._faults("connect"):
+                    robot.connect(calibrate=False)
+                break
+            except RobotFault as error:
+                if robot.is_connected:  # half: its port is open
+                    self._close()
+                if not tries_left:
+                    raise
+                log.warning("%s; trying again", error.message)
         try:
             with self._faults("connect"):
                 calibrated = bool(robot.is_calibrated)
@@ -70,8 +80,17 @@ class LerobotHal(HalBase):
         try:
             with self._faults("disconnect"):
                 self._robot.disconnect()
-        except RobotFault as error:  # the cable is out: it is disconnected all right
+        except (
+            RobotFault
+        ) as error:  # the cable is out: nobody can switch the motors off, but the port is given back
             log.warning("%s", error)
+            bus = getattr(self._robot, "bus", None)
+            if getattr(bus, "is_connected", False):
+                try:
+                    with self._faults("give its port back"):
+                        self._robot.bus.disconnect(disable_torque=False)
+                except RobotFault as second:
+                    log.warning("%s", second)
 
     def _read(self) -> JointState:
         stamp_ns = self._clock.now_ns()  # before the bus is asked: never younger than the data

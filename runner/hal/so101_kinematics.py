@@ -5,6 +5,7 @@ Points in metres in the arm's own base frame: origin under the base, x forward, 
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Mapping
 
 from runner.hal.so101 import NAME
@@ -45,5 +46,7 @@ class So101Kinematics:
 
 
 def kinematics_for(robot: RobotDescription) -> Kinematics | None:
-    """The kinematics of a robot that is known here, else None. Needs MuJoCo."""
-    return So101Kinematics() if robot.name == NAME else None
+    """The kinematics of a robot that is known here; None for another one, and on an install without MuJoCo."""
+    if robot.name != NAME or importlib.util.find_spec("mujoco") is None:
+        return None
+    return So101Kinematics()

@@ -348,7 +348,7 @@ def test_two_workspaces_without_a_common_place_are_refused() -> None:
     [{"max_ee_speed_m_s": 0.1}, {"workspace_box_min_xyz": (0, 0, 0)}, {"max_cartesian_step_m": 0.1}],
 )
 def test_what_needs_kinematics_is_refused_without(envelope: Any) -> None:
-    with pytest.raises(ConfigError, match="no kinematics"):
+    with pytest.raises(ConfigError, match="cannot be kept: there are no kinematics"):
         gate(kinematic=False, **envelope)
 
 

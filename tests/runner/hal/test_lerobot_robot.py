@@ -135,6 +135,17 @@ def test_an_unknown_robot_is_told_with_what_lerobot_knows() -> None:
         make_hal(HalConfig(adapter="lerobot:so101_folower"))
 
 
+def test_a_connection_that_fails_half_way_is_taken_back_and_tried_again(make: Make) -> None:
+    hal = make(lost_answers=2)
+    hal.connect()
+    assert robot_of(hal).is_connected
+    assert hal.read_state().position[0] == 0.0
+    lost = make(lost_answers=100)
+    with pytest.raises(RobotFault, match="motor 3 is missing"):
+        lost.connect()
+    assert not robot_of(lost).is_connected
+
+
 def test_an_uncalibrated_robot_asks_nobody_on_the_terminal(make: Make) -> None:
     hal = make(calibrated=False)
     with pytest.raises(RobotFault, match="lerobot-calibrate"):

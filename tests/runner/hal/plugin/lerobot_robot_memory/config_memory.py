@@ -9,7 +9,8 @@ from lerobot.robots import RobotConfig
 @RobotConfig.register_subclass("memory_robot")
 @dataclass(kw_only=True)
 class MemoryRobotConfig(RobotConfig):
-    """`values` are the first positions, in the robot's own units; `modes` names lerobot's unit of each motor."""
+    """`values` are the first positions, in the robot's own units; `modes` names lerobot's unit of each motor. `lost_answers`
+    times connecting fails half way, with the port open."""
 
     port: str = "memory"
     values: list[float] = field(default_factory=lambda: [0.0, 0.0, 50.0])
@@ -17,5 +18,6 @@ class MemoryRobotConfig(RobotConfig):
     calibrated: bool = True
     max_relative_target: float | None = None
     bus: bool = True
+    lost_answers: int = 0
     extra_feature: str | None = None
     cameras: dict[str, Any] = field(default_factory=dict)

@@ -34,6 +34,7 @@ class MemoryRobot(Robot):
             self.bus = MemoryBus(config.modes)
         self.fault: Exception | None = None
         self.sent: list[dict[str, Any]] = []
+        self.lost_answers = config.lost_answers
         self._connected = False
 
     @property
@@ -59,6 +60,9 @@ class MemoryRobot(Robot):
         if self.fault:
             raise self.fault
         self._connected = True
+        if self.lost_answers:
+            self.lost_answers -= 1
+            raise RuntimeError("motor 3 is missing")
         if calibrate:
             self.calibrate()
 
