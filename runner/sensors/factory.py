@@ -16,6 +16,7 @@ from schemas.robot import SensorBackend, SensorReaderConfig
 BACKENDS: Mapping[SensorBackend, str] = {
     SensorBackend.OPENCV_THREAD: "runner.sensors.opencv_thread",
     SensorBackend.GSTREAMER: "runner.sensors.gstreamer",
+    SensorBackend.ROS2_IMAGE: "runner.sensors.ros2_image",
 }
 """Backend → module."""
 
@@ -26,8 +27,10 @@ def make_reader(config: SensorReaderConfig, clock: Clock) -> SlotReader:
     if module is None:
         known = ", ".join(BACKENDS)
         raise refuse_field(config, "backend", f"{config.backend} is reserved; choose from {known}")
-    if config.publish_to_ros:
-        raise refuse_field(config, "publish_to_ros", "publishing is not there in this version")
     tee: FrameTee | None = None
+    if config.publish_to_ros:
+        from runner.sensors.ros2_image import make_tee
+
+        tee = make_tee(config)
     reader: SlotReader = importlib.import_module(module).make(config, clock, tee)
     return reader

@@ -21,6 +21,7 @@ HEAVY = (
     "numpy",
     "cv2",
     "mujoco",
+    "cyclonedds",
     "matplotlib",
     "pynvml",
     "opentelemetry.sdk",

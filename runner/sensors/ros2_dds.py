@@ -1,0 +1,110 @@
+"""ROS 2's side of DDS: topic and type names, the domain, the quality of service. Cyclone DDS, without a ROS installation.
+
+Which network is used is Cyclone's own business: `CYCLONEDDS_URI` says it, as it does for ROS with rmw_cyclonedds.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Literal
+
+from schemas.errors import ConfigError
+
+MessageKind = Literal["image", "compressed"]
+"""`sensor_msgs/Image` or `sensor_msgs/CompressedImage`."""
+
+DOMAIN_MAX = 232  # the last one whose ports exist
+DOMAIN_VARIABLE = "ROS_DOMAIN_ID"
+_NAME = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*")
+
+
+def full_topic(name: str) -> str:
+    """A topic as `ros2 topic list` shows it, with its leading slash. Raises ValueError if it is no ROS name."""
+    if not _NAME.fullmatch(name):
+        raise ValueError(
+            f"{name!r} is no ROS topic: letters, digits and _ between slashes, such as /front/image_raw"
+        )
+    return "/" + name.removeprefix("/")
+
+
+def dds_topic(name: str) -> str:
+    """The name of a ROS topic in DDS: `rt` for topic, then the full name."""
+    return "rt" + full_topic(name)
+
+
+def domain_of(environment: Mapping[str, str] = os.environ) -> int:
+    """The domain that the environment asks for; 0 without one. Raises ValueError."""
+    text = environment.get(DOMAIN_VARIABLE, "") or "0"
+    if not text.isascii() or not text.isdigit() or int(text) > DOMAIN_MAX:
+        raise ValueError(f"{DOMAIN_VARIABLE} is {text!r}, not a number from 0 to {DOMAIN_MAX}")
+    return int(text)
+
+
+@functools.cache
+def dds_type(kind: MessageKind) -> Any:
+    """The DDS type of a message, under the name that ROS gives it.
+
+    Its samples stay as bytes (`cdr_of`, `sample_of`): the fields only describe the type to other participants.
+    """
+    from cyclonedds.idl import make_idl_struct
+    from cyclonedds.idl.types import int32, sequence, uint8, uint32
+
+    time = make_idl_struct("Time_", "builtin_interfaces.msg.dds_.Time_", {"sec": int32, "nanosec": uint32})
+    header = make_idl_struct("Header_", "std_msgs.msg.dds_.Header_", {"stamp": time, "frame_id": str})
+    if kind == "image":
+        fields = {
+            "header": header, "height": uint32, "width": uint32, "encoding": str, "is_bigendian": uint8, "step": uint32,
+            "data": sequence[uint8],
+        }  # fmt: skip
+        made = make_idl_struct("Image_", "sensor_msgs.msg.dds_.Image_", fields)
+    else:
+        fields = {"header": header, "format": str, "data": sequence[uint8]}
+        made = make_idl_struct("CompressedImage_", "sensor_msgs.msg.dds_.CompressedImage_", fields)
+    made.deserialize = staticmethod(lambda data, *_, **__: sample_of(made, bytes(data)))
+    made.serialize = lambda self, *_, **__: cdr_of(self)
+    return made
+
+
+def sample_of(dds_type: Any, cdr: bytes) -> Any:
+    """A sample of that type with these bytes."""
+    sample = dds_type.__new__(dds_type)
+    sample.cdr = cdr
+    return sample
+
+
+def cdr_of(sample: Any) -> bytes:
+    """The bytes of a sample that came in or was made by `sample_of`."""
+    cdr: bytes = sample.cdr
+    return cdr
+
+
+def qos_of(reliability: str, *, writer: bool) -> Any:
+    """What ROS offers or asks: volatile, the newest sample only, plain CDR. A writer never waits for a slow reader: it drops."""
+    from cyclonedds.core import Policy, Qos
+
+    reliable = Policy.Reliability.Reliable(max_blocking_time=0)
+    return Qos(
+        reliable if reliability == "reliable" else Policy.Reliability.BestEffort,
+        Policy.Durability.Volatile,
+        Policy.History.KeepLast(1),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+        *((Policy.WriterDataLifecycle(autodispose=False),) if writer else ()),  # ROS disposes of nothing
+    )
+
+
+@contextmanager
+def dds_problems(domain_id: int) -> Iterator[None]:
+    """Turns DDS's errors while something is made into ConfigError: no such interface, a broken CYCLONEDDS_URI, no free port."""
+    from cyclonedds.core import DDSException
+
+    try:
+        yield
+    except DDSException as error:
+        raise ConfigError(
+            f"DDS could not be started on domain {domain_id}: {error}",
+            hint="look at CYCLONEDDS_URI: its interfaces and peers; Cyclone's own words are on stderr",
+        ) from error

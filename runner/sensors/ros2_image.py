@@ -1,0 +1,286 @@
+"""Cameras of ROS 2, read from the network by DDS, and the way back: the frames of any reader as ROS pictures."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from runner.clock import Clock
+from runner.sensors.params import BackendParams, read_params, refuse, refuse_field, require_module
+from runner.sensors.ros2_dds import (
+    DOMAIN_MAX,
+    MessageKind,
+    cdr_of,
+    dds_problems,
+    dds_topic,
+    dds_type,
+    domain_of,
+    full_topic,
+    qos_of,
+    sample_of,
+)
+from runner.sensors.ros2_messages import (
+    Picture,
+    RosCompressedImage,
+    RosImage,
+    message_of,
+    picture_of,
+    read_compressed,
+    read_image,
+    write_cdr,
+)
+from runner.sensors.slot import Feed, FrameTee, SlotReader
+from schemas.errors import ConfigError
+from schemas.robot import SensorReaderConfig
+from schemas.world import SensorFrame
+
+log = logging.getLogger(__name__)
+
+TAKE_MAX = 4  # samples a turn: the reader keeps one, and there may be words about a publisher beside it
+WAIT_S = 1.0  # the longest that the thread sleeps in DDS; what happens wakes it
+STOP_S = 2.0
+AHEAD_MAX_NS = 50_000_000  # a stamp may lie so far in the future: clocks of two machines never agree fully
+_RELIABILITY = 11  # DDS's number for the policy that two sides can disagree about
+
+
+class RosImageParams(BackendParams):
+    """`backend_params` of `ros2_image`."""
+
+    topic: Annotated[str, Field(min_length=1, max_length=256)]
+    """As `ros2 topic list` shows it."""
+    message: MessageKind = "image"
+    """`sensor_msgs/Image`, or `sensor_msgs/CompressedImage` (JPEG)."""
+    reliability: Literal["best_effort", "reliable"] = "best_effort"
+    """Best effort reads every publisher; reliable only those that offer it."""
+    domain_id: Annotated[int, Field(ge=0, le=DOMAIN_MAX)] | None = None
+    """null: ROS_DOMAIN_ID of the environment, else 0."""
+    stamp: Literal["header", "arrival"] = "header"
+    """What a picture's age counts from: its header's stamp (the clocks of both machines must agree), or its arrival here (delays stay unseen)."""
+
+
+def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> SlotReader:
+    """A reader, not started. Raises ConfigError: parameters, Cyclone DDS not installed."""
+    params = read_params(config, RosImageParams)
+    require_module(config, "cyclonedds", "Cyclone DDS", "ros2")
+    try:
+        topic = full_topic(params.topic)
+    except ValueError as error:
+        raise refuse(config, "topic", str(error)) from error
+    if config.publish_topic is not None and full_topic(config.publish_topic) == topic:
+        raise refuse_field(config, "publish_topic", f"the camera is read from {topic} itself")
+    try:
+        domain_id = domain_of() if params.domain_id is None else params.domain_id
+    except ValueError as error:
+        raise refuse(config, "domain_id", str(error)) from error
+    return RosImageReader(config.sensor_id, config.max_age_ms, params, domain_id, clock, tee)
+
+
+def make_tee(config: SensorReaderConfig) -> RosImagePublisher:
+    """What publishes a camera's frames on its `publish_topic`. Raises ConfigError."""
+    require_module(config, "cyclonedds", "Cyclone DDS", "ros2")
+    try:
+        return RosImagePublisher(config.publish_topic or "", domain_of(), rate_hz=config.publish_rate_hz)
+    except ValueError as error:
+        raise refuse_field(config, "publish_topic", str(error)) from error
+
+
+class RosImageReader(SlotReader):
+    """One ROS topic as a camera. Its thread sleeps in DDS until a picture comes, publishers come or go, or it is stopped."""
+
+    def __init__(
+        self,
+        sensor_id: str,
+        max_age_ms: float,
+        params: RosImageParams,
+        domain_id: int,
+        clock: Clock,
+        tee: FrameTee | None = None,
+    ) -> None:
+        super().__init__(sensor_id, max_age_ms, clock, tee)
+        self._params = params
+        self._domain_id = domain_id
+        self._topic = full_topic(params.topic)
+        self._guard: Any = None
+        self._thread: threading.Thread | None = None
+
+    def _run_begins(self, feed: Feed) -> None:
+        """Raises ConfigError if DDS cannot be started."""
+        from cyclonedds.core import (
+            DDSStatus,
+            GuardCondition,
+            InstanceState,
+            ReadCondition,
+            SampleState,
+            ViewState,
+            WaitSet,
+        )
+        from cyclonedds.domain import DomainParticipant
+        from cyclonedds.sub import DataReader
+        from cyclonedds.topic import Topic
+
+        with dds_problems(self._domain_id):
+            participant = DomainParticipant(self._domain_id)
+            reader = DataReader(
+                participant,
+                Topic(participant, dds_topic(self._topic), dds_type(self._params.message)),
+                qos=qos_of(self._params.reliability, writer=False),
+            )
+            reader.set_status_mask(DDSStatus.SubscriptionMatched | DDSStatus.RequestedIncompatibleQos)
+            guard = self._guard = GuardCondition(participant)
+            waitset = WaitSet(participant)
+            data = ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any)
+            for entity in (data, reader, guard):
+                waitset.attach(entity)
+        self._thread = threading.Thread(
+            target=self._run,
+            args=(feed, waitset, reader, guard),
+            name=f"camera-{self.sensor_id}",
+            daemon=True,
+        )
+        self._thread.start()
+
+    def _run_ends(self) -> None:
+        if self._thread is not None:
+            self._guard.set(True)
+            self._thread.join(STOP_S)
+            self._thread = self._guard = None
+
+    # -- on the camera's thread ---------------------------------------------------------------------------------
+    def _run(self, feed: Feed, waitset: Any, reader: Any, guard: Any) -> None:
+        from cyclonedds.core import DDSException
+        from cyclonedds.util import duration
+
+        try:
+            while not guard.read():
+                waitset.wait(duration(seconds=WAIT_S))
+                self._look_at_publishers(feed, reader)
+                self._take(feed, reader)
+        except DDSException as error:
+            feed.end(f"DDS failed: {error}")
+        finally:
+            feed.end(
+                "the thread of its reader broke down; its log says why"
+            )  # if nothing else was said before
+
+    def _look_at_publishers(self, feed: Feed, reader: Any) -> None:
+        from cyclonedds.core import DDSStatus
+
+        changes = reader.take_status(DDSStatus.SubscriptionMatched | DDSStatus.RequestedIncompatibleQos)
+        if not changes:
+            return
+        matched = reader.get_subscription_matched_status()
+        refused = reader.get_requested_incompatible_qos_status()
+        if matched.current_count:
+            return
+        if matched.current_count_change < 0:
+            feed.interrupt(f"nobody publishes on {self._topic} any more")
+        if refused.total_count_change:
+            feed.interrupt(
+                f"who publishes on {self._topic} offers best effort, and this reader asks for reliable: say reliability: best_effort"
+                if refused.last_policy_id == _RELIABILITY
+                else f"a publisher on {self._topic} offers another quality of service (policy {refused.last_policy_id})"
+            )
+
+    def _take(self, feed: Feed, reader: Any) -> None:
+        samples = reader.take(N=TAKE_MAX)
+        newest = next((sample for sample in reversed(samples) if sample.sample_info.valid_data), None)
+        if newest is None:
+            return
+        try:
+            message = (read_image if self._params.message == "image" else read_compressed)(cdr_of(newest))
+            picture = picture_of(message)
+            frame = self._frame(message, picture, newest.sample_info.source_timestamp)
+        except ValueError as error:
+            feed.interrupt(f"what comes on {self._topic} cannot be used: {error}")
+        else:
+            self.deliver(feed, frame)
+
+    def _frame(self, message: RosImage | RosCompressedImage, picture: Picture, sent_ns: int) -> SensorFrame:
+        """Raises ValueError for a stamp of the future."""
+        now_ns, wall_ns = self.clock.now_ns(), self.clock.wall_ns()
+        taken_ns = (message.stamp_ns or sent_ns) if self._params.stamp == "header" else wall_ns
+        if taken_ns < 0:
+            raise ValueError("it is stamped before 1970")
+        age_ns = wall_ns - taken_ns
+        if age_ns < -AHEAD_MAX_NS:
+            raise ValueError(
+                f"it is stamped {-age_ns / 1e6:.0f} ms in the future; set the machines' clocks, or say stamp: arrival"
+            )
+        return SensorFrame(
+            sensor_id=self.sensor_id,
+            stamp_monotonic_ns=max(0, now_ns - max(0, age_ns)),
+            stamp_wall_ns=taken_ns,
+            encoding=picture.encoding,
+            width=picture.width,
+            height=picture.height,
+            channels=picture.channels,
+            data=picture.data,
+            metadata={"frame_id": message.frame_id, "topic": self._topic},
+        )
+
+
+class RosImagePublisher:
+    """A `FrameTee` onto a ROS topic: Image, or CompressedImage for JPEG frames.
+
+    Offered as reliable, which every ROS subscriber takes; kept for nobody, so a slow one misses pictures and the camera never waits.
+    `publish` never raises: pictures that could not be sent are counted in `dropped`, and the first of a row is logged.
+    """
+
+    def __init__(self, topic: str, domain_id: int, *, rate_hz: float | None = None) -> None:
+        """Raises ValueError if `topic` is no ROS name. `rate_hz`: at most so many pictures a second."""
+        self.topic = full_topic(topic)
+        self.domain_id = domain_id
+        self.published = 0
+        self.dropped = 0
+        self._period_ns = 0.0 if rate_hz is None else 1e9 / rate_hz
+        self._next_ns = 0.0
+        self._failing = False
+        self._kind: MessageKind | None = None
+        self._writer: Any = None
+
+    def publish(self, frame: SensorFrame) -> None:
+        from cyclonedds.core import DDSException
+
+        if frame.stamp_monotonic_ns < self._next_ns:
+            return
+        try:
+            if frame.data is None:
+                raise ValueError("the frame's bytes are not in this process")
+            picture = Picture(frame.encoding, frame.width, frame.height, frame.channels, frame.data)
+            message = message_of(picture, frame.stamp_wall_ns, frame.sensor_id)
+            kind: MessageKind = "image" if isinstance(message, RosImage) else "compressed"
+            self._open(kind).write(sample_of(dds_type(kind), write_cdr(message)))
+        except (ValueError, ConfigError, DDSException) as error:
+            self.dropped += 1
+            if not self._failing:
+                log.warning("camera %s: no picture on %s: %s", frame.sensor_id, self.topic, error)
+            self._failing = True
+            return
+        self._failing = False
+        self.published += 1
+        due_ns = self._next_ns + self._period_ns
+        self._next_ns = (
+            due_ns if due_ns > frame.stamp_monotonic_ns else frame.stamp_monotonic_ns + self._period_ns
+        )
+
+    def close(self) -> None:
+        """Leave the domain. `publish` joins it again."""
+        self._writer = self._kind = None
+
+    def _open(self, kind: MessageKind) -> Any:
+        from cyclonedds.domain import DomainParticipant
+        from cyclonedds.pub import DataWriter
+        from cyclonedds.topic import Topic
+
+        if self._writer is None:
+            with dds_problems(self.domain_id):
+                participant = DomainParticipant(self.domain_id)
+                topic = Topic(participant, dds_topic(self.topic), dds_type(kind))
+                self._writer = DataWriter(participant, topic, qos=qos_of("reliable", writer=True))
+            self._kind = kind
+        elif kind != self._kind:
+            raise ValueError("a topic carries one type: the camera changed between JPEG and plain pictures")
+        return self._writer

@@ -1,0 +1,387 @@
+"""ROS 2 pictures over DDS on loopback: a publisher and a subscriber in processes of their own, which know nothing of the product."""
+
+import base64
+import json
+import os
+import signal
+import subprocess
+import sys
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from runner.clock import SystemClock
+from runner.sensors import SlotReader
+from runner.sensors.factory import make_reader
+from runner.sensors.ros2_dds import domain_of, full_topic
+from runner.sensors.ros2_image import RosImagePublisher
+from schemas.errors import ConfigError, FrameStale
+from schemas.robot import SensorBackend, SensorReaderConfig
+from schemas.world import FrameEncoding, SensorFrame
+
+pytestmark = pytest.mark.heavy  # Cyclone DDS
+
+NETWORK = (
+    '<CycloneDDS><Domain Id="any"><General><AllowMulticast>false</AllowMulticast>'
+    '<Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces></General>'
+    "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>"
+    '<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>'
+)
+DOMAIN = "77"
+Reading = Callable[[SlotReader], SlotReader]
+
+
+class Node:
+    """The other process. `tell` sends it a line, `told` waits for one of its."""
+
+    def __init__(self, what: str, topic: str, message: str, reliability: str, network: str = NETWORK) -> None:
+        script = Path(__file__).with_name("ros2_node.py")
+        self.process = subprocess.Popen(
+            [sys.executable, str(script), what, topic, message, reliability],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, "CYCLONEDDS_URI": network},
+            text=True,
+        )
+        assert self.told() == {"ready": True}
+
+    def tell(self, **line: Any) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps(line) + "\n")
+        self.process.stdin.flush()
+
+    def told(self) -> Any:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, f"the node ended with {self.process.wait(30)}"
+        return json.loads(line)
+
+    def publish(self, data: bytes, stamp_ns: int | None = None, **fields: Any) -> None:
+        stamp_ns = SystemClock().wall_ns() if stamp_ns is None else stamp_ns
+        self.tell(stamp=divmod(stamp_ns, 10**9), data=base64.b64encode(data).decode(), **fields)
+        assert self.told() == {"sent": True}
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            assert self.process.stdin is not None
+            self.process.stdin.close()
+            self.process.wait(30)
+
+
+@pytest.fixture(autouse=True)
+def loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", NETWORK)
+    monkeypatch.setenv("ROS_DOMAIN_ID", DOMAIN)
+
+
+@pytest.fixture
+def topic() -> str:
+    return f"/front_{uuid.uuid4().hex}/image_raw"
+
+
+@pytest.fixture
+def node() -> Iterator[Callable[..., Node]]:
+    made: list[Node] = []
+
+    def make(
+        what: str,
+        topic: str,
+        message: str = "image",
+        reliability: str = "best_effort",
+        network: str = NETWORK,
+    ) -> Node:
+        made.append(Node(what, topic, message, reliability, network))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def config(topic: str, max_age_ms: float = 60_000.0, **params: Any) -> SensorReaderConfig:
+    return SensorReaderConfig(
+        sensor_id="front",
+        backend=SensorBackend.ROS2_IMAGE,
+        backend_params={"topic": topic, **params},
+        max_age_ms=max_age_ms,
+    )
+
+
+def reader_of(topic: str, **params: Any) -> SlotReader:
+    return make_reader(config(topic, **params), SystemClock())
+
+
+def image(width: int, height: int, encoding: str = "rgb8", per_pixel: int = 3) -> dict[str, Any]:
+    return {
+        "width": width, "height": height, "encoding": encoding, "is_bigendian": 0, "step": width * per_pixel,
+    }  # fmt: skip
+
+
+def picture_now(reader: SlotReader, publisher: Node, data: bytes, **fields: Any) -> SensorFrame:
+    """Publish until this picture is the newest: best effort repeats nothing. At most a minute."""
+    slot = reader.slot
+    for _ in range(300):
+        publisher.publish(data, **fields)
+        with slot._changed:
+            if slot._changed.wait_for(lambda: slot._frame is not None and slot._frame.data == data, 0.2):
+                return reader.read_latest()
+    raise AssertionError(f"no picture within a minute: {slot._reason}")
+
+
+def why_stale(reader: SlotReader, word: str) -> str:
+    """What readers are told, once it contains `word`; waits at most a minute."""
+    slot = reader.slot
+    with slot._changed:
+        assert slot._changed.wait_for(lambda: word in slot._reason, 60), slot._reason
+    with pytest.raises(FrameStale) as stale:
+        reader.read_latest()
+    return str(stale.value)
+
+
+@pytest.mark.parametrize("reliability", ["best_effort", "reliable"])
+def test_pictures_of_another_process_arrive(
+    topic: str, node: Callable[..., Node], reading: Reading, reliability: str
+) -> None:
+    reader = reading(reader_of(topic, reliability=reliability))
+    publisher = node("publish", topic, "image", "reliable")
+    data = os.urandom(64 * 48 * 3)
+    before_ns = SystemClock().wall_ns()
+    frame = picture_now(reader, publisher, data, **image(64, 48))
+    assert (frame.sensor_id, frame.encoding, frame.width, frame.height) == ("front", "rgb8", 64, 48)
+    assert frame.data == data
+    assert frame.metadata == {"frame_id": "cam", "topic": topic}
+    assert before_ns <= frame.stamp_wall_ns <= SystemClock().wall_ns()
+    again = os.urandom(64 * 48 * 3)
+    assert picture_now(reader, publisher, again, **image(64, 48)).data == again
+
+
+def test_a_picture_larger_than_a_datagram_arrives_whole(
+    topic: str, node: Callable[..., Node], reading: Reading
+) -> None:
+    reader = reading(reader_of(topic, reliability="reliable"))
+    publisher = node("publish", topic, "image", "reliable")
+    data = os.urandom(640 * 480 * 3)
+    assert picture_now(reader, publisher, data, **image(640, 480, "bgr8")).data == data
+
+
+def test_jpeg_pictures(topic: str, node: Callable[..., Node], reading: Reading) -> None:
+    import cv2
+    import numpy as np
+
+    data = bytes(cv2.imencode(".jpg", np.full((48, 64, 3), 90, dtype=np.uint8))[1])
+    reader = reading(reader_of(topic + "/compressed", message="compressed"))
+    publisher = node("publish", topic + "/compressed", "compressed")
+    frame = picture_now(reader, publisher, data, format="jpeg")
+    assert (frame.encoding, frame.width, frame.height, frame.channels) == ("jpeg", 64, 48, 3)
+    assert frame.data == data
+
+
+def test_age_counts_from_the_header(topic: str, node: Callable[..., Node], reading: Reading) -> None:
+    reader = reading(reader_of(topic, max_age_ms=1_000.0, reliability="reliable"))
+    publisher = node("publish", topic, "image", "reliable")
+    old_ns = SystemClock().wall_ns() - 3600 * 10**9
+    publisher.publish(bytes(12), old_ns, **image(2, 2))
+    slot = reader.slot
+    with slot._changed:
+        assert slot._changed.wait_for(lambda: slot._frame is not None, 60)
+    with pytest.raises(FrameStale, match=r"is 36\d\d\d\d\d ms old, 1000 ms are accepted"):
+        reader.read_latest()
+    publisher.publish(bytes(12), SystemClock().wall_ns() + 3600 * 10**9, **image(2, 2))
+    assert "in the future; set the machines' clocks" in why_stale(reader, "future")
+
+
+def test_age_can_count_from_the_arrival(topic: str, node: Callable[..., Node], reading: Reading) -> None:
+    reader = reading(reader_of(topic, stamp="arrival"))
+    publisher = node("publish", topic)
+    frame = picture_now(
+        reader, publisher, bytes(12), stamp_ns=1, **image(2, 2)
+    )  # a clock that begins with the machine
+    assert reader.read_latest().data == frame.data
+
+
+def test_a_picture_that_cannot_be_used_is_not_shown(
+    topic: str, node: Callable[..., Node], reading: Reading
+) -> None:
+    reader = reading(reader_of(topic, reliability="reliable"))
+    publisher = node("publish", topic, "image", "reliable")
+    picture_now(reader, publisher, bytes(12), **image(2, 2))
+    publisher.publish(bytes(4), **image(2, 2, "bayer_rggb8", 1))
+    assert "'bayer_rggb8' is not supported" in why_stale(reader, "bayer")
+    picture_now(reader, publisher, bytes(12), **image(2, 2))
+    publisher.publish(bytes(11), **image(2, 2))
+    assert "in 11 bytes" in why_stale(reader, "11 bytes")
+    assert picture_now(reader, publisher, bytes(12), **image(2, 2)).width == 2
+
+
+def test_a_publisher_that_leaves_takes_its_picture_with_it(
+    topic: str, node: Callable[..., Node], reading: Reading
+) -> None:
+    reader = reading(reader_of(topic))
+    publisher = node("publish", topic)
+    picture_now(reader, publisher, bytes(12), **image(2, 2))
+    publisher.close()
+    assert f"nobody publishes on {topic} any more" in why_stale(reader, "nobody")
+    other = node("publish", topic)
+    assert picture_now(reader, other, bytes(12), **image(2, 2)).height == 2
+
+
+def test_a_killed_publisher_is_noticed_too(topic: str, node: Callable[..., Node], reading: Reading) -> None:
+    reader = reading(reader_of(topic))
+    brief = NETWORK.replace("<Discovery>", "<Discovery><LeaseDuration>1s</LeaseDuration>")
+    publisher = node("publish", topic, network=brief)
+    picture_now(reader, publisher, bytes(12), **image(2, 2))
+    publisher.process.send_signal(signal.SIGKILL)
+    publisher.process.wait(30)
+    assert "nobody publishes" in why_stale(reader, "nobody")  # when its lease in DDS is over
+
+
+def test_a_publisher_with_another_quality_of_service_is_named(
+    topic: str, node: Callable[..., Node], reading: Reading
+) -> None:
+    reader = reading(reader_of(topic, reliability="reliable"))
+    node("publish", topic, "image", "best_effort")
+    assert "say reliability: best_effort" in why_stale(reader, "best_effort")
+
+
+def test_stopping_ends_the_thread_and_starting_begins_anew(topic: str, node: Callable[..., Node]) -> None:
+    reader = reader_of(topic)
+    publisher = node("publish", topic)
+    for _ in range(2):
+        reader.start()
+        thread = reader._thread  # type: ignore[attr-defined]  # of the reader of this backend
+        picture_now(reader, publisher, bytes(12), **image(2, 2))
+        reader.stop()
+        thread.join(30)
+        assert not thread.is_alive()
+        with pytest.raises(FrameStale, match="stopped"):
+            reader.read_latest()
+
+
+def test_the_frames_of_any_reader_can_be_published(
+    topic: str, node: Callable[..., Node], make_video: Callable[..., Path], reading: Reading
+) -> None:
+    subscriber = node("subscribe", topic, "image", "reliable")
+    camera = SensorReaderConfig(
+        sensor_id="file",
+        backend_params={"path": str(make_video([200], fps=20.0)), "loop": True},
+        publish_to_ros=True,
+        publish_topic=topic,
+    )
+    reading(make_reader(camera, SystemClock()))
+    got = subscriber.told()
+    assert (got["width"], got["height"], got["encoding"], got["step"], got["frame_id"]) == (
+        64, 48, "bgr8", 64 * 3, "file",
+    )  # fmt: skip
+    data = base64.b64decode(got["data"])
+    assert len(data) == 64 * 48 * 3
+    assert sum(data) / len(data) == pytest.approx(200, abs=3)
+
+
+def plain(stamp_ns: int, encoding: FrameEncoding = FrameEncoding.MONO8, **where: Any) -> SensorFrame:
+    return SensorFrame(
+        sensor_id="front", stamp_monotonic_ns=stamp_ns, stamp_wall_ns=stamp_ns, encoding=encoding, width=1, height=1,
+        channels=1, **(where or {"data": b"x"}),
+    )  # fmt: skip
+
+
+def test_the_publisher_keeps_to_its_rate_and_counts_what_it_cannot_send(topic: str) -> None:
+    publisher = RosImagePublisher(topic, int(DOMAIN), rate_hz=10.0)
+    for at_ms in range(1000, 2000, 33):
+        publisher.publish(plain(at_ms * 1_000_000))
+    assert (publisher.published, publisher.dropped) == (10, 0)
+    publisher.publish(plain(3_000_000_000, handle=7))
+    publisher.publish(plain(3_000_000_000, FrameEncoding.CUDA_NV12))
+    publisher.publish(plain(3_000_000_000, FrameEncoding.JPEG))
+    assert (publisher.published, publisher.dropped) == (10, 3)
+    publisher.close()
+    publisher.publish(plain(4_000_000_000))
+    assert publisher.published == 11
+    publisher.close()
+
+
+@pytest.mark.parametrize("encoding", [FrameEncoding.DEPTH16, FrameEncoding.JPEG])
+def test_what_is_published_is_read_as_it_was(topic: str, reading: Reading, encoding: FrameEncoding) -> None:
+    import cv2
+    import numpy as np
+
+    depth = np.arange(12, dtype="<u2").reshape(3, 4) * 5000
+    data = (
+        depth.tobytes() if encoding is FrameEncoding.DEPTH16 else bytes(cv2.imencode(".jpg", depth >> 8)[1])
+    )
+    message = "image" if encoding is FrameEncoding.DEPTH16 else "compressed"
+    reader = reading(reader_of(topic, message=message, reliability="reliable"))
+    publisher = RosImagePublisher(topic, int(DOMAIN))
+    slot, clock = reader.slot, SystemClock()
+    for _ in range(300):
+        frame = SensorFrame(
+            sensor_id="other", stamp_monotonic_ns=clock.now_ns(), stamp_wall_ns=clock.wall_ns(), encoding=encoding,
+            width=4, height=3, channels=1, data=data,
+        )  # fmt: skip
+        publisher.publish(frame)
+        with slot._changed:
+            if slot._changed.wait_for(lambda: slot._frame is not None, 0.2):
+                break
+    got = reader.read_latest()
+    publisher.close()
+    assert (got.encoding, got.width, got.height, got.channels, got.data) == (encoding, 4, 3, 1, data)
+
+
+def test_a_network_that_is_not_there_is_said_at_the_start(
+    topic: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a process of its own: Cyclone reads its settings once."""
+    monkeypatch.setenv("CYCLONEDDS_URI", NETWORK.replace('name="lo"', 'name="no-such-if"'))
+    code = (
+        "from runner.clock import SystemClock\n"
+        "from runner.sensors.factory import make_reader\n"
+        "from schemas.robot import SensorReaderConfig\n"
+        f"reader = make_reader(SensorReaderConfig(sensor_id='a', backend='ros2_image', backend_params={{'topic': {topic!r}}}), SystemClock())\n"
+        "try:\n    reader.start()\nexcept Exception as error:\n    print(type(error).__name__, error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.stdout.startswith("ConfigError DDS could not be started on domain 77"), done
+    assert "CYCLONEDDS_URI" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("params", "problem"),
+    [
+        ({}, "backend_params.topic: Field required"),
+        ({"topic": "front camera"}, "is no ROS topic"),
+        ({"topic": "/a", "qos": "reliable"}, "backend_params.qos: unknown key"),
+        ({"topic": "/a", "domain_id": 233}, "domain_id"),
+        ({"topic": "/a", "message": "depth"}, "'image' or 'compressed'"),
+    ],
+)
+def test_wrong_parameters_are_refused(params: dict[str, Any], problem: str) -> None:
+    camera = SensorReaderConfig(sensor_id="front", backend=SensorBackend.ROS2_IMAGE, backend_params=params)
+    with pytest.raises(ConfigError) as refused:
+        make_reader(camera, SystemClock())
+    assert problem in str(refused.value)
+
+
+def test_a_camera_is_not_published_where_it_is_read() -> None:
+    camera = config("/a/b").model_copy(update={"publish_to_ros": True, "publish_topic": "a/b"})
+    with pytest.raises(ConfigError, match="read from /a/b itself"):
+        make_reader(camera, SystemClock())
+    other = SensorReaderConfig(
+        sensor_id="front", backend_params={"device": 0}, publish_to_ros=True, publish_topic="a b"
+    )
+    with pytest.raises(ConfigError, match=r"publish_topic: 'a b' is no ROS topic"):
+        make_reader(other, SystemClock())
+
+
+def test_names_and_domains() -> None:
+    assert full_topic("front/image_raw") == full_topic("/front/image_raw") == "/front/image_raw"
+    for wrong in ("", "/", "//a", "/a/", "/1a", "a-b"):
+        with pytest.raises(ValueError, match="no ROS topic"):
+            full_topic(wrong)
+    assert (domain_of({}), domain_of({"ROS_DOMAIN_ID": "42"})) == (0, 42)
+    for wrong in ("-1", "233", "x"):
+        with pytest.raises(ValueError, match="ROS_DOMAIN_ID"):
+            domain_of({"ROS_DOMAIN_ID": wrong})
