@@ -62,7 +62,7 @@ class Catalogue:
     ) -> tuple[SkillKey, Callable[[], Skill], RSkillManifest]:
         """Key, maker and manifest of an executable skill. Raises UnknownSkill, which says what there is."""
         manifest = self._manifests.get(rskill_id)
-        runnable = [m.name for m in self._manifests.values() if m.kind in self._makers]
+        runnable = [manifest.name for manifest in self.executable()]
         if (why := self._refused.get(rskill_id)) is not None:
             raise UnknownSkill(f"{rskill_id} is not offered here: {why}")
         if manifest is None:
@@ -82,6 +82,10 @@ class Catalogue:
     def deadline_s(self, manifest: RSkillManifest, asked_s: float) -> float:
         """Seconds a goal may take in all, from acceptance: as asked, else the manifest's time of motion and 90 s to get there."""
         return asked_s or (manifest.latency_budget.max_execution_s or MOTION_S) + START_S
+
+    def executable(self) -> list[RSkillManifest]:
+        """What a goal may ask for."""
+        return [manifest for manifest in self._manifests.values() if manifest.kind in self._makers]
 
     def summary(self) -> list[str]:
         """A line a skill, for people: name, version, licence, and whether a goal may execute it."""

@@ -115,7 +115,7 @@ class Deploy:
         manifests = read_manifests(self._args.skills or [default_skills()])
         check = self._offered(parts, manifests, None)
         if self._args.dry_run:
-            print(plan(self._file, parts, check, self._facts()))
+            print(plan(self._file, parts, check, self._facts(check)))
             print("dry run: nothing was opened")
             return 0
         for text in (*parts.gate.unkept, *unused(self._file.robot)):
@@ -147,9 +147,15 @@ class Deploy:
         makers = self._make_makers(parts.hal, arbiter)
         return offered(self._file, parts, manifests, makers, self._args.allow_noncommercial)
 
-    def _facts(self) -> dict[str, str]:
+    def _facts(self, catalogue: Catalogue) -> list[tuple[str, str]]:
+        given = sidecars_given(self._args.sidecar)
+        sidecars = [
+            ("sidecar", f"of {manifest.name} at {sidecar_endpoint(manifest.name, given, os.environ)}")
+            for manifest in catalogue.executable()
+            if manifest.kind is Kind.VLA
+        ]
         arbiter = "none" if self._args.no_arbiter else self._args.arbiter or "the machine's own"
-        return {"goals": f"served on {self._endpoint}", "arbiter": arbiter}
+        return [*sidecars, ("goals", f"served on {self._endpoint}"), ("arbiter", arbiter)]
 
     def _identity(self, parts: Parts, arbiter: Arbiter | None) -> dict[str, object]:
         return {

@@ -214,7 +214,7 @@ def unused(robot: RobotEnvironment) -> list[str]:
 
 
 # -- for people ---------------------------------------------------------------------------------------------------------
-def plan(file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Mapping[str, str]) -> str:
+def plan(file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Iterable[tuple[str, str]]) -> str:
     """What would run, a line a part. `facts` are lines of whoever puts the program together."""
     robot, description = file.robot, parts.hal.description
     twin = ", simulated" if description.simulated else ""
@@ -241,7 +241,7 @@ def plan(file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Mappin
         lines.append(("task", f"{robot.task.id}: {robot.vla.id} {robot.task.instruction!r}{limit}"))
     if robot.max_ticks is not None:
         lines.append(("end", f"after {robot.max_ticks} ticks"))
-    lines += list(facts.items())
+    lines += facts
     lines += [("unused", text) for text in unused(robot)]
     return "\n".join(f"{label:<9} {text}" for label, text in lines)
 

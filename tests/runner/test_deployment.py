@@ -149,6 +149,7 @@ def test_a_task_that_fits_passes(dry_run: DryRun) -> None:
     code, out, err = dry_run(TWIN + "sensors:\n" + cameras + GRAB_TASK, skills=GRAB)
     assert code == 0, err
     assert "task      grab: vram-arbiter/so101-grab 'grab it'" in out
+    assert re.search(r"sidecar +of vram-arbiter/so101-grab at ipc://.*/grab\.sock", out), out
     assert "camera    front by opencv_thread, at most 100 ms old" in out
 
 

@@ -24,6 +24,7 @@ from schemas.errors import (
     AlreadyRunning,
     BadRequest,
     BadState,
+    EstopRequested,
     Evicted,
     GoalRejected,
     ManifestInvalid,
@@ -358,3 +359,22 @@ def test_manifests_are_read_from_folders_and_checked(tmp_path: Path, navigate_ma
     (tmp_path / "one/empty").mkdir()
     with pytest.raises(ManifestInvalid, match="no skill"):
         read_manifests([tmp_path / "one" / "empty"])
+
+
+@pytest.mark.parametrize("prompt", ["forever", "hang"])
+def test_the_emergency_stop_of_a_simulator_ends_its_goal_too(
+    bench: Any, endpoint: str, run_async: Run, prompt: str
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt=prompt)
+        while not b.made:
+            await client.ping()
+        await b.made[0].begun.wait()
+        assert "emergency stop: smoke" in (await client.estop("smoke"))["message"]
+        result = await goal.result(60)
+        assert (result["status"], result["code"]) == ("failed", "estop_requested")
+        assert b.made[0].story == [f"start {prompt}", "finish"]
+        with pytest.raises(EstopRequested, match="smoke"):
+            await client.send_goal(RSKILL, prompt="end")
+
+    play(run_async, bench, endpoint, body)
