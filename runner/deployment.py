@@ -99,6 +99,7 @@ def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
             rate_hz=robot.rate_hz,
             kinematics=kinematics_for(hal.description),
             envelopes={"safety": robot.safety},
+            sent=hal.sent,
         )
     except ConfigError as error:
         raise file.merged([*errors, file.located(error, "safety")]) from error

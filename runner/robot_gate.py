@@ -8,7 +8,7 @@ is not read: nobody who makes actions can switch a check off. Knows no skills, a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from runner.limits import EVERYWHERE, Kinematics, Limits, Vector3, outside_m, own_limits, tighten
@@ -31,6 +31,7 @@ SHORTENINGS_MAX = 20
 EPSILON = 1e-9
 
 Targets = dict[str, float]
+Sent = Callable[[], Mapping[str, float]]
 Verdict = tuple[Action | None, tuple[str, ...]]
 
 
@@ -59,6 +60,8 @@ class _Withheld(Exception):
 class RobotGate:
     """`envelopes` by the name that errors use for them; each only tightens the robot's own limits (see `runner.limits`).
 
+    `sent` gives the last target (rad) that the motors really got, by joint (`HalBase.sent`): an action that passes here can still be
+    dropped for being late, and the next step must not begin where that one would have ended. Without it what passed counts as sent.
     `needs` are the components of the world state that must be fresh, beside the joint state; None: all that are in it. Raises
     ConfigError for envelopes that cannot be kept. `check` on the control thread, `trip` on any.
     """
@@ -70,12 +73,14 @@ class RobotGate:
         rate_hz: float,
         kinematics: Kinematics | None = None,
         envelopes: Mapping[str, SafetyEnvelope | None] | None = None,
+        sent: Sent | None = None,
         needs: frozenset[str] | None = None,
         _base: tuple[Limits, _Memory] | None = None,
     ) -> None:
         self._robot = robot
         self._period_s = 1.0 / rate_hz
         self._kinematics = kinematics
+        self._sent = sent
         self._needs = needs
         limits, self._memory = _base or (own_limits(robot), _Memory())
         for name, envelope in (envelopes or {}).items():
@@ -93,6 +98,7 @@ class RobotGate:
             rate_hz=1.0 / self._period_s,
             kinematics=self._kinematics,
             envelopes={name: envelope},
+            sent=self._sent,
             needs=self._needs if needs is None else needs,
             _base=(self.limits, self._memory),
         )
@@ -189,8 +195,7 @@ class RobotGate:
                 continue
             # what made this effort is the last target's distance; with less distance there is less effort
             share = min(1.0, limit / abs(effort))
-            last = self._memory.last.get(name, (measured[name], 0))[0]
-            most = measured[name] + share * (last - measured[name])
+            most = measured[name] + share * (self._last(name, measured) - measured[name])
             if (target - most) * effort <= 0:
                 continue
             low, high = self.limits.joints_rad[name]
@@ -205,6 +210,12 @@ class RobotGate:
             return min(self.limits.torque_nm, self.limits.force_n * self._kinematics.gripper_lever_m)
         return self.limits.torque_nm
 
+    def _last(self, name: str, measured: Mapping[str, float]) -> float:
+        """The joint's last target, or where it is when it never had one."""
+        if self._sent is not None:
+            return self._sent().get(name, measured[name])
+        return self._memory.last.get(name, (measured[name], 0))[0]
+
     # -- speeds ------------------------------------------------------------------------------------------------------------
     def _motion(
         self, targets: Targets, measured: Mapping[str, float], yielding: frozenset[str], now_ns: int
@@ -213,7 +224,7 @@ class RobotGate:
         for name in targets:
             last = self._memory.last.get(name)
             if last is not None and 0 <= now_ns - last[1] <= REFERENCE_AGE_S * 1e9:
-                start[name] = last[0]
+                start[name] = self._last(name, measured)
                 late_s = (now_ns - last[1]) / 1e9
                 elapsed_s = max(elapsed_s, min(late_s, LATE_MAX * self._period_s))
             else:

@@ -25,6 +25,7 @@ class HalBase(ABC):
         self.description = description
         self._connected = False
         self._estop: EstopRequested | None = None
+        self._sent: dict[str, float] = {}
 
     # -- what the hardware does ------------------------------------------------------------------------------------------
     @abstractmethod
@@ -38,8 +39,8 @@ class HalBase(ABC):
     def _read(self) -> JointState: ...
 
     @abstractmethod
-    def _drive(self, targets: Mapping[str, float]) -> None:
-        """Send joint targets in rad. Joints that are left out keep their last target."""
+    def _drive(self, targets: Mapping[str, float]) -> Mapping[str, float]:
+        """Send joint targets in rad; returns those that the hardware accepted. Joints that are left out keep their last target."""
 
     @abstractmethod
     def _halt(self) -> str:
@@ -51,6 +52,7 @@ class HalBase(ABC):
         if self._estop is not None:
             raise self._estop
         if not self._connected:
+            self._sent = {}
             self._open()
             self._connected = True
 
@@ -78,7 +80,11 @@ class HalBase(ABC):
         if self._estop is not None:
             raise self._estop
         self._require_connected()
-        self._drive(self._targets_of(action))
+        self._sent.update(self._drive(self._targets_of(action)))
+
+    def sent(self) -> Mapping[str, float]:
+        """The last target (rad) that the motors were really given, by joint; empty before the first action."""
+        return self._sent
 
     def estop(self, reason: str) -> NoReturn:
         """Stop the motors, latch, raise EstopRequested. Again: stops again and raises the first one's reason."""

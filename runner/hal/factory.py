@@ -12,11 +12,12 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from runner.clock import Clock
+from runner.hal.base import HalBase
 from runner.hal.kinematic import KinematicTwin
 from runner.hal.lerobot_robot import POSITION, Estop, LerobotHal, can_switch_off
 from runner.hal.so101 import so101
 from runner.hal.units import JointScale, JointUnit
-from runner.protocols import Hal, Joint, RobotDescription
+from runner.protocols import Joint, RobotDescription
 from schemas.errors import ConfigError
 from schemas.robot import HalConfig
 from schemas.yamltext import Path, Problem, config_error, did_you_mean, dotted
@@ -66,7 +67,7 @@ class LerobotParams(_Params):
     estop: Estop = "hold"
 
 
-def make_hal(config: HalConfig, *, clock: Clock | None = None, source: str = "deployment") -> Hal:
+def make_hal(config: HalConfig, *, clock: Clock | None = None, source: str = "deployment") -> HalBase:
     """The adapter that `config` asks for, not connected. `source` is how errors call the file.
 
     Raises ConfigError (details.fields: field, problem) for an unknown adapter and for what it does not take.
@@ -109,7 +110,7 @@ def _joints_are_known(given: Mapping[str, Any], names: tuple[str, ...], path: Pa
 
 
 # -- twins --------------------------------------------------------------------------------------------------------------
-def _twin(config: HalConfig, clock: Clock | None, source: str) -> Hal:
+def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
     if config.transport:
         raise _wrong(source, ("transport", next(iter(config.transport))), "a twin is reached by no transport")
     description = so101(simulated=True)
@@ -135,7 +136,7 @@ def _twin(config: HalConfig, clock: Clock | None, source: str) -> Hal:
 
 
 # -- lerobot ------------------------------------------------------------------------------------------------------------
-def _lerobot(config: HalConfig, clock: Clock | None, source: str) -> Hal:
+def _lerobot(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
     params = _params(LerobotParams, config, source)
     robot = _robot(config, source)
     features = list(robot.action_features)

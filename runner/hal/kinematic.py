@@ -49,9 +49,10 @@ class KinematicTwin(HalBase):
             stamp_ns=self._now_ns,
         )
 
-    def _drive(self, targets: Mapping[str, float]) -> None:
+    def _drive(self, targets: Mapping[str, float]) -> Mapping[str, float]:
         self._advance()
         self._target.update(targets)
+        return targets
 
     def _halt(self) -> str:
         self._advance()

@@ -97,7 +97,7 @@ class LerobotHal(HalBase):
         positions = self._positions()
         return JointState(name=tuple(positions), position=tuple(positions.values()), stamp_ns=stamp_ns)
 
-    def _drive(self, targets: Mapping[str, float]) -> None:
+    def _drive(self, targets: Mapping[str, float]) -> Mapping[str, float]:
         wanted = {**self._target, **targets}
         command = {name + POSITION: self._scales[name].from_rad(value) for name, value in wanted.items()}
         with self._faults("move"):
@@ -106,6 +106,7 @@ class LerobotHal(HalBase):
         for name in wanted:
             value = sent.get(name + POSITION, command[name + POSITION])
             self._target[name] = self._scales[name].to_rad(self._number(name, value))
+        return self._target
 
     def _halt(self) -> str:
         if self._estop_by == "hold":

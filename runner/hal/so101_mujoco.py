@@ -64,10 +64,11 @@ class So101MujocoTwin(HalBase):
             stamp_ns=self._clock.now_ns(),
         )
 
-    def _drive(self, targets: Mapping[str, float]) -> None:
+    def _drive(self, targets: Mapping[str, float]) -> Mapping[str, float]:
         self._advance()
         for name, value in targets.items():
             self._data.ctrl[self._u[name]] = value
+        return targets
 
     def _halt(self) -> str:
         self._advance()

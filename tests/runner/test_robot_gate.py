@@ -181,6 +181,23 @@ def test_a_withheld_step_is_no_reference_for_the_next_one() -> None:
         assert checked.check(to(2.0, 1.0, 0.5), at(*HERE, ms=1000 + 33 * tick))[0] is None
 
 
+def test_steps_that_were_dropped_for_being_late_do_not_add_up() -> None:
+    """Everything passes, nothing is applied (the deadline policy drops it), then one action is: it is one step long, not ten."""
+    motors = {"turn": 0.0}
+    checked = RobotGate(ROBOT, rate_hz=30.0, sent=lambda: motors)
+    wanted, seen = 0.0, at(*HERE)
+    for tick in range(10):
+        wanted += STEP
+        seen = at(*HERE, ms=1000 + 100 * tick / 3)
+        allowed, _ = checked.check(to(wanted, joint_names=("turn",)), seen)
+        assert allowed is None or abs(allowed.rows[0][0]) <= LATE_MAX * STEP
+    motors["turn"] = 0.05
+    later = RobotGate(ROBOT, rate_hz=30.0, sent=lambda: motors)
+    row_of(later.check(to(0.1, joint_names=("turn",)), at(*HERE, ms=1000)))
+    shortened = later.tightened("skill", None).check(to(0.2, joint_names=("turn",)), at(*HERE, ms=1033))
+    assert row_of(shortened) == pytest.approx((0.15,))
+
+
 def test_a_joint_that_does_not_follow_is_not_pushed_further() -> None:
     checked, turn, allowed = gate(), 0.0, True
     for tick in range(30):  # blocked at 0: measured never changes

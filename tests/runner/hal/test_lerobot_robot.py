@@ -90,6 +90,7 @@ def test_a_shortened_step_is_remembered_as_it_was_made(make: Make) -> None:
     hal = make(max_relative_target=5.0)
     hal.connect()
     hal.send_action(to(motor_1=1.0))
+    assert hal.sent()["motor_1"] == pytest.approx(math.radians(5.0))
     hal.send_action(to(motor_2=0.0))  # motor_1 was left out: it does not creep on to 1.0 rad
     assert hal.read_state().position[0] == pytest.approx(math.radians(5.0))
 

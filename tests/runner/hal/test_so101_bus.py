@@ -77,9 +77,11 @@ def test_angles_are_read_from_the_servos_counts(hal: Hal, bus: ServoBus) -> None
 
 def test_targets_reach_the_servos(hal: Hal, bus: ServoBus) -> None:
     hal.send_action(to(elbow_flex=-0.5, gripper=RANGES_RAD["gripper"][0]))
+    assert hal.read_state().position[2] == pytest.approx(
+        -0.5, abs=0.002
+    )  # answered after the writes before it
     assert bus.get(3, PRESENT) == pytest.approx(2047 - 0.5 * COUNTS_PER_RAD, abs=2)
     assert bus.get(6, PRESENT) == 0
-    assert hal.read_state().position[2] == pytest.approx(-0.5, abs=0.002)
     assert bus.get(1, PRESENT) == pytest.approx(2047, abs=1)  # was not named
 
 
@@ -87,6 +89,7 @@ def test_the_stop_holds_and_the_end_lets_go(hal: Hal, bus: ServoBus) -> None:
     hal.send_action(to(shoulder_pan=0.3))
     with pytest.raises(EstopRequested, match="hold the present pose"):
         hal.estop("test")
+    assert hal.read_state().position[0] == pytest.approx(0.3, abs=0.002)
     assert all(bus.torque(servo) for servo in range(1, 7))
     assert bus.get(1, PRESENT) == pytest.approx(2047 + 0.3 * COUNTS_PER_RAD, abs=2)
     with pytest.raises(EstopRequested):

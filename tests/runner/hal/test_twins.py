@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from runner.hal.base import HalBase
 from runner.hal.factory import make_hal
-from runner.protocols import Hal
 from schemas.control import ControlMode
 from schemas.errors import BadState, EstopRequested, InternalError
 from schemas.robot import HalConfig
@@ -15,7 +15,7 @@ from schemas.world import Action
 
 HEAVY = pytest.mark.heavy
 BOTH = pytest.mark.parametrize("adapter", ["so101_kinematic", pytest.param("so101_mujoco", marks=HEAVY)])
-MakeHal = Callable[..., Hal]
+MakeHal = Callable[..., HalBase]
 
 
 def to(**targets: float) -> Action:
@@ -26,14 +26,14 @@ def to(**targets: float) -> Action:
     )
 
 
-def positions(hal: Hal) -> dict[str, float]:
+def positions(hal: HalBase) -> dict[str, float]:
     state = hal.read_state()
     return dict(zip(state.name, state.position, strict=True))
 
 
 @pytest.fixture
 def make(clock: Any) -> MakeHal:
-    def made(adapter: str, **params: Any) -> Hal:
+    def made(adapter: str, **params: Any) -> HalBase:
         hal = make_hal(HalConfig(adapter=adapter, params=params), clock=clock)
         hal.connect()
         return hal
@@ -80,6 +80,20 @@ def test_a_named_joint_moves_and_the_others_stay(adapter: str, make: MakeHal, cl
         {n: v for n, v in before.items() if n != "shoulder_pan"}, abs=0.03
     )
     assert hal.read_state().velocity == pytest.approx((0.0,) * 6, abs=0.05)
+
+
+@BOTH
+def test_what_was_sent_is_known(adapter: str, make: MakeHal) -> None:
+    hal = make(adapter)
+    assert hal.sent() == {}
+    hal.send_action(to(shoulder_pan=0.4))
+    hal.send_action(to(gripper=0.2))
+    with pytest.raises(InternalError):
+        hal.send_action(to(gripper=0.9, tail=0.0))
+    assert hal.sent() == {"shoulder_pan": 0.4, "gripper": 0.2}
+    hal.disconnect()
+    hal.connect()
+    assert hal.sent() == {}
 
 
 @BOTH
