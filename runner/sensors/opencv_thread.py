@@ -14,6 +14,7 @@ from urllib.parse import urlsplit, urlunsplit
 from pydantic import Field, model_validator
 
 from runner.clock import Clock
+from runner.sensors.lag import LagMeter
 from runner.sensors.params import BackendParams, read_params, refuse, require_module
 from runner.sensors.slot import Feed, FrameTee, SlotReader
 from schemas.robot import SensorReaderConfig
@@ -51,6 +52,9 @@ class OpenCvParams(BackendParams):
     """Devices and URLs: so many failures in a row end the camera."""
     reconnect_s: Seconds = 0.25
     """Devices and URLs: pause before the first new try."""
+    stamp: Literal["source", "arrival"] = "source"
+    """Devices and URLs: what a picture's age counts from. `source` adds the time that it waited in a queue, by the source's own stamps; `arrival` is for
+    sources whose stamps are wrong."""
     timeout_s: Seconds = 5.0
     """URLs: the longest that opening, or waiting for a picture, may take."""
 
@@ -77,9 +81,9 @@ class OpenCvParams(BackendParams):
 
 
 _NEEDED = {
-    "device": {"width", "height", "fps", "fourcc", "reconnect_tries", "reconnect_s"},
+    "device": {"width", "height", "fps", "fourcc", "stamp", "reconnect_tries", "reconnect_s"},
     "path": {"fps", "loop"},
-    "url": {"reconnect_tries", "reconnect_s", "timeout_s"},
+    "url": {"stamp", "reconnect_tries", "reconnect_s", "timeout_s"},
 }
 
 
@@ -148,8 +152,11 @@ class OpenCvReader(SlotReader):
         while True:
             capture = self._open(cv2)
             opened, taken = capture.isOpened(), 0
+            lag = LagMeter() if params.stamp == "source" else None
             try:
-                while opened and not stopping.is_set() and (frame := self._take(cv2, capture)) is not None:
+                while (
+                    opened and not stopping.is_set() and (frame := self._take(cv2, capture, lag)) is not None
+                ):
                     self.deliver(feed, frame)
                     taken += 1
             finally:
@@ -221,11 +228,14 @@ class OpenCvReader(SlotReader):
         if params.fps is not None:
             capture.set(cv2.CAP_PROP_FPS, params.fps)
 
-    def _take(self, cv2: Any, capture: Any) -> SensorFrame | None:
-        """The next picture, stamped when it arrived and before it is decoded; None if there is none."""
+    def _take(self, cv2: Any, capture: Any, lag: LagMeter | None = None) -> SensorFrame | None:
+        """The next picture, stamped when it was taken, as far as `lag` can tell, else when it arrived; None if there is none."""
         if not capture.grab():
             return None
-        stamp_ns, wall_ns = self.clock.now_ns(), self.clock.wall_ns()
+        arrival_ns, wall_ns = self.clock.now_ns(), self.clock.wall_ns()
+        stamp_ns = arrival_ns
+        if lag is not None:
+            stamp_ns = max(0, lag.taken_ns(arrival_ns, float(capture.get(cv2.CAP_PROP_POS_MSEC))))
         done, image = capture.retrieve()
         if not done or image is None or not image.size:
             return None
@@ -234,7 +244,7 @@ class OpenCvReader(SlotReader):
         return SensorFrame(
             sensor_id=self.sensor_id,
             stamp_monotonic_ns=stamp_ns,
-            stamp_wall_ns=wall_ns,
+            stamp_wall_ns=wall_ns - (arrival_ns - stamp_ns),
             encoding=FrameEncoding(self._params.encoding),
             width=int(width),
             height=int(height),

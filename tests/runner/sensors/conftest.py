@@ -90,13 +90,15 @@ class Server:
 class RtspServer(Server):
     """A small RTSP server: one transport stream, in RTP packets inside the RTSP connection (what a firewall-friendly camera does).
 
-    Each play sends the whole stream again, with time stamps at the rate it was made for, then waits until it is cut or the client leaves.
+    Each play sends the whole stream again, at once, then waits until it is cut or the client leaves. With `hold`, it keeps back the second half
+    until that is set: a network that stands still, then delivers in a rush.
     """
 
     def __init__(self, stream: bytes) -> None:
         self.stream = stream
         self.played = 0
         self.cut = threading.Event()
+        self.hold: threading.Event | None = None
         super().__init__()
 
     def serve(self, connection: socket.socket) -> None:
@@ -127,6 +129,8 @@ class RtspServer(Server):
     def play(self, connection: socket.socket) -> None:
         self.played += 1
         for sequence, at in enumerate(range(0, len(self.stream), 7 * PACKET)):
+            if self.hold is not None and at >= len(self.stream) // 2:
+                self.hold.wait(60)
             payload = self.stream[at : at + 7 * PACKET]
             packet = struct.pack(">BBHII", 0x80, 33, sequence & 0xFFFF, sequence * 900, 1) + payload
             connection.sendall(struct.pack(">BBH", 0x24, 0, len(packet)) + packet)
@@ -137,6 +141,8 @@ class RtspServer(Server):
     def close(self) -> None:
         self._closing = True
         self.cut.set()
+        if self.hold is not None:
+            self.hold.set()
         super().close()
 
 

@@ -1,6 +1,7 @@
 """The OpenCV reader on real sources: video files, a stream over RTSP that breaks off and comes back, a device that is not there."""
 
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -52,13 +53,8 @@ def grey(frame: SensorFrame) -> int:
 
 def wait_for_end(reader: SlotReader) -> str:
     """Why the source ended, as everybody who reads is told; waits at most a minute."""
-    deadline_ns = SystemClock().now_ns() + 60 * 10**9
-    while reader.slot.ended is None:
-        try:
-            reader.read_synced(deadline_ns)
-        except FrameStale as stale:
-            if not stale.details.get("ended"):
-                raise
+    with reader.slot._changed:
+        assert reader.slot._changed.wait_for(lambda: reader.slot._ended, 60), "it did not end"
     with pytest.raises(FrameStale) as gone:
         reader.read_latest(60_000.0)
     return str(gone.value)
@@ -171,6 +167,42 @@ def test_a_stream_that_breaks_off_is_opened_again_and_given_up_in_the_end(
     assert "hidden" not in said
 
 
+class Shifted(SystemClock):
+    """The machine's clock, which a test moves on."""
+
+    shift_ns = 0
+
+    def now_ns(self) -> int:
+        return super().now_ns() + self.shift_ns
+
+
+@pytest.mark.parametrize("stamp", ["source", "arrival"])
+def test_pictures_that_waited_in_the_network_are_as_old_as_they_are(
+    make_video: Callable[..., Path], make_rtsp: Callable[[bytes], Any], reading: Reading, stamp: str
+) -> None:
+    server = make_rtsp(make_video([100] * 100, name="a.ts", fourcc="mpg2").read_bytes())
+    server.hold = threading.Event()
+    shelf, clock = Shelf(), Shifted()
+    url = f"rtsp://127.0.0.1:{server.port}/"
+    reader = make_reader(camera(url=url, reconnect_tries=0, timeout_s=20.0, stamp=stamp), clock)
+    reader._tee = shelf
+    reading(reader)
+    with reader.slot._changed:
+        assert reader.slot._changed.wait_for(lambda: len(shelf.frames) >= 20, 60)
+    begun_ns = clock.now_ns()
+    clock.shift_ns = 100 * 10**9  # the network stands still for a hundred seconds
+    server.hold.set()
+    server.cut.set()
+    wait_for_end(reader)
+    late = shelf.frames[-1]
+    age_s = (clock.now_ns() - late.stamp_monotonic_ns) / 1e9
+    if stamp == "arrival":
+        assert late.stamp_monotonic_ns >= begun_ns + 100 * 10**9
+    else:
+        assert 90 < age_s < 170  # a hundred, less the four that the stream lasts, and what this test took
+        assert late.stamp_wall_ns <= clock.wall_ns() - 90 * 10**9
+
+
 def test_a_device_that_is_not_there_is_tried_and_given_up(reading: Reading) -> None:
     reader = reading(reader_of(device=NO_DEVICE, reconnect_tries=1, reconnect_s=0.01))
     assert f"device {NO_DEVICE} cannot be opened, given up after 1 new tries" in wait_for_end(reader)
@@ -193,6 +225,7 @@ def test_stopping_does_not_wait_for_the_next_try(reading: Reading) -> None:
         ({}, "one of device, path and url, not none"),
         ({"device": 0, "url": "rtsp://a/b"}, "not device and url"),
         ({"device": 0, "loop": True}, "not for a device: loop"),
+        ({"path": "x.avi", "stamp": "arrival"}, "not for a path: stamp"),
         ({"path": "x.avi", "reconnect_tries": 3}, "not for a path: reconnect_tries"),
         ({"url": "rtsp://a/b", "fps": 30.0}, "not for a url: fps"),
         ({"url": "ftp://a/b"}, "url begins with one of rtsp://"),
