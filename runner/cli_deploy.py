@@ -72,7 +72,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 async def run(args: argparse.Namespace) -> int:
-    """`vram-runner deploy`. 0: ended on request, or the task succeeded; 1: it failed; 2: the file or a flag is wrong."""
+    """`vram-runner deploy`. 0: ended on request, or the task succeeded; 1: it failed; 2: a person has to act (a wrong file
+    or flag, or a task that the emergency stop ended)."""
     file = read_deployment(args.config)
     return await Deploy(args, file, policy_makers(args, file)).run()
 
@@ -138,7 +139,7 @@ class Deploy:
                 identity=self._identity(parts, arbiter),
                 stopping=self._stopping,
             )
-            ended = await self._serve(server)
+            ended = await self._serve(server, runner)
         failed = control.ended.exception() is not None
         return self._conclude(runner, ended, failed)
 
@@ -191,9 +192,10 @@ class Deploy:
                     return None
                 raise
 
-    async def _serve(self, server: GoalServer) -> ResultPush | None:
+    async def _serve(self, server: GoalServer, runner: HardwareRunner) -> ResultPush | None:
         """Until a signal, `shutdown`, the end of the time, or of the file's task, whose result is returned."""
-        own = asyncio.create_task(self._own_task(server)) if self._file.robot.task is not None else None
+        task = self._file.robot.task
+        own = asyncio.create_task(self._own_task(server, runner)) if task is not None else None
         try:
             async with asyncio.timeout(self._args.max_seconds):
                 await server.serve()
@@ -207,8 +209,11 @@ class Deploy:
             own.result()  # raises what kept the task from being a goal at all
         return server.result_of(OWN_GOAL)
 
-    async def _own_task(self, server: GoalServer) -> None:
-        """The file's task, as a goal like any other; its end is the end of the program."""
+    async def _own_task(self, server: GoalServer, runner: HardwareRunner) -> None:
+        """The file's task, as a goal like any other; its end is the end of the program.
+
+        Not after an emergency stop: disconnecting may take the torque away, and that is for a person to decide.
+        """
         robot = self._file.robot
         if robot.task is None or robot.vla is None:
             return
@@ -226,7 +231,8 @@ class Deploy:
             if not server.stopping.is_set():
                 raise
         finally:
-            server.stopping.set()
+            if runner.estop is None:
+                server.stopping.set()
 
     def _conclude(self, runner: HardwareRunner, ended: ResultPush | None, failed: bool) -> int:
         robot = self._file.robot
@@ -237,7 +243,9 @@ class Deploy:
             success = ended["success"] and (key is None or ended["data"].get(key) is True)
             log.info("task %s %s", "done:" if success else "not done:", ended["message"] or ended["data"])
         print(summary(result, runner, success, robot.robot_id))
-        return 1 if failed or success is False else 0
+        if not failed and success is not False:
+            return 0
+        return 1 if runner.estop is None else 2  # 2: whoever restarts failed programs leaves this one alone
 
 
 def claim(robot_id: str, stack: contextlib.AsyncExitStack) -> None:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import argparse
 
 from clients.runner import RunnerClient
+from schemas.errors import RunnerUnreachable
+
+ANSWER_S = 3.0  # the server itself waits a second for its control loop
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
@@ -19,7 +22,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 async def run(args: argparse.Namespace) -> int:
     """Raises RunnerUnreachable when no runner answers, InternalError when its control loop does not."""
-    async with RunnerClient(args.endpoint) as runner:
-        reply = await runner.estop(args.reason)
+    async with RunnerClient(args.endpoint, timeout_s=ANSWER_S) as runner:
+        try:
+            reply = await runner.estop(args.reason)
+        except RunnerUnreachable as error:
+            hint = "if a robot moves, cut its power"
+            raise RunnerUnreachable(error.message, hint=hint, details=error.details) from error
     print(reply["message"])
     return 0

@@ -11,6 +11,7 @@ One tick:
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Mapping, Sequence
 
@@ -114,15 +115,15 @@ class HardwareRunner(SkillRunner):
     def deactivate(self) -> None:
         """The motors keep their last target until the adapter disconnects as its hardware wants it. Repeatable."""
         self._end(SkillEnded({}, self.estop or InternalError("the runner is stopping")))
-        try:
-            self.hal.disconnect()
-        except VramError as error:
-            log.error("the robot did not disconnect cleanly: %s", error)
-        else:
-            log.info("%s is disconnected", self.hal.description.name)
-        finally:
+        with contextlib.ExitStack() as stack:  # each is stopped, whatever another one raises
             for reader in self._readers.values():
-                reader.stop()
+                stack.callback(reader.stop)
+            try:
+                self.hal.disconnect()
+            except VramError as error:
+                log.error("the robot did not disconnect cleanly: %s", error)
+            else:
+                log.info("%s is disconnected", self.hal.description.name)
 
     # -- the skill and the emergency stop ------------------------------------------------------------------------------
     def begin_skill(self, skill: Skill, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:

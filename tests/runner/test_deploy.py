@@ -192,6 +192,30 @@ def test_the_emergency_stop_of_a_real_process(start: Start, tmp_path: Path) -> N
     assert "emergency stop: test" in json.loads(out)["metadata"]["estop"]
 
 
+def test_after_an_emergency_stop_a_task_is_not_restarted_and_the_robot_stays_connected(
+    start: Start, tmp_path: Path
+) -> None:
+    process = start(more=TASK)
+
+    async def body(client: RunnerClient) -> None:
+        await client.ping(timeout_s=60)
+        while (await client.state())["goal"] is None:
+            pass
+        await client.estop("test")
+        while (await client.state())["goal"] is not None:
+            pass
+        ticks = (await client.state())["ticks"]
+        while (state := await client.state())["ticks"] < ticks + 10:
+            pass
+        assert "emergency stop: test" in state["estop"]
+        process.send_signal(signal.SIGTERM)
+
+    play(tmp_path, body)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 2, err  # systemd's RestartPreventExitStatus
+    assert json.loads(out)["success"] is False
+
+
 def test_a_robot_has_one_runner(start: Start, tmp_path: Path) -> None:
     first = start()
 

@@ -312,6 +312,21 @@ def test_it_does_not_start_on_a_camera_that_shows_nothing(
     assert twin.story == []  # a robot that nobody sees gets no power
 
 
+def test_everything_is_stopped_whatever_one_of_them_raises(
+    make: MakeRunner, twin: Twin, front: FedCamera, clock: Any
+) -> None:
+    class Stubborn(FedCamera):
+        def _run_ends(self) -> None:
+            raise OSError("the driver hangs")
+
+    runner = make([front, Stubborn("wrist", clock)])
+    runner.activate()
+    with pytest.raises(OSError, match="hangs"):
+        runner.deactivate()
+    assert twin.story == ["connect", "disconnect"]
+    assert front.feed is None
+
+
 def test_it_does_not_start_on_a_robot_that_says_nothing(make: MakeRunner, twin: Twin) -> None:
     twin.silent = True
     runner = make()

@@ -146,6 +146,11 @@ def test_the_command_line_stops_the_robot(
     assert "emergency stop: smoke; all joints stand still" in capfd.readouterr().out
 
 
+def test_a_stop_that_nobody_hears_is_an_error(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["estop", "--endpoint", endpoint]) == 1
+    assert "cut its power" in capsys.readouterr().err
+
+
 def test_a_canceled_goal_leaves_the_arm_where_it_was_sent(bench: Any, run_async: Run) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
         goal = await client.send_goal(RSKILL, prompt="nod")
