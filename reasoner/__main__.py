@@ -1,6 +1,6 @@
-"""`vram-reasoner`: run one task with the runner and the sidecars that are there.
+"""`vram-reasoner`: run one task with the runner and the sidecars that are there; or speak to one that runs.
 
-Exit codes: 0 the task succeeded, 1 it failed, 2 wrong usage or configuration, 3 the runner cannot be reached.
+Exit codes: 0 the task succeeded, 1 it failed, 2 wrong usage or configuration, 3 the runner, or the reasoner that was spoken to, cannot be reached.
 """
 
 import argparse
@@ -15,15 +15,24 @@ from pathlib import Path
 
 from clients.runner import RunnerClient
 from clients.sidecar.perception import DetectorClient, SceneVlmClient
-from reasoner.llm.openai import LlmConfig, OpenAiPlanner
+from reasoner.inbox import Inbox
+from reasoner.llm.anthropic import AnthropicPlanner
+from reasoner.llm.base import LlmConfig, LlmPlanner
+from reasoner.llm.openai import OpenAiPlanner
 from reasoner.llm.scripted import ScriptedPlanner
-from reasoner.loop import Result, run_episode
-from reasoner.palette import Palette, palette_of
+from reasoner.loop import STEPS_MAX, Result, run_episode
+from reasoner.palette import OPERATOR, Palette, palette_of
 from reasoner.planner import Planner
+from reasoner.playbooks import Playbook, load_playbook
+from reasoner.server import OperatorServer, send
 from reasoner.tools import Tools
+from reasoner.watch import watch
 from schemas.endpoints import program_endpoint
-from schemas.errors import RunnerUnreachable, SidecarUnavailable, VramError
+from schemas.errors import ConfigError, ReasonerUnreachable, RunnerUnreachable, SidecarUnavailable, VramError
 from schemas.manifest import RSkillManifest
+
+LLM_PLANNERS: dict[str, type[LlmPlanner]] = {"openai": OpenAiPlanner, "anthropic": AnthropicPlanner}
+MANAGED = ("detector", "scene-vlm")
 
 EXIT_FAILED, EXIT_USAGE, EXIT_UNREACHABLE = 1, 2, 3
 
@@ -32,12 +41,37 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="vram-reasoner", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--task", required=True, help='what to do, e.g. "grab the red cube"')
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--task", help='what to do, e.g. "grab the red cube"')
+    what.add_argument(
+        "--say", metavar="TEXT", help="tell the planner of a running reasoner something, and end"
+    )
+    what.add_argument(
+        "--cancel", metavar="REASON", help="end the episode of a running reasoner and its goal, and end"
+    )
     parser.add_argument(
         "--planner",
-        choices=("scripted", "openai"),
+        choices=("scripted", *LLM_PLANNERS),
         default="scripted",
-        help="openai: VRAM_REASONER_LLM_BASE_URL and _MODEL say where",
+        help="openai, anthropic: VRAM_REASONER_LLM_{BASE_URL,MODEL,API_KEY,TIMEOUT_S,MAX_TOKENS} say where",
+    )
+    parser.add_argument(
+        "--playbook", type=Path, metavar="RSKILL.YAML", help="the procedure that a language model follows"
+    )
+    parser.add_argument(
+        "--manage",
+        action="append",
+        default=[],
+        choices=MANAGED,
+        help="a sidecar that the planner may load and unload (repeat; default: none, the arbiter decides)",
+    )
+    parser.add_argument(
+        "--allow-noncommercial",
+        action="store_true",
+        help="also use models whose licence forbids commercial use",
+    )
+    parser.add_argument(
+        "--listen", help="where to hear --say and --cancel (default: ipc://RUNTIME/reasoner.sock)"
     )
     parser.add_argument("--runner", help="endpoint of the runner (default: ipc://RUNTIME/runner.sock)")
     parser.add_argument("--detector", help='endpoint of the detector sidecar; "none": there is none')
@@ -50,8 +84,11 @@ def main() -> None:
     arguments = _parser().parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s", stream=sys.stderr)
     try:
+        if arguments.task is None:
+            asyncio.run(_speak(arguments))
+            return
         result = asyncio.run(_run(arguments))
-    except (RunnerUnreachable, SidecarUnavailable) as error:
+    except (RunnerUnreachable, SidecarUnavailable, ReasonerUnreachable) as error:
         sys.exit(_complain(error, EXIT_UNREACHABLE))
     except VramError as error:
         sys.exit(_complain(error, EXIT_USAGE))
@@ -67,13 +104,29 @@ def _complain(error: VramError, code: int) -> int:
     return code
 
 
+async def _speak(arguments: argparse.Namespace) -> None:
+    said = arguments.say is not None
+    request = {"op": "say", "text": arguments.say} if said else {"op": "cancel", "reason": arguments.cancel}
+    await send(_endpoint(arguments.listen, "reasoner"), request)
+
+
 async def _run(arguments: argparse.Namespace) -> Result:
     task = asyncio.current_task()
     assert task is not None, "inside asyncio.run there is a current task"
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, task.cancel)
     async with contextlib.AsyncExitStack() as stack:
+        playbook = load_playbook(arguments.playbook) if arguments.playbook else None
+        if playbook is not None and arguments.planner not in LLM_PLANNERS:
+            raise ConfigError(
+                "a playbook is read by a language model", hint=f"--planner {' or '.join(LLM_PLANNERS)}"
+            )
+        inbox = Inbox()
+        await stack.enter_async_context(
+            OperatorServer(_endpoint(arguments.listen, "reasoner"), arguments.task, inbox)
+        )
         runner = await stack.enter_async_context(RunnerClient(_endpoint(arguments.runner, "runner")))
+        eyes = await stack.enter_async_context(RunnerClient(_endpoint(arguments.runner, "runner")))
         detector = vlm = None
         if arguments.detector != "none":
             detector = await stack.enter_async_context(
@@ -81,20 +134,46 @@ async def _run(arguments: argparse.Namespace) -> Result:
             )
         if arguments.scene_vlm != "none":
             vlm = await stack.enter_async_context(SceneVlmClient(_endpoint(arguments.scene_vlm, "scene-vlm")))
+        named = {"detector": detector, "scene-vlm": vlm}
+        components = {name: client for name, client in named.items() if client is not None}
         manifests = [
             RSkillManifest.model_validate(manifest) for manifest in (await runner.skills())["skills"]
         ]
-        palette = palette_of(manifests, can_locate=detector is not None, can_query=vlm is not None)
-        planner = await _planner(arguments, palette, stack)
-        return await run_episode(arguments.task, planner, palette, Tools(runner, detector, vlm))
+        palette = palette_of(
+            manifests,
+            can_locate=detector is not None,
+            can_query=vlm is not None,
+            allow_noncommercial=arguments.allow_noncommercial,
+            managed=[name for name in arguments.manage if name in components],
+            topics=[OPERATOR],
+        )
+        if playbook is not None:
+            palette = playbook.narrow(palette)
+        planner = await _planner(arguments, palette, playbook, stack)
+        watching = asyncio.create_task(watch(eyes, inbox))
+        stack.callback(watching.cancel)
+        return await run_episode(
+            arguments.task,
+            planner,
+            palette,
+            Tools(runner, detector, vlm, palette=palette, components=components),
+            inbox=inbox,
+            steps_max=STEPS_MAX if playbook is None else min(STEPS_MAX, playbook.max_steps),
+        )
 
 
 async def _planner(
-    arguments: argparse.Namespace, palette: Palette, stack: contextlib.AsyncExitStack
+    arguments: argparse.Namespace,
+    palette: Palette,
+    playbook: Playbook | None,
+    stack: contextlib.AsyncExitStack,
 ) -> Planner:
     if arguments.planner == "scripted":
         return ScriptedPlanner(arguments.task, palette)
-    return await stack.enter_async_context(OpenAiPlanner(LlmConfig.from_environ(os.environ), palette))
+    kind = LLM_PLANNERS[arguments.planner]
+    config = LlmConfig.from_environ(os.environ, base_url=kind.default_base_url)
+    procedure = playbook.procedure if playbook is not None else ""
+    return await stack.enter_async_context(kind(config, palette, procedure=procedure))
 
 
 def _endpoint(given: str | None, name: str) -> str:

@@ -1,23 +1,39 @@
 """The reasoner's loop: ask the planner, check the palette, dispatch, remember. It knows neither VRAM nor any model.
 
-The planner (perhaps a language model) and the tools run as awaits: a cancel of the loop's task reaches whichever is under way.
+Nothing waits for the planner (perhaps a language model that hangs): planner and tool are two tasks, and the loop wakes for whichever
+comes first, for them or for the inbox. A result, a cancel or a danger that comes while the planner thinks is taken at once; what the
+planner was asked is out of date then, so it is asked again. While a goal runs the planner is asked only when an operator
+said something, and may let the goal go on, stop it, or end the episode.
 """
 
+import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 from typing import Any, Literal, TypedDict
 
+from reasoner.inbox import Cancel, Danger, Inbox, Said
 from reasoner.palette import Palette
-from reasoner.planner import Episode, Finish, Outcome, Planner, Step
-from schemas.errors import VramError
-from schemas.tools import QueryScene, ToolCall
+from reasoner.planner import Episode, Finish, Note, Outcome, Planner, Step, benched
+from schemas.errors import EstopRequested, VramError
+from schemas.tools import ExecuteRskill, LocateInView, QueryScene, StopGoal, ToolCall, Wait
 
 log = logging.getLogger(__name__)
 
 STEPS_MAX = 60
 REPEATS_MAX = 8  # the same call over and over is a planner that does not listen
+REFUSALS_MAX = 5  # in a row
+LOOKS_IN_A_ROW_MAX = (
+    12  # looking and asking without anything done between: the answers prompt only more questions
+)
+THINK_MAX_S = 300.0  # a decision, with all retries of the planner's own
+SUPERSEDED_MAX = 3  # whoever speaks all the time does not keep the planner from ever deciding
+STOP_MAX_S = 15.0  # at the end, for a goal that was cancelled to say so
 
 Dispatch = Callable[[ToolCall], Awaitable[Outcome]]
+
+
+class _NoDecision(Finish):
+    """The planner gave none: ends an episode, but no goal that runs."""
 
 
 class StepRecord(TypedDict):
@@ -25,6 +41,12 @@ class StepRecord(TypedDict):
     status: str
     code: str
     text: str
+
+
+class NoteRecord(TypedDict):
+    source: str
+    text: str
+    after: int
 
 
 class Result(TypedDict):
@@ -37,43 +59,242 @@ class Result(TypedDict):
     vlm_confirmed: bool
     vlm_answers: list[str]
     steps: list[StepRecord]
+    notes: list[NoteRecord]
 
 
 async def run_episode(
-    task: str, planner: Planner, palette: Palette, dispatch: Dispatch, *, steps_max: int = STEPS_MAX
+    task: str,
+    planner: Planner,
+    palette: Palette,
+    dispatch: Dispatch,
+    *,
+    inbox: Inbox | None = None,
+    steps_max: int = STEPS_MAX,
+    think_max_s: float = THINK_MAX_S,
 ) -> Result:
-    """Run one task to its end. Never raises for what a planner or a tool does: the result says how it ended."""
-    episode = Episode(task)
-    finish = Finish(False, f"gave up after {steps_max} steps")
-    for _ in range(steps_max):
-        try:
-            decision = await planner.decide(episode)
-        except VramError as error:
-            finish = Finish(False, f"the planner failed: {error}")
-            break
-        if isinstance(decision, Finish):
-            finish = decision
-            break
-        if _stuck(episode, decision):
-            finish = Finish(False, f"the same call {REPEATS_MAX} times in a row: {decision.tool}")
-            break
-        log.info("%s %s", decision.tool, describe(decision))
-        outcome = await _outcome(decision, palette, dispatch)
-        log.info("%s: %s%s", decision.tool, outcome.status, f", {outcome.text}" if outcome.text else "")
-        episode.steps.append(Step(decision, outcome))
+    """Run one task to its end. Never raises for what a planner or a tool does: the result says how it ended.
+
+    A cancelled episode cancels its goal and waits for it, at most `STOP_MAX_S`.
+    """
+    loop = _Loop(Episode(task), planner, palette, dispatch, inbox or Inbox(), steps_max, think_max_s)
+    finish = await loop.run()
     log.info("%s: %s", "success" if finish.success else "failure", finish.reason)
-    return _result(episode, finish, palette)
+    return _result(loop.episode, finish, palette)
 
 
-async def _outcome(call: ToolCall, palette: Palette, dispatch: Dispatch) -> Outcome:
-    if (refusal := palette.check(call)) is not None:
-        return Outcome("refused", str(refusal), refusal.code)
-    return await dispatch(call)
+class _Loop:
+    def __init__(
+        self,
+        episode: Episode,
+        planner: Planner,
+        palette: Palette,
+        dispatch: Dispatch,
+        inbox: Inbox,
+        steps_max: int,
+        think_max_s: float,
+    ) -> None:
+        self.episode = episode
+        self._planner = planner
+        self._palette = palette
+        self._dispatch = dispatch
+        self._inbox = inbox
+        self._steps_max = steps_max
+        self._think_max_s = think_max_s
+        self._thinking: asyncio.Task[ToolCall | Finish] | None = None
+        self._acting: asyncio.Task[Outcome] | None = None
+        self._call: ToolCall | None = None  # what `_acting` does
+        self._news = False  # said while a goal runs: the planner is to be asked
+        self._superseded = 0
+        self._finish: Finish | None = None
+
+    async def run(self) -> Finish:
+        """1. Ask whoever is to be asked. 2. Wait for the first news of any kind. 3. Take all of it, the urgent first."""
+        message = asyncio.create_task(self._inbox.wait())
+        try:
+            while self._ask():
+                waited = {task for task in (message, self._thinking, self._acting) if task is not None}
+                await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
+                if message.done():
+                    self._take_messages()
+                    message = asyncio.create_task(self._inbox.wait())
+                if self._acting is not None and self._acting.done():
+                    self._take_outcome()
+                if self._thinking is not None and self._thinking.done():
+                    self._take_decision()
+        finally:
+            message.cancel()
+            self._forget_decision()
+            await self._stop_acting()
+        assert self._finish is not None, "only an end stops the asking"
+        return self._finish
+
+    # -- 1 -------------------------------------------------------------------------------------------------------------
+    def _ask(self) -> bool:
+        """Whether the episode goes on."""
+        if self._finish is not None:
+            return False
+        if self._thinking is not None or (self._acting is not None and not self._news):
+            return True
+        if self._acting is None and len(self.episode.steps) >= self._steps_max:
+            self._finish = Finish(False, f"gave up after {self._steps_max} steps")
+            return False
+        self._news = False
+        self.episode.running = self._call
+        self._thinking = asyncio.create_task(self._think(), name="think")
+        return True
+
+    async def _think(self) -> ToolCall | Finish:
+        try:
+            async with asyncio.timeout(self._think_max_s):
+                return await self._planner.decide(self.episode)
+        except VramError as error:
+            return _NoDecision(False, f"the planner failed: {error}")
+        except TimeoutError:
+            return _NoDecision(False, f"the planner failed: no decision within {self._think_max_s:g} s")
+
+    # -- 3 -------------------------------------------------------------------------------------------------------------
+    def _take_messages(self) -> None:
+        for item in self._inbox.take():
+            match item:
+                case Cancel():
+                    self._end(f"canceled: {item.reason}")
+                case Danger(stop=True):
+                    self._end(f"stopped: {item.text}")
+                case Danger():
+                    self._note(Note("safety", item.text, len(self.episode.steps)))
+                case Said():
+                    self._note(Note("operator", item.text, len(self.episode.steps)))
+
+    def _end(self, reason: str) -> None:
+        log.warning("%s", reason)
+        self._finish = self._finish or Finish(False, reason)
+
+    def _note(self, note: Note) -> None:
+        log.info("%s: %s", note.source, note.text)
+        self.episode.notes.append(note)
+        if self._superseded < SUPERSEDED_MAX:
+            self._superseded += self._thinking is not None
+            self._forget_decision()
+        self._news = isinstance(self._call, ExecuteRskill)
+
+    def _take_outcome(self) -> None:
+        assert self._acting is not None, "only called when it is done"
+        assert self._call is not None, "whoever acts does something"
+        outcome = (
+            Outcome("canceled", "called off", "cancelled")
+            if self._acting.cancelled()
+            else self._acting.result()
+        )
+        self._remember(self._call, outcome)
+        self._acting = self._call = None
+        self._news = False
+        self._forget_decision()  # it was made without this outcome
+        if outcome.code == EstopRequested.code:
+            self._end(f"stopped: {outcome.text}")
+
+    def _remember(self, call: ToolCall, outcome: Outcome) -> None:
+        log.info("%s: %s%s", call.tool, outcome.status, f", {outcome.text}" if outcome.text else "")
+        self.episode.steps.append(Step(call, outcome))
+
+    def _take_decision(self) -> None:
+        assert self._thinking is not None, "only called when it is done"
+        decision, self._thinking = self._thinking.result(), None
+        self._superseded = 0
+        self.episode.running = None
+        if self._finish is not None:
+            return
+        if self._acting is not None:
+            self._decided_beside(decision)
+        elif isinstance(decision, Finish):
+            self._finish = decision
+        elif _stuck(self.episode, decision):
+            self._finish = Finish(False, f"the same call {REPEATS_MAX} times in a row: {decision.tool}")
+        else:
+            self._begin(decision)
+
+    def _decided_beside(self, decision: ToolCall | Finish) -> None:
+        """A goal runs: it goes on unless the decision says clearly that it should not. A planner that failed says nothing."""
+        match decision:
+            case Finish() if not isinstance(decision, _NoDecision):
+                self._finish = decision
+            case StopGoal() if self._acting is not None:
+                log.info("stop_goal %s", describe(decision))
+                self._acting.cancel()
+            case Wait():
+                pass
+            case _:
+                log.warning("the goal goes on; not taken: %s", decision)
+
+    def _begin(self, call: ToolCall) -> None:
+        log.info("%s %s", call.tool, describe(call))
+        if (refusal := self._refusal(call)) is not None:
+            self._remember(call, refusal)
+            if _refused_in_a_row(self.episode) >= REFUSALS_MAX:
+                self._finish = Finish(False, f"{REFUSALS_MAX} calls in a row were refused: {refusal.text}")
+            return
+        self._call = call
+        self._acting = asyncio.ensure_future(self._dispatch(call))
+
+    def _refusal(self, call: ToolCall) -> Outcome | None:
+        palette = self._palette.without(benched(self.episode.steps))
+        if (error := palette.check(call)) is not None:
+            return Outcome("refused", str(error), error.code)
+        if _is_look(call) and _looks_in_a_row(self.episode) >= LOOKS_IN_A_ROW_MAX:
+            return Outcome(
+                "refused",
+                f"looked and asked {LOOKS_IN_A_ROW_MAX} times in a row: do something, or finish",
+                "limit_exceeded",
+            )
+        return None
+
+    # -- ends --------------------------------------------------------------------------------------------------------
+    def _forget_decision(self) -> None:
+        if self._thinking is not None:
+            self._thinking.cancel()
+            self._thinking.add_done_callback(_look_away)
+        self._thinking = None
+        self.episode.running = None
+
+    async def _stop_acting(self) -> None:
+        """A goal does not outlive its episode."""
+        if self._acting is None or self._call is None:
+            return
+        self._acting.cancel()
+        await asyncio.wait({self._acting}, timeout=STOP_MAX_S)
+        if not self._acting.done():
+            log.error("%s did not end within %.0f s of its cancellation", self._call.tool, STOP_MAX_S)
+        elif self._acting.cancelled():
+            self._remember(self._call, Outcome("canceled", "called off", "cancelled"))
+        else:
+            self._remember(self._call, self._acting.result())
+
+
+def _look_away(task: "asyncio.Task[Any]") -> None:
+    """Retrieve an exception that nobody waits for any more."""
+    if not task.cancelled() and (error := task.exception()) is not None:
+        log.warning("a decision that was not waited for failed: %r", error)
 
 
 def _stuck(episode: Episode, call: ToolCall) -> bool:
     recent = episode.steps[-REPEATS_MAX:]
     return len(recent) == REPEATS_MAX and all(step.call == call for step in recent)
+
+
+def _refused_in_a_row(episode: Episode) -> int:
+    return next(
+        (n for n, step in enumerate(reversed(episode.steps)) if step.outcome.status != "refused"),
+        len(episode.steps),
+    )
+
+
+def _is_look(call: ToolCall) -> bool:
+    return isinstance(call, LocateInView | QueryScene)
+
+
+def _looks_in_a_row(episode: Episode) -> int:
+    return next(
+        (n for n, step in enumerate(reversed(episode.steps)) if not _is_look(step.call)), len(episode.steps)
+    )
 
 
 def describe(call: ToolCall) -> str:
@@ -105,4 +326,5 @@ def _result(episode: Episode, finish: Finish, palette: Palette) -> Result:
             }
             for step in episode.steps
         ],
+        "notes": [{"source": note.source, "text": note.text, "after": note.after} for note in episode.notes],
     }

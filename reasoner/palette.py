@@ -1,14 +1,17 @@
 """Which tools and skills a planner may use: a skill is executable only if its *kind* is on the allow-list.
 
 A detector, a scene VLM or a reward model can never be executed as an action, whatever its role says: they are reached through
-`locate_in_view` and `query_scene`, and only if those are provided.
+`locate_in_view` and `query_scene`, and only if those are provided. A playbook is read, not executed. What is offered and what is
+accepted come from the same fields; `check` is asked again for each call, whoever made it.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import dataclasses
+from collections.abc import Iterable, Mapping, Set
+from dataclasses import dataclass, field
 from typing import Any
 
-from schemas.errors import CallerError, NotPermitted, UnknownSkill
+from reasoner.params import misfits
+from schemas.errors import BadRequest, CallerError, NotPermitted, UnknownSkill
 from schemas.manifest import RSkillManifest
 from schemas.tools import (
     EmitPrompt,
@@ -16,11 +19,29 @@ from schemas.tools import (
     LifecycleTransition,
     LocateInView,
     QueryScene,
+    StopGoal,
     ToolCall,
+    Wait,
+    function_schema,
     function_schemas,
+    parse_skill_call,
+    parse_tool_call,
+    skill_function,
+    skill_tool_name,
 )
 
 EXECUTABLE_KINDS = frozenset({"vla", "ros_action", "ros_service"})
+WHILE_A_GOAL_RUNS = frozenset({"wait", "stop_goal"})
+OPERATOR = "/operator"
+
+_USED_AS = {
+    "detector": "it is asked through locate_in_view",
+    "segmenter": "nothing here serves it",
+    "vlm": "it is asked through query_scene",
+    "reward": "it judges and moves nothing",
+    "playbook": "it is a text for the planner: --playbook FILE",
+    "wam": "nothing here runs world action models",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,86 +52,212 @@ class Skill:
     kind: str
     description: str
     actions: tuple[str, ...]
+    goal_params_schema: Mapping[str, Any] | None = None
+    barred: str = ""
+    """Why it must not be used although its kind could be; empty: it may."""
 
 
 @dataclass(frozen=True, slots=True)
 class Palette:
-    """`can_locate` and `can_query` are independent: the two are provided by different sidecars."""
+    """`can_locate` and `can_query` are independent: the two are provided by different sidecars.
+
+    `managed` names the components that `lifecycle_transition` may touch, `topics` where `emit_prompt` may speak; empty: the tool is not
+    there. `only` narrows all of it to the tools that a playbook composes; None does not.
+    """
 
     skills: tuple[Skill, ...]
     can_locate: bool = True
     can_query: bool = True
+    managed: frozenset[str] = frozenset()
+    topics: frozenset[str] = frozenset()
+    only: frozenset[str] | None = None
+    benched: frozenset[str] = field(default_factory=frozenset)
+    """Skills that could not be started several times in a row: not offered, and refused, for the rest of the episode."""
 
     @property
     def executable(self) -> dict[str, Skill]:
-        return {skill.id: skill for skill in self.skills if skill.kind in EXECUTABLE_KINDS}
+        return {
+            skill.id: skill
+            for skill in self.skills
+            if skill.kind in EXECUTABLE_KINDS and not skill.barred and skill.id not in self.benched
+        }
 
     @property
     def manipulation(self) -> frozenset[str]:
         """Ids of learnt manipulation skills: what counts as an attempt."""
         return frozenset(skill.id for skill in self.skills if skill.kind == "vla")
 
+    @property
+    def tools(self) -> frozenset[str]:
+        """Names of the tools that are there while no goal runs."""
+        there = {
+            "execute_rskill": bool(self.executable),
+            "locate_in_view": self.can_locate,
+            "query_scene": self.can_query,
+            "lifecycle_transition": bool(self.managed),
+            "emit_prompt": bool(self.topics),
+        }
+        names = frozenset(name for name, given in there.items() if given)
+        return names if self.only is None else names & self.only
+
     def first(self, action: str) -> Skill:
         """The first executable skill that offers an action verb. Raises UnknownSkill."""
         for skill in self.executable.values():
             if action in skill.actions:
                 return skill
+        barred = [
+            f"{skill.id}: {skill.barred}" for skill in self.skills if action in skill.actions and skill.barred
+        ]
         raise UnknownSkill(
-            f"no installed skill can {action}", hint="start the runner with a manifest that lists this action"
+            f"no installed skill can {action}",
+            hint="; ".join(barred) or "start the runner with a manifest that lists this action",
         )
 
-    def check(self, call: ToolCall) -> CallerError | None:
+    def without(self, benched: Set[str]) -> "Palette":
+        """The same palette with these skills not to be had."""
+        return self if benched == self.benched else dataclasses.replace(self, benched=frozenset(benched))
+
+    # -- is a call allowed? ----------------------------------------------------------------------------------------
+    def check(self, call: ToolCall, *, goal_runs: bool = False) -> CallerError | None:
         """Why a call is not allowed, or None."""
+        if isinstance(call, Wait | StopGoal):
+            return (
+                None if goal_runs else NotPermitted("no goal runs", hint=f"choose from {_list(self.tools)}")
+            )
+        if goal_runs:
+            return NotPermitted(
+                f"a goal runs: {call.tool} has to wait", hint=f"choose from {_list(WHILE_A_GOAL_RUNS)}"
+            )
+        if self.only is not None and call.tool not in self.only:
+            return NotPermitted(
+                f"{call.tool} is not a tool of this playbook", hint=f"choose from {_list(self.tools)}"
+            )
         match call:
-            case ExecuteRskill(rskill_id=rskill) if rskill not in self.executable:
-                kind = next((skill.kind for skill in self.skills if skill.id == rskill), None)
-                if kind is not None:
-                    return NotPermitted(
-                        f"{rskill} is of kind {kind} and cannot be executed",
-                        hint=f"choose from {_names(self.executable)}",
-                    )
-                return UnknownSkill(
-                    f"there is no skill {rskill}", hint=f"choose from {_names(self.executable)}"
-                )
+            case ExecuteRskill():
+                return self._check_skill(call)
             case LocateInView() if not self.can_locate:
                 return NotPermitted("no detector is provided", hint="start the detector sidecar")
             case QueryScene() if not self.can_query:
                 return NotPermitted("no scene VLM is provided", hint="start the scene-VLM sidecar")
-            case LifecycleTransition():
+            case LifecycleTransition() if call.node not in self.managed:
                 return NotPermitted(
-                    "no component may be managed by this reasoner",
-                    hint="the arbiter decides what is resident",
+                    f"{call.node} may not be managed by this reasoner",
+                    hint=f"it may manage {_list(self.managed)}; the arbiter decides what is resident",
                 )
-            case EmitPrompt():
-                return NotPermitted("this reasoner has nobody to prompt")
+            case EmitPrompt() if call.target_topic not in self.topics:
+                return NotPermitted(
+                    f"nobody may be prompted at {call.target_topic}", hint=f"choose from {_list(self.topics)}"
+                )
             case _:
                 return None
 
-    def functions(self) -> list[dict[str, Any]]:
-        """OpenAI-style descriptions of what is allowed; the executable skills are listed in `execute_rskill`."""
-        names = ["execute_rskill"] + ["locate_in_view"] * self.can_locate + ["query_scene"] * self.can_query
-        functions = function_schemas(names)
-        rskill = functions[0]["function"]["parameters"]["properties"]["rskill_id"]
-        rskill["enum"] = list(self.executable)
-        rskill["description"] = " ".join(
-            f"{skill.id}: {skill.description}" for skill in self.executable.values()
-        )
-        return functions
+    def _check_skill(self, call: ExecuteRskill) -> CallerError | None:
+        skill = self.executable.get(call.rskill_id)
+        choose = f"choose from {_names(self.executable)}"
+        if skill is not None:
+            wrong = misfits(call.goal_params, skill.goal_params_schema) if call.goal_params_json else []
+            return (
+                BadRequest(f"{skill.id}: {'; '.join(wrong[:8])}", hint="see its parameters")
+                if wrong
+                else None
+            )
+        known = next((known for known in self.skills if known.id == call.rskill_id), None)
+        if known is None:
+            return UnknownSkill(f"there is no skill {call.rskill_id}", hint=choose)
+        if known.kind not in EXECUTABLE_KINDS:
+            how = _USED_AS.get(known.kind, "nothing here runs this kind")
+            return NotPermitted(
+                f"{known.id} is of kind {known.kind} and cannot be executed: {how}", hint=choose
+            )
+        if known.barred:
+            return NotPermitted(f"{known.id} must not be used: {known.barred}", hint=choose)
+        return NotPermitted(f"{known.id} could not be started several times", hint=choose)
+
+    def permits(self, rskill_id: str) -> CallerError | None:
+        """Whether the model that a perception sidecar says it serves may be asked. A model that is not listed here is its operator's business."""
+        for skill in self.skills:
+            if skill.id == rskill_id and skill.barred:
+                return NotPermitted(f"{rskill_id} must not be used: {skill.barred}")
+        return None
+
+    # -- what is offered, and how it is read back ---------------------------------------------------------------
+    def functions(self, *, goal_runs: bool = False) -> list[dict[str, Any]]:
+        """OpenAI-style descriptions of what is allowed now: one function for each executable skill, and the other tools."""
+        if goal_runs:
+            return function_schemas(sorted(WHILE_A_GOAL_RUNS))
+        tools = self.tools
+        offered = []
+        if "execute_rskill" in tools:
+            offered += [
+                skill_function(skill.id, skill.description, skill.goal_params_schema)
+                for skill in self.executable.values()
+            ]
+        offered += function_schemas(name for name in ("locate_in_view", "query_scene") if name in tools)
+        for tool, parameter, allowed in (
+            (LifecycleTransition, "node", self.managed),
+            (EmitPrompt, "target_topic", self.topics),
+        ):
+            function = function_schema(tool)
+            if function["function"]["name"] in tools:
+                function["function"]["parameters"]["properties"][parameter] = {
+                    "type": "string",
+                    "enum": sorted(allowed),
+                }
+                offered.append(function)
+        return offered
+
+    def parse(self, name: str, arguments: str | Mapping[str, Any]) -> ToolCall:
+        """Read a call by the name under which it was offered, or by the tool's own. Raises UnknownOp and BadRequest."""
+        for skill in self.skills:
+            if skill_tool_name(skill.id) == name:
+                return parse_skill_call(skill.id, arguments)
+        return parse_tool_call(name, arguments)
 
 
-def palette_of(manifests: Iterable[RSkillManifest], *, can_locate: bool, can_query: bool) -> Palette:
-    """Palette of installed manifests."""
+def palette_of(
+    manifests: Iterable[RSkillManifest],
+    *,
+    can_locate: bool,
+    can_query: bool,
+    allow_noncommercial: bool = False,
+    managed: Iterable[str] = (),
+    topics: Iterable[str] = (),
+) -> Palette:
+    """Palette of installed manifests. Templates and, unless allowed, skills whose licence forbids commercial use are listed but barred."""
     skills = tuple(
         Skill(
             manifest.name,
             str(manifest.kind),
             manifest.description.strip(),
             tuple(str(action) for action in manifest.actions),
+            manifest.goal_params_schema,
+            _barred(manifest, allow_noncommercial),
         )
         for manifest in manifests
     )
-    return Palette(skills, can_locate=can_locate, can_query=can_query)
+    return Palette(
+        skills,
+        can_locate=can_locate,
+        can_query=can_query,
+        managed=frozenset(managed),
+        topics=frozenset(topics),
+    )
 
 
-def _names(skills: dict[str, Skill]) -> str:
+def _barred(manifest: RSkillManifest, allow_noncommercial: bool) -> str:
+    if manifest.is_scaffold_placeholder:
+        return "its manifest is still the template"
+    weightless = manifest.weights_uri is None  # nothing that a licence of weights could be about
+    if not weightless and not allow_noncommercial and not manifest.is_commercial_use_allowed:
+        return (
+            f"its licence ({manifest.license}) does not allow commercial use; --allow-noncommercial lets it"
+        )
+    return ""
+
+
+def _names(skills: Mapping[str, Skill]) -> str:
     return ", ".join(skills) or "nothing: no executable skill is installed"
+
+
+def _list(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names)) or "nothing"

@@ -4,11 +4,14 @@ Pure data and one protocol. Planners never touch sockets, models or leases: `rea
 planner can put bytes on a GPU other than through a sidecar that holds a lease.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
+from schemas.errors import SidecarUnavailable
 from schemas.tools import ExecuteRskill, QueryScene, ToolCall
+
+UNSTARTABLE_MAX = 3
 
 Status = Literal[
     "found",  # locate_in_view: the object, with its place
@@ -16,6 +19,8 @@ Status = Literal[
     "answered",  # query_scene
     "succeeded",  # execute_rskill
     "failed",  # execute_rskill ended without success
+    "canceled",  # execute_rskill was called off, by the planner or by a person
+    "done",  # lifecycle_transition, emit_prompt
     "evicted",  # the model was made to leave: says nothing about the scene
     "no_frame",  # no picture young enough
     "refused",  # not allowed, or not understood
@@ -40,6 +45,15 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
+class Note:
+    """Something said from outside while the episode ran. `after` counts the steps that were over by then."""
+
+    source: Literal["operator", "safety"]
+    text: str
+    after: int
+
+
+@dataclass(frozen=True, slots=True)
 class Finish:
     """The planner's last word."""
 
@@ -53,6 +67,9 @@ class Episode:
 
     task: str
     steps: list[Step] = field(default_factory=list)
+    notes: list[Note] = field(default_factory=list)
+    running: ToolCall | None = None
+    """The goal that runs while the planner is asked: only `wait`, `stop_goal` and the end can be decided then."""
 
     def attempts(self, manipulation: frozenset[str]) -> int:
         """How many goals of the skills named in `manipulation` were executed."""
@@ -75,10 +92,21 @@ class Episode:
 class Planner(Protocol):
     """Decides what happens next. May take long (a language model): the loop stays responsive meanwhile.
 
-    Raises LlmError when no decision can be had.
+    A decision that came too late is thrown away and asked for again, with what has happened meanwhile: `decide` must not count
+    its calls. Raises LlmError when no decision can be had.
     """
 
     async def decide(self, episode: Episode) -> ToolCall | Finish: ...
+
+
+def benched(steps: Sequence[Step]) -> frozenset[str]:
+    """Skills whose sidecar could not be started `UNSTARTABLE_MAX` times in a row: not worth another try in this episode."""
+    streaks: dict[str, int] = {}
+    for step in steps:
+        if isinstance(step.call, ExecuteRskill) and streaks.get(step.call.rskill_id, 0) < UNSTARTABLE_MAX:
+            failed = step.outcome.code == SidecarUnavailable.code
+            streaks[step.call.rskill_id] = streaks.get(step.call.rskill_id, 0) + 1 if failed else 0
+    return frozenset(rskill for rskill, streak in streaks.items() if streak >= UNSTARTABLE_MAX)
 
 
 def says_yes(answer: str) -> bool:

@@ -1,15 +1,23 @@
 """What the tools do: each call becomes one request to the runner or to a sidecar, each answer a typed outcome.
 
 The difference between *not seen*, *evicted*, *no frame* and *error* is kept: only a detector that really looked may say that something is not there.
+A goal does not outlive whoever waits for it: when its wait is cancelled, or it makes no progress for as long as the call allows, it is cancelled
+at the runner. Nothing here names bytes, leases or victims: loading and leaving are between the sidecars and the arbiter.
 """
 
+import asyncio
 import logging
+import uuid
+from collections.abc import Mapping
 from typing import Any, Protocol
 
-from clients.runner import RunnerClient
+from clients.runner import Goal, RunnerClient
+from clients.sidecar.base import SidecarClient
 from clients.sidecar.perception import DetectorClient, SceneVlmClient
+from reasoner.palette import Palette
 from reasoner.planner import Outcome
 from schemas.errors import (
+    BadRequest,
     Evicted,
     FrameStale,
     GoalRejected,
@@ -18,8 +26,8 @@ from schemas.errors import (
     RunnerUnreachable,
     VramError,
 )
-from schemas.goals import FrameReply
-from schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall
+from schemas.goals import FrameReply, ResultPush
+from schemas.tools import EmitPrompt, ExecuteRskill, LifecycleTransition, LocateInView, QueryScene, ToolCall
 from schemas.world import CameraModel
 
 log = logging.getLogger(__name__)
@@ -27,6 +35,10 @@ log = logging.getLogger(__name__)
 FRAME_MAX_AGE_MS = 1000.0
 GOAL_GRACE_S = 60.0  # beyond the goal's own deadline: loading the skill's model is not part of the motion
 GOAL_MAX_S = 600.0  # when the manifest sets the deadline
+CANCEL_S = 10.0  # for a cancelled goal to end: it takes the arm back and finishes its use
+IDENTITY_S = 10.0  # for a perception sidecar to say which model it serves
+PROGRESS_TOLERANCE = 0.0
+BEFORE_MOTION = frozenset({"acquiring", "starting"})  # waiting for the card is no lack of progress
 
 
 class Dispatcher(Protocol):
@@ -34,14 +46,27 @@ class Dispatcher(Protocol):
 
 
 class Tools:
-    """Dispatch to a runner, a detector and a scene VLM. None of the sidecars needs to be up before it is asked."""
+    """Dispatch to a runner, a detector and a scene VLM. None of the sidecars needs to be up before it is asked.
+
+    `components` are the sidecars by name that `lifecycle_transition` may load and unload, if the palette allows it.
+    """
 
     def __init__(
-        self, runner: RunnerClient, detector: DetectorClient | None, scene_vlm: SceneVlmClient | None
+        self,
+        runner: RunnerClient,
+        detector: DetectorClient | None,
+        scene_vlm: SceneVlmClient | None,
+        *,
+        palette: Palette | None = None,
+        components: Mapping[str, SidecarClient] | None = None,
+        goal_grace_s: float = GOAL_GRACE_S,
     ) -> None:
         self._runner = runner
         self._detector = detector
         self._scene_vlm = scene_vlm
+        self._palette = palette
+        self._components = dict(components or {})
+        self._goal_grace_s = goal_grace_s
 
     async def __call__(self, call: ToolCall) -> Outcome:
         """Never raises for what the other side does; the outcome says it."""
@@ -53,6 +78,11 @@ class Tools:
                     return await self._query(call)
                 case ExecuteRskill():
                     return await self._execute(call)
+                case LifecycleTransition():
+                    return await self._transition(call)
+                case EmitPrompt():
+                    log.warning("to %s: %s", call.target_topic, call.text)
+                    return Outcome("done", f"said to {call.target_topic}")
                 case _:
                     return Outcome("refused", f"{call.tool} is not provided here", "not_permitted")
         except VramError as error:
@@ -61,6 +91,8 @@ class Tools:
     async def _locate(self, call: LocateInView) -> Outcome:
         if self._detector is None:
             return Outcome("refused", "no detector is provided", "not_permitted")
+        if (refusal := await self._not_permitted(self._detector)) is not None:
+            return refusal
         frame = await self._frame(call.camera)
         detections = await self._detector.detect(frame["data"], call.query)
         if not detections:
@@ -95,28 +127,98 @@ class Tools:
     async def _query(self, call: QueryScene) -> Outcome:
         if self._scene_vlm is None:
             return Outcome("refused", "no scene VLM is provided", "not_permitted")
+        if (refusal := await self._not_permitted(self._scene_vlm)) is not None:
+            return refusal
         frame = await self._frame(call.camera)
         answer = await self._scene_vlm.query(frame["data"], call.question)
         return Outcome("answered", answer, data={"camera": frame["camera"], "question": call.question})
 
     async def _execute(self, call: ExecuteRskill) -> Outcome:
-        goal = await self._runner.send_goal(
-            call.rskill_id, prompt=call.prompt, goal_params=call.goal_params, deadline_s=call.deadline_s
-        )
-        limit_s = call.deadline_s + GOAL_GRACE_S if call.deadline_s else GOAL_MAX_S
+        goal = await self._send(call)
+        limit_s = call.deadline_s + self._goal_grace_s if call.deadline_s else GOAL_MAX_S
+        patience = asyncio.create_task(_stands_still(goal, call)) if call.patience_s is not None else None
+        waiting = asyncio.create_task(goal.result(timeout_s=limit_s))
         try:
-            result = await goal.result(timeout_s=limit_s)
+            either: set[asyncio.Task[Any]] = {waiting} if patience is None else {waiting, patience}
+            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+            if not waiting.done() and patience is not None and patience.result():
+                result = await _called_off(goal)
+                if result is None or not result["success"]:
+                    return Outcome(
+                        "failed",
+                        f"no progress for {call.patience_s:g} s; the goal was cancelled",
+                        "no_progress",
+                    )
+                return _ended(result)
+            return _ended(await waiting)
         except (TimeoutError, RunnerUnreachable):
-            await goal.cancel()
+            await _called_off(goal)
             return Outcome(
                 "failed", f"no result within {limit_s:.0f} s; the goal was cancelled", "wait_timeout"
             )
-        return Outcome(
-            "succeeded" if result["success"] else "failed",
-            result["message"] or result["status"],
-            result["code"],
-            dict(result["data"]),
-        )
+        except asyncio.CancelledError:
+            await _called_off(goal)
+            raise
+        finally:
+            for task in (waiting, patience):
+                if task is not None:
+                    task.cancel()
+                    task.add_done_callback(_retrieve)
+
+    async def _send(self, call: ExecuteRskill) -> Goal:
+        """A goal whose acceptance was not heard may run: it is cancelled by its name."""
+        goal_id = f"goal-{uuid.uuid4().hex[:12]}"
+        try:
+            return await self._runner.send_goal(
+                call.rskill_id,
+                prompt=call.prompt,
+                goal_params=call.goal_params,
+                deadline_s=call.deadline_s,
+                goal_id=goal_id,
+            )
+        except (asyncio.CancelledError, RunnerUnreachable):
+            await asyncio.shield(asyncio.create_task(self._cancel_unheard(goal_id)))
+            raise
+
+    async def _cancel_unheard(self, goal_id: str) -> None:
+        try:
+            await self._runner.call("cancel", {"goal_id": goal_id}, timeout_s=CANCEL_S)
+        except BadRequest:
+            pass  # it never was accepted
+        except VramError as error:
+            log.error("goal %s may run: %s", goal_id, error)
+
+    async def _transition(self, call: LifecycleTransition) -> Outcome:
+        """`configure` asks whether it is there, `activate` loads, `deactivate` and `cleanup` unload; never beside a goal.
+
+        The state is read just before; should a goal begin in between, its lease is in use and the arbiter lets nobody in its way.
+        """
+        component = self._components.get(call.node)
+        if component is None:
+            return Outcome("refused", f"there is no component {call.node} to manage", "not_permitted")
+        if call.transition == "configure":
+            identity = await component.ping(timeout_s=IDENTITY_S)
+            return Outcome("done", f"{call.node} serves {identity['rskill']}, {identity['state']}")
+        if (goal := (await self._runner.state())["goal"]) is not None:
+            return Outcome(
+                "refused",
+                f"goal {goal} runs: nothing is loaded or unloaded beside it",
+                "bad_state",
+                {"goal": goal},
+            )
+        if call.transition == "activate":
+            loaded = await component.load()
+            return Outcome("done", f"{call.node} is resident" + ("" if loaded["loaded"] else " as before"))
+        await component.unload()
+        return Outcome("done", f"{call.node} leaves at its next safe point")
+
+    async def _not_permitted(self, sidecar: SidecarClient) -> Outcome | None:
+        """Whether the palette bars the model that is served (its licence, say). Asked until the sidecar has answered once."""
+        if self._palette is None:
+            return None
+        identity = sidecar.identity or await sidecar.ping(timeout_s=IDENTITY_S)
+        error = self._palette.permits(str(identity.get("rskill", "")))
+        return None if error is None else Outcome("refused", str(error), error.code)
 
     async def _frame(self, camera: str) -> FrameReply:
         return await self._runner.frame(camera, max_age_ms=FRAME_MAX_AGE_MS, encoding="png")
@@ -132,6 +234,61 @@ def point_on_plane(frame: FrameReply, box: tuple[float, float, float, float]) ->
     model = CameraModel.model_validate(frame["camera_model"])
     point = model.ground_point((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
     return None if point is None else list(point)
+
+
+def _ended(result: ResultPush) -> Outcome:
+    status = result["status"]
+    return Outcome(
+        "succeeded" if result["success"] else "canceled" if status == "canceled" else "failed",
+        result["message"] or status,
+        result["code"] or ("deadline" if status == "deadline" else ""),
+        dict(result["data"]),
+    )
+
+
+async def _stands_still(goal: Goal, call: ExecuteRskill) -> bool:
+    """True once the goal's progress has not grown for `patience_s`; False when its feedback ends before. Getting ready does not count."""
+    assert call.patience_s is not None, "only watched with patience"
+    tolerance = PROGRESS_TOLERANCE if call.progress_tolerance is None else call.progress_tolerance
+    best: float | None = None
+    feedback = aiter(goal.feedback())
+    deadline_s: float | None = None
+    while True:
+        try:
+            async with asyncio.timeout_at(deadline_s):
+                item = await anext(feedback)
+        except TimeoutError:
+            return True
+        except StopAsyncIteration:
+            return False
+        if item["state"] in BEFORE_MOTION:
+            continue
+        if best is None or item["progress"] > best + tolerance:
+            best = item["progress"]
+            deadline_s = asyncio.get_running_loop().time() + call.patience_s
+
+
+async def _called_off(goal: Goal) -> ResultPush | None:
+    """Cancel a goal and hear its end, within `CANCEL_S`; None if the runner does not say. A cancellation of ours does not cut this short."""
+
+    async def end() -> ResultPush | None:
+        try:
+            async with asyncio.timeout(CANCEL_S):
+                if not goal.done:
+                    await goal.cancel()
+                return await goal.result()
+        except (TimeoutError, VramError) as error:
+            log.error(
+                "goal %s may still run: %s", goal.goal_id, error or "the runner did not say that it ended"
+            )
+            return None
+
+    return await asyncio.shield(asyncio.create_task(end()))
+
+
+def _retrieve(task: "asyncio.Task[Any]") -> None:
+    if not task.cancelled():
+        task.exception()
 
 
 def _failed(error: VramError) -> Outcome:

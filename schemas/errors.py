@@ -198,6 +198,10 @@ class RunnerUnreachable(TransientError):
     code = "runner_unreachable"  # it does not answer: not running, or hanging
 
 
+class ReasonerUnreachable(TransientError):
+    code = "reasoner_unreachable"  # no episode runs there, or it hangs
+
+
 class GoalRejected(CallerError):
     code = "goal_rejected"
 

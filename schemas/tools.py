@@ -2,15 +2,24 @@
 
 Only the shapes: what a call does, whether it is allowed and who serves it are the reasoner's business. The same classes give
 the function schemas that are offered to a language model, so that what is offered and what is accepted cannot drift apart.
+
+A skill may also be offered as a function of its own, `execute_rskill__OWNER__REPO`, with the parameters its manifest describes:
+`skill_tool_name` names it, `skill_function` describes it, `parse_skill_call` reads it back as an `ExecuteRskill`.
 """
 
+import copy
+import hashlib
 import json
+import re
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
+from schemas import strictjson
 from schemas.errors import BadRequest, UnknownOp
+
+TOOL_NAME_MAX_CHARS = 64  # what the public chat APIs accept
 
 Text = Annotated[str, Field(max_length=4096)]
 
@@ -44,15 +53,30 @@ class ExecuteRskill(_Tool):
             ge=0, allow_inf_nan=False, description="Seconds until it is cancelled; 0: as the manifest says."
         ),
     ] = 0.0
-    patience_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
-    progress_tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    patience_s: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            allow_inf_nan=False,
+            description="Cancel it when its progress stands still for so long, seconds.",
+        ),
+    ] = None
+    progress_tolerance: Annotated[
+        float | None,
+        Field(
+            ge=0,
+            le=1,
+            allow_inf_nan=False,
+            description="A gain of progress (0..1) no larger than this is none.",
+        ),
+    ] = None
 
     @field_validator("goal_params_json")
     @classmethod
     def _is_json_object(cls, text: str) -> str:
         if text:
             try:
-                value = json.loads(text)
+                value = strictjson.loads(text)
             except ValueError as error:
                 raise ValueError(f"must be empty or a JSON object: {error}") from error
             if not isinstance(value, dict):
@@ -108,7 +132,19 @@ class EmitPrompt(_Tool):
     metadata_json: Text = ""
 
 
-ToolCall = ExecuteRskill | LocateInView | QueryScene | LifecycleTransition | EmitPrompt
+class Wait(_Tool):
+    """Let the goal that runs go on."""
+
+    tool: Literal["wait"] = "wait"
+
+
+class StopGoal(_Tool):
+    """Cancel the goal that runs. The robot holds where it is."""
+
+    tool: Literal["stop_goal"] = "stop_goal"
+
+
+ToolCall = ExecuteRskill | LocateInView | QueryScene | LifecycleTransition | EmitPrompt | Wait | StopGoal
 
 TOOLS: dict[str, type[ToolCall]] = {
     "execute_rskill": ExecuteRskill,
@@ -116,9 +152,23 @@ TOOLS: dict[str, type[ToolCall]] = {
     "query_scene": QueryScene,
     "lifecycle_transition": LifecycleTransition,
     "emit_prompt": EmitPrompt,
+    "wait": Wait,
+    "stop_goal": StopGoal,
 }
 
 TOOL_CALL: TypeAdapter[ToolCall] = TypeAdapter(Annotated[ToolCall, Field(discriminator="tool")])
+
+
+def read_arguments(name: str, arguments: str | Mapping[str, Any]) -> dict[str, Any]:
+    """A call's arguments, a JSON text (empty: none) or a mapping, as a dict. Raises BadRequest, see `schemas.strictjson`."""
+    try:
+        value = strictjson.loads(arguments or "{}") if isinstance(arguments, str) else arguments
+        strictjson.check(value)
+    except ValueError as error:
+        raise BadRequest(f"{name}: the arguments are not JSON: {error}") from error
+    if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
+        raise BadRequest(f"{name}: the arguments are not a JSON object")
+    return dict(value)
 
 
 def parse_tool_call(name: str, arguments: str | Mapping[str, Any]) -> ToolCall:
@@ -130,13 +180,7 @@ def parse_tool_call(name: str, arguments: str | Mapping[str, Any]) -> ToolCall:
         raise UnknownOp(
             f"there is no tool {name!r}", hint=f"choose from {', '.join(TOOLS)}", details={"known": [*TOOLS]}
         )
-    if isinstance(arguments, str):
-        try:
-            arguments = json.loads(arguments or "{}")
-        except ValueError as error:
-            raise BadRequest(f"{name}: the arguments are not JSON: {error}") from error
-    if not isinstance(arguments, Mapping):
-        raise BadRequest(f"{name}: the arguments are not a JSON object")
+    arguments = read_arguments(name, arguments)
     try:
         return TOOL_CALL.validate_python({**arguments, "tool": name})
     except ValidationError as error:
@@ -146,6 +190,61 @@ def parse_tool_call(name: str, arguments: str | Mapping[str, Any]) -> ToolCall:
         ]
         text = "; ".join(f"{field['path']}: {field['problem']}" for field in fields)
         raise BadRequest(f"{name}: {text}", details={"fields": fields}) from error
+
+
+def skill_tool_name(rskill_id: str) -> str:
+    """`execute_rskill__OWNER__REPO`, letters, digits, `_` and `-`, at most 64. Different skills never share a name.
+
+    A name that would be too long, or that cannot be read back because letters were replaced or underscores run together, ends in
+    `_` and eight digits of the id's SHA-1.
+    """
+    name = "execute_rskill__" + "__".join(
+        re.sub(r"[^A-Za-z0-9_-]", "_", part) for part in rskill_id.split("/")
+    )
+    if len(name) <= TOOL_NAME_MAX_CHARS and re.fullmatch(f"{_PLAIN}/{_PLAIN}", rskill_id):
+        return name
+    digits = hashlib.sha1(rskill_id.encode(errors="surrogatepass"), usedforsecurity=False).hexdigest()[:8]
+    return f"{name[: TOOL_NAME_MAX_CHARS - 9]}_{digits}"
+
+
+_PLAIN = "[A-Za-z0-9-]+(?:_[A-Za-z0-9-]+)*"
+
+
+def skill_function(
+    rskill_id: str, description: str, goal_params_schema: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """The function description of one skill: `execute_rskill` without `rskill_id`, its parameters as the manifest describes them.
+
+    `goal_params` takes the place of `goal_params_json` where the manifest has a schema; a skill without one takes none.
+    """
+    function = function_schema(ExecuteRskill)
+    body = function["function"]
+    body["name"], body["description"] = skill_tool_name(rskill_id), " ".join(description.split())
+    parameters = body["parameters"]
+    del (
+        parameters["properties"]["rskill_id"],
+        parameters["properties"]["goal_params_json"],
+        parameters["required"],
+    )
+    if goal_params_schema:
+        parameters["properties"]["goal_params"] = copy.deepcopy(dict(goal_params_schema))
+    return function
+
+
+def parse_skill_call(rskill_id: str, arguments: str | Mapping[str, Any]) -> ExecuteRskill:
+    """Read a call of a skill's own function. Raises BadRequest; whether the parameters fit the skill is the palette's to say."""
+    name = skill_tool_name(rskill_id)
+    fields = read_arguments(name, arguments)
+    if stray := [key for key in ("rskill_id", "goal_params_json", "tool") if key in fields]:
+        raise BadRequest(f"{name}: {stray[0]}: is not an argument of this function")
+    params = fields.pop("goal_params", None)
+    if params is not None and not isinstance(params, Mapping):
+        raise BadRequest(f"{name}: goal_params: must be a JSON object")
+    if params:
+        fields["goal_params_json"] = json.dumps(params, sort_keys=True, separators=(",", ":"))
+    call = parse_tool_call("execute_rskill", fields | {"rskill_id": rskill_id})
+    assert isinstance(call, ExecuteRskill), "the name says so"
+    return call
 
 
 def function_schema(tool: type[ToolCall]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from reasoner.palette import Palette
 from reasoner.planner import Episode, Finish, Outcome, says_yes
 from schemas.errors import BadRequest
-from schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall
+from schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall, Wait
 
 ATTEMPTS_MAX = 3
 LOOKS_MAX = 3  # repeats of a locate that gave no answer about the scene
@@ -60,13 +60,22 @@ class ScriptedPlanner:
             palette.first("grasp").id,
             can_query=palette.can_query,
         )
+        self._decided_after = -1  # steps: a decision that was thrown away is given again
+        self._decision: ToolCall | Finish = Finish(False, "nothing was decided")
 
     async def decide(self, episode: Episode) -> ToolCall | Finish:
+        if episode.running is not None:
+            return Wait(rationale="the script goes on when the goal has ended")
+        if len(episode.steps) == self._decided_after:
+            return self._decision
         try:
-            return self._script.send(episode.steps[-1].outcome) if episode.steps else next(self._script)
+            self._decision = (
+                self._script.send(episode.steps[-1].outcome) if episode.steps else next(self._script)
+            )
         except StopIteration as stop:
-            finish: Finish = stop.value
-            return finish
+            self._decision = stop.value
+        self._decided_after = len(episode.steps)
+        return self._decision
 
 
 def _script(thing: str, navigate: str, grab: str, *, can_query: bool) -> Script:

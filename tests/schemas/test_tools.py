@@ -1,12 +1,26 @@
 """Tool calls: what a model may say, what is refused, and that what is offered is what is accepted."""
 
 import json
+import re
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from schemas.errors import BadRequest, UnknownOp
-from schemas.tools import TOOL_CALL, TOOLS, ExecuteRskill, function_schema, function_schemas, parse_tool_call
+from schemas.tools import (
+    TOOL_CALL,
+    TOOL_NAME_MAX_CHARS,
+    TOOLS,
+    ExecuteRskill,
+    function_schema,
+    function_schemas,
+    parse_skill_call,
+    parse_tool_call,
+    skill_function,
+    skill_tool_name,
+)
 
 CALLS: dict[str, dict[str, Any]] = {
     "execute_rskill": {"rskill_id": "acme/rskill-grab", "prompt": "grab the red cube"},
@@ -14,6 +28,8 @@ CALLS: dict[str, dict[str, Any]] = {
     "query_scene": {"question": "Is the cube held?", "camera": "wrist"},
     "lifecycle_transition": {"node": "detector", "transition": "deactivate"},
     "emit_prompt": {"target_topic": "/operator", "text": "I cannot find it."},
+    "wait": {},
+    "stop_goal": {"rationale": "a person is in the way"},
 }
 
 
@@ -88,3 +104,52 @@ def test_function_schema_offers_what_the_class_accepts(name: str) -> None:
 def test_function_schemas_of_some_or_all() -> None:
     assert [schema["function"]["name"] for schema in function_schemas(["query_scene"])] == ["query_scene"]
     assert len(function_schemas()) == len(TOOLS)
+
+
+NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,40}/[A-Za-z0-9._-]{1,60}", fullmatch=True)
+
+
+@given(st.lists(NAMES, min_size=2, max_size=6, unique=True))
+def test_each_skill_has_a_function_name_of_its_own(names: list[str]) -> None:
+    made = [skill_tool_name(name) for name in names]
+    assert len(set(made)) == len(made)
+    assert all(re.fullmatch(r"[A-Za-z0-9_-]+", name) and len(name) <= TOOL_NAME_MAX_CHARS for name in made)
+
+
+def test_function_names_that_need_a_suffix() -> None:
+    assert skill_tool_name("lab/grab-it_2") == "execute_rskill__lab__grab-it_2"
+    assert re.fullmatch(r"execute_rskill__lab__a_b_[0-9a-f]{8}", skill_tool_name("lab/a.b"))
+    assert skill_tool_name("a__b/c") != skill_tool_name("a/b__c")
+    assert len(skill_tool_name("lab/" + "x" * 200)) == TOOL_NAME_MAX_CHARS
+
+
+def test_a_skills_function_takes_its_parameters_by_name() -> None:
+    schema = {"type": "object", "properties": {"x": {"type": "number"}}}
+    function = skill_function("lab/go", "Drive.", schema)["function"]
+    assert function["parameters"]["properties"]["goal_params"] == schema
+    assert function["parameters"]["additionalProperties"] is False
+    assert parse_skill_call("lab/go", '{"goal_params": {"x": 1}}').goal_params == {"x": 1}
+    for wrong in (
+        '{"goal_params": [1]}',
+        '{"rskill_id": "lab/other"}',
+        '{"goal_params_json": "{}"}',
+        '{"tool": "wait"}',
+    ):
+        with pytest.raises(BadRequest):
+            parse_skill_call("lab/go", wrong)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        '{"rskill_id": "a/b", "goal_params_json": "{\\"x\\": NaN}"}',
+        '{"rskill_id": "a/b", "goal_params_json": "{\\"x\\": 1e999}"}',
+        '{"rskill_id": "a/b", "deadline_s": Infinity}',
+        '{"rskill_id": "a/b", "rskill_id": "a/c"}',
+        '{"rskill_id": ' + "[" * 100_000,
+        {"rskill_id": "a/b", "deadline_s": float("nan")},
+    ],
+)
+def test_numbers_that_are_none_and_keys_given_twice_are_refused(arguments: Any) -> None:
+    with pytest.raises(BadRequest):
+        parse_tool_call("execute_rskill", arguments)

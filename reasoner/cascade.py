@@ -1,0 +1,132 @@
+"""The episode as a conversation, for any language model: what was called, what came of it, what was said from outside.
+
+The answers of `locate_in_view` and `query_scene` are prompts in their own right: they go back to the planner with their source and with
+what they mean, so that *not seen*, *evicted*, *no frame* and *error* stay four different things. Words of a model or of the
+scene are data inside a JSON text, cut to `ANSWER_MAX_CHARS`; only an operator's words are told as words. Knows no API.
+"""
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from reasoner.palette import Palette
+from reasoner.planner import Episode, Note, Outcome, Status, Step
+from schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall, skill_tool_name
+
+ANSWER_MAX_CHARS = 2000
+
+MEANING: dict[Status, str] = {
+    "found": "the detector looked and sees it",
+    "not_seen": "the detector looked and does not see it in this picture",
+    "answered": "the scene model looked at the present picture and answered",
+    "succeeded": "the goal was reached",
+    "failed": "the goal ended without success",
+    "canceled": "the goal was called off before its end",
+    "done": "it was done",
+    "evicted": "nothing was looked at: the model had to leave the card. This says nothing about the scene; try again",
+    "no_frame": "nothing was looked at: no picture is fresh enough. This says nothing about the scene",
+    "refused": "this call is not allowed or not understood; nothing was done",
+    "error": "it could not be done. This says nothing about the scene",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """Said to the model: the task, an operator, a nudge."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Called:
+    """A call of the model's, as it was read; `arguments` is a JSON object."""
+
+    id: str
+    name: str
+    arguments: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """What came of the call with this id."""
+
+    id: str
+    text: str
+    is_error: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Thought:
+    """Words of the model's own, without a call."""
+
+    text: str
+
+
+Turn = Words | Called | Answered | Thought
+
+
+def conversation(episode: Episode, palette: Palette) -> list[Turn]:
+    """Task, steps and notes in the order in which they happened; a goal that runs comes last, with nothing to show yet."""
+    turns: list[Turn] = [Words(episode.task)]
+    notes = list(episode.notes)
+    for number, step in enumerate(episode.steps):
+        turns += _notes(notes, number)
+        turns += _step(number, step, palette)
+    if episode.running is None:
+        return turns + _notes(notes, len(episode.steps))
+    number = len(episode.steps)
+    turns.append(_called(number, episode.running, palette))
+    turns.append(
+        Answered(_id(number), json.dumps({"status": "running", "meaning": "the goal runs; it is not over"}))
+    )
+    return turns + _notes(notes, number)
+
+
+def _notes(notes: list[Note], after: int) -> list[Turn]:
+    due = [note for note in notes if note.after <= after]
+    del notes[: len(due)]
+    return [Words(f"{note.source}: {_short(note.text)}") for note in due]
+
+
+def _step(number: int, step: Step, palette: Palette) -> list[Turn]:
+    text = json.dumps(told(step.call, step.outcome), ensure_ascii=False)
+    return [
+        _called(number, step.call, palette),
+        Answered(_id(number), text, step.outcome.status in ("refused", "error")),
+    ]
+
+
+def told(call: ToolCall, outcome: Outcome) -> dict[str, Any]:
+    """An outcome as a model reads it: status, its meaning, who says so, the words, the numbers."""
+    source = {LocateInView: "detector", QueryScene: "scene_vlm", ExecuteRskill: "runner"}.get(
+        type(call), "reasoner"
+    )
+    fields = {
+        "status": outcome.status,
+        "meaning": MEANING[outcome.status],
+        "source": source,
+        "text": _short(outcome.text),
+    }
+    if outcome.code:
+        fields["code"] = outcome.code
+    return fields | ({"data": dict(outcome.data)} if outcome.data else {})
+
+
+def _called(number: int, call: ToolCall, palette: Palette) -> Called:
+    fields = call.model_dump(mode="json", exclude={"tool"}, exclude_defaults=True)
+    if not isinstance(call, ExecuteRskill) or call.rskill_id not in {skill.id for skill in palette.skills}:
+        return Called(_id(number), call.tool, fields)
+    del fields["rskill_id"]
+    fields.pop("goal_params_json", None)
+    if call.goal_params:
+        fields["goal_params"] = call.goal_params
+    return Called(_id(number), skill_tool_name(call.rskill_id), fields)
+
+
+def _id(number: int) -> str:
+    return f"call-{number}"
+
+
+def _short(text: str) -> str:
+    text = "".join(letter if letter.isprintable() else " " for letter in text)
+    return text if len(text) <= ANSWER_MAX_CHARS else text[: ANSWER_MAX_CHARS - 1] + "…"

@@ -1,0 +1,66 @@
+"""What reaches a running episode from outside, past the planner: an operator's words, a cancel, a danger.
+
+Bounded: words beyond `WORDS_MAX` push the oldest words out; a cancel or a danger is never dropped.
+"""
+
+import asyncio
+import logging
+from dataclasses import dataclass
+
+log = logging.getLogger(__name__)
+
+WORDS_MAX = 32
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """An operator's words for the planner. They start no motion and stop none by themselves."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Cancel:
+    """End the episode: the goal is cancelled, the planner is not asked."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Danger:
+    """Something that concerns safety. `stop` ends the episode; otherwise the planner is told at once."""
+
+    text: str
+    stop: bool
+
+
+Message = Said | Cancel | Danger
+
+
+class Inbox:
+    """One reader, any number of writers on the reader's event loop."""
+
+    def __init__(self) -> None:
+        self._urgent: list[Message] = []
+        self._words: list[Said] = []
+        self._there = asyncio.Event()
+
+    def put(self, message: Message) -> None:
+        if isinstance(message, Said):
+            if len(self._words) >= WORDS_MAX:
+                log.warning("an operator's words were pushed out: %s", self._words.pop(0).text)
+            self._words.append(message)
+        else:
+            self._urgent.append(message)
+        self._there.set()
+
+    async def wait(self) -> None:
+        """Until there is something to take."""
+        await self._there.wait()
+
+    def take(self) -> list[Message]:
+        """All there is, cancels and dangers first."""
+        taken = [*self._urgent, *self._words]
+        self._urgent, self._words = [], []
+        self._there.clear()
+        return taken

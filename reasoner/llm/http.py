@@ -1,0 +1,121 @@
+"""One JSON request to a model server that may be slow, broken or hostile: bounded in time, bytes and tries.
+
+The limit is on the whole exchange: a server that sends a byte a second is as late as one that sends none. A busy or failing
+server (`RETRY_STATUSES`) and a connection that broke are tried again after a pause; a wrong key or a wrong request is not.
+"""
+
+import asyncio
+import json
+import logging
+from collections.abc import Mapping
+from typing import Any, Self
+
+from schemas import strictjson
+from schemas.errors import LlmError
+
+log = logging.getLogger(__name__)
+
+TRIES_MAX = 3
+RETRY_PAUSE_S = 0.5  # doubled each time
+RETRY_STATUSES = frozenset({408, 429, 500, 502, 503, 504, 529})
+ANSWER_MAX_BYTES = 1 << 20
+COMPLAINT_MAX_CHARS = 300
+
+
+class _Busy(Exception):
+    """Worth another try."""
+
+
+class JsonHttp:
+    """`async with JsonHttp(headers, timeout_s) as http: await http.post(url, body)`. Redirects are not followed: the key goes nowhere else."""
+
+    def __init__(
+        self, headers: Mapping[str, str], timeout_s: float, *, retry_pause_s: float = RETRY_PAUSE_S
+    ) -> None:
+        import httpx  # only installed with the reasoner's extra
+
+        self._timeout_s = timeout_s
+        self._retry_pause_s = retry_pause_s
+        self._http = httpx.AsyncClient(headers=dict(headers), timeout=timeout_s, follow_redirects=False)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        await self._http.aclose()
+
+    async def post(self, url: str, body: Mapping[str, Any]) -> dict[str, Any]:
+        """The answer's JSON object. Raises LlmError for everything that goes wrong."""
+        content = json.dumps(body, ensure_ascii=False).encode(errors="replace")
+        problem = ""
+        for number in range(TRIES_MAX):
+            if number:
+                log.warning("%s: %s; trying again", url, problem)
+                await asyncio.sleep(self._retry_pause_s * 2 ** (number - 1))
+            try:
+                async with asyncio.timeout(self._timeout_s):
+                    return await self._once(url, content)
+            except TimeoutError as error:
+                raise LlmError(
+                    f"no answer from {url} within {self._timeout_s:g} s",
+                    hint="raise VRAM_REASONER_LLM_TIMEOUT_S",
+                ) from error
+            except _Busy as error:
+                problem = str(error)
+        raise LlmError(
+            f"{url}: {problem}, {TRIES_MAX} times", hint="is the server running, and does it keep up?"
+        )
+
+    async def _once(self, url: str, content: bytes) -> dict[str, Any]:
+        import httpx
+
+        try:
+            async with self._http.stream(
+                "POST", url, content=content, headers={"content-type": "application/json"}
+            ) as response:
+                answer = await self._read(url, response)
+                status = int(response.status_code)
+        except httpx.TimeoutException as error:
+            raise TimeoutError from error
+        except httpx.TransportError as error:
+            raise _Busy(f"{type(error).__name__}: {error}") from error
+        except (httpx.HTTPError, httpx.InvalidURL) as error:
+            raise LlmError(f"{url}: {error}", hint="is VRAM_REASONER_LLM_BASE_URL right?") from error
+        if status in RETRY_STATUSES:
+            raise _Busy(f"HTTP status {status}: {_complaint(answer)}")
+        if status != 200:
+            raise LlmError(
+                f"{url}: HTTP status {status}: {_complaint(answer)}", hint="are address, key and model right?"
+            )
+        try:
+            value = strictjson.loads(answer, max_chars=ANSWER_MAX_BYTES)
+        except ValueError as error:
+            raise LlmError(f"{url} answered something that is no JSON: {error}") from error
+        if not isinstance(value, dict):
+            raise LlmError(f"{url} answered a JSON {type(value).__name__}, not an object")
+        return value
+
+    @staticmethod
+    async def _read(url: str, response: Any) -> bytes:
+        parts: list[bytes] = []
+        size = 0
+        async for part in response.aiter_bytes():
+            size += len(part)
+            if size > ANSWER_MAX_BYTES:
+                raise LlmError(f"{url} answered more than {ANSWER_MAX_BYTES} bytes")
+            parts.append(part)
+        return b"".join(parts)
+
+
+def _complaint(answer: bytes) -> str:
+    """The server's own words, short and on one line. Both APIs put them under `error.message`."""
+    text = answer.decode(errors="replace")
+    try:
+        error = json.loads(text)["error"]
+        text = str(error["message"] if isinstance(error, dict) else error)
+    except (ValueError, LookupError, TypeError, RecursionError):
+        pass
+    return " ".join(text.split())[:COMPLAINT_MAX_CHARS] or "no words"

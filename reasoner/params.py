@@ -1,0 +1,83 @@
+"""Do a call's goal parameters fit the schema in the skill's manifest? A check before anything is sent to the robot.
+
+The part of JSON Schema that manifests use: `type`, `properties`, `required`, `additionalProperties: false`, `enum`, `items`,
+`minItems`, `maxItems`, `minimum`, `maximum`. Other keywords are left to the skill, which checks its goal anyhow.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+_TYPES: dict[str, tuple[type, ...]] = {
+    "object": (dict,),
+    "array": (list,),
+    "string": (str,),
+    "number": (int, float),
+    "integer": (int,),
+    "boolean": (bool,),
+    "null": (type(None),),
+}
+
+
+def misfits(value: Any, schema: Any, path: str = "goal_params") -> list[str]:
+    """What is wrong with a value, each with its path; empty if it fits."""
+    if not isinstance(schema, Mapping):
+        return []
+    kinds = schema.get("type", [])
+    kinds = [kinds] if isinstance(kinds, str) else kinds
+    if isinstance(kinds, list) and kinds and not any(_is(value, kind) for kind in kinds):
+        return [f"{path}: must be of type {' or '.join(map(str, kinds))}"]
+    options = schema.get("enum")
+    if isinstance(options, list) and value not in options:
+        return [f"{path}: must be one of {', '.join(map(repr, options))}"]
+    if isinstance(value, dict):
+        return _object(value, schema, path)
+    if isinstance(value, list):
+        return _array(value, schema, path)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return _number(value, schema, path)
+    return []
+
+
+def _is(value: Any, kind: Any) -> bool:
+    types = _TYPES.get(kind) if isinstance(kind, str) else None
+    if types is None:
+        return True  # a word that this check does not know refuses nothing
+    if isinstance(value, bool):
+        return bool in types
+    return isinstance(value, types) or (kind == "integer" and isinstance(value, float) and value.is_integer())
+
+
+def _object(value: dict[str, Any], schema: Mapping[str, Any], path: str) -> list[str]:
+    known = schema.get("properties")
+    known = known if isinstance(known, Mapping) else {}
+    required = schema.get("required")
+    wrong = [
+        f"{path}.{name}: is required"
+        for name in (required if isinstance(required, list) else [])
+        if isinstance(name, str) and name not in value
+    ]
+    for name, item in value.items():
+        if name in known:
+            wrong += misfits(item, known[name], f"{path}.{name}")
+        elif schema.get("additionalProperties") is False:
+            wrong.append(f"{path}.{name}: is not a parameter of this skill")
+    return wrong
+
+
+def _array(value: list[Any], schema: Mapping[str, Any], path: str) -> list[str]:
+    wrong = []
+    if isinstance(least := schema.get("minItems"), int) and len(value) < least:
+        wrong.append(f"{path}: must have at least {least} items")
+    if isinstance(most := schema.get("maxItems"), int) and len(value) > most:
+        wrong.append(f"{path}: must have at most {most} items")
+    for index, item in enumerate(value):
+        wrong += misfits(item, schema.get("items"), f"{path}[{index}]")
+    return wrong
+
+
+def _number(value: float, schema: Mapping[str, Any], path: str) -> list[str]:
+    if isinstance(low := schema.get("minimum"), int | float) and value < low:
+        return [f"{path}: must be at least {low}"]
+    if isinstance(high := schema.get("maximum"), int | float) and value > high:
+        return [f"{path}: must be at most {high}"]
+    return []

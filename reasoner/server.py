@@ -1,0 +1,109 @@
+"""The operator's way into a running episode: a small socket whose messages go into the inbox, past the planner.
+
+Speaks `schemas.reasoner`. Both ends are here: the server beside the loop, and `send` for `vram-reasoner --say` and `--cancel`.
+"""
+
+import asyncio
+import logging
+import os
+from collections.abc import Mapping
+from typing import Any, Self
+
+from pydantic import ValidationError
+
+from clients.serve import Message, Peer, RouterServer
+from clients.transport import Transport
+from reasoner.inbox import Cancel, Inbox, Said
+from schemas.errors import BadRequest, ReasonerUnreachable, UnknownOp, VramError, from_wire
+from schemas.reasoner import OPS, REASONER_REQUEST, CancelEpisode, GetEpisode, Say
+
+log = logging.getLogger(__name__)
+
+SEND_S = 5.0
+
+
+class OperatorServer:
+    """`async with OperatorServer(endpoint, task, inbox)`: serves until the block ends. Raises AlreadyRunning when another reasoner serves there."""
+
+    def __init__(self, endpoint: str, task: str, inbox: Inbox) -> None:
+        self._task_text = task
+        self._inbox = inbox
+        self._server = RouterServer(endpoint, lambda error: _refusal(None, error))
+        self._serving: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> Self:
+        await self._server.__aenter__()
+        self._serving = asyncio.create_task(self._server.serve(self._handle))
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        if self._serving is not None:
+            self._serving.cancel()
+            await asyncio.gather(self._serving, return_exceptions=True)
+        await self._server.__aexit__()
+
+    async def _handle(self, peer: Peer, message: Message) -> None:
+        number = message.get("id")
+        request_id = number if isinstance(number, int) else None
+        try:
+            reply = self._answer(message)
+        except VramError as error:
+            await self._server.send(peer, _refusal(request_id, error))
+        else:
+            await self._server.send(peer, {"re": request_id, "ok": True, **reply})
+
+    def _answer(self, message: Message) -> Message:
+        match _parse(message):
+            case Say(text=text):
+                self._inbox.put(Said(text))
+            case CancelEpisode(reason=reason):
+                self._inbox.put(Cancel(reason or "by an operator"))
+            case GetEpisode():
+                return {"task": self._task_text, "pid": os.getpid()}
+        return {"pid": os.getpid()}
+
+
+def _parse(message: Message) -> Any:
+    if message.get("op") not in OPS:
+        raise UnknownOp(
+            f"unknown op {message.get('op')!r}", hint=f"one of {', '.join(OPS)}", details={"known": [*OPS]}
+        )
+    try:
+        return REASONER_REQUEST.validate_python(message)
+    except ValidationError as error:
+        problems = [
+            f"{'.'.join(map(str, item['loc'][1:]))}: {item['msg']}"
+            for item in error.errors(include_url=False, include_input=False)
+        ]
+        raise BadRequest(f"{message['op']}: {'; '.join(problems)}") from error
+
+
+def _refusal(request_id: int | None, error: VramError) -> Message:
+    return {"re": request_id, "ok": False, "error": error.to_wire()}
+
+
+async def send(endpoint: str, request: Mapping[str, Any], *, timeout_s: float = SEND_S) -> Message:
+    """One request to a running reasoner. Raises ReasonerUnreachable, or the typed error of its answer."""
+    answer: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
+
+    def received(message: Message) -> None:
+        if not answer.done():
+            answer.set_result(message)
+
+    def hung_up() -> None:
+        if not answer.done():
+            answer.set_exception(ReasonerUnreachable(f"{endpoint} hung up", hint="has the episode ended?"))
+
+    transport = Transport(endpoint, asyncio.get_running_loop(), received, hung_up)
+    try:
+        transport.send({"id": 1, **request})
+        reply = await asyncio.wait_for(answer, timeout_s)
+    except TimeoutError:
+        raise ReasonerUnreachable(
+            f"no reasoner answers at {endpoint} within {timeout_s:g} s", hint="does an episode run?"
+        ) from None
+    finally:
+        transport.close()
+    if not reply.get("ok"):
+        raise from_wire(reply.get("error") or {})
+    return reply

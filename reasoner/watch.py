@@ -1,0 +1,39 @@
+"""Looks after the robot while an episode runs and the planner thinks: an emergency stop or a runner that is gone ends the episode.
+
+Reads the runner's state once a second on a connection of its own, so that no other request delays it.
+"""
+
+import asyncio
+import logging
+
+from clients.runner import RunnerClient
+from reasoner.inbox import Danger, Inbox
+from schemas.errors import VramError
+
+log = logging.getLogger(__name__)
+
+PERIOD_S = 1.0
+ANSWER_S = 10.0  # a machine that loads models is slow
+LOST_MAX = 3  # answers missed in a row
+
+
+async def watch(
+    runner: RunnerClient, inbox: Inbox, *, period_s: float = PERIOD_S, answer_s: float = ANSWER_S
+) -> None:
+    """Until it has said that the episode must stop, or is cancelled."""
+    lost = 0
+    while True:
+        try:
+            state = await runner.call("state", timeout_s=answer_s)
+        except VramError as error:
+            lost += 1
+            log.warning("%s", error)
+            if lost >= LOST_MAX:
+                inbox.put(Danger(f"the runner is gone: {error}", stop=True))
+                return
+        else:
+            lost = 0
+            if stopped := state.get("estop"):
+                inbox.put(Danger(f"emergency stop: {stopped}", stop=True))
+                return
+        await asyncio.sleep(period_s)

@@ -1,0 +1,159 @@
+"""A runner and a perception sidecar that speak the real wires on real sockets, without robot and models."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clients.serve import Message, Peer, RouterServer
+from schemas.errors import BadRequest, GoalRejected, VramError
+from schemas.goals import RUNNER_REQUEST, CancelGoal, GetFrame, GetResult, GetState, SendGoal
+
+
+class Runner:
+    """One goal at a time, ended by the test; `deaf` ops are never answered."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.endpoint = endpoint
+        self.goal: SendGoal | None = None
+        self.peer: Peer | None = None
+        self.accepted = asyncio.Event()
+        self.cancelled: list[str] = []
+        self.deaf: set[str] = set()
+        self.estop: str | None = None
+        self.frame_error: VramError | None = None
+        self.ends_on_cancel = True
+        self.heard = asyncio.Event()
+        """An op that is not answered has come."""
+        self._server = RouterServer(
+            endpoint, lambda error: {"re": None, "ok": False, "error": error.to_wire()}
+        )
+
+    async def serve(self) -> None:
+        async with self._server:
+            await self._server.serve(self._handle)
+
+    async def end(self, status: str = "succeeded", *, code: str = "", message: str = "") -> None:
+        assert self.goal is not None, "no goal runs"
+        goal, self.goal = self.goal, None
+        assert self.peer is not None, "somebody sent it"
+        push = {"push": "result", "goal_id": goal.goal_id, "status": status, "success": status == "succeeded",
+                "code": code, "message": message, "data": {}}  # fmt: skip
+        await self._server.send(self.peer, push)
+
+    async def feed(self, progress: float, state: str = "running") -> None:
+        assert self.goal is not None, "no goal runs"
+        assert self.peer is not None, "somebody sent it"
+        push = {
+            "push": "feedback",
+            "goal_id": self.goal.goal_id,
+            "progress": progress,
+            "state": state,
+            "tick_idx": 0,
+            "detail": "",
+        }
+        await self._server.send(self.peer, push)
+
+    async def _handle(self, peer: Peer, message: Message) -> None:
+        request = RUNNER_REQUEST.validate_python(message)
+        number = {"re": request.id}
+        try:
+            reply = await self._answer(peer, request)
+        except VramError as error:
+            await self._server.send(peer, {**number, "ok": False, "error": error.to_wire()})
+            return
+        if request.op in self.deaf:
+            self.heard.set()
+        else:
+            await self._server.send(peer, {**number, "ok": True, **reply})
+        if isinstance(request, CancelGoal) and self.goal is not None and self.ends_on_cancel:
+            await self.end("canceled")
+
+    async def _answer(self, peer: Peer, request: Any) -> Message:
+        match request:
+            case SendGoal():
+                if self.goal is not None:
+                    raise GoalRejected("another goal is running")
+                self.goal, self.peer = request, peer
+                self.accepted.set()
+                return {"goal_id": request.goal_id, "accepted": True}
+            case CancelGoal(goal_id=goal_id):
+                self.cancelled.append(goal_id)
+                if self.goal is None or self.goal.goal_id != goal_id:
+                    raise BadRequest(f"there is no goal {goal_id}")
+                return {"goal_id": goal_id}
+            case GetFrame():
+                if self.frame_error is not None:
+                    raise self.frame_error
+                return {"camera": request.camera or "front", "encoding": "png", "data": b"\x89PNG\r\n\x1a\n", "width": 4,
+                        "height": 4, "stamp_monotonic_ns": 1, "age_ms": 1.0}  # fmt: skip
+            case GetState():
+                return {
+                    "goal": self.goal.goal_id if self.goal else None,
+                    "phase": "idle",
+                    "estop": self.estop,
+                }
+            case GetResult():
+                raise BadRequest("asked too early")
+        return {}
+
+
+class Sidecar:
+    """Answers `detect` and `query` with `answer`, or fails with `error`."""
+
+    def __init__(self, endpoint: str, rskill: str) -> None:
+        self.endpoint = endpoint
+        self.rskill = rskill
+        self.asked: list[str] = []
+        self.error: VramError | None = None
+        self.detections: list[dict[str, Any]] = []
+        self._server = RouterServer(
+            endpoint, lambda error: {"ok": False, "error": str(error), "code": error.code}
+        )
+
+    async def serve(self) -> None:
+        async with self._server:
+            await self._server.serve(self._handle)
+
+    async def _handle(self, peer: Peer, message: Message) -> None:
+        op = message["op"]
+        self.asked.append(op)
+        reply: Message = {"re": message["id"], "ok": True}
+        if op == "ping":
+            reply |= {"model": "m", "revision": "", "kind": "vlm", "rskill": self.rskill, "pid": 1, "boot_id": "b",
+                      "state": "unloaded"}  # fmt: skip
+        elif self.error is not None:
+            wire = self.error.to_wire()
+            reply |= {
+                "ok": False,
+                "error": f"{type(self.error).__name__}: {self.error.message}",
+                "code": wire["code"],
+            }
+        elif op == "load":
+            reply |= {"lease_id": "l", "token": [1, 1], "loaded": True}
+        else:
+            reply |= {"answer": "Yes, a red cube.", "norm": 1000, "detections": self.detections}
+        await self._server.send(peer, reply)
+
+
+@asynccontextmanager
+async def _served(program: Any) -> AsyncIterator[Any]:
+    task = asyncio.create_task(program.serve())
+    try:
+        yield program
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+@pytest.fixture
+def a_runner(tmp_path: Path) -> Callable[[], AbstractAsyncContextManager[Runner]]:
+    return lambda: _served(Runner(f"ipc://{tmp_path}/runner.sock"))
+
+
+@pytest.fixture
+def a_sidecar(tmp_path: Path) -> Callable[[str], AbstractAsyncContextManager[Sidecar]]:
+    return lambda rskill: _served(Sidecar(f"ipc://{tmp_path}/{rskill.replace('/', '-')}.sock", rskill))

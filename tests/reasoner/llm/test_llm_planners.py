@@ -1,0 +1,357 @@
+"""Both language-model planners against a local server that speaks their wire, or nonsense: real HTTP."""
+
+import asyncio
+import json
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from reasoner.llm.anthropic import AnthropicPlanner
+from reasoner.llm.base import LlmConfig, LlmPlanner
+from reasoner.llm.openai import OpenAiPlanner
+from reasoner.palette import Palette, Skill
+from reasoner.planner import Episode, Finish, Note, Outcome, Step
+from schemas.errors import ConfigError, LlmError
+from schemas.tools import ExecuteRskill, LocateInView, QueryScene, StopGoal, Wait
+
+pytest.importorskip("httpx", reason="needs the reasoner extra")
+
+SCHEMA = {
+    "type": "object",
+    "properties": {"turn_rad": {"type": "number", "maximum": 3.2}},
+    "additionalProperties": False,
+}
+PALETTE = Palette(
+    (
+        Skill("lab/navigate", "ros_action", "drive", ("navigate",), SCHEMA),
+        Skill("lab/grab", "vla", "grab", ("grasp",)),
+        Skill("lab/vlm", "vlm", "look", ("query",)),
+    )
+)
+KEY = "sk-very-secret"
+
+
+class OpenAi:
+    """How this API's server answers, and how its requests read."""
+
+    planner: type[LlmPlanner] = OpenAiPlanner
+    base = "/v1"
+    path = "/v1/chat/completions"
+
+    @staticmethod
+    def says(*calls: tuple[str, str], text: str = "") -> Any:
+        made = [
+            {"id": f"c{n}", "type": "function", "function": {"name": name, "arguments": arguments}}
+            for n, (name, arguments) in enumerate(calls)
+        ]
+        return {
+            "choices": [
+                {"message": {"role": "assistant", "content": text or None, "tool_calls": made or None}}
+            ]
+        }
+
+    @staticmethod
+    def offered(body: dict[str, Any]) -> dict[str, Any]:
+        return {tool["function"]["name"]: tool["function"]["parameters"] for tool in body["tools"]}
+
+    @staticmethod
+    def told(body: dict[str, Any]) -> list[str]:
+        """Everything that is said to the model after the instructions, in order: words, calls, results."""
+        found = []
+        for message in body["messages"]:
+            if message["role"] == "system":
+                continue
+            for call in message.get("tool_calls", ()):
+                found.append(f"{call['function']['name']} {call['function']['arguments']}")
+            if message["content"] is not None:
+                found.append(message["content"])
+        return found
+
+
+class Anthropic:
+    planner: type[LlmPlanner] = AnthropicPlanner
+    base = ""
+    path = "/v1/messages"
+
+    @staticmethod
+    def says(*calls: tuple[str, str], text: str = "") -> Any:
+        content: list[dict[str, Any]] = [{"type": "text", "text": text}] if text else []
+        for n, (name, arguments) in enumerate(calls):
+            try:
+                value = json.loads(arguments)
+            except ValueError:
+                value = arguments
+            content.append({"type": "tool_use", "id": f"toolu_{n}", "name": name, "input": value})
+        return {"type": "message", "role": "assistant", "content": content, "stop_reason": "tool_use"}
+
+    @staticmethod
+    def offered(body: dict[str, Any]) -> dict[str, Any]:
+        return {tool["name"]: tool["input_schema"] for tool in body["tools"]}
+
+    @staticmethod
+    def told(body: dict[str, Any]) -> list[str]:
+        found = []
+        for message in body["messages"]:
+            for block in message["content"]:
+                match block["type"]:
+                    case "text":
+                        found.append(block["text"])
+                    case "tool_use":
+                        found.append(f"{block['name']} {json.dumps(block['input'], separators=(',', ':'))}")
+                    case "tool_result":
+                        found.append(block["content"])
+        return found
+
+
+@pytest.fixture(params=[OpenAi, Anthropic])
+def api(request: pytest.FixtureRequest) -> Any:
+    return request.param
+
+
+@pytest.fixture
+def decide(api: Any, stand_in: Any) -> Callable[..., Any]:
+    def run(episode: Episode | None = None, *, timeout_s: float = 20.0, palette: Palette = PALETTE) -> Any:
+        config = LlmConfig(stand_in.url + api.base, "m", KEY, timeout_s)
+
+        async def once() -> Any:
+            async with api.planner(config, palette, retry_pause_s=0.0) as planner:
+                return await planner.decide(episode or Episode("grab the red cube"))
+
+        return asyncio.run(once())
+
+    return run
+
+
+def test_a_call_is_decoded_and_only_what_may_be_used_is_offered(api: Any, stand_in: Any, decide: Any) -> None:
+    stand_in.json(api.says(("locate_in_view", '{"query": "red cube", "rationale": "look first"}')))
+    assert decide() == LocateInView(query="red cube", rationale="look first")
+    assert stand_in.paths == [api.path]
+    offered = api.offered(stand_in.asked[0])
+    assert set(offered) == {
+        "execute_rskill__lab__navigate", "execute_rskill__lab__grab", "locate_in_view", "query_scene", "finish",
+    }  # fmt: skip
+    navigate = offered["execute_rskill__lab__navigate"]["properties"]
+    assert navigate["goal_params"] == SCHEMA
+    assert "rskill_id" not in navigate
+    assert "goal_params" not in offered["execute_rskill__lab__grab"]["properties"]
+    assert api.told(stand_in.asked[0]) == ["grab the red cube"]
+
+
+def test_a_skill_is_called_by_its_own_function(api: Any, stand_in: Any, decide: Any) -> None:
+    stand_in.json(
+        api.says(("execute_rskill__lab__navigate", '{"goal_params": {"turn_rad": 0.5}, "deadline_s": 9}'))
+    )
+    assert decide() == ExecuteRskill(
+        rskill_id="lab/navigate", goal_params_json='{"turn_rad":0.5}', deadline_s=9
+    )
+
+
+def test_parameters_that_do_not_fit_the_skill_are_told_back(api: Any, stand_in: Any, decide: Any) -> None:
+    stand_in.json(api.says(("execute_rskill__lab__navigate", '{"goal_params": {"turn_rad": 90}}')))
+    stand_in.json(api.says(("execute_rskill__lab__navigate", '{"goal_params": {"turn_rad": 1.57}}')))
+    assert decide().goal_params == {"turn_rad": 1.57}
+    assert "goal_params.turn_rad: must be at most 3.2" in api.told(stand_in.asked[1])[-1]
+
+
+def test_the_episode_is_told_as_a_conversation(api: Any, stand_in: Any, decide: Any) -> None:
+    stand_in.json(api.says(("finish", '{"success": true, "reason": "done"}')))
+    steps = [
+        Step(ExecuteRskill(rskill_id="lab/navigate", goal_params_json='{"turn_rad":1}'), Outcome("failed", "blocked", data={"at": 1})),
+        Step(LocateInView(query="cube"), Outcome("evicted", "it left", "evicted")),
+    ]  # fmt: skip
+    episode = Episode("grab it", steps, [Note("operator", "mind the cat", 1)])
+    assert decide(episode) == Finish(True, "done")
+    task, call, result, note, look, seen = api.told(stand_in.asked[0])
+    assert task == "grab it"
+    assert call == 'execute_rskill__lab__navigate {"goal_params":{"turn_rad":1}}'
+    assert json.loads(result)["status"] == "failed"
+    assert json.loads(result)["data"] == {"at": 1}
+    assert note == "operator: mind the cat"
+    assert look == 'locate_in_view {"query":"cube"}'
+    assert "nothing was looked at" in json.loads(seen)["meaning"]
+
+
+def test_words_without_a_call_get_one_nudge_and_no_second(api: Any, stand_in: Any, decide: Any) -> None:
+    stand_in.json(api.says(text="I would look."))
+    stand_in.json(api.says(("query_scene", '{"question": "what is there?"}')))
+    assert decide() == QueryScene(question="what is there?")
+    assert api.told(stand_in.asked[1])[-2:] == ["I would look.", "Answer with exactly one tool call."]
+    stand_in.json(api.says(text="I would look."))
+    stand_in.json(api.says(text=""))
+    with pytest.raises(LlmError, match="no tool call"):
+        decide()
+    assert len(stand_in.asked) == 4
+
+
+@pytest.mark.parametrize(
+    ("calls", "problem"),
+    [
+        ([("locate_in_view", '{"quary": "red cube"}')], "quary"),
+        ([("format_disk", "{}")], "there is no tool"),
+        (
+            [("locate_in_view", '{"query": "a"}'), ("query_scene", '{"question": "b"}')],
+            "2 tool calls at once",
+        ),
+        ([("locate_in_view", "not json")], "not JSON"),
+        ([("execute_rskill__lab__grab", '{"rskill_id": "lab/vlm"}')], "rskill_id"),
+        ([("execute_rskill__lab__navigate", '{"goal_params": {"turn_rad": NaN}}')], "NaN"),
+        ([("execute_rskill__lab__navigate", '{"goal_params": {"turn_rad": 1e999}}')], "goal_params"),
+        ([("finish", '{"success": "yes", "reason": "x"}')], "success"),
+    ],
+)
+def test_it_gives_up_after_three_unusable_answers(
+    api: Any, stand_in: Any, decide: Any, calls: list[tuple[str, str]], problem: str
+) -> None:
+    for _ in range(3):
+        stand_in.json(api.says(*calls))
+    with pytest.raises(LlmError):
+        decide()
+    if len(stand_in.asked) > 1:  # a body that is no strict JSON is refused before its calls are read
+        assert len(stand_in.asked) == 3
+        assert problem in " ".join(api.told(stand_in.asked[2]))
+
+
+def test_while_a_goal_runs_only_its_going_on_is_decided(api: Any, stand_in: Any, decide: Any) -> None:
+    running = Episode(
+        "grab it", notes=[Note("operator", "careful", 0)], running=ExecuteRskill(rskill_id="lab/grab")
+    )
+    stand_in.json(api.says(("execute_rskill__lab__navigate", "{}")))
+    stand_in.json(api.says(("stop_goal", "{}")))
+    assert decide(running) == StopGoal()
+    assert set(api.offered(stand_in.asked[0])) == {"wait", "stop_goal", "finish"}
+    said = api.told(stand_in.asked[0])
+    assert "operator: careful" in said
+    assert any('"running"' in text for text in said)
+    assert "a goal runs" in api.told(stand_in.asked[1])[-1]
+    stand_in.json(api.says(("wait", "{}")))
+    assert decide(running) == Wait()
+
+
+def test_a_skill_that_cannot_be_started_is_no_longer_offered(api: Any, stand_in: Any, decide: Any) -> None:
+    """The defect of the field: a policy whose sidecar does not start was selected for ever."""
+    failed = Step(ExecuteRskill(rskill_id="lab/grab"), Outcome("failed", "no process", "sidecar_unavailable"))
+    stand_in.json(api.says(("finish", '{"success": false, "reason": "x"}')))
+    decide(Episode("x", [failed, failed, failed]))
+    assert "execute_rskill__lab__grab" not in api.offered(stand_in.asked[0])
+    assert "execute_rskill__lab__navigate" in api.offered(stand_in.asked[0])
+
+
+def test_a_perception_model_called_as_a_skill_goes_to_the_loop_to_be_refused(
+    api: Any, stand_in: Any, decide: Any
+) -> None:
+    stand_in.json(api.says(("execute_rskill__lab__vlm", "{}")))
+    call = decide()
+    refusal = PALETTE.check(call)
+    assert refusal is not None
+    assert refusal.code == "not_permitted"
+
+
+# -- servers that misbehave ----------------------------------------------------------------------------------------
+@pytest.mark.parametrize("how", ["hangs", "drips"])
+def test_a_server_that_never_ends_its_answer_is_given_up(stand_in: Any, decide: Any, how: str) -> None:
+    getattr(stand_in, how)()
+    with pytest.raises(LlmError, match=r"within 0\.3 s"):
+        decide(timeout_s=0.3)
+
+
+def test_a_flood_is_cut_off(stand_in: Any, decide: Any) -> None:
+    stand_in.floods()
+    with pytest.raises(LlmError, match="more than 1048576 bytes"):
+        decide()
+
+
+@pytest.mark.parametrize("status", [429, 500, 503, 529])
+def test_a_busy_server_is_asked_again(api: Any, stand_in: Any, decide: Any, status: int) -> None:
+    stand_in.json({"error": {"message": "overloaded"}}, status)
+    stand_in.hangs_up()
+    stand_in.json(api.says(("locate_in_view", '{"query": "cube"}')))
+    assert decide() == LocateInView(query="cube")
+
+
+def test_a_server_that_stays_busy_is_given_up_with_its_words(stand_in: Any, decide: Any) -> None:
+    for _ in range(3):
+        stand_in.json({"error": {"message": "overloaded"}}, 529)
+    with pytest.raises(LlmError, match=r"HTTP status 529: overloaded, 3 times"):
+        decide()
+
+
+@pytest.mark.parametrize("status", [302, 400, 401, 404])
+def test_a_wrong_request_is_not_repeated_and_the_key_stays_secret(
+    stand_in: Any, decide: Any, status: int
+) -> None:
+    stand_in.body(
+        b'{"error": {"message": "no such model"}}', status, {"location": "http://127.0.0.1:1/steal"}
+    )
+    with pytest.raises(LlmError, match="no such model") as caught:
+        decide()
+    assert len(stand_in.asked) == 1
+    assert KEY not in str(caught.value)
+    assert KEY in str(stand_in.headers[0])
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"", b"<html>", b"[]", b"3", b"{}", b'{"choices": []}', b'{"choices": [{"message": 3}]}', b"[" * 100_000,
+        b'{"choices": [{"message": {"tool_calls": [3]}}]}', b'{"choices": [{"message": {"tool_calls": {"a": 1}}}]}',
+        b'{"type": "error", "error": {}}', b'{"type": "message", "role": "user", "content": []}',
+        b'{"type": "message", "role": "assistant", "content": [{"type": "tool_use"}]}',
+        b'{"type": "message", "role": "assistant", "content": "words"}', b"\xff\xfe", b'{"choices": NaN}',
+    ],
+)  # fmt: skip
+def test_garbage_is_a_typed_error(stand_in: Any, decide: Any, body: bytes) -> None:
+    stand_in.body(body)
+    with pytest.raises(LlmError):
+        decide()
+
+
+def test_nobody_there_is_a_typed_error(api: Any) -> None:
+    async def ask() -> None:
+        async with api.planner(LlmConfig("http://127.0.0.1:1", "m"), PALETTE, retry_pause_s=0.0) as planner:
+            await planner.decide(Episode("x"))
+
+    with pytest.raises(LlmError, match="3 times"):
+        asyncio.run(ask())
+
+
+# -- what only one of the two does ------------------------------------------------------------------------------------
+def test_the_messages_api_gets_what_it_demands(stand_in: Any) -> None:
+    stand_in.json(Anthropic.says(("locate_in_view", "{}")))
+    stand_in.json(Anthropic.says(("locate_in_view", '{"query": "cube"}')))
+    steps = [Step(QueryScene(question="?"), Outcome("answered", "Yes."))]
+
+    async def ask() -> Any:
+        async with AnthropicPlanner(LlmConfig(stand_in.url + "/v1", "m", KEY), PALETTE) as planner:
+            return await planner.decide(Episode("x", steps, [Note("operator", "go on", 1)]))
+
+    assert asyncio.run(ask()) == LocateInView(query="cube")
+    body = stand_in.asked[1]
+    assert stand_in.paths[0] == "/v1/messages"
+    assert stand_in.headers[0]["x-api-key"] == KEY
+    assert stand_in.headers[0]["anthropic-version"] == "2023-06-01"
+    assert body["tool_choice"] == {"type": "any", "disable_parallel_tool_use": True}
+    assert body["max_tokens"] > 0
+    roles = [message["role"] for message in body["messages"]]
+    assert roles == ["user", "assistant"] * (len(roles) // 2) + ["user"] * (len(roles) % 2)
+    for called, answered in zip(body["messages"][1::2], body["messages"][2::2], strict=True):
+        uses = [block["id"] for block in called["content"] if block["type"] == "tool_use"]
+        first = answered["content"][0]
+        assert [first["tool_use_id"]] == uses
+    assert body["messages"][-1]["content"][0]["is_error"] is True
+
+
+def test_the_environment_is_checked() -> None:
+    with pytest.raises(ConfigError, match="VRAM_REASONER_LLM_BASE_URL and VRAM_REASONER_LLM_MODEL"):
+        LlmConfig.from_environ({})
+    complete = {"VRAM_REASONER_LLM_BASE_URL": "http://x/v1/", "VRAM_REASONER_LLM_MODEL": "m"}
+    assert LlmConfig.from_environ(complete).base_url == "http://x/v1"
+    for name, text in (("TIMEOUT_S", "soon"), ("TIMEOUT_S", "-1"), ("TIMEOUT_S", "nan"), ("MAX_TOKENS", "0")):
+        with pytest.raises(ConfigError, match="no number"):
+            LlmConfig.from_environ(complete | {f"VRAM_REASONER_LLM_{name}": text})
+    with pytest.raises(ConfigError, match="no http"):
+        LlmConfig.from_environ(complete | {"VRAM_REASONER_LLM_BASE_URL": "file:///etc/passwd"})
+    cloud = LlmConfig.from_environ(
+        {"VRAM_REASONER_LLM_MODEL": "m"}, base_url=AnthropicPlanner.default_base_url
+    )
+    assert cloud.base_url == "https://api.anthropic.com"

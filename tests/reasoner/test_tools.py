@@ -1,0 +1,255 @@
+"""What each tool does on the wire, and which outcome each answer becomes: real sockets, real clients."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from clients.runner import RunnerClient
+from clients.sidecar.perception import DetectorClient, SceneVlmClient
+from reasoner.inbox import Danger, Inbox
+from reasoner.palette import Palette, Skill
+from reasoner.tools import Tools
+from reasoner.watch import watch
+from schemas.errors import (
+    Evicted,
+    FrameStale,
+    LeaseRevoking,
+    Loading,
+    ModelError,
+    NotResident,
+    OutOfMemory,
+    VramError,
+    WaitTimeout,
+)
+from schemas.tools import EmitPrompt, ExecuteRskill, LifecycleTransition, LocateInView, QueryScene
+
+GRAB = ExecuteRskill(rskill_id="lab/grab", prompt="grab it", deadline_s=30)
+LOOK = LocateInView(query="red cube")
+ASK = QueryScene(question="what is held?")
+
+
+def play(story: Callable[[], Any]) -> Any:
+    async def bounded() -> Any:
+        async with asyncio.timeout(60):
+            return await story()
+
+    return asyncio.run(bounded())
+
+
+def test_a_goals_end_becomes_an_outcome(a_runner: Any) -> None:
+    async def story() -> list[tuple[str, str]]:
+        found = []
+        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+            for status, code in (("succeeded", ""), ("failed", "oom"), ("canceled", ""), ("deadline", "")):
+                runner.accepted.clear()
+                doing = asyncio.create_task(Tools(client, None, None)(GRAB))
+                await runner.accepted.wait()
+                await runner.end(status, code=code)
+                outcome = await doing
+                found.append((outcome.status, outcome.code))
+        return found
+
+    assert play(story) == [("succeeded", ""), ("failed", "oom"), ("canceled", ""), ("failed", "deadline")]
+
+
+def test_a_goal_nobody_waits_for_any_more_is_cancelled_and_its_end_is_heard(a_runner: Any) -> None:
+    async def story() -> tuple[list[str], bool]:
+        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+            doing = asyncio.create_task(Tools(client, None, None)(GRAB))
+            await runner.accepted.wait()
+            doing.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await doing
+            return runner.cancelled, runner.goal is None
+
+    cancelled, ended = play(story)
+    assert len(cancelled) == 1
+    assert ended
+
+
+def test_a_goal_whose_acceptance_was_not_heard_is_cancelled_by_its_name(a_runner: Any) -> None:
+    async def story() -> bool:
+        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+            runner.deaf.add("goal")
+            doing = asyncio.create_task(Tools(client, None, None)(GRAB))
+            await runner.heard.wait()
+            doing.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await doing
+            return len(runner.cancelled) == 1 and runner.goal is None
+
+    assert play(story)
+
+
+def test_patience_counts_motion_and_not_the_wait_for_the_card(a_runner: Any) -> None:
+    async def story(patient: ExecuteRskill, feed: Callable[[Any], Any]) -> Any:
+        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+            doing = asyncio.create_task(Tools(client, None, None)(patient))
+            await runner.accepted.wait()
+            await feed(runner)
+            return await doing, runner.cancelled
+
+    patient = ExecuteRskill(rskill_id="lab/grab", patience_s=0.3, progress_tolerance=0.05)
+
+    async def stands_still(runner: Any) -> None:
+        await runner.feed(0.2)
+        await runner.feed(0.24)  # within the tolerance: no progress
+
+    outcome, cancelled = play(lambda: story(patient, stands_still))
+    assert (outcome.status, outcome.code) == ("failed", "no_progress")
+    assert len(cancelled) == 1
+
+    async def loads(runner: Any) -> None:
+        await runner.feed(0.0, "acquiring")
+        await asyncio.sleep(0.6)  # twice the patience: what is tested is that time passes without a cancel
+        await runner.end()
+
+    outcome, cancelled = play(lambda: story(patient, loads))
+    assert outcome.status == "succeeded"
+    assert cancelled == []
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (Evicted("it left"), "evicted"), (NotResident("not there"), "evicted"), (LeaseRevoking("leaving"), "evicted"),
+        (OutOfMemory("full"), "error"), (Loading("soon"), "error"), (ModelError("broken"), "error"), (WaitTimeout("busy"), "error"),
+    ],
+)  # fmt: skip
+def test_a_model_that_did_not_look_never_says_that_nothing_is_there(
+    a_runner: Any, a_sidecar: Any, error: VramError, status: str
+) -> None:
+    """The defect of the field: an evicted detector answered `found: false`."""
+
+    async def story() -> list[Any]:
+        async with (
+            a_runner() as runner,
+            RunnerClient(runner.endpoint) as client,
+            a_sidecar("lab/eye") as sidecar,
+            DetectorClient(sidecar.endpoint) as detector,
+            SceneVlmClient(sidecar.endpoint) as vlm,
+        ):
+            sidecar.error = error
+            tools = Tools(client, detector, vlm)
+            return [await tools(LOOK), await tools(ASK)]
+
+    for outcome in play(story):
+        assert (outcome.status, outcome.code) == (status, error.code)
+
+
+def test_looked_not_seen_answered_and_no_frame_are_four_things(a_runner: Any, a_sidecar: Any) -> None:
+    async def story() -> list[str]:
+        async with (
+            a_runner() as runner,
+            RunnerClient(runner.endpoint) as client,
+            a_sidecar("lab/eye") as sidecar,
+            DetectorClient(sidecar.endpoint) as detector,
+            SceneVlmClient(sidecar.endpoint) as vlm,
+        ):
+            tools = Tools(client, detector, vlm)
+            found = [(await tools(LOOK)).status, (await tools(ASK)).status]
+            sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]}]
+            seen = await tools(LOOK)
+            assert "the camera cannot say where it stands" in seen.text
+            runner.frame_error = FrameStale("the newest frame is 9 s old")
+            return [*found, seen.status, (await tools(LOOK)).status, (await tools(ASK)).status]
+
+    assert play(story) == ["not_seen", "answered", "error", "no_frame", "no_frame"]
+
+
+def test_a_model_whose_licence_is_barred_is_not_asked(a_runner: Any, a_sidecar: Any) -> None:
+    palette = Palette((Skill("lab/eye", "vlm", "", ("query",), barred="its licence"),))
+
+    async def story() -> tuple[Any, list[str]]:
+        async with (
+            a_runner() as runner,
+            RunnerClient(runner.endpoint) as client,
+            a_sidecar("lab/eye") as sidecar,
+            SceneVlmClient(sidecar.endpoint) as vlm,
+        ):
+            return await Tools(client, None, vlm, palette=palette)(ASK), sidecar.asked
+
+    outcome, asked = play(story)
+    assert (outcome.status, outcome.code) == ("refused", "not_permitted")
+    assert asked == ["ping"]
+
+
+def test_nothing_is_loaded_or_unloaded_beside_a_goal(a_runner: Any, a_sidecar: Any) -> None:
+    """The defect of the field: a language model could activate the detector in the middle of a grab."""
+
+    async def story() -> tuple[list[str], list[str], list[str]]:
+        async with (
+            a_runner() as runner,
+            RunnerClient(runner.endpoint) as client,
+            RunnerClient(runner.endpoint) as other,
+            a_sidecar("lab/eye") as sidecar,
+            DetectorClient(sidecar.endpoint) as detector,
+        ):
+            tools = Tools(client, detector, None, components={"detector": detector})
+            await other.send_goal("lab/grab")  # somebody else's goal counts as well
+            calls = [
+                LifecycleTransition.model_validate({"node": "detector", "transition": transition})
+                for transition in ("activate", "deactivate", "cleanup", "configure")
+            ]
+            beside = [(await tools(call)).status for call in calls]
+            asked = [op for op in sidecar.asked if op != "ping"]
+            await runner.end()
+            after = [(await tools(call)).status for call in calls]
+            assert asked == []
+            return beside, after, [op for op in sidecar.asked if op != "ping"]
+
+    beside, after, asked = play(story)
+    assert beside == ["refused", "refused", "refused", "done"]
+    assert after == ["done"] * 4
+    assert asked == ["load", "unload", "unload"]
+
+
+def test_an_unknown_component_and_a_prompt(a_runner: Any) -> None:
+    async def story() -> list[str]:
+        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+            tools = Tools(client, None, None)
+            calls = [
+                LifecycleTransition(node="kernel", transition="deactivate"),
+                EmitPrompt(target_topic="/operator", text="help"),
+                LOOK,
+                ASK,
+            ]
+            return [(await tools(call)).status for call in calls]
+
+    assert play(story) == ["refused", "done", "refused", "refused"]
+
+
+def test_an_emergency_stop_and_a_runner_that_is_gone_reach_the_inbox(a_runner: Any) -> None:
+    async def story() -> list[Any]:
+        inbox = Inbox()
+        async with a_runner() as runner, RunnerClient(runner.endpoint, connect_timeout_s=0.2) as client:
+            watching = asyncio.create_task(watch(client, inbox, period_s=0.01, answer_s=0.2))
+            await client.state()
+            assert inbox.take() == []
+            runner.estop = "somebody pressed it"
+            await inbox.wait()
+            await watching
+            stopped = inbox.take()
+        async with RunnerClient(runner.endpoint, connect_timeout_s=0.1) as client:
+            await watch(client, inbox, period_s=0.01, answer_s=0.1)
+        return stopped + inbox.take()
+
+    stopped, gone = play(story)
+    assert stopped == Danger("emergency stop: somebody pressed it", stop=True)
+    assert gone.stop
+    assert "gone" in gone.text
+
+
+def test_a_goal_without_an_end_is_given_up(a_runner: Any) -> None:
+    async def story() -> tuple[Any, list[str]]:
+        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+            outcome = await Tools(client, None, None, goal_grace_s=0.0)(
+                ExecuteRskill(rskill_id="lab/grab", deadline_s=0.2)
+            )
+            return outcome, runner.cancelled
+
+    outcome, cancelled = play(story)
+    assert (outcome.status, outcome.code) == ("failed", "wait_timeout")
+    assert len(cancelled) == 1
