@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 from reasoner.cascade import Answered, Called, Thought, Turn, Words, conversation
-from reasoner.llm.http import RETRY_PAUSE_S, JsonHttp
+from reasoner.llm.http import RETRY_PAUSE_S, JsonHttp, check_installed
 from reasoner.palette import Palette
 from reasoner.planner import Episode, Finish, benched
 from schemas.errors import BadRequest, ConfigError, LlmError, NotPermitted, UnknownOp
@@ -131,6 +131,7 @@ class LlmPlanner(ABC):
         self.config = config
         self._palette = palette
         self._system = f"{SYSTEM}\n\n{procedure}" if procedure else SYSTEM
+        check_installed()
         self._http = JsonHttp(self._headers(), config.timeout_s, retry_pause_s=retry_pause_s)
 
     async def __aenter__(self) -> Self:

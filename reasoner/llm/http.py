@@ -5,13 +5,14 @@ server (`RETRY_STATUSES`) and a connection that broke are tried again after a pa
 """
 
 import asyncio
+import importlib.util
 import json
 import logging
 from collections.abc import Mapping
 from typing import Any, Self
 
 from schemas import strictjson
-from schemas.errors import LlmError
+from schemas.errors import ConfigError, LlmError
 
 log = logging.getLogger(__name__)
 
@@ -26,17 +27,22 @@ class _Busy(Exception):
     """Worth another try."""
 
 
+def check_installed() -> None:
+    """Raises ConfigError without the reasoner's extra."""
+    if importlib.util.find_spec("httpx") is None:
+        raise ConfigError("httpx is not installed", hint="pip install 'vram-arbiter[reasoner]'")
+
+
 class JsonHttp:
     """`async with JsonHttp(headers, timeout_s) as http: await http.post(url, body)`. Redirects are not followed: the key goes nowhere else."""
 
     def __init__(
         self, headers: Mapping[str, str], timeout_s: float, *, retry_pause_s: float = RETRY_PAUSE_S
     ) -> None:
-        import httpx  # only installed with the reasoner's extra
-
+        self._headers = dict(headers)
         self._timeout_s = timeout_s
         self._retry_pause_s = retry_pause_s
-        self._http = httpx.AsyncClient(headers=dict(headers), timeout=timeout_s, follow_redirects=False)
+        self._http: Any = None
 
     async def __aenter__(self) -> Self:
         return self
@@ -45,7 +51,8 @@ class JsonHttp:
         await self.close()
 
     async def close(self) -> None:
-        await self._http.aclose()
+        if self._http is not None:
+            await self._http.aclose()
 
     async def post(self, url: str, body: Mapping[str, Any]) -> dict[str, Any]:
         """The answer's JSON object. Raises LlmError for everything that goes wrong."""
@@ -70,8 +77,12 @@ class JsonHttp:
         )
 
     async def _once(self, url: str, content: bytes) -> dict[str, Any]:
-        import httpx
+        import httpx  # only installed with the reasoner's extra
 
+        if self._http is None:
+            self._http = httpx.AsyncClient(
+                headers=self._headers, timeout=self._timeout_s, follow_redirects=False
+            )
         try:
             async with self._http.stream(
                 "POST", url, content=content, headers={"content-type": "application/json"}

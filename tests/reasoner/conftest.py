@@ -10,7 +10,7 @@ import pytest
 
 from clients.serve import Message, Peer, RouterServer
 from schemas.errors import BadRequest, GoalRejected, VramError
-from schemas.goals import RUNNER_REQUEST, CancelGoal, GetFrame, GetResult, GetState, SendGoal
+from schemas.goals import RUNNER_REQUEST, CancelGoal, GetFrame, GetResult, GetSkills, GetState, SendGoal
 
 
 class Runner:
@@ -24,6 +24,7 @@ class Runner:
         self.cancelled: list[str] = []
         self.deaf: set[str] = set()
         self.estop: str | None = None
+        self.skills: list[dict[str, Any]] = []
         self.frame_error: VramError | None = None
         self.ends_on_cancel = True
         self.heard = asyncio.Event()
@@ -96,6 +97,8 @@ class Runner:
                     "phase": "idle",
                     "estop": self.estop,
                 }
+            case GetSkills():
+                return {"skills": self.skills, "resident": None}
             case GetResult():
                 raise BadRequest("asked too early")
         return {}

@@ -1,0 +1,85 @@
+"""An operator's way into a running episode: over the socket, past the planner."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from reasoner.inbox import Cancel, Inbox, Said
+from reasoner.loop import run_episode
+from reasoner.palette import Palette
+from reasoner.planner import Episode, Finish, Outcome
+from reasoner.server import OperatorServer, send
+from schemas.errors import AlreadyRunning, BadRequest, ReasonerUnreachable, UnknownOp
+from schemas.tools import ToolCall
+
+
+def play(story: Callable[[], Any]) -> Any:
+    async def bounded() -> Any:
+        async with asyncio.timeout(30):
+            return await story()
+
+    return asyncio.run(bounded())
+
+
+def test_words_and_a_cancel_reach_the_inbox(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/reasoner.sock"
+
+    async def story() -> list[Any]:
+        inbox = Inbox()
+        async with OperatorServer(endpoint, "tidy up", inbox):
+            await send(endpoint, {"op": "say", "text": "mind the cat"})
+            await send(endpoint, {"op": "cancel"})
+            assert (await send(endpoint, {"op": "state"}))["task"] == "tidy up"
+            assert (await send(endpoint, {"op": "ping"}))["ok"]
+        return inbox.take()
+
+    assert play(story) == [Cancel("by an operator"), Said("mind the cat")]
+
+
+def test_what_is_no_request_is_refused_and_the_server_lives(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/reasoner.sock"
+
+    async def story() -> list[Any]:
+        inbox = Inbox()
+        async with OperatorServer(endpoint, "x", inbox):
+            for wrong, error in (
+                ({"op": "execute"}, UnknownOp),
+                ({"op": "say"}, BadRequest),
+                ({"op": "say", "text": "x" * 9000}, BadRequest),
+                ({"op": "say", "text": "x", "shout": True}, BadRequest),
+            ):
+                with pytest.raises(error):
+                    await send(endpoint, wrong)
+            await send(endpoint, {"op": "ping"})
+            with pytest.raises(AlreadyRunning):
+                async with OperatorServer(endpoint, "y", inbox):
+                    pass
+        with pytest.raises(ReasonerUnreachable):
+            await send(endpoint, {"op": "ping"}, timeout_s=0.1)
+        return inbox.take()
+
+    assert play(story) == []
+
+
+def test_a_cancel_over_the_socket_ends_an_episode_whose_planner_hangs(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/reasoner.sock"
+
+    class Hanging:
+        async def decide(self, episode: Episode) -> ToolCall | Finish:
+            await asyncio.Event().wait()
+            raise AssertionError("never set")
+
+    async def dispatch(call: ToolCall) -> Outcome:
+        raise AssertionError("nothing was decided")
+
+    async def story() -> str:
+        inbox = Inbox()
+        async with OperatorServer(endpoint, "x", inbox):
+            episode = asyncio.create_task(run_episode("x", Hanging(), Palette(()), dispatch, inbox=inbox))
+            await send(endpoint, {"op": "cancel", "reason": "lunch"})
+            return (await episode)["reason"]
+
+    assert play(story) == "canceled: lunch"

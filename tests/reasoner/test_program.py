@@ -1,0 +1,85 @@
+"""`vram-reasoner` as a process: how it ends, what it refuses, how a running one is spoken to."""
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+NOBODY = ["--runner", "tcp://127.0.0.1:1", "--detector", "none", "--scene-vlm", "none"]
+
+
+def reasoner(runtime: Path, *arguments: str, **environ: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "reasoner", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env={k: v for k, v in os.environ.items() if not k.startswith("VRAM_")}
+        | {"VRAM_ARBITER_RUNTIME": str(runtime), **environ},
+    )
+
+
+def test_usage(tmp_path: Path) -> None:
+    ended = reasoner(tmp_path, "--task", "x", "--say", "y")
+    assert ended.returncode == 2
+    ended = reasoner(tmp_path, "--say", "hello")
+    assert ended.returncode == 3
+    assert "no reasoner answers" in ended.stderr
+    ended = reasoner(tmp_path, "--task", "grab the cube", "--playbook", "/nonexistent/rskill.yaml", *NOBODY)
+    assert ended.returncode == 2
+    assert "cannot be read" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: Any) -> None:
+    """The runner knows one skill; the language model's server takes the connection and never answers."""
+    pytest.importorskip("httpx", reason="needs the reasoner extra")
+    manifest = {"name": "lab/go", "version": "1.0.0", "license": "mit", "kind": "ros_action", "embodiment_tags": ["any"], "chunk_size": 1,
+                "latency_budget": {"per_chunk_ms": 1}, "description": "drive", "actions": ["navigate"],
+                "actuators_required": [{"kind": "body_twist", "control_mode_semantics": {"mode": "absolute"}}],
+                "ros_integration": {"package": "p", "interface_type": "T", "interface_name": "/t", "default_goal_json": "{}"}}  # fmt: skip
+
+    async def story() -> tuple[int | None, str]:
+        asked = asyncio.Event()
+
+        async def silent(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await reader.readline()
+            asked.set()
+            await reader.read()  # until the client hangs up
+            writer.close()
+
+        server = await asyncio.start_server(silent, "127.0.0.1", 0)
+        port = server.sockets[0].getsockname()[1]
+        environ = os.environ | {
+            "VRAM_ARBITER_RUNTIME": str(tmp_path),
+            "VRAM_REASONER_LLM_BASE_URL": f"http://127.0.0.1:{port}",
+            "VRAM_REASONER_LLM_MODEL": "m",
+        }
+        async with a_runner() as runner, asyncio.timeout(200):
+            runner.skills = [manifest]
+            process = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "reasoner", "--task", "drive home", "--planner", "anthropic", "--detector", "none",
+                "--scene-vlm", "none", "--result", str(tmp_path / "result.json"), env=environ, stderr=asyncio.subprocess.PIPE,
+            )  # fmt: skip
+            try:
+                await asked.wait()
+                told = await asyncio.to_thread(reasoner, tmp_path, "--cancel", "lunch")
+                assert told.returncode == 0, told.stderr
+                _, err = await process.communicate()
+            finally:
+                if process.returncode is None:
+                    process.kill()
+            server.close()
+            return process.returncode, err.decode()
+
+    code, err = asyncio.run(story())
+    assert code == 1, err
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["reason"] == "canceled: lunch"
+    assert "Traceback" not in err
