@@ -1,10 +1,12 @@
-"""Looks after the robot while an episode runs and the planner thinks: an emergency stop or a runner that is gone ends the episode.
+"""Looks after the robot while an episode runs and the planner thinks: an emergency stop or a runner that is gone ends the episode, a
+sensor or joint state that has become stale is told to the planner.
 
 Reads the runner's state once a second on a connection of its own, so that no other request delays it.
 """
 
 import asyncio
 import logging
+from typing import Any
 
 from clients.runner import RunnerClient
 from reasoner.inbox import Danger, Inbox
@@ -22,6 +24,7 @@ async def watch(
 ) -> None:
     """Until it has said that the episode must stop, or is cancelled."""
     lost = 0
+    told: set[str] = set()  # stale components that the planner has heard of
     while True:
         try:
             state = await runner.call("state", timeout_s=answer_s)
@@ -36,4 +39,13 @@ async def watch(
             if stopped := state.get("estop"):
                 inbox.put(Danger(f"emergency stop: {stopped}", stop=True))
                 return
+            stale = _stale(state)
+            if new := stale - told:
+                inbox.put(Danger(f"not to be trusted now, too old: {', '.join(sorted(new))}", stop=False))
+            told = stale
         await asyncio.sleep(period_s)
+
+
+def _stale(state: dict[str, Any]) -> set[str]:
+    diagnostics = (state.get("world") or {}).get("diagnostics") or {}
+    return {name for name, said in diagnostics.items() if said in ("stale", "error")}

@@ -25,6 +25,7 @@ class Runner:
         self.deaf: set[str] = set()
         self.estop: str | None = None
         self.skills: list[dict[str, Any]] = []
+        self.diagnostics: dict[str, str] = {}
         self.frame_error: VramError | None = None
         self.ends_on_cancel = True
         self.heard = asyncio.Event()
@@ -96,6 +97,7 @@ class Runner:
                     "goal": self.goal.goal_id if self.goal else None,
                     "phase": "idle",
                     "estop": self.estop,
+                    "world": {"diagnostics": dict(self.diagnostics)},
                 }
             case GetSkills():
                 return {"skills": self.skills, "resident": None}

@@ -140,6 +140,18 @@ def test_words_reach_a_thinking_planner_by_asking_it_again() -> None:
     assert (len(planner.asked), planner.dropped) == (2, 1)
 
 
+def test_a_danger_that_stops_nothing_is_told_to_a_thinking_planner() -> None:
+    async def story() -> Result:
+        inbox = Inbox()
+        planner = Planner(lambda episode: Finish(False, episode.notes[0].source) if episode.notes else None)
+        episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
+        await planner.hanging.wait()
+        inbox.put(Danger("the front camera is stale", stop=False))
+        return await episode
+
+    assert play(story)["reason"] == "safety"
+
+
 def test_whoever_speaks_all_the_time_does_not_keep_the_planner_from_deciding() -> None:
     async def story() -> Planner:
         inbox = Inbox()

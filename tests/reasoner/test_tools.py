@@ -228,6 +228,9 @@ def test_an_emergency_stop_and_a_runner_that_is_gone_reach_the_inbox(a_runner: A
             watching = asyncio.create_task(watch(client, inbox, period_s=0.01, answer_s=0.2))
             await client.state()
             assert inbox.take() == []
+            runner.diagnostics = {"front": "stale", "joint_state": "ok"}
+            await inbox.wait()
+            assert inbox.take() == [Danger("not to be trusted now, too old: front", stop=False)]
             runner.estop = "somebody pressed it"
             await inbox.wait()
             await watching
