@@ -1,0 +1,55 @@
+"""A camera through GStreamer whose frames are published on a ROS 2 topic as well, read back there over DDS on loopback."""
+
+import uuid
+
+import pytest
+
+from runner.clock import SystemClock
+from runner.sensors.factory import make_reader
+from schemas.robot import SensorBackend, SensorReaderConfig
+
+pytestmark = pytest.mark.heavy
+pytest.importorskip("gi", reason="GStreamer's binding is not installed; .ci/setup says what to install")
+pytest.importorskip("cyclonedds")
+
+CLOCK = SystemClock()
+WAIT_NS = 60 * 10**9
+NETWORK = (
+    '<CycloneDDS><Domain Id="any"><General><AllowMulticast>false</AllowMulticast>'
+    '<Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces></General>'
+    "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>"
+    '<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>'
+)
+
+
+def test_recorders_see_the_same_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", NETWORK)
+    monkeypatch.setenv("ROS_DOMAIN_ID", "78")
+    topic = f"/wrist_{uuid.uuid4().hex[:8]}/image"
+    camera = make_reader(
+        SensorReaderConfig(
+            sensor_id="wrist",
+            backend=SensorBackend.GSTREAMER,
+            backend_params={"source": "test", "pattern": "red", "width": 33, "height": 17},
+            max_age_ms=WAIT_NS / 1e6,
+            publish_to_ros=True,
+            publish_topic=topic,
+        ),
+        CLOCK,
+    )
+    recorder = make_reader(
+        SensorReaderConfig(
+            sensor_id="seen", backend=SensorBackend.ROS2_IMAGE, backend_params={"topic": topic}
+        ),
+        CLOCK,
+    )
+    try:
+        recorder.start()
+        camera.start()
+        own = camera.read_synced(CLOCK.now_ns() + WAIT_NS)
+        seen = recorder.read_synced(CLOCK.now_ns() + WAIT_NS)
+    finally:
+        camera.stop()
+        recorder.stop()
+    assert (seen.encoding, seen.width, seen.height, seen.data) == ("bgr8", 33, 17, own.data)
+    assert own.data == b"\x00\x00\xff" * (33 * 17)
