@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 
 from runner import telemetry
 from runner.clock import Clock
@@ -111,6 +112,11 @@ class HardwareRunner(SkillRunner):
             except FrameStale as error:
                 if error.details.get("ended") or self.clock.now_ns() >= deadline_ns:
                     raise
+            with suppress(
+                FrameStale
+            ):  # pictures may take longer on their way than a slice, and still be young enough
+                reader.read_latest()
+                return
 
     def deactivate(self) -> None:
         """The motors keep their last target until the adapter disconnects as its hardware wants it. Repeatable."""

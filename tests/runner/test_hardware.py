@@ -1,15 +1,18 @@
 """The loop on a robot: what reaches the motors, what is withheld and why, and how it begins and ends. Time moves only when told."""
 
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
 from small_robots import FedCamera, Nod, Twin
 
+from runner.clock import SystemClock
 from runner.hal.so101 import so101
-from runner.hardware import FIRST_STATE_TRIES, HardwareRunner
+from runner.hardware import FIRST_DATA_SLICE_S, FIRST_STATE_TRIES, HardwareRunner
 from runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded
 from runner.safety import Envelope
+from runner.sensors import Feed
 from runner.skills.base import SkillState
 from schemas.errors import (
     BadRequest,
@@ -21,7 +24,7 @@ from schemas.errors import (
     StateStale,
 )
 from schemas.manifest import load_manifest
-from schemas.world import WorldState
+from schemas.world import SensorFrame, WorldState
 
 PERIOD_S = 1 / 30
 MakeRunner = Callable[..., HardwareRunner]
@@ -325,6 +328,35 @@ def test_everything_is_stopped_whatever_one_of_them_raises(
         runner.deactivate()
     assert twin.story == ["connect", "disconnect"]
     assert front.feed is None
+
+
+class Distant(FedCamera):
+    """A camera over a network: each picture arrives later than one slice of the wait for the first is long."""
+
+    def deliver(self, feed: Feed, frame: SensorFrame) -> None:
+        taken_ns = frame.stamp_monotonic_ns - round(1.5 * FIRST_DATA_SLICE_S * 1e9)
+        super().deliver(feed, frame.model_copy(update={"stamp_monotonic_ns": taken_ns}))
+
+
+def test_it_starts_on_a_camera_whose_pictures_take_their_time(twin: Twin) -> None:
+    clock, over = SystemClock(), threading.Event()
+    far = Distant("far", clock, 60_000.0, always=False)
+    runner = HardwareRunner(twin, [(far, 60_000.0)], gate, clock=clock, first_data_s=50.0)
+
+    def film() -> None:
+        while not over.wait(0.01):
+            if far.feed is not None:
+                far.show()
+
+    thread = threading.Thread(target=film)
+    thread.start()
+    try:
+        runner.activate()
+    finally:
+        over.set()
+        thread.join(30)
+    assert twin.story == ["connect"]
+    runner.deactivate()
 
 
 def test_it_does_not_start_on_a_robot_that_says_nothing(make: MakeRunner, twin: Twin) -> None:
