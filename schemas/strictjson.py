@@ -1,7 +1,7 @@
 """JSON from outside, read strictly: what Python's parser lets through and no robot should act on is an error.
 
-Refused: NaN and infinities (also `1e999`), an object that names a key twice, nesting deeper than `DEPTH_MAX`, text beyond `max_chars`.
-Pure; knows no message.
+Refused: NaN and infinities (also `1e999`), whole numbers beyond 64 bits and halves of surrogate pairs (no wire could carry them on), an object that
+names a key twice, nesting deeper than `DEPTH_MAX`, text beyond `max_chars`. Pure; knows no message.
 """
 
 import json
@@ -33,11 +33,15 @@ def check(value: Any) -> None:
         below: list[Any] = []
         for item in layer:
             if isinstance(item, dict):
-                below += item.values()
+                below += [*item, *item.values()]
             elif isinstance(item, list | tuple):
                 below += item
             elif isinstance(item, float) and not math.isfinite(item):
                 raise ValueError(f"{item} is no number that anything could act on")
+            elif isinstance(item, int) and not -(1 << 63) <= item < 1 << 63:
+                raise ValueError("a whole number has more than 64 bits")
+            elif isinstance(item, str) and any("\ud800" <= letter <= "\udfff" for letter in item):
+                raise ValueError("a text has half of a surrogate pair")
         if not below:
             return
         layer = below
