@@ -39,7 +39,7 @@ from runner.deployment import (
 )
 from runner.goals import GoalServer
 from runner.hardware import HardwareRunner
-from runner.protocols import DeadlinePolicy, Hal, Skill
+from runner.protocols import DeadlinePolicy, Skill
 from runner.skills.sidecar_policy import Arbiter
 from schemas.endpoints import program_endpoint, runtime_dir
 from schemas.errors import AlreadyRunning, RunnerUnreachable, VramError
@@ -51,7 +51,7 @@ log = logging.getLogger("runner")
 
 OWN_GOAL = "task"  # goal id of the file's own task
 
-MakeMakers = Callable[[Hal, Arbiter | None], Mapping[Kind, Maker]]
+MakeMakers = Callable[[Parts, Arbiter | None], Mapping[Kind, Maker]]
 """How skills of each kind are made for this robot, with or without an arbiter."""
 
 
@@ -82,16 +82,21 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
     """Learnt policies, each in its sidecar."""
     given = sidecars_given(args.sidecar)
 
-    def make_makers(hal: Hal, arbiter: Arbiter | None) -> Mapping[Kind, Maker]:
+    def make_makers(parts: Parts, arbiter: Arbiter | None) -> Mapping[Kind, Maker]:
         def make_policy(manifest: RSkillManifest) -> Skill:
             from clients.sidecar.policy import PolicyClient
             from runner.skills.sidecar_policy import SidecarPolicy, wire_up
 
-            joints, rest = hal.description.joint_names, hal.description.rest_pose_rad
-            client = PolicyClient(sidecar_endpoint(manifest.name, given, os.environ))
-            period_s = 1.0 / file.robot.rate_hz
+            description = parts.hal.description
+            wiring = wire_up(manifest, description.joint_names, description.rest_pose_rad)
+            limits = goal_gate(parts.gate, manifest, ()).limits
             return SidecarPolicy(
-                manifest, wire_up(manifest, joints, rest), client, arbiter, period_s=period_s
+                manifest,
+                wiring,
+                PolicyClient(sidecar_endpoint(manifest.name, given, os.environ)),
+                arbiter,
+                period_s=1.0 / file.robot.rate_hz,
+                speeds_rad_s=limits.speeds_rad_s if wiring.rollout.targets_lead else None,
             )
 
         return {Kind.VLA: make_policy}
@@ -145,7 +150,7 @@ class Deploy:
 
     # -- steps -------------------------------------------------------------------------------------------------------
     def _offered(self, parts: Parts, manifests: list[RSkillManifest], arbiter: Arbiter | None) -> Catalogue:
-        makers = self._make_makers(parts.hal, arbiter)
+        makers = self._make_makers(parts, arbiter)
         return offered(self._file, parts, manifests, makers, self._args.allow_noncommercial)
 
     def _facts(self, catalogue: Catalogue) -> list[tuple[str, str]]:

@@ -49,6 +49,7 @@ RETRY_S = 0.2
 CHUNK_TIMEOUT_S = 30.0  # a policy that needs longer for one chunk is gone
 LOCKSTEP_WAIT_S = 2.0  # how long one tick of a simulator waits with its world
 ROLLOUT_S = 5.0  # of motion, unless the manifest says otherwise
+STEP_SHARE = 0.98  # of the longest step: rounding must not reach the gate
 STILL_WINDOW = 20  # steps over which targets that move less than STILL_RAD mean that the policy has ended
 STILL_RAD = 0.01
 STILL_FROM = 0.5  # share of the rollout before which standing still is just waiting
@@ -89,6 +90,9 @@ class Rollout(BaseModel):
     stop_when_still: bool = True
     views: dict[str, View] = Field(default_factory=dict)
     prefetch_at: int = Field(default=0, ge=0, le=1000)
+    targets_lead: bool = (
+        False  # its targets are set points far ahead of the arm: a robot goes there step by step
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +141,11 @@ def wire_up(manifest: RSkillManifest, joints: tuple[str, ...], rest: Mapping[str
 
 
 class SidecarPolicy(SkillBase):
-    """`arbiter` None: nobody arbitrates, the sidecar loads at once. `wait_s` > 0 lets a simulated world wait for each chunk."""
+    """`arbiter` None: nobody arbitrates, the sidecar loads at once. `wait_s` > 0 lets a simulated world wait for each chunk.
+
+    `speeds_rad_s`, by joint: never command a step that is longer than this allows in one period. The safety gate withholds such leaps, and
+    rightly; they are meant only where the manifest says so (`targets_lead`). None sends the policy's targets as they are.
+    """
 
     holds_gpu = True
 
@@ -151,8 +159,15 @@ class SidecarPolicy(SkillBase):
         period_s: float,
         wait_s: float = 0.0,
         revision: str = "",
+        speeds_rad_s: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__(manifest, revision=revision)
+        self._longest = (
+            tuple(STEP_SHARE * speeds_rad_s[name] * period_s for name in wiring.joints)
+            if speeds_rad_s is not None
+            else None
+        )
+        self._commanded: Row | None = None
         self.cameras = tuple(wiring.cameras)
         self._wiring = wiring
         self._client = client
@@ -178,7 +193,7 @@ class SidecarPolicy(SkillBase):
             raise ModelError(f"{self.key} needs a prompt", hint="say what to do, e.g. `grab the red cube`")
         await self._occupy(goal)
         await self._client.reset({TASK_KEY: self._task}, token=self._token)
-        self._ramp, self._running = None, False
+        self._ramp, self._running, self._commanded = None, False, None
         self._recent.clear()
         self._player = ChunkPlayer(
             self._request, prefetch_at=self._wiring.rollout.prefetch_at, wait_s=self._wait_s
@@ -247,7 +262,7 @@ class SidecarPolicy(SkillBase):
         chunk, row = popped
         self._recent.append(row)
         self.fraction = player.played / self._steps
-        return Act(self._action(row, world), chunk_index=chunk)
+        return Act(self._action(self._step_towards(row, measured), world), chunk_index=chunk)
 
     def _at_start(self, measured: Mapping[str, float]) -> bool:
         """Whether the arm is at the start pose; sets the next target when not."""
@@ -260,6 +275,17 @@ class SidecarPolicy(SkillBase):
             return True
         self._target = self._ramp.next_target()
         return False
+
+    def _step_towards(self, row: Row, measured: Mapping[str, float]) -> Row:
+        """The policy's targets, or as much of the way there as one period allows."""
+        if self._longest is None:
+            return row
+        start = self._commanded or tuple(measured[name] for name in self._wiring.joints)
+        self._commanded = tuple(
+            here + min(max(target - here, -longest), longest)
+            for here, target, longest in zip(start, row, self._longest, strict=True)
+        )
+        return self._commanded
 
     def _stands_still(self, player: ChunkPlayer) -> bool:
         if not self._wiring.rollout.stop_when_still or player.played < STILL_FROM * self._steps:

@@ -11,8 +11,7 @@ from small_robots import Nod
 from runner.__main__ import parse
 from runner.catalogue import Maker
 from runner.cli_deploy import Deploy
-from runner.deployment import read_deployment
-from runner.protocols import Hal
+from runner.deployment import Parts, read_deployment
 from runner.skills.sidecar_policy import Arbiter
 from schemas.errors import ConfigError, VramError
 from schemas.manifest import Kind
@@ -21,7 +20,7 @@ STEPS = os.environ.get("NOD_STEPS")
 CAMERAS = tuple(filter(None, os.environ.get("NOD_CAMERAS", "").split(",")))
 
 
-def makers(hal: Hal, arbiter: Arbiter | None) -> Mapping[Kind, Maker]:
+def makers(parts: Parts, arbiter: Arbiter | None) -> Mapping[Kind, Maker]:
     steps = int(STEPS) if STEPS else None
     return {Kind.ROS_ACTION: lambda manifest: Nod(manifest, cameras=CAMERAS, steps=steps)}
 

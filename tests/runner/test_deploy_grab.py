@@ -95,13 +95,16 @@ async def scenario(arbiter: ArbiterProcess, programs: Programs) -> None:
         ArbiterClient(arbiter.endpoint, name="watcher") as watcher,
     ):
         assert (await runner.call("ping"))["arbiter"] is True
+        begun = await runner.state()
         goal = await runner.send_goal(GRAB, prompt="grab the red cube")
         async for feedback in goal.feedback():
-            if feedback["progress"] > 0.1:  # rows of chunks have reached the arm
+            if feedback["state"] == "running":
                 break
-        else:
-            raise AssertionError(await goal.result(1))
         assert [count >= 1 for count in uses(await watcher.status())] == [True]
+        lift = begun["world"]["joint_state"]["name"].index("shoulder_lift")
+        here = begun["world"]["joint_state"]["position"][lift]
+        while abs((await runner.state())["world"]["joint_state"]["position"][lift] - here) < 0.5:
+            assert not goal.done, await goal.result(1)
         programs.runner.send_signal(signal.SIGTERM)
         assert (await goal.result(60))["status"] == "canceled"
         assert await asyncio.to_thread(programs.runner.wait, 60) == 0

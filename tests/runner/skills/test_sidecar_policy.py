@@ -12,7 +12,7 @@ from clients.serve import Message, Peer, RouterServer
 from clients.sidecar import npy
 from clients.sidecar.policy import PolicyClient
 from runner.protocols import Act, Done, Goal, Hold, StepOutcome
-from runner.skills.sidecar_policy import SidecarPolicy, Wiring, wire_up
+from runner.skills.sidecar_policy import STEP_SHARE, SidecarPolicy, Wiring, wire_up
 from schemas.errors import (
     BadState,
     Evicted,
@@ -403,3 +403,19 @@ def test_views_are_cropped_and_averaged_as_trained(
 
     viewing = manifest.model_copy(update={"policy_extras": extras})
     scenario(run_async, Bench(viewing, f"ipc://{tmp_path}/grab.sock", Arbiter()), play)
+
+
+def test_a_policy_whose_targets_lead_goes_there_as_fast_as_the_robot_may(
+    bench: Callable[..., Bench], run_async: Run
+) -> None:
+    async def play(b: Bench) -> None:
+        import numpy as np
+
+        b.sidecar.action = np.array([[0.9, -0.9]] * 3, dtype=np.float32)
+        await b.skill.start(GOAL)
+        rows, _ = await b.play()
+        assert rows == [
+            pytest.approx((n * 3.0 * STEP_SHARE / 30, 0.5 - n * 1.5 * STEP_SHARE / 30)) for n in range(1, 8)
+        ]
+
+    scenario(run_async, bench(Arbiter(), speeds_rad_s={"a": 3.0, "b": 1.5}), play)
