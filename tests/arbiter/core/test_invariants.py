@@ -183,6 +183,12 @@ def account_off(b: Broken) -> None:
     b.gpu.ledger.accounts[b.held.process].charges[b.held.id].booked_bytes -= 1
 
 
+def approved_off(b: Broken) -> None:
+    account = b.gpu.ledger.accounts[b.held.process]
+    account.charges[b.held.id].approved_bytes += 1
+    account.charged_approved_bytes += 1
+
+
 def state_off(b: Broken) -> None:
     b.held.state = LeaseState.REVOKING
 
@@ -220,6 +226,7 @@ def connected_off(b: Broken) -> None:
         (connected_off, "are connected, kept as"),
         (sum_off, "the sums are"),
         (account_off, "is charged"),
+        (approved_off, "and approved"),
         (state_off, "listed as held"),
         (exclusive_off, "listed as exclusive"),
         (pin_off, "listed as pinned"),
