@@ -425,7 +425,7 @@ def on_expiry_due(core: Core, lease_id: str) -> None:
 
 def expire(core: Core, lease: Lease, why: str) -> None:
     """The lease is over for good, perhaps before its time (an operator's word). Its holder may still be loading until it fences itself,
-    so no verdict before that; one that is loaded has to be measured gone, or to have fenced itself."""
+    so no verdict before that; one that is loaded has to be measured gone (if that can be seen), or to have fenced itself."""
     error = {
         "code": "lease_expired",
         "message": why,
@@ -442,8 +442,9 @@ def expire(core: Core, lease: Lease, why: str) -> None:
     # a restart's deadline has the grace in it
     grace_s = core.settings.fence_grace_s if lease.attached else 0.0
     fenced_at = lease.expires_at + grace_s
-    if lease.state is LeaseState.LOADING:
-        grace_s = max(0.0, fenced_at - core.now)
+    weight_bytes = core.gpu_of(lease).ledger.charge_bytes(lease.id) - lease.spec.residue_bytes
+    if lease.state is LeaseState.LOADING or weight_bytes <= 2 * core.settings.verify_tolerance_bytes:
+        grace_s = max(0.0, fenced_at - core.now)  # what is so small no reading can tell from nothing
     if (
         core.recovering is not None
     ):  # its bytes stay charged: nobody who fits beside them has to wait for the verdict
