@@ -17,6 +17,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from arbiter import telemetry
 from arbiter.core.arbiter import Arbiter
@@ -416,13 +417,14 @@ def try_records(journal: Journal, settings: Settings) -> None:
         journal.put_aside(f"{type(error).__name__}: {error}")
 
 
-def processes_of(records: Mapping[str, Mapping[str, object]]) -> list[ProcessKey]:
-    """The processes that the journal's records belong to, each once."""
+def processes_of(records: Mapping[str, Mapping[str, Any]]) -> list[ProcessKey]:
+    """The processes that the journal's records belong to, and those that use what belongs to others; each once."""
     found = set()
     for record in records.values():
-        pid, ticks = record.get("pid"), record.get("start_ticks")
-        if isinstance(pid, int) and isinstance(ticks, int) and pid > 0:
-            found.add(ProcessKey(pid, ticks))
+        users = [(user[0], user[1]) for user in record.get("users", ())]
+        for pid, ticks in [(record.get("pid"), record.get("start_ticks")), *users]:
+            if isinstance(pid, int) and isinstance(ticks, int) and pid > 0:
+                found.add(ProcessKey(pid, ticks))
     return sorted(found)
 
 
