@@ -366,7 +366,7 @@ class Daemon:
         """Feeds the watchdog only with an event that has just passed through the core and the executor, on this very thread: whatever is
         stuck there starves it."""
         period_s = min(STATUS_EVERY_S, (notifier.watchdog_s or 3 * STATUS_EVERY_S) / 3)
-        text, kept_at = "", time.monotonic()
+        said, kept_at = "", time.monotonic()
         while True:
             await asyncio.sleep(period_s)
             if notifier.watchdog_s is not None and parts.inbox.pulse():
@@ -374,10 +374,9 @@ class Daemon:
             parts.journal.settle()
             parts.executor.settle()
             wrong = problems(parts.journal, parts.history)
-            if text != (
-                text := "; ".join([*wrong, status_text(parts.gpus), f"{len(parts.sessions)} clients"])
-            ):
-                notifier.status(text)
+            text = "; ".join([*wrong, status_text(parts.gpus), f"{len(parts.sessions)} clients"])
+            if text != said and notifier.status(text):
+                said = text
             if time.monotonic() - kept_at >= KEEP_LEARNT_EVERY_S and not parts.inbox.closed:
                 keep_learnt(parts)
                 kept_at = time.monotonic()
