@@ -78,8 +78,9 @@ class Tally:
 class Storm:
     """One run. `run` returns the report."""
 
-    def __init__(self, seconds: float, seed: int, out: Path) -> None:
+    def __init__(self, seconds: float, seed: int, out: Path, faults: int = 0) -> None:
         self._seconds = seconds
+        self._faults = faults  # as many at least, however long that takes on a busy machine
         self._seed = seed
         self._out = out
         self._random = random.Random(seed)
@@ -217,7 +218,7 @@ class Storm:
     # -- striking ------------------------------------------------------------------------------------------------------
     async def _strike_until(self, end: float) -> None:
         """Every cell of step × role × signal in a shuffled order, again and again; faults of card and disk in between."""
-        while time.monotonic() < end:
+        while time.monotonic() < end or sum(self._tally.by_kind.values()) < self._faults:
             if not self._plan:
                 self._plan = [(s, r, h) for s in STEPS.values() for r in ROLES for h in ("kill", "stop")]
                 self._plan += [("any time", "machine", fault) for fault in (*CARD_FAULTS, *DISK_FAULTS) * 2]
@@ -535,11 +536,12 @@ def main() -> int:
         description="Hit every process at every step of a switch, and judge what came of it."
     )
     parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--faults", type=int, default=0, help="go on until there were so many")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/chaos"))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    report = asyncio.run(Storm(options.seconds, options.seed, options.out).run())
+    report = asyncio.run(Storm(options.seconds, options.seed, options.out, options.faults).run())
     (options.out / "report.json").write_text(json.dumps(report, indent=2) + "\n")
     faults = report["faults"]
     for kind, count in faults["by_kind"].items():
