@@ -279,14 +279,19 @@ def _set_poll(core: Core, gpu: Gpu) -> None:
 
 
 def _weigh(core: Core, gpu: Gpu, verification: Verification, sample: MemorySampled) -> None:
+    loading_bytes = _loading_bytes(gpu, verification, sample)
     judgement = judge(
         verification,
         gpu.ledger,
         sample,
-        _grown_by_right(gpu, verification, sample),
+        max(0, _grown_by_right(gpu, verification, sample) - loading_bytes),
         families.unfilled_bytes(gpu) if sample.processes is None else 0,
         core.settings.verify_tolerance_bytes,
+        loading_bytes,
     )
+    if loading_bytes and not verification.settling:  # nothing is granted meanwhile, so nobody waits for it
+        verification.deadline_at = max(verification.deadline_at, core.now + core.settings.verify_timeout_s)
+        return
     if judgement is None:
         if verification.settling:
             verification.next_poll_at = max(core.now, sample.taken_at + core.settings.verify_confirm_s)
@@ -295,6 +300,24 @@ def _weigh(core: Core, gpu: Gpu, verification: Verification, sample: MemorySampl
     _announce(core, gpu, verification, judgement, sample)
     if judgement.resolved:
         _resolve(core, gpu, verification, judgement)
+
+
+def _loading_bytes(gpu: Gpu, verification: Verification, sample: MemorySampled) -> int:
+    """What others are charged that load just now, and are not seen to hold yet.
+
+    Where lists say who grew, they are believed. A total alone cannot tell what comes from what has not gone.
+    """
+    baseline = verification.baseline
+    if baseline is not None and baseline.processes is not None and sample.processes is not None:
+        return 0
+    count = 0
+    for lease in gpu.in_state(LeaseState.LOADING):
+        if lease.process != verification.process:
+            account = gpu.ledger.accounts[lease.process]
+            others = account.charged_bytes - gpu.ledger.charge_bytes(lease.id)
+            held = max(others, account.residue_bytes, process_bytes(sample, lease.process) or 0)
+            count += max(0, account.booked_bytes() - held)
+    return count
 
 
 def _grown_by_right(gpu: Gpu, verification: Verification, sample: MemorySampled) -> int:

@@ -87,11 +87,13 @@ def judge(
     grown_bytes: int,
     unfilled_bytes: int,
     tolerance_bytes: int,
+    loading_bytes: int = 0,
 ) -> Judgement | None:
     """Judge a counting reading. None: not yet. `grown_bytes`: what others may have grown since the baseline, by right.
 
     `unfilled_bytes` of the charges are reservations. Where nothing but the ledger bound can be checked they must not hide what is still
-    there: what comes back to a reservation is carved out again without another look.
+    there: what comes back to a reservation is carved out again without another look. `loading_bytes` are charged for a load under way, and
+    hide nothing either way.
     """
     used = sample.used_bytes
     stable = v.last_used_bytes is not None and abs(used - v.last_used_bytes) <= tolerance_bytes
@@ -99,6 +101,7 @@ def judge(
     expected = ledger.process_after_bytes(v.process, v.going(), dead=v.vanishes)
     held = process_bytes(sample, v.process)
     bound_a = ledger.total_after_bytes(v.process, v.going(), dead=v.vanishes) + ledger.driver_bytes()
+    bound_a -= loading_bytes
     bound_b = _delta_bound(v, ledger, expected, grown_bytes)
     if bound_b is None:
         bound_a -= unfilled_bytes
