@@ -77,6 +77,9 @@ class Reuse:
         return (1 + sum(self.soon)) / (2 + len(self.soon))
 
 
+LEFT_KEPT = 64  # more verdicts than can fall between a baseline and its own
+
+
 @dataclass(slots=True)
 class Gpu:
     """One card: its ledger, who is on it, who waits for it, what was measured."""
@@ -88,6 +91,9 @@ class Gpu:
     verifications: dict[str, Verification] = field(default_factory=dict)
     evictions: list[Eviction] = field(default_factory=list)  # not yet counted to a grant
     returning: Returning = field(default_factory=Returning)
+    left: deque[tuple[float, int]] = field(
+        default_factory=lambda: deque(maxlen=LEFT_KEPT)
+    )  # verdict at, bytes
     sample: MemorySampled | None = None
     before_sleep: MemorySampled | None = None  # says nothing of now, but what was there then
     reading_s: float = 0.0  # how long the newest reading took
