@@ -17,6 +17,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from arbiter import telemetry
 from arbiter.core.arbiter import Arbiter
@@ -365,7 +366,7 @@ class Daemon:
         """Feeds the watchdog only with an event that has just passed through the core and the executor, on this very thread: whatever is
         stuck there starves it."""
         period_s = min(STATUS_EVERY_S, (notifier.watchdog_s or 3 * STATUS_EVERY_S) / 3)
-        text, kept_at = "", time.monotonic()
+        said, kept_at = "", time.monotonic()
         while True:
             await asyncio.sleep(period_s)
             if notifier.watchdog_s is not None and parts.inbox.pulse():
@@ -373,10 +374,9 @@ class Daemon:
             parts.journal.settle()
             parts.executor.settle()
             wrong = problems(parts.journal, parts.history)
-            if text != (
-                text := "; ".join([*wrong, status_text(parts.gpus), f"{len(parts.sessions)} clients"])
-            ):
-                notifier.status(text)
+            text = "; ".join([*wrong, status_text(parts.gpus), f"{len(parts.sessions)} clients"])
+            if text != said and notifier.status(text):
+                said = text
             if time.monotonic() - kept_at >= KEEP_LEARNT_EVERY_S and not parts.inbox.closed:
                 keep_learnt(parts)
                 kept_at = time.monotonic()
@@ -416,13 +416,14 @@ def try_records(journal: Journal, settings: Settings) -> None:
         journal.put_aside(f"{type(error).__name__}: {error}")
 
 
-def processes_of(records: Mapping[str, Mapping[str, object]]) -> list[ProcessKey]:
-    """The processes that the journal's records belong to, each once."""
+def processes_of(records: Mapping[str, Mapping[str, Any]]) -> list[ProcessKey]:
+    """The processes that the journal's records belong to, and those that use what belongs to others; each once."""
     found = set()
     for record in records.values():
-        pid, ticks = record.get("pid"), record.get("start_ticks")
-        if isinstance(pid, int) and isinstance(ticks, int) and pid > 0:
-            found.add(ProcessKey(pid, ticks))
+        users = [(user[0], user[1]) for user in record.get("users", ())]
+        for pid, ticks in [(record.get("pid"), record.get("start_ticks")), *users]:
+            if isinstance(pid, int) and isinstance(ticks, int) and pid > 0:
+                found.add(ProcessKey(pid, ticks))
     return sorted(found)
 
 

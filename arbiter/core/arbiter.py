@@ -237,6 +237,8 @@ class Arbiter:
                     measure.on_probe_due(core, subject)
                 case "gang":
                     gangs.on_due(core, subject)
+                case "users":
+                    uses.on_users_due(core, subject)
                 case "recover":
                     recovery.on_recover_due(core, subject)
                 case _:  # "plan": a residency ended, or somebody has aged; "return": the card has been quiet

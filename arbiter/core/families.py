@@ -202,8 +202,9 @@ def _left(estate: Estate) -> tuple[int, int]:
 
 
 def _rebook(core: Core, gpu: Gpu, parent: Lease) -> None:
+    """What is left of it. A sub-lease that took more than its share has it from here: that much is no longer approved either."""
     booked, approved = _left(_estate(parent))
-    gpu.ledger.rebook(parent.id, booked, approved, core.now)
+    gpu.ledger.rebook(parent.id, booked, min(approved, booked), core.now)
 
 
 def _share(core: Core, gpu: Gpu, child: Lease) -> None:

@@ -81,7 +81,7 @@ class IllegalTransition(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Use:
-    """A busy interval. It ends with the client that marked it at the latest."""
+    """A busy interval. It ends with the client that marked it at the latest; "": it is from the journal, and not said again yet."""
 
     id: UseId
     client: ClientId
@@ -334,6 +334,15 @@ class Lease:
     def may_leave(self) -> bool:
         """May it be asked, with everything that was carved out of it?"""
         return self.evictable and all(child.may_leave for child in self.children)
+
+    def users(self) -> list[Use]:
+        """The oldest busy use of each process but its own: what the journal keeps (`Core.record_lease`). The holder tells its own uses
+        when it re-attaches, and until then nobody asks it to leave."""
+        oldest: dict[ProcessKey, Use] = {}
+        for use in self.uses.values():
+            oldest.setdefault(use.process, use)
+        oldest.pop(self.process, None)
+        return list(oldest.values())
 
     def all_uses(self) -> list[Use]:
         """Busy and pausing ones."""

@@ -234,6 +234,9 @@ class GpuLedger:
             approved = sum(charge.approved_bytes for charge in account.charges.values())
             if (booked, approved) != (account.charged_bytes, account.charged_approved_bytes):
                 return f"{process} is charged {booked} ({approved}), kept as {account.charged_bytes} ({account.charged_approved_bytes})"
+            for lease, charge in account.charges.items():
+                if charge.approved_bytes > charge.booked_bytes:
+                    return f"{lease} is booked {charge.booked_bytes} and approved {charge.approved_bytes}"
         kept = (self._occupied_bytes, self._booked_bytes, self._approved_bytes, self._strangers_bytes)
         counted = (
             sum(account.occupied_bytes() for account in self.accounts.values()),

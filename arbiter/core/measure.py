@@ -279,14 +279,20 @@ def _set_poll(core: Core, gpu: Gpu) -> None:
 
 
 def _weigh(core: Core, gpu: Gpu, verification: Verification, sample: MemorySampled) -> None:
+    loading_bytes = _loading_bytes(gpu, verification, sample)
     judgement = judge(
         verification,
         gpu.ledger,
         sample,
-        _grown_by_right(gpu, verification, sample),
+        _grown_by_right(gpu, verification, sample) - loading_bytes,
         families.unfilled_bytes(gpu) if sample.processes is None else 0,
         core.settings.verify_tolerance_bytes,
+        loading_bytes,
+        _left_bytes(core, gpu, verification, sample),
     )
+    if loading_bytes and not verification.settling:  # nothing is granted meanwhile, so nobody waits for it
+        verification.deadline_at = max(verification.deadline_at, core.now + core.settings.verify_timeout_s)
+        return
     if judgement is None:
         if verification.settling:
             verification.next_poll_at = max(core.now, sample.taken_at + core.settings.verify_confirm_s)
@@ -295,6 +301,43 @@ def _weigh(core: Core, gpu: Gpu, verification: Verification, sample: MemorySampl
     _announce(core, gpu, verification, judgement, sample)
     if judgement.resolved:
         _resolve(core, gpu, verification, judgement)
+
+
+def _left_bytes(core: Core, gpu: Gpu, verification: Verification, sample: MemorySampled) -> int:
+    """The most that others may have taken off the card since the baseline: who leaves, has left, shrinks, or is no longer listed."""
+    baseline = verification.baseline
+    if baseline is None:
+        return 0
+    leaving = {other.process for other in gpu.verifications.values()} - {verification.process}
+    count = sum(_filled_bytes(gpu, process) for process in leaving)
+    count += sum(left for at, left in gpu.left if at > baseline.taken_at)
+    count += gpu.returning.since(baseline.taken_at - core.settings.verify_timeout_s)
+    if baseline.processes is not None and sample.processes is not None:
+        now = {use.process: use.used_bytes or 0 for use in sample.processes}
+        count += sum(
+            max(0, (use.used_bytes or 0) - now.get(use.process, 0))
+            for use in baseline.processes
+            if use.process.pid != verification.process.pid
+        )
+    return count
+
+
+def _loading_bytes(gpu: Gpu, verification: Verification, sample: MemorySampled) -> int:
+    """What is charged for loads under way, and is not seen to be held yet.
+
+    Where lists say who grew, they are believed. A total alone cannot tell what comes from what has not gone.
+    """
+    baseline = verification.baseline
+    if baseline is not None and baseline.processes is not None and sample.processes is not None:
+        return 0
+    count = 0
+    # of one that has become ready since the reading began, it shows no more than of one that loads
+    for lease in (*gpu.in_state(LeaseState.LOADING), *gpu.residents.ready_since(sample.taken_at)):
+        account = gpu.ledger.accounts[lease.process]
+        others = account.charged_bytes - gpu.ledger.charge_bytes(lease.id)
+        held = max(others, account.residue_bytes, process_bytes(sample, lease.process) or 0)
+        count += max(0, account.booked_bytes() - held)
+    return count
 
 
 def _grown_by_right(gpu: Gpu, verification: Verification, sample: MemorySampled) -> int:
@@ -350,19 +393,26 @@ def _announce(
     )
 
 
+def _filled_bytes(gpu: Gpu, process: ProcessKey) -> int:
+    return gpu.ledger.filled_bytes(process) if process in gpu.ledger.accounts else 0
+
+
 def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgement) -> None:
     del gpu.verifications[verification.key]
     _set_poll(core, gpu)
     gpu.changed_at = core.now
     core.wake(gpu)
     process = verification.process
+    held_bytes = _filled_bytes(gpu, process)
     if verification.lease is None:
+        gpu.left.append((core.now, held_bytes))
         gpu.ledger.set_residue(process, 0, core.now)
         families.residue_fell(core, gpu, process)
         core.record_residue(gpu, process, 0)
         return
     drift.on_verdict(core, gpu, verification)
     residue = gpu.ledger.drop(verification.lease, judgement.residue_bytes, verification.kept_bytes, core.now)
+    gpu.left.append((core.now, held_bytes - _filled_bytes(gpu, process)))
     families.gone(core, gpu, verification.lease, process)
     core.record_residue(gpu, process, residue)
     core.forget(f"lease:{verification.lease}")
@@ -425,7 +475,7 @@ def on_expiry_due(core: Core, lease_id: str) -> None:
 
 def expire(core: Core, lease: Lease, why: str) -> None:
     """The lease is over for good, perhaps before its time (an operator's word). Its holder may still be loading until it fences itself,
-    so no verdict before that; one that is loaded has to be measured gone, or to have fenced itself."""
+    so no verdict before that; one that is loaded has to be measured gone (if that can be seen), or to have fenced itself."""
     error = {
         "code": "lease_expired",
         "message": why,
@@ -442,8 +492,9 @@ def expire(core: Core, lease: Lease, why: str) -> None:
     # a restart's deadline has the grace in it
     grace_s = core.settings.fence_grace_s if lease.attached else 0.0
     fenced_at = lease.expires_at + grace_s
-    if lease.state is LeaseState.LOADING:
-        grace_s = max(0.0, fenced_at - core.now)
+    weight_bytes = core.gpu_of(lease).ledger.charge_bytes(lease.id) - lease.spec.residue_bytes
+    if lease.state is LeaseState.LOADING or weight_bytes <= 2 * core.settings.verify_tolerance_bytes:
+        grace_s = max(0.0, fenced_at - core.now)  # what is so small no reading can tell from nothing
     if (
         core.recovering is not None
     ):  # its bytes stay charged: nobody who fits beside them has to wait for the verdict

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from arbiter.core import drift, eviction, explain, families, gangs, operators, placement, standby
+from arbiter.core import drift, eviction, explain, families, gangs, operators, placement, standby, uses
 from arbiter.core.events import MemorySampled, Reattached, ReattachedLease, Recovered, Spec
 from arbiter.core.lease import AWAY, EXPIRING, Lease, LeaseState, Order, Use
 from arbiter.core.ledger import process_bytes
@@ -130,6 +130,8 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
         gangs.restore(core, lease, str(record["gang"][0]), int(record["gang"][1]))
     lease.expires_at = core.now + spec.ttl_s + core.settings.fence_grace_s
     core.timers.set(("ttl", lease_id), lease.expires_at)
+    if lease.state is LeaseState.HELD:
+        uses.restore(core, lease, record.get("users", ()))
     assert core.recovering is not None, "restoring outside recovery"
     core.recovering.add(lease_id)
 

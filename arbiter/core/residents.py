@@ -105,6 +105,16 @@ class Residents(dict[LeaseId, Lease]):
             if lease.ready_at > since:
                 yield lease
 
+    def ready_since(self, moment: float) -> Iterator[Lease]:
+        """Who has become ready no earlier than that, and has not begun to leave."""
+        for lease in reversed(self._by_state[LeaseState.HELD].values()):
+            if lease.ready_at < moment:
+                break
+            yield lease
+        for lease in self._by_state[LeaseState.REVOKING].values():
+            if lease.ready_at >= moment:
+                yield lease
+
     def disagreement(self) -> str:
         """Where the sub-tables and the leases disagree; "" if nowhere. Looks at everybody: for tests."""
         for state, table in self._by_state.items():

@@ -9,6 +9,7 @@ from arbiter.core.events import Resumed
 from arbiter.core.lease import EXPIRING
 from arbiter.core.recovery import EMPTY_JOURNAL
 from arbiter.core.state import Core, Gpu
+from arbiter.core.uses import await_users
 from schemas import defaults
 
 
@@ -20,6 +21,8 @@ def on_resumed(core: Core, event: Resumed) -> None:
         if lease.state in EXPIRING:
             lease.expires_at = core.now + lease.spec.ttl_s + (0.0 if lease.attached else grace_s)
             core.timers.set(("ttl", lease.id), lease.expires_at)
+        if ("users", lease.id) in core.timers:
+            await_users(core, lease)
     if ("recover", EMPTY_JOURNAL) in core.timers:
         core.timers.set(("recover", EMPTY_JOURNAL), core.now + defaults.LEASE_TTL_S + grace_s)
     for gpu in core.gpus.values():

@@ -77,6 +77,9 @@ class Reuse:
         return (1 + sum(self.soon)) / (2 + len(self.soon))
 
 
+LEFT_KEPT = 64  # more verdicts than can fall between a baseline and its own
+
+
 @dataclass(slots=True)
 class Gpu:
     """One card: its ledger, who is on it, who waits for it, what was measured."""
@@ -88,6 +91,9 @@ class Gpu:
     verifications: dict[str, Verification] = field(default_factory=dict)
     evictions: list[Eviction] = field(default_factory=list)  # not yet counted to a grant
     returning: Returning = field(default_factory=Returning)
+    left: deque[tuple[float, int]] = field(
+        default_factory=lambda: deque(maxlen=LEFT_KEPT)
+    )  # verdict at, bytes
     sample: MemorySampled | None = None
     before_sleep: MemorySampled | None = None  # says nothing of now, but what was there then
     reading_s: float = 0.0  # how long the newest reading took
@@ -287,6 +293,9 @@ class Core:
         shrinking = {lease.id for lease in self.leases.values() if lease.shrink is not None}
         if shrinking != {lease_id for gpu in self.gpus.values() for lease_id in gpu.shrinking}:
             return f"{sorted(shrinking)} shrink, others are listed"
+        busy = {(*use, lease.id) for lease in self.leases.values() for use in lease.uses}
+        if odd := busy ^ {(who, use, lease) for who, mine in self.users.items() for lease, use in mine}:
+            return f"{sorted(odd)}: uses are listed otherwise than they are"
         counted = Counter(client.process for client in self.clients.values())
         return "" if counted == self.connected else f"{counted} are connected, kept as {self.connected}"
 
@@ -339,7 +348,7 @@ class Core:
         del self.leases[lease.id]
         _take_out(self._of_process, lease.process, lease.id)
         _take_out(self._of_client, lease.client, lease.id)
-        for kind in ("ttl", "revoke", "overstay", "shrink"):
+        for kind in ("ttl", "revoke", "overstay", "shrink", "users"):
             self.timers.clear((kind, lease.id))
         self.away.pop(lease.id, None)
         self.host.drop(lease.id)
@@ -376,12 +385,14 @@ class Core:
         spec = lease.spec
         charge_bytes = 0 if lease.gpu is None else self.gpu_of(lease).ledger.charge_bytes(lease.id)
         assert lease.token is not None, f"{lease.id} is recorded without a token"
+        asked = lease.asked_before and lease.state is LeaseState.HELD  # and not by this daemon yet
+        users = [[*astuple(use.process), use.id, use.label] for use in lease.users()]
         self.journal(
             f"lease:{lease.id}",
             {
                 "lease_id": lease.id,
                 "token": [lease.token.epoch, lease.token.serial],
-                "state": "debt" if debt else str(lease.state),
+                "state": "debt" if debt else str(LeaseState.REVOKING if asked else lease.state),
                 "gpu": lease.gpu,
                 "pid": lease.process.pid,
                 "start_ticks": lease.process.start_ticks,
@@ -400,6 +411,7 @@ class Core:
                 "parked_bytes": self.host.booked.get(lease.id, 0),
                 "left_for": lease.left_for,
                 "dismissed": lease.dismissed,
+                **({"users": users} if users else {}),
                 "spec": {
                     "consumer": spec.consumer,
                     "model_id": spec.key.model_id,

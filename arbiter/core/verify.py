@@ -87,11 +87,14 @@ def judge(
     grown_bytes: int,
     unfilled_bytes: int,
     tolerance_bytes: int,
+    loading_bytes: int = 0,
+    left_bytes: int = 0,
 ) -> Judgement | None:
     """Judge a counting reading. None: not yet. `grown_bytes`: what others may have grown since the baseline, by right.
 
     `unfilled_bytes` of the charges are reservations. Where nothing but the ledger bound can be checked they must not hide what is still
-    there: what comes back to a reservation is carved out again without another look.
+    there: what comes back to a reservation is carved out again without another look. `loading_bytes` are charged for a load under way, and
+    hide nothing either way. `left_bytes`: what others who leave, or have left, may have taken off the card since the baseline.
     """
     used = sample.used_bytes
     stable = v.last_used_bytes is not None and abs(used - v.last_used_bytes) <= tolerance_bytes
@@ -99,6 +102,7 @@ def judge(
     expected = ledger.process_after_bytes(v.process, v.going(), dead=v.vanishes)
     held = process_bytes(sample, v.process)
     bound_a = ledger.total_after_bytes(v.process, v.going(), dead=v.vanishes) + ledger.driver_bytes()
+    bound_a -= loading_bytes + _doubtful_bytes(v, ledger, sample, expected, left_bytes, tolerance_bytes)
     bound_b = _delta_bound(v, ledger, expected, grown_bytes)
     if bound_b is None:
         bound_a -= unfilled_bytes
@@ -123,10 +127,32 @@ def _delta_bound(v: Verification, ledger: GpuLedger, expected: int, grown_bytes:
     return v.baseline.used_bytes - (held_then - expected) + grown_bytes
 
 
+def _doubtful_bytes(
+    v: Verification,
+    ledger: GpuLedger,
+    sample: MemorySampled,
+    expected: int,
+    left_bytes: int,
+    tolerance_bytes: int,
+) -> int:
+    """Bytes in nobody's list that the ledger still allows for, and that may have left in place of the lease's.
+
+    More is gone than everybody who leaves accounts for, so somebody unnamed went too, and what he left room for may be the lease's. A total
+    cannot tell, unless all of the unnamed is gone. Once the time is up this doubt alone keeps nobody waiting.
+    """
+    if v.baseline is None or v.overdue:
+        return 0
+    leaves_bytes = _may_hold(v, ledger, v.baseline) - expected + left_bytes
+    excess_bytes = v.baseline.used_bytes - sample.used_bytes - leaves_bytes
+    return (
+        ledger.unnamed_bytes if tolerance_bytes < excess_bytes < ledger.unnamed_bytes - tolerance_bytes else 0
+    )
+
+
 def _may_hold(v: Verification, ledger: GpuLedger, sample: MemorySampled) -> int:
     """A process that the reading does not name: what it is charged, as far as the total has bytes that nobody in the list explains."""
-    filled, hidden = ledger.filled_bytes(v.process), ledger.hidden_bytes(sample)
-    return filled if hidden is None else min(filled, hidden)
+    hidden = ledger.hidden_bytes(sample)
+    return min(ledger.filled_bytes(v.process), sample.used_bytes if hidden is None else hidden)
 
 
 def _late(

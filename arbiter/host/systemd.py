@@ -26,8 +26,9 @@ class Notifier:
     def ready(self, status: str) -> None:
         self._send(f"READY=1\nSTATUS={status}\nMAINPID={os.getpid()}", READY_S)
 
-    def status(self, text: str) -> None:
-        self._send(f"STATUS={text}")
+    def status(self, text: str) -> bool:
+        """False: the manager's queue is full, and it has to be said again."""
+        return self._send(f"STATUS={text}")
 
     def watchdog(self) -> None:
         self._send("WATCHDOG=1")
@@ -35,12 +36,13 @@ class Notifier:
     def stopping(self, reason: str) -> None:
         self._send(f"STOPPING=1\nSTATUS={reason}")
 
-    def _send(self, message: str, timeout_s: float = 0.0) -> None:
+    def _send(self, message: str, timeout_s: float = 0.0) -> bool:
         if not self._address:
-            return
+            return True
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as out:
                 out.settimeout(timeout_s)
                 out.sendto(message.encode(), self._address)
         except OSError:
-            pass  # a manager that does not listen must not stop the daemon
+            return False  # a manager that does not listen must not stop the daemon
+        return True

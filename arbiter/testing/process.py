@@ -125,14 +125,18 @@ class ArbiterProcess:
 
     def heard(self, seconds: float) -> list[str]:
         """What the daemon tells its manager from now on, for so long; what it told before is put aside (`messages`)."""
-        while select.select([self._notify.fileno()], [], [], 0)[0]:
-            self.messages.append(self._notify.recv(4096).decode())
+        self._put_aside()
         found: list[str] = []
         deadline = time.monotonic() + seconds
         while select.select([self._notify.fileno()], [], [], max(0.0, deadline - time.monotonic()))[0]:
             found.append(self._notify.recv(4096).decode())
         self.messages += found
         return found
+
+    def _put_aside(self) -> None:
+        """What the daemon has told by now. The kernel keeps no more than ten of its messages, and drops the rest."""
+        while select.select([self._notify.fileno()], [], [], 0)[0]:
+            self.messages.append(self._notify.recv(4096).decode())
 
     def stop(self) -> int:
         """SIGTERM, and its exit code."""
@@ -144,6 +148,7 @@ class ArbiterProcess:
 
     def _end(self, number: signal.Signals) -> int:
         assert self.process is not None
+        self._put_aside()
         if self.process.poll() is None:
             self.process.send_signal(number)
         return self.process.wait(STOP_S)

@@ -1,9 +1,11 @@
 """The daemon as an operator meets it: flags, exit codes, start, stop, notifications. Real processes."""
 
+import contextlib
 import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import textwrap
@@ -155,6 +157,23 @@ def test_the_watchdog_is_fed_and_the_status_tells(make_arbiter: Make) -> None:
     with WireClient(arbiter.endpoint) as client:
         client.hello()
         assert "Simulated GPU (8 GiB); 1 clients" in arbiter.wait_for("1 clients", PATIENCE_S)
+
+
+def test_a_status_that_the_manager_had_no_room_for_is_told_again(make_arbiter: Make) -> None:
+    """Regression: a full disk was in `vramctl status`, and never in `systemctl status`."""
+    arbiter = make_arbiter().start({"WATCHDOG_USEC": "300000"})
+    with (
+        WireClient(arbiter.endpoint) as client,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as another,
+    ):
+        another.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                another.sendto(b"EXTEND_TIMEOUT_USEC=1", str(arbiter.runtime / "notify.sock"))
+        began_s = client.hello().ask("status")["uptime_s"]
+        while client.ask("status")["uptime_s"] < began_s + 1.0:  # ten beats
+            client.receive(0.1)
+        assert "1 clients" in arbiter.wait_for("1 clients", PATIENCE_S)
 
 
 def test_a_cap_and_a_reserve_from_the_file_are_the_budget(make_arbiter: Make) -> None:

@@ -1,9 +1,13 @@
 """Crashes of the daemon, corrupt and unwritable journals, hanging probes: leases survive, and nothing is granted on a guess."""
 
+import contextlib
 import json
 import os
+import signal
 import sqlite3
-from collections.abc import Callable
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -50,6 +54,73 @@ def reattach(client: WireClient, on: dict[str, Any], name: str, size: int) -> di
     answer = reply["leases"][0]
     assert isinstance(answer, dict)
     return answer
+
+
+RUNNER = """
+import sys
+from clients.sync import SyncArbiterClient
+with SyncArbiterClient(name="runner") as client, client.use(sys.argv[1], (int(sys.argv[2]), int(sys.argv[3])), "goal") as use:
+    print("in use", flush=True)
+    sys.stdin.readline()
+    print(use.lost, flush=True)
+"""
+
+
+@contextlib.contextmanager
+def runner_on(arbiter: ArbiterProcess, on: dict[str, Any]) -> Iterator[subprocess.Popen[str]]:
+    """Another process, by the product's own client, uses the lease whose token it was told. It ends its use with a line of input."""
+    words = [on["lease_id"], *map(str, on["token"])]
+    runner = subprocess.Popen(
+        [sys.executable, "-c", RUNNER, *words],
+        env=arbiter.environ,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert runner.stdout is not None
+        assert runner.stdout.readline() == "in use\n"
+        yield runner
+    finally:
+        runner.kill()
+        runner.communicate()
+
+
+@pytest.mark.parametrize("end", ["it goes on", "it dies"])
+def test_a_user_that_is_stopped_while_the_daemon_restarts_keeps_the_holder(
+    make_arbiter: Make, end: str
+) -> None:
+    """Regression: nothing but its own client knew of the use, and the holder was sent away in the middle of a grab."""
+    arbiter = make_arbiter().start()
+    with WireClient(arbiter.endpoint) as client:
+        on = hold(client.hello(), arbiter, "sidecar", 5 * GIB)
+        with runner_on(arbiter, on) as runner:
+            runner.send_signal(signal.SIGSTOP)
+            arbiter.kill()
+            arbiter.start()
+            with WireClient(arbiter.endpoint) as sidecar:
+                answer = reattach(sidecar.hello(), on, "sidecar", 5 * GIB)
+                assert (answer["kept"], answer["lease"]["uses"]) == (True, 1)
+                waiting = sidecar.acquire("waiter", 5 * GIB, priority=100)
+                assert waiting["state"] == "queued"
+                assert sidecar.push("revoke")["uses"] == 1
+                refused = sidecar.ask("unloading", **on)["error"]
+                assert (refused["code"], refused["details"]["uses"]) == ("bad_state", 1)
+                if end == "it dies":
+                    runner.kill()  # the kernel tells, also of one that is stopped
+                else:
+                    assert sidecar.ask("subscribe")["ok"]
+                    runner.send_signal(signal.SIGCONT)
+                    again = sidecar.push(
+                        "event", timeout_s=30.0, where=lambda push: push["event"]["kind"] == "use_began"
+                    )
+                    assert again["event"]["resumed"]
+                    assert runner.communicate("end\n", timeout=30.0)[0] == "None\n", "its use was not lost"
+                assert sidecar.push("revoke", where=lambda push: push["uses"] == 0)
+                assert sidecar.ask("unloading", **on)["ok"]
+                occupy(arbiter, 0)
+                assert sidecar.ask("release", **on)["ok"]
+                assert sidecar.push("granted")["lease"]["lease_id"] == waiting["lease"]["lease_id"]
 
 
 def leases(client: WireClient) -> list[tuple[str, str, list[int] | None]]:

@@ -78,8 +78,9 @@ class Tally:
 class Storm:
     """One run. `run` returns the report."""
 
-    def __init__(self, seconds: float, seed: int, out: Path) -> None:
+    def __init__(self, seconds: float, seed: int, out: Path, faults: int = 0) -> None:
         self._seconds = seconds
+        self._faults = faults  # as many at least, however long that takes on a busy machine
         self._seed = seed
         self._out = out
         self._random = random.Random(seed)
@@ -217,7 +218,7 @@ class Storm:
     # -- striking ------------------------------------------------------------------------------------------------------
     async def _strike_until(self, end: float) -> None:
         """Every cell of step × role × signal in a shuffled order, again and again; faults of card and disk in between."""
-        while time.monotonic() < end:
+        while time.monotonic() < end or not self._enough():
             if not self._plan:
                 self._plan = [(s, r, h) for s in STEPS.values() for r in ROLES for h in ("kill", "stop")]
                 self._plan += [("any time", "machine", fault) for fault in (*CARD_FAULTS, *DISK_FAULTS) * 2]
@@ -228,6 +229,11 @@ class Storm:
             elif (event := await self._next(step)) is not None:
                 await self._strike_process(step, role, how, event)
             await asyncio.sleep(self._random.uniform(0.05, 0.4))
+
+    def _enough(self) -> bool:
+        """Of faults as many as were wanted at least, and of grants half as many: a storm in which nobody loads shows nothing."""
+        grants = sum(event["kind"] == "granted" for event in self._events.values())
+        return sum(self._tally.by_kind.values()) >= self._faults and 2 * grants >= self._faults
 
     async def _strike_process(self, step: str, role: str, how: str, event: dict[str, Any]) -> None:
         if role == "daemon":
@@ -535,11 +541,12 @@ def main() -> int:
         description="Hit every process at every step of a switch, and judge what came of it."
     )
     parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--faults", type=int, default=0, help="go on until there were so many")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/chaos"))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    report = asyncio.run(Storm(options.seconds, options.seed, options.out).run())
+    report = asyncio.run(Storm(options.seconds, options.seed, options.out, options.faults).run())
     (options.out / "report.json").write_text(json.dumps(report, indent=2) + "\n")
     faults = report["faults"]
     for kind, count in faults["by_kind"].items():

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-pytestmark = [pytest.mark.e2e, pytest.mark.heavy, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.e2e, pytest.mark.heavy, pytest.mark.timeout(720)]
 
 GIB = 1 << 30
 
@@ -23,7 +23,7 @@ def run_demo(out: Path, *arguments: str) -> tuple[int, dict[str, Any]]:
         capture_output=True,
         text=True,
         env=os.environ | {"MUJOCO_GL": "egl"},
-        timeout=380,
+        timeout=700,
         check=False,
     )
     assert (out / "summary.json").exists(), ended.stdout + ended.stderr

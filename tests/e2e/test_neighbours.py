@@ -184,7 +184,7 @@ def test_2_an_unload_that_does_not_unload_is_named_until_its_process_ends(stage:
     assert [culprit["pid"] for culprit in verdict["culprits"]] == [leaky.pid]
     assert f"residue of pid {leaky.pid}" in stage.vramctl("status")
     assert "leaky" in (why := stage.vramctl("why", "waiter-2")), why
-    assert "keeps its context until it exits" in why
+    assert f"keeps more than its context until its process (pid {leaky.pid})" in why
     leaky.kill()
     waiter.until("ready")
 

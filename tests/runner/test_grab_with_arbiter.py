@@ -91,7 +91,9 @@ async def scenario(arbiter: ArbiterProcess, programs: Programs) -> None:
         async for feedback in grab.feedback():
             if feedback["state"] == "running":
                 break
-        ((state, uses),) = leases(await rival.status(), "grab")
+        while (found := leases(await rival.status(), "grab"))[0][0] == "loading":
+            await asyncio.sleep(0.01)  # the goal runs, its policy is on its way
+        ((state, uses),) = found
         assert state == "held"
         assert uses >= 1, "the goal is one use; an op under way is another"
         whole_card = LeaseSpec(

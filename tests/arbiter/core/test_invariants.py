@@ -45,6 +45,11 @@ def force(lease: Lease, state: LeaseState) -> None:
     lease.roster.moved(lease, before)
 
 
+def idle(b: Broken) -> None:
+    for use in list(b.held.uses.values()):
+        b.core.unmark(b.held, use)
+
+
 def over_budget(b: Broken) -> None:
     b.gpu.ledger.charge(LeaseId("x"), X, 5 * GIB, 5 * GIB, 0.0)
 
@@ -70,7 +75,7 @@ def beside_exclusive_debt(b: Broken) -> None:
 
 
 def two_loads(b: Broken) -> None:
-    b.held.uses.clear()
+    idle(b)
     force(b.held, LeaseState.LOADING)
     b.queued.state = LeaseState.LOADING
     b.gpu.ledger.charge(b.queued.id, X, 1, 1, 0.0)
@@ -79,7 +84,7 @@ def two_loads(b: Broken) -> None:
 
 
 def unloads_in_use(b: Broken) -> None:
-    b.held.uses[X, UseId("u")] = Use(UseId("u"), ClientId("c"), X, "", 0.0)
+    b.core.mark(b.held, Use(UseId("u"), ClientId("c"), X, "", 0.0))
     force(b.held, LeaseState.UNLOADING)
 
 
@@ -88,7 +93,7 @@ def resident_without_charge(b: Broken) -> None:
 
 
 def verifying_without_verification(b: Broken) -> None:
-    b.held.uses.clear()
+    idle(b)
     force(b.held, LeaseState.VERIFYING)
 
 
@@ -183,6 +188,12 @@ def account_off(b: Broken) -> None:
     b.gpu.ledger.accounts[b.held.process].charges[b.held.id].booked_bytes -= 1
 
 
+def approved_off(b: Broken) -> None:
+    account = b.gpu.ledger.accounts[b.held.process]
+    account.charges[b.held.id].approved_bytes += 1
+    account.charged_approved_bytes += 1
+
+
 def state_off(b: Broken) -> None:
     b.held.state = LeaseState.REVOKING
 
@@ -211,15 +222,21 @@ def connected_off(b: Broken) -> None:
     b.core.connected[b.held.process] += 1
 
 
+def user_off(b: Broken) -> None:
+    b.core.users[X] = b.core.users.pop(b.held.process)
+
+
 @pytest.mark.parametrize(
     ("breaks", "says"),
     [
+        (user_off, "uses are listed otherwise than they are"),
         (client_off, "not listed under its process and its client"),
         (gone_and_listed, "listed and gone"),
         (shrinking_off, "shrink, others are listed"),
         (connected_off, "are connected, kept as"),
         (sum_off, "the sums are"),
         (account_off, "is charged"),
+        (approved_off, "and approved"),
         (state_off, "listed as held"),
         (exclusive_off, "listed as exclusive"),
         (pin_off, "listed as pinned"),

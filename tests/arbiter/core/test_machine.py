@@ -88,6 +88,9 @@ class Leases(RuleBasedStateMachine):
         self.mine: dict[LeaseId, Consumer] = {}
         self.loaded: dict[ProcessKey, dict[LeaseId, int]] = {}  # what each process holds for which lease
         self.context: dict[ProcessKey, int] = {}  # what it keeps once it has loaded anything
+        self.taking_over: dict[
+            LeaseId, int
+        ] = {}  # away, and perhaps taken over by the request of this event: its peak then
         self.bounds: dict[LeaseId, float] = {}  # who may wait until when
         self.broke: dict[str, int] = {}  # events until the last breakdown of a kind
         self.tokens: list[Any] = []
@@ -132,7 +135,9 @@ class Leases(RuleBasedStateMachine):
     def ask(
         self, person: Consumer, size: int, steady: int, bound: float | None, spec: dict[str, Any]
     ) -> LeaseId | None:
+        self.taking_over = {lease: size for lease in self.having(*AWAY) if self.mine[lease] is person}
         effects = person.try_acquire(size, steady, wait_timeout_s=bound, **spec)
+        self.taking_over = {}
         reply = next((effect for effect in effects if isinstance(effect, Reply)), None)
         if reply is None:  # beside a pinned lease it can never fit
             return None
@@ -310,7 +315,7 @@ class Leases(RuleBasedStateMachine):
         coming = 0
         for lease in self.having(LOADING):
             person = self.mine[lease]
-            peak = person.specs[lease].load_peak_bytes
+            peak = self.taking_over.get(lease, person.specs[lease].load_peak_bytes)
             if self.loaded.get(person.process):
                 coming += peak
             else:  # its context is part of the peak

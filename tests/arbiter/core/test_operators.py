@@ -10,7 +10,7 @@ from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
 from schemas import defaults as d
 from schemas.ids import LeaseId
 
-GIB = d.GIB
+GIB, MIB = d.GIB, d.MIB
 BY = "ops (uid 0, pid 7)"
 
 
@@ -297,6 +297,20 @@ def test_who_is_given_up_and_keeps_its_bytes_has_its_lease_until_it_fences_itsel
     assert driver.notes("verified")[-1]["resolved"] is True
     assert driver.gpu()["charged_bytes"] == 6 * GIB
     assert driver.state(other) == "queued"
+
+
+def test_who_is_given_up_and_is_too_small_to_be_seen_has_its_lease_until_it_fences_itself(
+    driver: CoreDriver, ops: Consumer
+) -> None:
+    """What it holds beyond its context is less than a reading can be off: its bytes are "gone" while all of them are there."""
+    det, lease = held(driver, "det", 500 * MIB, residue_bytes=450 * MIB, ttl_s=10.0)
+    driver.restart()
+    ops.connect()
+    ask(ops, "release_dead", lease, "frozen")
+    waiter = driver.consumer("policy").acquire(1 * GIB, exclusive=True)
+    took = driver.until(lambda: driver.state(waiter) == "loading")
+    assert 14.9 <= took <= 15.1, "its ttl, and the grace"
+    assert det.process in driver.card.held
 
 
 def test_who_is_given_up_while_it_loads_may_load_on_until_it_fences_itself(

@@ -373,3 +373,18 @@ def test_a_carve_before_the_first_reading_goes_by_what_is_charged() -> None:
     driver.restart()
     leaf = driver.consumer("policy").acquire(5 * GIB, parent=(root, token))
     assert driver.view(root)["charge_bytes"] == 0, driver.view(leaf)  # type: ignore[index]
+
+
+def test_what_a_sub_lease_took_beyond_its_share_is_not_approved_for_its_parent() -> None:
+    """Else the parent that leaves after it keeps more approved than booked, and who fits beside the booking breaks invariant 1."""
+    tree = Tree()
+    tree.policy.hold(int(4.5 * GIB))
+    tree.policy.ready(tree.leaf, int(4.5 * GIB))
+    assert tree.charges() == [GIB // 2, int(4.5 * GIB)]
+    tree.runner.hold(GIB // 2)
+    tree.driver.advance(0.1)
+    tree.runner.unload(tree.root)
+    tree.runner.hold(GIB // 2)
+    other = tree.driver.consumer("other").acquire(7 * GIB)
+    tree.policy.unload(tree.leaf)
+    tree.driver.until(lambda: tree.state(other) == "loading", limit_s=20.0)

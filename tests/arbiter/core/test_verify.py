@@ -178,14 +178,49 @@ def test_totals_alone_verify_by_what_the_lease_was_charged() -> None:
     driver.advance(1.0)
     b.unloading(second)
     c = driver.consumer("c")
-    third = c.acquire(1 * GIB)  # loads while b is measured: what it may take is allowed for
+    third = c.acquire(1 * GIB)  # loads while b is measured: what it may take is allowed for once it has it
     assert driver.state(third) == "loading"
     c.hold(1 * GIB)
     b.hold(0)
     b.release(second)
+    driver.advance(15.0)
+    assert (driver.state(second), verdicts(driver)) == ("verifying", [])
+    c.ready(third)
     driver.until(lambda: driver.state(second) == "over", limit_s=1.0)
     assert verdicts(driver) == [("verified", True)]
     assert a.driver.state(first) == "held"
+
+
+def test_what_a_load_has_not_taken_yet_hides_nobodys_bytes() -> None:
+    """Regression (storm, seed 3): a dead holder's 500 MiB were measured gone behind the 500 that somebody was about to load."""
+    driver = CoreDriver(8 * GIB)
+    total_only(driver)
+    a, _ = held(driver, "a", 1)
+    driver.advance(1.5)
+    second = driver.consumer("b").acquire(2 * GIB)
+    driver.until(lambda: driver.state(second) == "loading")
+    driver.card.lag_s = 3.0
+    a.die()
+    assert driver.until(lambda: bool(driver.notes("verified")), step_s=0.001) == pytest.approx(3.0, abs=0.05)
+    assert (driver.state(second), verdicts(driver)) == ("loading", [("verified", True)])
+
+
+def test_lists_tell_a_load_from_what_has_not_gone_though_there_is_no_list_of_before() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lists_processes = False
+    driver.advance(1.5)
+    a, first = held(driver, "a", 1)
+    driver.advance(1.5)
+    b = driver.consumer("b")
+    second = b.acquire(2 * GIB)
+    driver.until(lambda: driver.state(second) == "loading")
+    a.unloading(first)
+    driver.card.lists_processes = True
+    a.hold(0)
+    b.hold(2 * GIB)
+    a.release(first)
+    driver.until(lambda: driver.state(first) == "over", limit_s=1.0)
+    assert (driver.state(second), verdicts(driver)) == ("loading", [("verified", True)])
 
 
 def test_without_a_comparable_reading_the_ledger_bound_decides() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from arbiter.core.events import MemorySampled, ProcessUse
 from arbiter.testing.core_driver import CoreDriver
-from arbiter.testing.scenes import held
+from arbiter.testing.scenes import held, hidden_card
 from schemas import defaults as d
 from schemas.ids import ProcessKey
 
@@ -188,3 +188,55 @@ def test_a_process_that_is_known_by_its_pid_alone_is_no_stranger() -> None:
     assert isinstance(reading, MemorySampled)
     assert ledger.hidden_bytes(reading) == 0
     assert ledger.hidden_bytes(replace(reading, processes=(ProcessUse(det.process, "det", None),))) is None
+
+
+# -- what the rule machines found by night -----------------------------------------------------------------------------------
+def test_a_lender_that_never_held_anything_keeps_nothing() -> None:
+    """Regression (families, seed 20778062350): a card that was empty all the time showed a residue of 4.3 GB, because so much was charged."""
+    driver = hidden_card(lists=False)
+    lender = driver.consumer("lender")
+    lease = lender.acquire(int(4.3e9), exclusive=True)
+    driver.until(lambda: driver.state(lease) == "loading")
+    lender.ready(lease)
+    driver.advance(1.0)
+    lender.unload(lease)
+    assert driver.until(lambda: driver.state(lease) == "over") < 0.2
+    assert driver.gpu()["charged_bytes"] == 0
+
+
+@pytest.mark.parametrize("leaves", [False, True])
+def test_a_newcomer_that_is_ready_before_a_reading_ends_hides_no_release(leaves: bool) -> None:
+    """Regression (leases, seed 20778062337): what had become ready since the reading began counted as on it, in place of what was going."""
+    driver = hidden_card(lists=False)
+    small, lease = held(driver, "small", 0.5)
+    driver.advance(1.0)
+    driver.card.lag_s = 2.0
+    newcomer = driver.consumer("newcomer")
+    wanted = newcomer.acquire(1 * GIB)
+    driver.until(lambda: driver.state(wanted) == "loading")
+    small.unload(lease)
+    driver.restart()  # no reading from before it
+    newcomer.connect()
+    newcomer.reattach(wanted, newcomer.token(wanted), held=False)
+    driver.advance(0.0)
+    newcomer.load(wanted)
+    if leaves:
+        newcomer.ack(wanted)
+    assert driver.until(lambda: driver.gpu()["charged_bytes"] == 1 * GIB) > 1.0
+
+
+def test_what_its_own_process_loads_hides_no_release() -> None:
+    driver = hidden_card(lists=False, lag_s=2.0)
+    person, lease = held(driver, "person", 0.5)
+    driver.advance(1.0)
+    wanted = person.acquire(1 * GIB, key="another")
+    driver.until(lambda: driver.state(wanted) == "loading")
+    person.unload(lease)
+    token = person.token(wanted)
+    driver.restart()  # no reading from before it
+    person.connect()
+    person.reattach(wanted, token, held=False)
+    driver.advance(1.0)
+    assert driver.gpu()["charged_bytes"] == int(1.5 * GIB)
+    person.load(wanted)
+    driver.until(lambda: driver.gpu()["charged_bytes"] == 1 * GIB)

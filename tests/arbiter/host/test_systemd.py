@@ -1,6 +1,7 @@
 """Notifications on a real datagram socket, and silence without one."""
 
 import os
+import select
 import socket
 import tempfile
 from collections.abc import Iterator
@@ -49,10 +50,16 @@ def test_an_abstract_address() -> None:
 def test_a_manager_that_does_not_listen_stops_nobody(manager: tuple[str, socket.socket]) -> None:
     address, listening = manager
     Notifier({}).ready("x")
+    assert Notifier({}).status("nobody is to be told")
     Notifier({"NOTIFY_SOCKET": "/nonexistent/socket"}).ready("x")
     notifier = Notifier({"NOTIFY_SOCKET": address})
     for _ in range(5000):  # its queue is full long before
         notifier.watchdog()
+    assert not notifier.status("has to be said again")
+    while listening.recv(100) == b"WATCHDOG=1" and select.select([listening], [], [], 0)[0]:
+        pass
+    assert notifier.status("said")
+    assert listening.recv(100) == b"STATUS=said"
     listening.close()
     notifier.watchdog()
 

@@ -1,0 +1,424 @@
+"""Decisions at their very edge: one byte less, or one moment earlier, and it is decided the other way."""
+
+from typing import Any
+
+import pytest
+
+from arbiter.core.events import MemorySampled, ProcessDied, ProcessUse, Resumed
+from arbiter.testing.core_driver import Consumer, CoreDriver
+from arbiter.testing.scenes import charge, held, why
+from schemas import defaults as d
+from schemas.ids import LeaseId, ProcessKey
+
+GIB, MIB = d.GIB, d.MIB
+TOLERANCE = d.VERIFY_TOLERANCE_BYTES
+BUDGET = 8 * GIB - d.RESERVE_BYTES
+
+
+# -- what a process keeps ------------------------------------------------------------------------------------------------
+def kept(driver: CoreDriver, who: Consumer) -> int:
+    """What the journal has of the residue of a process, which is what is charged for it."""
+    record = driver.journal.get(f"residue:{who.process}:GPU-0", {"residue_bytes": 0})
+    account = driver.arbiter._core.gpus[driver.card.gpu].ledger.accounts.get(who.process)
+    assert (0 if account is None else account.residue_bytes) == record["residue_bytes"]
+    return int(record["residue_bytes"])
+
+
+def leftover(driver: CoreDriver, count: int, residue_bytes: int = 0) -> Consumer:
+    """A process that gave its lease back and still holds so much."""
+    person, lease = held(driver, "det", 5, residue_bytes=residue_bytes)
+    person.unloading(lease)
+    person.hold(count)
+    person.release(lease)
+    driver.until(lambda: driver.state(lease) == "over", limit_s=15.0)
+    assert kept(driver, person) == count
+    return person
+
+
+@pytest.mark.parametrize(("less", "after"), [(TOLERANCE, 2 * GIB), (TOLERANCE + 1, 2 * GIB - TOLERANCE - 1)])
+def test_a_leftover_falls_by_more_than_the_tolerance_or_not_at_all(less: int, after: int) -> None:
+    driver = CoreDriver(8 * GIB)
+    person = leftover(driver, 2 * GIB)
+    person.hold(2 * GIB - less)
+    driver.advance(3.0)
+    assert kept(driver, person) == after
+    assert driver.gpu()["charged_bytes"] == after
+
+
+@pytest.mark.parametrize(("shown", "after"), [(0, 0), (1, 450 * MIB), (100 * MIB, 450 * MIB)])
+def test_only_who_is_neither_connected_nor_on_the_card_has_no_context(shown: int, after: int) -> None:
+    driver = CoreDriver(8 * GIB)
+    person = leftover(driver, 450 * MIB, 450 * MIB)
+    person.hold(shown)
+    driver.advance(3.0)
+    assert kept(driver, person) == 450 * MIB, "it is connected: its context may come back any time"
+    person.leave()
+    driver.consumer("looks on")
+    driver.advance(3.0)
+    assert kept(driver, person) == after
+
+
+def test_a_context_that_is_not_on_the_card_is_kept_until_all_have_come_back() -> None:
+    driver = CoreDriver(8 * GIB)
+    person = leftover(driver, 450 * MIB, 450 * MIB)
+    other, lease = held(driver, "other", 1)
+    token = other.token(lease)
+    person.hold(0)
+    driver.restart()
+    driver.advance(3.0)
+    assert kept(driver, person) == 450 * MIB
+    other.connect()
+    other.reattach(lease, token)
+    driver.advance(3.0)
+    assert kept(driver, person) == 0
+
+
+def test_a_reading_that_began_when_a_residue_was_charged_says_nothing_of_it() -> None:
+    driver = CoreDriver(8 * GIB)
+    person = leftover(driver, 2 * GIB)
+    driver.card.silent = True
+    charged_at = driver.now
+    driver.restart()
+    for taken_at, after in ((charged_at, 2 * GIB), (charged_at + 0.0001, 0)):
+        driver.post(MemorySampled(driver.card.gpu, taken_at, 0, 8 * GIB, ()))
+        assert kept(driver, person) == after
+
+
+def test_what_a_dead_process_kept_is_measured_away_twice_as_any_bytes() -> None:
+    driver = CoreDriver(8 * GIB)
+    person = leftover(driver, 450 * MIB, 450 * MIB)
+    driver.card.silent = True
+    person.die()
+    for n, after in ((1, 450 * MIB), (2, 0)):
+        driver.post(MemorySampled(driver.card.gpu, driver.now + n / 100, 0, 8 * GIB, ()))
+        assert kept(driver, person) == after
+
+
+def test_one_that_has_a_lease_does_not_keep_others_residues_from_falling() -> None:
+    driver = CoreDriver(8 * GIB)
+    held(driver, "stays", 1)
+    person = leftover(driver, 2 * GIB)
+    person.hold(1 * GIB)
+    driver.advance(3.0)
+    assert kept(driver, person) == 1 * GIB
+
+
+# -- others that grew ----------------------------------------------------------------------------------------------------
+def stranger(driver: CoreDriver, pid: int, count: int) -> None:
+    key = ProcessKey(pid, 7 * pid)
+    driver.card.names[key] = f"p{9 - pid}"
+    driver.card.set(key, count, driver.now)
+
+
+def culprits(driver: CoreDriver) -> list[tuple[int, str, int]]:
+    """Of the last verdict."""
+    return [(one["pid"], one["name"], one["bytes"]) for one in driver.notes("verified")[-1]["culprits"]]
+
+
+def test_who_grew_by_a_byte_is_named_and_who_did_not_is_not_the_largest_first() -> None:
+    driver = CoreDriver(8 * GIB)
+    for pid in range(1, 7):
+        stranger(driver, pid, 10 * MIB)
+    det, lease = held(driver, "det", 4)
+    det.unloading(lease)
+    driver.advance(0.5)
+    grew = {1: 1, 2: 300 * MIB, 3: 0, 4: 300 * MIB, 5: 500 * MIB, 6: -1}
+    for pid, count in grew.items():
+        stranger(driver, pid, 10 * MIB + count)
+    det.hold(0)
+    det.release(lease)
+    driver.advance(11.0)
+    assert culprits(driver) == [(pid, f"p{9 - pid}", grew[pid]) for pid in (5, 2, 4, 1)]
+
+
+def test_without_a_reading_from_before_only_strangers_are_named_and_with_all_that_they_hold() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, _ = held(driver, "det", 3)
+    held(driver, "other", 1)
+    driver.card.failing = "the driver hangs"
+    driver.restart()
+    driver.post(ProcessDied(det.process))
+    driver.card.set(det.process, 0, driver.now)
+    driver.card.overhead_bytes = 2 * GIB
+    stranger(driver, 9, 500 * MIB)
+    driver.card.failing = ""
+    driver.advance(30.0)
+    assert culprits(driver) == [(9, "p0", 500 * MIB)]
+
+
+def test_a_process_without_a_figure_has_not_grown() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 4)
+    det.unloading(lease)
+    driver.advance(0.5)
+    driver.card.silent = True
+    det.release(lease)
+    uses = (ProcessUse(ProcessKey(8, 8), "silent", None), ProcessUse(ProcessKey(9, 9), "browser", GIB))
+    for _ in range(25):
+        driver.advance(0.5)
+        driver.post(MemorySampled(driver.card.gpu, driver.now, GIB, 8 * GIB, uses))
+    assert culprits(driver) == [(9, "browser", GIB)]
+
+
+# -- sub-leases ----------------------------------------------------------------------------------------------------------
+def test_what_a_process_kept_of_a_sub_lease_is_its_own_once_it_has_a_lease_of_its_own() -> None:
+    driver = CoreDriver(8 * GIB)
+    runner, policy = driver.consumer("runner"), driver.consumer("policy")
+    root = runner.acquire(5 * GIB)
+    token = runner.token(root)
+    leaf = policy.acquire(4 * GIB, residue_bytes=450 * MIB, parent=(root, token))
+    policy.load(leaf)
+    policy.unload(leaf)
+    driver.until(lambda: driver.state(leaf) == "over", limit_s=15.0)
+    assert charge(driver, root) == 5 * GIB - 450 * MIB, "its parent bears it"
+    own = policy.acquire(1 * GIB, residue_bytes=450 * MIB)
+    driver.until(lambda: driver.state(own) == "loading")
+    assert charge(driver, root) == 5 * GIB - 450 * MIB
+    estate = driver.journal[f"lease:{root}"]["estate"]
+    assert (estate["booked_bytes"], estate["approved_bytes"]) == (5 * GIB - 450 * MIB, 5 * GIB - 450 * MIB)
+    assert estate["borne"] == []
+    assert driver.gpu()["charged_bytes"] == 6 * GIB - 450 * MIB
+
+
+# -- waiting for a load on another card ------------------------------------------------------------------------------------
+def two_cards() -> tuple[CoreDriver, LeaseId, Consumer, LeaseId]:
+    """An idle holder on the first card; somebody loads on the second, where there is room for one more."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    _, idle = held(driver, "idle", 6, gpu="0")
+    slow = driver.consumer("slow")
+    loading = slow.acquire(3 * GIB, gpu="1")
+    driver.until(lambda: driver.state(loading) == "loading")
+    return driver, idle, slow, loading
+
+
+def test_a_load_elsewhere_is_waited_for_as_long_as_a_holder_that_was_asked() -> None:
+    driver, idle, _, loading = two_cards()
+    granted_at = driver.arbiter._core.leases[loading].granted_at
+    driver.consumer("w").acquire(4 * GIB)
+    driver.advance(granted_at + d.REVOKE_DEADLINE_S - 0.001 - driver.now)
+    assert driver.state(idle) == "held"
+    driver.advance(0.001)
+    assert driver.state(idle) == "revoking"
+
+
+@pytest.mark.parametrize("trouble", ["it cannot be read", "pressure", "it has not been read since a suspend"])
+def test_a_load_on_a_card_in_trouble_is_not_waited_for(trouble: str) -> None:
+    driver, idle, _, _ = two_cards()
+    card = list(driver.cards.values())[1]
+    if trouble == "pressure":
+        card.set(ProcessKey(9, 9), 7 * GIB, driver.now)
+    elif trouble == "it cannot be read":
+        card.failing = "the driver hangs"
+    else:
+        card.silent = True
+        driver.post(Resumed(60.0))
+    driver.advance(1.5)
+    if trouble == "pressure":
+        assert driver.gpu(1)["pressure_bytes"] > 0
+        card.set(ProcessKey(9, 9), 0, driver.now)
+    driver.consumer("w").acquire(4 * GIB)
+    assert driver.state(idle) == "revoking"
+
+
+def test_a_gang_that_loads_is_not_waited_for() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    _, idle = held(driver, "idle", 6, gpu="0")
+    for name in ("a", "b"):
+        driver.consumer(name).acquire(1 * GIB, gpu="1", gang=("g", 2))
+    driver.consumer("w").acquire(4 * GIB)
+    assert driver.state(idle) == "revoking"
+
+
+# -- who has not come back -----------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_up_to_three_who_have_not_come_back_are_named(count: int) -> None:
+    driver = CoreDriver(8 * GIB)
+    people = [held(driver, f"m{n}", 1)[0] for n in range(count)]
+    driver.restart()
+    named = ", ".join(f"m{n} (pid {who.process.pid})" for n, who in enumerate(people[:3]))
+    more = " and 1 more" if count == 4 else ""
+    assert driver.gpu()["blocked"] == f"recovering after a restart: {named}{more} must come back first"
+
+
+# -- gangs that load -----------------------------------------------------------------------------------------------------
+def gang_of(driver: CoreDriver, *sizes: tuple[int, int]) -> list[tuple[Consumer, LeaseId]]:
+    """Members with these load peaks and steady bytes, the first of which loads."""
+    found = []
+    for n, (peak, steady) in enumerate(sizes):
+        who = driver.consumer(f"member{n}")
+        found.append((who, who.acquire(peak, steady, gang=("g", len(sizes)))))
+    assert [driver.state(lease) for _, lease in found] == ["loading"] + ["queued"] * (len(sizes) - 1)
+    return found
+
+
+def ready_with(member: tuple[Consumer, LeaseId], count: int, says: int | None = None) -> None:
+    """Loaded: it holds so much, and readings have seen it."""
+    who, lease = member
+    who.hold(count)
+    who.driver.advance(1.1)
+    who.ready(lease, count if says is None else says)
+    who.driver.advance(0.1)
+
+
+@pytest.mark.parametrize(("beyond", "after"), [(0, "loading"), (1, "over")])
+def test_a_member_may_hold_more_than_it_declared_as_long_as_the_rest_fits(beyond: int, after: str) -> None:
+    driver = CoreDriver(8 * GIB)
+    one, (_, second) = gang_of(driver, (4608 * MIB, 4 * GIB), (3500 * MIB, 3 * GIB))
+    ready_with(one, BUDGET - 3500 * MIB + beyond)
+    assert driver.state(second) == after
+    if beyond:
+        assert "holds more than it declared" in driver.pushes("denied", second)[0]["error"]["message"]
+
+
+@pytest.mark.parametrize("says", [3200 * MIB, 3250 * MIB])
+@pytest.mark.parametrize(("beyond", "after"), [(0, "held"), (1, "revoking")])
+def test_who_grew_is_asked_to_leave_for_a_gang_by_the_byte_that_it_lacks(
+    beyond: int, after: str, says: int
+) -> None:
+    driver = CoreDriver(8 * GIB)
+    other, lease = held(driver, "other", 1)
+    one, (_, second) = gang_of(driver, (3300 * MIB, 3200 * MIB), (3300 * MIB, 3200 * MIB))
+    other.hold(BUDGET - 3300 * MIB - says + beyond)
+    ready_with(one, says)
+    assert (driver.state(lease), driver.state(second)) == (after, "queued" if beyond else "loading")
+    asked = [(push["reason"], push["wanted_by"]) for push in driver.pushes("revoke", lease)]
+    assert asked[:1] == [("gang g needs the room", "member1")][:beyond]
+
+
+def test_while_one_leaves_for_a_gang_nobody_else_is_asked() -> None:
+    driver = CoreDriver(8 * GIB)
+    other, lease = held(driver, "other", 1)
+    _, idle = held(driver, "idle", 1)
+    one, (_, second) = gang_of(driver, (2800 * MIB, 2700 * MIB), (2800 * MIB, 2700 * MIB))
+    other.hold(BUDGET - 5500 * MIB - 1 * GIB + 1)
+    ready_with(one, 2700 * MIB)
+    driver.advance(2.0)
+    assert sorted((driver.state(lease), driver.state(idle))) == ["held", "revoking"]
+    assert driver.state(second) == "queued"
+
+
+@pytest.mark.parametrize("says", [3 * GIB, 3 * GIB + 100 * MIB])
+@pytest.mark.parametrize(("shown", "after"), [(0, "loading"), (1, "queued")])
+def test_the_next_member_loads_once_the_last_byte_is_on_its_way_back(
+    shown: int, after: str, says: int
+) -> None:
+    """What the one before still shows of its peak may be there as long as all of it fits beside the load."""
+    driver = CoreDriver(8 * GIB)
+    one, (_, second) = gang_of(driver, (4 * GIB, 3 * GIB), (4 * GIB, 3 * GIB))
+    ready_with(one, 4 * GIB + 1, says)
+    assert driver.state(second) == "queued"
+    one[0].hold(BUDGET - 4 * GIB + shown)
+    driver.advance(0.1)
+    assert driver.state(second) == after
+
+
+def test_what_a_process_shows_of_its_peak_may_be_what_is_kept_for_its_next_member() -> None:
+    driver = CoreDriver(8 * GIB)
+    who, third = driver.consumer("two"), driver.consumer("third")
+    first, second = (who.acquire(3 * GIB, 1 * GIB, gang=("g", 3)) for _ in range(2))
+    third.acquire(3 * GIB, gang=("g", 3))
+    ready_with((who, first), 5 * GIB + 1, 1 * GIB)
+    assert driver.state(second) == "queued", "the card has no room for its peak"
+    who.hold(3500 * MIB)
+    driver.until(lambda: driver.state(second) == "loading", limit_s=2.0)
+
+
+def test_the_headroom_goes_to_the_member_that_loads_and_what_it_does_not_need_stays_for_the_next() -> None:
+    driver = CoreDriver(8 * GIB)
+    sizes = [(2100 * MIB, 2000 * MIB), (2500 * MIB, 2000 * MIB), (2300 * MIB, 2000 * MIB)]
+    members = gang_of(driver, *sizes)
+    assert driver.gpu()["charged_bytes"] == 6500 * MIB
+    driver.consumer("w").acquire(3 * GIB)
+    blockers = {one["consumer"]: one for one in why(driver, "w")["blockers"]}
+    assert [blockers[f"member{n}"]["bytes"] for n in range(3)] == [2100 * MIB, 2400 * MIB, 2000 * MIB]
+    assert blockers["member1"] == {
+        "lease_id": members[1][1],
+        "consumer": "member1",
+        "bytes": 2400 * MIB,
+        "state": "queued",
+        "uses": 0,
+        "condition": "has its bytes kept for its turn in gang g",
+    }
+    ready_with(members[0], 2000 * MIB)
+    assert driver.state(members[1][1]) == "loading"
+    assert driver.gpu()["charged_bytes"] == 6500 * MIB
+    blockers = {one["consumer"]: one for one in why(driver, "w")["blockers"]}
+    assert [blockers[f"member{n}"]["bytes"] for n in range(3)] == [2000 * MIB, 2500 * MIB, 2000 * MIB]
+
+
+def test_a_gang_over_two_cards_keeps_no_bytes_for_a_member_elsewhere() -> None:
+    driver = CoreDriver(8 * GIB, cards=2)
+    a, b, c = (driver.consumer(name) for name in "abc")
+    a.acquire(3 * GIB, gang=("g", 3), gpu="0")
+    b.acquire(3 * GIB, gang=("g", 3), gpu="1")
+    c.acquire(3 * GIB, gang=("g", 3), gpu="1")
+    driver.consumer("w").acquire(6 * GIB, gpu="0")
+    assert [one["consumer"] for one in why(driver, "w")["blockers"]] == ["a"]
+
+
+def test_a_gang_that_may_be_given_up_says_when_and_why() -> None:
+    driver = CoreDriver(8 * GIB)
+    one, (_, second) = gang_of(driver, (4608 * MIB, 3 * GIB), (4608 * MIB, 3 * GIB))
+    ready_with(one, 4 * GIB, 3 * GIB)
+    assert driver.state(second) == "queued"
+    step = why(driver, "member1")["plan"][-1]
+    gives_up_at = driver.now + step["in_s"]
+    assert step["action"] == "break"
+    assert step["text"] == f"gives gang g up in {step['in_s']:.1f} s, if its memory is not free then"
+    assert "lease_id" not in step or step["lease_id"] is None
+    driver.advance(gives_up_at - 0.2 - driver.now)
+    assert driver.state(second) == "queued"
+    driver.advance(0.7)
+    assert driver.state(second) == "over"
+
+
+# -- residues in the journal -----------------------------------------------------------------------------------------------
+def restarted_with(driver: CoreDriver, person: Consumer, **changes: Any) -> None:
+    """A restart that finds another record of what the process keeps."""
+    key = f"residue:{person.process}:GPU-0"
+    record = {**driver.journal[key], **changes}
+    driver.journal[key] = {name: value for name, value in record.items() if value is not None}
+    driver.restart()
+
+
+@pytest.mark.parametrize(
+    ("floor", "after"),
+    [(100 * MIB, 100 * MIB), (450 * MIB, 450 * MIB), (900 * MIB, 450 * MIB), (None, 450 * MIB)],
+)
+def test_a_residue_falls_after_a_restart_to_what_was_declared_of_it(floor: int | None, after: int) -> None:
+    """A record of an older daemon does not say: then all of it was."""
+    driver = CoreDriver(8 * GIB)
+    person = leftover(driver, 450 * MIB, 450 * MIB)
+    restarted_with(driver, person, floor_bytes=floor)
+    assert kept(driver, person) == 450 * MIB
+    person.connect()
+    person.hold(0)
+    driver.advance(3.0)
+    assert kept(driver, person) == after
+
+
+@pytest.mark.parametrize("room", [450 * MIB, 450 * MIB - 1, 1, 0])
+def test_a_residue_of_the_journal_takes_what_room_there_is(room: int) -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease = held(driver, "a", 1)
+    person = leftover(driver, 450 * MIB, 450 * MIB)
+    key = f"lease:{lease}"
+    driver.journal[key] = {**driver.journal[key], "charge_bytes": BUDGET - room}
+    driver.restart()
+    account = driver.arbiter._core.gpus[driver.card.gpu].ledger.accounts.get(person.process)
+    found = (0, 0) if account is None else (account.residue_bytes, account.residue_floor_bytes)
+    assert found == (room, room)
+    assert (f"residue:{person.process}:GPU-0" in driver.journal) == bool(room)
+
+
+def test_what_a_restart_found_is_told_and_what_is_of_a_card_that_is_gone_is_taken_out() -> None:
+    driver = CoreDriver(8 * GIB)
+    person = leftover(driver, 450 * MIB, 450 * MIB)
+    _, lease = held(driver, "a", 1)
+    _, lost = held(driver, "b", 1)
+    gone = {"gpu": "GPU-9"}
+    driver.journal[f"lease:{lost}"] = {**driver.journal[f"lease:{lost}"], **gone}
+    driver.journal["residue:elsewhere"] = {**driver.journal[f"residue:{person.process}:GPU-0"], **gone}
+    driver.restart()
+    assert driver.notes("recovered")[-1] == {"leases": [lease], "records": 4}
+    assert driver.journal.keys() == {f"lease:{lease}", f"residue:{person.process}:GPU-0"}
