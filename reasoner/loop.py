@@ -26,6 +26,7 @@ LOOKS_IN_A_ROW_MAX = (
     12  # looking and asking without anything done between: the answers prompt only more questions
 )
 THINK_MAX_S = 300.0  # a decision, with all retries of the planner's own
+NOTES_MAX = 64  # the oldest are forgotten
 SUPERSEDED_MAX = 3  # whoever speaks all the time does not keep the planner from ever deciding
 STOP_MAX_S = 15.0  # at the end, for a goal that was cancelled to say so
 
@@ -172,6 +173,7 @@ class _Loop:
     def _note(self, note: Note) -> None:
         log.info("%s: %s", note.source, note.text)
         self.episode.notes.append(note)
+        del self.episode.notes[:-NOTES_MAX]
         if self._superseded < SUPERSEDED_MAX:
             self._superseded += self._thinking is not None
             self._forget_decision()

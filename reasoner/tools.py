@@ -95,6 +95,8 @@ class Tools:
             return refusal
         frame = await self._frame(call.camera)
         detections = await self._detector.detect(frame["data"], call.query)
+        if (refusal := await self._not_permitted(self._detector)) is not None:
+            return refusal  # it was replaced meanwhile
         if not detections:
             return Outcome(
                 "not_seen",
@@ -131,6 +133,8 @@ class Tools:
             return refusal
         frame = await self._frame(call.camera)
         answer = await self._scene_vlm.query(frame["data"], call.question)
+        if (refusal := await self._not_permitted(self._scene_vlm)) is not None:
+            return refusal
         return Outcome("answered", answer, data={"camera": frame["camera"], "question": call.question})
 
     async def _execute(self, call: ExecuteRskill) -> Outcome:

@@ -152,6 +152,31 @@ def test_a_danger_that_stops_nothing_is_told_to_a_thinking_planner() -> None:
     assert play(story)["reason"] == "safety"
 
 
+def test_a_long_talk_is_forgotten_from_its_beginning() -> None:
+    async def story() -> Result:
+        robot, inbox = Robot(), Inbox()
+
+        def decide(episode: Episode) -> ToolCall | Finish:
+            if episode.running:
+                return Wait()
+            return Finish(True, "done") if episode.steps else GRAB
+
+        planner = Planner(decide)
+        episode = asyncio.create_task(run_episode("x", planner, PALETTE, robot, inbox=inbox))
+        await robot.begun.wait()
+        for number in range(looping.NOTES_MAX + 9):
+            asked = len(planner.asked)
+            inbox.put(Said(str(number)))
+            while len(planner.asked) == asked:
+                await asyncio.sleep(0)
+        robot.end.set()
+        return await episode
+
+    assert [note["text"] for note in play(story)["notes"]] == [
+        str(n) for n in range(9, looping.NOTES_MAX + 9)
+    ]
+
+
 def test_whoever_speaks_all_the_time_does_not_keep_the_planner_from_deciding() -> None:
     async def story() -> Planner:
         inbox = Inbox()

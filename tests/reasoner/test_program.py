@@ -35,6 +35,21 @@ def test_usage(tmp_path: Path) -> None:
     assert ended.returncode == 2
     assert "cannot be read" in ended.stderr
     assert "Traceback" not in ended.stderr
+    written(tmp_path)
+    ended = reasoner(
+        tmp_path, "--task", "grab the cube", "--playbook", str(tmp_path / "rskill.yaml"), *NOBODY
+    )
+    assert ended.returncode == 2
+    assert "a playbook is read by a language model (--planner openai or anthropic)" in ended.stderr
+
+
+def written(folder: Path) -> None:
+    (folder / "rskill.yaml").write_text(
+        'name: acme/search\nversion: "0.1.0"\nlicense: mit\nrole: s2\nkind: playbook\nembodiment_tags: [any]\nchunk_size: 1\n'
+        "latency_budget: {per_chunk_ms: 5000}\ndescription: x\nactions: [plan]\n"
+        "playbook: {trigger: t, body_uri: ./P.md, composes_tools: [execute_rskill], done_predicate: d, max_steps: 4}\n"
+    )
+    (folder / "P.md").write_text("Turn left first.")
 
 
 def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: Any) -> None:
@@ -45,11 +60,18 @@ def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: A
                 "actuators_required": [{"kind": "body_twist", "control_mode_semantics": {"mode": "absolute"}}],
                 "ros_integration": {"package": "p", "interface_type": "T", "interface_name": "/t", "default_goal_json": "{}"}}  # fmt: skip
 
+    asked_for: list[bytes] = []
+
     async def story() -> tuple[int | None, str]:
         asked = asyncio.Event()
+        written(tmp_path)
 
         async def silent(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            await reader.readline()
+            asked_for.append(await reader.readuntil(b"\r\n\r\n"))
+            length = next(
+                line for line in asked_for[0].lower().split(b"\r\n") if line.startswith(b"content-length")
+            )
+            asked_for.append(await reader.readexactly(int(length.split(b":")[1])))
             asked.set()
             await reader.read()  # until the client hangs up
             writer.close()
@@ -65,7 +87,7 @@ def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: A
             runner.skills = [manifest]
             process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "reasoner", "--task", "drive home", "--planner", "anthropic", "--detector", "none",
-                "--scene-vlm", "none", "--result", str(tmp_path / "result.json"), env=environ, stderr=asyncio.subprocess.PIPE,
+                "--scene-vlm", "none", "--playbook", str(tmp_path / "rskill.yaml"), "--result", str(tmp_path / "result.json"), env=environ, stderr=asyncio.subprocess.PIPE,
             )  # fmt: skip
             try:
                 await asked.wait()
@@ -82,4 +104,7 @@ def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: A
     assert code == 1, err
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["reason"] == "canceled: lunch"
+    body = json.loads(asked_for[1])
+    assert "Turn left first." in body["system"]
+    assert [tool["name"] for tool in body["tools"]] == ["execute_rskill__lab__go", "finish"]
     assert "Traceback" not in err
