@@ -6,6 +6,7 @@ GStreamer is loaded when a reader is made, never by importing this: programs wit
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import re
 import threading
@@ -59,6 +60,7 @@ class Libraries:
 
 def load() -> Libraries:
     """GStreamer, initialised. Raises ConfigError that says what to install."""
+    _keep_unwinding()
     try:
         import gi
 
@@ -74,6 +76,15 @@ def load() -> Libraries:
     if not Gst.is_initialized():
         Gst.init(None)
     return Libraries(GLib, Gst, GstApp, GstVideo)
+
+
+def _keep_unwinding() -> None:
+    """Let C++ exceptions unwind by libgcc, as before: Debian's GStreamer brings libunwind, whose functions have the same names, and the
+    next library that throws (matplotlib's, OpenCV's) would end the process. Whoever comes first in the global scope is taken."""
+    try:
+        ctypes.CDLL("libgcc_s.so.1", mode=ctypes.RTLD_GLOBAL)
+    except OSError as error:  # a system without GNU's compiler library has no such clash
+        log.debug("no libgcc_s: %s", error)
 
 
 def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> SlotReader:
