@@ -36,7 +36,10 @@ def on_recovered(core: Core, event: Recovered) -> None:
             core.forget(key)
         elif key.startswith("residue:"):
             process = ProcessKey(int(record["pid"]), int(record["start_ticks"]))
-            residue_bytes = min(int(record["residue_bytes"]), _room_bytes(gpu))
+            account = gpu.ledger.accounts.get(process)
+            # it lies within what the process is charged for its leases, which were restored before it
+            own_bytes = 0 if account is None else account.approved_bytes()
+            residue_bytes = min(int(record["residue_bytes"]), _room_bytes(gpu) + own_bytes)
             floor_bytes = min(int(record.get("floor_bytes", residue_bytes)), residue_bytes)
             gpu.ledger.set_residue(process, residue_bytes, core.now, floor_bytes)
             if not residue_bytes:  # stale leases fill the card: nobody would ever take the record out

@@ -240,3 +240,22 @@ def test_what_its_own_process_loads_hides_no_release() -> None:
     assert driver.gpu()["charged_bytes"] == int(1.5 * GIB)
     person.load(wanted)
     driver.until(lambda: driver.gpu()["charged_bytes"] == 1 * GIB)
+
+
+def test_what_a_process_keeps_is_restored_beside_its_lease() -> None:
+    """Regression (rule machine, seed 500085): a card that leases fill has room for contexts all the same, which lie within their leases."""
+    driver = hidden_card(lists=False)
+    small, first = held(driver, "small", 0.5, residue_bytes=450 * MIB)
+    small.unload(first)
+    driver.until(lambda: driver.state(first) == "over")
+    small.hold(450 * MIB)
+    _, second = held(driver, "small", 0.5, small)
+    big, lease = held(driver, "big", 7)
+    tokens = small.token(second), big.token(lease)
+    driver.restart()
+    for person, mine, token in zip((small, big), (second, lease), tokens, strict=True):
+        person.connect()
+        person.reattach(mine, token)
+    small.release(second)
+    driver.advance(2.0)
+    assert driver.gpu()["charged_bytes"] == 7 * GIB + 450 * MIB
