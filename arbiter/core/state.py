@@ -91,9 +91,8 @@ class Gpu:
     verifications: dict[str, Verification] = field(default_factory=dict)
     evictions: list[Eviction] = field(default_factory=list)  # not yet counted to a grant
     returning: Returning = field(default_factory=Returning)
-    left: deque[tuple[float, int]] = field(
-        default_factory=lambda: deque(maxlen=LEFT_KEPT)
-    )  # verdict at, bytes
+    # when the newest verdicts fell, and how many bytes left by each
+    left: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=LEFT_KEPT))
     sample: MemorySampled | None = None
     before_sleep: MemorySampled | None = None  # says nothing of now, but what was there then
     reading_s: float = 0.0  # how long the newest reading took

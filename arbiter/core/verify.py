@@ -59,9 +59,8 @@ class Verification:
     alive: bool = True
     exiting: bool = False
     exclusive: bool = False  # nobody else may come before these bytes are gone, whatever would fit
-    fenced_at: float = (
-        0.0  # until then a living holder may believe in its lease: what it keeps is no mere residue
-    )
+    # until then a living holder may believe in its lease: what it keeps is no mere residue
+    fenced_at: float = 0.0
     last_used_bytes: int | None = None  # of the newest counting reading
     verdict: Verdict | None = None  # announced, but not resolved
     overdue: bool = False

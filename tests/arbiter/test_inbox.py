@@ -117,6 +117,7 @@ def test_an_earlier_deadline_replaces_a_later_one() -> None:
         core.deadline = time.monotonic() - 5  # passed already
         inbox.post(left("c"))
         await core.ticked.wait()
+        assert core.seen.count(Tick()) == 2, "one for each deadline that came"
 
     with_inbox(test)
 
@@ -131,6 +132,7 @@ def test_the_same_deadline_twice_in_a_row_still_ticks() -> None:
             inbox.post(left("a"))
             await core.ticked.wait()
             core.ticked.clear()
+        assert core.seen.count(Tick()) == 3, "one for each time that it was named"
 
     with_inbox(test)
 

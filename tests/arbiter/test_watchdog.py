@@ -82,7 +82,7 @@ def feed(messages: list[str]) -> list[str]:
 def test_a_daemon_that_decides_feeds_it(make_arbiter: Make) -> None:
     arbiter = make_arbiter().start({"WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6))})
     for _ in range(3):
-        arbiter.wait_for("WATCHDOG=1", PATIENCE_S)
+        assert "WATCHDOG=1" in arbiter.wait_for("WATCHDOG=1", PATIENCE_S)
 
 
 def test_without_a_watchdog_none_is_fed(make_arbiter: Make) -> None:

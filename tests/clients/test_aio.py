@@ -232,6 +232,8 @@ async def test_an_acquire_cancelled_at_any_moment_leaks_nothing(
         async with asyncio.timeout(WAIT_S):
             while await states(client):
                 await asyncio.sleep(0.01)
+        whole = await client.acquire(spec("whole", 5), WAIT_S)
+        assert (whole.state, await states(client)) == ("loading", {"whole": "loading"})
 
 
 async def test_callbacks_that_raise_do_not_keep_the_lease(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:

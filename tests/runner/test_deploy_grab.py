@@ -3,13 +3,12 @@
 import asyncio
 import random
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from grab_programs import GRAB, SKILL, GrabPrograms, need_checkpoint
 
 from arbiter.testing.process import ArbiterProcess
 from clients.aio import ArbiterClient
@@ -17,40 +16,16 @@ from clients.runner import RunnerClient
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(240)]
 
-ROOT = Path(__file__).parents[2]
-GRAB = "vram-arbiter/so101-grab"
-SKILL = ROOT / "configs/rskills/so101-grab/rskill.yaml"
 
-
-class Programs:
-    """Policy sidecar and `vram-runner deploy` in the daemon's runtime folder."""
-
-    def __init__(self, arbiter: ArbiterProcess) -> None:
-        config = arbiter.runtime / "robot.yaml"
-        cameras = "".join(
-            f"  - {{sensor_id: {name}, max_age_ms: 2000, backend_params: {{path: {path}, loop: true}}}}\n"
-            for name, path in _videos(arbiter.runtime).items()
-        )
-        config.write_text(f"robot_id: bench\nhal: {{adapter: so101_mujoco}}\nsensors:\n{cameras}")
-        self.log = arbiter.runtime / "programs.log"
-        environ = arbiter.environ | {"OMP_NUM_THREADS": "1"}
-        sidecar = ["sidecars", "--name", "grab", "--rskill", str(SKILL), "--device", f"fake:{arbiter.card}"]
-        runner = ["runner", "deploy", "--config", str(config), "--skills", str(SKILL)]
-        with self.log.open("ab") as log:
-            self.sidecar, self.runner = (
-                subprocess.Popen([sys.executable, "-m", *argv], cwd=ROOT, env=environ, stdout=log, stderr=log)
-                for argv in (sidecar, runner)
-            )
-
-    def close(self) -> None:
-        for process in (self.runner, self.sidecar):
-            if process.poll() is None:
-                process.terminate()
-                try:
-                    process.wait(20)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+def deployed(arbiter: ArbiterProcess) -> GrabPrograms:
+    """Policy sidecar and `vram-runner deploy` on a file with the twin and two cameras."""
+    config = arbiter.runtime / "robot.yaml"
+    cameras = "".join(
+        f"  - {{sensor_id: {name}, max_age_ms: 2000, backend_params: {{path: {path}, loop: true}}}}\n"
+        for name, path in _videos(arbiter.runtime).items()
+    )
+    config.write_text(f"robot_id: bench\nhal: {{adapter: so101_mujoco}}\nsensors:\n{cameras}")
+    return GrabPrograms(arbiter, "deploy", "--config", str(config), "--skills", str(SKILL))
 
 
 def _videos(folder: Path) -> dict[str, Path]:
@@ -77,10 +52,9 @@ def _videos(folder: Path) -> dict[str, Path]:
 
 
 @pytest.fixture
-def programs(arbiter_daemon: ArbiterProcess) -> Iterator[Programs]:
-    if not (ROOT / "configs/models/so101-grab/model.safetensors").exists():
-        pytest.skip("the grab checkpoint is not in this tree")
-    started = Programs(arbiter_daemon)
+def programs(arbiter_daemon: ArbiterProcess) -> Iterator[GrabPrograms]:
+    need_checkpoint()
+    started = deployed(arbiter_daemon)
     yield started
     started.close()
 
@@ -89,7 +63,7 @@ def uses(status: dict[str, Any]) -> list[int]:
     return [lease["uses"] for lease in status["leases"] if lease["consumer"] == "grab"]
 
 
-async def scenario(arbiter: ArbiterProcess, programs: Programs) -> None:
+async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
     async with (
         RunnerClient(f"ipc://{arbiter.runtime}/runner.sock", connect_timeout_s=60.0) as runner,
         ArbiterClient(arbiter.endpoint, name="watcher") as watcher,
@@ -114,14 +88,6 @@ async def scenario(arbiter: ArbiterProcess, programs: Programs) -> None:
 
 
 def test_the_policy_moves_the_arm_and_a_signal_ends_its_use(
-    arbiter_daemon: ArbiterProcess, programs: Programs
+    arbiter_daemon: ArbiterProcess, programs: GrabPrograms
 ) -> None:
-    async def bounded() -> None:
-        async with asyncio.timeout(200):
-            await scenario(arbiter_daemon, programs)
-
-    try:
-        asyncio.run(bounded())
-    except (AssertionError, TimeoutError):
-        print(programs.log.read_text(errors="replace")[-4000:])
-        raise
+    programs.play(scenario(arbiter_daemon, programs))

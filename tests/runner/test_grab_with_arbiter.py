@@ -6,13 +6,11 @@ One use spans the goal: a rival that needs the whole card waits for the goal's e
 import asyncio
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
+from grab_programs import GRAB, SKILLS, GrabPrograms, need_checkpoint
 
 from arbiter.testing.process import ArbiterProcess
 from clients.aio import ArbiterClient
@@ -21,51 +19,14 @@ from schemas.wire import Footprint, LeaseSpec
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(240)]
 
-ROOT = Path(__file__).parents[2]
-GRAB, NAVIGATE = "vram-arbiter/so101-grab", "vram-arbiter/so101-navigate"
-
-
-class Programs:
-    """Policy sidecar and runner in the daemon's runtime folder."""
-
-    def __init__(self, arbiter: ArbiterProcess) -> None:
-        environ = arbiter.environ | {"OMP_NUM_THREADS": "1"}
-        log = (arbiter.runtime / "programs.log").open("ab")
-        skills = ROOT / "configs/rskills"
-        sidecar = ["sidecars", "--name", "grab", "--rskill", f"{skills}/so101-grab/rskill.yaml"]
-        runner = [
-            "runner",
-            "sim",
-            "--seed",
-            "1",
-            "--skills",
-            f"{skills}/so101-grab",
-            f"{skills}/so101-navigate",
-        ]
-        device = ["--device", f"fake:{arbiter.card}"]
-        self.sidecar, self.runner = (
-            subprocess.Popen([sys.executable, "-m", *argv], cwd=ROOT, env=environ, stdout=log, stderr=log)
-            for argv in ([*sidecar, *device], runner)
-        )
-        self.log = arbiter.runtime / "programs.log"
-        log.close()
-
-    def close(self) -> None:
-        for process in (self.runner, self.sidecar):
-            if process.poll() is None:
-                process.terminate()
-                try:
-                    process.wait(20)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+NAVIGATE = "vram-arbiter/so101-navigate"
 
 
 @pytest.fixture
-def programs(arbiter_daemon: ArbiterProcess) -> Iterator[Programs]:
-    if not (ROOT / "configs/models/so101-grab/model.safetensors").exists():
-        pytest.skip("the grab checkpoint is not in this tree")
-    started = Programs(arbiter_daemon)
+def programs(arbiter_daemon: ArbiterProcess) -> Iterator[GrabPrograms]:
+    need_checkpoint()
+    skills = [f"{SKILLS}/so101-grab", f"{SKILLS}/so101-navigate"]
+    started = GrabPrograms(arbiter_daemon, "sim", "--seed", "1", "--skills", *skills)
     yield started
     started.close()
 
@@ -74,7 +35,7 @@ def leases(status: dict[str, Any], consumer: str) -> list[tuple[str, int]]:
     return [(lease["state"], lease["uses"]) for lease in status["leases"] if lease["consumer"] == consumer]
 
 
-async def scenario(arbiter: ArbiterProcess, programs: Programs) -> None:
+async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
     async with (
         RunnerClient(f"ipc://{arbiter.runtime}/runner.sock", connect_timeout_s=60.0) as runner,
         ArbiterClient(arbiter.endpoint, name="rival") as rival,
@@ -126,14 +87,6 @@ async def scenario(arbiter: ArbiterProcess, programs: Programs) -> None:
 
 
 def test_a_goal_is_one_use_and_a_dead_policy_fails_closed(
-    arbiter_daemon: ArbiterProcess, programs: Programs
+    arbiter_daemon: ArbiterProcess, programs: GrabPrograms
 ) -> None:
-    async def bounded() -> None:
-        async with asyncio.timeout(200):
-            await scenario(arbiter_daemon, programs)
-
-    try:
-        asyncio.run(bounded())
-    except (AssertionError, TimeoutError):
-        print(programs.log.read_text(errors="replace")[-4000:])
-        raise
+    programs.play(scenario(arbiter_daemon, programs))

@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from arbiter.core.events import MemorySampled, ProcessUse
-from arbiter.testing.core_driver import CoreDriver
+from arbiter.testing.core_driver import Consumer, CoreDriver
 from arbiter.testing.scenes import held, hidden_card
 from schemas import defaults as d
-from schemas.ids import ProcessKey
+from schemas.ids import LeaseId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 BROWSER = ProcessKey(9, 9)
@@ -115,12 +115,8 @@ def test_where_the_list_has_no_bytes_all_of_it_stays_charged() -> None:
     assert driver.gpu()["charged_bytes"] == 5 * GIB, "nor does it shrink by readings that cannot say"
 
 
-def test_two_that_nobody_lists_change_places() -> None:
-    """What the one loads while the other leaves is not the other's; what it held before is no growth of its."""
-    driver = CoreDriver(10 * GIB)
-    driver.card.unlisted |= {ProcessKey(pid, 7 * pid) for pid in (101, 102, 103)}
-    held(driver, "stays", 2)
-    det, lease = held(driver, "det", 4)
+def change_places(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
+    """Another one loads in the moment in which this one leaves, and that is seen at once."""
     vlm = driver.consumer("vlm")
     load = vlm.acquire(3 * GIB)
     driver.until(lambda: driver.state(load) == "loading")
@@ -130,6 +126,15 @@ def test_two_that_nobody_lists_change_places() -> None:
     det.release(lease)
     driver.until(lambda: driver.state(lease) == "over", limit_s=0.1)
     assert verdicts(driver) == [("verified", True)]
+
+
+def test_two_that_nobody_lists_change_places() -> None:
+    """What the one loads while the other leaves is not the other's; what it held before is no growth of its."""
+    driver = CoreDriver(10 * GIB)
+    driver.card.unlisted |= {ProcessKey(pid, 7 * pid) for pid in (101, 102, 103)}
+    held(driver, "stays", 2)
+    det, lease = held(driver, "det", 4)
+    change_places(driver, det, lease)
 
 
 def test_one_that_comes_onto_the_list_has_not_grown() -> None:
@@ -150,15 +155,7 @@ def test_one_that_comes_onto_the_list_has_not_grown() -> None:
 def test_one_that_comes_onto_the_list_by_its_load_has_grown() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 3)
-    vlm = driver.consumer("vlm")
-    load = vlm.acquire(3 * GIB)
-    driver.until(lambda: driver.state(load) == "loading")
-    det.unloading(lease)
-    vlm.load(load)
-    det.hold(0)
-    det.release(lease)
-    driver.until(lambda: driver.state(lease) == "over", limit_s=0.1)
-    assert verdicts(driver) == [("verified", True)]
+    change_places(driver, det, lease)
 
 
 def test_what_another_holder_grew_by_right_hides_no_dead_one() -> None:

@@ -3,6 +3,7 @@
 import socket
 import struct
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ def make_video(tmp_path: Path) -> Callable[..., Path]:
     return make
 
 
-class Server:
+class Server(ABC):
     """Accepts connections one after another on loopback and gives each to `serve`, until it is closed."""
 
     def __init__(self) -> None:
@@ -61,8 +62,9 @@ class Server:
                 except OSError:
                     pass  # the reader went away, or the test cut the line
 
+    @abstractmethod
     def serve(self, connection: socket.socket) -> None:
-        raise NotImplementedError
+        """Talk to one client; returning ends its connection."""
 
     def request(self, stream: Any) -> str:
         """The head of the next request."""

@@ -1,0 +1,63 @@
+"""The grab policy's sidecar and a runner as real processes beside a real daemon, and a scenario that is played against them."""
+
+import asyncio
+import subprocess
+import sys
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+
+ROOT = Path(__file__).parents[2]
+SKILLS = ROOT / "configs/rskills"
+SKILL = SKILLS / "so101-grab/rskill.yaml"
+GRAB = "vram-arbiter/so101-grab"
+SCENARIO_S = 200.0
+
+
+def need_checkpoint() -> None:
+    """Skip the test where the shipped weights are missing."""
+    if not (ROOT / "configs/models/so101-grab/model.safetensors").exists():
+        pytest.skip("the grab checkpoint is not in this tree")
+
+
+class GrabPrograms:
+    """Both programs in the daemon's runtime folder; `runner` are the words after `vram-runner`."""
+
+    def __init__(self, arbiter: ArbiterProcess, *runner: str) -> None:
+        self.log = arbiter.runtime / "programs.log"
+        environ = arbiter.environ | {"OMP_NUM_THREADS": "1"}
+        sidecar = ["sidecars", "--name", "grab", "--rskill", str(SKILL), "--device", f"fake:{arbiter.card}"]
+        with self.log.open("ab") as log:
+            self.sidecar, self.runner = (
+                subprocess.Popen(
+                    [sys.executable, "-m", *words], cwd=ROOT, env=environ, stdout=log, stderr=log
+                )
+                for words in (sidecar, ["runner", *runner])
+            )
+
+    def play(self, scenario: Coroutine[Any, Any, None]) -> None:
+        """Run it; a failure shows what the programs said."""
+
+        async def bounded() -> None:
+            async with asyncio.timeout(SCENARIO_S):
+                await scenario
+
+        try:
+            asyncio.run(bounded())
+        except (AssertionError, TimeoutError):
+            print(self.log.read_text(errors="replace")[-4000:])
+            raise
+
+    def close(self) -> None:
+        for process in (self.runner, self.sidecar):
+            if process.poll() is None:
+                process.terminate()
+                try:
+                    process.wait(20)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
