@@ -20,12 +20,13 @@ from typing import Any, Literal, Protocol
 from pydantic import ValidationError
 
 from clients.serve import Message, Peer, RouterServer
-from runner import frames, telemetry
+from runner import frames
 from runner.catalogue import Catalogue
 from runner.clock import Clock
 from runner.control import ControlThread
 from runner.protocols import Goal, Progress, Skill, SkillEnded
 from runner.skills.residency import Residency
+from schemas import telemetry, tracing
 from schemas.errors import (
     BadRequest,
     BadState,
@@ -310,7 +311,7 @@ class GoalServer:
         try:
             if running.canceled:
                 raise asyncio.CancelledError
-            with telemetry.span(telemetry.SPAN_GOAL, goal.traceparent, {"rskill.id": goal.rskill_id}):
+            with tracing.span(telemetry.SPAN_GOAL, goal.traceparent, {telemetry.ATTR_SKILL: goal.rskill_id}):
                 async with asyncio.timeout(goal.deadline_s):
                     ended = await self._run(running, make)
             data, error = dict(ended.data), ended.error

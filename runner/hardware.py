@@ -16,7 +16,6 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 
-from runner import telemetry
 from runner.clock import Clock
 from runner.loop import Applied, Decision
 from runner.pictures import FramePicture
@@ -31,6 +30,7 @@ from runner.protocols import (
 )
 from runner.skill_runner import Active, SkillRunner
 from runner.world_state import JOINT_STATE, WorldStateAggregator
+from schemas import telemetry, tracing
 from schemas.errors import (
     BadRequest,
     Cancelled,
@@ -156,7 +156,7 @@ class HardwareRunner(SkillRunner):
             except VramError as error:
                 log.error("the robot did not take the emergency stop: %s", error)
             log.critical("%s", self.estop)
-            telemetry.event(telemetry.EVENT_ESTOP, reason=self.estop.message)
+            tracing.event(telemetry.EVENT_ESTOP, reason=self.estop.message)
         return super().obey_estop()
 
     # -- pictures ------------------------------------------------------------------------------------------------------
@@ -175,11 +175,11 @@ class HardwareRunner(SkillRunner):
         self.obey_estop()  # 1
         self._mailbox.run_pending()  # 2
         started_s = self.clock.now_s()
-        with telemetry.span(telemetry.SPAN_SENSORS):  # 3
+        with tracing.span(telemetry.SPAN_SENSORS):  # 3
             self._read_cameras()
             self._read_joints()
         sensed_s = self.clock.now_s()
-        with telemetry.span(telemetry.SPAN_WORLD):
+        with tracing.span(telemetry.SPAN_WORLD):
             self.world = world = self.aggregator.snapshot(self.clock.now_ns())  # 4
         decision = Decision(
             sensors_ms=(sensed_s - started_s) * 1e3, world_state_ms=(self.clock.now_s() - sensed_s) * 1e3
@@ -234,7 +234,7 @@ class HardwareRunner(SkillRunner):
         if self._stale_since_s is None:
             self._stale_since_s = now_s
             self.violations.append(problem)
-            telemetry.event(telemetry.EVENT_STALE, component=name)
+            tracing.event(telemetry.EVENT_STALE, component=name)
         self._withheld(active, problem)
         if now_s - self._stale_since_s < STALE_FAIL_S:
             return

@@ -18,9 +18,9 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from runner import telemetry
 from runner.clock import Clock, SystemClock
 from runner.protocols import DeadlineMissed, DeadlinePolicy
+from schemas import telemetry, tracing
 from schemas.world import Action, RunResult, TickResult
 
 TIMINGS_KEPT = 36_000  # twenty minutes at 30 Hz; older timings leave the percentiles, never the counts
@@ -116,11 +116,11 @@ class RunnerBase(ABC):
 
     def tick(self) -> TickResult:
         """One turn. See the module's docstring for its steps."""
-        with telemetry.span(telemetry.SPAN_TICK, self.traceparent) as span:
+        with tracing.span(telemetry.SPAN_TICK, self.traceparent) as span:
             context = span.get_span_context()
             if context.is_valid and self._trace_id is None:
                 self._trace_id = f"{context.trace_id:032x}"
-            return self._tick(telemetry.carrier())
+            return self._tick(tracing.carrier())
 
     def _tick(self, trace_context: dict[str, str] | None) -> TickResult:
         started_s = self.clock.now_s()
@@ -131,7 +131,7 @@ class RunnerBase(ABC):
         if withheld and not decision.reset:
             decision.action = None
         apply_s = self.clock.now_s()
-        with telemetry.span(telemetry.SPAN_SEND):
+        with tracing.span(telemetry.SPAN_SEND):
             applied = self._apply(decision)  # 3
         ended_s = self.clock.now_s()
         missed = ended_s > deadline_s
@@ -161,7 +161,7 @@ class RunnerBase(ABC):
             self._inference_ms.append(result.inference_ms)
         if missed:  # 4
             self.deadline_misses += 1
-            telemetry.event(telemetry.EVENT_DEADLINE_MISSED, tick_ms=result.tick_ms)
+            tracing.event(telemetry.EVENT_DEADLINE_MISSED, tick_ms=result.tick_ms)
             if self.deadline_policy is DeadlinePolicy.RAISE:
                 raise DeadlineMissed(
                     f"tick {result.tick_idx} took {result.tick_ms:.1f} ms of its {1e3 / self.rate_hz:.1f} ms",

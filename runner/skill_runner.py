@@ -13,11 +13,11 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from runner import telemetry
 from runner.clock import Clock
 from runner.control import Mailbox
 from runner.loop import Decision, RunnerBase
 from runner.protocols import Act, DeadlinePolicy, Done, Goal, Hold, Progress, SafetyGate, Skill, SkillEnded
+from schemas import telemetry, tracing
 from schemas.errors import EstopRequested, InternalError, LimitExceeded, ModelError, VramError
 from schemas.world import Action, WorldState
 
@@ -130,7 +130,7 @@ class SkillRunner(RunnerBase):
             return
         asked_s = self.clock.now_s()
         try:
-            with telemetry.span(telemetry.SPAN_INFERENCE):
+            with tracing.span(telemetry.SPAN_INFERENCE):
                 outcome = active.skill.step(world)
         except VramError as error:
             decision.safety_violations = (f"{error.code}: {error.message}",)
@@ -161,7 +161,7 @@ class SkillRunner(RunnerBase):
 
     def _check(self, active: Active, action: Action, world: WorldState, decision: Decision) -> None:
         checked_s = self.clock.now_s()
-        with telemetry.span(telemetry.SPAN_SAFETY):
+        with tracing.span(telemetry.SPAN_SAFETY):
             allowed, problems = self._safety_gate().check(action, world)
         decision.safety_ms = (self.clock.now_s() - checked_s) * 1e3
         decision.safety_violations = problems
@@ -187,6 +187,6 @@ class SkillRunner(RunnerBase):
 
     def _withheld(self, active: Active, reason: str) -> None:
         """Note that nothing reaches the motors in this tick, and why."""
-        telemetry.event(telemetry.EVENT_ACTION_WITHHELD, reason=reason)
+        tracing.event(telemetry.EVENT_ACTION_WITHHELD, reason=reason)
         active.withheld += 1
         active.detail = f"withheld: {reason}"

@@ -15,7 +15,6 @@ from typing import Any, Protocol
 
 from pydantic import ValidationError
 
-from runner import telemetry
 from runner.clock import Clock
 from runner.frames import Snapshot
 from runner.loop import Applied, Decision
@@ -23,6 +22,7 @@ from runner.protocols import DeadlinePolicy, SkillEnded
 from runner.recorder import Recorder
 from runner.safety import Envelope
 from runner.skill_runner import SkillRunner
+from schemas import telemetry, tracing
 from schemas.control import ControlMode
 from schemas.errors import InternalError
 from schemas.world import Action, CameraModel, FrameEncoding, JointState, Pose, SensorFrame, WorldState
@@ -163,11 +163,11 @@ class SimRunner(SkillRunner):
         active = self._active
         frames: dict[str, SensorFrame] | None = None
         if active is not None and active.skill.wants_frames():  # 3
-            with telemetry.span(telemetry.SPAN_SENSORS):
+            with tracing.span(telemetry.SPAN_SENSORS):
                 frames = {camera: self._sensor_frame(self._render(camera)) for camera in active.skill.cameras}
         sensed_s = self.clock.now_s()
         try:
-            with telemetry.span(telemetry.SPAN_WORLD):
+            with tracing.span(telemetry.SPAN_WORLD):
                 world = self._world(frames)  # 4
         except ValidationError as error:  # a state that is not finite: nobody may act on it
             self.world = None

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from runner import telemetry
+from schemas import telemetry
 
 pytestmark = pytest.mark.heavy  # the OpenTelemetry SDK
 

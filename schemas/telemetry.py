@@ -1,0 +1,80 @@
+"""Names of all spans, span events, metrics and attributes, in one place. Names only: nothing is recorded here.
+
+Who records what: the arbiter `lease.*`, the runner `rskill.*` and the parts of a tick, the reasoner `reasoner.*`, a sidecar `sidecar.*`,
+every command line `cli.command`. One trace runs through all of them by the W3C `traceparent` on their sockets.
+"""
+
+TRACER = "vram-arbiter"
+
+# -- spans ------------------------------------------------------------------------------------------------------------
+SPAN_COMMAND = "cli.command"
+
+SPAN_ACQUIRE = "lease.acquire"  # from the request to `ready`; children: what the time went into
+SPAN_QUEUE = "lease.queue"
+SPAN_EVICT = "lease.evict"  # one for each lease that had to leave
+SPAN_VERIFY = "lease.verify"
+SPAN_LOAD = "lease.load"
+
+SPAN_GOAL = "rskill.goal"
+SPAN_ACTIVATE = "rskill.activate"
+SPAN_TICK = "rskill.tick"
+SPAN_SENSORS = "sensors.read"
+SPAN_WORLD = "world_state.snapshot"
+SPAN_INFERENCE = "inference"
+SPAN_CHUNK = "rskill.chunk_inference"
+SPAN_SAFETY = "safety.check"
+SPAN_SEND = "hal.send_action"
+SPAN_EPISODE = "sim.episode"
+
+SPAN_REASONER_TICK = "reasoner.tick"
+SPAN_PLAN = "reasoner.plan"
+SPAN_TOOL = "reasoner.tool"
+
+SPAN_SIDECAR_LOAD = "sidecar.load"
+SPAN_SIDECAR_UNLOAD = "sidecar.unload"
+SPAN_SIDECAR_REQUEST = "sidecar.request"
+
+# -- events within a span -----------------------------------------------------------------------------------------------
+EVENT_DEADLINE_MISSED = "vram.event.deadline_missed"
+EVENT_ESTOP = "vram.event.estop_requested"
+EVENT_STALE = "vram.event.staleness_latched"
+EVENT_ACTION_WITHHELD = "vram.event.action_withheld"
+EVENT_PREFETCH_HIT = "vram.event.chunk_prefetch_hit"
+EVENT_PREFETCH_MISS = "vram.event.chunk_prefetch_miss"
+
+# -- metrics: name, unit in the name's comment; labels are ATTR_ names -----------------------------------------------------
+METRIC_GRANTS = "vram.lease.grants"  # 1, by consumer
+METRIC_DENIALS = "vram.lease.denials"  # 1, by reason
+METRIC_WAIT = "vram.lease.wait"  # s, from request to grant
+METRIC_WAITERS = "vram.lease.waiters"  # 1, now
+METRIC_EVICTIONS = "vram.evictions"  # 1, by verdict
+METRIC_HANDOVER = "vram.handover"  # s, from the first ask to the grant that needed the room
+METRIC_CHARGED = "vram.gpu.charged"  # By, by GPU and consumer
+METRIC_MEASURED = "vram.gpu.measured"  # By, by GPU and consumer ("" is the whole card)
+METRIC_CAPACITY = "vram.gpu.capacity"  # By, by GPU
+METRIC_TICK = "vram.tick.duration"  # ms
+METRIC_INFERENCE = "vram.inference.duration"  # ms
+METRIC_DEADLINE_MISSES = "vram.tick.deadline_misses"  # 1
+METRIC_SAFETY_VIOLATIONS = "vram.safety.violations"  # 1
+METRIC_WITHHELD = "vram.safety.withheld"  # 1
+METRIC_GOALS = "vram.goals"  # 1, by skill and state
+METRIC_TOOL_CALLS = "vram.reasoner.tool_calls"  # 1, by tool and outcome
+METRIC_SIDECAR_LOAD = "vram.sidecar.load"  # s, by model
+METRIC_SIDECAR_REQUEST = "vram.sidecar.request"  # ms, by operation and outcome
+
+# -- attributes and labels: a closed set, so that no metric's cardinality grows with use -----------------------------------------
+ATTR_LEASE = "vram.lease_id"  # spans only
+ATTR_CONSUMER = "vram.consumer"
+ATTR_MODEL = "vram.model"
+ATTR_GPU = "vram.gpu"
+ATTR_VERDICT = "vram.verdict"
+ATTR_REASON = "vram.reason"
+ATTR_BYTES = "vram.bytes"  # spans only
+ATTR_SKILL = "rskill.id"
+ATTR_REVISION = "rskill.revision"
+ATTR_GOAL = "rskill.goal_id"  # spans only
+ATTR_ROBOT = "robot.model"
+ATTR_TOOL = "reasoner.tool"
+ATTR_OPERATION = "sidecar.operation"
+ATTR_OUTCOME = "outcome"
+ATTR_COMMAND = "cli.command"
