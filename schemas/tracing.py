@@ -33,6 +33,14 @@ def carrier() -> dict[str, str] | None:
     return headers or None
 
 
+def log_ids() -> dict[str, str]:
+    """`trace_id` and `span_id` of the present span for a line of a log, in hexadecimal; {} outside any trace."""
+    context = trace.get_current_span().get_span_context()
+    if not context.is_valid:
+        return {}
+    return {"trace_id": f"{context.trace_id:032x}", "span_id": f"{context.span_id:016x}"}
+
+
 def event(name: str, **attributes: str | float) -> None:
     """Add an event to the present span."""
     trace.get_current_span().add_event(name, attributes)

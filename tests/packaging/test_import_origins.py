@@ -25,6 +25,8 @@ HEAVY = (
     "matplotlib",
     "pynvml",
     "opentelemetry.sdk",
+    "opentelemetry.exporter",
+    "prometheus_client",
 )
 
 BASE_MODULES = [

@@ -1,0 +1,294 @@
+"""Telemetry is asked for in standard words, refused with words that help, and costs nothing when it is not asked for."""
+
+import importlib.util
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from arbiter.testing.collector import Collector
+from schemas.errors import ConfigError
+from schemas.otel import OTLP_DEFAULT, Plan, Telemetry, plan, set_up
+
+needs_sdk = pytest.mark.skipif(
+    not all(importlib.util.find_spec(name) for name in ("opentelemetry.sdk", "prometheus_client")),
+    reason="needs the extra `telemetry`",
+)
+
+BASE = "http://collector:4318"
+
+
+def run(code: str, environ: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
+    """In a process of its own: an SDK is installed once per process."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("OTEL_")}
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**kept, **environ},
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+# -- what is asked for --------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("environ", "wanted"),
+    [
+        ({}, Plan()),
+        ({"OTEL_SERVICE_NAME": "robot", "OTEL_TRACES_SAMPLER": "always_on"}, Plan()),
+        (
+            {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE + "/"},
+            Plan(traces=BASE + "/v1/traces", metrics=BASE + "/v1/metrics"),
+        ),
+        (
+            {"OTEL_EXPORTER_OTLP_TRACES_ENDPOINT": BASE + "/own"},
+            Plan(traces=BASE + "/own"),
+        ),
+        (
+            {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_METRICS_EXPORTER": "none"},
+            Plan(traces=BASE + "/v1/traces"),
+        ),
+        ({"OTEL_TRACES_EXPORTER": "otlp"}, Plan(traces=OTLP_DEFAULT + "/v1/traces")),
+        ({"OTEL_METRICS_EXPORTER": "prometheus"}, Plan(prometheus=("127.0.0.1", 9464))),
+        (
+            {
+                "OTEL_EXPORTER_OTLP_ENDPOINT": BASE,
+                "OTEL_METRICS_EXPORTER": "otlp,prometheus",
+                "OTEL_EXPORTER_PROMETHEUS_HOST": "::1",
+                "OTEL_EXPORTER_PROMETHEUS_PORT": "9500",
+            },
+            Plan(BASE + "/v1/traces", BASE + "/v1/metrics", ("::1", 9500)),
+        ),
+        (
+            {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_METRICS_EXPORTER": "prometheus"},
+            Plan(traces=BASE + "/v1/traces", prometheus=("127.0.0.1", 9464)),
+        ),
+        (
+            {"OTEL_TRACES_EXPORTER": "otlp", "OTEL_TRACES_SAMPLER_ARG": "0.25"},
+            Plan(traces=OTLP_DEFAULT + "/v1/traces", ratio=0.25),
+        ),
+        (
+            {
+                "OTEL_TRACES_EXPORTER": "otlp",
+                "OTEL_TRACES_SAMPLER": "always_off",
+                "OTEL_TRACES_SAMPLER_ARG": "?",
+            },
+            Plan(traces=OTLP_DEFAULT + "/v1/traces", sampler="always_off"),
+        ),
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_SDK_DISABLED": "True"}, Plan()),
+    ],
+)
+def test_the_standard_variables_mean_what_they_say(environ: Mapping[str, str], wanted: Plan) -> None:
+    assert plan(environ) == wanted
+
+
+def test_a_configuration_wins_over_the_environment() -> None:
+    environ = {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://other:4318", "OTEL_TRACES_SAMPLER": "always_off"}
+    got = plan(environ, endpoint=BASE, prometheus_port=0, sample_ratio=0.5)
+    assert got == Plan(
+        BASE + "/v1/traces",
+        BASE + "/v1/metrics",
+        ("127.0.0.1", 0),
+        sampler="parentbased_traceidratio",
+        ratio=0.5,
+    )
+
+
+@pytest.mark.parametrize(
+    ("environ", "words"),
+    [
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "collector:4318"}, "OTEL_EXPORTER_OTLP_ENDPOINT"),
+        ({"OTEL_EXPORTER_OTLP_TRACES_ENDPOINT": "http://:1"}, "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT"),
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://host:99999"}, "no URL of a collector"),
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_EXPORTER_OTLP_PROTOCOL": "grpc"}, "port 4318"),
+        ({"OTEL_TRACES_EXPORTER": "zipkin"}, "one of otlp, none"),
+        ({"OTEL_METRICS_EXPORTER": "console"}, "one of otlp, prometheus, none"),
+        (
+            {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_HOST": "0.0.0.0"},
+            "no loopback address",
+        ),
+        ({"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_HOST": "robot"}, "no loopback"),
+        ({"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_PORT": "70000"}, "no port"),
+        ({"OTEL_TRACES_EXPORTER": "otlp", "OTEL_TRACES_SAMPLER": "sometimes"}, "parentbased_traceidratio"),
+        ({"OTEL_TRACES_EXPORTER": "otlp", "OTEL_TRACES_SAMPLER_ARG": "2"}, "0 (no trace) to 1 (all)"),
+        ({"OTEL_TRACES_EXPORTER": "otlp", "OTEL_TRACES_SAMPLER_ARG": "nan"}, "OTEL_TRACES_SAMPLER_ARG"),
+    ],
+)
+def test_what_makes_no_sense_is_named(environ: Mapping[str, str], words: str) -> None:
+    with pytest.raises(ConfigError, match=words.replace("(", r"\(").replace(")", r"\)")):
+        plan(environ)
+
+
+# -- off ----------------------------------------------------------------------------------------------------------------
+def test_off_imports_nothing_of_opentelemetry_and_starts_nothing() -> None:
+    result = run(
+        "import sys, threading, schemas.otel as o\n"
+        "t = o.set_up('robot')\n"
+        "t()\n"
+        "assert not t.on\n"
+        "assert threading.active_count() == 1\n"
+        "print([m for m in sys.modules if m.startswith('opentelemetry')])\n",
+        {},
+    )
+    assert (result.returncode, result.stdout.strip()) == (0, "[]"), result.stderr
+
+
+@needs_sdk
+def test_packages_that_are_missing_are_asked_for() -> None:
+    hidden = (
+        "import sys\n"
+        "class Hidden:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.startswith('{}'): raise ModuleNotFoundError('No module named ' + repr(name))\n"
+        "sys.meta_path.insert(0, Hidden())\n"
+        "import threading, schemas.otel as o\n"
+        "try: o.set_up('robot')\n"
+        "except Exception as e: print(type(e).__name__, e, threading.active_count())\n"
+    )
+    environ = {
+        "OTEL_TRACES_EXPORTER": "otlp",
+        "OTEL_METRICS_EXPORTER": "otlp,prometheus",
+        "OTEL_EXPORTER_PROMETHEUS_PORT": "0",
+    }
+    for package in ("opentelemetry.sdk", "opentelemetry.exporter.otlp", "prometheus_client"):
+        said = run(hidden.format(package), environ).stdout
+        assert "ConfigError" in said, said
+        assert "pip install 'vram-arbiter[telemetry]'" in said
+        assert said.strip().endswith(" 1"), "no thread was left"
+
+
+# -- on -----------------------------------------------------------------------------------------------------------------
+PROGRAM = """
+import sys, schemas.otel as o
+from schemas import telemetry, tracing
+from opentelemetry import metrics
+made_before = metrics.get_meter(telemetry.TRACER).create_counter(telemetry.METRIC_GOALS)
+t = o.set_up('vram-runner', attributes={'robot.model': 'so101'})
+assert t.on and o.set_up('other') is t
+with tracing.span(telemetry.SPAN_GOAL, sys.argv[1] if len(sys.argv) > 1 else None):
+    with tracing.span(telemetry.SPAN_TICK):
+        tracing.event(telemetry.EVENT_ESTOP, who='operator')
+        print(tracing.traceparent())
+        assert tracing.traceparent()[3:-3] == '-'.join(tracing.log_ids().values())
+made_before.add(3, {telemetry.ATTR_OUTCOME: 'succeeded'})
+assert tracing.log_ids() == {}
+"""
+
+
+@needs_sdk
+def test_spans_and_metrics_reach_the_collector_at_the_programs_end() -> None:
+    with Collector() as collector:
+        environ = {
+            "OTEL_EXPORTER_OTLP_ENDPOINT": collector.endpoint,
+            "OTEL_RESOURCE_ATTRIBUTES": "robot.model=so101-b",
+        }
+        result = run(PROGRAM, environ)  # nothing is due before the end: it is the end that sends
+        assert (result.returncode, result.stderr) == (0, "")
+        tick, goal = collector.spans()
+        assert [tick.name, goal.name] == ["rskill.tick", "rskill.goal"]
+        assert (tick.parent_id, goal.parent_id) == (goal.span_id, "")
+        assert result.stdout.startswith(f"00-{tick.trace_id}-{tick.span_id}-")
+        assert [(event.name, event.attributes) for event in tick.events] == [
+            ("vram.event.estop_requested", {"who": "operator"})
+        ]
+        assert {tick.service, goal.service} == {"vram-runner"}
+        (point,) = collector.points("vram.goals")
+        assert (point.value, point.attributes, point.service) == (
+            3,
+            {"outcome": "succeeded"},
+            "vram-runner",
+        )
+
+
+@needs_sdk
+@pytest.mark.parametrize(("flag", "kept"), [("01", 2), ("00", 0)])
+def test_a_trace_that_began_elsewhere_is_kept_if_it_was_kept_there(flag: str, kept: int) -> None:
+    parent = f"00-{'a' * 32}-{'b' * 16}-{flag}"
+    with Collector() as collector:
+        environ = {"OTEL_EXPORTER_OTLP_ENDPOINT": collector.endpoint, "OTEL_TRACES_SAMPLER_ARG": "0"}
+        result = run(f"import sys; sys.argv[1:] = [{parent!r}]\n{PROGRAM}", environ)
+        assert (result.returncode, result.stderr) == (0, "")
+        assert len(collector.spans()) == kept
+        assert {span.trace_id for span in collector.spans()} <= {"a" * 32}
+        assert result.stdout.startswith(f"00-{'a' * 32}-"), "the chain is passed on, kept or not"
+        collector.wait(lambda: bool(collector.points("vram.goals")), "metrics, which are never sampled")
+
+
+@needs_sdk
+def test_prometheus_is_read_on_loopback_and_not_after_the_end() -> None:
+    result = run(
+        "import http.client, schemas.otel as o\n"
+        "from schemas import telemetry as n\n"
+        "t = o.set_up('vram-arbiter', prometheus_port=0)\n"
+        "from opentelemetry import metrics\n"
+        "m = metrics.get_meter(n.TRACER)\n"
+        "m.create_counter(n.METRIC_GRANTS).add(2, {n.ATTR_CONSUMER: 'detector'})\n"
+        "m.create_histogram(n.METRIC_WAIT, unit='s').record(0.3)\n"
+        "c = http.client.HTTPConnection('127.0.0.1', t.prometheus_port, timeout=60)\n"
+        "c.request('GET', '/metrics')\n"
+        "print(c.getresponse().read().decode())\n"
+        "c.close()\n"
+        "t()\n"
+        "try: http.client.HTTPConnection('127.0.0.1', t.prometheus_port, timeout=60).connect()\n"
+        "except ConnectionRefusedError: print('refused')\n",
+        {},
+    )
+    assert (result.returncode, result.stderr) == (0, "")
+    lines = result.stdout.splitlines()
+    assert 'vram_lease_grants_total{vram_consumer="detector"} 2.0' in lines
+    assert 'vram_lease_wait_seconds_bucket{le="0.25"} 0.0' in lines
+    assert 'vram_lease_wait_seconds_bucket{le="0.5"} 1.0' in lines
+    assert any('service_name="vram-arbiter"' in line for line in lines)
+    assert lines[-1] == "refused"
+
+
+@needs_sdk
+def test_a_taken_port_is_named() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError, match=f"no Prometheus endpoint on 127.0.0.1:{port}"):
+            set_up("vram-arbiter", environ={}, prometheus_port=port)
+
+
+@needs_sdk
+def test_a_collector_that_is_away_is_complained_of_once_and_holds_up_no_end() -> None:
+    with socket.socket() as deaf:  # takes connections and never answers
+        deaf.bind(("127.0.0.1", 0))
+        deaf.listen()
+        result = run(
+            "import logging; logging.basicConfig(format='%(message)s')\n"
+            "import time, schemas.otel as o\n"
+            "from schemas import tracing\n"
+            "t = o.set_up('robot')\n"
+            "from opentelemetry import trace\n"
+            "for n in range(3):\n"
+            "    with tracing.span('rskill.tick'): pass\n"
+            "    trace.get_tracer_provider().force_flush()\n"
+            "t(1.0)\n"
+            "import threading; print([x.name for x in threading.enumerate() if not x.daemon])\n",
+            {
+                "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT": f"http://127.0.0.1:{deaf.getsockname()[1]}",
+                "OTEL_EXPORTER_OTLP_TIMEOUT": "0.2",
+            },
+        )
+    assert result.returncode == 0
+    assert result.stdout.strip() == "['MainThread']", "nothing is left that an interpreter would wait for"
+    assert result.stderr.count("Failed to export") == 1, result.stderr
+
+
+def test_ending_waits_for_nobody_longer_than_it_was_told() -> None:
+    never = threading.Event()
+    said: list[str] = []
+    ends = Telemetry([lambda: never.wait(), lambda: said.append("flushed")])
+    ends(0.5)
+    ends(0.5)  # again is nothing
+    assert said == ["flushed"]
+    never.set()
