@@ -275,6 +275,7 @@ def summary(result: RunResult, runner: HardwareRunner, success: bool | None, rob
     """The run as one line of JSON."""
     facts = {
         "robot": robot_id,
+        "robot_model": runner.hal.description.name,
         "estop": runner.estop.message if runner.estop else None,
         "violations": list(runner.violations)[-8:],
     }

@@ -37,6 +37,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     sim.add_argument("--seed", type=int, default=0, help="decides everything about the episode")
     sim.add_argument("--video", type=Path, help="write the episode as H.264 video to this file")
     sim.add_argument(
+        "--timings",
+        type=Path,
+        help="write when each tick began and how long it took, a JSON line each, at the end",
+    )
+    sim.add_argument(
         "--rate", type=not_negative, default=30.0, help="ticks per second; 0: as fast as possible"
     )
     sim.add_argument("--deadline-policy", choices=("warn", "drop", "raise"), default="warn")
@@ -111,6 +116,7 @@ async def run(args: argparse.Namespace) -> int:
             video_camera=VIDEO_CAMERA,
             video_every=VIDEO_EVERY,
         )
+        runner.identity = {"robot": "so101-mobile", "scene": str(args.scene or "built-in")}
         control = await stack.enter_async_context(ControlThread(runner))
         await asyncio.to_thread(warm_up)
         await control.call(lambda: None)  # the scene stands and the cameras have rendered: ready means ready
@@ -125,7 +131,7 @@ async def run(args: argparse.Namespace) -> int:
                 runner, "recorder", recorder
             ),  # not before: a second runner must not touch the first's video
             identity={
-                "robot": "so101-mobile",
+                **runner.identity,
                 "simulated": True,
                 "seed": args.seed,
                 "arbiter": arbiter is not None,
@@ -139,4 +145,7 @@ async def run(args: argparse.Namespace) -> int:
             log.info("ending after %.0f s, as asked", args.max_seconds)
     result = runner.result()
     log.info("%d ticks, %d late, p99 %.1f ms", result.n_ticks, result.budget_violations, result.p99_tick_ms)
+    print(result.model_dump_json())
+    if args.timings is not None:
+        runner.timings.write(args.timings)
     return 1 if control.ended.exception() is not None else 0

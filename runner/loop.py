@@ -14,16 +14,16 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from runner.clock import Clock, SystemClock
 from runner.protocols import DeadlineMissed, DeadlinePolicy
+from runner.timings import Timings, mean, percentile
 from schemas import telemetry, tracing
 from schemas.world import Action, RunResult, TickResult
 
-TIMINGS_KEPT = 36_000  # twenty minutes at 30 Hz; older timings leave the percentiles, never the counts
+_SHARES = {"p50": 0.5, "p99": 0.99, "max": 1.0}
 
 
 @dataclass(slots=True)
@@ -52,17 +52,6 @@ class Applied:
     truncated: bool | None = None
 
 
-def percentile(values: Sequence[float], share: float) -> float:
-    """Percentile by linear interpolation between the two nearest ranks; 0.0 for no values. `share` runs from 0 to 1."""
-    if not values:
-        return 0.0
-    ordered = sorted(values)
-    rank = share * (len(ordered) - 1)
-    low = math.floor(rank)
-    high = min(low + 1, len(ordered) - 1)
-    return ordered[low] + (ordered[high] - ordered[low]) * (rank - low)
-
-
 class RunnerBase(ABC):
     """`rate_hz` 0 runs as fast as it can, without deadlines. Raises DeadlineMissed from `tick` and `run` under RAISE."""
 
@@ -80,10 +69,11 @@ class RunnerBase(ABC):
         self.clock: Clock = clock or SystemClock()
         self.tick_idx = 0
         self.deadline_misses = 0
+        self.late_actions_withheld = 0
         self.traceparent: str | None = None  # of the goal that the ticks are for; they join its trace
         self._due_s: float | None = None  # when the present tick should have begun
-        self._tick_ms: deque[float] = deque(maxlen=TIMINGS_KEPT)
-        self._inference_ms: deque[float] = deque(maxlen=TIMINGS_KEPT)
+        self.timings = Timings()
+        self.identity: dict[str, Any] = {}  # what it is that runs: robot, scene, seed; goes into the result
         self._trace_id: str | None = None
 
     # -- what a subclass provides --
@@ -125,11 +115,13 @@ class RunnerBase(ABC):
     def _tick(self, trace_context: dict[str, str] | None) -> TickResult:
         started_s = self.clock.now_s()
         due_s = started_s if self._due_s is None else self._due_s
+        late_ms = max(0.0, started_s - due_s) * 1e3
         deadline_s = math.inf if self.period_s is None else due_s + self.period_s
         decision = self._decide(self.tick_idx)  # 1
         withheld = self.clock.now_s() > deadline_s and self.deadline_policy is not DeadlinePolicy.WARN  # 2
-        if withheld and not decision.reset:
+        if withheld and decision.action is not None:
             decision.action = None
+            self.late_actions_withheld += 1
         apply_s = self.clock.now_s()
         with tracing.span(telemetry.SPAN_SEND):
             applied = self._apply(decision)  # 3
@@ -139,6 +131,7 @@ class RunnerBase(ABC):
             stamp_ns=self.clock.now_ns(),
             tick_idx=self.tick_idx,
             tick_ms=(ended_s - started_s) * 1e3,
+            late_ms=late_ms,
             sensors_ms=decision.sensors_ms,
             world_state_ms=decision.world_state_ms,
             inference_ms=decision.inference_ms,
@@ -156,9 +149,7 @@ class RunnerBase(ABC):
             trace_context=trace_context,
         )
         self.tick_idx += 1
-        self._tick_ms.append(result.tick_ms)
-        if not decision.reset:
-            self._inference_ms.append(result.inference_ms)
+        self.timings.add(started_s, late_ms, result.tick_ms, result.inference_ms, reset=decision.reset)
         if missed:  # 4
             self.deadline_misses += 1
             tracing.event(telemetry.EVENT_DEADLINE_MISSED, tick_ms=result.tick_ms)
@@ -193,14 +184,27 @@ class RunnerBase(ABC):
 
     def result(self) -> RunResult:
         """The run so far."""
-        ticks, inferences = list(self._tick_ms), list(self._inference_ms)
+        tick_ms, inference_ms = self.timings.tick_ms, self.timings.inference_ms
         return RunResult(
             n_ticks=self.tick_idx,
             success=self._success(),
             budget_violations=self.deadline_misses,
-            avg_inference_ms=sum(inferences) / len(inferences) if inferences else 0.0,
-            p99_inference_ms=percentile(inferences, 0.99),
-            avg_tick_ms=sum(ticks) / len(ticks) if ticks else 0.0,
-            p99_tick_ms=percentile(ticks, 0.99),
+            avg_inference_ms=mean(inference_ms),
+            p99_inference_ms=percentile(inference_ms, 0.99),
+            avg_tick_ms=mean(tick_ms),
+            p99_tick_ms=percentile(tick_ms, 0.99),
             trace_id=self._trace_id,
+            metadata=self._metadata(),
         )
+
+    def _metadata(self) -> dict[str, Any]:
+        """What else there is to say of the run; subclasses add what they know."""
+        late_ms = self.timings.late_ms
+        return {
+            **self.identity,
+            "rate_hz": self.rate_hz,
+            "deadline_policy": self.deadline_policy.value,
+            "deadline_misses": self.deadline_misses,
+            "late_actions_withheld": self.late_actions_withheld,
+            "start_late_ms": {name: percentile(late_ms, share) for name, share in _SHARES.items()},
+        }

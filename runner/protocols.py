@@ -73,11 +73,15 @@ class Goal:
 
 @dataclass(frozen=True, slots=True)
 class Act:
-    """Apply this one-step action now."""
+    """Apply this one-step action now.
+
+    `prefetched` comes with the first action of a chunk: whether the chunk was there when it was due. None says nothing about that.
+    """
 
     action: Action
     chunk_index: int | None = None
     inference_ms: float = 0.0
+    prefetched: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)

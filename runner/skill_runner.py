@@ -11,7 +11,8 @@ import logging
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 from runner.clock import Clock
 from runner.control import Mailbox
@@ -28,14 +29,40 @@ WITHHELD_IN_A_ROW_MAX = 15  # half a second of refused actions: the policy is lo
 
 
 @dataclass(slots=True)
+class Tally:
+    """What became of a goal's actions, or of a whole run's."""
+
+    withheld: int = 0
+    clamped: int = 0
+    prefetch_hits: int = 0
+    prefetch_misses: int = 0
+
+    def count_chunk(self, in_time: bool) -> None:
+        if in_time:
+            self.prefetch_hits += 1
+        else:
+            self.prefetch_misses += 1
+
+    def as_data(self) -> dict[str, Any]:
+        """For people and programs; chunks only where some followed another."""
+        data: dict[str, Any] = {"withheld": self.withheld, "clamped": self.clamped}
+        if chunks := self.prefetch_hits + self.prefetch_misses:
+            data["prefetch"] = {
+                "hits": self.prefetch_hits,
+                "misses": self.prefetch_misses,
+                "hit_rate": self.prefetch_hits / chunks,
+            }
+        return data
+
+
+@dataclass(slots=True)
 class Active:
     skill: Skill
     goal: Goal
     on_end: Callable[[SkillEnded], None]
     began_tick: int
-    withheld: int = 0
     withheld_in_a_row: int = 0
-    clamped: int = 0
+    tally: Tally = field(default_factory=Tally)
     detail: str = ""
 
 
@@ -53,6 +80,8 @@ class SkillRunner(RunnerBase):
         self._mailbox = Mailbox()
         self._active: Active | None = None
         self._stopping = False
+        self._total = Tally()
+        self._skills: dict[str, int] = {}  # goals by skill
         self.world: WorldState | None = None  # the newest; replaced, never changed
         self.violations: deque[str] = deque(maxlen=VIOLATIONS_KEPT)
         self.progress = Progress(0.0, "idle")  # replaced whole: the event loop may read it any time
@@ -89,6 +118,9 @@ class SkillRunner(RunnerBase):
     def _finished(self) -> bool:
         return self._stopping
 
+    def _metadata(self) -> dict[str, Any]:
+        return {**super()._metadata(), **self._total.as_data(), "goals_by_skill": dict(self._skills)}
+
     # -- the skill that has the arm --------------------------------------------------------------------------------------
     def begin_skill(self, skill: Skill, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
         """Control thread. Raises InternalError when another skill has the arm, EstopRequested when the stop is latched."""
@@ -97,6 +129,8 @@ class SkillRunner(RunnerBase):
         if self._active is not None:
             raise InternalError("another skill has the arm")
         self._active = Active(skill, goal, on_end, self.tick_idx)
+        key = str(skill.key)
+        self._skills[key] = self._skills.get(key, 0) + 1
         self.traceparent = goal.traceparent
         self.progress = Progress(0.0, "running")
 
@@ -112,12 +146,8 @@ class SkillRunner(RunnerBase):
         self._active = None
         self.traceparent = None
         self.progress = Progress(1.0 if ended.error is None else self.progress.fraction, "ended")
-        ticks = {
-            "ticks": self.tick_idx - active.began_tick,
-            "withheld": active.withheld,
-            "clamped": active.clamped,
-        }
-        active.on_end(SkillEnded({**ticks, **ended.data}, ended.error))
+        data = {"ticks": self.tick_idx - active.began_tick, **active.tally.as_data(), **ended.data}
+        active.on_end(SkillEnded(data, ended.error))
 
     # -- one tick ------------------------------------------------------------------------------------------------------
     def _ask_skill(self, active: Active, world: WorldState, decision: Decision) -> None:
@@ -143,8 +173,10 @@ class SkillRunner(RunnerBase):
             return
         decision.inference_ms = (self.clock.now_s() - asked_s) * 1e3
         match outcome:
-            case Act(action=action, chunk_index=chunk_index):
+            case Act(action=action, chunk_index=chunk_index, prefetched=prefetched):
                 decision.chunk_index = chunk_index
+                if prefetched is not None:
+                    self._count_chunk(active, prefetched)
                 self._check(active, action, world, decision)
             case Hold(reason=reason):
                 active.detail = reason
@@ -159,6 +191,11 @@ class SkillRunner(RunnerBase):
                 active.detail,
             )
 
+    def _count_chunk(self, active: Active, in_time: bool) -> None:
+        tracing.event(telemetry.EVENT_PREFETCH_HIT if in_time else telemetry.EVENT_PREFETCH_MISS)
+        active.tally.count_chunk(in_time)
+        self._total.count_chunk(in_time)
+
     def _check(self, active: Active, action: Action, world: WorldState, decision: Decision) -> None:
         checked_s = self.clock.now_s()
         with tracing.span(telemetry.SPAN_SAFETY):
@@ -169,7 +206,8 @@ class SkillRunner(RunnerBase):
         self.violations.extend(problems)
         if allowed is not None:
             active.withheld_in_a_row = 0
-            active.clamped += bool(problems)
+            active.tally.clamped += bool(problems)
+            self._total.clamped += bool(problems)
             active.detail = ""
             return
         self._withheld(active, problems[0])
@@ -188,5 +226,6 @@ class SkillRunner(RunnerBase):
     def _withheld(self, active: Active, reason: str) -> None:
         """Note that nothing reaches the motors in this tick, and why."""
         tracing.event(telemetry.EVENT_ACTION_WITHHELD, reason=reason)
-        active.withheld += 1
+        active.tally.withheld += 1
+        self._total.withheld += 1
         active.detail = f"withheld: {reason}"

@@ -330,6 +330,7 @@ class TickResult(_Frozen):
     stamp_ns: Nanoseconds
     tick_idx: Annotated[int, Field(ge=0)]
     tick_ms: Milliseconds
+    late_ms: Milliseconds = 0.0  # behind its slot when it began
     sensors_ms: Milliseconds = 0.0
     world_state_ms: Milliseconds = 0.0
     inference_ms: Milliseconds = 0.0

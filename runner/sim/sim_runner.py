@@ -154,6 +154,10 @@ class SimRunner(SkillRunner):
         judged = [episode.success for episode in self.episodes if episode.success is not None]
         return all(judged) if judged else None
 
+    def _metadata(self) -> dict[str, Any]:
+        finished = len(self.episodes)
+        return {**super()._metadata(), "seed": self._seed, "episodes": finished}
+
     def _decide(self, tick_idx: int) -> Decision:
         """1. reset tick? 2. posted work 3. cameras 4. world state 5. the skill 6. safety."""
         if self._reset_due:  # 1

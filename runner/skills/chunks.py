@@ -3,6 +3,8 @@
 The owner is the control thread: it alone pops rows and asks for the next chunk. A chunk is fetched elsewhere (`fetch` returns a
 future at once). With `prefetch_at` 0 the next observation is taken when the last row was played; with n > 0 it is taken when n
 rows are left, and the new chunk plays after them. Any chunk size works with any `prefetch_at`.
+
+A chunk after the first is a *hit* when it was there as its first row was due, a *miss* when the robot (or the simulated world) waited.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 import concurrent.futures
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from schemas.errors import ModelError
@@ -17,6 +20,16 @@ from schemas.errors import ModelError
 Row = tuple[float, ...]
 Rows = Sequence[Row]
 CHUNK_ROWS_MAX = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """A row to play now, of which chunk. `prefetched`: with the first row of a chunk, whether it came in time; None with any other row,
+    and with the very first chunk, before which there was nothing to play."""
+
+    chunk: int
+    row: Row
+    prefetched: bool | None = None
 
 
 class ChunkPlayer:
@@ -36,6 +49,8 @@ class ChunkPlayer:
         self._wait_s = wait_s
         self._rows: deque[tuple[int, Row]] = deque()
         self._under_way: concurrent.futures.Future[Rows] | None = None
+        self._late = False  # the chunk that is awaited was due and not there
+        self._begun = -1  # the newest chunk of which a row was played
         self.chunks = 0
         self.played = 0
 
@@ -43,37 +58,40 @@ class ChunkPlayer:
         """Whether the next `next_row` will ask for a chunk and so needs an observation."""
         return self._under_way is None and len(self._rows) <= self._prefetch_at
 
-    def next_row(self, observation: Any) -> tuple[int, Row] | None:
-        """(index of the chunk, row) to play now, or None while the next chunk is awaited. Raises what the fetch raised."""
+    def next_row(self, observation: Any) -> Played | None:
+        """What to play now, or None while the next chunk is awaited. Raises what the fetch raised."""
         if self.wants_observation():
             if observation is None:
                 raise ModelError(
                     "no observation for the next chunk", hint="the world state came without frames"
                 )
             self._under_way = self._fetch(observation)
-        if not self._rows:
-            self._collect(self._wait_s)
-        elif self._under_way is not None and self._under_way.done():
-            self._collect(0.0)
+        if (future := self._under_way) is not None:
+            if not self._rows and not future.done():
+                self._late = True
+                concurrent.futures.wait([future], self._wait_s)
+            if future.done():
+                self._under_way = None
+                self._collect(future)
         if not self._rows:
             return None
         self.played += 1
-        return self._rows.popleft()
+        chunk, row = self._rows.popleft()
+        return Played(chunk, row, self._in_time(chunk))
 
-    def _collect(self, wait_s: float) -> None:
-        if (future := self._under_way) is None:
-            return
+    def _in_time(self, chunk: int) -> bool | None:
+        if chunk == self._begun:
+            return None
+        late, self._late, self._begun = self._late, False, chunk
+        return None if chunk == 0 else not late
+
+    def _collect(self, future: concurrent.futures.Future[Rows]) -> None:
+        """Take the rows of an answered request. Raises what it failed with."""
+        self._late = self._late or (not self._rows and (future.cancelled() or future.exception() is not None))
         try:
-            rows = future.result(timeout=wait_s)
-        except concurrent.futures.TimeoutError:
-            if future.done():  # the fetch itself timed out: that is an answer
-                self._under_way = None
-                raise ModelError("the policy gave no chunk in time") from None
-            return
-        except BaseException:
-            self._under_way = None
-            raise
-        self._under_way = None
+            rows = future.result()
+        except (TimeoutError, concurrent.futures.CancelledError) as error:
+            raise ModelError("the policy gave no chunk in time") from error
         if not 0 < len(rows) <= CHUNK_ROWS_MAX:
             raise ModelError(f"a chunk of {len(rows)} actions; 1 to {CHUNK_ROWS_MAX} are accepted")
         self._rows.extend((self.chunks, row) for row in rows)

@@ -256,13 +256,13 @@ class SidecarPolicy(SkillBase):
         if player.played >= self._steps or self._stands_still(player):
             return Done({"steps": player.played, "chunks": player.chunks})
         observation = self._observation(world, measured) if player.wants_observation() else None
-        popped = player.next_row(observation)
-        if popped is None:
+        played = player.next_row(observation)
+        if played is None:
             return Hold("the policy thinks")
-        chunk, row = popped
-        self._recent.append(row)
+        self._recent.append(played.row)
         self.fraction = player.played / self._steps
-        return Act(self._action(self._step_towards(row, measured), world), chunk_index=chunk)
+        action = self._action(self._step_towards(played.row, measured), world)
+        return Act(action, chunk_index=played.chunk, prefetched=played.prefetched)
 
     def _at_start(self, measured: Mapping[str, float]) -> bool:
         """Whether the arm is at the start pose; sets the next target when not."""

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from runner.skills.chunks import ChunkPlayer
+from runner.skills.chunks import ChunkPlayer, Played
 from schemas.errors import Evicted, ModelError
 
 Row = tuple[float, ...]
@@ -42,8 +42,8 @@ def test_every_row_is_played_once_and_in_order(size: int, prefetch_at: int, dela
     for step in range(400):
         row = player.next_row(step)
         if row is not None:
-            played.append(row[1])
-            assert row[0] == int(row[1][0])
+            played.append(row.row)
+            assert row.chunk == int(row.row[0])
         if policy.futures and not policy.futures[-1].done():
             waited += 1
             if waited > delay:
@@ -62,7 +62,7 @@ def test_without_prefetch_the_observation_is_taken_after_the_last_row() -> None:
     assert player.next_row("o0") is None
     assert not player.wants_observation()
     policy.answer()
-    assert [player.next_row(None) for _ in range(3)] == [(0, (0.0, float(i))) for i in range(3)]
+    assert [player.next_row(None) for _ in range(3)] == [Played(0, (0.0, float(i))) for i in range(3)]
     assert player.wants_observation()
     assert player.next_row("o3") is None
     assert policy.asked == ["o0", "o3"]
@@ -79,7 +79,7 @@ def test_a_chunk_that_is_there_is_played_at_once_when_waiting_is_allowed() -> No
         future.set_result([(1.0,)])
         return future
 
-    assert ChunkPlayer(fetch, wait_s=1.0).next_row("o") == (0, (1.0,))
+    assert ChunkPlayer(fetch, wait_s=1.0).next_row("o") == Played(0, (1.0,))
 
 
 @pytest.mark.parametrize("error", [Evicted("gone"), ModelError("no")])
@@ -111,3 +111,49 @@ def test_closing_forgets_what_is_under_way() -> None:
     player.next_row(None)
     player.close()
     assert player.wants_observation()
+
+
+def test_a_chunk_that_is_there_when_it_is_due_is_a_hit_and_a_late_one_a_miss() -> None:
+    policy = Policy(2)
+    player = ChunkPlayer(policy.fetch, prefetch_at=1)
+    told: list[bool | None] = []
+
+    def play(rows: int) -> None:
+        for _ in range(rows):
+            row = player.next_row("o")
+            assert row is not None
+            told.append(row.prefetched)
+
+    assert player.next_row("o") is None
+    policy.answer()
+    play(2)  # the second row asks for the next chunk
+    policy.answer()
+    play(2)
+    assert player.next_row("o") is None
+    policy.answer()
+    play(2)
+    assert told == [None, None, True, None, False, None]
+
+
+def test_an_answer_that_comes_while_it_is_waited_for_is_played_at_once() -> None:
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+
+        def fetch(observation: Any) -> Any:
+            return pool.submit(lambda: [(float(observation),)])
+
+        player = ChunkPlayer(fetch, wait_s=60.0)
+        rows = [player.next_row(n) for n in range(20)]
+    assert [row.row for row in rows if row is not None] == [(float(n),) for n in range(20)]
+
+
+def test_a_request_that_was_cancelled_or_timed_out_is_a_typed_error() -> None:
+    policy = Policy(1)
+    player = ChunkPlayer(policy.fetch)
+    player.next_row("o")
+    policy.futures[-1].set_exception(TimeoutError())
+    with pytest.raises(ModelError, match="in time"):
+        player.next_row(None)
+    player.next_row("o")
+    policy.futures[-1].cancel()
+    with pytest.raises(ModelError, match="in time"):
+        player.next_row(None)

@@ -1,12 +1,15 @@
 """The base loop on a clock that moves only when told: rates, deadline policies, resynchronisation, figures."""
 
+import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from runner.loop import Applied, Decision, RunnerBase, percentile
+from runner.loop import Applied, Decision, RunnerBase
 from runner.protocols import DeadlineMissed, DeadlinePolicy, InferenceRunner
+from runner.timings import Timings, percentile
 from schemas.control import ControlMode
 from schemas.world import Action
 
@@ -69,6 +72,7 @@ def test_drop_really_withholds_a_late_action(clock: Any) -> None:
     runner = Scripted(clock, [0.25, 0.0], rate_hz=10, deadline_policy=DeadlinePolicy.DROP)
     assert runner.run(max_ticks=2).budget_violations == 1
     assert runner.applied == [None, ACTION]
+    assert runner.result().metadata["late_actions_withheld"] == 1
 
 
 def test_drop_keeps_an_action_that_was_decided_in_time(clock: Any) -> None:
@@ -136,3 +140,34 @@ def test_ticks_carry_the_callers_trace(clock: Any) -> None:
 
 def test_make_runner_is_a_real_runner(make_runner: Callable[..., Any]) -> None:
     assert isinstance(make_runner(), InferenceRunner)
+
+
+class Oversleeper:
+    """A manual clock on a busy machine: its sleeps end late, by so much each."""
+
+    def __init__(self, clock: Any, late_s: list[float]) -> None:
+        self._clock, self._late_s = clock, list(late_s)
+        self.now_s, self.now_ns, self.wall_ns = clock.now_s, clock.now_ns, clock.wall_ns
+
+    def sleep_s(self, duration_s: float) -> None:
+        self._clock.sleep_s(duration_s + self._late_s.pop(0))
+
+
+def test_how_far_behind_its_slot_a_tick_began_is_kept(clock: Any, tmp_path: Path) -> None:
+    runner = Scripted(clock, [0.01, 0.02], rate_hz=10)
+    runner.clock = Oversleeper(clock, [0.003, 0.0, 0.0])
+    result = runner.run(max_ticks=3)
+    assert runner.timings.late_ms == pytest.approx([0.0, 3.0, 0.0])
+    assert result.metadata["start_late_ms"] == pytest.approx({"p50": 0.0, "p99": 2.94, "max": 3.0})
+    runner.timings.write(tmp_path / "ticks.jsonl")
+    lines = [json.loads(line) for line in (tmp_path / "ticks.jsonl").read_text().splitlines()]
+    assert [line["started_s"] for line in lines] == pytest.approx([100.0, 100.103, 100.2])
+    assert [line["tick_ms"] for line in lines] == pytest.approx([10.0, 20.0, 0.0])
+    assert [line["reset"] for line in lines] == [False] * 3
+
+
+def test_only_so_many_timings_are_kept() -> None:
+    timings = Timings(kept=2)
+    for n in range(4):
+        timings.add(float(n), 0.0, float(n), 0.0, reset=False)
+    assert timings.tick_ms == [2.0, 3.0]

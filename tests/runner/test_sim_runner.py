@@ -218,6 +218,33 @@ def test_the_ticks_of_a_goal_join_its_trace(make_runner: Make) -> None:
     assert ticks[0].trace_context["traceparent"].split("-")[1] == parent.split("-")[1]
 
 
+def test_goals_and_runs_say_what_became_of_chunks_and_actions(make_runner: Make) -> None:
+    runner = make_runner(rate_hz=0, seed=3)
+    runner.identity = {"robot": "arm", "scene": "table"}
+    script = [
+        Act(joints(0.1), chunk_index=0),
+        Act(joints(9.0), chunk_index=1, prefetched=True),
+        Act(joints(2.1), chunk_index=1),
+        Act(joints(0.1), chunk_index=2, prefetched=False),
+        Act(joints(0.1), chunk_index=3, prefetched=True),
+        Evicted("gone"),
+    ]
+    _, ended = play(runner, script, 6)
+    counts = {"withheld": 1, "clamped": 1, "prefetch": {"hits": 2, "misses": 1, "hit_rate": 2 / 3}}
+    assert ended[0].data == {"ticks": 5, **counts}
+    metadata = runner.result().metadata
+    assert metadata.items() >= {**counts, "robot": "arm", "scene": "table", "seed": 3}.items()
+    assert metadata["goals_by_skill"] == {"test/skill": 1}
+    assert (metadata["rate_hz"], metadata["deadline_policy"], metadata["deadline_misses"]) == (0, "warn", 0)
+
+
+def test_a_skill_without_chunks_says_nothing_of_them(make_runner: Make) -> None:
+    runner = make_runner(rate_hz=0)
+    _, ended = play(runner, [Act(joints(0.1))], 2)
+    assert "prefetch" not in ended[0].data
+    assert "prefetch" not in runner.result().metadata
+
+
 # -- pictures -------------------------------------------------------------------------------------------------------
 @pytest.mark.heavy
 def test_frames_are_rendered_on_demand_and_reused_while_young(

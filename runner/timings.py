@@ -1,0 +1,71 @@
+"""When the ticks of a run began, how far behind their slots, and how long they took: the newest of them, for figures and for a file.
+
+Plain numbers, no objects that the garbage collector would have to walk. Written by the control thread, read by any.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+TIMINGS_KEPT = 36_000  # twenty minutes at 30 Hz; older timings leave the percentiles, never the counts
+
+
+def percentile(values: Sequence[float], share: float) -> float:
+    """Percentile by linear interpolation between the two nearest ranks; 0.0 for no values. `share` runs from 0 to 1."""
+    if not values:
+        return 0.0
+    ordered = sorted(values)
+    rank = share * (len(ordered) - 1)
+    low = math.floor(rank)
+    high = min(low + 1, len(ordered) - 1)
+    return ordered[low] + (ordered[high] - ordered[low]) * (rank - low)
+
+
+def mean(values: Sequence[float]) -> float:
+    """0.0 for no values."""
+    return sum(values) / len(values) if values else 0.0
+
+
+class Timings:
+    """The last `kept` ticks. A reset tick builds a scene: it says nothing of how a skill fares, or of the rate."""
+
+    def __init__(self, kept: int = TIMINGS_KEPT) -> None:
+        self._rows: deque[tuple[float, ...]] = deque(maxlen=kept)
+
+    def add(
+        self, started_s: float, late_ms: float, tick_ms: float, inference_ms: float, *, reset: bool
+    ) -> None:
+        """One tick: monotonic start, how far behind its slot that was, how long it took, and its skill in it."""
+        self._rows.append((started_s, late_ms, tick_ms, inference_ms, float(reset)))
+
+    @property
+    def tick_ms(self) -> list[float]:
+        """Of all ticks."""
+        return [row[2] for row in self._snapshot()]
+
+    @property
+    def inference_ms(self) -> list[float]:
+        """Of all ticks that may have asked a skill."""
+        return [row[3] for row in self._snapshot() if not row[4]]
+
+    @property
+    def late_ms(self) -> list[float]:
+        """How far behind its slot each tick began."""
+        return [row[1] for row in self._snapshot() if not row[4]]
+
+    def write(self, path: Path) -> None:
+        """One JSON line a tick. Raises OSError."""
+        names = ("started_s", "late_ms", "tick_ms", "inference_ms")
+        with path.open("w") as file:
+            file.writelines(
+                json.dumps(dict(zip(names, row, strict=False)) | {"reset": bool(row[4])}) + "\n"
+                for row in self._snapshot()
+            )
+
+    def _snapshot(self) -> Iterable[tuple[float, ...]]:
+        """A copy at once, in one step of the interpreter: the control thread goes on adding."""
+        return self._rows.copy()
