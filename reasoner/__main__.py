@@ -27,6 +27,7 @@ from reasoner.playbooks import Playbook, load_playbook
 from reasoner.server import OperatorServer, send
 from reasoner.tools import Tools
 from reasoner.watch import watch
+from schemas.body import read_body
 from schemas.endpoints import program_endpoint
 from schemas.errors import ConfigError, ReasonerUnreachable, RunnerUnreachable, SidecarUnavailable, VramError
 from schemas.manifest import RSkillManifest
@@ -136,9 +137,8 @@ async def _run(arguments: argparse.Namespace) -> Result:
             vlm = await stack.enter_async_context(SceneVlmClient(_endpoint(arguments.scene_vlm, "scene-vlm")))
         named = {"detector": detector, "scene-vlm": vlm}
         components = {name: client for name, client in named.items() if client is not None}
-        manifests = [
-            RSkillManifest.model_validate(manifest) for manifest in (await runner.skills())["skills"]
-        ]
+        installed = await runner.skills()
+        manifests = [RSkillManifest.model_validate(manifest) for manifest in installed["skills"]]
         palette = palette_of(
             manifests,
             can_locate=detector is not None,
@@ -146,6 +146,7 @@ async def _run(arguments: argparse.Namespace) -> Result:
             allow_noncommercial=arguments.allow_noncommercial,
             managed=[name for name in arguments.manage if name in components],
             topics=[OPERATOR],
+            body=read_body(installed.get("body")),
         )
         if playbook is not None:
             palette = playbook.narrow(palette)

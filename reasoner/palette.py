@@ -1,8 +1,9 @@
 """Which tools and skills a planner may use: a skill is executable only if its *kind* is on the allow-list.
 
 A detector, a scene VLM or a reward model can never be executed as an action, whatever its role says: they are reached through
-`locate_in_view` and `query_scene`, and only if those are provided. A playbook is read, not executed. What is offered and what is
-accepted come from the same fields; `check` is asked again for each call, whoever made it.
+`locate_in_view`, `query_scene` and `query_task_progress`, and only if those are provided. A playbook is read, not executed. A model that was made
+for another robot, or that needs what this one lacks, is listed and refused with the reason. What is offered and what is accepted come from
+the same fields; `check` is asked again for each call, whoever made it.
 """
 
 import dataclasses
@@ -11,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from reasoner.params import misfits
+from schemas.body import NOBODY, Body
 from schemas.errors import BadRequest, CallerError, NotPermitted, UnknownSkill
 from schemas.manifest import RSkillManifest
 from schemas.tools import (
@@ -222,8 +224,10 @@ def palette_of(
     allow_noncommercial: bool = False,
     managed: Iterable[str] = (),
     topics: Iterable[str] = (),
+    body: Body = NOBODY,
 ) -> Palette:
-    """Palette of installed manifests. Templates and, unless allowed, skills whose licence forbids commercial use are listed but barred."""
+    """Palette of installed manifests. Templates, models that do not fit the robot's `body` and, unless allowed, those whose licence forbids
+    commercial use are listed but barred. A robot that does not say what it is gets what is made for any."""
     skills = tuple(
         Skill(
             manifest.name,
@@ -231,7 +235,7 @@ def palette_of(
             manifest.description.strip(),
             tuple(str(action) for action in manifest.actions),
             manifest.goal_params_schema,
-            _barred(manifest, allow_noncommercial),
+            _barred(manifest, allow_noncommercial) or body.misfit(manifest),
         )
         for manifest in manifests
     )

@@ -10,10 +10,24 @@ from pathlib import Path
 from typing import Any
 
 from runner.protocols import Skill, SkillKey
+from schemas.body import Body
 from schemas.errors import ManifestInvalid, UnknownSkill
 from schemas.manifest import Kind, ManifestError, RSkillManifest, load_manifest
 
 EXECUTABLE = frozenset({Kind.VLA, Kind.ROS_ACTION, Kind.ROS_SERVICE})
+NOT_EXECUTED = {
+    Kind.DETECTOR: "it is asked for things in a picture, by whoever plans",
+    Kind.SEGMENTER: "it is asked about a picture, and nothing here serves it",
+    Kind.VLM: "it is asked about a picture, by whoever plans",
+    Kind.REWARD: "it judges progress and moves nothing",
+    Kind.PLAYBOOK: "it is a text for whoever plans",
+    Kind.WAM: "nothing here runs world action models",
+}
+UNMADE = {
+    Kind.VLA: "nothing here makes learnt policies",
+    Kind.ROS_ACTION: "this runner has no ROS 2 action client and no stand-in for this one",
+    Kind.ROS_SERVICE: "this runner has no ROS 2 service client",
+}
 MOTION_S = 45.0  # of a goal when neither it nor its manifest says how long
 START_S = 90.0  # for what comes before the motion: others finish and leave, a model loads, the arm goes to its start
 FILE_NAME = "rskill.yaml"
@@ -44,7 +58,7 @@ def read_manifests(paths: Iterable[Path]) -> list[RSkillManifest]:
 
 class Catalogue:
     """`makers` says how a skill of a kind is made; kinds without a maker are listed but not executed. `refused` names what is installed
-    but not offered here, and why."""
+    but not offered here, and why. `body` is the robot: skills that are made for others are listed and refused, whoever asks; None: any fits."""
 
     def __init__(
         self,
@@ -52,10 +66,16 @@ class Catalogue:
         makers: Mapping[Kind, Maker],
         *,
         refused: Mapping[str, str] | None = None,
+        body: Body | None = None,
     ) -> None:
         self._manifests = {manifest.name: manifest for manifest in manifests}
         self._refused = dict(refused or {})
         self._makers = {kind: maker for kind, maker in makers.items() if kind in EXECUTABLE}
+        self._body = body
+        if body is not None:
+            for manifest in self._manifests.values():
+                if manifest.kind in EXECUTABLE and (why := body.misfit(manifest)):
+                    self._refused.setdefault(manifest.name, why)
 
     def find(
         self, rskill_id: str, revision: str = ""
@@ -72,7 +92,7 @@ class Catalogue:
         maker = self._makers.get(manifest.kind)
         if maker is None:
             raise UnknownSkill(
-                f"{rskill_id} is a {manifest.kind} and cannot be executed",
+                f"{rskill_id} is a {manifest.kind} and cannot be executed: {_why_not(manifest.kind)}",
                 hint=f"choose from {', '.join(runnable)}",
             )
         if revision not in ("", manifest.version):
@@ -85,16 +105,34 @@ class Catalogue:
 
     def executable(self) -> list[RSkillManifest]:
         """What a goal may ask for."""
-        return [manifest for manifest in self._manifests.values() if manifest.kind in self._makers]
+        return [
+            manifest
+            for manifest in self._manifests.values()
+            if manifest.kind in self._makers and manifest.name not in self._refused
+        ]
 
     def summary(self) -> list[str]:
         """A line a skill, for people: name, version, licence, and whether a goal may execute it."""
         lines = []
         for manifest in self._manifests.values():
-            kind = "" if manifest.kind in self._makers else f", a {manifest.kind}: listed, not executed"
+            if manifest.name in self._refused:
+                continue
+            kind = (
+                ""
+                if manifest.kind in self._makers
+                else f", a {manifest.kind}: listed, not executed: {_why_not(manifest.kind)}"
+            )
             lines.append(f"{manifest.name} {manifest.version} ({manifest.license}){kind}")
         return lines + [f"{name} is not offered: {why}" for name, why in self._refused.items()]
 
     def as_wire(self) -> list[dict[str, Any]]:
         """All manifests as plain maps, for a reasoner's palette."""
         return [manifest.model_dump(mode="json") for manifest in self._manifests.values()]
+
+    def body_as_wire(self) -> dict[str, Any] | None:
+        """The robot's body, for the same palette; None where any skill fits."""
+        return None if self._body is None else self._body.model_dump(mode="json")
+
+
+def _why_not(kind: Kind) -> str:
+    return NOT_EXECUTED.get(kind) or UNMADE[kind]

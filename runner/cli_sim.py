@@ -58,6 +58,7 @@ async def run(args: argparse.Namespace) -> int:
     from pydantic import ValidationError
 
     from clients.sidecar.policy import PolicyClient
+    from runner.body import SIMULATED
     from runner.catalogue import Catalogue, Maker, read_manifests
     from runner.clock import SystemClock
     from runner.control import ControlThread
@@ -124,7 +125,7 @@ async def run(args: argparse.Namespace) -> int:
             args.endpoint or program_endpoint("runner", os.environ, os.getuid()),
             control,
             runner,
-            Catalogue(manifests, makers),
+            Catalogue(manifests, makers, body=SIMULATED),
             clock,
             ground_truth=lambda: truth_as_wire(env),
             on_bound=lambda: setattr(

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from runner.body import body_of
 from runner.catalogue import EXECUTABLE, Catalogue, Maker
 from runner.clock import Clock
 from runner.protocols import Hal, SensorReader
@@ -142,7 +143,8 @@ def offered(
             refused[manifest.name] = "; ".join(problem for _, problem in found)
         else:
             kept.append(manifest)
-    catalogue = Catalogue(kept, makers, refused=refused)
+    body = body_of(file.robot, parts.hal.description)
+    catalogue = Catalogue(kept, makers, refused=refused, body=body)
     if spec is None:
         return catalogue
     try:
@@ -219,7 +221,12 @@ def plan(file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Iterab
     """What would run, a line a part. `facts` are lines of whoever puts the program together."""
     robot, description = file.robot, parts.hal.description
     twin = ", simulated" if description.simulated else ""
-    lines = [("robot", f"{robot.robot_id}: {description.name} by {robot.hal.adapter}{twin}")]
+    body = body_of(robot, description)
+    able = ", ".join(f"{name} {value}" for name, value in body.capabilities.items())
+    lines = [
+        ("robot", f"{robot.robot_id}: {description.name} by {robot.hal.adapter}{twin}"),
+        ("body", f"{' and '.join(body.embodiment_tags) or 'not said: embodiment_tags is empty'}; {able}"),
+    ]
     lines += [
         (
             "joint",

@@ -191,7 +191,11 @@ class GoalServer:
             case GetState():
                 return self._state()
             case GetSkills():
-                return {"skills": self._catalogue.as_wire(), "resident": _text(self._residency.resident)}
+                return {
+                    "skills": self._catalogue.as_wire(),
+                    "body": self._catalogue.body_as_wire(),
+                    "resident": _text(self._residency.resident),
+                }
             case GetGroundTruth():
                 if self._ground_truth is None:
                     raise UnknownOp("only a simulator knows the truth", details={"known": [*OPS]})

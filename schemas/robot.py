@@ -11,7 +11,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from schemas.body import Body, Capability
 from schemas.manifest.contracts import SafetyEnvelope
+from schemas.manifest.vocabulary import EmbodimentTag
 from schemas.yamltext import Path, config_error, parse_yaml, problems_of
 
 RATE_HZ_MAX = 1000.0
@@ -103,6 +105,10 @@ class RobotEnvironment(_Section):
     """One robot as it is deployed."""
 
     robot_id: Text
+    embodiment_tags: tuple[EmbodimentTag, ...] = ()
+    """What the robot is, e.g. `so101_follower`; empty: what its adapter is known to be. Skills made for other robots are refused."""
+    capabilities: dict[str, Capability] = {}
+    """Facts that manifests ask for by name: `has_vision: true`, `can_lift_kg: 0.5`. Cameras and grippers are seen without being named here."""
     hal: HalConfig
     sensors: tuple[SensorReaderConfig, ...] = ()
     task: TaskSpec | None = None
@@ -124,6 +130,7 @@ class RobotEnvironment(_Section):
             raise ValueError(f"sensor_id must be unique; given twice: {', '.join(twice)}")
         if (self.vla is None) != (self.task is None):
             raise ValueError("task and vla go together: give both, or neither to serve goals only")
+        Body(embodiment_tags=self.embodiment_tags, capabilities=self.capabilities)
         return self
 
 

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reasoner.palette import EXECUTABLE_KINDS, OPERATOR, Palette, Skill, palette_of
+from schemas.body import Body
 from schemas.errors import BadRequest, NotPermitted, UnknownSkill
 from schemas.manifest import Kind, RSkillManifest, parse_manifest
 from schemas.tools import (
@@ -108,6 +109,50 @@ def test_a_skill_without_weights_has_no_licence_of_weights() -> None:
         palette(manifest("ros_action", license="unknown")).check(ExecuteRskill(rskill_id="lab/ros_action"))
         is None
     )
+
+
+ARM = Body(embodiment_tags=("so101_follower",), capabilities={"can_lift_kg": 0.25, "has_vision": True})
+
+
+def test_a_skill_for_another_robot_is_not_offered() -> None:
+    arm, dog = skill_for("so101_follower", name="lab/arm"), skill_for("go2", name="lab/dog")
+    found = palette(arm, dog, body=ARM)
+    offered = {f["function"]["name"] for f in found.functions()}
+    assert "execute_rskill__lab__arm" in offered
+    assert "execute_rskill__lab__dog" not in offered
+    error = found.check(ExecuteRskill(rskill_id="lab/dog"))
+    assert isinstance(error, NotPermitted)
+    assert "it is made for go2; this robot is so101_follower" in str(error)
+    assert found.first("grasp").id == "lab/arm"
+    with pytest.raises(UnknownSkill, match="made for go2"):
+        palette(dog, body=ARM).first("grasp")
+
+
+def test_a_robot_that_does_not_say_what_it_is_gets_what_is_made_for_any() -> None:
+    found = palette(manifest("vla"), skill_for("so101_follower", name="lab/arm"))
+    assert list(found.executable) == ["lab/vla"]
+
+
+@pytest.mark.parametrize(("kg", "fits"), [(0.2, True), (0.25, True), (0.5, False)])
+def test_capabilities_count_by_value(kg: float, fits: bool) -> None:
+    """The defect of the field: any arm that can lift at all was offered skills that lift fifty kilograms."""
+    found = palette(
+        skill_for("any", name="lab/lift", needs=f"{{can_lift_kg: {kg}, has_vision: true}}"), body=ARM
+    )
+    assert (found.check(ExecuteRskill(rskill_id="lab/lift")) is None) == fits
+    assert bool(found.executable) == fits
+
+
+def test_a_model_for_another_robot_is_not_asked_either() -> None:
+    eye = manifest("vlm")
+    other = eye.model_copy(update={"embodiment_tags": ("go2",)})
+    assert palette(eye, body=ARM).permits("lab/vlm") is None
+    assert "made for go2" in str(palette(other, body=ARM).permits("lab/vlm"))
+
+
+def skill_for(tag: str, *, name: str, needs: str = "{}") -> RSkillManifest:
+    head = f'name: "{name}"\nlicense: "mit"\nkind: "vla"\ncapabilities_required: {needs}\n'
+    return parse_manifest(head + BASE.replace('"any"', f'"{tag}"') + BY_KIND["vla"])
 
 
 def test_a_template_is_never_executed() -> None:

@@ -50,7 +50,7 @@ def start(tmp_path: Path, video: Path) -> Iterator[Start]:
     ) -> subprocess.Popen[str]:
         config = tmp_path / "robot.yaml"
         config.write_text(
-            "robot_id: bench\nhal: {adapter: so101_mujoco}\n"
+            "robot_id: bench\nembodiment_tags: [so101_follower, mobile_base]\nhal: {adapter: so101_mujoco}\n"
             f"sensors:\n  - {{sensor_id: front, max_age_ms: 2000, backend_params: {{path: {video}, loop: {str(loop).lower()}}}}}\n"
             + more
         )

@@ -65,7 +65,11 @@ def test_the_dry_run_says_what_would_run_and_opens_nothing(dry_run: DryRun) -> N
     assert any(line.startswith("goals ") and "runner.sock" in line for line in lines)
     assert "NOT KEPT  safety.deadman_required" in lines
     assert any(line.startswith("unused    thumbnail_hz") for line in lines)
-    assert any("so101-navigate" in line and "listed, not executed" in line for line in lines)
+    assert "body      so101_follower; has_vision False, has_gripper True" in lines
+    assert (
+        "skill     vram-arbiter/so101-navigate is not offered: it is made for mobile_base; this robot is so101_follower"
+        in lines
+    )
     assert lines[-1] == "dry run: nothing was opened"
 
 
@@ -96,7 +100,19 @@ def test_the_dry_run_says_what_would_run_and_opens_nothing(dry_run: DryRun) -> N
         ),
         (
             TWIN + "task: {id: t}\nvla:\n  id: vram-arbiter/so101-navigate\n",
-            r"robot\.yaml:5: vla\.id: .* is a ros_action and cannot be executed",
+            r"robot\.yaml:5: vla\.id: vram-arbiter/so101-navigate is not offered here: it is made for mobile_base; this robot is so101_follower",
+        ),
+        (
+            TWIN + "embodiment_tags: [mobile_base]\ntask: {id: t}\nvla:\n  id: vram-arbiter/so101-navigate\n",
+            r"robot\.yaml:6: vla\.id: .* is a ros_action and cannot be executed: this runner has no ROS 2 action client",
+        ),
+        (
+            TWIN + "embodiment_tags: [any]\n",
+            r"robot\.yaml:1: .*'any' is what a skill may be made for, not what a robot is",
+        ),
+        (
+            TWIN + "embodiment_tags: [so101]\n",
+            r"robot\.yaml:3: embodiment_tags\[0\]: ",
         ),
     ],
 )
@@ -198,3 +214,27 @@ def test_serving_goals_offers_only_what_is_licensed_and_fits(dry_run: DryRun, tm
     assert re.search(
         r"skill +vram-arbiter/so101-grab is not offered: .*looks at front, wrist; there is none", out
     ), out
+
+
+def test_a_skill_for_another_robot_or_beyond_this_one_is_refused(dry_run: DryRun, tmp_path: Path) -> None:
+    """By tag, and by the value of a capability; the file may say more of the robot than its adapter does."""
+    folder = tmp_path / "skills"
+    folder.mkdir()
+    needs = "capabilities_required: {can_lift_kg: 0.5, has_vision: true}\nkind: "
+    (folder / "rskill.yaml").write_text(GRAB.read_text(encoding="utf-8").replace("kind: ", needs, 1))
+    cameras = "".join(
+        f"  - {{sensor_id: {name}, backend_params: {{device: 0}}}}\n" for name in ("front", "wrist")
+    )
+    text = TWIN + "sensors:\n" + cameras + GRAB_TASK
+    code, _, err = dry_run(text, skills=folder)
+    assert code == 2
+    assert "robot.yaml:7: vla.id: " in err
+    assert "it needs can_lift_kg of at least 0.5; this robot has none" in err
+    weak, strong = (f"capabilities: {{can_lift_kg: {kg}}}\n" for kg in (0.2, 0.5))
+    assert "this robot has 0.2" in dry_run(text + weak, skills=folder)[2]
+    code, out, err = dry_run(text + strong, skills=folder)
+    assert code == 0, err
+    assert "has_vision True, has_gripper True, can_lift_kg 0.5" in out
+    code, _, err = dry_run(text + strong + "embodiment_tags: [ur5e]\n", skills=folder)
+    assert code == 2
+    assert "it is made for so101_follower; this robot is ur5e" in err

@@ -1,0 +1,45 @@
+"""Which body a robot has: by its adapter, its parts, and what its deployment file says of it. Opens nothing."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+from runner.protocols import RobotDescription
+from schemas.body import NOT_A_ROBOT, Body, Capability
+from schemas.manifest.vocabulary import EmbodimentTag
+from schemas.robot import RobotEnvironment
+
+SO101 = "so101_follower"
+TWINS = ("so101_mujoco", "so101_kinematic")
+LEROBOT = "lerobot:"
+KNOWN = frozenset(get_args(EmbodimentTag)) - NOT_A_ROBOT - {"custom"}
+
+SIMULATED = Body(
+    embodiment_tags=(SO101, "mobile_base"),
+    capabilities={"has_vision": True, "has_gripper": True, "has_mobile_base": True},
+)
+"""The SO-101 on a mobile base of `vram-runner sim`."""
+
+
+def body_of(robot: RobotEnvironment, description: RobotDescription) -> Body:
+    """The file's `embodiment_tags`, else what the adapter is known to be; and what can be seen of it, with the file's `capabilities` on top.
+
+    Tags of the file take the place of the adapter's: whoever gives any gives all.
+    """
+    seen: dict[str, Capability] = {
+        "has_vision": bool(robot.sensors),
+        "has_gripper": any(joint.gripper for joint in description.joints),
+    }
+    return Body.model_validate(
+        {
+            "embodiment_tags": robot.embodiment_tags or _by_adapter(robot.hal.adapter),
+            "capabilities": {**seen, **robot.capabilities},
+        }
+    )
+
+
+def _by_adapter(adapter: str) -> tuple[str, ...]:
+    if adapter in TWINS:
+        return (SO101,)
+    kind = adapter.removeprefix(LEROBOT) if adapter.startswith(LEROBOT) else ""
+    return (kind,) if kind in KNOWN else ()
