@@ -65,6 +65,7 @@ async def run(args: argparse.Namespace) -> int:
     from runner.goals import GoalServer
     from runner.protocols import DeadlinePolicy, Skill
     from runner.recorder import Recorder
+    from runner.sim.arm_env import ArmEnvironment
     from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
     from runner.sim.env import SimEnv
     from runner.sim.sim_runner import SimRunner
@@ -108,7 +109,7 @@ async def run(args: argparse.Namespace) -> int:
             recorder = Recorder(args.video, fps=1.0 / period_s / VIDEO_EVERY)
             stack.callback(recorder.close)
         runner = SimRunner(
-            lambda: env,
+            lambda: ArmEnvironment(env),
             cameras=tuple(name for name in OBSERVATION_CAMERAS if name in scene.cameras),
             seed=args.seed,
             rate_hz=args.rate,

@@ -50,6 +50,7 @@ class Applied:
     reward: float | None = None
     terminated: bool | None = None
     truncated: bool | None = None
+    success: bool | None = None
 
 
 class RunnerBase(ABC):
@@ -146,6 +147,7 @@ class RunnerBase(ABC):
             reward=applied.reward,
             terminated=applied.terminated,
             truncated=applied.truncated,
+            success=applied.success,
             trace_context=trace_context,
         )
         self.tick_idx += 1

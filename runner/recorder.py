@@ -19,7 +19,8 @@ FONT_SCALE = 0.5
 
 
 class Recorder:
-    """`Recorder(path, fps)`; `submit(rgb, lines)` from any one thread; `close()` finishes the file. Needs even picture sizes."""
+    """`Recorder(path, fps)`; `submit(rgb, lines)` from any one thread; `close()` finishes the file. H.264 wants even sizes: an odd last row or
+    column is cut off."""
 
     def __init__(self, path: Path, *, fps: float) -> None:
         self.path = path
@@ -52,6 +53,7 @@ class Recorder:
                 if self.error:
                     continue  # keep the queue moving, so that close() never waits for a dead encoder
                 rgb, lines = item
+                rgb = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
                 try:
                     if writer is None:
                         writer = self._open(rgb.shape[1], rgb.shape[0])

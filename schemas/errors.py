@@ -216,6 +216,10 @@ class RobotFault(OperatorError):
     )
 
 
+class EnvironmentFailed(OperatorError):
+    code = "environment_failed"  # a simulated world raised, or told what cannot be: its own code, or its packages
+
+
 class FrameStale(TransientError):
     code = "frame_stale"  # no frame young enough: fail closed
 

@@ -325,7 +325,10 @@ class Action(_Frozen):
 
 # -- what a runner reports ----------------------------------------------------------------------------------------
 class TickResult(_Frozen):
-    """One turn of a runner's loop: where the time went and what became of the action."""
+    """One turn of a runner's loop: where the time went and what became of the action.
+
+    A tick without `step_idx` stepped no world: it reset it, or there was nothing to do. `success` is the world's own word, of that moment.
+    """
 
     stamp_ns: Nanoseconds
     tick_idx: Annotated[int, Field(ge=0)]
@@ -345,6 +348,7 @@ class TickResult(_Frozen):
     reward: Finite | None = None
     terminated: bool | None = None
     truncated: bool | None = None
+    success: bool | None = None
     trace_context: dict[str, str] | None = None
 
 

@@ -1,118 +1,87 @@
-"""`SimRunner`: the control loop on the simulator. One environment step per tick, a reset tick before each episode.
+"""`SimRunner`: the control loop on a simulated world. One environment step per tick, a reset tick before each episode.
 
-Everything here runs on the control thread (MuJoCo's rendering contexts belong to it). It gives the arm to at most one skill,
-holds the pose when there is none, and knows no sockets, goals' clients or arbiter.
+Everything here runs on the control thread (MuJoCo's rendering contexts belong to it). It gives the world to at most one skill,
+holds when there is none, and knows no sockets, goals' clients or arbiter, and no make of simulator.
 
-A run of n episodes has n reset ticks: the last episode ends the run by itself, nothing is reset for an episode that nobody plays.
+A run of n episodes has n reset ticks: the last episode ends the run by itself, nothing is reset for an episode that nobody plays. One that
+is broken off (`deactivate`, an environment that fails) is no episode: the next reset tick begins it again, with its own seed.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+import logging
+from collections.abc import Callable
+from typing import Any
 
 from pydantic import ValidationError
 
 from runner.clock import Clock
 from runner.frames import Snapshot
 from runner.loop import Applied, Decision
-from runner.protocols import DeadlinePolicy, SkillEnded
+from runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded
 from runner.recorder import Recorder
-from runner.safety import Envelope
+from runner.sim.environment import Environment, EnvStep
+from runner.sim.episodes import Episode, EpisodeView
 from runner.skill_runner import SkillRunner
 from schemas import telemetry, tracing
-from schemas.control import ControlMode
-from schemas.errors import InternalError
-from schemas.world import Action, CameraModel, FrameEncoding, JointState, Pose, SensorFrame, WorldState
+from schemas.errors import EnvironmentFailed, InternalError, LimitExceeded, ModelError, VramError
+from schemas.world import FrameEncoding, SensorFrame, TickResult
+
+log = logging.getLogger(__name__)
 
 STILL_AFTER_TICKS = 20  # without a skill nothing moves: the video repeats its last picture
 FRAME_REUSE_S = 0.1  # observation cameras are rendered on demand, at most at 10 Hz
 
 
-class Environment(Protocol):
-    """What the loop needs of a simulator (`runner.sim.env.SimEnv`)."""
-
-    def reset(self, seed: int) -> None: ...
-
-    def step(
-        self, arm_target: Mapping[str, float] | None, base_velocity: tuple[float, float, float] | None = None
-    ) -> None: ...
-
-    @property
-    def time_s(self) -> float: ...
-
-    def joint_state(self) -> dict[str, float]: ...
-
-    def joint_velocity(self) -> dict[str, float]: ...
-
-    def joint_limits(self) -> dict[str, tuple[float, float]]: ...
-
-    def base_pose(self) -> tuple[float, float, float]: ...
-
-    def render(self, camera: str) -> Any: ...
-
-    def camera_model(self, camera: str) -> CameraModel: ...
-
-    def close(self) -> None: ...
-
-
-@dataclass(slots=True)
-class Episode:
-    """One finished episode of a batch run."""
-
-    index: int
-    steps: int
-    success: bool | None
-    truncated: bool
-
-
 class SimRunner(SkillRunner):
-    """`seed + i` seeds episode i. `episodes` None plays one endless episode (the live runner). `judge` ends an episode when it
-    returns True; `max_steps` truncates it."""
+    """`seed + i` seeds episode i. `episodes` None goes on until it is stopped (the live runner). An episode ends when its world says so,
+    after `max_steps` steps (truncated), and with `ends_with_skill` when its skill does (truncated, too: the world itself was not done).
+
+    `cameras` None takes those of the environment. A goal is over with its episode: done where the environment says success, failed otherwise.
+    """
 
     def __init__(
         self,
         make_env: Callable[[], Environment],
         *,
-        cameras: tuple[str, ...],
+        cameras: tuple[str, ...] | None = None,
         seed: int = 0,
         rate_hz: float = 30.0,
         deadline_policy: DeadlinePolicy = DeadlinePolicy.WARN,
         clock: Clock | None = None,
         episodes: int | None = None,
         max_steps: int | None = None,
-        judge: Callable[[Environment], bool] | None = None,
+        ends_with_skill: bool = False,
         recorder: Recorder | None = None,
         video_camera: str = "overview",
         video_every: int = 3,
     ) -> None:
         super().__init__(rate_hz=rate_hz, deadline_policy=deadline_policy, clock=clock)
         self._make_env = make_env
-        self._cameras = cameras
+        self._cameras = cameras or ()
+        self._cameras_given = cameras is not None
         self._seed = seed
         self._episodes_wanted = episodes
         self._max_steps = max_steps
-        self._judge = judge
+        self._ends_with_skill = ends_with_skill
         self.recorder = recorder  # may be set while running
         self._video_camera = video_camera
         self._video_every = video_every
         self._video_picture: Any = None
         self._env: Environment | None = None
-        self._envelope: Envelope | None = None
-        self._targets: dict[str, float] = {}  # last joint targets, rad
+        self._gate: SafetyGate | None = None
         self._idle_ticks = 0
         self._reset_due = True
-        self._episode_idx = 0
-        self._step_idx = 0
+        self._next_seed: int | None = None
+        self._had_skill = False  # in this episode
         self._snapshots: dict[str, Snapshot] = {}
-        self.episodes: list[Episode] = []
+        self._view = EpisodeView()
 
     # -- life --------------------------------------------------------------------------------------------------------
     def activate(self) -> None:
         if self._env is None:
             self._env = self._make_env()
+            self._reset_due = True
 
     def deactivate(self) -> None:
         self._end(SkillEnded({}, InternalError("the runner is stopping")))
@@ -125,6 +94,20 @@ class SimRunner(SkillRunner):
         if self._env is None:
             raise InternalError("the simulator is not active")
         return self._env
+
+    @property
+    def episodes(self) -> list[Episode]:
+        """The finished ones, of a long run the last ten thousand."""
+        return list(self._view.finished)
+
+    def begin_episode(self, seed: int) -> None:
+        """Control thread: the next tick resets the world, and every later reset does, to this seed. What is open is no episode."""
+        self._next_seed = seed
+        self._reset_due = True
+
+    def begin_skill(self, skill: Skill, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
+        super().begin_skill(skill, goal, on_end)
+        self._had_skill = True
 
     # -- pictures -----------------------------------------------------------------------------------------------------
     def camera_names(self) -> tuple[str, ...]:
@@ -147,16 +130,20 @@ class SimRunner(SkillRunner):
 
     # -- one tick -----------------------------------------------------------------------------------------------------
     def _finished(self) -> bool:
-        played = len(self.episodes)
-        return super()._finished() or (self._episodes_wanted is not None and played >= self._episodes_wanted)
+        enough = self._episodes_wanted is not None and self._view.count >= self._episodes_wanted
+        return super()._finished() or enough
+
+    def tick(self) -> TickResult:
+        result = super().tick()
+        self._view.add(result)
+        return result
 
     def _success(self) -> bool | None:
-        judged = [episode.success for episode in self.episodes if episode.success is not None]
+        judged = [episode.success for episode in self._view.finished if episode.success is not None]
         return all(judged) if judged else None
 
     def _metadata(self) -> dict[str, Any]:
-        finished = len(self.episodes)
-        return {**super()._metadata(), "seed": self._seed, "episodes": finished}
+        return {**super()._metadata(), "seed": self._seed, "episodes": self._view.count}
 
     def _decide(self, tick_idx: int) -> Decision:
         """1. reset tick? 2. posted work 3. cameras 4. world state 5. the skill 6. safety."""
@@ -166,13 +153,19 @@ class SimRunner(SkillRunner):
         started_s = self.clock.now_s()
         active = self._active
         frames: dict[str, SensorFrame] | None = None
-        if active is not None and active.skill.wants_frames():  # 3
-            with tracing.span(telemetry.SPAN_SENSORS):
-                frames = {camera: self._sensor_frame(self._render(camera)) for camera in active.skill.cameras}
+        try:
+            if active is not None and active.skill.wants_frames():  # 3
+                with tracing.span(telemetry.SPAN_SENSORS):
+                    frames = {
+                        camera: self._sensor_frame(self._render(camera)) for camera in active.skill.cameras
+                    }
+        except EnvironmentFailed as error:
+            self._broken_off(error)
+            return Decision(reset=True)
         sensed_s = self.clock.now_s()
         try:
             with tracing.span(telemetry.SPAN_WORLD):
-                world = self._world(frames)  # 4
+                world = self.env.observe(self.clock.now_ns(), frames)  # 4
         except ValidationError as error:  # a state that is not finite: nobody may act on it
             self.world = None
             self._end(
@@ -187,74 +180,101 @@ class SimRunner(SkillRunner):
             self._ask_skill(active, world, decision)  # 5, 6
         return decision
 
-    def _safety_gate(self) -> Envelope:
-        if self._envelope is None:
-            self._envelope = Envelope(self.env.joint_limits())
-        return self._envelope
+    def _safety_gate(self) -> SafetyGate:
+        if self._gate is None:
+            raise InternalError("an action before the first reset")
+        return self._gate
 
     def _apply(self, decision: Decision) -> Applied:
         if decision.reset:
-            self._reset_due = False
-            self._step_idx = 0
-            self._snapshots.clear()
-            self.env.reset(self._seed + self._episode_idx)
-            self._envelope = Envelope(self.env.joint_limits())
-            self._targets = self.env.joint_state()
-            for camera in self._cameras:  # a first picture takes a second: rendering contexts, shaders
-                self._render(camera)
-            return Applied(action_applied=False, episode_idx=self._episode_idx)
-        arm, base = _commands(decision.action)
-        if (
-            arm is not None
-        ):  # joints that an action leaves out keep their last target: a closed gripper stays closed
-            self._targets.update(arm)
-        self.env.step(dict(self._targets) if arm is not None else None, base)
-        self._step_idx += 1
+            return self._reset()
+        before = self._view.steps
+        try:
+            step = self.env.step(decision.action)
+        except EnvironmentFailed as error:
+            return self._broken_off(error)
+        steps = before + step.moved
         self._idle_ticks = 0 if self._active is not None else self._idle_ticks + 1
-        terminated = self._judge is not None and self._judge(self.env)
-        truncated = not terminated and self._max_steps is not None and self._step_idx >= self._max_steps
+        truncated = step.truncated or (self._max_steps is not None and steps >= self._max_steps)
+        truncated |= self._ends_with_skill and self._had_skill and self._active is None
         applied = Applied(
             action_applied=decision.action is not None,
-            step_idx=self._step_idx,
-            episode_idx=self._episode_idx,
-            terminated=terminated,
-            truncated=truncated,
+            step_idx=steps if step.moved else None,
+            episode_idx=self.episode_idx,
+            reward=step.reward,
+            terminated=step.terminated,
+            truncated=truncated and not step.terminated,
+            success=step.success,
         )
-        self._record(closing=terminated or truncated)
-        if terminated or truncated:
-            self.episodes.append(
-                Episode(self._episode_idx, self._step_idx, terminated if self._judge else None, truncated)
-            )
-            self._episode_idx += 1
+        over = bool(applied.terminated or applied.truncated)
+        self._record(closing=over)
+        if over:
+            self._end_with_episode(steps, step, truncated=bool(applied.truncated))
             self._reset_due = True
         return applied
+
+    @property
+    def episode_idx(self) -> int:
+        """Of the episode that is open, or begins next."""
+        return self._view.count
+
+    def _reset(self) -> Applied:
+        """What was in the world before belongs to nobody any more. Raises EnvironmentFailed, which ends the run: no world, no ticks."""
+        self._reset_due = self._had_skill = False
+        self._snapshots.clear()
+        self._video_picture = None
+        seed = self._seed + self.episode_idx if self._next_seed is None else self._next_seed
+        self.env.reset(seed)
+        self._gate = self.env.gate()
+        if not self._cameras_given:
+            self._cameras = self.env.cameras
+        for camera in self._cameras:  # a first picture takes a second: rendering contexts, shaders
+            self._render(camera)
+        return Applied(action_applied=False, episode_idx=self.episode_idx)
+
+    def _broken_off(self, error: EnvironmentFailed) -> Applied:
+        """The episode never happened; its seed is played again. Raises when nobody had the world: then it fails by itself, every time."""
+        log.error("episode %d is broken off: %s", self.episode_idx, error)
+        self.world = None
+        if not self._had_skill:
+            raise error
+        self._end(SkillEnded({}, error))
+        self._reset_due = True
+        return Applied(action_applied=False, episode_idx=self.episode_idx)
+
+    def _end_with_episode(self, steps: int, step: EnvStep, *, truncated: bool) -> None:
+        """A skill that still has the world loses it. That nobody judges is no success."""
+        if self._active is None:
+            return
+        reward = self._view.total_reward
+        if step.reward is not None:
+            reward = (reward or 0.0) + step.reward
+        story = {"episode": self.episode_idx, "steps": steps, "total_reward": reward, "success": step.success}
+        error: VramError | None = None
+        if step.success is None:
+            error = ModelError(
+                f"the episode is over after {steps} steps, and nobody says whether that is a success",
+                hint="the environment's file can say what a success is (`success`)",
+            )
+        elif not step.success and truncated:
+            problem = f"the episode was cut off after {steps} steps without success"
+            error = LimitExceeded(problem, details={"limit": "episode"})
+        elif not step.success:
+            error = ModelError(f"the episode ended after {steps} steps without success")
+        self._end(SkillEnded(story, error))
 
     def _record(self, *, closing: bool) -> None:
         recorder = self.recorder
         if recorder is None or (self.tick_idx % self._video_every and not closing):
             return
         if self._video_picture is None or self._idle_ticks < STILL_AFTER_TICKS:
-            self._video_picture = self.env.render(self._video_camera)
-        recorder.submit(self._video_picture, (*self.caption, f"t = {self.env.time_s:.1f} s"))
-
-    # -- observation ----------------------------------------------------------------------------------------------------
-    def _world(self, frames: dict[str, SensorFrame] | None) -> WorldState:
-        stamp_ns = self.clock.now_ns()
-        positions, velocities = self.env.joint_state(), self.env.joint_velocity()
-        x, y, yaw = self.env.base_pose()
-        return WorldState(
-            stamp_ns=stamp_ns,
-            joint_state=JointState(
-                name=tuple(positions),
-                position=tuple(positions.values()),
-                velocity=tuple(velocities[name] for name in positions),
-                stamp_ns=stamp_ns,
-            ),
-            base_pose=Pose(
-                xyz=(x, y, 0.0), quat_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)), frame_id="map"
-            ),
-            image_frames=frames,
-        )
+            try:
+                self._video_picture = self.env.render(self._video_camera)
+            except EnvironmentFailed as error:  # the episode goes on
+                log.error("no more pictures for the video: %s", error)
+                self.recorder = None
+                return
+        recorder.submit(self._video_picture, (*self.caption, self.env.clock_text))
 
     def _sensor_frame(self, taken: Snapshot) -> SensorFrame:
         height, width = taken.rgb.shape[:2]
@@ -267,16 +287,3 @@ class SimRunner(SkillRunner):
             height=int(height),
             data=taken.rgb.tobytes(),
         )
-
-
-def _commands(action: Action | None) -> tuple[dict[str, float] | None, tuple[float, float, float] | None]:
-    """Arm target by joint name and base velocity of an action; (None, None) holds."""
-    if action is None:
-        return None, None
-    if action.control_mode is ControlMode.BODY_TWIST:
-        twist = action.rows[0]
-        return None, (twist[0], twist[1], twist[5])
-    names = action.joint_names
-    if names is None:
-        raise InternalError("a joint action reached the simulator without joint names")
-    return dict(zip(names, action.rows[0], strict=True)), None

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from runner.protocols import DeadlinePolicy
+from runner.sim.arm_env import ArmEnvironment
 from runner.sim.sim_runner import SimRunner
 from schemas.world import CameraModel
 
@@ -51,6 +52,7 @@ class KinematicEnv:
         self.resets: list[int] = []
         self.steps: list[tuple[Any, Any]] = []
         self.closed = 0
+        self.fails = False
 
     def reset(self, seed: int) -> None:
         self.resets.append(seed)
@@ -60,6 +62,8 @@ class KinematicEnv:
     def step(
         self, arm_target: Mapping[str, float] | None, base_velocity: tuple[float, float, float] | None = None
     ) -> None:
+        if self.fails:
+            raise ValueError("the physics blew up")
         self.steps.append((arm_target, base_velocity))
         if arm_target is not None:
             self.joints = {
@@ -115,12 +119,14 @@ def env() -> KinematicEnv:
 
 @pytest.fixture
 def make_runner(env: KinematicEnv) -> Callable[..., SimRunner]:
-    """A SimRunner on the kinematic robot; no cameras unless asked for, so that no picture library is needed."""
+    """A SimRunner on the kinematic robot; no cameras unless asked for, so that no picture library is needed. `judge` looks at the robot."""
 
     def make(**options: Any) -> SimRunner:
         options.setdefault("cameras", ())
         options.setdefault("deadline_policy", DeadlinePolicy.WARN)
-        return SimRunner(lambda: env, **options)
+        judge = options.pop("judge", None)
+        world = ArmEnvironment(env, judge=None if judge is None else lambda: judge(env))
+        return SimRunner(lambda: world, **options)
 
     return make
 

@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 
 from runner.protocols import Act, DeadlinePolicy, Done, Goal, Hold, SkillEnded, SkillKey, StepOutcome
+from runner.sim.episodes import episodes_of
 from runner.skill_runner import WITHHELD_IN_A_ROW_MAX
 from schemas.control import ControlMode
-from schemas.errors import Evicted, InternalError, ModelError
+from schemas.errors import EnvironmentFailed, Evicted, InternalError, ModelError
 from schemas.world import Action, WorldState
 
 Make = Callable[..., Any]
@@ -100,6 +101,97 @@ def test_a_live_run_ends_when_asked(make_runner: Make, env: Any) -> None:
     runner.deactivate()
     runner.deactivate()
     assert env.closed == 1
+
+
+def test_episodes_are_read_off_the_ticks(make_runner: Make, env: Any) -> None:
+    runner = make_runner(seed=3, rate_hz=0, episodes=3, max_steps=4, judge=lambda e: len(e.steps) == 6)
+    runner.activate()
+    ticks = []
+    while not runner._finished():
+        ticks.append(runner.tick())
+    assert episodes_of(ticks) == runner.episodes
+    resets = [tick.tick_idx for tick in ticks if tick.step_idx is None]
+    assert [episode.first_tick for episode in runner.episodes] == resets == [0, 5, 8]
+    assert [tick.step_idx for tick in ticks if tick.step_idx] == [1, 2, 3, 4, 1, 2, 1, 2, 3, 4]
+    assert [(e.steps, e.success, e.truncated) for e in runner.episodes] == [
+        (4, False, True),
+        (2, True, False),
+        (4, False, True),
+    ]
+    assert episodes_of(ticks[:-1]) == runner.episodes[:-1]
+
+
+def test_stopping_within_an_episode_leaves_no_phantom(make_runner: Make, env: Any) -> None:
+    runner = make_runner(seed=3, rate_hz=0, episodes=2, max_steps=4)
+    runner.activate()
+    runner.run(max_ticks=8)  # reset, 4 steps, reset, 2 steps
+    runner.deactivate()
+    assert env.resets == [3, 4]
+    assert [episode.index for episode in runner.episodes] == [0]
+    runner.activate()  # what was broken off is played again, from its reset on, with its own seed
+    assert runner.run().n_ticks == 8 + 5
+    assert env.resets == [3, 4, 4]
+    assert [(e.index, e.steps) for e in runner.episodes] == [(0, 4), (1, 4)]
+
+
+def test_a_run_that_is_over_resets_nothing_however_often_it_is_run(make_runner: Make, env: Any) -> None:
+    runner = make_runner(rate_hz=0, episodes=1, max_steps=2)
+    runner.activate()
+    for _ in range(3):
+        assert runner.run().n_ticks == 3
+    runner.deactivate()
+    assert env.resets == [0]
+
+
+def test_a_skill_loses_the_world_with_its_episode(make_runner: Make, env: Any) -> None:
+    runner = make_runner(rate_hz=0, max_steps=3, judge=lambda e: len(e.steps) == 5)
+    ticks, ended = play(runner, [Act(joints(0.1))] * 9, 3)
+    assert [tick.truncated for tick in ticks] == [False, False, True]
+    assert (ended[0].error.code, ended[0].error.details) == ("limit_exceeded", {"limit": "episode"})
+    assert ended[0].data["steps"] == 3
+    assert runner.tick().step_idx is None  # the live runner begins anew at once
+    runner.begin_skill(Scripted(*[Act(joints(0.1))] * 9), GOAL, ended.append)
+    runner.tick()
+    assert runner.tick().terminated
+    assert (ended[1].error, ended[1].data["success"]) == (None, True)
+    assert env.resets == [0, 1]
+
+
+def test_an_episode_that_nobody_judges_is_no_success(make_runner: Make) -> None:
+    _, ended = play(make_runner(rate_hz=0, max_steps=2), [Act(joints(0.1))] * 9, 2)
+    assert isinstance(ended[0].error, ModelError)
+    assert "nobody says" in ended[0].error.message
+
+
+def test_an_episode_may_end_with_its_skill(make_runner: Make, env: Any) -> None:
+    runner = make_runner(rate_hz=0, ends_with_skill=True, judge=lambda e: len(e.steps) > 99)
+    ticks, ended = play(runner, [Act(joints(0.1))], 2)
+    assert ended[0].error is None
+    assert [tick.truncated for tick in ticks] == [False, True]
+    assert [(e.steps, e.success, e.truncated) for e in runner.episodes] == [(2, False, True)]
+    runner.begin_episode(41)
+    runner.tick()
+    assert env.resets == [0, 41]
+    assert runner.tick().truncated is False  # the new episode had no skill yet
+
+
+def test_a_world_that_fails_ends_the_goal_and_is_reset(make_runner: Make, env: Any) -> None:
+    runner = make_runner(rate_hz=0, seed=5)
+    bad = Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.3, 0.0, 0.0, 0.0, 0.0, 0.1),))
+    _, ended = play(runner, [Act(joints(0.1))], 1)
+    env.fails = True
+    runner.end_skill()
+    runner.begin_skill(Scripted(Act(bad)), GOAL, ended.append)
+    failed = runner.tick()
+    assert isinstance(ended[0].error, EnvironmentFailed)
+    assert (failed.action_applied, failed.step_idx) == (False, None)
+    env.fails = False
+    runner.tick()
+    assert env.resets == [5, 5]
+    assert runner.episodes == []
+    env.fails = True
+    with pytest.raises(EnvironmentFailed):  # nobody asked it for anything: it is broken
+        runner.tick()
 
 
 # -- the skill at the arm -------------------------------------------------------------------------------------------
@@ -283,6 +375,7 @@ def test_navigating_the_real_simulator_and_filming_it(
     import imageio_ffmpeg
 
     from runner.recorder import Recorder
+    from runner.sim.arm_env import ArmEnvironment
     from runner.sim.config import SceneConfig
     from runner.sim.env import SimEnv
     from runner.sim.sim_runner import SimRunner
@@ -292,7 +385,7 @@ def test_navigating_the_real_simulator_and_filming_it(
     scene = SceneConfig()
     env = SimEnv(scene)
     recorder = Recorder(tmp_path / "episode.mp4", fps=10)
-    runner = SimRunner(lambda: env, cameras=("front",), seed=1, rate_hz=0, recorder=recorder)
+    runner = SimRunner(lambda: ArmEnvironment(env), cameras=("front",), seed=1, rate_hz=0, recorder=recorder)
     skill = Navigate(load_manifest(navigate_manifest), scene, period_s=1 / 30)
     ended: list[SkillEnded] = []
     try:

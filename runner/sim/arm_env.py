@@ -1,0 +1,163 @@
+"""An arm on a mobile base (`runner.sim.env.SimEnv`) as an `Environment`: joint targets and base velocities in, joint state and odometry out.
+
+What an episode is about comes from outside: `prepare` sets the scene up after a reset, `judge` looks at it after each step. Without a judge an
+episode never ends by itself and nobody says whether it went well.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+from runner.safety import Envelope
+from runner.sim.environment import EnvStep
+from schemas.control import ControlMode
+from schemas.errors import EnvironmentFailed, InternalError, ModelError
+from schemas.world import Action, CameraModel, JointState, Pose, SensorFrame, WorldState
+
+
+class MobileArm(Protocol):
+    """What is needed of the robot's simulator: joints in rad by name, the base's pose in m and rad."""
+
+    def reset(self, seed: int) -> None: ...
+
+    def step(
+        self, arm_target: Mapping[str, float] | None, base_velocity: tuple[float, float, float] | None = None
+    ) -> None: ...
+
+    @property
+    def time_s(self) -> float: ...
+
+    def joint_state(self) -> dict[str, float]: ...
+
+    def joint_velocity(self) -> dict[str, float]: ...
+
+    def joint_limits(self) -> dict[str, tuple[float, float]]: ...
+
+    def base_pose(self) -> tuple[float, float, float]: ...
+
+    def render(self, camera: str) -> Any: ...
+
+    def camera_model(self, camera: str) -> CameraModel: ...
+
+    def close(self) -> None: ...
+
+
+class ArmEnvironment:
+    """`cameras` for skills, the default one first. An episode is over once `judge` has said True for `steady` steps in a row; 0: never."""
+
+    def __init__(
+        self,
+        arm: MobileArm,
+        *,
+        cameras: tuple[str, ...] = (),
+        prepare: Callable[[int], None] | None = None,
+        judge: Callable[[], bool] | None = None,
+        steady: int = 1,
+    ) -> None:
+        self.arm = arm
+        self.cameras = cameras
+        self._prepare = prepare
+        self._judge = judge
+        self._steady = steady
+        self._in_a_row = 0
+        self._targets: dict[str, float] = {}  # last joint targets, rad
+        self._random = random.Random(0)
+
+    def reset(self, seed: int) -> None:
+        self.arm.reset(seed)
+        if self._prepare is not None:
+            self._prepare(seed)
+        self._in_a_row = 0
+        self._targets = self.arm.joint_state()
+        self._random = random.Random(f"actions-{seed}")
+
+    def observe(self, stamp_ns: int, frames: Mapping[str, SensorFrame] | None) -> WorldState:
+        positions, velocities = self.arm.joint_state(), self.arm.joint_velocity()
+        x, y, yaw = self.arm.base_pose()
+        return WorldState(
+            stamp_ns=stamp_ns,
+            joint_state=JointState(
+                name=tuple(positions),
+                position=tuple(positions.values()),
+                velocity=tuple(velocities[name] for name in positions),
+                stamp_ns=stamp_ns,
+            ),
+            base_pose=Pose(
+                xyz=(x, y, 0.0), quat_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)), frame_id="map"
+            ),
+            image_frames=dict(frames) if frames is not None else None,
+        )
+
+    def step(self, action: Action | None) -> EnvStep:
+        """Joints that an action leaves out keep their last target: a closed gripper stays closed."""
+        arm, base = _commands(action)
+        if arm is not None:
+            self._targets.update(arm)
+        try:
+            self.arm.step(dict(self._targets) if arm is not None else None, base)
+        except (ValueError, KeyError) as error:
+            raise EnvironmentFailed(f"the simulator refused a step: {error}") from error
+        if self._judge is None:
+            return EnvStep()
+        success = self._judge()
+        self._in_a_row = self._in_a_row + 1 if success else 0
+        return EnvStep(terminated=0 < self._steady <= self._in_a_row, success=success)
+
+    def gate(self) -> Envelope:
+        return Envelope(self.arm.joint_limits())
+
+    def action_of(self, raw: Any) -> Action:
+        """Joint targets (rad): a map by joint name, or a row in the order of the joints."""
+        names = tuple(self.arm.joint_limits())
+        try:
+            if isinstance(raw, Mapping):
+                names, row = tuple(map(str, raw)), [float(value) for value in raw.values()]
+            else:
+                row = [float(value) for value in raw]
+        except (TypeError, ValueError) as error:
+            raise ModelError(f"{raw!r} is no row of joint targets: {error}") from error
+        if not row or len(row) != len(names) or not all(map(math.isfinite, row)):
+            raise ModelError(f"an action is {len(names)} finite joint targets in rad, not {row}")
+        return _joint_action(names, row)
+
+    def sample(self) -> Action:
+        limits = self.arm.joint_limits()
+        return _joint_action(tuple(limits), [self._random.uniform(*limits[name]) for name in limits])
+
+    @property
+    def observation(self) -> dict[str, float]:
+        """Measured joint angles in rad, by name."""
+        return self.arm.joint_state()
+
+    @property
+    def clock_text(self) -> str:
+        return f"t = {self.arm.time_s:.1f} s"
+
+    def render(self, camera: str) -> Any:
+        return self.arm.render(camera)
+
+    def camera_model(self, camera: str) -> CameraModel:
+        return self.arm.camera_model(camera)
+
+    def close(self) -> None:
+        self.arm.close()
+
+
+def _joint_action(names: tuple[str, ...], row: Sequence[float]) -> Action:
+    return Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(tuple(row),), joint_names=names)
+
+
+def _commands(action: Action | None) -> tuple[dict[str, float] | None, tuple[float, float, float] | None]:
+    """Arm target by joint name and base velocity of an action; (None, None) holds."""
+    if action is None:
+        return None, None
+    if action.control_mode is ControlMode.BODY_TWIST:
+        twist = action.rows[0]
+        return None, (twist[0], twist[1], twist[5])
+    names = action.joint_names
+    if names is None:
+        raise InternalError("a joint action reached the simulator without joint names")
+    return dict(zip(names, action.rows[0], strict=True)), None

@@ -1,0 +1,81 @@
+"""`Environment`: what `SimRunner` needs of a simulator, whatever it simulates.
+
+`runner.sim.arm_env.ArmEnvironment` is our SO-101 scene, `runner.sim.gym_env.GymEnv` any gymnasium environment. All calls on one thread, the one
+that made it. Nothing is filled in: what an environment does not tell is missing in its world state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from runner.protocols import SafetyGate
+from schemas.world import Action, CameraModel, SensorFrame, WorldState
+
+
+@dataclass(frozen=True, slots=True)
+class EnvStep:
+    """What one step came to. None: this environment does not say.
+
+    `moved` False: time stood still, because there was no action and this world has no way to wait. `success` is what is so now, not only
+    at the end.
+    """
+
+    reward: float | None = None
+    terminated: bool = False
+    truncated: bool = False
+    success: bool | None = None
+    moved: bool = True
+
+
+class Environment(Protocol):
+    """One simulated world. `reset` begins an episode that follows from the seed alone; it comes before everything else.
+
+    Raises EnvironmentFailed for what goes wrong inside; the world is then of no use before the next reset.
+    """
+
+    def reset(self, seed: int) -> None: ...
+
+    def observe(self, stamp_ns: int, frames: Mapping[str, SensorFrame] | None) -> WorldState:
+        """The state now, with the frames that the caller took. Raises pydantic's ValidationError for numbers that are not finite."""
+        ...
+
+    def step(self, action: Action | None) -> EnvStep:
+        """One period with a one-step action that has passed `gate`; None holds."""
+        ...
+
+    def gate(self) -> SafetyGate:
+        """What every action passes before `step`; asked for after each reset."""
+        ...
+
+    def action_of(self, raw: Any) -> Action:
+        """An action from what a scripted policy returns. Raises ModelError for what cannot be one."""
+        ...
+
+    def sample(self) -> Action:
+        """An action at random, within the limits; the sequence follows from the seed of the reset."""
+        ...
+
+    @property
+    def observation(self) -> Any:
+        """What the environment itself calls its observation, for scripted policies."""
+        ...
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Cameras for skills, the default one first; known after the first reset."""
+        ...
+
+    @property
+    def clock_text(self) -> str:
+        """How far the episode is, for a video's caption."""
+        ...
+
+    def render(self, camera: str) -> Any:
+        """RGB, uint8, height × width × 3. Raises KeyError for an unknown camera."""
+        ...
+
+    def camera_model(self, camera: str) -> CameraModel | None: ...
+
+    def close(self) -> None: ...

@@ -1,0 +1,78 @@
+"""Episodes as a view over ticks: nobody counts them, they are read off the results of a run's ticks.
+
+An episode begins with its reset tick and ends with the first tick that is terminated or truncated. One that did not get that far is no
+episode: a run that is stopped in the middle leaves none behind.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from schemas.world import TickResult
+
+EPISODES_KEPT = 10_000  # a live run may have any number; older ones are counted, no longer listed
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """One finished episode. `total_reward` and `success` None: the environment rewards nothing, or does not judge."""
+
+    index: int
+    steps: int
+    success: bool | None
+    truncated: bool
+    total_reward: float | None = None
+    first_tick: int = 0
+    last_tick: int = 0
+
+
+class EpisodeView:
+    """Takes a run's ticks in order. `finished` are the last whole episodes, `count` says how many there were; `steps` and `total_reward`
+    are those of the open one."""
+
+    def __init__(self) -> None:
+        self.finished: deque[Episode] = deque(maxlen=EPISODES_KEPT)
+        self.count = 0
+        self._begin(0)
+
+    def _begin(self, tick_idx: int) -> None:
+        self._first_tick = tick_idx
+        self.steps = 0
+        self.total_reward: float | None = None
+
+    def add(self, tick: TickResult) -> None:
+        """Ticks without an episode (a runner that has none) are passed over."""
+        if tick.episode_idx is None:
+            return
+        ends = bool(tick.terminated or tick.truncated)
+        if tick.step_idx is None and not ends:
+            if tick.terminated is None:  # a reset tick: what was open before it never finished
+                self._begin(tick.tick_idx)
+            return
+        self.steps += tick.step_idx is not None
+        if tick.reward is not None:
+            self.total_reward = (self.total_reward or 0.0) + tick.reward
+        if ends:
+            self.finished.append(
+                Episode(
+                    index=tick.episode_idx,
+                    steps=self.steps,
+                    success=tick.success,
+                    truncated=bool(tick.truncated),
+                    total_reward=self.total_reward,
+                    first_tick=self._first_tick,
+                    last_tick=tick.tick_idx,
+                )
+            )
+            self.count += 1
+            self._begin(tick.tick_idx + 1)
+
+
+def episodes_of(ticks: Iterable[TickResult]) -> list[Episode]:
+    """The finished episodes of a recorded run."""
+    view = EpisodeView()
+    for tick in ticks:
+        view.add(tick)
+    return list(view.finished)

@@ -1,0 +1,111 @@
+"""How a gymnasium environment's observations and actions are to be read: what its spaces do not say, a file says (`--env-config FILE`).
+
+Nothing is guessed: without `joints` a world state has no joints, without `success` (and without gymnasium's usual keys) nobody judges.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from schemas.control import JOINT_MODES, ControlMode
+from schemas.errors import ConfigError
+from schemas.yamltext import config_error as said
+from schemas.yamltext import parse_yaml, problems_of
+
+RENDER: Final = "render"  # the camera that is the environment's own `render()`
+SUCCESS_KEYS: Final = ("is_success", "success")  # of `info`, where nothing else is said
+VECTOR_MODES: Final = (
+    *sorted(JOINT_MODES),
+    ControlMode.CARTESIAN_DELTA,
+    ControlMode.CARTESIAN_TWIST,
+    ControlMode.DEX_HAND_JOINT,
+)
+
+Index = Annotated[int, Field(ge=0)]
+
+
+class GymConfig(BaseModel):
+    """Paths into a Dict observation are written with dots (`pixels.top`); an empty path is the whole observation.
+
+    `joints` and `velocities` name entries of the vector at `state`: a list in its order, or a map from name to index (rad and rad/s).
+    `actions` names the entries of a Box action, in its order; `control_mode` says what they are. `hold` is the action that waits: without
+    one the world stands still while nobody acts. `success` is `info:KEY` or `return:NUMBER` (rewards of the episode, summed).
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kwargs: dict[str, Any] = {}
+    state: str = ""
+    joints: dict[str, Index] = {}
+    velocities: dict[str, Index] = {}
+    cameras: dict[str, str] = {}
+    control_mode: ControlMode = ControlMode.JOINT_POSITION
+    actions: tuple[str, ...] = ()
+    hold: int | tuple[float, ...] | None = None
+    success: str = ""
+
+    @field_validator("joints", "velocities", mode="before")
+    @classmethod
+    def _in_order(cls, value: object) -> object:
+        if isinstance(value, list):
+            if len(set(value)) != len(value):
+                raise ValueError("names must be unique")
+            return {name: index for index, name in enumerate(value)}
+        return value
+
+    @field_validator("control_mode")
+    @classmethod
+    def _vector(cls, mode: ControlMode) -> ControlMode:
+        if mode not in VECTOR_MODES:
+            raise ValueError(f"a Box action is one of {', '.join(VECTOR_MODES)}")
+        return mode
+
+    @field_validator("success")
+    @classmethod
+    def _rule(cls, rule: str) -> str:
+        kind, _, rest = rule.partition(":")
+        if rule and not (kind == "info" and rest) and not (kind == "return" and _is_number(rest)):
+            raise ValueError("give info:KEY or return:NUMBER")
+        return rule
+
+    @model_validator(mode="after")
+    def _check(self) -> GymConfig:
+        if unknown := sorted(set(self.velocities) - set(self.joints)):
+            raise ValueError(f"velocities of {', '.join(unknown)}, which are no joints")
+        if self.velocities and len(self.velocities) != len(self.joints):
+            raise ValueError("give the velocities of all joints, or of none")
+        if len(set(self.actions)) != len(self.actions):
+            raise ValueError("names of actions must be unique")
+        return self
+
+    @classmethod
+    def load(cls, path: Path) -> GymConfig:
+        """Raises ConfigError with the file's name, line and field."""
+        try:
+            source = parse_yaml(path.read_text(encoding="utf-8"), str(path))
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"the environment's file {path} cannot be read: {error}") from error
+        try:
+            return cls.model_validate(source.data)
+        except ValidationError as error:
+            raise said(str(path), problems_of(error, source, {(): set(cls.model_fields)})) from error
+
+    def with_success(self, rule: str) -> GymConfig:
+        """Raises ConfigError for a rule that is none."""
+        try:
+            return GymConfig.model_validate({**self.model_dump(), "success": rule})
+        except ValidationError as error:
+            raise ConfigError(
+                f"--success {rule}: {error.errors()[0]['msg']}", hint="info:KEY or return:NUMBER"
+            ) from error
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
