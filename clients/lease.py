@@ -295,6 +295,13 @@ class Lease:
                 self._progress.changed()
             await self._progress.wait()
 
+    async def wait_change(self) -> LeaseState:
+        """Until its `state` is another than now (at once where it is over); says which. A state that lasts for a moment may be missed."""
+        before = self.state
+        while self.state == before and not self._over:
+            await self._progress.wait()
+        return self.state
+
     async def wait_gone(self) -> None:
         """Until the lease has ended and its `unload`, if any, is done."""
         while not self._over:

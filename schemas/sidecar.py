@@ -95,6 +95,7 @@ class PingResult(TypedDict):
     state: Literal["unloaded", "waiting", "loading", "resident", "unloading"]
     lease_id: NotRequired[str | None]
     token: NotRequired[list[int] | None]
+    standby: NotRequired[bool]  # evicted, and it comes back by itself when there is room
     last_error: NotRequired[str]
 
 

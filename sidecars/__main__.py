@@ -70,6 +70,11 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
 
 def settings_from(flags: argparse.Namespace) -> Settings:
     """Flags, files and environment as settings. Raises ConfigError or ManifestError."""
+    if flags.standby and flags.idle_release_s is not None:
+        raise ConfigError(
+            "--standby comes back by itself and --idle-release-s leaves by itself",
+            hint="choose one: --standby for what shall be there between goals, --idle-release-s for what makes room for it",
+        )
     configs = flags.configs or configs_folder(os.environ)
     manifest, weights = read_model(flags.rskill, configs)
     if flags.footprint:
@@ -94,6 +99,7 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         min_residency_s=flags.min_residency_s,
         wait_timeout_s=flags.wait_timeout_s,
         idle_release_s=flags.idle_release_s,
+        standby=flags.standby,
     )
 
 
@@ -180,7 +186,12 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--idle-release-s",
         type=_number(float, 0.1, 86_400),
-        help="let go of an idle model after so long; default: never",
+        help="let go of a model that no request and no goal used for so long; default: never",
+    )
+    add(
+        "--standby",
+        action="store_true",
+        help="once evicted, load again by itself when there is room and nobody waits",
     )
     add("--log-level", choices=("debug", "info", "warning", "error"), default="info")
     add("--check", action="store_true", help="check manifest, footprint and flags, then end")

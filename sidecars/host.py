@@ -109,6 +109,8 @@ class SidecarHost:
             else None,
             "token": list(token) if token is not None else None,
         }
+        if residency.on_standby:
+            found["standby"] = True
         if residency.last_error is not None:
             found["last_error"] = f"{residency.last_error.code}: {residency.last_error.message}"
         return found

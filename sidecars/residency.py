@@ -1,8 +1,9 @@
 """Whether the model is on the card: acquire, load, use, unload, in step with the lease.
 
 States: unloaded → waiting (for the lease) → loading → resident → unloading → unloaded. One model, one lease at a time. The
-lease's own protocol (revoke, drain, release, fencing) is the client library's, which calls `_unload` when the bytes must go. Knows no
-sockets and no wire.
+lease's own protocol (revoke, drain, release, fencing) is the client library's, which calls `_unload` when the bytes must go. A lease on
+standby is unloaded and not over: the arbiter grants it again when there is room (`_on_return` loads then), and a request calls it back
+as a waiter like any other. Knows no sockets and no wire.
 """
 
 import asyncio
@@ -16,6 +17,7 @@ from typing import Any, Literal
 from clients.aio import ArbiterClient
 from clients.lease import Lease
 from schemas.errors import (
+    BadState,
     Evicted,
     LeaseExpired,
     LeaseLost,
@@ -36,6 +38,7 @@ from sidecars.worker import Worker
 State = Literal["unloaded", "waiting", "loading", "resident", "unloading"]
 Token = tuple[int, int]
 _GONE = (LeaseRevoking, LeaseLost, LeaseExpired, StaleToken, UnknownLease, Evicted)
+_LEAVING = ("revoking", "unloading")
 _log = logging.getLogger("sidecars")
 
 
@@ -61,6 +64,7 @@ class Residency:
         self._loads = 0  # counts loads and unloads, in the worker: an op that was queued before an unload must not run after it
         self._running = 0
         self._last_use_s = time.monotonic()
+        self._calling: asyncio.Task[VramError | None] | None = None  # a lease on standby back
         self.lease: Lease | None = None
         self.state: State = "unloaded"
         self.last_error: VramError | None = None
@@ -76,8 +80,7 @@ class Residency:
 
         Raises what the arbiter denies with (WaitTimeout, VramInsufficient …), OutOfMemory, ModelError.
         """
-        if self._worker.stopping.is_set():
-            raise SidecarUnavailable(f"{self._settings.name} is ending", hint="start it again")
+        self._refuse_if_ending()
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         try:
             async with asyncio.timeout(timeout_s):
@@ -124,11 +127,16 @@ class Residency:
                 if token is not None:
                     raise self._evicted() from error
                 if lease is not None:
-                    await self._until_gone(lease, deadline)  # then there is a lease to ask for again
+                    await self._until_left(lease, deadline)  # then there is a lease to ask for again
 
     def token(self) -> Token | None:
         """Token of the lease under which the model is resident now."""
         return self.lease.token if self.lease is not None and self.state == "resident" else None
+
+    @property
+    def on_standby(self) -> bool:
+        """Evicted, and it comes back by itself."""
+        return self.lease is not None and self.lease.state == "standby"
 
     async def leave(self) -> bool:
         """End of the process: after the op that runs, everything goes, the context included.
@@ -151,13 +159,31 @@ class Residency:
         return True
 
     async def release_when_idle(self, idle_s: float) -> None:
-        """Runs beside the host: lets go of a model that nobody used for `idle_s`."""
+        """Runs beside the host: lets go of a model that nobody used for `idle_s`, at the latest after twice as long.
+
+        A goal is a use that somebody else marks at the arbiter, and it may ask us for nothing for a while (its arm goes to the start pose):
+        the arbiter is asked before anything is let go. One that cannot be reached cannot say, and the model stays.
+        """
         while True:
             left = self._last_use_s + idle_s - time.monotonic()
             if self.state == "resident" and not self._running and left <= 0:
-                _log.info("idle for %.0f s: releasing", idle_s)
-                await self.unload()
+                if await self._used_by_others():
+                    _log.debug("in use by somebody else: not idle")
+                    self._last_use_s = time.monotonic()
+                else:
+                    _log.info("idle for %.1f s: releasing", idle_s)
+                    await self.unload()
             await asyncio.sleep(max(left, 0.05, idle_s / 10))
+
+    async def _used_by_others(self) -> bool:
+        if self._client is None or self.lease is None:
+            return False
+        try:
+            status = await self._client.status()
+        except VramError as error:
+            _log.info("whether anybody uses the lease is not known (%s): staying", error.code)
+            return True
+        return any(view["lease_id"] == self.lease.lease_id and view["uses"] for view in status["leases"])
 
     def _prepare_blocking(self) -> None:
         self._adapter.prepare()
@@ -168,8 +194,9 @@ class Residency:
     async def _load_in_turn(self, deadline: float | None, traceparent: str | None) -> bool:
         if self.state == "resident" and (self.lease is None or self.lease.state == "held"):
             return False
-        if self.lease is not None:
-            await self._until_gone(self.lease, deadline)
+        if self.lease is not None and await self._brought_back(self.lease, deadline):
+            return True
+        self._refuse_if_ending()
         self.prepare()
         assert self._prepared is not None
         self.state = "waiting"
@@ -184,20 +211,94 @@ class Residency:
         self.last_error = None
         return True
 
-    async def _until_gone(self, lease: Lease, deadline: float | None) -> None:
+    def _refuse_if_ending(self) -> None:
+        if self._worker.stopping.is_set():
+            raise SidecarUnavailable(f"{self._settings.name} is ending", hint="start it again")
+
+    async def _until_left(self, lease: Lease, deadline: float | None) -> None:
         """Wait until a lease that is leaving has left, its bytes unloaded. Raises Loading when the time is over."""
         try:
-            async with asyncio.timeout(None if deadline is None else max(0.0, deadline - time.monotonic())):
-                await lease.wait_gone()
+            async with asyncio.timeout(_left_s(deadline)):
+                while lease.state in _LEAVING:
+                    await lease.wait_change()
+                if lease.state == "gone":
+                    await lease.wait_gone()
         except TimeoutError:
             raise Loading(
                 f"{self._settings.name} is still {self.state}", hint="ask again, or wait longer"
             ) from None
 
+    # -- coming back from standby -----------------------------------------------------------------------------------------
+    async def _brought_back(self, lease: Lease, deadline: float | None) -> bool:
+        """Follow a lease that leaves until it is resident again, calling it back from standby. False: it ended, its bytes are unloaded.
+
+        Raises Loading or WaitTimeout when the time is over, or what the arbiter refuses with. A wait that ends so goes on in the background:
+        the model was wanted, and comes back as soon as it may.
+        """
+        while lease.state not in ("held", "gone"):
+            if lease.state == "loading":  # `_on_return` is at it, which takes as long as it takes
+                await lease.wait_change()
+                continue
+            try:
+                async with asyncio.timeout(_left_s(deadline)):
+                    if lease.state != "standby":
+                        await lease.wait_change()
+                    elif (refused := await asyncio.shield(self._called_back(lease))) is not None:
+                        raise refused
+            except TimeoutError:
+                if lease.state == "standby":
+                    raise WaitTimeout(
+                        f"{self._settings.name} is on standby and there was no room for it in time",
+                        hint=f"`vramctl why {self._settings.name}` says who has it; it comes back as soon as it may",
+                    ) from None
+                if lease.state in _LEAVING:
+                    raise Loading(
+                        f"{self._settings.name} is still {lease.state}", hint="ask again, or wait longer"
+                    ) from None
+        if lease.state == "held":
+            return True
+        await self._until_left(lease, deadline)
+        return False
+
+    def _called_back(self, lease: Lease) -> asyncio.Task[VramError | None]:
+        """Ask for it as a waiter, once for all who want it, and without a limit: their own limits are shorter than a goal may be."""
+        if self._calling is None or self._calling.done():
+            self._calling = asyncio.create_task(self._call_back(lease), name="call back")
+        return self._calling
+
+    async def _call_back(self, lease: Lease) -> VramError | None:
+        """Until it is granted again or over. Says why the arbiter does not even let it wait."""
+        _log.info("wanted: calling the lease back from standby")
+        try:
+            await lease.reacquire()
+        except BadState:  # it comes back by itself in this very moment
+            if lease.state == "standby":
+                await lease.wait_change()
+        except VramError as error:
+            if lease.state == "standby":
+                return error
+        return None
+
+    async def _on_return(self, lease: Lease) -> None:
+        """Granted again, by itself or because it was called back. A load that fails ends the lease; the next request starts anew."""
+        if self._worker.stopping.is_set():
+            return  # `leave` gives it back
+        _log.info("back from standby: loading")
+        self.state = "loading"
+        try:
+            await self._load(lease)
+        except BaseException as error:
+            self.state = "unloaded"
+            if not isinstance(error, VramError):
+                raise
+            self.last_error = error
+        else:
+            self.last_error = None
+
     async def _acquire(self, deadline: float | None, traceparent: str | None) -> Lease | None:
         if self._client is None:
             return None
-        wait_s = None if deadline is None else max(0.0, deadline - time.monotonic())
+        wait_s = _left_s(deadline)
         if wait_s == 0.0:
             raise WaitTimeout(
                 f"{self._settings.name}: no time left to wait for the lease", hint="wait longer"
@@ -206,6 +307,7 @@ class Residency:
             self._settings.lease_spec(),
             wait_s,
             unload=self._unload,
+            on_return=self._on_return,
             on_lost=self._on_lost,
             traceparent=traceparent,
         )
@@ -317,3 +419,8 @@ class Residency:
         if loads != self._loads:
             raise self._evicted()
         return work()
+
+
+def _left_s(deadline: float | None) -> float | None:
+    """Seconds until a moment of the monotonic clock; None: no limit."""
+    return None if deadline is None else max(0.0, deadline - time.monotonic())

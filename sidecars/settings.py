@@ -59,6 +59,7 @@ class Settings:
     min_residency_s: float = d.MIN_RESIDENCY_S
     wait_timeout_s: float = WAIT_TIMEOUT_S
     idle_release_s: float | None = None  # None: resident until somebody else needs the room
+    standby: bool = False  # once evicted, it comes back by itself when there is room
 
     @property
     def revision(self) -> str:
@@ -74,6 +75,7 @@ class Settings:
             priority=self.priority,
             evictable=self.evictable,
             min_residency_s=self.min_residency_s,
+            standby=self.standby,
         )
 
 

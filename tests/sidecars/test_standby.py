@@ -1,0 +1,133 @@
+"""A sidecar that was evicted and is on standby: it comes back by itself, or as soon as it may when somebody wants it."""
+
+from threading import Event
+from time import monotonic
+
+import pytest
+
+from arbiter.testing.wire import WireClient
+
+pytestmark = pytest.mark.e2e
+
+PATIENCE_S = 60.0
+DETECTOR = ("--standby", "--min-residency-s", "0")
+BOTH = "5GB,5GB,100MB"  # each fits, both together do not
+
+
+@pytest.fixture
+def arbiter(arbiter_daemon):
+    with WireClient(arbiter_daemon.endpoint) as client:
+        yield client.hello("looker")
+
+
+def state(arbiter, consumer):
+    return next(
+        (lease["state"] for lease in arbiter.ask("status")["leases"] if lease["consumer"] == consumer), None
+    )
+
+
+def until(condition):
+    deadline = monotonic() + PATIENCE_S
+    while not condition():
+        assert monotonic() < deadline, "it did not happen in time"
+        Event().wait(0.01)
+
+
+def sent_away(box, arbiter):
+    """A detector on standby, and the policy that it left for, resident and idle."""
+    detector = box.start("detector", *DETECTOR, footprint=BOTH)
+    policy = box.start("policy", "--min-residency-s", "0", footprint=BOTH)
+    assert detector.detect()["ok"]
+    assert policy.detect()["ok"]
+    until(lambda: state(arbiter, "detector") == "standby")
+    return detector, policy
+
+
+def test_it_comes_back_by_itself_when_the_one_that_it_left_for_has_gone(box, arbiter):
+    detector, policy = sent_away(box, arbiter)
+    identity = detector.ask("ping")
+    assert (identity["state"], identity["standby"], identity["token"]) == ("unloaded", True, None)
+    policy.ask("unload")
+    until(lambda: detector.state() == "resident")
+    identity = detector.ask("ping")
+    assert "standby" not in identity
+    assert identity["token"] is not None
+    assert state(arbiter, "detector") == "held"
+    assert detector.detect(token=identity["token"])["answer"] == "red cube"
+    assert "back from standby: loading" in detector.log
+
+
+def test_a_request_calls_it_back_as_a_waiter_like_any_other(box, arbiter):
+    detector, policy = sent_away(box, arbiter)
+    first = detector.detect("red cube")
+    assert (first["ok"], policy.state()) == (True, "unloaded")
+    assert policy.detect()["ok"]
+    until(lambda: state(arbiter, "detector") == "standby")
+    policy.ask("unload")
+    until(lambda: detector.state() == "resident")
+
+
+def test_a_request_whose_time_ends_does_not_end_the_standby(box, arbiter):
+    detector, policy = sent_away(box, arbiter)
+    running = policy.hold()
+    late = detector.ask("load", timeout_s=0.2)
+    assert (late["ok"], late["code"]) == (False, "wait_timeout")
+    assert "vramctl why detector" in late["hint"]
+    assert state(arbiter, "policy") in ("held", "revoking"), "nobody is made to leave in the middle of a step"
+    policy.let_go()
+    assert policy.client.reply(running, PATIENCE_S)["ok"]
+    until(lambda: detector.state() == "resident")
+
+
+def test_a_load_that_fails_on_the_way_back_leaves_nothing_behind(box, arbiter):
+    detector, policy = sent_away(box, arbiter)
+    switch = detector.folder / "fail_load"
+    switch.touch()
+    policy.ask("unload")
+    until(lambda: "fails as told" in detector.ask("ping").get("last_error", ""))
+    until(lambda: state(arbiter, "detector") is None)
+    until(lambda: box.used() == 2 * 100_000_000)  # two contexts, no weights
+    switch.unlink()
+    assert detector.detect()["ok"]
+
+
+def test_asked_to_unload_it_does_not_come_back(box, arbiter):
+    detector, policy = sent_away(box, arbiter)
+    assert detector.ask("unload")["ok"]
+    until(lambda: state(arbiter, "detector") is None)
+    assert policy.state() == "resident"
+
+
+def test_its_process_ends_in_order_while_it_is_away(box, arbiter):
+    detector, _ = sent_away(box, arbiter)
+    assert detector.terminate() == 0
+    until(lambda: state(arbiter, "detector") is None)
+
+
+def test_the_arbiter_may_be_killed_while_it_is_away(box, arbiter_daemon, arbiter):
+    detector, policy = sent_away(box, arbiter)
+    arbiter_daemon.kill()
+    arbiter_daemon.start()
+    with WireClient(arbiter_daemon.endpoint) as again:
+        again.hello("looker")
+        until(lambda: state(again, "detector") == "standby" and state(again, "policy") == "held")
+        policy.ask("unload")
+        until(lambda: detector.state() == "resident")
+
+
+def test_a_model_that_a_goal_uses_is_not_idle(box, arbiter):
+    """Regression: an idle policy was let go of in the middle of a goal whose arm was still on its way to the start pose."""
+    policy = box.start("policy", "--idle-release-s", "0.1", "--log-level", "debug", footprint=BOTH)
+    held = policy.ask("load")
+    goal = {"lease_id": held["lease_id"], "token": held["token"], "use_id": "goal-1"}
+    assert arbiter.ask("use_begin", **goal)["ok"]
+    until(lambda: policy.log.count("in use by somebody else: not idle") >= 3)
+    assert policy.state() == "resident"
+    arbiter.ask("use_end", **goal)
+    until(lambda: policy.state() == "unloaded")
+
+
+def test_standby_and_idle_release_contradict_each_other(box):
+    sidecar = box.spawn("detector", "--standby", "--idle-release-s", "1")
+    assert sidecar.process.wait(PATIENCE_S) == 1
+    assert "choose one" in sidecar.log
