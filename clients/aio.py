@@ -22,7 +22,7 @@ from collections.abc import AsyncIterator, Awaitable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from typing import Any, Self
 
-from clients import inside
+from clients import inside, traces
 from clients import records as r
 from clients.connection import REQUEST_TIMEOUT_S
 from clients.lease import Callbacks, ForeignUse, Lease, OnLost, OnReturn, OnRevoke, SafePointEta, Unload
@@ -150,7 +150,7 @@ class ArbiterClient:
         """Wait for a lease; returns when it is granted (state `loading`): load the model now, then `lease.ready()`.
 
         With `spec.standby` or `park` the lease may be evicted and come back under the same object: `on_return` loads then, as
-        the caller does after this first grant.
+        the caller does after this first grant. The arbiter's part of the wait joins the present trace, or the one of `traceparent`.
 
         Raises WaitTimeout (details.why: who blocked), VramInsufficient, UnknownGpu, HolderBusy, LimitExceeded; from inside a use also
         WouldDeadlock, if that use is in its own way (`clients.inside`).
@@ -174,7 +174,7 @@ class ArbiterClient:
             spec.model_dump(mode="json"),
             self.now(),
             wait_timeout_s=wait_timeout_s,
-            traceparent=traceparent,
+            traceparent=traceparent or traces.present(),
         )
         self.pump()
         try:
@@ -257,7 +257,7 @@ class ArbiterClient:
         pair = (int(token[0]), int(token[1]))
         use = ForeignUse(self, lease_id, pair, f"{self.protocol.connection.instance}/{self.new_id()}")
         request = self.protocol.foreign_uses.begin(
-            lease_id, pair, use.use_id, label, self.now(), timeout_s=timeout_s
+            lease_id, pair, use.use_id, label, self.now(), timeout_s=timeout_s, traceparent=traces.present()
         )
         self._foreign[use.use_id] = use
         try:
@@ -283,7 +283,7 @@ class ArbiterClient:
     ) -> r.Message:
         """Any request of `schemas.wire` that has no method here."""
         return await self.reply(
-            self.protocol.connection.request(op, fields or {}, self.now(), timeout_s=timeout_s)
+            self.protocol.connection.request(op, traces.along(fields), self.now(), timeout_s=timeout_s)
         )
 
     async def status(self) -> r.Message:

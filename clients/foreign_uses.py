@@ -15,9 +15,16 @@ class ForeignUses:
         self._uses: dict[str, ForeignUseRecord] = {}
 
     def begin(
-        self, lease_id: str, token: TokenPair, use_id: str, label: str, now: float, timeout_s: float
+        self,
+        lease_id: str,
+        token: TokenPair,
+        use_id: str,
+        label: str,
+        now: float,
+        timeout_s: float,
+        traceparent: str | None = None,
     ) -> int:
-        use = ForeignUseRecord(lease_id, token, label)
+        use = ForeignUseRecord(lease_id, token, label, traceparent)
         self._uses[use_id] = use
 
         def begun(_: Message, __: float) -> None:

@@ -121,9 +121,11 @@ class Holdings:
 
         return self._connection.ask(message, now, timeout_s, on_reply=let_go, on_error=refused)
 
-    def reacquire(self, record: LeaseRecord, wait_timeout_s: float | None, now: float) -> int:
+    def reacquire(
+        self, record: LeaseRecord, wait_timeout_s: float | None, now: float, traceparent: str | None = None
+    ) -> int:
         """A lease that is asleep wants in now, as a waiter like any other. Its grant comes as `Returned`."""
-        record.wanted = True
+        record.wanted, record.wanted_by = True, traceparent
         record.wanted_until = None if wait_timeout_s is None else now + wait_timeout_s
         return self._send_reacquire(record, now)
 
@@ -277,6 +279,8 @@ class Holdings:
 
         left_s = None if record.wanted_until is None else max(0.0, record.wanted_until - now)
         message = {"op": "reacquire", **record.ref(), "wait_timeout_s": left_s}
+        if record.wanted_by is not None:
+            message["traceparent"] = record.wanted_by
         record.reacquire_id = self._connection.ask(
             message, now, on_reply=replied, on_error=refused, quiet=quiet
         )

@@ -12,7 +12,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-from clients import inside
+from clients import inside, traces
 from clients.holdings import GONE_CODES
 from clients.protocol import ClientProtocol
 from clients.records import LeaseRecord, TokenPair
@@ -249,7 +249,9 @@ class Lease:
         """
         self._raise_if_gone()
         await self._driver.reply(
-            self._driver.protocol.holdings.reacquire(self._record, wait_timeout_s, self._driver.now())
+            self._driver.protocol.holdings.reacquire(
+                self._record, wait_timeout_s, self._driver.now(), traces.present()
+            )
         )
         await self.wait_returned()
 
@@ -314,9 +316,12 @@ class Lease:
             self._driver.protocol.holdings.revoke_ack(
                 self._record, eta() if eta else None, self._driver.now()
             )
-            if not self._asked and self._callbacks.on_revoke is not None:
-                self._driver.spawn(self._call(self._callbacks.on_revoke, push), f"on_revoke {self.lease_id}")
-            self._start_leaving()
+            with traces.joined(push.get("traceparent")):  # leaving is part of whose room it is to be
+                if not self._asked and self._callbacks.on_revoke is not None:
+                    self._driver.spawn(
+                        self._call(self._callbacks.on_revoke, push), f"on_revoke {self.lease_id}"
+                    )
+                self._start_leaving()
         self._progress.changed()
 
     def returned(self) -> None:
@@ -324,7 +329,9 @@ class Lease:
         self._asked = self._own_will = self._unloading = self._unloaded = self._park_now = False
         self._leaving = None
         if self._callbacks.on_return is not None:
-            self._driver.spawn(self._call(self._callbacks.on_return), f"on_return {self.lease_id}")
+            with traces.joined(self._record.wanted_by):  # coming back by itself it begins a trace of its own
+                self._driver.spawn(self._call(self._callbacks.on_return), f"on_return {self.lease_id}")
+            self._record.wanted_by = None
         self._progress.changed()
 
     def resized(self, error: VramError | None) -> None:
@@ -337,7 +344,8 @@ class Lease:
         if self._gone:
             return
         self._gone, self._asked, self.error = True, True, error
-        self._driver.spawn(self._after_loss(error, fenced), f"lost {self.lease_id}")
+        with traces.joined(None):
+            self._driver.spawn(self._after_loss(error, fenced), f"lost {self.lease_id}")
         self._progress.changed()
 
     # -- steps -------------------------------------------------------------------------------------------------------

@@ -149,6 +149,7 @@ class LeaseRecord:
     asleep: str = ""  # `standby` or `parked`: evicted, and may come back under the same id
     wanted: bool = False  # asleep, and its owner waits for its return
     wanted_until: float | None = None  # None: for ever
+    wanted_by: str | None = None  # the traceparent of whoever called it back
     reacquire_id: int | None = None  # the newest request that asked for it
     resizing: Message | None = None  # the footprint that its owner waits for
     resizing_until: float | None = None  # None: for ever
@@ -206,8 +207,10 @@ class ForeignUseRecord:
     lease_id: str
     token: TokenPair
     label: str
+    traceparent: str | None = None
     begun: bool = False
 
     def begin(self, use_id: str) -> Message:
         on = {"lease_id": self.lease_id, "token": list(self.token)}
-        return {"op": "use_begin", **on, "use_id": use_id, "label": self.label}
+        message = {"op": "use_begin", **on, "use_id": use_id, "label": self.label}
+        return message | ({"traceparent": self.traceparent} if self.traceparent else {})

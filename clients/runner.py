@@ -7,6 +7,7 @@ import uuid
 from collections.abc import AsyncIterator, Mapping
 from typing import Any, Literal, Self, cast
 
+from clients import traces
 from clients.transport import Transport
 from schemas.endpoints import program_endpoint
 from schemas.errors import BadState, GoalRejected, RunnerUnreachable, from_wire
@@ -107,6 +108,7 @@ class RunnerClient:
         traceparent: str | None = None,
     ) -> Goal:
         """Start a skill; returns once it is accepted. `deadline_s` 0 takes the manifest's; `max_ticks` None sets no limit in ticks.
+        The goal's spans join the present trace, or the one of `traceparent`.
 
         Raises GoalRejected (another goal runs), EstopRequested, UnknownSkill, RunnerUnreachable.
         """
@@ -124,7 +126,7 @@ class RunnerClient:
         }
         if max_ticks is not None:
             fields["max_ticks"] = max_ticks
-        if traceparent:
+        if traceparent := traceparent or traces.present():
             fields["traceparent"] = traceparent
         try:
             await self.call("goal", fields)

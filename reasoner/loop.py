@@ -4,18 +4,26 @@ Nothing waits for the planner (perhaps a language model that hangs): planner and
 comes first, for them or for the inbox. A result, a cancel or a danger that comes while the planner thinks is taken at once; what the
 planner was asked is out of date then, so it is asked again. While a goal runs the planner is asked only when an operator
 said something, and may let the goal go on, stop it, or end the episode.
+
+Traced as `reasoner.tick`: from the first question to what came of the answer, with every `reasoner.plan` (also those whose answer came
+too late) and the `reasoner.tool` within it; the tool's calls carry it on to the runner and the sidecars.
 """
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import Awaitable, Callable
-from typing import Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from reasoner.inbox import Cancel, Danger, Inbox, Said
 from reasoner.palette import Palette
 from reasoner.planner import Episode, Finish, Note, Outcome, Planner, Step, benched
+from schemas import meters, telemetry, tracing
 from schemas.errors import EstopRequested, VramError
 from schemas.tools import ExecuteRskill, LocateInView, QueryScene, StopGoal, ToolCall, Wait
+
+if TYPE_CHECKING:
+    from opentelemetry.trace import Span
 
 log = logging.getLogger(__name__)
 
@@ -107,6 +115,7 @@ class _Loop:
         self._news = False  # said while a goal runs: the planner is to be asked
         self._superseded = 0
         self._finish: Finish | None = None
+        self._tick: Span | None = None
 
     async def run(self) -> Finish:
         """1. Ask whoever is to be asked. 2. Wait for the first news of any kind. 3. Take all of it, the urgent first."""
@@ -126,6 +135,7 @@ class _Loop:
             message.cancel()
             self._forget_decision()
             await self._stop_acting()
+            self._end_tick("finished" if self._finish is not None else "canceled")
         assert self._finish is not None, "only an end stops the asking"
         return self._finish
 
@@ -141,17 +151,47 @@ class _Loop:
             return False
         self._news = False
         self.episode.running = self._call
-        self._thinking = asyncio.create_task(self._think(), name="think")
+        if self._tick is None:
+            self._tick = tracing.begin(telemetry.SPAN_REASONER_TICK)
+        with tracing.inside(self._tick):
+            self._thinking = asyncio.create_task(self._think(), name="think")
         return True
 
     async def _think(self) -> ToolCall | Finish:
-        try:
-            async with asyncio.timeout(self._think_max_s):
-                return await self._planner.decide(self.episode)
-        except VramError as error:
-            return _NoDecision(False, f"the planner failed: {error}")
-        except TimeoutError:
-            return _NoDecision(False, f"the planner failed: no decision within {self._think_max_s:g} s")
+        outcome = "superseded"
+        with tracing.span(telemetry.SPAN_PLAN):
+            try:
+                async with asyncio.timeout(self._think_max_s):
+                    decision = await self._planner.decide(self.episode)
+                outcome = "finish" if isinstance(decision, Finish) else decision.tool
+                return decision
+            except VramError as error:
+                outcome = error.code
+                return _NoDecision(False, f"the planner failed: {error}")
+            except TimeoutError:
+                outcome = "timeout"
+                return _NoDecision(False, f"the planner failed: no decision within {self._think_max_s:g} s")
+            finally:
+                tracing.note({telemetry.ATTR_OUTCOME: outcome})
+
+    async def _act(self, call: ToolCall) -> Outcome:
+        attributes: dict[str, str] = {telemetry.ATTR_TOOL: call.tool}
+        if isinstance(call, ExecuteRskill):
+            attributes[telemetry.ATTR_SKILL] = call.rskill_id
+        status = "canceled"
+        with tracing.span(telemetry.SPAN_TOOL, attributes=attributes):
+            try:
+                outcome = await self._dispatch(call)
+                status = outcome.status
+                return outcome
+            finally:
+                tracing.note({telemetry.ATTR_OUTCOME: status})
+
+    def _end_tick(self, outcome: str) -> None:
+        if self._tick is not None:
+            self._tick.set_attribute(telemetry.ATTR_OUTCOME, outcome)
+            self._tick.end()
+        self._tick = None
 
     # -- 3 -------------------------------------------------------------------------------------------------------------
     def _take_messages(self) -> None:
@@ -189,6 +229,7 @@ class _Loop:
         )
         self._remember(self._call, outcome)
         self._acting = self._call = None
+        self._end_tick(outcome.status)
         self._news = False
         self._forget_decision()  # it was made without this outcome
         if outcome.code == EstopRequested.code:
@@ -196,6 +237,8 @@ class _Loop:
 
     def _remember(self, call: ToolCall, outcome: Outcome) -> None:
         log.info("%s: %s%s", call.tool, outcome.status, f", {outcome.text}" if outcome.text else "")
+        labels = {telemetry.ATTR_TOOL: call.tool, telemetry.ATTR_OUTCOME: outcome.status}
+        meters.count(telemetry.METRIC_TOOL_CALLS, labels)
         self.episode.steps.append(Step(call, outcome))
 
     def _take_decision(self) -> None:
@@ -231,11 +274,13 @@ class _Loop:
         log.info("%s %s", call.tool, describe(call))
         if (refusal := self._refusal(call)) is not None:
             self._remember(call, refusal)
+            self._end_tick(refusal.status)
             if _refused_in_a_row(self.episode) >= REFUSALS_MAX:
                 self._finish = Finish(False, f"{REFUSALS_MAX} calls in a row were refused: {refusal.text}")
             return
         self._call = call
-        self._acting = asyncio.ensure_future(self._dispatch(call))
+        with tracing.inside(self._tick) if self._tick is not None else contextlib.nullcontext():
+            self._acting = asyncio.create_task(self._act(call), name=call.tool)
 
     def _refusal(self, call: ToolCall) -> Outcome | None:
         palette = self._palette.without(benched(self.episode.steps))

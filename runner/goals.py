@@ -14,7 +14,7 @@ import logging
 import os
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 from pydantic import ValidationError
@@ -26,7 +26,7 @@ from runner.clock import Clock
 from runner.control import ControlThread
 from runner.protocols import Goal, Progress, Skill, SkillEnded
 from runner.skills.residency import Residency
-from schemas import telemetry, tracing
+from schemas import meters, telemetry, tracing
 from schemas.errors import (
     BadRequest,
     BadState,
@@ -305,8 +305,21 @@ class GoalServer:
 
     # -- a goal --------------------------------------------------------------------------------------------------------
     async def _execute(self, running: _Running, make: Callable[[], Skill]) -> None:
+        """All of it is one span, `rskill.goal`: the caller's child, and the parent of activation and ticks."""
         goal = running.goal
         running.begun = True
+        attributes = {telemetry.ATTR_SKILL: goal.rskill_id, telemetry.ATTR_GOAL: goal.goal_id}
+        if goal.revision:
+            attributes[telemetry.ATTR_REVISION] = goal.revision
+        with tracing.span(telemetry.SPAN_GOAL, goal.traceparent, attributes) as span:
+            running.goal = replace(goal, traceparent=tracing.traceparent())
+            status = await self._carry_out(running, make)
+            span.set_attribute(telemetry.ATTR_OUTCOME, status)
+            labels = {telemetry.ATTR_SKILL: goal.rskill_id, telemetry.ATTR_OUTCOME: status}
+            meters.count(telemetry.METRIC_GOALS, labels)
+
+    async def _carry_out(self, running: _Running, make: Callable[[], Skill]) -> Status:
+        goal = running.goal
         log.info("goal %s: %s %s", goal.goal_id, goal.rskill_id, goal.prompt)
         telling = asyncio.create_task(self._tell(running))
         status: Status = "failed"
@@ -315,9 +328,8 @@ class GoalServer:
         try:
             if running.canceled:
                 raise asyncio.CancelledError
-            with tracing.span(telemetry.SPAN_GOAL, goal.traceparent, {telemetry.ATTR_SKILL: goal.rskill_id}):
-                async with asyncio.timeout(goal.deadline_s):
-                    ended = await self._run(running, make)
+            async with asyncio.timeout(goal.deadline_s):
+                ended = await self._run(running, make)
             data, error = dict(ended.data), ended.error
             status = "succeeded" if error is None else "failed"
         except TimeoutError:
@@ -335,6 +347,7 @@ class GoalServer:
         telling.cancel()
         await asyncio.gather(telling, return_exceptions=True)
         await self._conclude(running, status, error, data)
+        return status
 
     @staticmethod
     async def _finish(skill: Skill) -> None:
@@ -350,10 +363,11 @@ class GoalServer:
         goal = running.goal
         key, _, _ = self._catalogue.find(goal.rskill_id, goal.revision)
         self._caption(running)
-        running.skill = skill = await self._residency.acquire(key, make)
-        running.phase = "starting"
-        self._caption(running)
-        await skill.start(goal)
+        with tracing.span(telemetry.SPAN_ACTIVATE, attributes={telemetry.ATTR_SKILL: str(key)}):
+            running.skill = skill = await self._residency.acquire(key, make)
+            running.phase = "starting"
+            self._caption(running)
+            await skill.start(goal)
         running.phase = "running"
         self._caption(running)
         return await self._control.run_skill(skill, goal)

@@ -173,7 +173,7 @@ class HardwareRunner(SkillRunner):
     # -- one tick ------------------------------------------------------------------------------------------------------
     def _decide(self, tick_idx: int) -> Decision:
         self.obey_estop()  # 1
-        self._mailbox.run_pending()  # 2
+        self._take_posted_after_stop()  # 2
         started_s = self.clock.now_s()
         with tracing.span(telemetry.SPAN_SENSORS):  # 3
             self._read_cameras()

@@ -4,6 +4,7 @@ Subclasses say what is sensed and decided (`_decide`) and how it reaches the rob
 policy acts, so that DROP really withholds a late action. Knows no robot, simulator, skill or socket.
 
 One tick:
+ 0. take what was posted (subclass): a goal that begins here has this tick in its trace
  1. decide: sensors → world state → inference → safety (subclass)
  2. was the slot over before the decision was there? DROP and RAISE withhold the action
  3. apply, or hold (subclass)
@@ -14,13 +15,14 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 from runner.clock import Clock, SystemClock
 from runner.protocols import DeadlineMissed, DeadlinePolicy
 from runner.timings import Timings, mean, percentile
-from schemas import telemetry, tracing
+from schemas import meters, telemetry, tracing
 from schemas.world import Action, RunResult, TickResult
 
 _SHARES = {"p50": 0.5, "p99": 0.99, "max": 1.0}
@@ -72,12 +74,19 @@ class RunnerBase(ABC):
         self.deadline_misses = 0
         self.late_actions_withheld = 0
         self.traceparent: str | None = None  # of the goal that the ticks are for; they join its trace
+        self.labels: dict[str, str] = {}  # of what the ticks measure: the goal's skill
+        self.trace_ticks = 1.0  # share of the ticks that get spans, 0 to 1
+        self._still = True  # no action was applied yet: until then every tick gets spans
+        self._tick_credit = 0.0
         self._due_s: float | None = None  # when the present tick should have begun
         self.timings = Timings()
         self.identity: dict[str, Any] = {}  # what it is that runs: robot, scene, seed; goes into the result
         self._trace_id: str | None = None
 
     # -- what a subclass provides --
+    def _take_posted(self) -> None:  # noqa: B027 - a run without an event loop has nobody who posts
+        """Work for this thread, before the tick begins."""
+
     @abstractmethod
     def activate(self) -> None:
         """Acquire what a run needs. Raises when it cannot."""
@@ -106,15 +115,31 @@ class RunnerBase(ABC):
         return 1.0 / self.rate_hz if self.rate_hz > 0 else None
 
     def tick(self) -> TickResult:
-        """One turn. See the module's docstring for its steps."""
-        with tracing.span(telemetry.SPAN_TICK, self.traceparent) as span:
-            context = span.get_span_context()
-            if context.is_valid and self._trace_id is None:
-                self._trace_id = f"{context.trace_id:032x}"
-            return self._tick(tracing.carrier())
+        """One turn. See the module's docstring for its steps.
 
-    def _tick(self, trace_context: dict[str, str] | None) -> TickResult:
+        Its span joins the trace of the goal, or the present one (a benchmark's command). Outside both a tick begins no trace of its own: a
+        robot that waits would begin thirty a second.
+        """
         started_s = self.clock.now_s()
+        self._take_posted()  # 0
+        with self._spanned():
+            carrier = tracing.carrier() or {}
+            if self._trace_id is None and "traceparent" in carrier:
+                self._trace_id = carrier["traceparent"].split("-")[1]
+            return self._tick(started_s, carrier or None)
+
+    def _spanned(self) -> AbstractContextManager[object]:
+        """The tick's span; for one that is left out (`trace_ticks`) no span, and what it would have joined stands for it."""
+        if self.traceparent is None and not tracing.traced():
+            return tracing.left_out(None)
+        if not self._still:
+            self._tick_credit += self.trace_ticks
+            if self._tick_credit < 1.0:
+                return tracing.left_out(self.traceparent)
+            self._tick_credit -= 1.0
+        return tracing.span(telemetry.SPAN_TICK, self.traceparent, self.labels)
+
+    def _tick(self, started_s: float, trace_context: dict[str, str] | None) -> TickResult:
         due_s = started_s if self._due_s is None else self._due_s
         late_ms = max(0.0, started_s - due_s) * 1e3
         deadline_s = math.inf if self.period_s is None else due_s + self.period_s
@@ -124,8 +149,9 @@ class RunnerBase(ABC):
             decision.action = None
             self.late_actions_withheld += 1
         apply_s = self.clock.now_s()
-        with tracing.span(telemetry.SPAN_SEND):
+        with nullcontext() if decision.action is None else tracing.span(telemetry.SPAN_SEND):
             applied = self._apply(decision)  # 3
+        self._still = self._still and not applied.action_applied
         ended_s = self.clock.now_s()
         missed = ended_s > deadline_s
         result = TickResult(
@@ -152,8 +178,10 @@ class RunnerBase(ABC):
         )
         self.tick_idx += 1
         self.timings.add(started_s, late_ms, result.tick_ms, result.inference_ms, reset=decision.reset)
+        meters.measure(telemetry.METRIC_TICK, result.tick_ms, self.labels)
         if missed:  # 4
             self.deadline_misses += 1
+            meters.count(telemetry.METRIC_DEADLINE_MISSES, self.labels)
             tracing.event(telemetry.EVENT_DEADLINE_MISSED, tick_ms=result.tick_ms)
             if self.deadline_policy is DeadlinePolicy.RAISE:
                 raise DeadlineMissed(

@@ -18,7 +18,7 @@ from runner.clock import Clock
 from runner.control import Mailbox
 from runner.loop import Decision, RunnerBase
 from runner.protocols import Act, DeadlinePolicy, Done, Goal, Hold, Progress, SafetyGate, Skill, SkillEnded
-from schemas import telemetry, tracing
+from schemas import meters, telemetry, tracing
 from schemas.errors import EstopRequested, InternalError, LimitExceeded, ModelError, VramError
 from schemas.world import Action, WorldState
 
@@ -115,6 +115,15 @@ class SkillRunner(RunnerBase):
     def mailbox(self) -> Mailbox:
         return self._mailbox
 
+    def _take_posted(self) -> None:
+        """Not before an emergency stop that is latched: obeying it comes first, in the tick."""
+        if self.estop is None:
+            self._mailbox.run_pending()
+
+    def _take_posted_after_stop(self) -> None:
+        if self.estop is not None:
+            self._mailbox.run_pending()
+
     def _finished(self) -> bool:
         return self._stopping
 
@@ -131,20 +140,21 @@ class SkillRunner(RunnerBase):
         self._active = Active(skill, goal, on_end, self.tick_idx)
         key = str(skill.key)
         self._skills[key] = self._skills.get(key, 0) + 1
-        self.traceparent = goal.traceparent
+        self.traceparent, self.labels = goal.traceparent, {telemetry.ATTR_SKILL: goal.rskill_id}
+        self._still = True
         self.progress = Progress(0.0, "running")
 
     def end_skill(self) -> None:
         """Control thread: take the arm back without a word to anybody; it holds. Repeatable."""
         self._active = None
-        self.traceparent = None
+        self.traceparent, self.labels = None, {}
         self.progress = Progress(0.0, "idle")
 
     def _end(self, ended: SkillEnded) -> None:
         if (active := self._active) is None:
             return
         self._active = None
-        self.traceparent = None
+        self.traceparent, self.labels = None, {}
         self.progress = Progress(1.0 if ended.error is None else self.progress.fraction, "ended")
         data = {"ticks": self.tick_idx - active.began_tick, **active.tally.as_data(), **ended.data}
         active.on_end(SkillEnded(data, ended.error))
@@ -172,6 +182,7 @@ class SkillRunner(RunnerBase):
             self._end(SkillEnded({}, InternalError(f"the skill failed: {type(error).__name__}: {error}")))
             return
         decision.inference_ms = (self.clock.now_s() - asked_s) * 1e3
+        meters.measure(telemetry.METRIC_INFERENCE, decision.inference_ms, self.labels)
         match outcome:
             case Act(action=action, chunk_index=chunk_index, prefetched=prefetched):
                 decision.chunk_index = chunk_index
@@ -204,6 +215,8 @@ class SkillRunner(RunnerBase):
         decision.safety_violations = problems
         decision.action = allowed
         self.violations.extend(problems)
+        if problems:
+            meters.count(telemetry.METRIC_SAFETY_VIOLATIONS, self.labels, len(problems))
         if allowed is not None:
             active.withheld_in_a_row = 0
             active.tally.clamped += bool(problems)
@@ -226,6 +239,7 @@ class SkillRunner(RunnerBase):
     def _withheld(self, active: Active, reason: str) -> None:
         """Note that nothing reaches the motors in this tick, and why."""
         tracing.event(telemetry.EVENT_ACTION_WITHHELD, reason=reason)
+        meters.count(telemetry.METRIC_WITHHELD, self.labels)
         active.tally.withheld += 1
         self._total.withheld += 1
         active.detail = f"withheld: {reason}"

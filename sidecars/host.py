@@ -115,9 +115,9 @@ class SidecarHost:
             found["last_error"] = f"{residency.last_error.code}: {residency.last_error.message}"
         return found
 
-    async def load(self, timeout_s: float | None, traceparent: str | None) -> dict[str, Any]:
+    async def load(self, timeout_s: float | None) -> dict[str, Any]:
         residency = self._here
-        loaded = await residency.load(timeout_s, traceparent)
+        loaded = await residency.load(timeout_s)
         lease = residency.lease
         return {
             "ok": True,
@@ -133,7 +133,7 @@ class SidecarHost:
         residency = self._here
         if name == "reset" and call.token is None and residency.state != "resident":
             return {"ok": True}  # a model that is not there has nothing to forget, and no reason to load
-        return await residency.run(name, call.token, lambda: self._adapter.run(call), call.traceparent)
+        return await residency.run(name, call.token, lambda: self._adapter.run(call))
 
     @property
     def _here(self) -> Residency:

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from clients.aio import ArbiterClient
 from clients.lease import Lease
+from schemas import meters, telemetry, tracing
 from schemas.errors import (
     BadState,
     Evicted,
@@ -75,7 +76,7 @@ class Residency:
         if self._prepared is None or (self._prepared.done() and self._prepared.exception() is not None):
             self._prepared = asyncio.create_task(self._worker.run(self._prepare_blocking, abandon=True))
 
-    async def load(self, timeout_s: float | None = None, traceparent: str | None = None) -> bool:
+    async def load(self, timeout_s: float | None = None) -> bool:
         """Make the model resident; False if it was. `timeout_s` bounds the wait for the lease, not the loading.
 
         Raises what the arbiter denies with (WaitTimeout, VramInsufficient …), OutOfMemory, ModelError.
@@ -90,7 +91,7 @@ class Residency:
                 f"{self._settings.name} is still {self.state}", hint="ask again, or wait longer"
             ) from None
         try:
-            return await self._load_in_turn(deadline, traceparent)
+            return await self._load_in_turn(deadline)
         except VramError as error:
             self.last_error = error
             raise
@@ -106,7 +107,7 @@ class Residency:
                 await self._unload()
 
     async def run(
-        self, label: str, token: Token | None, work: Callable[[], dict[str, Any]], traceparent: str | None
+        self, label: str, token: Token | None, work: Callable[[], dict[str, Any]]
     ) -> dict[str, Any]:
         """Run one op of the model as a use of the lease.
 
@@ -116,7 +117,7 @@ class Residency:
         deadline = time.monotonic() + self._settings.wait_timeout_s
         while True:
             if token is None:
-                await self.load(max(0.0, deadline - time.monotonic()), traceparent)
+                await self.load(max(0.0, deadline - time.monotonic()))
             else:
                 self._check(token)
             lease, loads = self.lease, self._loads
@@ -191,7 +192,7 @@ class Residency:
         gc.freeze()  # a million objects of imported code: every later collection, at each unload, would walk them
 
     # -- loading ------------------------------------------------------------------------------------------------------
-    async def _load_in_turn(self, deadline: float | None, traceparent: str | None) -> bool:
+    async def _load_in_turn(self, deadline: float | None) -> bool:
         if self.state == "resident" and (self.lease is None or self.lease.state == "held"):
             return False
         if self.lease is not None and await self._brought_back(self.lease, deadline):
@@ -202,7 +203,7 @@ class Residency:
         self.state = "waiting"
         try:
             await asyncio.shield(self._prepared)
-            lease = await self._acquire(deadline, traceparent)
+            lease = await self._acquire(deadline)
             self.state, self.lease = "loading", lease
             await self._load(lease)
         except BaseException:
@@ -295,7 +296,7 @@ class Residency:
         else:
             self.last_error = None
 
-    async def _acquire(self, deadline: float | None, traceparent: str | None) -> Lease | None:
+    async def _acquire(self, deadline: float | None) -> Lease | None:
         if self._client is None:
             return None
         wait_s = _left_s(deadline)
@@ -309,11 +310,14 @@ class Residency:
             unload=self._unload,
             on_return=self._on_return,
             on_lost=self._on_lost,
-            traceparent=traceparent,
         )
 
     async def _load(self, lease: Lease | None) -> None:
         """Put the model on the card; on failure everything is taken back before the lease is."""
+        with tracing.span(telemetry.SPAN_SIDECAR_LOAD, attributes=self._labels()):
+            await self._load_measured(lease)
+
+    async def _load_measured(self, lease: Lease | None) -> None:
         began = time.monotonic()
         try:
             await self._worker.run(self._load_blocking)
@@ -331,6 +335,10 @@ class Residency:
                 await lease.release()
             _log.error("loading failed: %s", error)
             raise
+        model = {telemetry.ATTR_MODEL: self._settings.manifest.name}
+        meters.measure(telemetry.METRIC_SIDECAR_LOAD, time.monotonic() - began, model)
+        if measured is not None:
+            tracing.note({telemetry.ATTR_BYTES: measured})
         self._last_use_s = time.monotonic()
         self.state = "resident"
         _log.info("resident after %.2f s: %s bytes on the card", time.monotonic() - began, measured)
@@ -363,7 +371,8 @@ class Residency:
         """Called when the bytes must go: by the lease (revoked, lost, given up) or at the end of the process."""
         began, self.state = time.monotonic(), "unloading"
         try:
-            await self._worker.run(self._unload_blocking)
+            with tracing.span(telemetry.SPAN_SIDECAR_UNLOAD, attributes=self._labels()):
+                await self._worker.run(self._unload_blocking)
         finally:
             self.state = "unloaded"
         _log.info("unloaded in %.2f s", time.monotonic() - began)
@@ -380,6 +389,12 @@ class Residency:
     def _on_lost(self, lease: Lease, error: VramError) -> None:
         self.last_error = error
         _log.warning("lease %s is lost: %s", lease.lease_id, error)
+
+    def _labels(self) -> dict[str, str]:
+        return {
+            telemetry.ATTR_CONSUMER: self._settings.name,
+            telemetry.ATTR_MODEL: self._settings.manifest.name,
+        }
 
     # -- uses -------------------------------------------------------------------------------------------------------------
     def _check(self, token: Token) -> None:

@@ -4,6 +4,7 @@ Every bad message gets a typed error; none ends the sidecar. Both families can b
 """
 
 import logging
+import time
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Protocol
 
@@ -11,6 +12,7 @@ from pydantic import ValidationError
 
 from clients.serve import Message, Peer
 from clients.sidecar import npy
+from schemas import meters, telemetry, tracing
 from schemas.errors import BadRequest, InternalError, LimitExceeded, UnknownOp, VramError
 from schemas.sidecar import ENDPOINT_REQUEST, OP_REQUEST, DetectOp, EndpointCall, LoadOp, OpRequest, QueryOp
 
@@ -28,7 +30,7 @@ class Host(Protocol):
 
     def identity(self) -> dict[str, Any]: ...
 
-    async def load(self, timeout_s: float | None, traceparent: str | None) -> dict[str, Any]: ...
+    async def load(self, timeout_s: float | None) -> dict[str, Any]: ...
 
     async def unload(self) -> None: ...
 
@@ -67,6 +69,22 @@ class Wire:
         if name == "shutdown":
             self._host.stop()
             return {"ok": True}
+        labels = {telemetry.ATTR_OPERATION: name}
+        outcome, began = "canceled", time.monotonic()
+        with tracing.span(telemetry.SPAN_SIDECAR_REQUEST, call.traceparent, labels):
+            try:
+                reply = await self._answer_by_the_model(name, call)
+                outcome = "ok"
+                return reply
+            except VramError as error:
+                outcome = error.code
+                raise
+            finally:
+                labels[telemetry.ATTR_OUTCOME] = outcome
+                tracing.note(labels)
+                meters.measure(telemetry.METRIC_SIDECAR_REQUEST, (time.monotonic() - began) * 1e3, labels)
+
+    async def _answer_by_the_model(self, name: str, call: Call) -> dict[str, Any]:
         if name == "unload":
             await self._host.unload()
             return {"ok": True}
@@ -79,7 +97,7 @@ class Wire:
         self._pending += 1
         try:
             if name == "load":
-                return await self._host.load(_timeout_s(call), call.traceparent)
+                return await self._host.load(_timeout_s(call))
             assert isinstance(call, DetectOp | QueryOp | EndpointCall), "what is left is for the model"
             answer: dict[str, Any] = npy.pack(await self._host.run(name, call))
             return answer

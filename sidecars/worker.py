@@ -1,6 +1,7 @@
 """The one thread that touches model and device. The event loop hands it work and stays free for `ping` and `revoke`."""
 
 import asyncio
+import contextvars
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -19,9 +20,10 @@ class Worker:
         """Do the work and wait for it, also if the caller is cancelled meanwhile: a model is never left half loaded.
 
         `abandon`: do not wait then, for work that holds nothing (imports). Raises the work's own typed error; any other failure
-        comes as ModelError, a full card as OutOfMemory.
+        comes as ModelError, a full card as OutOfMemory. The work runs in the caller's context: its spans are the present span's children.
         """
-        future = asyncio.get_running_loop().run_in_executor(self._pool, self._guarded, work)
+        context = contextvars.copy_context()
+        future = asyncio.get_running_loop().run_in_executor(self._pool, context.run, self._guarded, work)
         try:
             return await asyncio.shield(future)
         except asyncio.CancelledError:

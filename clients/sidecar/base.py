@@ -12,6 +12,7 @@ import socket
 from collections.abc import Mapping, Sequence
 from typing import Any, Self, cast
 
+from clients import traces
 from clients.sidecar.spawn import Child, SpawnSpec
 from clients.transport import Transport
 from schemas.errors import ModelError, SidecarUnavailable, VramError, from_wire
@@ -91,12 +92,12 @@ class SidecarClient:
         token: Sequence[int] | None = None,
         timeout_s: float | None = None,
     ) -> Any:
-        """One request, connecting and starting the sidecar first where needed.
+        """One request, connecting and starting the sidecar first where needed. It carries the present span, if there is one.
 
         Raises the type of the reply's code (Evicted, NotResident, Loading, OutOfMemory, ModelError, …) or SidecarUnavailable.
         """
         await self._ensure()
-        message = dict(fields or {})
+        message = traces.along(fields)
         if token is not None:
             message["token"] = [int(token[0]), int(token[1])]
         return await self._exchange(op, message, self._timeout_s if timeout_s is None else timeout_s)

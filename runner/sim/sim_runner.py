@@ -129,6 +129,10 @@ class SimRunner(SkillRunner):
         return snapshot
 
     # -- one tick -----------------------------------------------------------------------------------------------------
+    def _take_posted(self) -> None:
+        if not self._reset_due:  # nobody meets a scene that does not stand yet
+            super()._take_posted()
+
     def _finished(self) -> bool:
         enough = self._episodes_wanted is not None and self._view.count >= self._episodes_wanted
         return super()._finished() or enough
@@ -149,7 +153,7 @@ class SimRunner(SkillRunner):
         """1. reset tick? 2. posted work 3. cameras 4. world state 5. the skill 6. safety."""
         if self._reset_due:  # 1
             return Decision(reset=True)
-        self._mailbox.run_pending()  # 2
+        self._take_posted_after_stop()  # 2
         started_s = self.clock.now_s()
         active = self._active
         frames: dict[str, SensorFrame] | None = None

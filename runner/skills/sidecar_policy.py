@@ -24,6 +24,7 @@ from runner.protocols import Act, Done, Goal, Hold, StepOutcome
 from runner.skills.base import SkillBase
 from runner.skills.chunks import ChunkPlayer, Row
 from runner.skills.motion import JointRamp, is_at, joint_positions
+from schemas import telemetry, tracing
 from schemas.control import ControlMode
 from schemas.errors import (
     BadState,
@@ -179,6 +180,7 @@ class SidecarPolicy(SkillBase):
         self._use: Use | None = None
         self._token: tuple[int, ...] | None = None
         self._task = ""
+        self._traceparent: str | None = None
         self._ramp: JointRamp | None = None
         self._running = False
         self._player: ChunkPlayer | None = None
@@ -188,6 +190,7 @@ class SidecarPolicy(SkillBase):
     # -- event loop ----------------------------------------------------------------------------------------------------
     async def _start(self, goal: Goal) -> None:
         self._loop = asyncio.get_running_loop()
+        self._traceparent = goal.traceparent
         self._task = goal.prompt or self.manifest.default_prompt or ""
         if not self._task:
             raise ModelError(f"{self.key} needs a prompt", hint="say what to do, e.g. `grab the red cube`")
@@ -234,8 +237,11 @@ class SidecarPolicy(SkillBase):
             await self._client.close()
 
     async def _fetch(self, observation: Mapping[str, Any]) -> list[Row]:
-        answer = await self._client.get_action(observation, token=self._token, timeout_s=CHUNK_TIMEOUT_S)
-        return self._rows(answer)
+        """The tick that asked is the span's parent; the goal, where that tick is not recorded."""
+        parent = None if tracing.recorded() else self._traceparent
+        with tracing.span(telemetry.SPAN_CHUNK, parent, {telemetry.ATTR_SKILL: self.key.rskill_id}):
+            answer = await self._client.get_action(observation, token=self._token, timeout_s=CHUNK_TIMEOUT_S)
+            return self._rows(answer)
 
     # -- control thread ------------------------------------------------------------------------------------------------
     def wants_frames(self) -> bool:

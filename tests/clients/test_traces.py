@@ -1,0 +1,127 @@
+"""The caller's trace goes along with what the clients send, and nobody who does not trace pays for it."""
+
+import asyncio
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from clients import traces
+from clients.aio import ArbiterClient
+from clients.runner import RunnerClient
+from clients.serve import Message, Peer, RouterServer
+from clients.sidecar.policy import PolicyClient
+from clients.sync import SyncArbiterClient
+from schemas import tracing
+from schemas.wire import LeaseSpec
+
+PARENT = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
+OTHER = "00-1af7651916cd43dd8448eb211c80319d-c7ad6b7169203332-01"
+Spec = Callable[..., LeaseSpec]
+
+
+def test_a_program_that_does_not_trace_does_not_import_the_api() -> None:
+    code = (
+        "import sys, clients.aio, clients.sync, clients.runner, clients.sidecar.policy, clients.traces as t\n"
+        "assert t.present() is None and t.along({'a': 1}) == {'a': 1}\n"
+        "with t.joined('00-1-2-01'): pass\n"
+        "print([name for name in sys.modules if name.startswith('opentelemetry')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "[]\n", done.stdout + done.stderr
+
+
+def test_the_present_span_goes_along_unless_another_one_is_named() -> None:
+    assert traces.present() is None
+    with tracing.joined(PARENT):
+        assert traces.present() == PARENT
+        assert traces.along({"op": "x"}) == {"op": "x", "traceparent": PARENT}
+        assert traces.along({"traceparent": OTHER}) == {"traceparent": OTHER}
+        with traces.joined(
+            OTHER
+        ):  # the arbiter asks the holder to leave while the program does something else
+            assert traces.present() == OTHER
+        with traces.joined(None):
+            assert traces.present() is None
+        assert traces.present() == PARENT
+    with tracing.joined("nonsense"):
+        assert traces.present() is None
+
+
+def test_what_is_left_out_of_a_trace_is_named_all_the_same() -> None:
+    with tracing.left_out(PARENT):
+        assert traces.present() == PARENT[:-2] + "00"
+
+
+def traced_in(history: Message, consumer: str) -> set[str | None]:
+    return {event.get("traceparent") for event in history["events"] if event.get("consumer") == consumer}
+
+
+@pytest.mark.e2e
+def test_the_arbiter_hears_of_the_trace_of_an_acquire(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    async def story() -> None:
+        async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+            with tracing.joined(PARENT):
+                present = await client.acquire(spec("present", 1))
+                await present.ready()
+                assert (await client.status())["ok"]  # any request may carry it
+                named = await client.acquire(spec("named", 1), traceparent=OTHER)
+                await named.ready()
+                use = await client.begin_use(present.lease_id, present.token, "look")
+                await use.end()
+            nobody = await client.acquire(spec("nobody", 1))
+            history = await client.history()
+            for lease in (present, named, nobody):
+                await lease.release()
+        assert PARENT in traced_in(history, "present")
+        assert OTHER in traced_in(history, "named")
+        assert traced_in(history, "nobody") == {None}
+
+    asyncio.run(story())
+    with SyncArbiterClient(arbiter_daemon.endpoint, name="threads") as client:
+        with tracing.joined(PARENT):
+            lease = client.acquire(spec("sync", 1))
+        assert PARENT in traced_in(client.history(), "sync")
+        lease.release()
+
+
+def test_goals_and_sidecars_requests_carry_it(tmp_path: Path) -> None:
+    heard: dict[str, Message] = {}
+
+    async def story() -> None:
+        async def answer(peer: Peer, message: Message) -> None:
+            heard[str(message.get("op") or message.get("endpoint"))] = message
+            await server.send(peer, {"re": message["id"], "ok": True, "action": []})
+
+        async with RouterServer(f"ipc://{tmp_path}/s.sock", lambda error: error.to_wire()) as server:
+            serving = asyncio.create_task(server.serve(answer))
+            runner, policy = RunnerClient(server.endpoint), PolicyClient(server.endpoint)
+            with tracing.joined(PARENT):
+                await runner.send_goal("a/skill")
+                await policy.get_action({})
+            await policy.reset()
+            await policy.close()
+            await runner.close()
+            serving.cancel()
+
+    asyncio.run(story())
+    assert heard["goal"]["traceparent"] == heard["get_action"]["traceparent"] == PARENT
+    assert "traceparent" not in heard["reset"]
+
+
+def test_the_models_thread_is_in_its_requests_trace() -> None:
+    from sidecars.worker import Worker
+
+    async def story() -> tuple[Any, Any]:
+        worker = Worker()
+        with tracing.joined(PARENT):
+            inside = await worker.run(tracing.traceparent)
+        outside = await worker.run(tracing.traceparent)
+        worker.close()
+        return inside, outside
+
+    assert asyncio.run(story()) == (PARENT, None)
