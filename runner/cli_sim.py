@@ -1,4 +1,5 @@
-"""`vram-runner sim`: owns the simulated robot, its cameras and safety, and serves goals. Puts its parts together, and nothing else."""
+"""`vram-runner sim`: owns the simulated world, its cameras and safety, and serves goals, or lets a policy play. Puts its parts together, and
+nothing else."""
 
 from __future__ import annotations
 
@@ -15,25 +16,43 @@ from runner.cli_common import (
     default_skills,
     install_signals,
     not_negative,
-    sidecar_endpoint,
+    positive_int,
     sidecars_given,
     warm_up,
 )
+from runner.control import ControlThread
 from schemas.endpoints import program_endpoint
-from schemas.errors import ConfigError
+from schemas.errors import ConfigError, InternalError
 
 log = logging.getLogger("runner")
 
-OBSERVATION_CAMERAS = ("front", "wrist")  # the first is the default one
-VIDEO_CAMERA = "overview"
-VIDEO_EVERY = 3  # ticks: ten pictures a second at 30 Hz
 AS_FAST_AS_POSSIBLE_HZ = 30.0  # simulated rate when nothing is paced
+
+
+def add_world_flags(parser: argparse.ArgumentParser) -> None:
+    """Flags that say what is simulated."""
+    parser.add_argument(
+        "--env", default="so101", help="so101 (default), or gym:ID for a gymnasium environment"
+    )
+    parser.add_argument("--scene", type=Path, help="scene file of so101; without it the built-in table")
+    parser.add_argument(
+        "--env-config", type=Path, help="how a gymnasium environment is to be read (docs/runner.md)"
+    )
+    parser.add_argument(
+        "--success", metavar="RULE", help="of a gymnasium environment: info:KEY or return:NUMBER"
+    )
+    parser.add_argument("--max-steps", type=positive_int, help="cut an episode off after so many steps")
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
     """The flags of `vram-runner sim`."""
-    sim = commands.add_parser("sim", help="the simulated SO-101 on a mobile base")
-    sim.add_argument("--scene", type=Path, help="scene file; without it the built-in table")
+    sim = commands.add_parser("sim", help="the simulated SO-101 on a mobile base, or another world")
+    add_world_flags(sim)
+    sim.add_argument(
+        "--policy",
+        help="random, scripted:MODULE or scripted:FILE.py plays --episodes episodes by itself; no goals are taken then",
+    )
+    sim.add_argument("--episodes", type=positive_int, help="of --policy; default 1")
     sim.add_argument("--seed", type=int, default=0, help="decides everything about the episode")
     sim.add_argument("--video", type=Path, help="write the episode as H.264 video to this file")
     sim.add_argument(
@@ -54,81 +73,71 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 async def run(args: argparse.Namespace) -> int:
-    """Build everything, serve until a signal, `shutdown` or `--max-seconds`, end in order."""
-    from pydantic import ValidationError
-
-    from clients.sidecar.policy import PolicyClient
-    from runner.body import SIMULATED
-    from runner.catalogue import Catalogue, Maker, read_manifests
+    """Build everything, serve until a signal, `shutdown`, `--max-seconds` or the last of `--episodes`, end in order."""
+    from runner.catalogue import Catalogue, read_manifests
     from runner.clock import SystemClock
-    from runner.control import ControlThread
     from runner.goals import GoalServer
-    from runner.protocols import DeadlinePolicy, Skill
+    from runner.protocols import DeadlinePolicy
     from runner.recorder import Recorder
-    from runner.sim.arm_env import ArmEnvironment
-    from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
-    from runner.sim.env import SimEnv
+    from runner.sim.policies import policy_of
     from runner.sim.sim_runner import SimRunner
     from runner.sim.truth import truth_as_wire
-    from runner.skills.navigate import Navigate
-    from runner.skills.sidecar_policy import LOCKSTEP_WAIT_S, SidecarPolicy, wire_up
-    from schemas.manifest import Kind, RSkillManifest
+    from runner.sim.worlds import makers_of, world_of
+    from runner.skills.sidecar_policy import LOCKSTEP_WAIT_S
 
-    try:
-        scene = SceneConfig.load(args.scene)
-    except (OSError, ValidationError, ValueError) as error:
-        raise ConfigError(f"the scene {args.scene} cannot be read: {error}") from error
-    manifests = read_manifests(args.skills or [default_skills()])
+    world = world_of(
+        args.env,
+        scene=args.scene,
+        env_config=args.env_config,
+        success=args.success,
+        render=True if args.video is not None else None,
+    )
+    if args.episodes is not None and args.policy is None:
+        raise ConfigError("--episodes is for --policy; goals end their episodes themselves")
+    policy = None if args.policy is None else policy_of(args.policy)
+    manifests = [] if policy is not None else read_manifests(args.skills or [default_skills()])
     given = sidecars_given(args.sidecar)
     period_s = 1.0 / (args.rate or AS_FAST_AS_POSSIBLE_HZ)
     wait_s = LOCKSTEP_WAIT_S if args.lockstep or args.rate == 0 else 0.0
     clock = SystemClock()
-    rest = dict(zip(ARM_JOINTS, REST_POSE, strict=True))
 
     async with contextlib.AsyncExitStack() as stack:
-        arbiter = None if args.no_arbiter else await connect_arbiter(args.arbiter, stack)
-
-        def make_policy(manifest: RSkillManifest) -> Skill:
-            client = PolicyClient(sidecar_endpoint(manifest.name, given, os.environ))
-            return SidecarPolicy(
-                manifest,
-                wire_up(manifest, ARM_JOINTS, rest),
-                client,
-                arbiter,
-                period_s=period_s,
-                wait_s=wait_s,
-            )
-
-        def make_navigate(manifest: RSkillManifest) -> Skill:
-            return Navigate(manifest, scene, period_s=period_s)
-
-        makers: dict[Kind, Maker] = {Kind.VLA: make_policy, Kind.ROS_ACTION: make_navigate}
-        env = SimEnv(scene)  # renders only on the control thread, from its first reset on
+        alone = args.no_arbiter or policy is not None  # such a policy holds no memory of a card
+        arbiter = None if alone else await connect_arbiter(args.arbiter, stack)
         recorder = None
         if args.video is not None:
-            recorder = Recorder(args.video, fps=1.0 / period_s / VIDEO_EVERY)
+            recorder = Recorder(args.video, fps=1.0 / period_s / world.video_every)
             stack.callback(recorder.close)
         runner = SimRunner(
-            lambda: ArmEnvironment(env),
-            cameras=tuple(name for name in OBSERVATION_CAMERAS if name in scene.cameras),
+            world.make,
+            cameras=world.cameras,
             seed=args.seed,
             rate_hz=args.rate,
             deadline_policy=DeadlinePolicy(args.deadline_policy),
             clock=clock,
-            video_camera=VIDEO_CAMERA,
-            video_every=VIDEO_EVERY,
+            episodes=None if policy is None else args.episodes or 1,
+            max_steps=args.max_steps,
+            policy=None if policy is None else policy.play,
+            video_camera=world.video_camera,
+            video_every=world.video_every,
         )
-        runner.identity = {"robot": "so101-mobile", "scene": str(args.scene or "built-in")}
+        runner.identity = dict(world.identity)
+        if policy is not None:
+            runner.identity["policy"] = policy.name
+            runner.recorder = recorder  # from its first step on: it may be over before anybody asks
         control = await stack.enter_async_context(ControlThread(runner))
         await asyncio.to_thread(warm_up)
-        await control.call(lambda: None)  # the scene stands and the cameras have rendered: ready means ready
+        await ready(control)
+        arm = world.arm
         server = GoalServer(
             args.endpoint or program_endpoint("runner", os.environ, os.getuid()),
             control,
             runner,
-            Catalogue(manifests, makers, body=SIMULATED),
+            Catalogue(
+                manifests, makers_of(world, given, arbiter, period_s=period_s, wait_s=wait_s), body=world.body
+            ),
             clock,
-            ground_truth=lambda: truth_as_wire(env),
+            ground_truth=None if arm is None else lambda: truth_as_wire(arm),
             on_bound=lambda: setattr(
                 runner, "recorder", recorder
             ),  # not before: a second runner must not touch the first's video
@@ -150,4 +159,16 @@ async def run(args: argparse.Namespace) -> int:
     print(result.model_dump_json())
     if args.timings is not None:
         runner.timings.write(args.timings)
+    if runner.policy_error is not None:
+        raise runner.policy_error
     return 1 if control.ended.exception() is not None else 0
+
+
+async def ready(control: ControlThread) -> None:
+    """The scene stands and the cameras have rendered: ready means ready. Raises what the first reset raised."""
+    try:
+        await control.call(lambda: None)
+    except InternalError:
+        await asyncio.wait([control.ended])
+        if (error := control.ended.exception()) is not None:
+            raise error from None

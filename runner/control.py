@@ -129,6 +129,8 @@ class ControlThread:
         failure: BaseException | None = None
         try:
             result = self.runner.run(self._max_ticks)
+        except VramError as error:  # says by itself what it is; who leaves the thread logs it
+            failure = error
         except BaseException as error:
             log.exception("the control loop failed")
             failure = error

@@ -140,7 +140,7 @@ class RunnerBase(ABC):
         return tracing.span(telemetry.SPAN_TICK, self.traceparent, self.labels)
 
     def _tick(self, started_s: float, trace_context: dict[str, str] | None) -> TickResult:
-        due_s = started_s if self._due_s is None else self._due_s
+        due_s = started_s if self._due_s is None or self.period_s is None else self._due_s
         late_ms = max(0.0, started_s - due_s) * 1e3
         deadline_s = math.inf if self.period_s is None else due_s + self.period_s
         decision = self._decide(self.tick_idx)  # 1

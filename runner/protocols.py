@@ -112,7 +112,26 @@ class Progress:
     detail: str = ""
 
 
-class Skill(Protocol):
+class Stepped(Protocol):
+    """What the control loop needs of a skill while it has the robot."""
+
+    @property
+    def key(self) -> SkillKey: ...
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Cameras whose frames `step` wants to see when `wants_frames` says so."""
+        ...
+
+    def wants_frames(self) -> bool: ...
+
+    def step(self, world: WorldState) -> StepOutcome: ...
+
+    @property
+    def fraction(self) -> float: ...
+
+
+class Skill(Stepped, Protocol):
     """Something that a goal can run. Life: `start` → `step`… → `finish` per goal, `release` when it loses residency.
 
     `start` leaves it reset whatever happened before. `step` raises a VramError to fail the goal; the arm then holds.
@@ -121,26 +140,11 @@ class Skill(Protocol):
     manifest: RSkillManifest
 
     @property
-    def key(self) -> SkillKey: ...
-
-    @property
     def holds_gpu(self) -> bool:
         """Whether it takes the resident slot. GPU-free skills neither take it nor make anyone leave."""
         ...
 
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Cameras whose frames `step` wants to see when `wants_frames` says so."""
-        ...
-
     async def start(self, goal: Goal) -> None: ...
-
-    def wants_frames(self) -> bool: ...
-
-    def step(self, world: WorldState) -> StepOutcome: ...
-
-    @property
-    def fraction(self) -> float: ...
 
     async def finish(self) -> None: ...
 

@@ -17,7 +17,18 @@ from typing import Any
 from runner.clock import Clock
 from runner.control import Mailbox
 from runner.loop import Decision, RunnerBase
-from runner.protocols import Act, DeadlinePolicy, Done, Goal, Hold, Progress, SafetyGate, Skill, SkillEnded
+from runner.protocols import (
+    Act,
+    DeadlinePolicy,
+    Done,
+    Goal,
+    Hold,
+    Progress,
+    SafetyGate,
+    Skill,
+    SkillEnded,
+    Stepped,
+)
 from schemas import meters, telemetry, tracing
 from schemas.errors import EstopRequested, InternalError, LimitExceeded, ModelError, VramError
 from schemas.world import Action, WorldState
@@ -57,7 +68,7 @@ class Tally:
 
 @dataclass(slots=True)
 class Active:
-    skill: Skill
+    skill: Stepped
     goal: Goal
     on_end: Callable[[SkillEnded], None]
     began_tick: int
@@ -133,6 +144,9 @@ class SkillRunner(RunnerBase):
     # -- the skill that has the arm --------------------------------------------------------------------------------------
     def begin_skill(self, skill: Skill, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
         """Control thread. Raises InternalError when another skill has the arm, EstopRequested when the stop is latched."""
+        self._give(skill, goal, on_end)
+
+    def _give(self, skill: Stepped, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
         if self.estop is not None:
             raise self.estop
         if self._active is not None:

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from schemas.control import JOINT_MODES, ControlMode
 from schemas.errors import ConfigError
+from schemas.manifest.vocabulary import EmbodimentTag
 from schemas.yamltext import config_error as said
 from schemas.yamltext import parse_yaml, problems_of
 
@@ -45,6 +46,7 @@ class GymConfig(BaseModel):
     cameras: dict[str, str] = {}
     control_mode: ControlMode = ControlMode.JOINT_POSITION
     actions: tuple[str, ...] = ()
+    embodiment_tags: tuple[EmbodimentTag, ...] = ()  # which robot it is; skills for others are refused then
     hold: int | tuple[float, ...] | None = None
     success: str = ""
 

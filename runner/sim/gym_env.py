@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 import math
 import os
+import random
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -161,7 +162,8 @@ class GymEnv:
     # -- Environment -------------------------------------------------------------------------------------------------------
     def reset(self, seed: int) -> None:
         self._steps, self._total_reward = 0, 0.0
-        self._env.action_space.seed(seed)
+        # not the same seed: both draw from the same kind of generator, and random actions would be the world's own random numbers
+        self._env.action_space.seed(random.Random(f"actions-{seed}").getrandbits(31))
         try:
             self._observation, info = self._env.reset(seed=seed)
         except Exception as error:

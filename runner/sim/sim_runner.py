@@ -18,18 +18,26 @@ from pydantic import ValidationError
 from runner.clock import Clock
 from runner.frames import Snapshot
 from runner.loop import Applied, Decision
-from runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded
+from runner.protocols import DeadlinePolicy, Goal, SafetyGate, SkillEnded, Stepped
 from runner.recorder import Recorder
 from runner.sim.environment import Environment, EnvStep
 from runner.sim.episodes import Episode, EpisodeView
 from runner.skill_runner import SkillRunner
 from schemas import telemetry, tracing
-from schemas.errors import EnvironmentFailed, InternalError, LimitExceeded, ModelError, VramError
+from schemas.errors import (
+    EnvironmentFailed,
+    GoalRejected,
+    InternalError,
+    LimitExceeded,
+    ModelError,
+    VramError,
+)
 from schemas.world import FrameEncoding, SensorFrame, TickResult
 
 log = logging.getLogger(__name__)
 
 STILL_AFTER_TICKS = 20  # without a skill nothing moves: the video repeats its last picture
+IDLE_S = 0.001
 FRAME_REUSE_S = 0.1  # observation cameras are rendered on demand, at most at 10 Hz
 
 
@@ -37,6 +45,7 @@ class SimRunner(SkillRunner):
     """`seed + i` seeds episode i. `episodes` None goes on until it is stopped (the live runner). An episode ends when its world says so,
     after `max_steps` steps (truncated), and with `ends_with_skill` when its skill does (truncated, too: the world itself was not done).
 
+    `policy(env, seed)` plays every episode from its reset tick on, instead of goals; its first error (`policy_error`) ends the run.
     `cameras` None takes those of the environment. A goal is over with its episode: done where the environment says success, failed otherwise.
     """
 
@@ -52,6 +61,7 @@ class SimRunner(SkillRunner):
         episodes: int | None = None,
         max_steps: int | None = None,
         ends_with_skill: bool = False,
+        policy: Callable[[Environment, int], Stepped] | None = None,
         recorder: Recorder | None = None,
         video_camera: str = "overview",
         video_every: int = 3,
@@ -63,7 +73,9 @@ class SimRunner(SkillRunner):
         self._seed = seed
         self._episodes_wanted = episodes
         self._max_steps = max_steps
-        self._ends_with_skill = ends_with_skill
+        self._ends_with_skill = ends_with_skill or policy is not None
+        self._policy = policy
+        self.policy_error: VramError | None = None
         self.recorder = recorder  # may be set while running
         self._video_camera = video_camera
         self._video_every = video_every
@@ -105,9 +117,27 @@ class SimRunner(SkillRunner):
         self._next_seed = seed
         self._reset_due = True
 
-    def begin_skill(self, skill: Skill, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
-        super().begin_skill(skill, goal, on_end)
+    def begin_skill(self, skill: Stepped, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
+        """As its base, and for whatever can be stepped. Raises GoalRejected for a skill that wants cameras which this world has not."""
+        if missing := [camera for camera in skill.cameras if camera not in self._cameras]:
+            raise GoalRejected(
+                f"{skill.key} looks through {', '.join(missing)}; here there is {', '.join(self._cameras) or 'no camera'}",
+                hint="cameras are renamed in the skill's `image_preprocessing.aliases`, or in the environment's file",
+            )
+        self._give(skill, goal, on_end)
         self._had_skill = True
+
+    def _play_policy(self, seed: int) -> None:
+        if self._policy is None:
+            return
+        player = self._policy(self.env, seed)
+        goal = Goal(f"episode-{self.episode_idx}", player.key.rskill_id)
+        self.begin_skill(player, goal, self._policy_ended)
+
+    def _policy_ended(self, ended: SkillEnded) -> None:
+        if ended.error is not None and "episode" not in ended.data and not self._stopping:
+            self.policy_error = self.policy_error or ended.error
+            self.request_stop()
 
     # -- pictures -----------------------------------------------------------------------------------------------------
     def camera_names(self) -> tuple[str, ...]:
@@ -140,6 +170,8 @@ class SimRunner(SkillRunner):
     def tick(self) -> TickResult:
         result = super().tick()
         self._view.add(result)
+        if self.period_s is None and result.step_idx is None and result.terminated is False:
+            self.clock.sleep_s(IDLE_S)  # a world that stands still is not looked at as fast as possible
         return result
 
     def _success(self) -> bool | None:
@@ -234,6 +266,7 @@ class SimRunner(SkillRunner):
             self._cameras = self.env.cameras
         for camera in self._cameras:  # a first picture takes a second: rendering contexts, shaders
             self._render(camera)
+        self._play_policy(seed)
         return Applied(action_applied=False, episode_idx=self.episode_idx)
 
     def _broken_off(self, error: EnvironmentFailed) -> Applied:

@@ -102,14 +102,14 @@ class Wiring:
 
     cameras: Mapping[str, str]
     joints: tuple[str, ...]
-    start_pose: Mapping[str, float]
+    start_pose: Mapping[str, float] | None  # None: it begins where the robot stands
     degrees: bool
     steps_per_chunk: int | None
     rollout: Rollout
     rollout_s: float
 
 
-def wire_up(manifest: RSkillManifest, joints: tuple[str, ...], rest: Mapping[str, float]) -> Wiring:
+def wire_up(manifest: RSkillManifest, joints: tuple[str, ...], rest: Mapping[str, float] | None) -> Wiring:
     """Read the manifest. Raises ManifestInvalid when it does not say what it looks at or does not fit the joints."""
     aliases = manifest.image_preprocessing.aliases if manifest.image_preprocessing else {}
     robot_name = {model: robot for robot, model in aliases.items()}
@@ -272,6 +272,8 @@ class SidecarPolicy(SkillBase):
 
     def _at_start(self, measured: Mapping[str, float]) -> bool:
         """Whether the arm is at the start pose; sets the next target when not."""
+        if self._wiring.start_pose is None:
+            return True
         goal = {name: self._wiring.start_pose[name] for name in self._wiring.joints}
         if self._ramp is None:
             if is_at(measured, goal):

@@ -12,9 +12,11 @@ class Point(gymnasium.Env[Any, Any]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012 — gymnasium's own way
 
-    def __init__(self, render_mode: str | None = None, fails_at: int = -1, told: bool = True) -> None:
+    def __init__(
+        self, render_mode: str | None = None, fails_at: int = -1, told: bool = True, mark: Any = None
+    ) -> None:
         self.render_mode = render_mode
-        self.fails_at, self.told = fails_at, told
+        self.fails_at, self.told, self.given = fails_at, told, mark
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.observation_space = spaces.Dict(
             {
@@ -35,6 +37,8 @@ class Point(gymnasium.Env[Any, Any]):
         super().reset(seed=seed)
         self.resets.append(seed)
         self.at, self.mark = np.zeros(2), self.np_random.uniform(-0.9, 0.9, 2)
+        if self.given is not None:
+            self.mark = np.asarray(self.given, float)
         self.steps = 0
         return self._look(), {}
 

@@ -83,6 +83,13 @@ def test_the_same_seed_is_the_same_episode() -> None:
     assert play() == play()
 
 
+def test_random_actions_are_not_the_worlds_own_random_numbers() -> None:
+    env = GymEnv(POINT, render=False)
+    for seed in range(20):
+        env.reset(seed)
+        assert not env.step(env.sample()).success
+
+
 # -- actions ----------------------------------------------------------------------------------------------------------
 def test_every_number_of_a_discrete_goes_there_and_back() -> None:
     env = GymEnv("CartPole-v1", render=False)

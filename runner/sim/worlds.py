@@ -1,0 +1,140 @@
+"""Which world the runner is to simulate (`--env`), and what goes with it: cameras, joints, who may act in it.
+
+`so101` is our own scene, `gym:ID` any gymnasium environment. Nothing is simulated here yet: `World.make` does that, on the control thread.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from runner.body import SIMULATED
+from runner.catalogue import Maker
+from runner.cli_common import sidecar_endpoint
+from runner.protocols import Skill
+from runner.sim.arm_env import ArmEnvironment
+from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
+from runner.sim.env import SimEnv
+from runner.sim.environment import Environment
+from runner.sim.gym_config import RENDER, GymConfig
+from runner.sim.gym_env import GymEnv
+from schemas.body import Body
+from schemas.control import ControlMode
+from schemas.errors import ConfigError, ManifestInvalid
+from schemas.manifest import Kind, RSkillManifest
+
+SO101: Final = "so101"
+GYM: Final = "gym:"
+OBSERVATION_CAMERAS: Final = ("front", "wrist")  # the first is the default one
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """`cameras` None: what the environment has. `arm` and `scene` are those of our own scene. `joints` are what a policy sees and moves, in
+    the policy's order; `rest` is where it begins (rad), None: wherever a reset leaves the world."""
+
+    name: str
+    make: Callable[[], Environment]
+    cameras: tuple[str, ...] | None
+    video_camera: str
+    video_every: int  # ticks
+    joints: tuple[str, ...]
+    rest: Mapping[str, float] | None
+    body: Body | None
+    identity: Mapping[str, Any] = field(default_factory=dict)
+    scene: SceneConfig | None = None
+    arm: SimEnv | None = None
+
+
+def so101_world(scene_file: Path | None) -> World:
+    """Raises ConfigError for a scene that cannot be read."""
+    try:
+        scene = SceneConfig.load(scene_file)
+    except (OSError, ValidationError, ValueError) as error:
+        raise ConfigError(f"the scene {scene_file} cannot be read: {error}") from error
+    arm = SimEnv(scene)  # renders only on the control thread, from its first reset on
+    cameras = tuple(name for name in OBSERVATION_CAMERAS if name in scene.cameras)
+    return World(
+        name=SO101,
+        make=lambda: ArmEnvironment(arm, cameras=cameras),
+        cameras=cameras,
+        video_camera="overview",
+        video_every=3,  # ten pictures a second at 30 Hz
+        joints=ARM_JOINTS,
+        rest=dict(zip(ARM_JOINTS, REST_POSE, strict=True)),
+        body=SIMULATED,
+        identity={"robot": "so101-mobile", "scene": str(scene_file or "built-in")},
+        scene=scene,
+        arm=arm,
+    )
+
+
+def gym_world(env_id: str, config: GymConfig, *, render: bool | None) -> World:
+    """`render` as in `GymEnv`. What is wrong with the id shows when the world is made."""
+    tags = config.embodiment_tags
+    return World(
+        name=GYM + env_id,
+        make=lambda: GymEnv(env_id, config, render=render),
+        cameras=None,
+        video_camera=RENDER,
+        video_every=1,
+        joints=config.actions if config.control_mode is ControlMode.JOINT_POSITION else (),
+        rest=None,
+        body=Body(embodiment_tags=tags) if tags else None,
+        identity={"robot": GYM + env_id, "scene": env_id},
+    )
+
+
+def world_of(
+    env: str,
+    *,
+    scene: Path | None = None,
+    env_config: Path | None = None,
+    success: str | None = None,
+    render: bool | None = None,
+) -> World:
+    """The world of `--env` and the flags beside it. Raises ConfigError for flags that do not go together."""
+    if env == SO101:
+        if env_config is not None or success is not None:
+            raise ConfigError("--env-config and --success are for --env gym:ID; the scene file is --scene")
+        return so101_world(scene)
+    if not env.startswith(GYM) or env == GYM:
+        raise ConfigError(f"--env {env} is no world", hint="so101, or gym:ID, e.g. gym:CartPole-v1")
+    if scene is not None:
+        raise ConfigError(f"--scene is for --env {SO101}; a gymnasium environment has --env-config")
+    config = GymConfig() if env_config is None else GymConfig.load(env_config)
+    if success is not None:
+        config = config.with_success(success)
+    return gym_world(env.removeprefix(GYM), config, render=render)
+
+
+def makers_of(
+    world: World, given: Mapping[str, str], arbiter: Any, *, period_s: float, wait_s: float
+) -> dict[Kind, Maker]:
+    """Who makes the installed skills that can act in this world."""
+    from clients.sidecar.policy import PolicyClient
+    from runner.skills.navigate import Navigate
+    from runner.skills.sidecar_policy import SidecarPolicy, wire_up
+
+    def make_policy(manifest: RSkillManifest) -> Skill:
+        if not world.joints:
+            raise ManifestInvalid(
+                f"{manifest.name} moves joints, and {world.name} names none",
+                hint="name them in the environment's file: `joints`, `actions`, control_mode joint_position",
+            )
+        wiring = wire_up(manifest, world.joints, world.rest)
+        client = PolicyClient(sidecar_endpoint(manifest.name, given, os.environ))
+        return SidecarPolicy(manifest, wiring, client, arbiter, period_s=period_s, wait_s=wait_s)
+
+    scene = world.scene
+    if scene is None:
+        return {Kind.VLA: make_policy}
+    return {
+        Kind.VLA: make_policy,
+        Kind.ROS_ACTION: lambda manifest: Navigate(manifest, scene, period_s=period_s),
+    }

@@ -1,0 +1,229 @@
+"""`vram-runner sim --env …`: policies that play by themselves, and goals with a served policy, in gymnasium environments and our own scene."""
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clients.runner import RunnerClient
+from clients.serve import Message, Peer, RouterServer
+from clients.sidecar import npy
+from runner.__main__ import main
+from schemas.errors import UnknownSkill
+
+pytestmark = pytest.mark.heavy
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+POINT = "gym:gym_worlds:test/Point-v0"
+MANIFEST = """
+name: "test/point-seek"
+version: "1.0.0"
+kind: vla
+model_family: act
+embodiment_tags: [custom]
+embodiment_extra:
+  sensors: [{modality: rgb, count: 1}]
+  actuators: [{kind: joint_position, n_dof: 2, control_mode_semantics: {mode: absolute}}]
+sensors_required:
+  - {modality: rgb, vla_feature_key: observation.images.front}
+actuators_required:
+  - {kind: joint_position, n_dof: 2, vla_action_key: action, control_mode_semantics: {mode: absolute}}
+weights_uri: "local://models/none"
+chunk_size: 3
+latency_budget: {per_chunk_ms: 100.0, max_execution_s: 20.0}
+min_vram_gb: {fp32: 1.0}
+description: "A policy of this test."
+actions: [reach]
+action_contract: {dim: 2}
+policy_extras: {rollout_steps: 600, stop_when_still: false}
+"""
+WORLD = """
+kwargs: {mark: [0.25, -0.5]}
+state: agent_pos
+joints: [a, b]
+actions: [a, b]
+cameras: {front: pixels.top}
+"""
+
+
+def sim(tmp_path: Path, capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, Any, str]:
+    """Exit code, result and what was said."""
+    code = main(["sim", "--endpoint", f"ipc://{tmp_path}/r.sock", "--rate", "0", *flags])
+    out, said = capsys.readouterr()
+    return code, json.loads(out.splitlines()[-1]) if out else None, said
+
+
+# -- policies by themselves -------------------------------------------------------------------------------------------
+def test_a_scripted_policy_balances_gymnasiums_pole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script = f"scripted:{HERE}/balance.py"
+    flags = ("--episodes", "2", "--max-steps", "120", "--success", "return:120")
+    code, result, _ = sim(tmp_path, capsys, "--env", "gym:CartPole-v1", "--policy", script, *flags)
+    assert (code, result["success"], result["n_ticks"]) == (0, True, 2 * 121)
+    assert result["metadata"]["episodes"] == 2
+    code, result, _ = sim(tmp_path, capsys, "--env", "gym:CartPole-v1", "--policy", "random", *flags)
+    assert (code, result["success"]) == (0, False)
+
+
+def test_random_actions_in_our_own_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, result, _ = sim(tmp_path, capsys, "--policy", "random", "--max-steps", "5")
+    assert (code, result["n_ticks"], result["success"]) == (0, 6, None)
+    assert result["metadata"]["withheld"] == 0
+
+
+def test_a_policy_with_a_defect_ends_the_run_and_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ("--env", POINT, "--policy", f"scripted:{HERE}/seek.py", "--seed", "12", "--episodes", "5")
+    code, result, said = sim(tmp_path, capsys, *flags)
+    assert (code, result["metadata"]["episodes"]) == (1, 2)  # the second is the one that failed
+    assert said.splitlines()[-1].endswith("seek.py: IndexError: beyond the mark")
+    assert "Traceback" not in said
+
+
+def test_an_environment_that_fails_ends_the_run_and_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world = tmp_path / "world.yaml"
+    world.write_text("kwargs: {fails_at: 1}\n", encoding="utf-8")
+    code, result, said = sim(
+        tmp_path, capsys, "--env", POINT, "--env-config", str(world), "--policy", "random"
+    )
+    assert (code, result["metadata"]["episodes"]) == (1, 0)
+    assert "ZeroDivisionError: the physics blew up" in said.splitlines()[-1]
+
+
+def test_the_video_of_an_environment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import imageio_ffmpeg
+
+    video = tmp_path / "point.mp4"
+    flags = ("--policy", f"scripted:{HERE}/seek.py", "--video", str(video))
+    code, result, _ = sim(tmp_path, capsys, "--env", POINT, *flags)
+    assert (code, result["success"]) == (0, True)
+    assert imageio_ffmpeg.count_frames_and_secs(str(video))[0] == result["n_ticks"] - 1
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--env", "gym:"], "is no world"),
+        (["--env", "mujoco"], "is no world"),
+        (["--env", "gym:NoSuch-v0", "--policy", "random"], "NoSuch"),
+        (["--env", "gym:CartPole-v1", "--scene", "x.yaml"], "--scene"),
+        (["--env-config", "x.yaml"], "--env-config"),
+        (["--env", "gym:CartPole-v1", "--success", "maybe"], "--success maybe"),
+        (["--policy", "clever"], "clever"),
+        (["--policy", "scripted:no_such_module"], "no_such_module"),
+        (["--policy", "scripted:none.py"], "none.py"),
+        (["--policy", "scripted:json"], "make(env, seed)"),
+        (["--episodes", "2"], "--policy"),
+    ],
+)
+def test_mistakes_are_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], said: str
+) -> None:
+    code, _, told = sim(tmp_path, capsys, "--no-arbiter", *flags)
+    assert code == 2
+    assert said in told
+    assert len(told.splitlines()) == 1
+
+
+# -- goals -----------------------------------------------------------------------------------------------------------
+class Sidecar:
+    """A served policy that always aims at the same place."""
+
+    def __init__(self) -> None:
+        self.aim = (0.25, -0.5)
+        self.observations: list[Any] = []
+
+    async def serve(self, endpoint: str) -> None:
+        async with RouterServer(endpoint, lambda error: {"ok": False, "error": str(error)}) as self.server:
+            await self.server.serve(self.answer)
+
+    async def answer(self, peer: Peer, message: Message) -> None:
+        import numpy as np
+
+        reply: Message = {"ok": True, "re": message.get("id")}
+        if message["endpoint"] == "load":
+            reply |= {"lease_id": None, "token": None, "loaded": True}
+        elif message["endpoint"] == "get_action":
+            self.observations.append(npy.unpack(message["data"]["observation"]))
+            reply = {"action": npy.pack(np.array([self.aim] * 3, dtype=np.float32)), "re": message.get("id")}
+        await self.server.send(peer, reply)
+
+
+@pytest.mark.e2e
+def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
+    (tmp_path / "world.yaml").write_text(WORLD, encoding="utf-8")
+    (tmp_path / "rskill.yaml").write_text(MANIFEST, encoding="utf-8")
+    argv = [
+        *(
+            sys.executable,
+            "-m",
+            "runner",
+            "sim",
+            "--env",
+            POINT,
+            "--env-config",
+            str(tmp_path / "world.yaml"),
+        ),
+        *("--skills", str(tmp_path / "rskill.yaml"), "--no-arbiter", "--rate", "0"),
+        *("--sidecar", f"test/point-seek=ipc://{tmp_path}/policy.sock"),
+    ]
+    environ = os.environ | {
+        "VRAM_ARBITER_RUNTIME": str(tmp_path),
+        "PYTHONPATH": f"{ROOT}:{HERE}",
+        "OMP_NUM_THREADS": "1",
+    }
+    process = subprocess.Popen(argv, cwd=ROOT, env=environ, stdout=subprocess.PIPE)
+
+    async def scenario() -> None:
+        sidecar = Sidecar()
+        serving = asyncio.create_task(sidecar.serve(f"ipc://{tmp_path}/policy.sock"))
+        async with (
+            asyncio.timeout(120),
+            RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=60.0) as client,
+        ):
+            assert (await client.call("ping"))["robot"] == POINT
+            frame = await client.call("frame", {"encoding": "png", "max_age_ms": 60_000.0})
+            assert (frame["camera"], frame["width"], frame["height"]) == ("front", 33, 24)
+            goal = await client.send_goal("test/point-seek", prompt="go there")
+            result = await goal.result(60)
+            assert (result["status"], result["data"]["success"], result["data"]["steps"]) == (
+                "succeeded",
+                True,
+                1,
+            )
+            assert sidecar.observations[0]["observation.state"].tolist() == [0.0, 0.0]
+            assert sidecar.observations[0]["observation.images.front"].shape == (24, 33, 3)
+            sidecar.aim = (0.9, 0.9)
+            result = await (await client.send_goal("test/point-seek", prompt="go there")).result(60)
+            assert (result["status"], result["code"]) == ("failed", "limit_exceeded")
+            assert (result["data"]["success"], result["data"]["steps"], result["data"]["episode"]) == (
+                False,
+                20,
+                1,
+            )
+            with pytest.raises(UnknownSkill):
+                await client.send_goal("vram-arbiter/so101-grab", prompt="grab")
+            await client.call("shutdown")
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+
+    try:
+        asyncio.run(scenario())
+        out, _ = process.communicate(timeout=60)
+        result = json.loads(out.splitlines()[-1])
+        assert process.returncode == 0
+        assert (result["success"], result["metadata"]["episodes"]) == (False, 2)
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
