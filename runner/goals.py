@@ -367,7 +367,7 @@ class GoalServer:
             running.skill = skill = await self._residency.acquire(key, make)
             running.phase = "starting"
             self._caption(running)
-            await skill.start(goal)
+            await self._residency.start(skill, goal)
         running.phase = "running"
         self._caption(running)
         return await self._control.run_skill(skill, goal)

@@ -24,6 +24,7 @@ from schemas.errors import (
     LeaseLost,
     LeaseRevoking,
     Loading,
+    NotResident,
     OutOfMemory,
     SidecarUnavailable,
     StaleToken,
@@ -65,6 +66,9 @@ class Residency:
         self._loads = 0  # counts loads and unloads, in the worker: an op that was queued before an unload must not run after it
         self._running = 0
         self._last_use_s = time.monotonic()
+        self._resident_since_s = self._last_use_s
+        self._obtaining: asyncio.Task[Lease | None] | None = None
+        self._unloads = 0  # times that somebody said so: whoever waited for the model then waits no longer
         self._calling: asyncio.Task[VramError | None] | None = None  # a lease on standby back
         self.lease: Lease | None = None
         self.state: State = "unloaded"
@@ -99,8 +103,11 @@ class Residency:
             self._turn.release()
 
     async def unload(self) -> None:
-        """Give the lease up at the next safe point. Nothing happens if the model is not resident."""
-        if self.lease is not None:
+        """Give the lease up at the next safe point, or the wait for it: whoever waits hears NotResident. Else nothing happens."""
+        self._unloads += 1
+        if self._obtaining is not None and not self._obtaining.done():
+            self._obtaining.cancel()
+        elif self.lease is not None:
             await self.lease.give_up()
         elif self.state == "resident":
             async with self._turn:
@@ -160,13 +167,17 @@ class Residency:
         return True
 
     async def release_when_idle(self, idle_s: float) -> None:
-        """Runs beside the host: lets go of a model that nobody used for `idle_s`, at the latest after twice as long.
+        """Runs beside the host: lets go of a model that nobody used for `idle_s`, at the latest after twice as long; never within its minimum
+        residency, in which whoever had it loaded begins to use it.
 
         A goal is a use that somebody else marks at the arbiter, and it may ask us for nothing for a while (its arm goes to the start pose):
         the arbiter is asked before anything is let go. One that cannot be reached cannot say, and the model stays.
         """
         while True:
-            left = self._last_use_s + idle_s - time.monotonic()
+            stays_until = max(
+                self._last_use_s + idle_s, self._resident_since_s + self._settings.min_residency_s
+            )
+            left = stays_until - time.monotonic()
             if self.state == "resident" and not self._running and left <= 0:
                 if await self._used_by_others():
                     _log.debug("in use by somebody else: not idle")
@@ -195,20 +206,30 @@ class Residency:
     async def _load_in_turn(self, deadline: float | None) -> bool:
         if self.state == "resident" and (self.lease is None or self.lease.state == "held"):
             return False
+        unloads = self._unloads
         if self.lease is not None and await self._brought_back(self.lease, deadline):
             return True
         self._refuse_if_ending()
+        if unloads != self._unloads:
+            raise self._unwanted()
         self.prepare()
-        assert self._prepared is not None
         self.state = "waiting"
+        self._obtaining = asyncio.create_task(self._obtain(deadline), name="obtain")
         try:
-            await asyncio.shield(self._prepared)
-            lease = await self._acquire(deadline)
+            lease = await self._obtaining
             self.state, self.lease = "loading", lease
             await self._load(lease)
-        except BaseException:
+        except BaseException as error:
             self.state = "unloaded"
+            if (
+                isinstance(error, asyncio.CancelledError)
+                and unloads != self._unloads
+                and not _being_cancelled()
+            ):
+                raise self._unwanted() from None
             raise
+        finally:
+            self._obtaining = None
         self.last_error = None
         return True
 
@@ -296,7 +317,10 @@ class Residency:
         else:
             self.last_error = None
 
-    async def _acquire(self, deadline: float | None) -> Lease | None:
+    async def _obtain(self, deadline: float | None) -> Lease | None:
+        """The host work done, and a lease granted. `unload` cancels it, which gives the place in the queue back."""
+        assert self._prepared is not None
+        await asyncio.shield(self._prepared)
         if self._client is None:
             return None
         wait_s = _left_s(deadline)
@@ -310,6 +334,12 @@ class Residency:
             unload=self._unload,
             on_return=self._on_return,
             on_lost=self._on_lost,
+        )
+
+    def _unwanted(self) -> NotResident:
+        return NotResident(
+            f"{self._settings.name} was told to unload before it was resident",
+            hint="ask again if it is wanted",
         )
 
     async def _load(self, lease: Lease | None) -> None:
@@ -339,7 +369,7 @@ class Residency:
         meters.measure(telemetry.METRIC_SIDECAR_LOAD, time.monotonic() - began, model)
         if measured is not None:
             tracing.note({telemetry.ATTR_BYTES: measured})
-        self._last_use_s = time.monotonic()
+        self._last_use_s = self._resident_since_s = time.monotonic()
         self.state = "resident"
         _log.info("resident after %.2f s: %s bytes on the card", time.monotonic() - began, measured)
 
@@ -434,6 +464,11 @@ class Residency:
         if loads != self._loads:
             raise self._evicted()
         return work()
+
+
+def _being_cancelled() -> bool:
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0
 
 
 def _left_s(deadline: float | None) -> float | None:

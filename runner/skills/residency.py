@@ -10,7 +10,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 
-from runner.protocols import Skill, SkillKey
+from runner.protocols import Goal, Skill, SkillKey
 from schemas.errors import VramError
 
 log = logging.getLogger(__name__)
@@ -22,11 +22,12 @@ CLOSE_S = 3.0  # the runner ends: its sidecar may be ending too
 
 
 class Residency:
-    """`acquire(key, make)` returns the resident skill of a key, making it if need be."""
+    """`acquire(key, make)` returns the resident skill of a key, making it if need be; `start` begins a goal with it."""
 
     def __init__(self) -> None:
         self._lock = asyncio.Lock()
         self._resident: Skill | None = None
+        self._served: Skill | None = None  # the one that was started for a goal at least once
         self._free: dict[SkillKey, Skill] = {}
 
     @property
@@ -48,6 +49,18 @@ class Residency:
             await self._evict(EVICT_S)
             self._resident = skill
             return skill
+
+    async def start(self, skill: Skill, goal: Goal) -> None:
+        """Start it for a goal. One that fails its very first start (its model does not load) leaves nothing behind; one that has
+        served stays, and its next start loads again what is missing. Raises what the start raises."""
+        try:
+            await skill.start(goal)
+        except BaseException:
+            if skill is self._resident and skill is not self._served:
+                self._resident = None
+                await _release(skill, CLOSE_S)
+            raise
+        self._served = skill if skill is self._resident else self._served
 
     async def _evict(self, timeout_s: float) -> None:
         if (leaving := self._resident) is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import contextlib
 import logging
 import math
 from collections import deque
@@ -41,12 +42,14 @@ from schemas.errors import (
     VramError,
 )
 from schemas.manifest import RSkillManifest
+from schemas.sidecar import LoadResult
 from schemas.world import Action, SensorFrame, WorldState
 
 log = logging.getLogger(__name__)
 
 LOAD_TRIES_MAX = 20
 RETRY_S = 0.2
+WITHDRAW_S = 3.0  # to take a load back; then the goal ends all the same
 CHUNK_TIMEOUT_S = 30.0  # a policy that needs longer for one chunk is gone
 LOCKSTEP_WAIT_S = 2.0  # how long one tick of a simulator waits with its world
 ROLLOUT_S = 5.0  # of motion, unless the manifest says otherwise
@@ -179,6 +182,7 @@ class SidecarPolicy(SkillBase):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._use: Use | None = None
         self._token: tuple[int, ...] | None = None
+        self._loaded = False
         self._task = ""
         self._traceparent: str | None = None
         self._ramp: JointRamp | None = None
@@ -198,15 +202,19 @@ class SidecarPolicy(SkillBase):
         await self._client.reset({TASK_KEY: self._task}, token=self._token)
         self._ramp, self._running, self._commanded = None, False, None
         self._recent.clear()
+        token = self._token  # of this goal: a request that comes late must not load the model anew, as one without a token would
         self._player = ChunkPlayer(
-            self._request, prefetch_at=self._wiring.rollout.prefetch_at, wait_s=self._wait_s
+            lambda observation: self._request(observation, token),
+            prefetch_at=self._wiring.rollout.prefetch_at,
+            wait_s=self._wait_s,
         )
 
     async def _occupy(self, goal: Goal) -> None:
         """Resident and in use, both at once. The goal's deadline bounds how long this may take."""
         for attempt in range(1, LOAD_TRIES_MAX + 1):
             try:
-                loaded = await self._client.load(timeout_s=goal.deadline_s or None)
+                loaded = await self._load(goal)
+                self._loaded = True
                 lease_id, token = loaded["lease_id"], loaded["token"]
                 self._token = tuple(token) if token is not None else None
                 if self._arbiter is not None and lease_id is not None and self._token is not None:
@@ -220,6 +228,17 @@ class SidecarPolicy(SkillBase):
                 )
                 await asyncio.sleep(RETRY_S)
 
+    async def _load(self, goal: Goal) -> LoadResult:
+        """A goal that is over before the model is there takes its load back: nobody else leaves the card for it."""
+        try:
+            return await self._client.load(timeout_s=goal.deadline_s or None)
+        except asyncio.CancelledError:
+            with contextlib.suppress(VramError, TimeoutError):
+                async with asyncio.timeout(WITHDRAW_S):
+                    if (await self._client.ping())["state"] in ("waiting", "loading"):
+                        await self._client.unload()
+            raise
+
     async def _finish(self) -> None:
         player, self._player = self._player, None
         if player is not None:
@@ -230,17 +249,18 @@ class SidecarPolicy(SkillBase):
             await use.end()
 
     async def _release(self) -> None:
-        """Another policy takes its place: the sidecar gives its memory back."""
+        """Another policy takes its place: the sidecar gives its memory back. One that never loaded for us is not even looked for."""
         try:
-            await self._client.unload()
+            if self._loaded:
+                await self._client.unload()
         finally:
             await self._client.close()
 
-    async def _fetch(self, observation: Mapping[str, Any]) -> list[Row]:
+    async def _fetch(self, observation: Mapping[str, Any], token: tuple[int, ...] | None) -> list[Row]:
         """The tick that asked is the span's parent; the goal, where that tick is not recorded."""
         parent = None if tracing.recorded() else self._traceparent
         with tracing.span(telemetry.SPAN_CHUNK, parent, {telemetry.ATTR_SKILL: self.key.rskill_id}):
-            answer = await self._client.get_action(observation, token=self._token, timeout_s=CHUNK_TIMEOUT_S)
+            answer = await self._client.get_action(observation, token=token, timeout_s=CHUNK_TIMEOUT_S)
             return self._rows(answer)
 
     # -- control thread ------------------------------------------------------------------------------------------------
@@ -317,10 +337,12 @@ class SidecarPolicy(SkillBase):
             observation[key] = _picture(frame, self._wiring.rollout.views.get(camera))
         return observation
 
-    def _request(self, observation: Any) -> concurrent.futures.Future[Sequence[Row]]:
+    def _request(
+        self, observation: Any, token: tuple[int, ...] | None
+    ) -> concurrent.futures.Future[Sequence[Row]]:
         if self._loop is None:
             raise BadState(f"{self.key} has no event loop")
-        return asyncio.run_coroutine_threadsafe(self._fetch(observation), self._loop)
+        return asyncio.run_coroutine_threadsafe(self._fetch(observation, token), self._loop)
 
     def _rows(self, answer: Mapping[str, Any]) -> list[Row]:
         """Rows of joint targets in rad. Raises ModelError for a wrong shape or a number that is not finite."""

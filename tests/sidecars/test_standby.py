@@ -63,8 +63,9 @@ def test_a_request_calls_it_back_as_a_waiter_like_any_other(box, arbiter):
     assert (first["ok"], policy.state()) == (True, "unloaded")
     assert policy.detect()["ok"]
     until(lambda: state(arbiter, "detector") == "standby")
-    policy.ask("unload")
-    until(lambda: detector.state() == "resident")
+    assert detector.ask("unload")["ok"], "whoever tells it to unload does not want it back"
+    until(lambda: state(arbiter, "detector") is None)
+    assert policy.state() == "resident"
 
 
 def test_a_request_whose_time_ends_does_not_end_the_standby(box, arbiter):
@@ -89,13 +90,6 @@ def test_a_load_that_fails_on_the_way_back_leaves_nothing_behind(box, arbiter):
     until(lambda: box.used() == 2 * 100_000_000)  # two contexts, no weights
     switch.unlink()
     assert detector.detect()["ok"]
-
-
-def test_asked_to_unload_it_does_not_come_back(box, arbiter):
-    detector, policy = sent_away(box, arbiter)
-    assert detector.ask("unload")["ok"]
-    until(lambda: state(arbiter, "detector") is None)
-    assert policy.state() == "resident"
 
 
 def test_its_process_ends_in_order_while_it_is_away(box, arbiter):
@@ -131,3 +125,20 @@ def test_standby_and_idle_release_contradict_each_other(box):
     sidecar = box.spawn("detector", "--standby", "--idle-release-s", "1")
     assert sidecar.process.wait(PATIENCE_S) == 1
     assert "choose one" in sidecar.log
+
+
+def test_told_to_unload_while_it_waits_it_waits_no_longer(box, arbiter):
+    """Regression: it waited on, and made others leave for a model that nobody wanted any more."""
+    policy = box.start("policy", footprint=BOTH)
+    running = policy.hold()
+    detector = box.start("detector", *DETECTOR, footprint=BOTH)
+    waiting = detector.send_detect()
+    until(lambda: state(arbiter, "detector") == "queued")
+    with WireClient(f"ipc://{box.runtime}/detector.sock") as other:
+        assert other.reply(other.send("unload"), PATIENCE_S)["ok"]
+    refused = detector.client.reply(waiting, PATIENCE_S)
+    assert (refused["ok"], refused["code"]) == (False, "not_resident")
+    until(lambda: state(arbiter, "detector") is None)
+    policy.let_go()
+    assert policy.client.reply(running, PATIENCE_S)["ok"]
+    assert detector.detect()["ok"], "the next request asks anew"

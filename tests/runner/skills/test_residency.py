@@ -16,6 +16,7 @@ from schemas.manifest import RSkillManifest, load_manifest
 from schemas.world import WorldState
 
 Run = Callable[[Any], Any]
+GOAL = Goal("g", "r", prompt="now")
 
 
 class Recording(SkillBase):
@@ -24,9 +25,13 @@ class Recording(SkillBase):
         self.holds_gpu = holds_gpu
         self.fails = fails
         self.story: list[str] = []
+        self.starting = asyncio.Event()
 
     async def _start(self, goal: Goal) -> None:
         self.story.append(f"start {goal.prompt}")
+        self.starting.set()
+        if self.fails == "cancel":
+            await asyncio.Event().wait()
         if self.fails == "start":
             raise SidecarUnavailable("no")
 
@@ -154,5 +159,81 @@ def test_a_skill_that_does_not_let_go_holds_nobody_up(
         await residency.acquire(old.key, lambda: old)
         assert await residency.acquire(new.key, lambda: new) is new
         assert residency.resident == new.key
+
+    run_async(scenario())
+
+
+def test_another_revision_of_the_same_skill_is_another_key(
+    skill: Callable[..., Recording], run_async: Run
+) -> None:
+    async def scenario() -> None:
+        residency, old, new = Residency(), skill("1"), skill("2")
+        assert old.key.rskill_id == new.key.rskill_id
+        assert await residency.acquire(old.key, lambda: old) is old
+        assert await residency.acquire(new.key, lambda: new) is new
+        assert (old.story, residency.resident) == (["release"], new.key)
+
+    run_async(scenario())
+
+
+@pytest.mark.parametrize("fails", ["start", "cancel"])
+def test_a_first_start_that_fails_leaves_nothing_behind(
+    skill: Callable[..., Recording], run_async: Run, fails: str
+) -> None:
+    """Regression: the runner called a skill resident whose model had never come up."""
+
+    async def scenario() -> None:
+        residency, old, new = Residency(), skill("1"), skill("2", fails=fails)
+        await residency.start(await residency.acquire(old.key, lambda: old), GOAL)
+        await old.finish()
+        await residency.acquire(new.key, lambda: new)
+        starting = asyncio.create_task(residency.start(new, GOAL))
+        if fails == "cancel":
+            await new.starting.wait()
+            starting.cancel()
+        with pytest.raises((SidecarUnavailable, asyncio.CancelledError)):
+            await starting
+        assert new.story == ["start now", "finish", "release"]
+        assert residency.resident is None
+        assert old.story[-1] == "release", (
+            "it has left already, and comes back by the next goal that wants it"
+        )
+        again = skill("1")
+        assert await residency.acquire(again.key, lambda: again) is again
+
+    run_async(scenario())
+
+
+def test_a_skill_that_has_served_stays_when_a_later_start_fails(
+    skill: Callable[..., Recording], run_async: Run
+) -> None:
+    async def scenario() -> None:
+        residency, made = Residency(), skill()
+        await residency.acquire(made.key, lambda: made)
+        await residency.start(made, GOAL)
+        await made.finish()
+        made.fails = "start"
+        with pytest.raises(SidecarUnavailable):
+            await residency.start(made, GOAL)
+        assert residency.resident == made.key
+        assert "release" not in made.story
+        made.fails = ""
+        await residency.start(made, GOAL)
+        assert made.state == "active"
+
+    run_async(scenario())
+
+
+def test_a_failing_gpu_free_skill_leaves_the_resident_one_alone(
+    skill: Callable[..., Recording], run_async: Run
+) -> None:
+    async def scenario() -> None:
+        residency, policy, drive = Residency(), skill("1"), skill("drive", holds_gpu=False, fails="start")
+        await residency.acquire(policy.key, lambda: policy)
+        await residency.acquire(drive.key, lambda: drive)
+        with pytest.raises(SidecarUnavailable):
+            await residency.start(drive, GOAL)
+        assert residency.resident == policy.key
+        assert "release" not in policy.story + drive.story
 
     run_async(scenario())

@@ -72,6 +72,8 @@ class Sidecar:
         self.error: VramError | None = None
         self.load_error: VramError | None = None
         self.arbitrated = True
+        self.state = "resident"
+        self.loads: asyncio.Event | None = None  # set once a load has come, which is never answered
 
     @asynccontextmanager
     async def served(self, endpoint: str) -> AsyncIterator[None]:
@@ -91,6 +93,9 @@ class Sidecar:
         if endpoint != "ping":
             self.calls.append(endpoint)
             self.tokens.append(message.get("token"))
+        if endpoint == "load" and self.loads is not None:
+            self.loads.set()
+            return
         error = self.load_error if endpoint == "load" else self.error
         if endpoint in ("load", "get_action") and error is not None:
             reply: Message = {
@@ -114,7 +119,7 @@ class Sidecar:
             reply = {"action": npy.pack(self.action if self.action is not None else action)}
         elif endpoint == "ping":
             reply = {"ok": True, "model": "m", "revision": "", "kind": "vla", "rskill": "test/arm-grab", "pid": 1,
-                     "boot_id": "b", "state": "resident"}  # fmt: skip
+                     "boot_id": "b", "state": self.state}  # fmt: skip
         else:
             reply = {"ok": True}
         if "id" in message:
@@ -419,3 +424,77 @@ def test_a_policy_whose_targets_lead_goes_there_as_fast_as_the_robot_may(
         ]
 
     scenario(run_async, bench(Arbiter(), speeds_rad_s={"a": 3.0, "b": 1.5}), play)
+
+
+def test_a_chunk_that_is_asked_for_too_late_loads_nothing(
+    bench: Callable[..., Bench], run_async: Run
+) -> None:
+    """Regression: a request that reached the event loop after the goal's end carried no token, and to a sidecar that means: load, evict others."""
+
+    async def play(b: Bench) -> None:
+        b.skill = SidecarPolicy(
+            b.skill.manifest, wire_up(b.skill.manifest, JOINTS, REST), b.client, b.arbiter, period_s=1 / 30
+        )
+        await b.skill.start(GOAL)
+        assert isinstance(b.skill.step(b.world()), Hold), "at the start pose"
+        assert isinstance(b.skill.step(b.world()), Hold), (
+            "asked on this very thread: the request is still on its way"
+        )
+        await b.skill.finish()
+        await b.client.unload()  # sent behind it, on the same socket
+        tokens = dict(zip(b.sidecar.calls, b.sidecar.tokens, strict=True))
+        assert tokens["get_action"] == [1, 1]
+
+    scenario(run_async, bench(Arbiter()), play)
+
+
+@pytest.mark.parametrize(("state", "taken_back"), [("waiting", True), ("loading", True), ("resident", False)])
+def test_a_goal_that_is_over_before_its_policy_is_there_takes_the_load_back(
+    bench: Callable[..., Bench], run_async: Run, state: str, taken_back: bool
+) -> None:
+    """Regression: the sidecar went on and made others leave the card for a goal that had been canceled."""
+
+    async def play(b: Bench) -> None:
+        b.sidecar.state, b.sidecar.loads = state, asyncio.Event()
+        starting = asyncio.create_task(b.skill.start(GOAL))
+        await b.sidecar.loads.wait()
+        starting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await starting
+        assert ("unload" in b.sidecar.calls) == taken_back
+
+    scenario(run_async, bench(Arbiter()), play)
+
+
+def test_the_next_goal_of_the_same_skill_begins_anew(bench: Callable[..., Bench], run_async: Run) -> None:
+    """Nothing of the goal before is played: reset, its own use, its own chunks, its own words."""
+
+    async def play(b: Bench) -> None:
+        await b.skill.start(GOAL)
+        for _ in range(3):
+            await b.step()
+        await b.skill.finish()
+        seen = len(b.sidecar.observations)
+        await b.skill.start(Goal("g2", "test/arm-grab", prompt="grab the blue ball", deadline_s=20.0))
+        rows, done = await b.play()
+        assert b.sidecar.calls.count("reset") == 2
+        assert done.data["steps"] == 7
+        assert rows[-7][1] == 0.0, "behind the way to the start pose, the first row of a fresh chunk"
+        assert {str(seen["task"]) for seen in b.sidecar.observations[seen:]} == {"grab the blue ball"}
+        assert b.arbiter is not None
+        assert [use.ended for use in b.arbiter.uses] == [1, 0]
+
+    scenario(run_async, bench(Arbiter()), play)
+
+
+def test_a_skill_that_never_loaded_is_released_without_a_word(
+    bench: Callable[..., Bench], run_async: Run
+) -> None:
+    async def play(b: Bench) -> None:
+        b.sidecar.load_error = ModelError("no")
+        with pytest.raises(ModelError):
+            await b.skill.start(GOAL)
+        await b.skill.release()
+        assert b.sidecar.calls == ["load"]
+
+    scenario(run_async, bench(Arbiter()), play)

@@ -1,0 +1,66 @@
+"""A sidecar process for the episodes: a real host, lease and simulated card around a model that looks at nothing and holds the arm still.
+
+`python episode_sidecar.py FOLDER [flags of vram-sidecar]`. While a file `hold` is in FOLDER, a call of the model does not come back
+(`holding` says that it is in one); a file `fail_load` or `fail` makes the load or a call fail, `slow_load` makes the load last.
+"""
+
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+from schemas.manifest import RSkillManifest
+from schemas.sidecar import EndpointCall
+from sidecars.__main__ import main
+from sidecars.weights import Weights
+
+LOOK_S = 0.005
+
+
+class StillModel:
+    def __init__(self, manifest: RSkillManifest, folder: Path) -> None:
+        self.kind: Any = manifest.kind.value
+        self.ops = frozenset({"detect"} if self.kind == "detector" else {"get_action", "reset"})
+        self._folder = folder
+
+    def _while_there(self, name: str) -> None:
+        while (self._folder / name).exists():
+            threading.Event().wait(LOOK_S)
+
+    def _fail(self, name: str) -> None:
+        if (self._folder / name).exists():
+            raise RuntimeError(f"{name} as told")
+
+    def prepare(self) -> None:
+        pass
+
+    def load(self, device: str) -> None:
+        self._while_there("slow_load")
+        self._fail("fail_load")
+
+    def unload(self) -> None:
+        pass
+
+    def run(self, call: Any) -> dict[str, Any]:
+        """An answer that moves nothing: where the joints are, for ten steps; or no detection."""
+        if not isinstance(call, EndpointCall):
+            return {"ok": True, "answer": "", "norm": 1000, "detections": []}
+        if call.endpoint == "reset":
+            return {}
+        (self._folder / "holding").touch()
+        self._while_there("hold")
+        (self._folder / "holding").unlink(missing_ok=True)
+        self._fail("fail")
+        import numpy as np
+
+        assert call.data is not None
+        return {"action": np.tile(call.data["observation"]["observation.state"], (10, 1))}
+
+
+def adapter_for(manifest: RSkillManifest, weights: Weights) -> Any:
+    return StillModel(manifest, folder)
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv.pop(1))
+    sys.exit(main(adapter_for=adapter_for))

@@ -1,0 +1,446 @@
+"""Episodes: after every goal's end, however it came, the detector is back on the card by itself, and never before.
+
+Real processes: arbiter, detector on standby, policy that lets go when idle, runner with the simulator, reasoner. Nobody sequences anything:
+each is a plain client. The witnesses are the arbiter's history and the card's own log, which an independent checker reads.
+"""
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import AsyncExitStack
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arbiter.testing.fakegpu_check import check_log
+from arbiter.testing.process import ArbiterProcess
+from clients.aio import ArbiterClient
+from clients.runner import Goal, RunnerClient
+from clients.sidecar.perception import DetectorClient
+from clients.sidecar.policy import PolicyClient
+from schemas.errors import GoalRejected, UnknownSkill, WaitTimeout
+
+pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(280)]
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+WAIT_S = 60.0  # for an event; a starved machine needs some of it
+SCENARIO_S = 200.0
+SKILL = "test/arm-policy"
+DEADLINE_S = 120.0  # of goals that shall not meet it
+GB = 10**9
+DETECTOR_BYTES, POLICY_BYTES, CONTEXT_BYTES = 5 * GB, 4 * GB, GB // 10
+JOINTS = "[shoulder_pan, shoulder_lift, elbow_flex, wrist_flex, wrist_roll, gripper]"
+MANIFESTS = {
+    "detector": """
+name: test/arm-detector
+version: 0.1.0
+license: mit
+kind: detector
+embodiment_tags: [any]
+chunk_size: 1
+weights_uri: hf://test/detector
+description: sees nothing
+latency_budget: {per_chunk_ms: 100}
+actions: [detect]
+detector: {labels: [cube]}
+""",
+    "policy": f"""
+name: {SKILL}
+version: 0.1.0
+license: mit
+kind: vla
+model_family: act
+embodiment_tags: [so101_follower]
+sensors_required:
+  - {{modality: rgb, vla_feature_key: observation.images.front}}
+actuators_required:
+  - {{kind: joint_position, control_mode_semantics: {{mode: absolute, joint_order: {JOINTS}}}}}
+weights_uri: hf://test/policy
+chunk_size: 10
+latency_budget: {{per_chunk_ms: 100, max_execution_s: 5}}
+description: holds the arm still
+actions: [grasp]
+action_contract: {{dim: 6}}
+policy_extras: {{rollout_steps: 12, stop_when_still: false}}
+""",
+}
+
+
+class Programs:
+    """The processes of one robot; those that a test killed are started again by `up`. `tell` makes the policy's model behave."""
+
+    def __init__(self) -> None:
+        self.arbiter = ArbiterProcess().start()
+        self.runtime = self.arbiter.runtime
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        for name, manifest in MANIFESTS.items():
+            (self.runtime / name).mkdir()
+            (self.runtime / name / "rskill.yaml").write_text(manifest)
+
+    def up(self) -> None:
+        for flag in ("hold", "holding", "fail", "fail_load", "slow_load"):
+            self.tell(flag, False)
+        self._sidecar("detector", DETECTOR_BYTES, "--standby", "--min-residency-s", "0")
+        self._sidecar("policy", POLICY_BYTES, "--idle-release-s", "0.2", "--min-residency-s", "1")
+        self.start("runner", "-m", "runner", "sim", "--skills", str(self.runtime / "policy"), "--seed", "1")
+
+    def _sidecar(self, name: str, size: int, *flags: str) -> None:
+        folder = self.runtime / name
+        self.start(
+            name, str(HERE / "episode_sidecar.py"), str(folder), "--name", name, "--rskill", f"{folder}/rskill.yaml",
+            "--device", f"fake:{self.arbiter.card}", "--footprint", f"{size},{size},{CONTEXT_BYTES}", *flags,
+        )  # fmt: skip
+
+    def start(self, name: str, *words: str, **environ: str) -> None:
+        known = self.running.get(name)
+        if known is not None and known.poll() is None:
+            return
+        with (self.runtime / "programs.log").open("ab") as log:
+            self.running[name] = subprocess.Popen(
+                [sys.executable, *words], cwd=ROOT, env=self.arbiter.environ | {"OMP_NUM_THREADS": "1"} | environ,
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            )  # fmt: skip
+
+    def tell(self, flag: str, on: bool) -> None:
+        path = self.runtime / "policy" / flag
+        path.touch() if on else path.unlink(missing_ok=True)
+
+    def kill(self, name: str) -> None:
+        os.kill(self.running[name].pid, signal.SIGKILL)
+        self.running[name].wait(WAIT_S)
+
+    def play(self, scenario: "Callable[[Stage], Coroutine[Any, Any, None]]") -> None:
+        """Run it on a stage of its own; a failure shows what the programs said."""
+
+        async def bounded() -> None:
+            async with asyncio.timeout(SCENARIO_S), AsyncExitStack() as stack:
+                await scenario(await Stage.open(self, stack))
+
+        self.up()
+        try:
+            asyncio.run(bounded())
+        except BaseException:
+            print((self.runtime / "programs.log").read_text(errors="replace")[-6000:])
+            raise
+
+    def close(self) -> None:
+        for process in reversed(self.running.values()):
+            if process.poll() is None:
+                process.terminate()
+        for process in self.running.values():
+            try:
+                process.wait(20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait(WAIT_S)
+        report = check_log((self.arbiter.card / "log.jsonl").read_text())
+        self.arbiter.close()
+        assert report.problems == [], report
+
+
+class Stage:
+    """One test's clients, and the history from its beginning on. It opens with the detector on the card and nobody else."""
+
+    def __init__(self, programs: Programs) -> None:
+        self.programs = programs
+        self.events: list[dict[str, Any]] = []
+        self._more = asyncio.Event()
+        self.arbiter: ArbiterClient
+        self.runner: RunnerClient
+        self.detector: DetectorClient
+
+    @classmethod
+    async def open(cls, programs: Programs, stack: AsyncExitStack) -> "Stage":
+        stage, where = cls(programs), f"ipc://{programs.runtime}"
+        stage.arbiter = await stack.enter_async_context(
+            ArbiterClient(programs.arbiter.endpoint, name="witness")
+        )
+        stage.runner = await stack.enter_async_context(
+            RunnerClient(f"{where}/runner.sock", connect_timeout_s=WAIT_S)
+        )
+        stage.detector = await stack.enter_async_context(
+            DetectorClient(f"{where}/detector.sock", connect_timeout_s=WAIT_S)
+        )
+        await stage.runner.ping(timeout_s=WAIT_S)
+        await stage.detector.load()
+        while "policy" in await stage.leases():  # of the test before
+            await asyncio.sleep(0.02)
+        listening = asyncio.create_task(stage._listen())
+        stack.callback(listening.cancel)
+        while not stage.events:  # subscribed: a use of nobody's is refused, a ping is not told; a look is
+            await stage.detector.detect(b"\x89PNG\r\n\x1a\n", "cube")
+            await asyncio.sleep(0.02)
+        stage.events.clear()
+        return stage
+
+    async def _listen(self) -> None:
+        async for event in self.arbiter.subscribe():
+            self.events.append(event)
+            self._more.set()
+
+    async def until(self, kind: str, consumer: str) -> dict[str, Any]:
+        """The first such event of this test, waited for if need be."""
+        async with asyncio.timeout(WAIT_S):
+            while (found := self.first(kind, consumer)) is None:
+                self._more.clear()
+                await self._more.wait()
+        return found
+
+    def first(self, kind: str, consumer: str) -> dict[str, Any] | None:
+        return next((e for e in self.events if (e["kind"], e.get("consumer")) == (kind, consumer)), None)
+
+    async def leases(self) -> dict[str, str]:
+        return {view["consumer"]: view["state"] for view in (await self.arbiter.status())["leases"]}
+
+    async def goal_under_way(self, *, held: bool = True, deadline_s: float = DEADLINE_S) -> Goal:
+        """A goal that has its policy resident and in use, `held` inside a call of the model, and the detector away."""
+        self.programs.tell("hold", held)
+        goal = await self.runner.send_goal(SKILL, prompt="hold still", deadline_s=deadline_s)
+        await self.until("use_began", "policy")
+        if held:
+            await self.holding()
+        assert await self.leases() == {"policy": "held", "detector": "standby"}
+        return goal
+
+    async def holding(self) -> None:
+        async with asyncio.timeout(WAIT_S):
+            while not (self.programs.runtime / "policy/holding").exists():
+                await asyncio.sleep(0.01)
+
+    async def detector_is_back(self, *, after: str = "use_ended") -> None:
+        """By itself, once: granted after the policy's `after` and after its bytes were measured gone, and loaded."""
+        ended = await self.until(after, "policy")
+        gone = await self.until("verified", "policy")
+        granted = await self.until("granted", "detector")
+        ready = await self.until("ready", "detector")
+        assert ended["seq"] < gone["seq"] < granted["seq"] < ready["seq"], self.events
+        assert gone["verdict"] in ("verified", "residue")
+        assert granted["reason"] == "back from standby: there is room and nobody waits"
+        assert sum(e["kind"] == "granted" and e.get("consumer") == "detector" for e in self.events) == 1
+        assert (await self.detector.ping())["state"] == "resident"
+        assert await self.leases() == {"detector": "held"}
+
+    def detector_was_away(self) -> bool:
+        return self.first("granted", "detector") is None
+
+
+@pytest.fixture(scope="module")
+def programs() -> Iterator[Programs]:
+    started = Programs()
+    yield started
+    started.close()
+
+
+# -- how a goal ends -----------------------------------------------------------------------------------------------------
+async def done(stage: Stage) -> None:
+    goal = await stage.goal_under_way()
+    shown = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "clients", "status", env=stage.programs.arbiter.environ, stdout=asyncio.subprocess.PIPE
+    )  # fmt: skip
+    said = (await shown.communicate())[0].decode()
+    (line,) = [line for line in said.splitlines() if " detector " in line]
+    assert " standby " in line, said
+    why = (await stage.arbiter.why("detector"))["leases"][0]["text"]
+    assert why == "detector: on standby until policy has left"
+    assert stage.detector_was_away()
+    stage.programs.tell("hold", False)
+    assert (await goal.result(WAIT_S))["status"] == "succeeded"
+    await stage.detector_is_back()
+
+
+async def failed(stage: Stage) -> None:
+    goal = await stage.goal_under_way()
+    stage.programs.tell("fail", True)
+    stage.programs.tell("hold", False)
+    result = await goal.result(WAIT_S)
+    assert (result["status"], result["code"]) == ("failed", "model_error")
+    await stage.detector_is_back()
+
+
+async def canceled(stage: Stage) -> None:
+    goal = await stage.goal_under_way()
+    await goal.cancel()
+    assert (await goal.result(WAIT_S))["status"] == "canceled"
+    stage.programs.tell("hold", False)
+    await stage.detector_is_back()
+
+
+async def rejected(stage: Stage) -> None:
+    """A goal that is refused changes nothing: neither while the detector is there, nor while another goal has sent it away."""
+    with pytest.raises(UnknownSkill):
+        await stage.runner.send_goal("test/arm-nothing", prompt="x")
+    assert await stage.leases() == {"detector": "held"}
+    goal = await stage.goal_under_way()
+    with pytest.raises(GoalRejected):
+        await stage.runner.send_goal(SKILL, prompt="another one")
+    assert await stage.leases() == {"policy": "held", "detector": "standby"}
+    stage.programs.tell("hold", False)
+    assert (await goal.result(WAIT_S))["status"] == "succeeded"
+    await stage.detector_is_back()
+
+
+async def past_its_deadline(stage: Stage) -> None:
+    """The result is out, but a call of the model still runs: its bytes are on the card, so the detector stays away until they are measured gone."""
+    async with PolicyClient(f"ipc://{stage.programs.runtime}/policy.sock") as policy:
+        await policy.load()  # what the deadline is met by is the call alone
+    goal = await stage.goal_under_way(deadline_s=4.0)
+    assert (await goal.result(WAIT_S))["status"] == "deadline"
+    await stage.until("use_ended", "policy")
+    assert (stage.programs.runtime / "policy/holding").exists()
+    assert (await stage.leases())["detector"] == "standby"
+    assert stage.detector_was_away()
+    (card,) = (await stage.arbiter.status())["gpus"]
+    assert card["charged_bytes"] >= POLICY_BYTES
+    stage.programs.tell("hold", False)
+    await stage.detector_is_back()
+
+
+async def policy_killed(stage: Stage) -> None:
+    goal = await stage.goal_under_way()
+    stage.programs.kill("policy")
+    result = await goal.result(WAIT_S)
+    assert (result["status"], result["code"] in ("sidecar_unavailable", "lease_lost")) == ("failed", True), (
+        result
+    )
+    await stage.detector_is_back(after="lost")
+
+
+async def load_failed(stage: Stage) -> None:
+    """The policy never comes up: the detector was sent away for nothing, and nothing of the load stays behind."""
+    stage.programs.tell("fail_load", True)
+    goal = await stage.runner.send_goal(SKILL, prompt="hold still", deadline_s=DEADLINE_S)
+    result = await goal.result(WAIT_S)
+    assert (result["status"], result["code"]) == ("failed", "model_error")
+    await stage.detector_is_back(after="granted")
+
+
+async def canceled_while_loading(stage: Stage) -> None:
+    """Nobody wants the policy any more: its load is taken back, not finished for nobody."""
+    stage.programs.tell("slow_load", True)
+    goal = await stage.runner.send_goal(SKILL, prompt="hold still", deadline_s=DEADLINE_S)
+    await stage.until("granted", "policy")
+    await goal.cancel()
+    stage.programs.tell("slow_load", False)
+    assert (await goal.result(WAIT_S))["status"] == "canceled"
+    await stage.detector_is_back(after="granted")
+    assert stage.first("ready", "policy") is None
+
+
+async def reasoner_killed(stage: Stage) -> None:
+    """The goal does not depend on who asked for it, and neither does the detector's return."""
+    server = Script({"prompt": "hold still"}, f"execute_rskill__{SKILL.replace('/', '__')}")
+    with server:
+        stage.programs.tell("hold", True)
+        stage.programs.start(
+            "reasoner", "-m", "reasoner", "--task", "hold still", "--planner", "openai", "--detector", "none", "--scene-vlm", "none",
+            VRAM_REASONER_LLM_BASE_URL=server.url, VRAM_REASONER_LLM_MODEL="m",
+        )  # fmt: skip
+        await stage.until("use_began", "policy")
+        await stage.holding()
+        stage.programs.kill("reasoner")
+    assert await stage.leases() == {"policy": "held", "detector": "standby"}
+    assert (await stage.runner.state())["phase"] == "running"
+    stage.programs.tell("hold", False)
+    await stage.detector_is_back()
+
+
+async def runner_killed(stage: Stage) -> None:
+    await stage.goal_under_way()
+    stage.programs.kill("runner")
+    await stage.until("use_ended", "policy")
+    stage.programs.tell("hold", False)
+    await stage.detector_is_back()
+
+
+@pytest.mark.parametrize(
+    "end",
+    [done, failed, canceled, rejected, past_its_deadline, load_failed, canceled_while_loading, policy_killed, reasoner_killed, runner_killed],
+    ids=lambda end: end.__name__,
+)  # fmt: skip
+def test_after_a_goal_the_detector_is_back_by_itself(
+    programs: Programs, end: Callable[[Stage], Coroutine[Any, Any, None]]
+) -> None:
+    programs.play(end)
+
+
+# -- while it runs -------------------------------------------------------------------------------------------------------
+async def wanted_meanwhile(stage: Stage) -> None:
+    goal = await stage.goal_under_way()
+    with pytest.raises(WaitTimeout):
+        await stage.detector.load(timeout_s=0.2)
+    assert stage.detector_was_away()
+    stage.programs.tell("hold", False)
+    assert (await goal.result(WAIT_S))["status"] == "succeeded"
+    ready = await stage.until("ready", "detector")
+    ended = await stage.until("use_ended", "policy")
+    assert ended["seq"] < ready["seq"]
+    assert await stage.leases() == {"detector": "held"}
+
+
+def test_who_wants_to_look_in_the_middle_of_a_goal_is_told_to_wait(programs: Programs) -> None:
+    """Nobody is made to leave in the middle of a step; the look that was wanted comes with the goal's end."""
+    programs.play(wanted_meanwhile)
+
+
+async def slow_start(stage: Stage) -> None:
+    stage.programs.tell("slow_load", True)
+    goal = await stage.runner.send_goal(SKILL, prompt="hold still", deadline_s=DEADLINE_S)
+    await stage.until("granted", "policy")
+    phases = []
+    async for feedback in goal.feedback():
+        phases.append(feedback["state"])
+        if feedback["state"] == "running":
+            break
+        if feedback["state"] == "starting":
+            assert (await stage.leases())["policy"] == "loading"
+            stage.programs.tell("slow_load", False)
+    assert set(phases) <= {"acquiring", "starting", "running"}
+    ready, began = await stage.until("ready", "policy"), await stage.until("use_began", "policy")
+    assert ready["seq"] < began["seq"]
+    assert (await goal.result(WAIT_S))["status"] == "succeeded"
+    await stage.detector_is_back()
+
+
+def test_no_goal_runs_before_its_policy_is_ready(programs: Programs) -> None:
+    programs.play(slow_start)
+
+
+class Script:
+    """A language model's server that says the same call whenever it is asked."""
+
+    def __init__(self, arguments: dict[str, Any], name: str) -> None:
+        function = {"name": name, "arguments": json.dumps(arguments)}
+        call = {"id": "c", "type": "function", "function": function}
+        said = {"choices": [{"message": {"role": "assistant", "content": None, "tool_calls": [call]}}]}
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_POST(self) -> None:
+                self.rfile.read(int(self.headers["Content-Length"]))
+                self.send_response(200)
+                self.end_headers()
+                self.wfile.write(json.dumps(said).encode())
+
+            def log_message(self, format: str, *args: Any) -> None:
+                pass
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server.daemon_threads = True
+        self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.02})
+        self.url = f"http://127.0.0.1:{self._server.server_port}"
+
+    def __enter__(self) -> "Script":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
