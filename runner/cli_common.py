@@ -56,6 +56,10 @@ def add_serving_flags(parser: argparse.ArgumentParser) -> None:
         "--sidecar", action="append", default=[], metavar="RSKILL=ENDPOINT",
         help="where a policy's sidecar is; default ipc://RUNTIME/NAME.sock, NAME being what follows the first - of the skill's name",
     )  # fmt: skip
+    parser.add_argument(
+        "--realtime", action=argparse.BooleanOptionalAction, default=True,
+        help="run the control loop before ordinary programs (SCHED_FIFO, or a lower nice value) where the machine allows it",
+    )  # fmt: skip
     parser.add_argument("--max-seconds", type=positive, help="stop by itself after so many seconds")
 
 

@@ -39,6 +39,7 @@ from runner.deployment import (
 )
 from runner.goals import GoalServer
 from runner.hardware import HardwareRunner
+from runner.promptness import make_prompt
 from runner.protocols import DeadlinePolicy, Skill
 from runner.skills.sidecar_policy import Arbiter
 from schemas.endpoints import program_endpoint, runtime_dir
@@ -134,6 +135,7 @@ class Deploy:
             control = await self._start(runner, stack)
             if control is None:
                 return 0
+            await make_prompt(control, first=self._args.realtime)
             catalogue = self._offered(parts, manifests, arbiter)
             server = GoalServer(
                 self._endpoint,

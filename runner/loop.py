@@ -177,7 +177,9 @@ class RunnerBase(ABC):
             trace_context=trace_context,
         )
         self.tick_idx += 1
-        self.timings.add(started_s, late_ms, result.tick_ms, result.inference_ms, reset=decision.reset)
+        self.timings.add(
+            started_s, late_ms, result.tick_ms, result.inference_ms, result.hal_ms, reset=decision.reset
+        )
         meters.measure(telemetry.METRIC_TICK, result.tick_ms, self.labels)
         if missed:  # 4
             self.deadline_misses += 1

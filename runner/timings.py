@@ -37,10 +37,17 @@ class Timings:
         self._rows: deque[tuple[float, ...]] = deque(maxlen=kept)
 
     def add(
-        self, started_s: float, late_ms: float, tick_ms: float, inference_ms: float, *, reset: bool
+        self,
+        started_s: float,
+        late_ms: float,
+        tick_ms: float,
+        inference_ms: float,
+        hal_ms: float = 0.0,
+        *,
+        reset: bool = False,
     ) -> None:
-        """One tick: monotonic start, how far behind its slot that was, how long it took, and its skill in it."""
-        self._rows.append((started_s, late_ms, tick_ms, inference_ms, float(reset)))
+        """One tick: monotonic start, how far behind its slot that was, how long it took, its skill in it, and the robot."""
+        self._rows.append((started_s, late_ms, tick_ms, inference_ms, hal_ms, float(reset)))
 
     @property
     def tick_ms(self) -> list[float]:
@@ -50,19 +57,19 @@ class Timings:
     @property
     def inference_ms(self) -> list[float]:
         """Of all ticks that may have asked a skill."""
-        return [row[3] for row in self._snapshot() if not row[4]]
+        return [row[3] for row in self._snapshot() if not row[5]]
 
     @property
     def late_ms(self) -> list[float]:
         """How far behind its slot each tick began."""
-        return [row[1] for row in self._snapshot() if not row[4]]
+        return [row[1] for row in self._snapshot() if not row[5]]
 
     def write(self, path: Path) -> None:
         """One JSON line a tick. Raises OSError."""
-        names = ("started_s", "late_ms", "tick_ms", "inference_ms")
+        names = ("started_s", "late_ms", "tick_ms", "inference_ms", "hal_ms")
         with path.open("w") as file:
             file.writelines(
-                json.dumps(dict(zip(names, row, strict=False)) | {"reset": bool(row[4])}) + "\n"
+                json.dumps(dict(zip(names, row, strict=False)) | {"reset": bool(row[5])}) + "\n"
                 for row in self._snapshot()
             )
 

@@ -21,6 +21,7 @@ from sidecars.adapters.base import ModelAdapter
 from sidecars.adapters.choose import make_adapter
 from sidecars.device.memory import DeviceMemory, NoDevice
 from sidecars.settings import (
+    NICE,
     WAIT_TIMEOUT_S,
     Settings,
     footprint_for,
@@ -100,6 +101,7 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         wait_timeout_s=flags.wait_timeout_s,
         idle_release_s=flags.idle_release_s,
         standby=flags.standby,
+        nice=flags.nice,
     )
 
 
@@ -192,6 +194,12 @@ def _parser() -> argparse.ArgumentParser:
         "--standby",
         action="store_true",
         help="once evicted, load again by itself when there is room and nobody waits",
+    )
+    add(
+        "--nice",
+        type=_number(int, 0, 19),
+        default=NICE,
+        help="of the thread that loads and runs the model; default %(default)s",
     )
     add("--log-level", choices=("debug", "info", "warning", "error"), default="info")
     add("--check", action="store_true", help="check manifest, footprint and flags, then end")

@@ -41,7 +41,7 @@ class SidecarHost:
         """Serve until the end. False if the worker's thread is still importing: the process should not wait for that.
 
         Raises AlreadyRunning, ConfigError, ArbiterUnreachable at the start; later trouble is answered on the wire."""
-        settings, worker = self._settings, Worker()
+        settings, worker = self._settings, Worker(self._settings.nice)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.stop)

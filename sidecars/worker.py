@@ -2,6 +2,7 @@
 
 import asyncio
 import contextvars
+import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -10,10 +11,16 @@ from schemas.errors import ModelError, OutOfMemory, VramError
 
 
 class Worker:
-    """Runs one piece of work after the other, in the order given. `stopping` ends waits inside the work (throttled loads)."""
+    """Runs one piece of work after the other, in the order given. `stopping` ends waits inside the work (throttled loads).
 
-    def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="model")
+    `nice` (0 to 19) is how far the thread, and those that a model library starts from it, stand behind other programs: imports and loads
+    take all cores for seconds, and beside them somebody controls a robot.
+    """
+
+    def __init__(self, nice: int = 0) -> None:
+        self._pool = ThreadPoolExecutor(
+            max_workers=1, thread_name_prefix="model", initializer=_stand_back, initargs=(nice,)
+        )
         self.stopping = threading.Event()
 
     async def run[T](self, work: Callable[[], T], *, abandon: bool = False) -> T:
@@ -54,3 +61,8 @@ class Worker:
             if isinstance(error, ImportError):
                 raise ModelError(str(error), hint="pip install 'vram-arbiter[sidecars]'") from error
             raise ModelError(f"{type(error).__name__}: {error}", hint="see the sidecar's log") from error
+
+
+def _stand_back(nice: int) -> None:
+    """Of the calling thread alone: on Linux a nice value is a thread's."""
+    os.setpriority(os.PRIO_PROCESS, 0, max(nice, os.getpriority(os.PRIO_PROCESS, 0)))

@@ -1,13 +1,14 @@
-"""`make bench`: how fast the arbiter is, beside a bare ZeroMQ round trip and Redis locks, all in one run on one machine.
+"""`make bench`: how fast the arbiter is, beside a bare ZeroMQ round trip and Redis locks, and how even a runner's ticks are beside a switch.
 
-Prints a table and writes `out/bench/arbiter.json` (`harness.Row` says what the fields mean). `--quick` (QUICK=1) takes less of
-everything, `--only grants` one subject. Only ratios within one run mean anything. Rows against etcd and nvshare are left out: neither is
+Prints tables and writes `out/bench/arbiter.json` (`harness.Row` says what the fields mean) and `runner.json` beside it (`bench_runner`).
+`--quick` (QUICK=1) takes less of everything, `--only grants` one subject. Only ratios within one run mean anything. Rows against etcd and nvshare are left out: neither is
 here to be measured.
 """
 
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import bench_core
@@ -17,8 +18,9 @@ import bench_eviction
 import bench_grants
 import bench_handover
 import bench_rest
+import bench_runner
 import bench_throughput
-from harness import Suite
+from harness import Row, Suite
 
 SUBJECTS = {
     "grants": bench_grants.run,
@@ -30,27 +32,41 @@ SUBJECTS = {
     "rest": bench_rest.run,
     "core": bench_core.run,
 }
+RUNNER = "runner"  # a file and a table of its own
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="less of everything")
     parser.add_argument(
-        "--only", action="append", choices=list(SUBJECTS), help="one subject; may be repeated"
+        "--only", action="append", choices=[*SUBJECTS, RUNNER], help="one subject; may be repeated"
     )
     parser.add_argument("--out", type=Path, default=Path("out/bench/arbiter.json"), help="where the rows go")
     options = parser.parse_args()
     suite = Suite(quick=options.quick)
-    for name in options.only or SUBJECTS:
+    names = options.only or [*SUBJECTS, RUNNER]
+    runner_rows: list[bench_runner.RunnerRow] = []
+    runner_out = options.out.with_name("runner.json")
+    for name in names:
         began = time.monotonic()
-        SUBJECTS[name](suite)
+        if name == RUNNER:
+            runner_rows = bench_runner.run(quick=options.quick, out=runner_out)
+        else:
+            SUBJECTS[name](suite)
         print(f"{name}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
     if not options.only:
         suite.skipped("against etcd and nvshare", "not here")
-    suite.write(options.out)
-    met, missed = (sum(row.ok is found for row in suite.rows) for found in (True, False))
-    print(f"{suite.table()}\n\n{met} targets met, {missed} missed; rows are in {options.out}")
+    if names != [RUNNER]:
+        suite.write(options.out)
+        print(f"{suite.table()}\n{_sum(suite.rows)}; rows are in {options.out}")
+    if runner_rows:
+        print(f"\n{bench_runner.table(runner_rows)}\n{_sum(runner_rows)}; rows are in {runner_out}")
     return 0
+
+
+def _sum(rows: Sequence[Row] | Sequence[bench_runner.RunnerRow]) -> str:
+    met, missed = (sum(row.ok is found for row in rows) for found in (True, False))
+    return f"{met} targets met, {missed} missed"
 
 
 if __name__ == "__main__":

@@ -12,12 +12,17 @@ HERE = Path(__file__).parent
 KEYS = {"name", "p50_us", "p99_us", "floor_us", "ratio", "target", "ok", "value", "unit", "against", "note"}
 
 
-@pytest.fixture(scope="module")
-def rows(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, object]]:
-    """What one short run over a few subjects writes."""
-    out = tmp_path_factory.mktemp("bench") / "deep" / "arbiter.json"
-    subjects = ["--only", "grants", "--only", "eviction", "--only", "death"]
-    command = [sys.executable, str(HERE / "run.py"), "--quick", *subjects, "--out", str(out)]
+def bench(out: Path, *subjects: str) -> list[dict[str, object]]:
+    """A short run over a few subjects: the rows that it wrote to `out`, all of them in the table that it printed."""
+    flags = [word for subject in subjects for word in ("--only", subject)]
+    command = [
+        sys.executable,
+        str(HERE / "run.py"),
+        "--quick",
+        *flags,
+        "--out",
+        str(out.with_name("arbiter.json")),
+    ]
     done = subprocess.run(
         command, env=os.environ | {"PYTHONPATH": str(HERE.parents[1])}, capture_output=True, text=True
     )
@@ -26,6 +31,12 @@ def rows(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, object]]:
     for row in found:
         assert str(row["name"]) in done.stdout
     return found
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, object]]:
+    """What one short run over a few subjects writes."""
+    return bench(tmp_path_factory.mktemp("bench") / "deep" / "arbiter.json", "grants", "eviction", "death")
 
 
 def test_every_row_has_the_documented_fields(rows: list[dict[str, object]]) -> None:
@@ -50,3 +61,20 @@ def test_a_comparison_names_its_floor(rows: list[dict[str, object]]) -> None:
     assert isinstance(grant["p50_us"], float)
     assert isinstance(grant["floor_us"], float)
     assert grant["ratio"] == pytest.approx(grant["p50_us"] / grant["floor_us"])
+
+
+@pytest.mark.heavy
+@pytest.mark.e2e
+@pytest.mark.timeout(600)
+def test_the_runners_ticks_are_measured_beside_real_sidecars(tmp_path: Path) -> None:
+    if not (HERE.parents[1] / "configs/models/so101-grab/model.safetensors").exists():
+        pytest.skip("the checkpoints are not in this tree")
+    rows = bench(tmp_path / "runner.json", "runner")
+    for row in rows:
+        assert set(row) == {"name", "p50_us", "p99_us", "idle_p99_us", "ratio", "target", "ok"}
+        assert isinstance(row["p50_us"], float)
+        assert isinstance(row["p99_us"], float)
+        assert 0 <= row["p50_us"] <= row["p99_us"]
+    (jitter,) = [row for row in rows if row["name"] == "tick_jitter"]
+    assert isinstance(jitter["idle_p99_us"], float)
+    assert jitter["ok"] == (float(str(jitter["p99_us"])) < 2000)

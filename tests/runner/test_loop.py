@@ -169,5 +169,5 @@ def test_how_far_behind_its_slot_a_tick_began_is_kept(clock: Any, tmp_path: Path
 def test_only_so_many_timings_are_kept() -> None:
     timings = Timings(kept=2)
     for n in range(4):
-        timings.add(float(n), 0.0, float(n), 0.0, reset=False)
+        timings.add(float(n), 0.0, float(n), 0.0)
     assert timings.tick_ms == [2.0, 3.0]

@@ -1,0 +1,252 @@
+"""How well `vram-runner sim` holds its 30 Hz, alone and while sidecars switch beside it. Writes `out/bench/runner.json`.
+
+Real processes: arbiter, simulator with physics, cameras and video as in the demo, and two sidecars with the shipped checkpoints that do not fit
+the card together, so that each load throws the other out. One run has stretches with nothing beside and stretches with one switch after the
+other; the runner itself notes when each tick began (`--timings`), and ticks are told apart by the stretch in which they began.
+
+*Jitter* is how far behind its slot a tick began. A slot that a long tick ate is no tick, and not in it; the row *from one start to the next*
+has such gaps, as a whole period each.
+"""
+
+import asyncio
+import itertools
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AsyncExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from harness import SHIPPED, arbiter, p50, p99
+
+from arbiter.testing.process import ArbiterProcess
+from clients.runner import RunnerClient
+from clients.sidecar.perception import DetectorClient
+from clients.sidecar.policy import PolicyClient
+from schemas.errors import RunnerUnreachable, SidecarUnavailable
+
+ROOT = Path(__file__).parents[2]
+SKILLS = {"detector": "so101-detector", "grab": "so101-grab"}
+GRAB = "vram-arbiter/so101-grab"
+RATE_HZ = 30.0
+JITTER_MAX_US = 2000.0
+NO_HOLD = "scheduling:\n  thrash_hold_max_s: 0\n"  # it would slow down on purpose what is measured here
+BOOT_S = 240.0
+SETTLE_S = 3.0  # after the start: imports, first pictures, page cache
+POLL_S = 0.1
+END_S = 30.0
+
+Tick = dict[str, float]
+Stretch = tuple[float, float]  # monotonic seconds
+
+
+@dataclass(slots=True)
+class RunnerRow:
+    """One row of the file. `idle_p99_us` is the same with nothing beside, `ratio` p99 over that; `target` in words."""
+
+    name: str
+    p50_us: float | None = None
+    p99_us: float | None = None
+    idle_p99_us: float | None = None
+    ratio: float | None = None
+    target: str | None = None
+    ok: bool | None = None
+
+
+def run(*, quick: bool, out: Path) -> list[RunnerRow]:
+    """Measure and write. Raises RuntimeError when a program ends by itself."""
+    with arbiter(SHIPPED + NO_HOLD) as daemon:
+        measured = asyncio.run(_measure(daemon, rounds=1 if quick else 4, stretch_s=5.0 if quick else 15.0))
+    rows = measured.rows()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(json.dumps([asdict(row) for row in rows], indent=1, ensure_ascii=False) + "\n")
+    return rows
+
+
+def table(rows: Sequence[RunnerRow]) -> str:
+    """For people."""
+    lines = [f"{'':46}{'p50 µs':>12}{'p99 µs':>12}{'idle p99':>12}{'ratio':>8}  {'':5}target"]
+    for row in rows:
+        cells = "".join(
+            f"{'' if x is None else f'{x:.0f}':>12}" for x in (row.p50_us, row.p99_us, row.idle_p99_us)
+        )
+        ratio = "" if row.ratio is None else f"{row.ratio:.2f}"
+        ok = {True: "ok", False: "MISS", None: ""}[row.ok]
+        lines.append(f"{row.name:46}{cells}{ratio:>8}  {ok:5}{row.target or ''}".rstrip())
+    return "\n".join(lines)
+
+
+@dataclass(slots=True)
+class Measured:
+    ticks: list[Tick]
+    idle: list[Stretch]
+    switching: list[Stretch]
+    starting: list[Stretch]
+    switches_us: list[float]
+    goals_us: list[float]
+    cold_goals_us: list[float]
+
+    def rows(self) -> list[RunnerRow]:
+        idle, busy = self._within(self.idle), self._within(self.switching)
+        starting = self._within(self.starting)
+        jitter = _compare("tick_jitter", _us(busy, "late_ms"), _us(idle, "late_ms"))
+        assert jitter.p99_us is not None
+        jitter.target, jitter.ok = "p99 < 2 ms", jitter.p99_us < JITTER_MAX_US
+        return [
+            jitter,
+            _compare(
+                "tick_jitter while a sidecar starts (imports)",
+                _us(starting, "late_ms"),
+                _us(idle, "late_ms"),
+            ),
+            _compare("tick: time from one start to the next, off by", _uneven(busy), _uneven(idle)),
+            _compare("tick: decide (world state, skill, safety)", _decide_us(busy), _decide_us(idle)),
+            _compare("tick: apply (physics, video)", _us(busy, "hal_ms"), _us(idle, "hal_ms")),
+            RunnerRow("switch: one sidecar out, the other in, asked", p50(self.switches_us), p99(self.switches_us)),
+            RunnerRow("goal of one tick, policy resident", p50(self.goals_us), p99(self.goals_us)),
+            RunnerRow("goal of one tick, policy to be loaded", p50(self.cold_goals_us), p99(self.cold_goals_us)),
+        ]  # fmt: skip
+
+    def _within(self, stretches: Sequence[Stretch]) -> list[Tick]:
+        found = [t for t in self.ticks if any(a <= t["started_s"] < b for a, b in stretches)]
+        if not found:
+            raise RuntimeError("no tick was noted: the runner did not run, or wrote no timings")
+        return found
+
+
+def _us(ticks: Sequence[Tick], field: str) -> list[float]:
+    return [tick[field] * 1e3 for tick in ticks]
+
+
+def _decide_us(ticks: Sequence[Tick]) -> list[float]:
+    return [(tick["tick_ms"] - tick["hal_ms"]) * 1e3 for tick in ticks]
+
+
+def _uneven(ticks: Sequence[Tick]) -> list[float]:
+    """How much more or less than a period lies between the starts of neighbours. A slot that a long tick ate counts as a whole period."""
+    gaps = [b["started_s"] - a["started_s"] for a, b in itertools.pairwise(ticks)]
+    return [abs(gap - 1 / RATE_HZ) * 1e6 for gap in gaps if gap < 1.0]  # longer ones lie between stretches
+
+
+def _compare(name: str, busy: Sequence[float], idle: Sequence[float]) -> RunnerRow:
+    return RunnerRow(name, p50(busy), p99(busy), p99(idle), p99(busy) / max(p99(idle), 1e-3))
+
+
+# -- the run ------------------------------------------------------------------------------------------------------------
+async def _measure(daemon: ArbiterProcess, rounds: int, stretch_s: float) -> Measured:
+    found = Measured([], [], [], [], [], [], [])
+    timings = daemon.runtime / "ticks.jsonl"
+    video = daemon.runtime / "episode.mp4"
+    words = ["runner", "sim", "--seed", "1", "--video", str(video), "--timings", str(timings)]
+    async with AsyncExitStack() as stack:
+        sidecars = {name: stack.enter_context(_sidecar(daemon, name)) for name in SKILLS}
+        detector = await stack.enter_async_context(DetectorClient(f"ipc://{daemon.runtime}/detector.sock"))
+        grab = await stack.enter_async_context(PolicyClient(f"ipc://{daemon.runtime}/grab.sock"))
+        runner = await stack.enter_async_context(RunnerClient(f"ipc://{daemon.runtime}/runner.sock"))
+        with _program(daemon, "runner", words) as process:
+            await _until_up(runner.ping, [process, *sidecars.values()])
+            for sidecar in (detector, grab):
+                await _until_up(sidecar.ping, [process, *sidecars.values()])
+            await _switch(runner, detector, grab)
+            await asyncio.sleep(SETTLE_S)
+            for _ in range(rounds):
+                began = time.monotonic()
+                await asyncio.sleep(stretch_s)
+                found.idle.append((began, time.monotonic()))
+                began = time.monotonic()
+                while time.monotonic() - began < stretch_s:
+                    found.switches_us += await _switch(runner, detector, grab)
+                found.switching.append((began, time.monotonic()))
+            found.starting.append(await _start_another(daemon, [process]))
+            await _goals(found, runner, detector, grab, 3 * rounds)
+    found.ticks = [json.loads(line) for line in timings.read_text().splitlines()]
+    return found
+
+
+async def _switch(runner: RunnerClient, detector: DetectorClient, grab: PolicyClient) -> list[float]:
+    """Detector in and policy out, with a picture of the runner's as a reasoner would send; then the other way. Microseconds of each."""
+    began = time.perf_counter()
+    frame = await runner.frame("front", encoding="png")
+    await detector.detect(frame["data"], "red cube", timeout_s=BOOT_S)
+    seen = time.perf_counter()
+    await grab.load(timeout_s=BOOT_S)
+    return [(seen - began) * 1e6, (time.perf_counter() - seen) * 1e6]
+
+
+async def _goals(
+    found: Measured, runner: RunnerClient, detector: DetectorClient, grab: PolicyClient, count: int
+) -> None:
+    """From asking to the result of a goal that may move for one tick: acceptance, residency, use, reset, arm and back."""
+    for _ in range(count):
+        await grab.load(timeout_s=BOOT_S)
+        found.goals_us.append(await _goal(runner))
+        frame = await runner.frame("front", encoding="png")
+        await detector.detect(frame["data"], "red cube", timeout_s=BOOT_S)
+        found.cold_goals_us.append(await _goal(runner))
+
+
+async def _goal(runner: RunnerClient) -> float:
+    began = time.perf_counter()
+    goal = await runner.send_goal(GRAB, prompt="grab the red cube", max_ticks=1)
+    result = await goal.result(BOOT_S)
+    if result["code"] != "limit_exceeded":
+        raise RuntimeError(f"the goal ended otherwise than after its one tick: {result}")
+    return (time.perf_counter() - began) * 1e6
+
+
+async def _start_another(daemon: ArbiterProcess, others: list["subprocess.Popen[bytes]"]) -> Stretch:
+    """A further sidecar process comes up beside the runner and imports all its libraries."""
+    began = time.monotonic()
+    with _sidecar(daemon, "third", "so101-grab") as process:
+        async with PolicyClient(f"ipc://{daemon.runtime}/third.sock") as client:
+            await _until_up(client.ping, [process, *others])
+            await client.load(timeout_s=BOOT_S)
+        return began, time.monotonic()
+
+
+# -- programs ---------------------------------------------------------------------------------------------------------
+async def _until_up(ping: Callable[[], Any], programs: Sequence["subprocess.Popen[bytes]"]) -> None:
+    async with asyncio.timeout(BOOT_S):
+        while True:
+            for program in programs:
+                if program.poll() is not None:
+                    raise RuntimeError(f"{program.args!r} ended with {program.returncode}")
+            try:
+                await ping()
+                return
+            except (SidecarUnavailable, RunnerUnreachable):
+                await asyncio.sleep(POLL_S)
+
+
+@contextmanager
+def _sidecar(daemon: ArbiterProcess, name: str, skill: str = "") -> Iterator["subprocess.Popen[bytes]"]:
+    manifest = ROOT / "configs/rskills" / (skill or SKILLS[name]) / "rskill.yaml"
+    words = ["sidecars", "--name", name, "--rskill", str(manifest), "--device", f"fake:{daemon.card}"]
+    with _program(daemon, name, [*words, "--min-residency-s", "0"]) as process:
+        yield process
+
+
+@contextmanager
+def _program(daemon: ArbiterProcess, name: str, words: Sequence[str]) -> Iterator["subprocess.Popen[bytes]"]:
+    """`python -m WORDS` in the daemon's runtime folder. What it said is shown when anything goes wrong."""
+    log = daemon.runtime / f"{name}.log"
+    environ = daemon.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}  # as the demo starts them
+    with log.open("ab") as sink:
+        process = subprocess.Popen(
+            [sys.executable, "-m", *words], cwd=ROOT, env=environ, stdout=sink, stderr=sink
+        )
+    try:
+        yield process
+    except BaseException:
+        print(f"{name}:\n{log.read_text(errors='replace')[-3000:]}", file=sys.stderr)
+        raise
+    finally:
+        process.terminate()
+        try:
+            process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
