@@ -12,10 +12,10 @@ import logging
 import sys
 from types import ModuleType
 
-from runner import cli_deploy, cli_estop, cli_sim
+from runner import cli_benchmark, cli_deploy, cli_estop, cli_sim
 from schemas.errors import ConfigError, VramError
 
-COMMANDS: tuple[ModuleType, ...] = (cli_sim, cli_deploy, cli_estop)
+COMMANDS: tuple[ModuleType, ...] = (cli_sim, cli_benchmark, cli_deploy, cli_estop)
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:

@@ -1,6 +1,7 @@
 """Writes the episode as H.264 video: RGB pictures with a caption, encoded by ffmpeg on a thread of its own.
 
-The control thread only hands a picture over: when the encoder is slow, pictures are dropped and counted, never waited for.
+The control thread only hands a picture over: when the encoder is slow, pictures are dropped and counted, never waited for. Only a world that
+waits for nobody else (a benchmark) may `wait`, and misses none.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 log = logging.getLogger(__name__)
 
 QUEUE_MAX = 30  # pictures; two to three seconds of video
+WAIT_S = 1.0  # between two looks whether the encoder is still there
 LINE_PX = 22
 FONT_SCALE = 0.5
 
@@ -22,8 +24,9 @@ class Recorder:
     """`Recorder(path, fps)`; `submit(rgb, lines)` from any one thread; `close()` finishes the file. H.264 wants even sizes: an odd last row or
     column is cut off."""
 
-    def __init__(self, path: Path, *, fps: float) -> None:
+    def __init__(self, path: Path, *, fps: float, wait: bool = False) -> None:
         self.path = path
+        self._wait = wait
         self.fps = fps
         self.written = 0
         self.dropped = 0
@@ -35,10 +38,14 @@ class Recorder:
 
     def submit(self, rgb: Any, lines: tuple[str, ...]) -> None:
         """Hand over one picture (uint8, height × width × 3); it must not be changed afterwards."""
-        try:
-            self._queue.put_nowait((rgb, lines))
-        except queue.Full:
-            self.dropped += 1
+        while True:
+            try:
+                self._queue.put((rgb, lines), block=self._wait, timeout=WAIT_S)
+                return
+            except queue.Full:
+                if not self._wait or not self._thread.is_alive():
+                    self.dropped += 1
+                    return
 
     def close(self) -> None:
         """Encode what is queued, finish the file; repeatable."""

@@ -197,7 +197,7 @@ class SimRunner(SkillRunner):
                     }
         except EnvironmentFailed as error:
             self._broken_off(error)
-            return Decision(reset=True)
+            return Decision()
         sensed_s = self.clock.now_s()
         try:
             with tracing.span(telemetry.SPAN_WORLD):
@@ -224,6 +224,8 @@ class SimRunner(SkillRunner):
     def _apply(self, decision: Decision) -> Applied:
         if decision.reset:
             return self._reset()
+        if self._reset_due:  # broken off while it was looked at
+            return Applied(action_applied=False, episode_idx=self.episode_idx)
         before = self._view.steps
         try:
             step = self.env.step(decision.action)

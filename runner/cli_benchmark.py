@@ -1,0 +1,279 @@
+"""`vram-runner benchmark`: how often skills and policies succeed, over worlds and seeds. Puts its parts together, writes the report, prints the table."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import dataclasses
+import json
+import logging
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from runner.cli_common import (
+    connect_arbiter,
+    default_skills,
+    install_signals,
+    positive,
+    positive_int,
+    sidecars_given,
+    warm_up,
+)
+from schemas.errors import ConfigError
+
+if TYPE_CHECKING:
+    from runner.sim.benchmark import Benchmark, Cell, Contestant
+    from runner.sim.tasks import Task
+    from runner.sim.worlds import World
+
+log = logging.getLogger("runner")
+
+REPORT = "benchmark.json"
+CONTROL_HZ = 30.0  # what one step of a world stands for, towards skills that count time
+COLUMNS = ("world", "contestant", "success", "95 % interval", "steps", "reward", "errors")
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
+    """The flags of `vram-runner benchmark`."""
+    bench = commands.add_parser("benchmark", help="success rates of skills and policies, with videos")
+    bench.add_argument(
+        "--env", action="append", default=[], help="so101 (default) or gym:ID; may be given several times"
+    )
+    bench.add_argument(
+        "--scene",
+        type=Path,
+        action="append",
+        default=[],
+        help="scene file of so101; may be given several times",
+    )
+    bench.add_argument("--env-config", type=Path, help="how the gymnasium environment is to be read")
+    bench.add_argument(
+        "--success", metavar="RULE", help="of a gymnasium environment: info:KEY or return:NUMBER"
+    )
+    bench.add_argument("--task", help="in so101: grab or navigate; by default what the skill's actions say")
+    bench.add_argument(
+        "--skill", action="append", default=[], help="an installed skill; may be given several times"
+    )
+    bench.add_argument(
+        "--policy", action="append", default=[],
+        help="random, scripted:MODULE, scripted:FILE.py or, for grabs in so101, expert; may be given several times",
+    )  # fmt: skip
+    bench.add_argument("--episodes", type=positive_int, default=10, help="seeds a cell; default 10")
+    bench.add_argument("--seed", type=int, default=0, help="the first one")
+    bench.add_argument(
+        "--max-steps", type=positive_int, default=600, help="of an episode; default 600, 20 s of the SO-101"
+    )
+    bench.add_argument(
+        "--episode-seconds", type=positive, default=600.0, help="of an episode, on the wall; default 600"
+    )
+    bench.add_argument("--out", type=Path, default=Path("out/benchmark"), help="folder of report and videos")
+    bench.add_argument("--videos", action=argparse.BooleanOptionalAction, default=True)
+    bench.add_argument(
+        "--skills", type=Path, nargs="+", action="extend", help="rskill.yaml files or folders of them"
+    )
+    bench.add_argument("--arbiter", help="the arbiter's endpoint")
+    bench.add_argument("--no-arbiter", action="store_true", help="nobody arbitrates: mark no uses")
+    bench.add_argument("--sidecar", action="append", default=[], metavar="RSKILL=ENDPOINT")
+    return bench
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Entry:
+    """One cell to be played: a contestant in a world, made when its turn comes."""
+
+    world: World
+    name: str
+    task: Task | None
+    contestant: Callable[[], Contestant]
+
+
+async def run(args: argparse.Namespace) -> int:
+    """Exit 0: every episode got a verdict or nobody judges; 1: errors, or stopped. Either way the report says what was played."""
+    async with contextlib.AsyncExitStack() as stack:
+        arbiter = None
+        if args.skill and not args.no_arbiter:
+            arbiter = await connect_arbiter(args.arbiter, stack)
+        entries = entries_of(args, arbiter)
+        args.out.mkdir(parents=True, exist_ok=True)
+        await asyncio.to_thread(warm_up)
+        stopping = asyncio.Event()
+        install_signals(stopping)
+        cells: list[Cell] = []
+        for entry in entries:
+            if stopping.is_set():
+                break
+            cells.append(await _play(entry, args, stopping))
+            _write(args, cells, complete=False)
+    complete = len(cells) == len(entries) and all(cell.complete for cell in cells)
+    _write(args, cells, complete=complete)
+    print(table([cell.summary() for cell in cells]))
+    print(f"{args.out / REPORT}")
+    return 0 if complete and not any(cell.errors for cell in cells) else 1
+
+
+async def _play(entry: Entry, args: argparse.Namespace, stopping: asyncio.Event) -> Cell:
+    bench = _benchmark(entry, args)
+    watching = asyncio.create_task(_stop_with(stopping, bench))
+    try:
+        return await bench.run(entry.contestant(), range(args.seed, args.seed + args.episodes))
+    finally:
+        watching.cancel()
+        await asyncio.gather(watching, return_exceptions=True)
+
+
+async def _stop_with(stopping: asyncio.Event, bench: Benchmark) -> None:
+    await stopping.wait()
+    bench.stop()
+
+
+def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
+    from runner.sim.arm_env import ArmEnvironment
+    from runner.sim.benchmark import Benchmark
+    from runner.sim.sim_runner import SimRunner
+
+    world, task, arm = entry.world, entry.task, entry.world.arm
+    make, told = world.make, None
+    if arm is not None and task is not None:
+        prepare = task.prepare
+        environment = ArmEnvironment(
+            arm,
+            cameras=world.cameras or (),
+            prepare=None if prepare is None else lambda seed: prepare(arm, seed),
+            judge=lambda: task.judge(arm),
+            steady=task.steady,
+        )
+        make, told = (lambda: environment), (lambda: task.told(arm))
+    runner = SimRunner(
+        make,
+        cameras=world.cameras,
+        rate_hz=0,
+        max_steps=args.max_steps,
+        ends_with_skill=True,
+        video_camera=world.video_camera,
+        video_every=world.video_every,
+    )
+    runner.identity = dict(world.identity)
+    return Benchmark(
+        runner,
+        world=world.name,
+        task=task.name if task is not None else None,
+        told=told or (lambda: ("", {})),
+        videos=args.out / "videos" if args.videos else None,
+        video_every=world.video_every,
+        episode_s=args.episode_seconds,
+    )
+
+
+# -- what is to be played -------------------------------------------------------------------------------------------------
+def worlds_of(args: argparse.Namespace) -> list[World]:
+    """Raises ConfigError for worlds that there are not, and files that could belong to several."""
+    from runner.sim.worlds import SO101, world_of
+
+    names = list(dict.fromkeys(args.env or [SO101]))
+    others = [name for name in names if name != SO101]
+    if len(others) > 1 and (args.env_config is not None or args.success is not None):
+        raise ConfigError(
+            "--env-config and --success are for one gymnasium environment: run them one after another"
+        )
+    if (args.scene or args.task) and SO101 not in names:
+        raise ConfigError(f"--scene and --task are for --env {SO101}")
+    worlds = []
+    for name in names:
+        if name != SO101:
+            render = None if args.videos else False
+            worlds.append(world_of(name, env_config=args.env_config, success=args.success, render=render))
+            continue
+        for scene in args.scene or [None]:
+            world = world_of(name, scene=scene)
+            worlds.append(
+                world if scene is None else dataclasses.replace(world, name=f"{SO101}:{scene.stem}")
+            )
+    return worlds
+
+
+def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
+    """Every contestant in every world. Raises ConfigError and UnknownSkill before anything is played."""
+    from runner.catalogue import Catalogue, read_manifests
+    from runner.sim.benchmark import PolicyContestant, SkillContestant
+    from runner.sim.policies import policy_of
+    from runner.sim.tasks import EXPERT, GRAB, TASKS, expert_policy, task_of
+    from runner.sim.worlds import makers_of
+    from runner.skills.sidecar_policy import LOCKSTEP_WAIT_S
+
+    if not args.skill and not args.policy:
+        raise ConfigError("nobody is to play", hint="--skill RSKILL or --policy random, any number of them")
+    if args.task is not None and args.task not in TASKS:
+        raise ConfigError(f"--task {args.task} is no task", hint=" or ".join(TASKS))
+    given_task = TASKS[args.task] if args.task is not None else None
+    policies = {name: policy_of(name) for name in dict.fromkeys(args.policy) if name != EXPERT}
+    manifests = read_manifests(args.skills or [default_skills()]) if args.skill else []
+    given = sidecars_given(args.sidecar)
+    entries = []
+    for world in worlds_of(args):
+        arm = world.arm
+        makers = makers_of(world, given, arbiter, period_s=1.0 / CONTROL_HZ, wait_s=LOCKSTEP_WAIT_S)
+        catalogue = Catalogue(manifests, makers, body=world.body)
+        for name in dict.fromkeys(args.skill):
+            _, make, manifest = catalogue.find(name)
+            task = None if arm is None else given_task or task_of(manifest)
+            entries.append(Entry(world, name, task, lambda make=make: SkillContestant(make())))  # type: ignore[misc]
+        for name in dict.fromkeys(args.policy):
+            task = None if arm is None else given_task or GRAB
+            if name != EXPERT:
+                policy = policies[name]
+            elif arm is None or task is not GRAB:
+                raise ConfigError(f"--policy {EXPERT} grabs in so101, and does nothing else")
+            else:
+                policy = expert_policy(arm)
+            entries.append(Entry(world, name, task, lambda policy=policy: PolicyContestant(policy)))  # type: ignore[misc]
+    return entries
+
+
+# -- what comes of it ---------------------------------------------------------------------------------------------------
+def _write(args: argparse.Namespace, cells: Sequence[Cell], *, complete: bool) -> None:
+    """After every cell, whole or not at all: a run that is killed leaves the cells before."""
+    report = {
+        "format": "vram-benchmark/1",
+        "complete": complete,
+        "seeds": [args.seed, args.seed + args.episodes - 1],
+        "max_steps": args.max_steps,
+        "cells": [
+            cell.summary() | {"episodes": [dataclasses.asdict(played) for played in cell.episodes]}
+            for cell in cells
+        ],
+    }
+    target = args.out / REPORT
+    beside = target.with_suffix(".new")
+    try:
+        beside.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        os.replace(beside, target)
+    except OSError as error:
+        raise ConfigError(f"{target} cannot be written: {error}") from error
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """The cells for people."""
+    lines = [COLUMNS, *(_row(row) for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(COLUMNS))]
+    return "\n".join(
+        "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
+    )
+
+
+def _row(row: dict[str, Any]) -> tuple[str, ...]:
+    interval = row["interval_95"]
+    rate = row["success_rate"]
+    task = f" ({row['task']})" if row["task"] else ""
+    return (
+        row["world"] + task,
+        row["contestant"],
+        "not judged" if rate is None else f"{row['successes']}/{row['judged']} = {rate:.0%}",
+        "" if interval is None else f"{interval[0]:.0%} to {interval[1]:.0%}",
+        "" if row["mean_steps"] is None else f"{row['mean_steps']:.1f}",
+        "" if row["mean_reward"] is None else f"{row['mean_reward']:.2f}",
+        f"{row['errors']}" + ("" if row["complete"] else f"; not complete: {row['why']}"),
+    )

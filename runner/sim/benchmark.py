@@ -1,0 +1,341 @@
+"""How often does it work? Plays seeds in a world with one contestant (an installed skill or a policy), judged by the world itself.
+
+Everything of the world happens on one worker thread, ticks happen only while a contestant has the world: nothing passes while a model loads, so
+that the same seed is the same episode on any machine. Knows no command line and no files but the videos.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import re
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from runner.protocols import Goal, Skill, SkillEnded, Stepped
+from runner.recorder import Recorder
+from runner.sim.environment import Environment
+from runner.sim.policies import Policy
+from runner.sim.sim_runner import SimRunner
+from schemas import telemetry, tracing
+from schemas.errors import Cancelled, LimitExceeded, ModelError, VramError
+
+log = logging.getLogger(__name__)
+
+Z_95: Final = 1.959964  # the normal distribution's 97.5 % point
+ERRORS_IN_A_ROW_MAX: Final = 3  # a sidecar that is not there will not be there for the next seed either
+VIDEO_HZ: Final = 30.0
+
+Told = tuple[str, dict[str, Any]]
+
+
+def wilson(successes: int, of: int) -> tuple[float, float] | None:
+    """Wilson's 95 % interval of a success rate: sensible for few episodes, too, and for none or all of them. None without episodes."""
+    if of == 0:
+        return None
+    share, square = successes / of, Z_95**2
+    middle = share + square / (2 * of)
+    half = Z_95 * math.sqrt(share * (1 - share) / of + square / (4 * of * of))
+    return max(0.0, (middle - half) / (1 + square / of)), min(1.0, (middle + half) / (1 + square / of))
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """One seed. `success` None: nobody judges in this world, or `error` says why there is no verdict.
+
+    An error of the contestant while it plays (`model_error`) is a failure, where anybody judges; any other (a sidecar that is not there, an
+    environment that raised) is no verdict on it.
+    """
+
+    seed: int
+    success: bool | None
+    steps: int = 0
+    total_reward: float | None = None
+    truncated: bool = False
+    error: str = ""
+    message: str = ""
+    failed: bool = False  # by an error of the contestant's own
+    seconds: float = 0.0
+    video: str | None = None
+
+    @property
+    def unjudged_error(self) -> bool:
+        return bool(self.error) and self.success is None
+
+
+@dataclass(slots=True)
+class Cell:
+    """All episodes of one contestant in one world. `complete` False: stopped, or given up (`why`)."""
+
+    world: str
+    contestant: str
+    task: str | None
+    episodes: list[Played] = field(default_factory=list)
+    complete: bool = False
+    why: str = ""
+
+    @property
+    def judged(self) -> int:
+        return sum(played.success is not None for played in self.episodes)
+
+    @property
+    def successes(self) -> int:
+        return sum(played.success is True for played in self.episodes)
+
+    @property
+    def errors(self) -> int:
+        return sum(played.unjudged_error for played in self.episodes)
+
+    @property
+    def success_rate(self) -> float | None:
+        return self.successes / self.judged if self.judged else None
+
+    def add(self, played: Played) -> None:
+        """In a world that judges, whoever fails by himself has failed, also before the first word of the world."""
+        self.episodes.append(played)
+        if self.judged:
+            self.episodes = [replace(one, success=False) if one.failed else one for one in self.episodes]
+
+    def summary(self) -> dict[str, Any]:
+        """Sums, as they go into the report."""
+        rewards = [played.total_reward for played in self.episodes if played.total_reward is not None]
+        steps = [played.steps for played in self.episodes if not played.unjudged_error]
+        return {
+            "world": self.world,
+            "contestant": self.contestant,
+            "task": self.task,
+            "complete": self.complete,
+            "why": self.why,
+            "played": len(self.episodes),
+            "judged": self.judged,
+            "successes": self.successes,
+            "errors": self.errors,
+            "success_rate": self.success_rate,
+            "interval_95": wilson(self.successes, self.judged),
+            "mean_steps": sum(steps) / len(steps) if steps else None,
+            "mean_reward": sum(rewards) / len(rewards) if rewards else None,
+        }
+
+
+class Contestant(Protocol):
+    """Who plays. `begin` on the event loop, before each episode; `player` on the worker thread."""
+
+    name: str
+
+    async def begin(self, goal: Goal) -> None: ...
+
+    def player(self, env: Environment, seed: int) -> Stepped: ...
+
+    async def finish(self) -> None: ...
+
+    async def release(self) -> None: ...
+
+
+class SkillContestant:
+    """An installed skill, started anew for every episode as a goal would start it."""
+
+    def __init__(self, skill: Skill) -> None:
+        self.name = skill.key.rskill_id
+        self._skill = skill
+
+    async def begin(self, goal: Goal) -> None:
+        await self._skill.start(goal)
+
+    def player(self, env: Environment, seed: int) -> Stepped:
+        return self._skill
+
+    async def finish(self) -> None:
+        await self._skill.finish()
+
+    async def release(self) -> None:
+        await self._skill.release()
+
+
+class PolicyContestant:
+    """A policy without a model."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.name = policy.name
+        self._policy = policy
+
+    async def begin(self, goal: Goal) -> None: ...
+
+    def player(self, env: Environment, seed: int) -> Stepped:
+        return self._policy.play(env, seed)
+
+    async def finish(self) -> None: ...
+
+    async def release(self) -> None: ...
+
+
+class Benchmark:
+    """`runner` runs as fast as it can, its episodes end with their skill. `told` says on the worker thread what the goal of an episode is.
+
+    `episode_s` bounds an episode on the wall clock (a contestant that never acts, a world that hangs between two steps).
+    """
+
+    def __init__(
+        self,
+        runner: SimRunner,
+        *,
+        world: str,
+        task: str | None = None,
+        told: Callable[[], Told] = lambda: ("", {}),
+        videos: Path | None = None,
+        video_every: int = 1,
+        episode_s: float = 600.0,
+    ) -> None:
+        self.runner = runner
+        self._world, self._task, self._told = world, task, told
+        self._videos, self._video_every = videos, video_every
+        self._episode_s = episode_s
+        self._stopping = asyncio.Event()
+
+    def stop(self) -> None:
+        """Event loop: end after the present tick; what was played stays."""
+        self._stopping.set()
+        self.runner.request_stop()
+
+    async def run(self, contestant: Contestant, seeds: Iterable[int]) -> Cell:
+        """Raises what making the world raises; everything later is an episode's error."""
+        cell = Cell(self._world, contestant.name, self._task)
+        with ThreadPoolExecutor(1, thread_name_prefix="benchmark") as worker:
+            await self._on(worker, self.runner.activate)
+            try:
+                for seed in seeds:
+                    if (played := await self._play(worker, contestant, seed)) is None:
+                        cell.why = "stopped"
+                        return cell
+                    cell.add(played)
+                    log.info("%s, %s, seed %d: %s", cell.world, cell.contestant, seed, _verdict(played))
+                    last = cell.episodes[-ERRORS_IN_A_ROW_MAX:]
+                    if len(last) == ERRORS_IN_A_ROW_MAX and all(one.unjudged_error for one in last):
+                        cell.why = f"given up after {len(last)} errors in a row: {played.message}"
+                        return cell
+                cell.complete = True
+                return cell
+            finally:
+                await self._on(worker, self.runner.deactivate)
+                await _quietly(contestant.release())
+
+    async def _play(self, worker: ThreadPoolExecutor, contestant: Contestant, seed: int) -> Played | None:
+        """None: stopped in its middle."""
+        began_s = time.monotonic()
+        path = self._video_of(contestant.name, seed)
+        recorder = None
+        if path is not None:
+            recorder = Recorder(path, fps=VIDEO_HZ / self._video_every, wait=True)
+        attributes = {telemetry.ATTR_SKILL: contestant.name}
+        try:
+            with tracing.span(telemetry.SPAN_EPISODE, attributes=attributes):
+                traceparent = tracing.traceparent()
+                prompt, params = await self._on(worker, lambda: self._reset(seed))
+                goal = Goal(
+                    f"seed-{seed}", contestant.name, prompt=prompt, params=params, traceparent=traceparent
+                )
+                self.runner.caption = (f"{contestant.name}, seed {seed}", *([prompt] if prompt else []))
+                try:
+                    await self._unless_stopped(contestant.begin(goal))
+                    played = await self._on(worker, lambda: self._episode(contestant, goal, seed, recorder))
+                finally:
+                    await _quietly(contestant.finish())
+        except Cancelled:
+            return None
+        except VramError as error:
+            played = Played(seed, None, error=error.code, message=str(error))
+        finally:
+            self.runner.recorder = None
+            if recorder is not None:
+                await asyncio.to_thread(recorder.close)
+        if played is None:
+            return None
+        video = str(path) if recorder is not None and recorder.written and not recorder.error else None
+        return replace(played, seconds=round(time.monotonic() - began_s, 3), video=video)
+
+    # -- worker thread -------------------------------------------------------------------------------------------------
+    def _reset(self, seed: int) -> Told:
+        self.runner.begin_episode(seed)
+        self.runner.tick()
+        return self._told()
+
+    def _episode(
+        self, contestant: Contestant, goal: Goal, seed: int, recorder: Recorder | None
+    ) -> Played | None:
+        """Ticks until the episode is over."""
+        runner, ended = self.runner, list[SkillEnded]()
+        runner.recorder = recorder
+        number, ends_s = runner.episode_idx, time.monotonic() + self._episode_s
+        runner.begin_skill(contestant.player(runner.env, seed), goal, ended.append)
+        while (
+            runner.episode_idx == number and not ended
+        ):  # a skill that ends, ends the episode in the same tick
+            if self._stopping.is_set():
+                runner.end_skill()
+                return None
+            if time.monotonic() > ends_s:
+                runner.end_skill()
+                raise LimitExceeded(
+                    f"the episode is not over after {self._episode_s:.0f} s",
+                    details={"limit": "episode_seconds"},
+                )
+            runner.tick()
+        error = ended[0].error if ended and "episode" not in ended[0].data else None
+        if error is not None and not isinstance(error, ModelError | LimitExceeded):
+            raise error  # the episode may not even be one
+        episode = runner.episodes[-1]
+        return Played(
+            seed,
+            False if error is not None and episode.success is not None else episode.success,
+            steps=episode.steps,
+            total_reward=episode.total_reward,
+            truncated=episode.truncated,
+            error=error.code if error is not None else "",
+            message=str(error) if error is not None else "",
+            failed=error is not None,
+        )
+
+    # -- helpers -------------------------------------------------------------------------------------------------------
+    async def _on[T](self, worker: ThreadPoolExecutor, work: Callable[[], T]) -> T:
+        return await asyncio.get_running_loop().run_in_executor(worker, work)
+
+    async def _unless_stopped(self, work: Any) -> None:
+        """Raises Cancelled when the benchmark is stopped meanwhile."""
+        task, stopping = asyncio.ensure_future(work), asyncio.ensure_future(self._stopping.wait())
+        try:
+            await asyncio.wait([task, stopping], return_when=asyncio.FIRST_COMPLETED)
+            if not task.done():
+                raise Cancelled("the benchmark is to stop")
+            task.result()
+        finally:
+            for one in (task, stopping):
+                one.cancel()
+            await asyncio.gather(task, stopping, return_exceptions=True)
+
+    def _video_of(self, contestant: str, seed: int) -> Path | None:
+        if self._videos is None:
+            return None
+        return self._videos / f"{file_name(self._world)}_{file_name(contestant)}_{seed}.mp4"
+
+
+def file_name(text: str) -> str:
+    """What can be a file's name of any text."""
+    return re.sub(r"[^A-Za-z0-9.-]+", "-", text).strip("-.")
+
+
+def _verdict(played: Played) -> str:
+    word = {True: "success", False: "failure", None: "error" if played.error else "not judged"}[
+        played.success
+    ]
+    return f"{word} after {played.steps} steps" + (f" ({played.message})" if played.message else "")
+
+
+async def _quietly(work: Any) -> None:
+    try:
+        await work
+    except VramError as error:  # the verdict is what it is
+        log.warning("the contestant did not leave cleanly: %s", error)

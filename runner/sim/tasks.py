@@ -1,0 +1,102 @@
+"""What an episode in our own scene is about: how it is set up, what the skill is told, when it is a success. For benchmarks.
+
+Both tasks are about the seed's target object; the verdict is the simulator's ground truth, which no skill sees. A gymnasium environment
+brings its own task.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+from runner.sim.dataset import stand_before
+from runner.sim.env import SimEnv
+from runner.sim.expert import GrabExpert
+from runner.sim.kinematics import ArmKinematics
+from runner.sim.policies import Policy, Step
+from schemas.errors import ConfigError
+from schemas.manifest import RSkillManifest
+
+HELD_STEPS: Final = 8  # a thing that is held this long, above the table, does not slip out any more
+STANDS_M: Final = 0.03  # of the grasp spot: what the grab policy was trained to make up for
+AFTER_STEPS: Final = 8  # that the expert holds what it has lifted
+EXPERT: Final = "expert"
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """`actions`: those of a manifest that ask for this task. `prepare` follows `reset(seed)`. `steady`: steps in a row that the judge must
+    say yes for the episode to be over; 0: it is over when the skill says so."""
+
+    name: str
+    actions: frozenset[str]
+    judge: Callable[[SimEnv], bool]
+    steady: int
+    prepare: Callable[[SimEnv, int], None] | None
+    told: Callable[[SimEnv], tuple[str, dict[str, Any]]]
+    """Prompt and goal parameters."""
+
+
+def _stand(env: SimEnv, seed: int) -> None:
+    """Where navigation leaves the base: before the target, a few centimetres off."""
+    stand_before(env, env.target, random.Random(f"benchmark-{seed}"))
+
+
+def _target_point(env: SimEnv) -> dict[str, Any]:
+    x, y, z = env.ground_truth().objects[env.target].position_base
+    return {"target_point": {"x": x, "y": y, "z": z}}
+
+
+def _stands_before(env: SimEnv) -> bool:
+    x, y, _ = env.ground_truth().objects[env.target].position_base
+    return math.dist((x, y), env.config.grasp_spot_in_base_m) < STANDS_M
+
+
+GRAB = Task(
+    name="grab",
+    actions=frozenset({"grasp", "pick"}),
+    judge=lambda env: env.held_object() == env.target,
+    steady=HELD_STEPS,
+    prepare=_stand,
+    told=lambda env: (f"grab the {env.target}", {}),
+)
+NAVIGATE = Task(
+    name="navigate",
+    actions=frozenset({"navigate"}),
+    judge=_stands_before,
+    steady=0,
+    prepare=None,
+    told=lambda env: (f"go to the {env.target}", _target_point(env)),
+)
+TASKS: Final = {task.name: task for task in (GRAB, NAVIGATE)}
+
+
+def task_of(manifest: RSkillManifest) -> Task:
+    """The task that fits what a skill can do. Raises ConfigError when none does, or several."""
+    fitting = [task for task in TASKS.values() if task.actions & set(manifest.actions)]
+    if len(fitting) != 1:
+        raise ConfigError(
+            f"which task is {manifest.name} for? Its actions are {', '.join(manifest.actions)}",
+            hint=f"--task {' or --task '.join(TASKS)}",
+        )
+    return fitting[0]
+
+
+def expert_policy(arm: SimEnv) -> Policy:
+    """The scripted grab that the demonstrations are made by. It reads the ground truth: the ceiling of a benchmark, nothing else."""
+
+    def make(_: Any, seed: int) -> Step:
+        expert = GrabExpert(arm, ArmKinematics(arm.config), arm.target)
+        after = 0
+
+        def act(_: Any) -> list[float] | None:
+            nonlocal after
+            after += expert.done
+            return None if after > AFTER_STEPS else expert.act()
+
+        return act
+
+    return Policy(EXPERT, make)
