@@ -26,6 +26,12 @@ def along(fields: Mapping[str, Any] | None = None) -> dict[str, Any]:
     return sent
 
 
+def environ() -> dict[str, str]:
+    """For the environment of a program that is started here: it joins the present trace (`schemas.commands`)."""
+    traceparent = present()
+    return {} if traceparent is None else {"TRACEPARENT": traceparent}
+
+
 @contextmanager
 def joined(traceparent: object) -> Iterator[None]:
     """Within the block (and in the tasks made there) the present span is the one that a message named, or none.

@@ -7,12 +7,12 @@ import argparse
 import asyncio
 import contextlib
 import json
-import logging
 import os
 import signal
 import sys
 from pathlib import Path
 
+from clients import logs
 from clients.runner import RunnerClient
 from clients.sidecar.perception import DetectorClient, SceneVlmClient
 from reasoner.inbox import Inbox
@@ -28,6 +28,7 @@ from reasoner.server import OperatorServer, send
 from reasoner.tools import Tools
 from reasoner.watch import watch
 from schemas.body import read_body
+from schemas.commands import command
 from schemas.endpoints import program_endpoint
 from schemas.errors import ConfigError, ReasonerUnreachable, RunnerUnreachable, SidecarUnavailable, VramError
 from schemas.manifest import RSkillManifest
@@ -77,13 +78,24 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--runner", help="endpoint of the runner (default: ipc://RUNTIME/runner.sock)")
     parser.add_argument("--detector", help='endpoint of the detector sidecar; "none": there is none')
     parser.add_argument("--scene-vlm", help='endpoint of the scene-VLM sidecar; "none": there is none')
+    parser.add_argument("--log-format", choices=logs.FORMS, default="human", help="json: one object a line")
     parser.add_argument("--result", type=Path, help="write the result as JSON into this file")
     return parser
 
 
 def main() -> None:
     arguments = _parser().parse_args()
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s", stream=sys.stderr)
+    logs.set_up("vram-reasoner", "info", arguments.log_format, "%(asctime)s %(name)s %(message)s")
+    what = "task" if arguments.task is not None else "say" if arguments.say is not None else "cancel"
+    try:
+        with command("vram-reasoner", what):
+            _main(arguments)
+    except ConfigError as error:  # of the telemetry: everything else is said within
+        sys.exit(_complain(error, EXIT_USAGE))
+
+
+def _main(arguments: argparse.Namespace) -> None:
+    """Exits with the code, unless that is 0."""
     try:
         if arguments.task is None:
             asyncio.run(_speak(arguments))

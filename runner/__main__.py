@@ -1,7 +1,7 @@
 """The runner's command line: a thin dispatcher, one module a command (`runner/cli_COMMAND.py`).
 
 A command's module has `add_parser(commands)`, which returns its parser, and `async run(args)`, which returns the exit code: 0 ended on
-request, 1 failed, 2 wrong usage or configuration.
+request, 1 failed, 2 wrong usage or configuration. `SERVES = True` says that it works for others, each in a trace of his own.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ import logging
 import sys
 from types import ModuleType
 
+from clients import logs
 from runner import cli_benchmark, cli_deploy, cli_estop, cli_sim
+from schemas.commands import command
 from schemas.errors import ConfigError, VramError
 
 COMMANDS: tuple[ModuleType, ...] = (cli_sim, cli_benchmark, cli_deploy, cli_estop)
@@ -25,25 +27,29 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     )
     commands = parser.add_subparsers(dest="command", required=True)
     for module in COMMANDS:
-        command = module.add_parser(commands)
-        command.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
-        command.set_defaults(run=module.run)
+        flags = module.add_parser(commands)
+        flags.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
+        flags.add_argument(
+            "--log-format", default="human", choices=logs.FORMS, help="json: one object a line"
+        )
+        flags.set_defaults(run=module.run, serves=getattr(module, "SERVES", False))
     return parser.parse_args(argv)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Console script `vram-runner`."""
     args = parse(argv)
-    logging.basicConfig(
-        level=args.log_level.upper(), stream=sys.stderr, format="%(asctime)s runner %(levelname)s %(message)s"
+    logs.set_up(
+        "vram-runner", args.log_level, args.log_format, "%(asctime)s runner %(levelname)s %(message)s"
     )
     logging.getLogger("OpenGL").setLevel(logging.WARNING)  # it announces an accelerator that nobody needs
     try:
-        code: int = asyncio.run(args.run(args))
+        with command("vram-runner", args.command, serves=args.serves) as running:
+            running.code = asyncio.run(args.run(args))
     except VramError as error:
         print(f"vram-runner: {error}", file=sys.stderr)
         return 2 if isinstance(error, ConfigError) else 1
-    return code
+    return running.code
 
 
 if __name__ == "__main__":

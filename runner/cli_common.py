@@ -36,6 +36,14 @@ def positive_int(text: str) -> int:
     return value
 
 
+def share(text: str) -> float:
+    """An argument from 0 to 1."""
+    value = float(text)
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
+    return value
+
+
 def not_negative(text: str) -> float:
     """An argument that must be 0 or more."""
     value = float(text)
@@ -59,6 +67,10 @@ def add_serving_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--realtime", action=argparse.BooleanOptionalAction, default=True,
         help="run the control loop before ordinary programs (SCHED_FIFO, or a lower nice value) where the machine allows it",
+    )  # fmt: skip
+    parser.add_argument(
+        "--trace-ticks", type=share, default=1.0, metavar="RATIO",
+        help="share of a goal's ticks that telemetry records, beyond those up to its first action; goals are recorded always",
     )  # fmt: skip
     parser.add_argument("--max-seconds", type=positive, help="stop by itself after so many seconds")
 

@@ -50,6 +50,7 @@ from schemas.world import RunResult
 
 log = logging.getLogger("runner")
 
+SERVES = True
 OWN_GOAL = "task"  # goal id of the file's own task
 
 MakeMakers = Callable[[Parts, Arbiter | None], Mapping[Kind, Maker]]
@@ -132,6 +133,7 @@ class Deploy:
             claim(self._file.robot.robot_id, stack)
             arbiter = None if self._args.no_arbiter else await connect_arbiter(self._args.arbiter, stack)
             runner = self._runner(parts)
+            runner.trace_ticks = self._args.trace_ticks
             control = await self._start(runner, stack)
             if control is None:
                 return 0

@@ -26,6 +26,7 @@ from schemas.errors import ConfigError, InternalError
 
 log = logging.getLogger("runner")
 
+SERVES = True
 AS_FAST_AS_POSSIBLE_HZ = 30.0  # simulated rate when nothing is paced
 
 
@@ -126,6 +127,7 @@ async def run(args: argparse.Namespace) -> int:
         if policy is not None:
             runner.identity["policy"] = policy.name
             runner.recorder = recorder  # from its first step on: it may be over before anybody asks
+        runner.trace_ticks = args.trace_ticks
         control = await stack.enter_async_context(ControlThread(runner))
         await asyncio.to_thread(warm_up)
         await ready(control)

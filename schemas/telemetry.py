@@ -78,3 +78,4 @@ ATTR_TOOL = "reasoner.tool"
 ATTR_OPERATION = "sidecar.operation"
 ATTR_OUTCOME = "outcome"
 ATTR_COMMAND = "cli.command"
+ATTR_EXIT_CODE = "process.exit.code"  # spans only

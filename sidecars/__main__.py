@@ -11,8 +11,11 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from clients import logs
 from clients.configs import configs_folder
 from schemas import defaults as d
+from schemas import telemetry
+from schemas.commands import command
 from schemas.endpoints import arbiter_endpoint, program_endpoint
 from schemas.errors import ConfigError, VramError
 from schemas.fakegpu import CARD_FILE, FOLDER_VARIABLE, parse_config
@@ -45,11 +48,9 @@ AdapterFor = Callable[[RSkillManifest, Weights], ModelAdapter]
 def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adapter) -> int:
     """Entry point of `vram-sidecar` and `python -m sidecars`. `adapter_for` lets a program serve a model of its own."""
     flags = _parser().parse_args(arguments)
-    logging.basicConfig(
-        level=flags.log_level.upper(),
-        stream=sys.stderr,
-        format=f"%(asctime)s {flags.name} %(levelname)s %(message)s",
-    )
+    service = f"vram-sidecar-{flags.name}"  # each a service of its own: a trace shows which model it was
+    human = f"%(asctime)s {flags.name} %(levelname)s %(message)s"
+    logs.set_up(service, flags.log_level, flags.log_format, human)
     try:
         settings = settings_from(flags)
         adapter = adapter_for(settings.manifest, settings.weights)
@@ -60,7 +61,9 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
 
         for name, value in _ENVIRONMENT.items():
             os.environ.setdefault(name, value)
-        if not asyncio.run(SidecarHost(settings, adapter, open_memory(settings)).serve()):
+        with command(service, "serve", serves=True, attributes={telemetry.ATTR_CONSUMER: flags.name}):
+            finished = asyncio.run(SidecarHost(settings, adapter, open_memory(settings)).serve())
+        if not finished:
             logging.shutdown()
             os._exit(0)  # the interpreter would wait for an import of many seconds that nobody needs any more
     except (VramError, ManifestError) as error:
@@ -202,6 +205,7 @@ def _parser() -> argparse.ArgumentParser:
         help="of the thread that loads and runs the model; default %(default)s",
     )
     add("--log-level", choices=("debug", "info", "warning", "error"), default="info")
+    add("--log-format", choices=logs.FORMS, default="human", help="json: one object a line")
     add("--check", action="store_true", help="check manifest, footprint and flags, then end")
     return parser
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from clients import traces
 from schemas.errors import SidecarUnavailable
 
 STOP_GRACE_S = 15.0
@@ -42,7 +43,7 @@ class Programs:
         with log.open("wb") as sink:
             process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", *arguments,
-                stdin=asyncio.subprocess.DEVNULL, stdout=sink, stderr=sink, env=dict(os.environ) | dict(self.environ),
+                stdin=asyncio.subprocess.DEVNULL, stdout=sink, stderr=sink, env=dict(os.environ) | traces.environ() | dict(self.environ),
             )  # fmt: skip
         program = self.running[name] = Program(name, process, log)
         return program

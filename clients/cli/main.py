@@ -4,15 +4,15 @@ import sys
 
 from clients.cli import quick
 
+TELEMETRY_S = 1.0  # a person waits for the prompt: a collector that is away costs no more than this
+
 
 def main() -> None:
     """Entry point. Exit codes: 0 done, 1 the answer is no or an error, 2 wrong usage, 3 the arbiter cannot be reached."""
     try:
         code = quick.try_run(sys.argv[1:])
         if code is None:
-            from clients.cli.app import run_app
-
-            code = run_app(sys.argv[1:])
+            code = _in_full(sys.argv[1:])
         sys.stdout.flush()
     except BrokenPipeError:  # `vramctl history | head`
         sys.stderr.close()
@@ -20,3 +20,18 @@ def main() -> None:
     except KeyboardInterrupt:
         code = 130
     sys.exit(code)
+
+
+def _in_full(arguments: list[str]) -> int:
+    """A command with everything that it may import, as a span where telemetry is asked for."""
+    from clients.cli.app import run_app
+    from schemas.commands import command
+    from schemas.errors import ConfigError
+
+    try:
+        with command("vramctl", arguments[0] if arguments else "", flush_s=TELEMETRY_S) as running:
+            running.code = run_app(arguments)
+    except ConfigError as error:
+        print(f"vramctl: {error}", file=sys.stderr)
+        return quick.USAGE
+    return running.code

@@ -14,6 +14,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from clients import traces
 from clients.aio import ArbiterClient
 from clients.lease import Lease
 from schemas.errors import VramError
@@ -124,6 +125,7 @@ def _forward(child: asyncio.subprocess.Process, number: signal.Signals) -> None:
 def _environ(lease: Lease) -> dict[str, str]:
     return {
         **os.environ,
+        **traces.environ(),
         "VRAM_LEASE_ID": lease.lease_id,
         "VRAM_LEASE_TOKEN": f"{lease.token[0]}.{lease.token[1]}",
         "VRAM_LEASE_GPU": lease.gpu,

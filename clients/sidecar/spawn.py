@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from clients import traces
 from schemas.errors import SidecarUnavailable
 
 BOOT_TIMEOUT_S = 120.0  # importing torch and lerobot takes ~8 s here, more on a busy machine
@@ -50,7 +51,7 @@ class Child:
         try:
             self._process = subprocess.Popen(
                 list(spec.argv),
-                env={**os.environ, **(spec.env or {})},
+                env={**os.environ, **traces.environ(), **(spec.env or {})},
                 stdin=subprocess.DEVNULL,
                 stdout=handle,
                 stderr=handle,

@@ -1,0 +1,235 @@
+"""One trace through all processes: from the reasoner's decision to the first action that reaches the robot.
+
+Real programs (arbiter, two sidecars, the simulator's runner, reasoner) export by OTLP to a collector in the test. The language model decides
+twice: look for the cube, so that the detector has the card; then grab, so that it has to leave. Once the arm has moved, everything is ended by
+SIGTERM, which has to lose nothing.
+"""
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arbiter.testing.collector import Collector, ReceivedSpan
+from arbiter.testing.process import ArbiterProcess
+from schemas import telemetry
+
+pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(280)]
+
+ROOT = Path(__file__).parents[2]
+GRAB = ROOT / "configs/rskills/so101-grab"
+MOVES_S, STOP_S = 200.0, 60.0
+ARBITER, RUNNER, REASONER = "vram-arbiter", "vram-runner", "vram-reasoner"
+DETECTOR, POLICY = "vram-sidecar-detector", "vram-sidecar-grab"
+DETECTOR_MANIFEST = """
+name: test/detector
+version: 0.1.0
+license: mit
+kind: detector
+embodiment_tags: [any]
+chunk_size: 1
+weights_uri: hf://test/detector
+description: sees nothing
+latency_budget: {per_chunk_ms: 100}
+actions: [detect]
+detector: {labels: [cube]}
+"""
+DECISIONS = (
+    ("locate_in_view", {"query": "red cube"}),
+    ("execute_rskill__vram-arbiter__so101-grab", {"prompt": "grab the red cube"}),
+    ("finish", {"success": True, "reason": "grabbed"}),
+)
+
+
+@contextmanager
+def language_model() -> Iterator[str]:
+    """An OpenAI-compatible server that decides by what was done so far. Yields its URL."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            asked = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+            done = sum(message["role"] == "tool" for message in asked["messages"])
+            name, arguments = DECISIONS[done]
+            function = {"name": name, "arguments": json.dumps(arguments)}
+            call = {"id": "c", "type": "function", "function": function}
+            message = {"role": "assistant", "content": None, "tool_calls": [call]}
+            body = json.dumps({"choices": [{"message": message}]}).encode()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, format: str, *args: Any) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+class Programs:
+    """Everything beside the daemon, in its runtime folder, each telling the collector."""
+
+    def __init__(self, arbiter: ArbiterProcess, environ: dict[str, str]) -> None:
+        self.log = arbiter.runtime / "programs.log"
+        self._environ = arbiter.environ | {"OMP_NUM_THREADS": "1"} | environ
+        self._running: list[subprocess.Popen[bytes]] = []
+
+    def start(self, *argv: str) -> "subprocess.Popen[bytes]":
+        with self.log.open("ab") as log:
+            made = subprocess.Popen(
+                [sys.executable, *argv], cwd=ROOT, env=self._environ, stdout=log, stderr=log
+            )
+        self._running.append(made)
+        return made
+
+    def end(self) -> list[int]:
+        """SIGTERM to each, the last started first; their exit codes."""
+        codes = []
+        for process in reversed(self._running):
+            process.send_signal(signal.SIGTERM)
+            codes.append(process.wait(STOP_S))
+        return codes
+
+    def close(self) -> None:
+        for process in self._running:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+
+
+def test_one_trace_runs_from_the_decision_to_the_first_action(
+    make_arbiter: Callable[..., ArbiterProcess], tmp_path: Path
+) -> None:
+    pytest.importorskip("mujoco", reason="needs the full install")
+    pytest.importorskip("httpx", reason="needs the reasoner extra")
+    if not (ROOT / "configs/models/so101-grab/model.safetensors").exists():
+        pytest.skip("the grab checkpoint is not in this tree")
+    with ExitStack() as stack:
+        collector = stack.enter_context(Collector())
+        llm = {
+            "VRAM_REASONER_LLM_BASE_URL": stack.enter_context(language_model()),
+            "VRAM_REASONER_LLM_MODEL": "m",
+        }
+        arbiter = make_arbiter().start(collector.environ())
+        programs = Programs(arbiter, collector.environ() | llm)
+        stack.callback(programs.close)
+        try:
+            codes = played(arbiter, programs, collector, tmp_path)
+        except (AssertionError, subprocess.TimeoutExpired):
+            print(programs.log.read_text(errors="replace")[-6000:])
+            raise
+        assert codes == [1, 0, 0, 0], "the reasoner's task was broken off, the others ended in order"
+        assert arbiter.stop() == 0
+    judge(Trace(collector.spans()), collector)
+
+
+def played(arbiter: ArbiterProcess, programs: Programs, collector: Collector, folder: Path) -> list[int]:
+    """Start the programs, let the arm move, end them. Their exit codes, the last started first."""
+    (folder / "rskill.yaml").write_text(DETECTOR_MANIFEST)
+    echo = str(ROOT / "tests/sidecars/echo_sidecar.py")
+    device = ["--device", f"fake:{arbiter.card}", "--min-residency-s", "0"]
+    detector = [
+        "--name",
+        "detector",
+        "--rskill",
+        str(folder / "rskill.yaml"),
+        "--footprint",
+        "5.3GB,5.3GB,450MiB",
+    ]
+    grab = ["--name", "grab", "--rskill", str(GRAB / "rskill.yaml"), "--footprint", "4.3GB,4.3GB,450MiB"]
+    programs.start(echo, str(folder), *detector, *device)
+    programs.start("-m", "sidecars", *grab, *device)
+    programs.start("-m", "runner", "sim", "--seed", "1", "--skills", str(GRAB))
+    programs.start(
+        "-m", "reasoner", "--task", "grab the red cube", "--planner", "openai", "--scene-vlm", "none"
+    )
+    collector.wait(
+        lambda: bool(collector.spans(telemetry.SPAN_SEND)), "action that reaches the robot", MOVES_S
+    )
+    return programs.end()
+
+
+class Trace:
+    """What was exported, as a tree."""
+
+    def __init__(self, spans: list[ReceivedSpan]) -> None:
+        self.spans = spans
+        self._by_id = {span.span_id: span for span in spans}
+
+    def named(self, name: str) -> list[ReceivedSpan]:
+        return sorted((span for span in self.spans if span.name == name), key=lambda span: span.start_ns)
+
+    def above(self, span: ReceivedSpan) -> list[ReceivedSpan]:
+        """Parent, its parent, and so on up to the root. Raises KeyError for a parent that never was exported."""
+        found: list[ReceivedSpan] = []
+        while span.parent_id:
+            span = self._by_id[span.parent_id]
+            found.append(span)
+        return found
+
+    def below(self, span: ReceivedSpan, name: str) -> list[ReceivedSpan]:
+        """Its children of that name, by their beginning."""
+        return [seen for seen in self.named(name) if seen.parent_id == span.span_id]
+
+
+def judge(trace: Trace, collector: Collector) -> None:
+    """Follow the trace upwards from the first action, then down again to everything that had to happen before it."""
+    first = trace.named(telemetry.SPAN_SEND)[0]
+    above = trace.above(first)
+    assert [(span.service, span.name) for span in above] == [
+        (RUNNER, telemetry.SPAN_TICK),
+        (RUNNER, telemetry.SPAN_GOAL),
+        (REASONER, telemetry.SPAN_TOOL),
+        (REASONER, telemetry.SPAN_REASONER_TICK),
+        (REASONER, telemetry.SPAN_COMMAND),
+    ]
+    assert first.service == RUNNER
+    assert {span.trace_id for span in above} == {first.trace_id}
+    _, goal, tool, turn, task = above
+    assert tool.attributes[telemetry.ATTR_TOOL] == "execute_rskill"
+    assert goal.attributes[telemetry.ATTR_SKILL] == "vram-arbiter/so101-grab"
+    assert goal.attributes[telemetry.ATTR_OUTCOME] == "canceled", "the reasoner took it with itself"
+    (plan,) = trace.below(turn, telemetry.SPAN_PLAN)
+    assert plan.attributes[telemetry.ATTR_OUTCOME] == "execute_rskill"
+
+    look, _ = trace.below(task, telemetry.SPAN_REASONER_TICK)
+    (seen,) = trace.below(look, telemetry.SPAN_TOOL)
+    (detect,) = trace.below(seen, telemetry.SPAN_SIDECAR_REQUEST)
+    assert (detect.service, detect.attributes[telemetry.ATTR_OUTCOME]) == (DETECTOR, "ok")
+    assert [span.service for span in trace.below(detect, telemetry.SPAN_SIDECAR_LOAD)] == [DETECTOR]
+
+    (activation,) = trace.below(goal, telemetry.SPAN_ACTIVATE)
+    load = trace.below(activation, telemetry.SPAN_SIDECAR_REQUEST)[0]
+    assert (load.service, load.attributes[telemetry.ATTR_OPERATION]) == (POLICY, "load")
+    (loading,) = trace.below(load, telemetry.SPAN_SIDECAR_LOAD)
+    assert loading.end_ns <= first.start_ns
+
+    codes = {
+        span.service: span.attributes[telemetry.ATTR_EXIT_CODE]
+        for span in trace.named(telemetry.SPAN_COMMAND)
+    }
+    assert codes == {REASONER: 1, RUNNER: 0, POLICY: 0, DETECTOR: 0}, "SIGTERM loses nothing"
+    others = {span.name for span in trace.spans if span.service == RUNNER and span.trace_id != first.trace_id}
+    assert others == {telemetry.SPAN_COMMAND}, "a robot that waits records nothing"
+    for service, metric in (
+        (RUNNER, telemetry.METRIC_TICK),
+        (RUNNER, telemetry.METRIC_GOALS),
+        (POLICY, telemetry.METRIC_SIDECAR_LOAD),
+        (REASONER, telemetry.METRIC_TOOL_CALLS),
+    ):
+        assert service in {point.service for point in collector.points(metric)}

@@ -1,0 +1,90 @@
+"""`cli.command`: how a program's life and end are recorded, also when a signal ends it, and that nothing is when nobody asked."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from arbiter.testing.collector import Collector
+from schemas import telemetry
+
+pytestmark = pytest.mark.heavy  # the OpenTelemetry SDK
+
+ROOT = Path(__file__).parents[2]
+TRACE, PARENT = "0af7651916cd43dd8448eb211c80319c", "b7ad6b7169203331"
+WAIT_S = 60.0
+
+
+def program(lines: str, collector: Collector | None, **environ: str) -> "subprocess.Popen[str]":
+    """A program of these lines inside `command("tool", "do")`; `serves` and `sys` are at hand."""
+    body = "\n".join(f"    {line}" for line in lines.splitlines())
+    code = f"import signal, sys\nfrom schemas.commands import command\nwith command('tool', 'do') as running:\n{body}\n"
+    given = {
+        "PYTHONPATH": str(ROOT),
+        "PATH": "/usr/bin",
+        **(collector.environ() if collector else {}),
+        **environ,
+    }
+    return subprocess.Popen(
+        [sys.executable, "-c", code], env=given, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+@pytest.mark.parametrize(
+    ("lines", "code"),
+    [
+        ("pass", 0),
+        ("running.code = 3", 3),
+        ("sys.exit(4)", 4),
+        ("sys.exit('no')", 1),
+        ("raise RuntimeError('broken')", 1),
+    ],
+)
+def test_the_end_of_a_command_is_recorded(lines: str, code: int) -> None:
+    with Collector() as collector:
+        process = program(lines, collector, TRACEPARENT=f"00-{TRACE}-{PARENT}-01")
+        process.communicate(timeout=WAIT_S)
+        (span,) = collector.spans(telemetry.SPAN_COMMAND)
+    assert span.attributes[telemetry.ATTR_EXIT_CODE] == code
+    assert span.attributes[telemetry.ATTR_COMMAND] == "do"
+    assert (span.service, span.trace_id, span.parent_id) == ("tool", TRACE, PARENT), "it joins who started it"
+    assert [event.name for event in span.events] == (["exception"] if "raise" in lines else [])
+
+
+def test_sigterm_loses_nothing() -> None:
+    with Collector() as collector:
+        process = program("print('up', flush=True)\nsignal.pause()", collector)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=WAIT_S)
+        (span,) = collector.spans(telemetry.SPAN_COMMAND)
+    assert process.returncode == span.attributes[telemetry.ATTR_EXIT_CODE] == 128 + signal.SIGTERM
+
+
+def test_nobody_asked_nothing_is_imported_or_changed() -> None:
+    process = program(
+        "print([name for name in sys.modules if name.startswith('opentelemetry')], signal.getsignal(signal.SIGTERM) is signal.SIG_DFL)",
+        None,
+    )
+    out, err = process.communicate(timeout=WAIT_S)
+    assert (out, err) == ("[] True\n", "")
+
+
+def test_variables_that_make_no_sense_are_told_in_one_line(tmp_path: Path) -> None:
+    """Each program says it before it does anything."""
+    nowhere = {"OTEL_EXPORTER_OTLP_ENDPOINT": "collector", "VRAM_ARBITER_RUNTIME": str(tmp_path)}
+    for argv, code in (
+        (["clients", "history"], 2),
+        (["reasoner", "--say", "x"], 2),
+        (["runner", "estop"], 2),
+    ):
+        done = subprocess.run(
+            [sys.executable, "-m", *argv], env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin", **nowhere},
+            capture_output=True, text=True, timeout=WAIT_S,
+        )  # fmt: skip
+        assert done.returncode == code, done.stderr
+        assert "OTEL_EXPORTER_OTLP_ENDPOINT" in done.stderr
+        assert "Traceback" not in done.stderr
