@@ -21,7 +21,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 async def run(args: argparse.Namespace) -> int:
-    """Raises RunnerUnreachable when no runner answers, InternalError when its control loop does not."""
+    """Raises RunnerUnreachable when no runner answers, InternalError when its control loop does not, RobotFault when the motors
+    could not be told."""
     async with RunnerClient(args.endpoint, timeout_s=ANSWER_S) as runner:
         try:
             reply = await runner.estop(args.reason)

@@ -120,7 +120,7 @@ class ControlThread:
             self.runner.activate()
         except BaseException as error:  # noqa: BLE001 — handed to whoever awaits the start
             self.runner.mailbox.close()
-            self.runner.deactivate()
+            self._deactivate()
             self._settle(self._ready, None, error)
             self._settle(self.ended, None, InternalError("the control loop never started"))
             return
@@ -134,10 +134,18 @@ class ControlThread:
         except BaseException as error:
             log.exception("the control loop failed")
             failure = error
-        finally:
-            self.runner.mailbox.close()
+        self.runner.mailbox.close()
+        stuck = self._deactivate()
+        self._settle(self.ended, result, failure or stuck)
+
+    def _deactivate(self) -> BaseException | None:
+        """What went wrong, if anything: whoever waits for the end hears of it, however it ends."""
+        try:
             self.runner.deactivate()
-        self._settle(self.ended, result, failure)
+        except BaseException as error:
+            log.exception("the runner did not let go of everything")
+            return error
+        return None
 
     def _settle(self, future: asyncio.Future[Any], result: Any, error: BaseException | None) -> None:
         def settle() -> None:

@@ -101,6 +101,7 @@ def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
             kinematics=kinematics_for(hal.description),
             envelopes={"safety": robot.safety},
             sent=hal.sent,
+            now_ns=clock.now_ns,
         )
     except ConfigError as error:
         raise file.merged([*errors, file.located(error, "safety")]) from error

@@ -10,10 +10,11 @@ covers all of it: status `deadline` is no success.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
@@ -33,6 +34,8 @@ from schemas.errors import (
     EstopRequested,
     GoalRejected,
     InternalError,
+    LimitExceeded,
+    RobotFault,
     UnknownOp,
     VramError,
 )
@@ -58,6 +61,9 @@ log = logging.getLogger(__name__)
 RESULTS_KEPT = 64
 FEEDBACK_PERIOD_S = 0.2  # at most five a second
 ESTOP_S = 1.0  # a control loop that has not obeyed by then hangs
+READS_MAX = 16  # requests that wait for the control thread; more are refused, so that an emergency stop is always read
+FINISHING = "finishing"
+FINISH_S = 8.0  # a skill that has not finished by then is left to itself; nobody waits longer for a result
 FEEDBACK_QUIET_S = 1.0  # said again after this long even if nothing changed
 OPS = ("goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "ping", "estop", "shutdown")
 
@@ -124,6 +130,7 @@ class GoalServer:
         self._running: _Running | None = None
         self._results: OrderedDict[str, ResultPush] = OrderedDict()
         self._server: RouterServer | None = None
+        self._reads = 0
         self.stopping = stopping or asyncio.Event()
         self.bound = asyncio.Event()
 
@@ -179,14 +186,15 @@ class GoalServer:
             case GetResult():
                 return self._result(request.goal_id)
             case GetFrame():
-                reply = await frames.fetch(
-                    self._control,
-                    self._robot,
-                    self._clock,
-                    request.camera,
-                    request.max_age_ms,
-                    request.encoding,
-                )
+                with self._waiting_read():
+                    reply = await frames.fetch(
+                        self._control,
+                        self._robot,
+                        self._clock,
+                        request.camera,
+                        request.max_age_ms,
+                        request.encoding,
+                    )
                 return dict(reply)
             case GetState():
                 return self._state()
@@ -199,7 +207,8 @@ class GoalServer:
             case GetGroundTruth():
                 if self._ground_truth is None:
                     raise UnknownOp("only a simulator knows the truth", details={"known": [*OPS]})
-                return await self._control.call(self._ground_truth)
+                with self._waiting_read():
+                    return await self._control.call(self._ground_truth)
             case PingRunner():
                 return {
                     "pid": os.getpid(),
@@ -211,8 +220,24 @@ class GoalServer:
                 return {}
         raise UnknownOp("unknown request", details={"known": [*OPS]})
 
+    @contextlib.contextmanager
+    def _waiting_read(self) -> Iterator[None]:
+        """Around what waits for the control thread. Raises LimitExceeded when too many do."""
+        if self._reads >= READS_MAX:
+            raise LimitExceeded(
+                f"{READS_MAX} requests wait for the control loop",
+                hint="ask again, and for fewer pictures at once",
+                details={"limit": READS_MAX},
+            )
+        self._reads += 1
+        try:
+            yield
+        finally:
+            self._reads -= 1
+
     async def _estop(self, reason: str) -> Message:
-        """Latched before anything else. Raises InternalError when the control loop does not say that it has obeyed."""
+        """Latched before anything else. Raises InternalError when the control loop does not say that it has obeyed, RobotFault when
+        the motors could not be told."""
         log.critical("emergency stop: %s", reason)
         self._robot.request_estop(reason)
         error = self._robot.estop
@@ -227,6 +252,10 @@ class GoalServer:
                 f"the control loop has not obeyed the emergency stop within {ESTOP_S:.0f} s",
                 hint="cut the robot's power; the loop hangs, and moves nothing if it comes back",
             ) from None
+        if error is not None and not error.details.get("told", True):
+            raise RobotFault(
+                error.message, hint="cut the robot's power; the runner goes on trying", details=error.details
+            )
         return {"reason": reason, "message": error.message if error is not None else ""}
 
     def _accept(self, peer: Peer, request: SendGoal) -> Message:
@@ -275,8 +304,8 @@ class GoalServer:
 
     @staticmethod
     def _stop(running: _Running) -> None:
-        """At most one cancellation reaches the task: what it does to end cleanly is not interrupted by a second."""
-        if running.task is not None and not running.canceled:
+        """At most one cancellation reaches the task, and none when its end is decided: what it does to end cleanly is not interrupted."""
+        if running.task is not None and not running.canceled and running.phase != FINISHING:
             running.canceled = True
             if running.begun:  # a task that is cancelled before its first step would never answer
                 running.task.cancel()
@@ -341,7 +370,7 @@ class GoalServer:
         except Exception as raised:
             log.exception("goal %s failed", goal.goal_id)
             error = InternalError(f"{type(raised).__name__}: {raised}", hint="see the runner's log")
-        running.phase = "finishing"
+        running.phase = FINISHING
         if running.skill is not None:
             await self._finish(running.skill)
         telling.cancel()
@@ -351,12 +380,14 @@ class GoalServer:
 
     @staticmethod
     async def _finish(skill: Skill) -> None:
+        """The goal's result is what it is, whatever happens here; the lease's use ends with our connection at the latest."""
         try:
-            await skill.finish()
-        except (
-            VramError
-        ) as error:  # the goal's result is what it is; the lease's use ends with our connection at the latest
-            log.warning("%s did not finish cleanly: %s", skill.key, error)
+            async with asyncio.timeout(FINISH_S):
+                await skill.finish()
+        except (VramError, TimeoutError) as error:
+            log.warning("%s did not finish cleanly: %s", skill.key, error or f"not within {FINISH_S:.0f} s")
+        except Exception:
+            log.exception("%s did not finish cleanly", skill.key)
 
     async def _run(self, running: _Running, make: Callable[[], Skill]) -> SkillEnded:
         """Raises what acquiring and starting raise; the arm is taken back whenever this ends."""

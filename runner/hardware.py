@@ -148,15 +148,16 @@ class HardwareRunner(SkillRunner):
 
     def obey_estop(self) -> EstopRequested | None:
         if self.estop is not None and not self._halted:
-            self._halted = True
+            before = self.estop.message
             try:
                 self.hal.estop(str(self.estop.details.get("reason", "")))
             except EstopRequested as error:
                 self.estop = error  # says what became of the motors, too
-            except VramError as error:
-                log.error("the robot did not take the emergency stop: %s", error)
-            log.critical("%s", self.estop)
-            tracing.event(telemetry.EVENT_ESTOP, reason=self.estop.message)
+            # a bus that lost this one is told again with every tick: the motors still pull
+            self._halted = bool(self.estop.details.get("told", True))
+            if self.estop.message != before or self._halted:
+                log.critical("%s", self.estop)
+                tracing.event(telemetry.EVENT_ESTOP, reason=self.estop.message)
         return super().obey_estop()
 
     # -- pictures ------------------------------------------------------------------------------------------------------
@@ -223,7 +224,7 @@ class HardwareRunner(SkillRunner):
 
     def _latched_by_hardware(self, error: EstopRequested) -> None:
         self.estop = self.estop or error
-        self._halted = True
+        self._halted = bool(error.details.get("told", True))
         self.obey_estop()
 
     def _withhold_stale(self, active: Active, name: str, decision: Decision) -> None:

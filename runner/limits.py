@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Protocol
+from typing import Annotated, Protocol, Self
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from runner.protocols import RobotDescription
 from schemas.errors import ConfigError
@@ -67,6 +67,12 @@ class BoxZone(_Zone):
 
     min_xyz: tuple[Finite, Finite, Finite]
     max_xyz: tuple[Finite, Finite, Finite]
+
+    @model_validator(mode="after")
+    def _has_an_inside(self) -> Self:
+        if any(low >= high for low, high in zip(self.min_xyz, self.max_xyz, strict=True)):
+            raise ValueError("min_xyz must be below max_xyz on every axis: nothing is inside")
+        return self
 
     def depth_m(self, point: Vector3) -> float:
         """How far inside; negative or 0 outside."""
@@ -179,12 +185,10 @@ def _refuse_what_is_wrong(
     for index, zone in enumerate(envelope.no_go_zones):
         try:
             _ZONE.validate_python(zone)
-        except ValidationError:
-            problems.append(
-                Problem(
-                    0, f"{name}.no_go_zones[{index}]", "give min_xyz and max_xyz, or center_xyz and radius_m"
-                )
-            )
+        except ValidationError as error:
+            wrong = [item["msg"] for item in error.errors() if item["type"] == "value_error"]
+            text = wrong[0] if wrong else "give min_xyz and max_xyz, or center_xyz and radius_m"
+            problems.append(Problem(0, f"{name}.no_go_zones[{index}]", text.removeprefix("Value error, ")))
     if kinematics is None:
         asked = [key for key in NEEDS_KINEMATICS if key in envelope.model_fields_set]
         problems += [

@@ -106,6 +106,9 @@ class RunnerBase(ABC):
         """Whether the run is over by itself, asked before every tick."""
         return False
 
+    def _came_too_late(self) -> None:  # noqa: B027 — most need not know
+        """The deadline policy has just withheld this tick's action."""
+
     def _success(self) -> bool | None:
         return None
 
@@ -148,6 +151,7 @@ class RunnerBase(ABC):
         if withheld and decision.action is not None:
             decision.action = None
             self.late_actions_withheld += 1
+            self._came_too_late()
         apply_s = self.clock.now_s()
         with nullcontext() if decision.action is None else tracing.span(telemetry.SPAN_SEND):
             applied = self._apply(decision)  # 3

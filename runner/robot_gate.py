@@ -62,7 +62,8 @@ class RobotGate:
 
     `sent` gives the last target (rad) that the motors really got, by joint (`HalBase.sent`): an action that passes here can still be
     dropped for being late, and the next step must not begin where that one would have ended. Without it what passed counts as sent.
-    `needs` are the components of the world state that must be fresh, beside the joint state; None: all that are in it. Raises
+    `now_ns` is the clock of the world's stamps: a skill that thought for long must not move the robot on what it saw before; without
+    it the state's age counts to the world state's stamp only. `needs` are the components of the world state that must be fresh, beside the joint state; None: all that are in it. Raises
     ConfigError for envelopes that cannot be kept. `check` on the control thread, `trip` on any.
     """
 
@@ -75,6 +76,7 @@ class RobotGate:
         envelopes: Mapping[str, SafetyEnvelope | None] | None = None,
         sent: Sent | None = None,
         needs: frozenset[str] | None = None,
+        now_ns: Callable[[], int] | None = None,
         _base: tuple[Limits, _Memory] | None = None,
     ) -> None:
         self._robot = robot
@@ -82,6 +84,7 @@ class RobotGate:
         self._kinematics = kinematics
         self._sent = sent
         self._needs = needs
+        self._now_ns = now_ns
         limits, self._memory = _base or (own_limits(robot), _Memory())
         for name, envelope in (envelopes or {}).items():
             if envelope is not None:
@@ -100,6 +103,7 @@ class RobotGate:
             envelopes={name: envelope},
             sent=self._sent,
             needs=self._needs if needs is None else needs,
+            now_ns=self._now_ns,
             _base=(self.limits, self._memory),
         )
 
@@ -157,7 +161,8 @@ class RobotGate:
         ]
         if stale:
             raise _Withheld(f"stale: {', '.join(stale)}")
-        age_s = (world.stamp_ns - world.joint_state.stamp_ns) / 1e9
+        now_ns = world.stamp_ns if self._now_ns is None else max(world.stamp_ns, self._now_ns())
+        age_s = (now_ns - world.joint_state.stamp_ns) / 1e9
         if age_s > MAX_STATE_AGE_S:
             raise _Withheld(f"the joint state is stale: {age_s:.2f} s old")
 

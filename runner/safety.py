@@ -50,6 +50,8 @@ class Envelope:
             for name, value in zip(names, row, strict=True):
                 if name not in self.joint_limits:
                     return None, (f"there is no joint {name}",)
+                if not math.isfinite(value):  # of a copy that was not validated
+                    return None, (f"{name}: {value} is no number of rad",)
                 low, high = self.joint_limits[name]
                 excess = max(low - value, value - high, 0.0)
                 if excess > 0:

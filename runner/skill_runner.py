@@ -73,6 +73,8 @@ class Active:
     on_end: Callable[[SkillEnded], None]
     began_tick: int
     withheld_in_a_row: int = 0
+    late_in_a_row: int = 0
+    was_late: bool = False  # the action before
     tally: Tally = field(default_factory=Tally)
     detail: str = ""
 
@@ -233,6 +235,9 @@ class SkillRunner(RunnerBase):
             meters.count(telemetry.METRIC_SAFETY_VIOLATIONS, self.labels, len(problems))
         if allowed is not None:
             active.withheld_in_a_row = 0
+            if not active.was_late:
+                active.late_in_a_row = 0
+            active.was_late = False
             active.tally.clamped += bool(problems)
             self._total.clamped += bool(problems)
             active.detail = ""
@@ -246,6 +251,25 @@ class SkillRunner(RunnerBase):
                     ModelError(
                         f"{active.withheld_in_a_row} actions in a row were withheld: {problems[0]}",
                         hint="the skill commands what this robot's envelope forbids",
+                    ),
+                )
+            )
+
+    def _came_too_late(self) -> None:
+        """A skill does not notice that nothing of it is sent: it would play to its end and call that a success."""
+        if (active := self._active) is None:
+            return
+        active.was_late = True
+        active.late_in_a_row += 1
+        self._withheld(active, "it came too late")
+        if active.late_in_a_row >= WITHHELD_IN_A_ROW_MAX:
+            self._end(
+                SkillEnded(
+                    {},
+                    LimitExceeded(
+                        f"{active.late_in_a_row} actions in a row came too late and were withheld",
+                        hint="lower rate_hz, or look at what makes the ticks long",
+                        details={"limit": "deadline"},
                     ),
                 )
             )

@@ -6,6 +6,7 @@ refused here is what could not be sent.
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import NoReturn
@@ -16,6 +17,8 @@ from runner.protocols import RobotDescription
 from schemas.control import ControlMode
 from schemas.errors import BadState, EstopRequested, InternalError, RobotFault, VramError
 from schemas.world import Action, JointState
+
+log = logging.getLogger(__name__)
 
 
 class HalBase(ABC):
@@ -87,18 +90,25 @@ class HalBase(ABC):
         return self._sent
 
     def estop(self, reason: str) -> NoReturn:
-        """Stop the motors, latch, raise EstopRequested. Again: stops again and raises the first one's reason."""
-        halted = "the robot is not connected"
+        """Stop the motors, latch, raise EstopRequested. Again: stops again and raises the first one's reason.
+
+        `details.told` says whether the motors have been told; while they have not it is worth trying again.
+        """
+        told, halted = True, "the robot is not connected"
         if self._connected:
             try:
                 halted = self._halt()
-            except VramError as error:
-                halted = f"the motors may still be on: {error.message}"
-        if self._estop is None:
+            except Exception as error:  # a driver's defect, too, must not keep anybody from hearing this
+                if self._estop is None:
+                    log.exception("the motors of %s could not be stopped", self.description.name)
+                text = error.message if isinstance(error, VramError) else f"{type(error).__name__}: {error}"
+                told, halted = False, f"the motors may still be on: {text}"
+        if self._estop is None or not self._estop.details["told"]:
+            first = reason if self._estop is None else self._estop.details["reason"]
             self._estop = EstopRequested(
-                f"emergency stop: {reason}; {halted}",
+                f"emergency stop: {first}; {halted}",
                 hint="look at the robot, then start the runner again",
-                details={"reason": reason, "halted": halted},
+                details={"reason": first, "halted": halted, "told": told},
             )
         raise self._estop
 

@@ -141,10 +141,13 @@ class LerobotHal(HalBase):
 
     @contextmanager
     def _faults(self, what: str) -> Iterator[None]:
-        """lerobot's own errors (its connection errors are OSErrors, its buses' are RuntimeErrors) as RobotFault."""
+        """Whatever a driver raises, as RobotFault: lerobot's own errors, and what a cable that is pulled makes of a serial port
+        (`termios.error` is no OSError)."""
         try:
             yield
-        except (OSError, RuntimeError, ValueError, KeyError) as error:
+        except RobotFault:
+            raise
+        except Exception as error:
             raise RobotFault(
                 f"{self.description.name} does not {what}: {type(error).__name__}: {error}",
                 hint="look at the robot's cables and power, and at hal.transport",

@@ -54,8 +54,10 @@ class SkillBase(ABC):
         try:
             await self._start(goal)
         except BaseException:
-            await self._finish()
-            self._move(SkillState.IDLE)
+            try:
+                await self._finish()
+            finally:
+                self._move(SkillState.IDLE)  # else it could never be started again
             raise
         self._move(SkillState.ACTIVE)
 

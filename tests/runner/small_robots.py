@@ -66,6 +66,8 @@ class Twin(KinematicTwin):
         self.silent = False
         self.deaf = False
         self.answers_lost = 0
+        self.halts_lost = 0
+        self.halt_breaks: Exception | None = None
         self.sent: list[Action] = []
         self.story: list[str] = []
 
@@ -78,6 +80,11 @@ class Twin(KinematicTwin):
         self.story.append("disconnect")
 
     def _halt(self) -> str:
+        self.halts_lost -= 1
+        if self.halts_lost >= 0:
+            raise RobotFault("motor 2 does not answer", hint="look at the cable")
+        if self.halt_breaks is not None:
+            raise self.halt_breaks
         self.story.append("halt")
         return super()._halt()
 

@@ -79,6 +79,32 @@ def test_a_loop_that_dies_fails_what_waits(make_runner: Make, env: Any, run_asyn
     run_async(scenario())
 
 
+@pytest.mark.parametrize("fails", ["at the start", "at the end"])
+def test_an_end_that_fails_leaves_nobody_waiting(
+    make_runner: Make, env: Any, run_async: Run, fails: str
+) -> None:
+    def stuck() -> None:
+        raise TypeError("the driver's defect")
+
+    def broken() -> None:
+        raise FileNotFoundError("no robot")
+
+    async def scenario() -> None:
+        runner = make_runner(rate_hz=500.0)
+        runner.deactivate = stuck  # type: ignore[method-assign]
+        if fails == "at the start":
+            runner.activate = broken  # type: ignore[method-assign]
+            with pytest.raises(FileNotFoundError, match="no robot"):
+                await asyncio.wait_for(ControlThread(runner).__aenter__(), 60)
+            return
+        control = ControlThread(runner)
+        await control.__aenter__()
+        await asyncio.wait_for(control.__aexit__(), 60)
+        assert isinstance(control.ended.exception(), TypeError)
+
+    run_async(scenario())
+
+
 def test_cancelling_a_skill_takes_the_arm_back(make_runner: Make, run_async: Run) -> None:
     async def scenario() -> None:
         runner = make_runner(rate_hz=500.0)

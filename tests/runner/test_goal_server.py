@@ -45,6 +45,7 @@ class Told(SkillBase):
         super().__init__(manifest)
         self.story: list[str] = []
         self.begun = asyncio.Event()
+        self.finishing, self.finished = asyncio.Event(), asyncio.Event()
         self.loop = asyncio.get_running_loop()
 
     async def _start(self, goal: Goal) -> None:
@@ -55,14 +56,14 @@ class Told(SkillBase):
         if goal.prompt == "hang":
             self.begun.set()
             await asyncio.Event().wait()
-        if goal.prompt == "unavailable":
+        if goal.prompt in ("unavailable", "unavailable for ever"):
             raise SidecarUnavailable("no process", hint="start it")
 
     def _step(self, world: WorldState) -> StepOutcome:
         self.steps += 1
         self.loop.call_soon_threadsafe(self.begun.set)
         match self.todo:
-            case "end" if self.steps > 3:
+            case "end" | "end slowly" | "end badly" if self.steps > 3:
                 return Done({"steps": self.steps})
             case "evicted" if self.steps > 2:
                 raise Evicted("another model is there")
@@ -76,6 +77,11 @@ class Told(SkillBase):
 
     async def _finish(self) -> None:
         self.story.append("finish")
+        if self.todo == "end slowly":
+            self.finishing.set()
+            await self.finished.wait()
+        if self.todo in ("end badly", "unavailable for ever"):
+            raise ZeroDivisionError("oops")
 
     async def _release(self) -> None:
         self.story.append("release")
@@ -164,6 +170,48 @@ def test_a_second_goal_is_refused_and_the_first_goes_on(bench: Any, endpoint: st
         assert not first.done
         await first.cancel()
         assert (await first.result(60))["status"] == "canceled"
+        assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
+
+    play(run_async, bench, endpoint, body)
+
+
+@pytest.mark.parametrize("by", ["cancel", "estop"])
+def test_a_cancel_or_stop_while_a_goal_finishes_does_not_cost_its_result(
+    bench: Any, endpoint: str, run_async: Run, by: str
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="end slowly")
+        while not b.made:
+            await asyncio.sleep(0)
+        await b.made[0].finishing.wait()
+        await (goal.cancel() if by == "cancel" else client.estop("smoke"))
+        b.made[0].finished.set()
+        assert (await goal.result(60))["status"] == "succeeded"  # it was over by then
+        assert (await client.state())["goal"] is None
+        if by == "cancel":
+            again = await client.send_goal(RSKILL, prompt="end")
+            assert (await again.result(60))["success"]
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_skill_that_could_not_undo_a_failed_start_can_be_started_again(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="unavailable for ever")
+        assert (await goal.result(60))["status"] == "failed"
+        assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_skill_that_breaks_while_it_finishes_still_gives_a_result(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="end badly")
+        assert (await goal.result(60))["success"]
         assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
 
     play(run_async, bench, endpoint, body)

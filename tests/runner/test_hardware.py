@@ -11,8 +11,10 @@ from runner.clock import SystemClock
 from runner.hal.so101 import so101
 from runner.hardware import FIRST_DATA_SLICE_S, FIRST_STATE_TRIES, HardwareRunner
 from runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded
+from runner.robot_gate import RobotGate
 from runner.safety import Envelope
 from runner.sensors import Feed
+from runner.skill_runner import WITHHELD_IN_A_ROW_MAX
 from runner.skills.base import SkillState
 from schemas.errors import (
     BadRequest,
@@ -263,6 +265,32 @@ def test_a_late_action_is_withheld_under_drop(make: MakeRunner, twin: Twin, nod:
     begin(runner, nod(on_step=lambda world: clock.advance(2 * PERIOD_S)))
     result = tick(runner, clock)
     assert (result.action_applied, result.deadline_missed) == (False, True)
+    assert not twin.sent
+
+
+def test_a_goal_whose_actions_all_come_too_late_fails(
+    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+) -> None:
+    runner = make(deadline_policy=DeadlinePolicy.DROP)
+    runner.activate()
+    ended = begin(runner, nod(steps=100, on_step=lambda world: clock.advance(2 * PERIOD_S)))
+    tick(runner, clock, 30)
+    assert not twin.sent
+    assert isinstance(ended[0].error, LimitExceeded)
+    assert "too late" in ended[0].error.message
+    assert ended[0].data["withheld"] == WITHHELD_IN_A_ROW_MAX
+
+
+def test_an_action_that_was_thought_out_for_too_long_is_not_sent(
+    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+) -> None:
+    own = RobotGate(twin.description, rate_hz=30.0, now_ns=clock.now_ns)
+    runner = make(make_gate=lambda skill: own)  # under WARN: what is merely late is sent
+    runner.activate()
+    begin(runner, nod(on_step=lambda world: clock.advance(0.5)))
+    result = tick(runner, clock)
+    assert not result.action_applied
+    assert "the joint state is stale: 0.50 s old" in result.safety_violations[0]
     assert not twin.sent
 
 

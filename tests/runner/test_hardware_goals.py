@@ -19,7 +19,7 @@ from runner.goals import GoalServer
 from runner.hardware import HardwareRunner
 from runner.protocols import Goal
 from runner.safety import Envelope
-from schemas.errors import EstopRequested, FrameStale, InternalError
+from schemas.errors import EstopRequested, FrameStale, InternalError, LimitExceeded, RobotFault
 from schemas.manifest import Kind, RSkillManifest, load_manifest
 from schemas.world import WorldState
 
@@ -144,6 +144,49 @@ def test_the_command_line_stops_the_robot(
 
     play(run_async, bench, body)
     assert "emergency stop: smoke; all joints stand still" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("cause", [RobotFault("motor 2 does not answer"), TypeError("a driver's defect")])
+def test_a_stop_that_did_not_reach_the_motors_is_no_success_and_is_tried_again(
+    bench: Any, run_async: Run, endpoint: str, capfd: pytest.CaptureFixture[str], cause: Exception
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        b.twin.halt_breaks = cause
+        goal = await client.send_goal(RSKILL, prompt="nod")
+        await b.skill.begun.wait()
+        argv = ["estop", "--reason", "smoke", "--endpoint", endpoint]
+        assert await asyncio.to_thread(main, argv) == 1
+        assert "cut the robot's power" in capfd.readouterr().err
+        assert (await goal.result(60))["code"] == "estop_requested"
+        assert "halt" not in b.twin.story
+        b.twin.halt_breaks = None  # the bus is back: nobody has to ask again
+        while "halt" not in b.twin.story:
+            await client.state()
+        assert await asyncio.to_thread(main, argv) == 0
+        said = capfd.readouterr().out
+        assert "emergency stop: smoke; all joints stand still" in said
+        assert b.twin.story.count("halt") == 1
+
+    play(run_async, bench, body)
+
+
+def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_being_read(
+    bench: Any, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        await client.send_goal(RSKILL, prompt="hang in the step")
+        await b.skill.begun.wait()
+        flood = [asyncio.create_task(client.frame("front", max_age_ms=60_000)) for _ in range(100)]
+        await asyncio.wait(flood, return_when=asyncio.FIRST_COMPLETED)
+        with pytest.raises(InternalError, match="cut the robot's power"):
+            await client.estop("it hangs")
+        assert b.runner.estop is not None
+        b.skill.go_on.set()
+        answers = await asyncio.gather(*flood, return_exceptions=True)
+        assert any(isinstance(answer, LimitExceeded) for answer in answers)
+        assert b.twin.sent == []
+
+    play(run_async, bench, body)
 
 
 def test_a_stop_that_nobody_hears_is_an_error(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -112,6 +112,15 @@ def test_a_state_or_target_that_is_no_number_cannot_be_built(value: float) -> No
         at(value, 0.0, 0.0)
 
 
+@pytest.mark.parametrize("kinematic", [True, False])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_target_that_is_no_number_is_withheld_however_it_was_built(value: float, kinematic: bool) -> None:
+    action = to(0.0, 1.0, 0.5).model_copy(update={"joint_targets": ((value, 1.0, 0.5),)})  # not validated
+    allowed, problems = gate(kinematic=kinematic).check(action, at(*HERE))
+    assert allowed is None
+    assert "is no number" in problems[0]
+
+
 # -- freshness ---------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("state", ["stale", "error"])
 @pytest.mark.parametrize(
@@ -343,6 +352,16 @@ def test_envelopes_only_tighten() -> None:
             {"no_go_zones": ({"min_xyz": (0, 0, float("nan")), "max_xyz": (1, 1, 1)},)},
             "no_go_zones[0]",
             "min_xyz",
+        ),
+        (
+            {"no_go_zones": ({"min_xyz": (0, 1, 0), "max_xyz": (1, 0, 1)},)},
+            "no_go_zones[0]",
+            "must be below",
+        ),
+        (
+            {"no_go_zones": ({"min_xyz": (0, 0, 0), "max_xyz": (1, 1, 0)},)},
+            "no_go_zones[0]",
+            "must be below",
         ),
     ],
 )

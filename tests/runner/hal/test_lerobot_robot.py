@@ -1,6 +1,7 @@
 """Any lerobot robot in rad: units, what it really did, faults, stop. The robot is one that lerobot itself finds and makes."""
 
 import math
+import termios
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -222,3 +223,16 @@ def test_a_stop_that_does_not_reach_the_motors_says_so(make: Make) -> None:
     with pytest.raises(EstopRequested, match="the motors may still be on") as caught:
         hal.estop("test")
     assert "cable" in caught.value.details["halted"]
+
+
+def test_a_cable_that_is_pulled_is_a_fault_whatever_the_serial_port_makes_of_it(make: Make) -> None:
+    hal = make()
+    hal.connect()
+    robot_of(hal).fault = termios.error(5, "Input/output error")  # no OSError, and no error of lerobot's
+    with pytest.raises(RobotFault, match="Input/output error"):
+        hal.read_state()
+    with pytest.raises(RobotFault):
+        hal.send_action(to(motor_1=0.1))
+    with pytest.raises(EstopRequested, match="the motors are off"):
+        hal.estop("smoke")
+    hal.disconnect()
