@@ -75,6 +75,7 @@ class Cell:
     world: str
     contestant: str
     task: str | None
+    revision: str = ""
     episodes: list[Played] = field(default_factory=list)
     complete: bool = False
     why: str = ""
@@ -108,6 +109,7 @@ class Cell:
         return {
             "world": self.world,
             "contestant": self.contestant,
+            "revision": self.revision,
             "task": self.task,
             "complete": self.complete,
             "why": self.why,
@@ -126,6 +128,7 @@ class Contestant(Protocol):
     """Who plays. `begin` on the event loop, before each episode; `player` on the worker thread."""
 
     name: str
+    revision: str
 
     async def begin(self, goal: Goal) -> None: ...
 
@@ -140,7 +143,7 @@ class SkillContestant:
     """An installed skill, started anew for every episode as a goal would start it."""
 
     def __init__(self, skill: Skill) -> None:
-        self.name = skill.key.rskill_id
+        self.name, self.revision = skill.key.rskill_id, skill.key.revision
         self._skill = skill
 
     async def begin(self, goal: Goal) -> None:
@@ -158,6 +161,8 @@ class SkillContestant:
 
 class PolicyContestant:
     """A policy without a model."""
+
+    revision = ""
 
     def __init__(self, policy: Policy) -> None:
         self.name = policy.name
@@ -203,12 +208,14 @@ class Benchmark:
 
     async def run(self, contestant: Contestant, seeds: Iterable[int]) -> Cell:
         """Raises what making the world raises; everything later is an episode's error."""
-        cell = Cell(self._world, contestant.name, self._task)
+        cell = Cell(self._world, contestant.name, self._task, contestant.revision)
         with ThreadPoolExecutor(1, thread_name_prefix="benchmark") as worker:
             await self._on(worker, self.runner.activate)
             try:
                 for seed in seeds:
-                    if (played := await self._play(worker, contestant, seed)) is None:
+                    stopped = self._stopping.is_set()
+                    played = None if stopped else await self._play(worker, contestant, seed)
+                    if played is None:
                         cell.why = "stopped"
                         return cell
                     cell.add(played)

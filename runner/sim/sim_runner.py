@@ -245,7 +245,8 @@ class SimRunner(SkillRunner):
             success=step.success,
         )
         over = bool(applied.terminated or applied.truncated)
-        self._record(closing=over)
+        if step.moved:  # where time stood still there is nothing new to see
+            self._record(closing=over)
         if over:
             self._end_with_episode(steps, step, truncated=bool(applied.truncated))
             self._reset_due = True

@@ -112,6 +112,11 @@ def clock() -> ManualClock:
     return ManualClock()
 
 
+@pytest.fixture(scope="session")
+def make_env() -> type[KinematicEnv]:
+    return KinematicEnv
+
+
 @pytest.fixture
 def env() -> KinematicEnv:
     return KinematicEnv()

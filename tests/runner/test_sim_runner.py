@@ -5,9 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from runner.protocols import Act, DeadlinePolicy, Done, Goal, Hold, SkillEnded, SkillKey, StepOutcome
+from runner.sim.arm_env import ArmEnvironment
 from runner.sim.episodes import episodes_of
+from runner.sim.sim_runner import SimRunner
 from runner.skill_runner import WITHHELD_IN_A_ROW_MAX
 from schemas.control import ControlMode
 from schemas.errors import EnvironmentFailed, Evicted, InternalError, ModelError
@@ -132,6 +136,41 @@ def test_stopping_within_an_episode_leaves_no_phantom(make_runner: Make, env: An
     assert runner.run().n_ticks == 8 + 5
     assert env.resets == [3, 4, 4]
     assert [(e.index, e.steps) for e in runner.episodes] == [(0, 4), (1, 4)]
+
+
+@settings(deadline=None)
+@given(
+    lengths=st.lists(st.integers(1, 6), min_size=1, max_size=6),
+    max_steps=st.none() | st.integers(1, 6),
+    stop_after=st.integers(0, 40),
+)
+def test_every_reset_is_an_episode_that_is_played(
+    make_env: Any, lengths: list[int], max_steps: int | None, stop_after: int
+) -> None:
+    """Whatever ends the episodes, and wherever the run is stopped and taken up again."""
+    robot = make_env()
+    begun: list[int] = []  # steps of the robot at each reset
+
+    def judge() -> bool:
+        while len(begun) < len(robot.resets):
+            begun.append(len(robot.steps) - 1)
+        return len(robot.steps) - begun[-1] >= lengths[robot.resets[-1]]
+
+    runner = SimRunner(
+        lambda: ArmEnvironment(robot, judge=judge), rate_hz=0, episodes=len(lengths), max_steps=max_steps
+    )
+    runner.activate()
+    runner.run(max_ticks=stop_after)
+    runner.deactivate()
+    open_ones = len(robot.resets) - len(runner.episodes)
+    assert open_ones in (0, 1)
+    runner.activate()
+    result = runner.run()
+    runner.deactivate()
+    assert len(robot.resets) == len(lengths) + open_ones
+    assert sorted(set(robot.resets)) == list(range(len(lengths)))
+    assert [e.steps for e in runner.episodes] == [min(n, max_steps or n) for n in lengths]
+    assert result.n_ticks == len(robot.resets) + len(robot.steps)
 
 
 def test_a_run_that_is_over_resets_nothing_however_often_it_is_run(make_runner: Make, env: Any) -> None:

@@ -142,6 +142,7 @@ class Sidecar:
     def __init__(self) -> None:
         self.aim = (0.25, -0.5)
         self.observations: list[Any] = []
+        self.calls: list[str] = []
 
     async def serve(self, endpoint: str) -> None:
         async with RouterServer(endpoint, lambda error: {"ok": False, "error": str(error)}) as self.server:
@@ -151,6 +152,7 @@ class Sidecar:
         import numpy as np
 
         reply: Message = {"ok": True, "re": message.get("id")}
+        self.calls.append(message["endpoint"])
         if message["endpoint"] == "load":
             reply |= {"lease_id": None, "token": None, "loaded": True}
         elif message["endpoint"] == "get_action":
@@ -227,3 +229,35 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
         if process.poll() is None:
             process.kill()
             process.communicate()
+
+
+# -- benchmarks of a served policy ----------------------------------------------------------------------------------------
+def test_a_served_policy_is_started_anew_for_every_seed_and_released(tmp_path: Path, run_async: Any) -> None:
+    from runner.sim.benchmark import Benchmark, SkillContestant
+    from runner.sim.sim_runner import SimRunner
+    from runner.sim.worlds import makers_of, world_of
+    from schemas.manifest import Kind, parse_manifest
+
+    (tmp_path / "world.yaml").write_text(WORLD, encoding="utf-8")
+    endpoint = f"ipc://{tmp_path}/policy.sock"
+    world = world_of(POINT, env_config=tmp_path / "world.yaml", render=False)
+    makers = makers_of(world, {"test/point-seek": endpoint}, None, period_s=1 / 30, wait_s=2.0)
+    manifest = parse_manifest(MANIFEST + 'default_prompt: "go there"\n')
+    runner = SimRunner(world.make, rate_hz=0, ends_with_skill=True)
+
+    async def scenario() -> None:
+        sidecar = Sidecar()
+        serving = asyncio.create_task(sidecar.serve(endpoint))
+        bench = Benchmark(runner, world=world.name)
+        cell = await bench.run(SkillContestant(makers[Kind.VLA](manifest)), range(3))
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+        assert [(e.seed, e.success, e.steps, e.error) for e in cell.episodes] == [
+            (seed, True, 1, "") for seed in range(3)
+        ]
+        assert cell.summary()["revision"] == "1.0.0"
+        assert [call for call in sidecar.calls if call != "ping"] == ["load", "reset", "get_action"] * 3 + [
+            "unload"
+        ]
+
+    run_async(scenario())
