@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from runner.cli_common import (
+    add_trace_flag,
     connect_arbiter,
     default_skills,
     install_signals,
@@ -77,6 +78,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     bench.add_argument("--arbiter", help="the arbiter's endpoint")
     bench.add_argument("--no-arbiter", action="store_true", help="nobody arbitrates: mark no uses")
     bench.add_argument("--sidecar", action="append", default=[], metavar="RSKILL=ENDPOINT")
+    add_trace_flag(bench)
     return bench
 
 
@@ -156,6 +158,7 @@ def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
         video_every=world.video_every,
     )
     runner.identity = dict(world.identity)
+    runner.trace_ticks = args.trace_ticks
     return Benchmark(
         runner,
         world=world.name,

@@ -52,6 +52,13 @@ def not_negative(text: str) -> float:
     return value
 
 
+def add_trace_flag(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--trace-ticks", type=share, default=1.0, metavar="RATIO",
+        help="share of a goal's ticks that telemetry records, beyond those up to its first action; goals are recorded always",
+    )  # fmt: skip
+
+
 def add_serving_flags(parser: argparse.ArgumentParser) -> None:
     """Flags of every command that serves goals."""
     parser.add_argument(
@@ -68,10 +75,7 @@ def add_serving_flags(parser: argparse.ArgumentParser) -> None:
         "--realtime", action=argparse.BooleanOptionalAction, default=True,
         help="run the control loop before ordinary programs (SCHED_FIFO, or a lower nice value) where the machine allows it",
     )  # fmt: skip
-    parser.add_argument(
-        "--trace-ticks", type=share, default=1.0, metavar="RATIO",
-        help="share of a goal's ticks that telemetry records, beyond those up to its first action; goals are recorded always",
-    )  # fmt: skip
+    add_trace_flag(parser)
     parser.add_argument("--max-seconds", type=positive, help="stop by itself after so many seconds")
 
 

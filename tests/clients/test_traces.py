@@ -12,6 +12,7 @@ import pytest
 from arbiter.testing.process import ArbiterProcess
 from clients import traces
 from clients.aio import ArbiterClient
+from clients.lease import Lease
 from clients.runner import RunnerClient
 from clients.serve import Message, Peer, RouterServer
 from clients.sidecar.policy import PolicyClient
@@ -87,6 +88,39 @@ def test_the_arbiter_hears_of_the_trace_of_an_acquire(arbiter_daemon: ArbiterPro
             lease = client.acquire(spec("sync", 1))
         assert PARENT in traced_in(client.history(), "sync")
         lease.release()
+
+
+@pytest.mark.e2e
+def test_a_model_that_is_called_back_is_loaded_in_the_trace_of_who_wants_it(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    """One that comes back by itself is nobody's: neither the evictor's nor that of whoever was just talking to the arbiter."""
+    loaded: list[str | None] = []
+
+    async def story() -> None:
+        async def load(lease: Lease) -> None:
+            loaded.append(traces.present())
+            await lease.ready()
+
+        async def unload() -> None:
+            pass
+
+        async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+            with tracing.joined(PARENT):
+                model = await client.acquire(spec("model", 5, standby=True), unload=unload, on_return=load)
+                await model.ready()
+                big = await client.acquire(spec("big", 5), unload=unload)
+                await big.ready()
+                assert model.state == "standby"
+                await big.release()
+            await model.wait_returned()
+            big = await client.acquire(spec("big", 5), unload=unload)
+            await big.ready()
+            with tracing.joined(OTHER):
+                await model.reacquire()
+
+    asyncio.run(story())
+    assert loaded == [None, OTHER]
 
 
 def test_goals_and_sidecars_requests_carry_it(tmp_path: Path) -> None:

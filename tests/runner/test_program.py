@@ -98,7 +98,13 @@ def test_without_an_arbiter_it_says_so_and_does_not_start(
 
 
 def test_wrong_flags_are_usage_errors(capsys: pytest.CaptureFixture[str]) -> None:
-    for flags in (["sim", "--rate", "-1"], ["sim", "--max-seconds", "0"], ["sim", "--sed", "1"], []):
+    for flags in (
+        ["sim", "--rate", "-1"],
+        ["sim", "--trace-ticks", "2"],
+        ["sim", "--max-seconds", "0"],
+        ["sim", "--sed", "1"],
+        [],
+    ):
         with pytest.raises(SystemExit) as ended:
             parse(flags)
         assert ended.value.code == 2
