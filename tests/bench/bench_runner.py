@@ -34,6 +34,7 @@ GRAB = "vram-arbiter/so101-grab"
 RATE_HZ = 30.0
 JITTER_MAX_US = 2000.0
 NO_HOLD = "scheduling:\n  thrash_hold_max_s: 0\n"  # it would slow down on purpose what is measured here
+FOOTPRINT = "5GB,5GB,450MiB"  # of each, on 8 GiB; without the simulated bandwidth of a real load there are more switches in a second
 BOOT_S = 240.0
 SETTLE_S = 3.0  # after the start: imports, first pictures, page cache
 POLL_S = 0.1
@@ -59,7 +60,7 @@ class RunnerRow:
 def run(*, quick: bool, out: Path) -> list[RunnerRow]:
     """Measure and write. Raises RuntimeError when a program ends by itself."""
     with arbiter(SHIPPED + NO_HOLD) as daemon:
-        measured = asyncio.run(_measure(daemon, rounds=1 if quick else 4, stretch_s=5.0 if quick else 15.0))
+        measured = asyncio.run(_measure(daemon, rounds=1 if quick else 4, stretch_s=4.0 if quick else 15.0))
     rows = measured.rows()
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps([asdict(row) for row in rows], indent=1, ensure_ascii=False) + "\n")
@@ -225,7 +226,7 @@ async def _until_up(ping: Callable[[], Any], programs: Sequence["subprocess.Pope
 def _sidecar(daemon: ArbiterProcess, name: str, skill: str = "") -> Iterator["subprocess.Popen[bytes]"]:
     manifest = ROOT / "configs/rskills" / (skill or SKILLS[name]) / "rskill.yaml"
     words = ["sidecars", "--name", name, "--rskill", str(manifest), "--device", f"fake:{daemon.card}"]
-    with _program(daemon, name, [*words, "--min-residency-s", "0"]) as process:
+    with _program(daemon, name, [*words, "--min-residency-s", "0", "--footprint", FOOTPRINT]) as process:
         yield process
 
 
