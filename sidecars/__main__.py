@@ -22,6 +22,7 @@ from schemas.fakegpu import CARD_FILE, FOLDER_VARIABLE, parse_config
 from schemas.manifest import ManifestError, RSkillManifest
 from sidecars.adapters.base import ModelAdapter
 from sidecars.adapters.choose import make_adapter
+from sidecars.adapters.gpu_passthrough import need_card
 from sidecars.device.memory import DeviceMemory, NoDevice
 from sidecars.settings import (
     NICE,
@@ -87,6 +88,7 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         path = flags.footprints or configs / FOOTPRINTS
         entry = footprint_for(manifest, read_footprints(path) if path.exists() or flags.footprints else {})
     device = _device(flags.device)
+    need_card(manifest, device)
     return Settings(
         name=flags.name,
         manifest=manifest,

@@ -5,6 +5,7 @@ from schemas.manifest import Kind, RSkillManifest
 from schemas.manifest.vocabulary import DetectorEngine, Runtime
 from sidecars.adapters.base import ModelAdapter
 from sidecars.adapters.detector import DetectorAdapter
+from sidecars.adapters.gpu_passthrough import GpuPassthroughAdapter, is_passthrough
 from sidecars.adapters.policy import PolicyAdapter
 from sidecars.adapters.scene_vlm import SceneVlmAdapter
 from sidecars.weights import Weights
@@ -25,6 +26,8 @@ def make_adapter(manifest: RSkillManifest, weights: Weights) -> ModelAdapter:
         return DetectorAdapter(manifest, weights)
     if manifest.kind is Kind.VLM:
         return SceneVlmAdapter(manifest, weights)
+    if manifest.kind is Kind.VLA and is_passthrough(manifest):
+        return GpuPassthroughAdapter(manifest)
     if manifest.kind is Kind.VLA:
         return PolicyAdapter(manifest, weights)
     raise ConfigError(

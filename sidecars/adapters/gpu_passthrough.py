@@ -1,0 +1,117 @@
+"""Camera frames to the card and back, the arm where it was: a check of a machine that has no model yet. Never on the CPU instead.
+
+It moves nothing and makes nothing up: a picture that is missing, of another shape or too small is refused, and so is a state that is not
+finite numbers. On a simulated card (`fake:FOLDER`) the bytes are simulated like every model's.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from schemas.errors import BadRequest, ConfigError, NoGpu
+from schemas.manifest import RSkillManifest
+from schemas.manifest.vocabulary import Modality
+from schemas.sidecar import EndpointCall
+from sidecars.adapters.base import ModelCall
+
+ADAPTER = "gpu_passthrough"
+STATE_KEY = "observation.state"
+SIDE_MAX = 64  # pixels a side that are taken to the card: every n-th, as a preview would
+
+
+def is_passthrough(manifest: RSkillManifest) -> bool:
+    """Whether a manifest asks for it (`policy_extras.adapter`)."""
+    return manifest.policy_extras.get("adapter") == ADAPTER
+
+
+def need_card(manifest: RSkillManifest, device: str) -> None:
+    """Raises NoGpu for a device that is none. A CUDA card that is not there is refused where the device is opened."""
+    if is_passthrough(manifest) and device == "none":
+        raise NoGpu(
+            f"{manifest.name} takes frames through a card, and --device none is none",
+            hint="use --device cuda, or fake:FOLDER for a simulated card",
+        )
+
+
+class GpuPassthroughAdapter:
+    """`get_action` answers `action` (1, D), the joints as they were at the first call since `reset`, and `brightness` (0..1) by picture."""
+
+    kind: Literal["vla"] = "vla"
+    ops = frozenset({"get_action", "reset"})
+
+    def __init__(self, manifest: RSkillManifest) -> None:
+        self._sizes = {
+            sensor.vla_feature_key: (sensor.min_height or 1, sensor.min_width or 1)
+            for sensor in manifest.sensors_required
+            if sensor.modality is Modality.RGB and sensor.vla_feature_key
+        }
+        if not self._sizes:
+            raise ConfigError(
+                f"{manifest.name} names no camera", hint="give a sensor of modality rgb a vla_feature_key"
+            )
+        self._device: str | None = None
+        self._pose: Any = None
+
+    def prepare(self) -> None:
+        import torch  # noqa: F401  the wait for it belongs here
+
+    def load(self, device: str) -> None:
+        self._device = device
+
+    def unload(self) -> None:
+        self._device = self._pose = None
+
+    def run(self, call: ModelCall) -> dict[str, Any]:
+        """Raises BadRequest for an observation that is not whole."""
+        assert isinstance(call, EndpointCall)
+        if call.endpoint == "reset":
+            self._pose = None
+            return {"ok": True}
+        observation = (call.data or {}).get("observation")
+        if not isinstance(observation, Mapping):
+            raise BadRequest("get_action needs data.observation, a map")
+        state = _state(observation)
+        brightness = {
+            name: self._brightness(_pixels(observation, name, *size)) for name, size in self._sizes.items()
+        }
+        if self._pose is None or self._pose.shape != state.shape:
+            self._pose = state
+        return {"action": self._pose[None], "brightness": brightness}
+
+    def _brightness(self, pixels: Any) -> float:
+        """Mean of all channels, 0..1, computed on the card and waited for."""
+        import numpy as np
+        import torch
+
+        rows, columns = (max(1, side // SIDE_MAX) for side in pixels.shape[:2])
+        picture = torch.from_numpy(np.array(pixels[::rows, ::columns])).to(self._device)
+        return float((picture.to(torch.float32) / 255).mean().cpu())
+
+
+def _state(observation: Mapping[str, Any]) -> Any:
+    import numpy as np
+
+    try:
+        state = np.array(observation[STATE_KEY], dtype=np.float32)
+    except KeyError:
+        raise BadRequest(f"the observation lacks {STATE_KEY}", hint=f"it has {sorted(observation)}") from None
+    except (TypeError, ValueError):
+        raise BadRequest(f"{STATE_KEY} must be numbers") from None
+    if state.ndim != 1 or not len(state) or not np.isfinite(state).all():
+        raise BadRequest(
+            f"{STATE_KEY} must be a row of finite numbers, not of shape {state.shape}",
+            hint="a stale or missing sensor must stop the goal",
+        )
+    return state
+
+
+def _pixels(observation: Mapping[str, Any], name: str, height: int, width: int) -> Any:
+    import numpy as np
+
+    pixels = observation.get(name)
+    if pixels is None:
+        raise BadRequest(f"the observation lacks {name}", hint=f"it has {sorted(observation)}")
+    if not isinstance(pixels, np.ndarray) or pixels.dtype != np.uint8 or pixels.ndim != 3:
+        raise BadRequest(f"{name} must be uint8 (H, W, 3)", hint="nothing is put in the place of a picture")
+    if pixels.shape[2] != 3 or pixels.shape[0] < height or pixels.shape[1] < width:
+        raise BadRequest(f"{name} must be at least ({height}, {width}, 3), not {pixels.shape}")
+    return pixels

@@ -1,0 +1,72 @@
+"""Frames of the simulator through a (simulated) card: a real arbiter, sidecar and runner; under a lease, and the arm keeps still."""
+
+import asyncio
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from grab_programs import ROOT
+
+from arbiter.testing.process import ArbiterProcess
+from clients.aio import ArbiterClient
+from clients.runner import RunnerClient
+
+pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(300)]
+
+RSKILL = ROOT / "configs/diagnostics/gpu-passthrough/rskill.yaml"
+SKILL = "vram-arbiter/gpu-passthrough"
+
+
+@pytest.fixture
+def programs(arbiter_daemon: ArbiterProcess, tmp_path: Path) -> Iterator[list["subprocess.Popen[bytes]"]]:
+    environ = arbiter_daemon.environ | {"OMP_NUM_THREADS": "1"}
+    sidecar = [
+        "sidecars", "--name", "passthrough", "--rskill", str(RSKILL), "--device", f"fake:{arbiter_daemon.card}"
+    ]  # fmt: skip
+    runner = ["runner", "sim", "--seed", "1", "--skills", str(RSKILL)]
+    log = tmp_path / "programs.log"
+    with log.open("ab") as sink:
+        started = [
+            subprocess.Popen([sys.executable, "-m", *words], cwd=ROOT, env=environ, stdout=sink, stderr=sink)
+            for words in (sidecar, runner)
+        ]
+    yield started
+    for process in reversed(started):
+        process.terminate()
+        try:
+            process.wait(60)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+    print(log.read_text(errors="replace")[-3000:])
+
+
+async def scenario(daemon: ArbiterProcess, sidecar: "subprocess.Popen[bytes]") -> None:
+    async with (
+        RunnerClient(f"ipc://{daemon.runtime}/runner.sock", connect_timeout_s=120.0) as runner,
+        ArbiterClient(daemon.endpoint, name="watcher", role="observer") as watcher,
+    ):
+        before = (await runner.state())["world"]["joint_state"]["position"]
+        goal = await runner.send_goal(SKILL, deadline_s=120.0)
+        held: list[int] = []
+        async for feedback in goal.feedback():
+            if feedback["state"] == "running" and not held:
+                (lease,) = (await watcher.status())["leases"]
+                assert lease["consumer"] == "passthrough"
+                assert lease["state"] == "held"
+                held.append(lease["pid"])
+        result = await goal.result(120)
+        assert result["status"] == "succeeded", result
+        assert result["data"]["steps"] == 60
+        assert result["data"]["withheld"] == 0
+        assert held == [sidecar.pid], "who holds the bytes holds the lease"
+        after = (await runner.state())["world"]["joint_state"]["position"]
+        assert after == pytest.approx(before, abs=0.03)
+
+
+def test_frames_pass_the_card_under_a_lease_and_nothing_moves(
+    arbiter_daemon: ArbiterProcess, programs: list["subprocess.Popen[bytes]"]
+) -> None:
+    asyncio.run(asyncio.wait_for(scenario(arbiter_daemon, programs[0]), 280))

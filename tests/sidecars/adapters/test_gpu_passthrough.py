@@ -1,0 +1,109 @@
+"""Frames through the card: nothing moves, nothing is made up, no card is an error at the start."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from schemas.errors import BadRequest, ConfigError
+from schemas.manifest import load_manifest
+from schemas.sidecar import EndpointCall
+from sidecars.__main__ import main
+from sidecars.adapters.choose import make_adapter
+from sidecars.adapters.gpu_passthrough import GpuPassthroughAdapter
+from sidecars.weights import resolve
+
+pytestmark = pytest.mark.heavy  # torch
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+RSKILL = CONFIGS / "diagnostics/gpu-passthrough/rskill.yaml"
+FRONT = "observation.images.front"
+
+
+def call(endpoint: str, observation: Any = None) -> EndpointCall:
+    return EndpointCall(endpoint=endpoint, data=None if observation is None else {"observation": observation})
+
+
+def observation(**changes: Any) -> dict[str, Any]:
+    import numpy as np
+
+    picture = np.zeros((100, 200, 3), dtype=np.uint8)
+    picture[:, 100:] = 255
+    return {"observation.state": np.array([0.1, -0.2, 0.3]), FRONT: picture, "task": "look"} | changes
+
+
+@pytest.fixture
+def adapter() -> GpuPassthroughAdapter:
+    manifest = load_manifest(RSKILL)
+    made = make_adapter(manifest, resolve(str(manifest.weights_uri), CONFIGS))
+    assert isinstance(made, GpuPassthroughAdapter)
+    made.prepare()
+    made.load("cpu")  # what a simulated card computes on
+    return made
+
+
+def test_the_arm_keeps_the_pose_it_had_at_first(adapter: GpuPassthroughAdapter) -> None:
+    import numpy as np
+
+    first = adapter.run(call("get_action", observation()))
+    assert first["action"].tolist() == [pytest.approx([0.1, -0.2, 0.3])]
+    assert first["brightness"] == {FRONT: pytest.approx(0.5, abs=0.01)}
+    sagged = observation(**{"observation.state": np.array([0.1, -0.25, 0.3])})
+    assert adapter.run(call("get_action", sagged))["action"][0, 1] == pytest.approx(-0.2)
+    adapter.run(call("reset"))
+    assert adapter.run(call("get_action", sagged))["action"][0, 1] == pytest.approx(-0.25)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({FRONT: None}, f"lacks {FRONT}"),
+        ({FRONT: b"\x89PNG"}, "uint8"),
+        ({FRONT: "float"}, "uint8"),
+        ({FRONT: (100, 200)}, "uint8"),
+        ({FRONT: (100, 200, 4)}, "at least"),
+        ({FRONT: (63, 200, 3)}, "at least"),
+        ({FRONT: (0, 0, 3)}, "at least"),
+        ({"observation.state": [0.1, float("nan")]}, "finite"),
+        ({"observation.state": [[0.1], [0.2]]}, "finite"),
+        ({"observation.state": []}, "finite"),
+        ({"observation.state": "left"}, "numbers"),
+    ],
+)
+def test_what_is_missing_or_misshapen_is_refused(
+    adapter: GpuPassthroughAdapter, changes: dict[str, Any], said: str
+) -> None:
+    import numpy as np
+
+    for name, value in changes.items():
+        if isinstance(value, tuple):
+            changes[name] = np.zeros(value, dtype=np.uint8)
+        elif value == "float":
+            changes[name] = np.zeros((100, 200, 3), dtype=np.float32)
+    with pytest.raises(BadRequest, match=said):
+        adapter.run(call("get_action", observation(**changes)))
+
+
+def test_an_observation_that_is_none_and_a_state_that_is_missing(adapter: GpuPassthroughAdapter) -> None:
+    with pytest.raises(BadRequest, match="a map"):
+        adapter.run(call("get_action", "look"))
+    with pytest.raises(BadRequest, match="lacks observation"):
+        adapter.run(call("get_action", {FRONT: observation()[FRONT]}))
+
+
+def test_without_cameras_there_is_nothing_to_pass_on() -> None:
+    manifest = load_manifest(RSKILL).model_copy(update={"sensors_required": ()})
+    with pytest.raises(ConfigError, match="names no camera"):
+        GpuPassthroughAdapter(manifest)
+
+
+@pytest.mark.parametrize("device", ["none", "cuda"])
+def test_without_a_card_it_does_not_start(device: str, capsys: pytest.CaptureFixture[str]) -> None:
+    import torch
+
+    if device == "cuda" and torch.cuda.is_available():
+        pytest.skip("this machine has a card")
+    assert main(["--name", "passthrough", "--rskill", str(RSKILL), "--device", device, "--no-arbiter"]) == 1
+    said = capsys.readouterr().err
+    assert "card" in said
+    assert "fake:FOLDER" in said
