@@ -14,7 +14,7 @@ from pathlib import Path
 
 from clients import logs
 from clients.runner import RunnerClient
-from clients.sidecar.perception import DetectorClient, SceneVlmClient
+from clients.sidecar.perception import DetectorClient, RewardClient, SceneVlmClient
 from reasoner.inbox import Inbox
 from reasoner.llm.anthropic import AnthropicPlanner
 from reasoner.llm.base import LlmConfig, LlmPlanner
@@ -22,10 +22,11 @@ from reasoner.llm.openai import OpenAiPlanner
 from reasoner.llm.scripted import ScriptedPlanner
 from reasoner.loop import STEPS_MAX, Result, run_episode
 from reasoner.palette import OPERATOR, Palette, palette_of
+from reasoner.past import RATE_HZ, Past
 from reasoner.planner import Planner
 from reasoner.playbooks import Playbook, load_playbook
 from reasoner.server import OperatorServer, send
-from reasoner.tools import Tools
+from reasoner.tools import FRAME_MAX_AGE_MS, Judge, Tools
 from reasoner.watch import watch
 from schemas.body import read_body
 from schemas.commands import command
@@ -34,7 +35,7 @@ from schemas.errors import ConfigError, ReasonerUnreachable, RunnerUnreachable, 
 from schemas.manifest import RSkillManifest
 
 LLM_PLANNERS: dict[str, type[LlmPlanner]] = {"openai": OpenAiPlanner, "anthropic": AnthropicPlanner}
-MANAGED = ("detector", "scene-vlm")
+MANAGED = ("detector", "scene-vlm", "reward")
 
 EXIT_FAILED, EXIT_USAGE, EXIT_UNREACHABLE = 1, 2, 3
 
@@ -79,6 +80,16 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--detector", help='endpoint of the detector sidecar; "none": there is none')
     parser.add_argument("--scene-vlm", help='endpoint of the scene-VLM sidecar; "none": there is none')
     parser.add_argument("--log-format", choices=logs.FORMS, default="human", help="json: one object a line")
+    parser.add_argument(
+        "--reward",
+        nargs="?",
+        const="",
+        metavar="ENDPOINT",
+        help="there is a reward model to ask for progress (default endpoint: ipc://RUNTIME/reward.sock); without this flag there is none",
+    )
+    parser.add_argument(
+        "--reward-camera", default="wrist", help="which camera it looks at (default: %(default)s)"
+    )
     parser.add_argument("--result", type=Path, help="write the result as JSON into this file")
     return parser
 
@@ -147,7 +158,10 @@ async def _run(arguments: argparse.Namespace) -> Result:
             )
         if arguments.scene_vlm != "none":
             vlm = await stack.enter_async_context(SceneVlmClient(_endpoint(arguments.scene_vlm, "scene-vlm")))
-        named = {"detector": detector, "scene-vlm": vlm}
+        reward = None
+        if arguments.reward is not None:
+            reward = await stack.enter_async_context(RewardClient(_endpoint(arguments.reward, "reward")))
+        named = {"detector": detector, "scene-vlm": vlm, "reward": reward}
         components = {name: client for name, client in named.items() if client is not None}
         installed = await runner.skills()
         manifests = [RSkillManifest.model_validate(manifest) for manifest in installed["skills"]]
@@ -155,6 +169,7 @@ async def _run(arguments: argparse.Namespace) -> Result:
             manifests,
             can_locate=detector is not None,
             can_query=vlm is not None,
+            can_judge=reward is not None,
             allow_noncommercial=arguments.allow_noncommercial,
             managed=[name for name in arguments.manage if name in components],
             topics=[OPERATOR],
@@ -162,6 +177,7 @@ async def _run(arguments: argparse.Namespace) -> Result:
         )
         if playbook is not None:
             palette = playbook.narrow(palette)
+        judge = await _judge(arguments, reward, manifests, stack) if reward is not None else None
         planner = await _planner(arguments, palette, playbook, stack)
         watching = asyncio.create_task(watch(eyes, inbox))
         stack.callback(watching.cancel)
@@ -169,10 +185,29 @@ async def _run(arguments: argparse.Namespace) -> Result:
             arguments.task,
             planner,
             palette,
-            Tools(runner, detector, vlm, palette=palette, components=components),
+            Tools(runner, detector, vlm, judge=judge, palette=palette, components=components),
             inbox=inbox,
             steps_max=STEPS_MAX if playbook is None else min(STEPS_MAX, playbook.max_steps),
         )
+
+
+async def _judge(
+    arguments: argparse.Namespace,
+    reward: RewardClient,
+    manifests: list[RSkillManifest],
+    stack: contextlib.AsyncExitStack,
+) -> Judge:
+    """The reward model with its pictures, taken on a connection of their own as often as its manifest wants them."""
+    camera = arguments.reward_camera
+    eyes = await stack.enter_async_context(RunnerClient(_endpoint(arguments.runner, "runner")))
+    rates = [manifest.reward.target_fps for manifest in manifests if manifest.reward is not None]
+    past = Past(
+        lambda: eyes.frame(camera, max_age_ms=FRAME_MAX_AGE_MS, encoding="png"),
+        rate_hz=min(rates, default=RATE_HZ),
+    )
+    looking = asyncio.create_task(past.run(), name="past")
+    stack.callback(looking.cancel)
+    return Judge(reward, past, arguments.task)
 
 
 async def _planner(

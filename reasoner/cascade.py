@@ -11,14 +11,21 @@ from typing import Any
 
 from reasoner.palette import Palette
 from reasoner.planner import Episode, Note, Outcome, Status, Step
-from schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall, skill_tool_name
+from schemas.tools import (
+    ExecuteRskill,
+    LocateInView,
+    QueryScene,
+    QueryTaskProgress,
+    ToolCall,
+    skill_tool_name,
+)
 
 ANSWER_MAX_CHARS = 2000
 
 MEANING: dict[Status, str] = {
     "found": "the detector looked and sees it",
     "not_seen": "the detector looked and does not see it in this picture",
-    "answered": "the scene model looked at the present picture and answered",
+    "answered": "the model looked and answered; its words are an opinion about the pictures",
     "succeeded": "the goal was reached",
     "failed": "the goal ended without success",
     "canceled": "the goal was called off before its end",
@@ -27,6 +34,14 @@ MEANING: dict[Status, str] = {
     "no_frame": "nothing was looked at: no picture is fresh enough. This says nothing about the scene",
     "refused": "this call is not allowed or not understood; nothing was done",
     "error": "it could not be done. This says nothing about the scene",
+}
+
+
+SOURCE: dict[type[ToolCall], str] = {
+    LocateInView: "detector",
+    QueryScene: "scene_vlm",
+    QueryTaskProgress: "reward_model",
+    ExecuteRskill: "runner",
 }
 
 
@@ -98,9 +113,7 @@ def _step(number: int, step: Step, palette: Palette) -> list[Turn]:
 
 def told(call: ToolCall, outcome: Outcome) -> dict[str, Any]:
     """An outcome as a model reads it: status, its meaning, who says so, the words, the numbers."""
-    source = {LocateInView: "detector", QueryScene: "scene_vlm", ExecuteRskill: "runner"}.get(
-        type(call), "reasoner"
-    )
+    source = SOURCE.get(type(call), "reasoner")
     fields = {
         "status": outcome.status,
         "meaning": MEANING[outcome.status],

@@ -20,7 +20,7 @@ from reasoner.palette import Palette
 from reasoner.planner import Episode, Finish, Note, Outcome, Planner, Step, benched
 from schemas import meters, telemetry, tracing
 from schemas.errors import EstopRequested, VramError
-from schemas.tools import ExecuteRskill, LocateInView, QueryScene, StopGoal, ToolCall, Wait
+from schemas.tools import ExecuteRskill, LocateInView, QueryScene, QueryTaskProgress, StopGoal, ToolCall, Wait
 
 if TYPE_CHECKING:
     from opentelemetry.trace import Span
@@ -335,7 +335,7 @@ def _refused_in_a_row(episode: Episode) -> int:
 
 
 def _is_look(call: ToolCall) -> bool:
-    return isinstance(call, LocateInView | QueryScene)
+    return isinstance(call, LocateInView | QueryScene | QueryTaskProgress)
 
 
 def _looks_in_a_row(episode: Episode) -> int:

@@ -21,6 +21,7 @@ from schemas.tools import (
     LifecycleTransition,
     LocateInView,
     QueryScene,
+    QueryTaskProgress,
     StopGoal,
     ToolCall,
     Wait,
@@ -34,13 +35,14 @@ from schemas.tools import (
 
 EXECUTABLE_KINDS = frozenset({"vla", "ros_action", "ros_service"})
 WHILE_A_GOAL_RUNS = frozenset({"wait", "stop_goal"})
+ASKED = ("locate_in_view", "query_scene", "query_task_progress")
 OPERATOR = "/operator"
 
 _USED_AS = {
     "detector": "it is asked through locate_in_view",
     "segmenter": "nothing here serves it",
     "vlm": "it is asked through query_scene",
-    "reward": "it judges and moves nothing",
+    "reward": "it judges through query_task_progress and moves nothing",
     "playbook": "it is a text for the planner: --playbook FILE",
     "wam": "nothing here runs world action models",
 }
@@ -61,7 +63,7 @@ class Skill:
 
 @dataclass(frozen=True, slots=True)
 class Palette:
-    """`can_locate` and `can_query` are independent: the two are provided by different sidecars.
+    """`can_locate`, `can_query` and `can_judge` are independent: different sidecars provide them.
 
     `managed` names the components that `lifecycle_transition` may touch, `topics` where `emit_prompt` may speak; empty: the tool is not
     there. `only` narrows all of it to the tools that a playbook composes; None does not.
@@ -70,6 +72,7 @@ class Palette:
     skills: tuple[Skill, ...]
     can_locate: bool = True
     can_query: bool = True
+    can_judge: bool = False
     managed: frozenset[str] = frozenset()
     topics: frozenset[str] = frozenset()
     only: frozenset[str] | None = None
@@ -96,6 +99,7 @@ class Palette:
             "execute_rskill": bool(self.executable),
             "locate_in_view": self.can_locate,
             "query_scene": self.can_query,
+            "query_task_progress": self.can_judge,
             "lifecycle_transition": bool(self.managed),
             "emit_prompt": bool(self.topics),
         }
@@ -141,6 +145,11 @@ class Palette:
                 return NotPermitted("no detector is provided", hint="start the detector sidecar")
             case QueryScene() if not self.can_query:
                 return NotPermitted("no scene VLM is provided", hint="start the scene-VLM sidecar")
+            case QueryTaskProgress() if not self.can_judge:
+                return NotPermitted(
+                    "no reward model is provided",
+                    hint="start the reward sidecar, and the reasoner with --reward",
+                )
             case LifecycleTransition() if call.node not in self.managed:
                 return NotPermitted(
                     f"{call.node} may not be managed by this reasoner",
@@ -194,7 +203,7 @@ class Palette:
                 skill_function(skill.id, skill.description, skill.goal_params_schema)
                 for skill in self.executable.values()
             ]
-        offered += function_schemas(name for name in ("locate_in_view", "query_scene") if name in tools)
+        offered += function_schemas(name for name in ASKED if name in tools)
         for tool, parameter, allowed in (
             (LifecycleTransition, "node", self.managed),
             (EmitPrompt, "target_topic", self.topics),
@@ -221,6 +230,7 @@ def palette_of(
     *,
     can_locate: bool,
     can_query: bool,
+    can_judge: bool = False,
     allow_noncommercial: bool = False,
     managed: Iterable[str] = (),
     topics: Iterable[str] = (),
@@ -243,6 +253,7 @@ def palette_of(
         skills,
         can_locate=can_locate,
         can_query=can_query,
+        can_judge=can_judge,
         managed=frozenset(managed),
         topics=frozenset(topics),
     )

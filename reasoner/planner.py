@@ -16,7 +16,7 @@ UNSTARTABLE_MAX = 3
 Status = Literal[
     "found",  # locate_in_view: the object, with its place
     "not_seen",  # locate_in_view: the detector looked and it is not there
-    "answered",  # query_scene
+    "answered",  # query_scene, query_task_progress
     "succeeded",  # execute_rskill
     "failed",  # execute_rskill ended without success
     "canceled",  # execute_rskill was called off, by the planner or by a person

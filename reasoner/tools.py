@@ -9,12 +9,14 @@ import asyncio
 import logging
 import uuid
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from clients.runner import Goal, RunnerClient
 from clients.sidecar.base import SidecarClient
-from clients.sidecar.perception import DetectorClient, SceneVlmClient
+from clients.sidecar.perception import DetectorClient, Judgement, RewardClient, SceneVlmClient
 from reasoner.palette import Palette
+from reasoner.past import Past, Taken
 from reasoner.planner import Outcome
 from schemas.errors import (
     BadRequest,
@@ -27,7 +29,15 @@ from schemas.errors import (
     VramError,
 )
 from schemas.goals import FrameReply, ResultPush
-from schemas.tools import EmitPrompt, ExecuteRskill, LifecycleTransition, LocateInView, QueryScene, ToolCall
+from schemas.tools import (
+    EmitPrompt,
+    ExecuteRskill,
+    LifecycleTransition,
+    LocateInView,
+    QueryScene,
+    QueryTaskProgress,
+    ToolCall,
+)
 from schemas.world import CameraModel
 
 log = logging.getLogger(__name__)
@@ -45,8 +55,18 @@ class Dispatcher(Protocol):
     async def __call__(self, call: ToolCall) -> Outcome: ...
 
 
+@dataclass(frozen=True, slots=True)
+class Judge:
+    """A reward model, the pictures it looks back at, and the task where a call names none. It only gives its opinion: no goal begins or
+    ends by it."""
+
+    reward: RewardClient
+    past: Past
+    task: str
+
+
 class Tools:
-    """Dispatch to a runner, a detector and a scene VLM. None of the sidecars needs to be up before it is asked.
+    """Dispatch to a runner, a detector, a scene VLM and a reward model. None of the sidecars needs to be up before it is asked.
 
     `components` are the sidecars by name that `lifecycle_transition` may load and unload, if the palette allows it.
     """
@@ -57,6 +77,7 @@ class Tools:
         detector: DetectorClient | None,
         scene_vlm: SceneVlmClient | None,
         *,
+        judge: Judge | None = None,
         palette: Palette | None = None,
         components: Mapping[str, SidecarClient] | None = None,
         goal_grace_s: float = GOAL_GRACE_S,
@@ -64,6 +85,7 @@ class Tools:
         self._runner = runner
         self._detector = detector
         self._scene_vlm = scene_vlm
+        self._judge = judge
         self._palette = palette
         self._components = dict(components or {})
         self._goal_grace_s = goal_grace_s
@@ -76,6 +98,8 @@ class Tools:
                     return await self._locate(call)
                 case QueryScene():
                     return await self._query(call)
+                case QueryTaskProgress():
+                    return await self._progress(call)
                 case ExecuteRskill():
                     return await self._execute(call)
                 case LifecycleTransition():
@@ -136,6 +160,21 @@ class Tools:
         if (refusal := await self._not_permitted(self._scene_vlm)) is not None:
             return refusal
         return Outcome("answered", answer, data={"camera": frame["camera"], "question": call.question})
+
+    async def _progress(self, call: QueryTaskProgress) -> Outcome:
+        """Judged by what the camera showed within the window, up to now: a camera that shows nothing now is no evidence."""
+        if self._judge is None:
+            return Outcome("refused", "no reward model is provided", "not_permitted")
+        reward, past = self._judge.reward, self._judge.past
+        if (refusal := await self._not_permitted(reward)) is not None:
+            return refusal
+        newest = await past.look()
+        shown = past.since(newest.at_s - call.window_s)
+        task = call.task or self._judge.task
+        judged = await reward.score([taken.image for taken in shown], task)
+        if (refusal := await self._not_permitted(reward)) is not None:
+            return refusal
+        return _opinion(task, shown, judged)
 
     async def _execute(self, call: ExecuteRskill) -> Outcome:
         goal = await self._send(call)
@@ -226,6 +265,27 @@ class Tools:
 
     async def _frame(self, camera: str) -> FrameReply:
         return await self._runner.frame(camera, max_age_ms=FRAME_MAX_AGE_MS, encoding="png")
+
+
+def _opinion(task: str, shown: list[Taken], judged: Judgement) -> Outcome:
+    span_s = shown[-1].at_s - shown[0].at_s
+    now = f"progress {judged.progress[-1]:.2f}"
+    if len(judged.progress) > 1:
+        now += f", {judged.progress[0]:.2f} {span_s:.1f} s before"
+    if judged.success:
+        done = "done" if judged.success[-1] >= judged.success_threshold else "not done"
+        now += f"; it looks {done} ({judged.success[-1]:.2f}, done from {judged.success_threshold:.2f} on)"
+    data = {
+        "task": task,
+        "progress": [round(value, 3) for value in judged.progress],
+        "success": [round(value, 3) for value in judged.success],
+        "success_threshold": judged.success_threshold,
+        "pictures": len(shown),
+        "span_s": round(span_s, 2),
+    }
+    return Outcome(
+        "answered", f"{task!r}: {now}. An opinion about {len(shown)} pictures, no proof", data=data
+    )
 
 
 def point_on_plane(frame: FrameReply, box: tuple[float, float, float, float]) -> list[float] | None:

@@ -1,6 +1,6 @@
 """The sidecars' wires: two families that the field already speaks, on one ZeroMQ ROUTER socket (ipc or loopback).
 
-Op family (detector, scene VLM)      {"op": "ping" | "load" | "detect" | "query" | "unload" | "shutdown", …}
+Op family (detector, scene VLM, reward)   {"op": "ping" | "load" | "detect" | "query" | "score" | "unload" | "shutdown", …}
                                      → {"ok": true, …} | {"ok": false, "error": "Type: message", "code": …, "hint": …, "details": …}
 Endpoint family (policy)             {"endpoint": "ping" | "load" | "reset" | "get_action" | "unload" | "shutdown", "data": …}
                                      → the result | {"error": "Type: message", "code": …, …}
@@ -13,14 +13,17 @@ Every request may carry "id" (echoed as "re": a DEALER may have several under wa
 the arbiter: a goal that spans many `get_action` calls is one use.
 """
 
-from typing import Annotated, Any, Literal, NotRequired, TypedDict
+from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
 from schemas.wire import Seconds, TokenPair
 
 ImageBytes = Annotated[bytes, Field(min_length=8, max_length=16 * 1024 * 1024)]
 Question = Annotated[str, Field(min_length=1, max_length=2000)]
+Side = Annotated[int, Field(ge=1, le=4096)]
+
+PICTURES_MAX = 32  # of one `score`
 
 
 class _Call(BaseModel):
@@ -69,7 +72,38 @@ class QueryOp(_Call):
     max_new_tokens: Annotated[int, Field(ge=1, le=8192)] = 256
 
 
-OpRequest = Annotated[PingOp | LoadOp | UnloadOp | ShutdownOp | DetectOp | QueryOp, Field(discriminator="op")]
+class ScoreOp(_Call):
+    """How far along `task` the robot is at each of one camera's pictures, oldest first.
+
+    Either `images` (PNG or JPEG bytes), or as the field writes it: `frames`, `n` raw pictures of `height` × `width` × 3 bytes, BGR, one after another.
+    """
+
+    op: Literal["score"]
+    task: Annotated[str, Field(max_length=2000)] = ""
+    images: Annotated[list[ImageBytes], Field(max_length=PICTURES_MAX)] = []
+    frames: Annotated[bytes, Field(max_length=16 * 1024 * 1024)] = b""
+    n: Annotated[int, Field(ge=1, le=PICTURES_MAX)] | None = None
+    width: Side | None = None
+    height: Side | None = None
+    num_bins: Annotated[int, Field(ge=2, le=1000)] = 100  # of the field's wire; the checkpoint knows its own
+
+    @model_validator(mode="after")
+    def _one_way_to_send_pictures(self) -> Self:
+        if bool(self.images) == bool(self.frames):
+            raise ValueError("give images, or frames with n, width and height")
+        if self.frames:
+            if self.n is None or self.width is None or self.height is None:
+                raise ValueError("frames need n, width and height")
+            if len(self.frames) != (expected := self.n * self.width * self.height * 3):
+                raise ValueError(
+                    f"frames has {len(self.frames)} bytes, not n x height x width x 3 = {expected}"
+                )
+        return self
+
+
+OpRequest = Annotated[
+    PingOp | LoadOp | UnloadOp | ShutdownOp | DetectOp | QueryOp | ScoreOp, Field(discriminator="op")
+]
 OP_REQUEST: TypeAdapter[OpRequest] = TypeAdapter(OpRequest)
 
 
@@ -88,7 +122,7 @@ class PingResult(TypedDict):
     ok: bool
     model: str
     revision: str
-    kind: Literal["detector", "vlm", "vla"]
+    kind: Literal["detector", "vlm", "vla", "reward"]
     rskill: str
     pid: int
     boot_id: str
@@ -122,3 +156,12 @@ class DetectResult(TypedDict):
 class QueryResult(TypedDict):
     ok: bool
     answer: str
+
+
+class ScoreResult(TypedDict):
+    """A value a picture, oldest first; models that judge a window as a whole give one, the newest's. All in 0..1."""
+
+    ok: bool
+    progress: list[float]
+    success: list[float]  # probability that the task is done; empty: the model does not say
+    success_threshold: float  # from here on its manifest calls it done

@@ -19,6 +19,7 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter, Va
 from schemas import strictjson
 from schemas.errors import BadRequest, UnknownOp
 
+PROGRESS_WINDOW_MAX_S = 60.0
 TOOL_NAME_MAX_CHARS = 64  # what the public chat APIs accept
 
 Text = Annotated[str, Field(max_length=4096)]
@@ -113,6 +114,19 @@ class QueryScene(_Tool):
     ] = ""
 
 
+class QueryTaskProgress(_Tool):
+    """Ask the reward model how far along a task the newest pictures show the robot to be. Moves nothing; its word is an opinion, never a proof."""
+
+    tool: Literal["query_task_progress"] = "query_task_progress"
+    window_s: Annotated[
+        float,
+        Field(
+            gt=0, le=PROGRESS_WINDOW_MAX_S, allow_inf_nan=False, description="How far to look back, seconds."
+        ),
+    ] = 8.0
+    task: Annotated[Text, Field(description="Progress towards what, in words; empty: the present task.")] = ""
+
+
 class LifecycleTransition(_Tool):
     """Configure, activate, deactivate or clean up a component that the reasoner is allowed to manage."""
 
@@ -144,12 +158,22 @@ class StopGoal(_Tool):
     tool: Literal["stop_goal"] = "stop_goal"
 
 
-ToolCall = ExecuteRskill | LocateInView | QueryScene | LifecycleTransition | EmitPrompt | Wait | StopGoal
+ToolCall = (
+    ExecuteRskill
+    | LocateInView
+    | QueryScene
+    | QueryTaskProgress
+    | LifecycleTransition
+    | EmitPrompt
+    | Wait
+    | StopGoal
+)
 
 TOOLS: dict[str, type[ToolCall]] = {
     "execute_rskill": ExecuteRskill,
     "locate_in_view": LocateInView,
     "query_scene": QueryScene,
+    "query_task_progress": QueryTaskProgress,
     "lifecycle_transition": LifecycleTransition,
     "emit_prompt": EmitPrompt,
     "wait": Wait,

@@ -15,8 +15,7 @@ from typing import Any
 from clients.aio import ArbiterClient
 from clients.serve import RouterServer
 from schemas.errors import VramError
-from schemas.sidecar import DetectOp, EndpointCall, QueryOp
-from sidecars.adapters.base import ModelAdapter
+from sidecars.adapters.base import ModelAdapter, ModelCall
 from sidecars.device.memory import DeviceMemory
 from sidecars.residency import Residency
 from sidecars.settings import Settings
@@ -129,7 +128,7 @@ class SidecarHost:
     async def unload(self) -> None:
         await self._here.unload()
 
-    async def run(self, name: str, call: DetectOp | QueryOp | EndpointCall) -> dict[str, Any]:
+    async def run(self, name: str, call: ModelCall) -> dict[str, Any]:
         residency = self._here
         if name == "reset" and call.token is None and residency.state != "resident":
             return {"ok": True}  # a model that is not there has nothing to forget, and no reason to load

@@ -86,7 +86,8 @@ def read_model(rskill: Path, configs: Path) -> tuple[RSkillManifest, Weights]:
     manifest = load_manifest(rskill)
     if manifest.weights_uri is None:
         raise ConfigError(
-            f"{rskill}: {manifest.name} has no weights", hint="sidecars serve detector, vlm and vla skills"
+            f"{rskill}: {manifest.name} has no weights",
+            hint="sidecars serve detector, vlm, vla and reward skills",
         )
     return manifest, resolve(manifest.weights_uri, configs)
 

@@ -14,7 +14,16 @@ from clients.serve import Message, Peer
 from clients.sidecar import npy
 from schemas import meters, telemetry, tracing
 from schemas.errors import BadRequest, InternalError, LimitExceeded, UnknownOp, VramError
-from schemas.sidecar import ENDPOINT_REQUEST, OP_REQUEST, DetectOp, EndpointCall, LoadOp, OpRequest, QueryOp
+from schemas.sidecar import (
+    ENDPOINT_REQUEST,
+    OP_REQUEST,
+    DetectOp,
+    EndpointCall,
+    LoadOp,
+    OpRequest,
+    QueryOp,
+    ScoreOp,
+)
 
 PENDING_MAX = 32  # model requests that wait or run; beyond this, `ping` would have to wait too
 Call = OpRequest | EndpointCall
@@ -34,7 +43,7 @@ class Host(Protocol):
 
     async def unload(self) -> None: ...
 
-    async def run(self, name: str, call: DetectOp | QueryOp | EndpointCall) -> dict[str, Any]: ...
+    async def run(self, name: str, call: DetectOp | QueryOp | ScoreOp | EndpointCall) -> dict[str, Any]: ...
 
     def stop(self) -> None: ...
 
@@ -98,7 +107,9 @@ class Wire:
         try:
             if name == "load":
                 return await self._host.load(_timeout_s(call))
-            assert isinstance(call, DetectOp | QueryOp | EndpointCall), "what is left is for the model"
+            assert isinstance(call, DetectOp | QueryOp | ScoreOp | EndpointCall), (
+                "what is left is for the model"
+            )
             answer: dict[str, Any] = npy.pack(await self._host.run(name, call))
             return answer
         finally:

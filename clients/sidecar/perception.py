@@ -1,10 +1,11 @@
-"""Clients of the two perception sidecars: open-vocabulary detector and scene VLM. They know images as PNG bytes only."""
+"""Clients of the perception sidecars: open-vocabulary detector, scene VLM, reward model. They know images as PNG bytes only."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clients.sidecar.base import SidecarClient
 from schemas.errors import ModelError
+from schemas.sidecar import PICTURES_MAX
 
 MAX_SIDE = 1024
 
@@ -78,6 +79,43 @@ class SceneVlmClient(SidecarClient):
         if not isinstance(answer, str):
             raise ModelError("the scene VLM's reply has no answer")
         return answer
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """Of each picture, oldest first, or of the newest alone: `progress` 0..1, `success` (probability; empty: not said). Advice, no proof."""
+
+    progress: tuple[float, ...]
+    success: tuple[float, ...]
+    success_threshold: float
+
+
+class RewardClient(SidecarClient):
+    """`await reward.score([png, png], "grab the red cube")`."""
+
+    async def score(
+        self,
+        images_png: Sequence[bytes],
+        task: str,
+        *,
+        token: Sequence[int] | None = None,
+        timeout_s: float | None = None,
+    ) -> Judgement:
+        """How far along the task one camera's pictures show the robot to be; the newest `PICTURES_MAX` are sent. Raises as `DetectorClient.detect`."""
+        fields = {"images": list(images_png)[-PICTURES_MAX:], "task": task}
+        reply = await self.call("score", fields, token=token, timeout_s=timeout_s)
+        try:
+            found = Judgement(
+                tuple(float(value) for value in reply["progress"]),
+                tuple(float(value) for value in reply["success"]),
+                float(reply["success_threshold"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ModelError(f"the reward model's answer has a wrong shape: {error!r}") from error
+        values = (*found.progress, *found.success)
+        if not found.progress or not all(0.0 <= value <= 1.0 for value in values):
+            raise ModelError("the reward model's answer is not in 0..1")
+        return found
 
 
 def _detection(entry: dict[str, object]) -> Detection:

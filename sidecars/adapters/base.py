@@ -2,9 +2,9 @@
 
 from typing import Any, Literal, Protocol
 
-from schemas.sidecar import DetectOp, EndpointCall, QueryOp
+from schemas.sidecar import DetectOp, EndpointCall, QueryOp, ScoreOp
 
-ModelCall = DetectOp | QueryOp | EndpointCall
+ModelCall = DetectOp | QueryOp | ScoreOp | EndpointCall
 
 
 class ModelAdapter(Protocol):
@@ -16,7 +16,7 @@ class ModelAdapter(Protocol):
     """
 
     @property
-    def kind(self) -> Literal["detector", "vlm", "vla"]: ...
+    def kind(self) -> Literal["detector", "vlm", "vla", "reward"]: ...
 
     @property
     def ops(self) -> frozenset[str]: ...

@@ -7,6 +7,7 @@ from sidecars.adapters.base import ModelAdapter
 from sidecars.adapters.detector import DetectorAdapter
 from sidecars.adapters.gpu_passthrough import GpuPassthroughAdapter, is_passthrough
 from sidecars.adapters.policy import PolicyAdapter
+from sidecars.adapters.reward import RewardAdapter
 from sidecars.adapters.scene_vlm import SceneVlmAdapter
 from sidecars.weights import Weights
 
@@ -30,7 +31,9 @@ def make_adapter(manifest: RSkillManifest, weights: Weights) -> ModelAdapter:
         return GpuPassthroughAdapter(manifest)
     if manifest.kind is Kind.VLA:
         return PolicyAdapter(manifest, weights)
+    if manifest.kind is Kind.REWARD:
+        return RewardAdapter(manifest, weights)
     raise ConfigError(
-        f"{manifest.name}: kind {manifest.kind.value!r} has no model to serve",
-        hint="sidecars serve detector, vlm and vla",
+        f"{manifest.name}: kind {manifest.kind.value!r} is not served",
+        hint="sidecars serve detector, vlm, vla and reward",
     )

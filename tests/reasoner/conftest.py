@@ -115,6 +115,12 @@ class Sidecar:
         self.asked: list[str] = []
         self.error: VramError | None = None
         self.detections: list[dict[str, Any]] = []
+        self.judgement: dict[str, Any] = {
+            "progress": [0.2, 0.7],
+            "success": [0.1, 0.9],
+            "success_threshold": 0.5,
+        }
+        self.messages: list[Message] = []
         self._server = RouterServer(
             endpoint, lambda error: {"ok": False, "error": str(error), "code": error.code}
         )
@@ -126,6 +132,7 @@ class Sidecar:
     async def _handle(self, peer: Peer, message: Message) -> None:
         op = message["op"]
         self.asked.append(op)
+        self.messages.append(message)
         reply: Message = {"re": message["id"], "ok": True}
         if op == "ping":
             reply |= {"model": "m", "revision": "", "kind": "vlm", "rskill": self.rskill, "pid": 1, "boot_id": "b",
@@ -140,7 +147,12 @@ class Sidecar:
         elif op == "load":
             reply |= {"lease_id": "l", "token": [1, 1], "loaded": True}
         else:
-            reply |= {"answer": "Yes, a red cube.", "norm": 1000, "detections": self.detections}
+            reply |= {
+                "answer": "Yes, a red cube.",
+                "norm": 1000,
+                "detections": self.detections,
+                **self.judgement,
+            }
         await self._server.send(peer, reply)
 
 

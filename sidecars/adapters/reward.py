@@ -1,0 +1,132 @@
+"""Reward models through lerobot's classes and processors: pictures of a robot at work and its task in, progress and success out."""
+
+import importlib
+import math
+from typing import Any, Literal
+
+from schemas.errors import BadRequest, ModelError
+from schemas.manifest import RSkillManifest
+from schemas.sidecar import ScoreOp
+from sidecars.adapters.base import ModelCall
+from sidecars.images import PIXELS_MAX, decode
+from sidecars.weights import Weights, from_pretrained
+
+_OWN_MODELS = ("sidecars.compact_progress",)  # reward types of ours, by lerobot's naming convention
+BYTES_A_PIXEL = 3
+
+
+class RewardAdapter:
+    """`score`. A model that judges every picture (`score(batch)`: progress and success, each (B, T)) answers a value a picture; any other
+    reward model of lerobot's answers one, that of the newest picture, and says nothing of success.
+
+    What goes in: (1, T, 3, H, W) floats in 0..1 under the checkpoint's own picture key, and `task`. Progress comes out in 0..1, whatever range the
+    manifest's model speaks in.
+    """
+
+    kind: Literal["reward"] = "reward"
+    ops = frozenset({"score"})
+
+    def __init__(self, manifest: RSkillManifest, weights: Weights) -> None:
+        assert manifest.reward is not None, "the kind's rules demand the block"
+        self._contract = manifest.reward
+        self._weights = weights
+        self._config: Any = None
+        self._model_class: Any = None
+        self._model: Any = None
+        self._before: Any = None
+
+    def prepare(self) -> None:
+        from lerobot.configs.rewards import RewardModelConfig
+        from lerobot.rewards.factory import get_reward_model_class
+
+        for package in _OWN_MODELS:
+            importlib.import_module(package)  # registers itself
+        self._config = from_pretrained(RewardModelConfig, self._weights)
+        self._model_class = get_reward_model_class(self._config.type)
+
+    def load(self, device: str) -> None:
+        from lerobot.rewards.factory import make_reward_pre_post_processors
+
+        self._config.device = device
+        self._config.pretrained_path = self._weights.source
+        self._model = from_pretrained(self._model_class, self._weights, config=self._config).eval()
+        try:
+            self._before, _ = make_reward_pre_post_processors(self._config)
+        except (ValueError, ImportError, OSError) as error:
+            raise ModelError(
+                f"{self._weights.source}: no processors for {self._config.type}: {error.__cause__ or error}",
+                hint="is everything installed that this reward model needs?",
+            ) from error
+
+    def unload(self) -> None:
+        self._model = self._before = None
+
+    def run(self, call: ModelCall) -> dict[str, Any]:
+        assert isinstance(call, ScoreOp)
+        if self._contract.instruction_required and not call.task.strip():
+            raise BadRequest("score needs a task: progress towards what?", hint="say the instruction")
+        progress, success = self._score(_pictures(call), call.task)
+        low, high = self._contract.progress_range
+        return {
+            "ok": True,
+            "progress": _shares([(value - low) / (high - low) for value in progress], "progress"),
+            "success": _shares(success, "success"),
+            "success_threshold": self._contract.success_threshold,
+        }
+
+    def _score(self, pictures: Any, task: str) -> tuple[list[float], list[float]]:
+        import torch
+
+        try:
+            batch = self._before({self._picture_key(): pictures, "task": [task]})
+        except ValueError as error:  # what the checkpoint's own processor cannot read
+            raise BadRequest(
+                f"task: {error}", hint="say it in the words that this model was made for"
+            ) from error
+        with torch.inference_mode():
+            if hasattr(self._model, "score"):
+                progress, success = self._model.score(batch)
+                return progress[0].float().tolist(), success[0].float().tolist()
+            return [float(self._model.compute_reward(batch)[-1])], []
+
+    def _picture_key(self) -> str:
+        known = [
+            key for key, feature in self._config.input_features.items() if feature.type.value == "VISUAL"
+        ]
+        if len(known) != 1:
+            raise ModelError(
+                f"{self._weights.source} looks at {len(known)} cameras",
+                hint="a reward sidecar judges one camera's pictures",
+            )
+        return str(known[0])
+
+
+def _pictures(call: ScoreOp) -> Any:
+    """All pictures, oldest first, as one tensor. Raises BadRequest when they are none, too many pixels, or of different sizes."""
+    import numpy as np
+    import torch
+
+    if call.frames:
+        assert call.width is not None, "the message's own check"
+        assert call.height is not None, "the message's own check"
+        shape = (-1, call.height, call.width, BYTES_A_PIXEL)
+        stack = np.frombuffer(call.frames, np.uint8).reshape(shape)[..., ::-1]
+    else:
+        taken = [decode(image) for image in call.images]
+        if len({picture.size for picture in taken}) > 1:
+            sizes = ", ".join(sorted({f"{picture.width} x {picture.height}" for picture in taken}))
+            raise BadRequest(f"pictures of different sizes: {sizes}", hint="send one camera's pictures")
+        if len(taken) * taken[0].width * taken[0].height > PIXELS_MAX:
+            raise BadRequest(
+                f"{len(taken)} pictures have more than {PIXELS_MAX} pixels",
+                hint="send fewer, or smaller ones",
+            )
+        stack = np.stack([np.asarray(picture) for picture in taken])
+    return torch.from_numpy(np.ascontiguousarray(stack)).permute(0, 3, 1, 2).to(torch.float32)[None] / 255
+
+
+def _shares(values: list[float], what: str) -> list[float]:
+    """Cut to 0..1 like lerobot does; a number that is none is no opinion."""
+    if not all(math.isfinite(value) for value in values):
+        raise ModelError(f"the reward model's {what} is no number", hint="it says nothing about the task")
+    return [min(1.0, max(0.0, value)) for value in values]

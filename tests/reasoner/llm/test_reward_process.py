@@ -1,0 +1,133 @@
+"""The reward kind end to end: a real arbiter, the shipped model in its sidecar, the simulator's runner, and a reasoner whose model asks for progress."""
+
+import asyncio
+import json
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arbiter.testing.fakegpu_check import check_log
+from arbiter.testing.wire import WireClient
+from clients.runner import RunnerClient
+from clients.sidecar.perception import RewardClient
+from schemas.errors import Evicted
+
+pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(400)]
+
+ROOT = Path(__file__).parents[3]
+CONFIGS = ROOT / "configs"
+SKILLS = [str(CONFIGS / "rskills/so101-navigate"), str(CONFIGS / "rskills/so101-progress")]
+GB = 10**9
+
+
+def openai(name: str, **arguments: Any) -> Any:
+    call = {"id": "c", "type": "function", "function": {"name": name, "arguments": json.dumps(arguments)}}
+    return {"choices": [{"message": {"role": "assistant", "content": None, "tool_calls": [call]}}]}
+
+
+@asynccontextmanager
+async def program(environ: dict[str, str], *argv: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", *argv, cwd=ROOT, env=environ, stderr=asyncio.subprocess.PIPE
+    )
+    heard = asyncio.create_task(process.stderr.read()) if process.stderr else None
+    try:
+        yield process
+    finally:
+        if process.returncode is None:
+            process.terminate()
+        await process.wait()
+        if heard is not None:
+            print((await heard).decode())  # shown by pytest where the test fails
+
+
+def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
+    arbiter_daemon: Any, stand_in: Any, tmp_path: Path
+) -> None:
+    runtime = arbiter_daemon.runtime
+    environ = {**arbiter_daemon.environ, "OMP_NUM_THREADS": "1", "MUJOCO_GL": "egl"}
+    result = tmp_path / "result.json"
+    stand_in.json(openai("query_task_progress", window_s=5.0))
+    stand_in.json(openai("query_task_progress", task="tidy up"))
+    stand_in.json(openai("execute_rskill", rskill_id="vram-arbiter/so101-progress"))
+    stand_in.json(openai("finish", success=False, reason="it was only a look"))
+
+    async def story() -> None:
+        serve = (
+            "sidecars",
+            "--name",
+            "reward",
+            "--rskill",
+            f"{SKILLS[1]}/rskill.yaml",
+            "--device",
+            f"fake:{arbiter_daemon.card}",
+        )
+        think = (
+            "reasoner", "--task", "grab the red cube", "--planner", "openai", "--detector", "none", "--scene-vlm", "none",
+            "--reward", "--result", str(result),
+        )  # fmt: skip
+        async with (
+            program(environ, *serve) as sidecar,
+            program(environ, "runner", "sim", "--no-arbiter", "--seed", "1", "--skills", *SKILLS),
+            RewardClient(f"ipc://{runtime}/reward.sock", connect_timeout_s=120.0) as reward,
+            RunnerClient(f"ipc://{runtime}/runner.sock", connect_timeout_s=120.0) as runner,
+        ):
+            picture = (await runner.frame("wrist", max_age_ms=60_000.0, encoding="png"))["data"]
+            llm = {"VRAM_REASONER_LLM_BASE_URL": stand_in.url, "VRAM_REASONER_LLM_MODEL": "m"}
+            async with program({**environ, **llm}, *think) as reasoner:
+                assert await reasoner.wait() == 1, "the planner said that it was no success"
+
+            # resident under a lease of its own, at the weight that it stands for
+            identity = await reward.ping()
+            assert (identity["state"], identity["kind"], identity["pid"]) == (
+                "resident",
+                "reward",
+                sidecar.pid,
+            )
+            with WireClient(arbiter_daemon.endpoint) as arbiter:
+                arbiter.hello("vla")
+                (lease,) = arbiter.ask("status")["leases"]
+                assert (lease["consumer"], lease["pid"], lease["charge_bytes"]) == (
+                    "reward",
+                    sidecar.pid,
+                    3.33 * GB,
+                )
+                token = lease["token"]
+                assert (await reward.score([picture], "grab the red cube", token=token)).progress[0] < 0.5
+
+                # somebody needs the card: it leaves, and says *evicted* to whoever still speaks of the old lease
+                granted = await asyncio.to_thread(arbiter.acquire, "vla", 6 * GB, wait_timeout_s=60.0)
+                assert granted["ok"], granted
+                push = await asyncio.to_thread(arbiter.push, "granted", 60.0)
+                assert (await reward.ping())["state"] == "unloaded"
+                with pytest.raises(Evicted):
+                    await reward.score([picture], "grab the red cube", token=token)
+                assert arbiter.ask(
+                    "release", lease_id=push["lease"]["lease_id"], token=push["lease"]["token"]
+                )["ok"]
+            judged = await reward.score([picture], "grab the red cube")  # there is room again
+            assert judged.progress[0] < 0.5
+
+    async def bounded() -> None:
+        async with asyncio.timeout(350):
+            await story()
+
+    asyncio.run(bounded())
+    steps = json.loads(result.read_text())["steps"]
+    assert [(step["call"]["tool"], step["status"], step["code"]) for step in steps] == [
+        ("query_task_progress", "answered", ""), ("query_task_progress", "error", "bad_request"), ("execute_rskill", "refused", "not_permitted"),
+    ]  # fmt: skip
+    assert "it judges through query_task_progress and moves nothing" in steps[2]["text"]
+    offered = {tool["function"]["name"] for tool in stand_in.asked[0]["tools"]}
+    assert "query_task_progress" in offered
+    assert not any("progress" in name for name in offered - {"query_task_progress"})
+    told = next(json.loads(m["content"]) for m in stand_in.asked[1]["messages"] if m["role"] == "tool")
+    assert told["source"] == "reward_model"
+    assert told["data"]["progress"][-1] < 0.5, "nothing has been grabbed"
+    assert told["data"]["success"][-1] < 0.5
+    report = check_log((arbiter_daemon.card / "log.jsonl").read_text())
+    assert (report.problems, report.oom_events) == ([], 0)
