@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 
+from schemas import otel
 from schemas.config import ArbiterConfig, load_config
 from schemas.errors import (
     AlreadyRunning,
@@ -36,6 +37,8 @@ environment:
   VRAM_ARBITER_ENDPOINT   endpoint, if neither --endpoint nor wire.endpoint is given
   VRAM_ARBITER_RUNTIME    folder of the sockets and of the simulated card (else RUNTIME_DIRECTORY,
                           XDG_RUNTIME_DIR/vram-arbiter or /tmp/vram-arbiter-UID)
+  OTEL_EXPORTER_OTLP_ENDPOINT, OTEL_METRICS_EXPORTER=prometheus and the other standard OTEL_ variables switch
+                          telemetry on (docs/operating.md)
 """
 
 
@@ -150,6 +153,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         places = find_places(config, os.environ, os.getuid())
         if flags.check_config:
+            chosen = config.telemetry
+            otel.plan(
+                os.environ,
+                endpoint=chosen.endpoint,
+                prometheus_port=chosen.prometheus_port,
+                sample_ratio=chosen.sample_ratio,
+            )
             print(
                 f"{flags.config or 'built-in configuration'}: ok (would serve {places.endpoint}, gpu {config.gpu.source})"
             )

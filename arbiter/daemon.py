@@ -17,7 +17,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from arbiter import telemetry
 from arbiter.core.arbiter import Arbiter
@@ -42,11 +42,15 @@ from arbiter.inbox import Inbox
 from arbiter.rpc.peer import group_id, start_ticks
 from arbiter.rpc.server import RouterServer, make_private_folder, socket_path
 from arbiter.rpc.session import SessionSettings, SessionTable
+from schemas import otel
 from schemas.config import ArbiterConfig, GpuConfig
 from schemas.endpoints import arbiter_endpoint, runtime_dir
 from schemas.errors import ConfigError
 from schemas.ids import ProcessKey
 from schemas.units import format_bytes
+
+if TYPE_CHECKING:
+    from arbiter.host.traced import Traced
 
 log = logging.getLogger(__name__)
 
@@ -204,6 +208,7 @@ class Daemon:
         places = find_places(config, self._environ, os.getuid())
         group = self._operators_group()
         self._take_folders(places, group, undo)  # 1
+        traced = self._open_telemetry(undo)
         boot = boot_id()
         journal = Journal.open(places.state, boot)  # 2
         undo.callback(journal.close)
@@ -257,7 +262,14 @@ class Daemon:
             problems=lambda: problems(journal, history),
         )
         executor = Executor(
-            sessions, journal, history, prober.sample, inbox.post, telemetry.log_event, watch.signal
+            sessions,
+            journal,
+            history,
+            prober.sample,
+            inbox.post,
+            telemetry.log_event if traced is None else traced.log_event,
+            watch.signal,
+            None if traced is None else traced.leases,
         )
 
         self._tell_start(history, journal, places, gpus)  # 5
@@ -267,6 +279,8 @@ class Daemon:
                 watch.add(process)
         else:
             inbox.post(Tick())  # lets the core ask for its first readings
+        if traced is not None:
+            traced.watch(loop, lambda: None if inbox.closed else inbox.figures())
         server.bind()  # 6
         server.start(loop, sessions.receive)
         undo.callback(server.stop_receiving)
@@ -282,6 +296,27 @@ class Daemon:
             lock = LockFile(path, str(protects))
             lock.acquire()
             undo.callback(lock.release)
+
+    def _open_telemetry(self, undo: contextlib.ExitStack) -> "Traced | None":
+        """None: it was not asked for, and nothing of it is imported. Raises ConfigError."""
+        chosen = self._config.telemetry
+        installed = otel.set_up(
+            "vram-arbiter",
+            environ=self._environ,
+            endpoint=chosen.endpoint,
+            prometheus_port=chosen.prometheus_port,
+            sample_ratio=chosen.sample_ratio,
+        )
+        if not installed.on:
+            return None
+        undo.callback(installed)
+        if installed.prometheus_port is not None:
+            log.info("telemetry: Prometheus endpoint on loopback, port %d", installed.prometheus_port)
+        from arbiter.host.traced import Traced
+
+        traced = Traced()
+        undo.callback(traced.close)
+        return traced
 
     async def _open_cards(self, places: Places) -> tuple[GpuProbe, tuple[GpuInfo, ...]]:
         chosen = self._config.gpu

@@ -36,6 +36,8 @@ class Core(Protocol):
 
     def why(self, consumer: str, now: float) -> dict[str, Any]: ...
 
+    def figures(self) -> dict[str, Any]: ...
+
     def learnt(self) -> dict[str, dict[str, float]]: ...
 
     def footprints(self) -> dict[str, dict[str, list[int]]]: ...
@@ -96,6 +98,9 @@ class Inbox:
 
     def why(self, consumer: str) -> dict[str, Any]:
         return self._core.why(consumer, self._clock())
+
+    def figures(self) -> dict[str, Any]:
+        return self._core.figures()
 
     def learnt(self) -> dict[str, dict[str, float]]:
         return self._core.learnt()

@@ -45,11 +45,11 @@ def level_of(kind: str) -> int:
     return logging.DEBUG if kind in _DETAILS else logging.INFO
 
 
-def log_event(event: Mapping[str, Any]) -> None:
-    """One event of the history as one line of the log."""
+def log_event(event: Mapping[str, Any], trace: Mapping[str, str] | None = None) -> None:
+    """One event of the history as one line of the log; as JSON with `trace_id` and `span_id` of its span, if it has one."""
     level = level_of(str(event["kind"]))
     if events_log.isEnabledFor(level):
-        events_log.log(level, "%s", sentence(event), extra={"event": dict(event)})
+        events_log.log(level, "%s", sentence(event), extra={"event": dict(event), "trace": trace})
 
 
 def sentence(event: Mapping[str, Any]) -> str:
@@ -91,6 +91,7 @@ class _Json(logging.Formatter):
         }
         if (event := getattr(record, "event", None)) is not None:
             line["event"] = event
+        line.update(getattr(record, "trace", None) or {})
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
         return json.dumps(line, default=str, ensure_ascii=False)

@@ -10,6 +10,8 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from schemas import defaults as d
+from schemas.errors import ConfigError
+from schemas.otel import checked_url
 from schemas.units import ByteSize
 from schemas.yamltext import Path, config_error, parse_yaml, problems_of
 
@@ -201,6 +203,25 @@ class LogConfig(_Section):
     """Lowest level that is written."""
 
 
+class TelemetryConfig(_Section):
+    """Traces and metrics, with the extra `telemetry`. What is set here wins over the OTEL_* variables; nothing set anywhere: off."""
+
+    endpoint: str | None = None
+    """OTLP collector (HTTP, protobuf) for spans and metrics. Null: `OTEL_EXPORTER_OTLP_ENDPOINT`, else none."""
+    prometheus_port: Annotated[int, Field(ge=0, le=65_535)] | None = None
+    """Port of a Prometheus endpoint on 127.0.0.1; 0: any free one, said in the log. Null: none, unless `OTEL_METRICS_EXPORTER` says so."""
+    sample_ratio: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] | None = None
+    """Share of the traces that begin in the daemon; the others are kept where their beginning was. Null: `OTEL_TRACES_SAMPLER_ARG`, else 1."""
+
+    @field_validator("endpoint")
+    @classmethod
+    def _a_collector(cls, value: str | None) -> str | None:
+        try:
+            return None if value is None else checked_url(value, "endpoint")
+        except ConfigError as error:
+            raise ValueError(f"{value!r} is no URL of a collector; {error.hint}") from None
+
+
 class ArbiterConfig(_Section):
     """Everything that an operator can set. Sizes may be written `8GiB`, `450MiB`, `5.3GB` or in bytes."""
 
@@ -217,6 +238,7 @@ class ArbiterConfig(_Section):
     wire: WireConfig = WireConfig()
     state: StateConfig = StateConfig()
     log: LogConfig = LogConfig()
+    telemetry: TelemetryConfig = TelemetryConfig()
 
 
 IPC_PATH_MAX = 107

@@ -362,6 +362,9 @@ class RevokePush(TypedDict):
     ]  # what still runs on the lease (or its tree), whoever marked it; `unloading` is refused before 0
     children: NotRequired[int]  # sub-leases that have to leave first
     park: NotRequired[bool]  # host RAM for its weights is booked until it lets go: release with `parked`
+    traceparent: NotRequired[
+        str
+    ]  # of the eviction, or of whoever waits: the unloading belongs to that trace. W3C
 
 
 class GrantedPush(TypedDict):

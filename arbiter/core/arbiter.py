@@ -20,6 +20,7 @@ from arbiter.core import (
     deadlock,
     eviction,
     explain,
+    figures,
     gangs,
     grants,
     growth,
@@ -108,6 +109,10 @@ class Arbiter:
         """Shape of `schemas.wire.WhyReply`."""
         self._core.now = max(self._core.now, now)
         return explain.why(self._core, consumer)
+
+    def figures(self) -> dict[str, Any]:
+        """The present in numbers (`figures.figures`)."""
+        return figures.figures(self._core)
 
     def learnt(self) -> dict[str, dict[str, float]]:
         """Medians of what was learnt, in the shape of `Settings.learnt`."""

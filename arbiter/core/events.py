@@ -164,6 +164,7 @@ class Reacquired:
     lease: LeaseId
     token: Token
     wait_timeout_s: float | None
+    traceparent: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,6 +41,7 @@ def _begin(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: st
         reason=reason,
         asked_at=core.now,
         next_push_at=core.now + core.settings.revoke_resend_s,
+        traceparent=None if waiter is None else waiter.traceparent,
     )
     gpu.evictions.append(holder.eviction)
     parks = core.host.book(holder.id, holder.spec.park_bytes)
@@ -80,6 +81,7 @@ def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
             "uses": holder.busy_uses(),
             **({"children": len(holder.children)} if holder.children else {}),
             "park": holder.id in core.host.booked,
+            **({"traceparent": eviction.traceparent} if eviction.traceparent else {}),
         },
     )
 

@@ -60,7 +60,11 @@ def begin(core: Core, gpu: Gpu, lease: Lease, event: ResizeAsked, more_bytes: in
     core.enqueue(growth)
     lease.growth = growth.id
     core.note(
-        "queued", growth, position=gpu.queue.position(growth), reason=f"{lease.id} grows by {more_bytes}"
+        "queued",
+        growth,
+        position=gpu.queue.position(growth),
+        grows=lease.id,
+        reason=f"{lease.id} grows by {more_bytes}",
     )
 
 

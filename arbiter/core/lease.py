@@ -123,6 +123,9 @@ class Eviction:
     verdict_at: float | None = None
     verdict: str = ""
     order: Order | None = None  # an operator wanted it
+    traceparent: str | None = (
+        None  # of whoever waits: goes with every `revoke`, so that the unloading is seen where it is waited for
+    )
 
 
 @dataclass(frozen=True, slots=True)

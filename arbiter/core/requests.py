@@ -220,9 +220,11 @@ def reacquire(core: Core, event: Reacquired) -> None:
             "not_permitted", f"{lease.id} belongs to process {lease.process.pid}", "ask as its holder"
         )
     if lease.state in AWAY:
+        lease.traceparent = event.traceparent
         _want_back(core, lease, event.client, event.request, event.wait_timeout_s)
         return
     if lease.state is LeaseState.VERIFYING and (lease.comes_back or lease.parks):
+        lease.traceparent = event.traceparent
         lease.recalled = lease.recalled or Recall(core.now, event.wait_timeout_s)
     elif lease.state is not LeaseState.QUEUED:
         raise bad_state(
@@ -252,6 +254,7 @@ def find_again(core: Core, event: AcquireRequested, client: Client) -> bool:
     if lease is None:
         raise ended_error(core.ended[lease_id])
     if lease.state in AWAY and _still_waits(lease, event):
+        lease.traceparent = event.traceparent
         _want_back(core, lease, event.client, event.request, event.wait_timeout_s)
         return True
     core.hand_to(lease, event.client)  # the newest connection of the process is the one that listens

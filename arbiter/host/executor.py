@@ -43,6 +43,14 @@ class Chronicle(Protocol):
     def append(self, kind: str, data: Mapping[str, Any]) -> Mapping[str, Any]: ...
 
 
+class Traces(Protocol):
+    """`otel.LeaseTelemetry`, where telemetry is on."""
+
+    def outgoing(self, effects: Sequence[fx.Effect]) -> None: ...
+
+    def revoke(self, body: Mapping[str, Any]) -> Mapping[str, Any]: ...
+
+
 class Executor:
     """`perform` is called by the inbox with the effects of one event."""
 
@@ -55,6 +63,7 @@ class Executor:
         post: Callable[[ev.Event], None],
         log_event: Callable[[Mapping[str, Any]], None],
         signal: Callable[[ProcessKey, str], None],
+        traces: Traces | None = None,
     ) -> None:
         self._outbox = outbox
         self._journal = journal
@@ -63,6 +72,7 @@ class Executor:
         self._post = post
         self._log_event = log_event
         self._signal = signal
+        self._traces = traces
         self.owed: dict[str, None] = {}
         """Records still to be deleted: the disk was full when they ended. The next write does it."""
 
@@ -73,6 +83,8 @@ class Executor:
         Whoever waits for an answer has it first: facts are written down after all answers, and readings are begun last of all, since
         their thread takes the interpreter from this one.
         """
+        if self._traces is not None:
+            self._traces.outgoing(effects)
         records = [effect for effect in effects if isinstance(effect, _RECORDS)]
         failed = self._write(records) if records else _NOTHING
         refused: dict[str, JournalUnavailable] = {}  # lease id → why
@@ -104,7 +116,7 @@ class Executor:
             case fx.Reply(client, request, body):
                 self._outbox.reply(client, request, body)
             case fx.Push(client, body):
-                self._outbox.push(client, body)
+                self._outbox.push(client, body if self._traces is None else self._traces.revoke(body))
             case fx.Signal(process, kind):
                 self._signal(process, kind)
             case fx.Refuse(client, request, code, message, hint, details):

@@ -402,7 +402,11 @@ class SessionTable:
             case w.Cancel():
                 post(ev.CancelRequested(client, re, LeaseId(request.lease_id)))
             case w.Reacquire():
-                post(ev.Reacquired(client, re, *_on_lease(request), request.wait_timeout_s))
+                post(
+                    ev.Reacquired(
+                        client, re, *_on_lease(request), request.wait_timeout_s, request.traceparent
+                    )
+                )
             case w.Resize():
                 size = request.footprint
                 sizes = (size.load_peak_bytes, size.steady_bytes, size.residue_bytes)

@@ -291,6 +291,7 @@ class Consumer:
     priority: int = d.PRIORITY
     specs: dict[LeaseId, Spec] = field(default_factory=dict)
     nonces: int = 0
+    traceparent: str | None = None  # sent with what it asks for
 
     # -- connection ------------------------------------------------------------------------------------------------
     def connect(self) -> list[Effect]:
@@ -389,6 +390,7 @@ class Consumer:
                 nonce or f"n{self.nonces}",
                 self.spec(load_peak_bytes, steady_bytes, **spec),
                 wait_timeout_s,
+                self.traceparent,
             )
         )
 
@@ -452,7 +454,12 @@ class Consumer:
     ) -> list[Effect]:
         return self.driver.post(
             Reacquired(
-                self.client, self.driver.next_request(), lease, token or self.token(lease), wait_timeout_s
+                self.client,
+                self.driver.next_request(),
+                lease,
+                token or self.token(lease),
+                wait_timeout_s,
+                self.traceparent,
             )
         )
 

@@ -67,7 +67,7 @@ class ArbiterProcess:
         environ = {
             key: value
             for key, value in os.environ.items()
-            if not key.startswith(("VRAM_ARBITER_", "WATCHDOG_"))
+            if not key.startswith(("VRAM_ARBITER_", "WATCHDOG_", "OTEL_"))
         }
         environ["VRAM_ARBITER_RUNTIME"] = str(self.runtime)
         environ["PYTHONPATH"] = str(_ROOT)

@@ -39,6 +39,13 @@ def test_an_event_for_programs(capsys: pytest.CaptureFixture[str]) -> None:
     assert line["level"] == "info"
 
 
+def test_a_line_for_programs_names_its_span(capsys: pytest.CaptureFixture[str]) -> None:
+    telemetry.set_up_logging("json", "info")
+    telemetry.log_event(EVENT, {"trace_id": "a" * 32, "span_id": "b" * 16})
+    line = json.loads(capsys.readouterr().err)
+    assert (line["event"], line["trace_id"], line["span_id"]) == (EVENT, "a" * 32, "b" * 16)
+
+
 def test_frequent_events_are_quiet_and_trouble_is_loud(capsys: pytest.CaptureFixture[str]) -> None:
     telemetry.set_up_logging("human", "info")
     telemetry.log_event({**EVENT, "kind": "use_began"})

@@ -146,6 +146,12 @@ def test_other_processes_stay_visible_and_the_cards_reachable() -> None:
     kill = settings_of((SOURCES / "system/vram-arbiter.service.d/kill.conf.example").read_text())
     assert kill["Service", "AmbientCapabilities"] == ["CAP_KILL"]
     assert found["Service", "AmbientCapabilities"] == [""], "opt-in means that it is not there by itself"
+    online = settings_of((SOURCES / "system/vram-arbiter.service.d/telemetry.conf.example").read_text())
+    assert (online["Service", "IPAddressAllow"], found["Service", "IPAddressDeny"]) == (
+        ["localhost"],
+        ["any"],
+    )
+    assert found["Service", "PrivateNetwork"] == ["yes"]
 
 
 def test_all_programs_meet_in_one_folder() -> None:

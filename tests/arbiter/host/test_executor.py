@@ -190,3 +190,29 @@ def test_what_is_owed_is_deleted_without_a_further_change() -> None:
     recorder.executor.settle()
     recorder.executor.settle()
     assert recorder.done == [("journal", ("lease:L1-1", None))], "once"
+
+
+def test_telemetry_hears_a_batch_before_it_is_performed_and_names_its_spans() -> None:
+    recorder = Recorder()
+
+    class Traces:
+        def outgoing(self, effects: Sequence[fx.Effect]) -> None:
+            recorder.done.append(("outgoing", len(effects)))
+
+        def revoke(self, body: Mapping[str, Any]) -> Mapping[str, Any]:
+            return {**body, "traceparent": "mine"}
+
+    executor = Executor(
+        recorder,
+        recorder,
+        recorder,
+        recorder.sample,
+        recorder.post,
+        recorder.log_event,
+        recorder.signal,
+        Traces(),
+    )
+    push = fx.Push(A, {"push": "revoke", "lease_id": "L1-1"})
+    executor.perform([fx.JournalPut("lease:L1-1", {}), push])
+    assert [done[0] for done in recorder.done] == ["outgoing", "journal", "push"]
+    assert recorder.done[-1][2] == {"push": "revoke", "lease_id": "L1-1", "traceparent": "mine"}

@@ -1,0 +1,76 @@
+"""The dashboard that is shipped shows what the daemon really exports, by the names that Prometheus sees."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("prometheus_client", reason="the extra `telemetry`")
+
+from opentelemetry.exporter.prometheus import PrometheusMetricReader
+from opentelemetry.sdk.metrics import MeterProvider
+from opentelemetry.trace import NoOpTracerProvider
+from prometheus_client import CollectorRegistry
+from prometheus_client.exposition import generate_latest
+from prometheus_client.parser import text_string_to_metric_families
+
+from arbiter.core.effects import Note, Push
+from arbiter.host.otel import LeaseTelemetry
+from arbiter.host.otel_metrics import LeaseMetrics
+from arbiter.testing.core_driver import CoreDriver
+from arbiter.testing.scenes import sent_away
+from schemas import defaults as d
+
+DASHBOARD = Path(__file__).parents[3] / "configs" / "grafana" / "arbiter.json"
+
+
+class NeverCalled:
+    def call_later(self, *_: object) -> Any:
+        return None
+
+
+@pytest.fixture(scope="module")
+def exported() -> dict[str, set[str]]:
+    """Names of series → their labels, after a handover and a denial. Only metrics are on: there is no tracer."""
+    registry = CollectorRegistry()
+    reader = PrometheusMetricReader(scope_info_enabled=False, registry=registry)
+    meters = MeterProvider([reader], shutdown_on_exit=False)
+    numbers = LeaseMetrics(meters.get_meter("test"))
+    telemetry = LeaseTelemetry(NoOpTracerProvider().get_tracer("test"), numbers)
+    driver = CoreDriver(8 * d.GIB)
+    sent_away(driver)
+    driver.consumer("huge").try_acquire(80 * d.GIB)
+    telemetry.outgoing(driver.effects)
+    for push in (effect for effect in driver.effects if isinstance(effect, Push)):
+        assert telemetry.revoke(push.body) == push.body, "no span of ours to name"
+    for note in (effect for effect in driver.effects if isinstance(effect, Note)):
+        event = {"seq": 1, "at_wall_s": 1.8e9, "kind": note.kind, **note.data}
+        assert telemetry.observe(event) == {}
+    numbers.watch(NeverCalled(), driver.arbiter.figures)  # type: ignore[arg-type]
+    series: dict[str, set[str]] = {}
+    for family in text_string_to_metric_families(generate_latest(registry).decode()):
+        for sample in family.samples:
+            series.setdefault(sample.name, set()).update(sample.labels)
+    return series
+
+
+def expressions() -> list[str]:
+    panels = json.loads(DASHBOARD.read_text())["panels"]
+    return [target["expr"] for panel in panels for target in panel["targets"]]
+
+
+@pytest.mark.parametrize("expression", expressions())
+def test_every_curve_exists(expression: str, exported: dict[str, set[str]]) -> None:
+    known = set(re.findall(r"\bvram_\w+", expression))
+    names = {name for name in known if name in exported}
+    assert names, f"{known} is not exported: {sorted(exported)}"
+    labels = set().union(*(exported[name] for name in names))
+    assert known - names <= labels
+
+
+def test_every_metric_has_a_panel(exported: dict[str, set[str]]) -> None:
+    shown = " ".join(expressions())
+    own = {re.sub(r"_(bucket|count|sum|total)$", "", name) for name in exported if name.startswith("vram_")}
+    assert {name for name in own if name not in shown} == set()
