@@ -35,6 +35,7 @@ from runner.deployment import (
     offered,
     plan,
     read_deployment,
+    unkept,
     unused,
 )
 from runner.goals import GoalServer
@@ -46,6 +47,7 @@ from schemas.endpoints import program_endpoint, runtime_dir
 from schemas.errors import AlreadyRunning, RunnerUnreachable, VramError
 from schemas.goals import ResultPush
 from schemas.manifest import Kind, RSkillManifest
+from schemas.robot import RobotEnvironment
 from schemas.world import RunResult
 
 log = logging.getLogger("runner")
@@ -126,11 +128,11 @@ class Deploy:
             print(plan(self._file, parts, check, self._facts(check)))
             print("dry run: nothing was opened")
             return 0
-        for text in (*parts.gate.unkept, *unused(self._file.robot)):
+        for text in (*unkept(parts, check), *unused(self._file.robot)):
             log.warning("%s is not kept", text)
         install_signals(self._stopping)
         async with contextlib.AsyncExitStack() as stack:
-            claim(self._file.robot.robot_id, stack)
+            claim(self._file.robot, stack)
             arbiter = None if self._args.no_arbiter else await connect_arbiter(self._args.arbiter, stack)
             runner = self._runner(parts)
             runner.trace_ticks = self._args.trace_ticks
@@ -257,20 +259,25 @@ class Deploy:
         return 1 if runner.estop is None else 2  # 2: whoever restarts failed programs leaves this one alone
 
 
-def claim(robot_id: str, stack: contextlib.AsyncExitStack) -> None:
-    """One robot, one runner. Raises AlreadyRunning before a second one touches the motors of the first."""
+def claim(robot: RobotEnvironment, stack: contextlib.AsyncExitStack) -> None:
+    """One robot, one runner; one port, too, under whatever names its robots go. Raises AlreadyRunning before a second one touches the
+    motors of the first."""
+    _claim(f"robot {robot.robot_id}", robot.robot_id, stack)
+    if port := robot.hal.transport.get("port"):
+        _claim(f"port {port}", os.path.realpath(str(port)), stack)
+
+
+def _claim(what: str, key: str, stack: contextlib.AsyncExitStack) -> None:
     folder = Path(runtime_dir(os.environ, os.getuid()))
     folder.mkdir(mode=0o750, parents=True, exist_ok=True)
-    path = folder / f"robot-{re.sub(r'[^A-Za-z0-9._-]', '_', robot_id)}.lock"
+    path = folder / f"{what.partition(' ')[0]}-{re.sub(r'[^A-Za-z0-9._-]', '_', key)}.lock"
     lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660)
     stack.callback(os.close, lock)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         owner = os.pread(lock, 32, 0).decode(errors="replace").strip()
-        raise AlreadyRunning(
-            f"robot {robot_id} belongs to process {owner or '?'}", hint="stop it first"
-        ) from None
+        raise AlreadyRunning(f"{what} belongs to process {owner or '?'}", hint="stop it first") from None
     os.ftruncate(lock, 0)
     os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
 

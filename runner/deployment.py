@@ -17,6 +17,7 @@ from runner.clock import Clock
 from runner.protocols import Hal, SensorReader
 from runner.robot_gate import RobotGate
 from runner.skills.sidecar_policy import wire_up
+from runner.world_state import JOINT_STATE
 from schemas.errors import ConfigError, ManifestInvalid, UnknownSkill
 from schemas.manifest import Kind, RSkillManifest
 from schemas.robot import RobotEnvironment, VlaSpec, load_robot
@@ -84,6 +85,10 @@ def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
     errors: list[ConfigError] = []
     readers: list[SensorReader] = []
     for index, sensor in enumerate(robot.sensors):
+        if sensor.sensor_id == JOINT_STATE:
+            errors.append(
+                file.error((f"sensors[{index}].sensor_id", f"no camera may be called {JOINT_STATE}"))
+            )
         try:
             readers.append(make_reader(sensor, clock))
         except ConfigError as error:
@@ -116,6 +121,14 @@ def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
 def goal_gate(gate: RobotGate, manifest: RSkillManifest, cameras: Iterable[str]) -> RobotGate:
     """The gate for one goal. Raises ConfigError for an envelope that cannot be kept on this robot."""
     return gate.tightened(f"envelope of {manifest.name}", manifest.envelope, frozenset(cameras))
+
+
+def unkept(parts: Parts, catalogue: Catalogue) -> tuple[str, ...]:
+    """What the file's `safety`, and the envelope of any skill that goals may ask for, want and the gate does not keep."""
+    found = dict.fromkeys(parts.gate.unkept)
+    for manifest in catalogue.executable():
+        found |= dict.fromkeys(goal_gate(parts.gate, manifest, ()).unkept)
+    return tuple(found)
 
 
 # -- skills -----------------------------------------------------------------------------------------------------------
@@ -243,7 +256,7 @@ def plan(file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Iterab
     if robot.safety is not None:
         given = robot.safety.model_dump(exclude_unset=True)
         lines.append(("safety", ", ".join(f"{key} {value}" for key, value in given.items())))
-    lines += [("NOT KEPT", text) for text in parts.gate.unkept]
+    lines += [("NOT KEPT", text) for text in unkept(parts, catalogue)]
     lines += [("skill", text) for text in catalogue.summary()]
     if robot.task is not None and robot.vla is not None:
         limit = f", at most {robot.task.max_steps} ticks" if robot.task.max_steps else ""

@@ -153,7 +153,7 @@ def tighten(
         torque_nm=min(limits.torque_nm, envelope.max_torque_nm),
         force_n=min(limits.force_n, envelope.max_force_n),
         contact_force_n=min(limits.contact_force_n, envelope.contact_force_threshold_n),
-        unkept=(*limits.unkept, *_unkept(envelope, name, kinematics)),
+        unkept=(*limits.unkept, *_unkept(envelope, name, robot, kinematics)),
     )
     if kinematics is None:
         return tightened
@@ -219,7 +219,9 @@ def _vector(values: Iterable[float]) -> Vector3:
     return x, y, z
 
 
-def _unkept(envelope: SafetyEnvelope, name: str, kinematics: Kinematics | None) -> Sequence[str]:
+def _unkept(
+    envelope: SafetyEnvelope, name: str, robot: RobotDescription, kinematics: Kinematics | None
+) -> Sequence[str]:
     """Fields that somebody wrote down and that this gate does not keep."""
     kept = {*POSITIVE, *NEEDS_KINEMATICS, *KEPT_ELSEWHERE, *NO_BASE}
     found = [
@@ -229,6 +231,15 @@ def _unkept(envelope: SafetyEnvelope, name: str, kinematics: Kinematics | None) 
     ]
     if kinematics is None:
         found.append(f"{name}.max_ee_speed_m_s (no kinematics of this robot)")
-        if "max_force_n" in envelope.model_fields_set:
-            found.append(f"{name}.max_force_n (no kinematics of this robot)")
+    without = (
+        ("max_torque_nm", robot.tells_efforts, "this robot does not tell efforts"),
+        ("max_force_n", robot.tells_efforts, "this robot does not tell efforts"),
+        ("max_force_n", kinematics is not None, "no kinematics of this robot"),
+        ("contact_force_threshold_n", False, "no robot here has contact sensors"),
+    )
+    reasons: dict[str, str] = {}
+    for key, there, why in without:
+        if not there and key in envelope.model_fields_set:
+            reasons.setdefault(key, why)
+    found += [f"{name}.{key} ({why})" for key, why in reasons.items()]
     return found

@@ -187,6 +187,9 @@ class RobotDescription:
     joints: tuple[Joint, ...]
     rest_pose_rad: Mapping[str, float]
     simulated: bool = False
+    tells_efforts: bool = (
+        False  # whether its joint state has efforts: limits of torque and force are kept by them
+    )
 
     @property
     def joint_names(self) -> tuple[str, ...]:

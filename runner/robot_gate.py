@@ -22,6 +22,7 @@ MAX_STATE_AGE_S = 0.2  # an older joint state is not the robot's any more
 REFERENCE_AGE_S = (
     0.2  # steps are measured from the last target while it is so young, else from where the robot is
 )
+SPARE = 1.0  # so many periods a joint may be ahead of its speed limit: what a tick came late the next one comes early
 LATE_MAX = 1.5  # a late tick's step may be so much longer, no more: the servo makes it as fast as it can
 MAX_FOLLOWING_ERROR_RAD = 0.8  # a joint so far behind its target is blocked; servos lag by 0.1 s at most
 OVERSPEED = 1.5  # a measured speed of so many times the limit is a fault, not a servo's overshoot
@@ -40,6 +41,8 @@ class _Memory:
     """What all gates of one robot share: the last targets that passed (rad, stamp) and the latch."""
 
     last: dict[str, tuple[float, int]] = field(default_factory=dict)
+    passed_ns: int = 0  # when the last action passed
+    spare_s: float = 0.0  # time that had passed by then and no step has used
     tripped: str = ""
 
 
@@ -48,8 +51,9 @@ class _Motion:
     """One step in judgement. Joints in rad by name."""
 
     measured: Mapping[str, float]
-    start: Mapping[str, float]  # where each commanded joint's step begins
-    elapsed_s: float
+    start: dict[str, float]  # where each commanded joint's step begins
+    elapsed_s: float  # what a step's length is measured by
+    unused_s: float  # what has passed since the last one, and what was left then: no step uses more
     yielding: frozenset[str]
 
 
@@ -146,6 +150,10 @@ class RobotGate:
         self._joint_speed(targets, motion, problems)
         self._tool_speed(targets, motion, problems)
         self._workspace(targets, motion, problems)
+        self._memory.passed_ns = world.stamp_ns
+        self._memory.spare_s = min(
+            max(0.0, motion.unused_s - self._used_s(targets, motion)), SPARE * self._period_s
+        )
         for name, value in targets.items():
             self._memory.last[name] = (value, world.stamp_ns)
         row = tuple(targets[name] for name in names)
@@ -225,18 +233,34 @@ class RobotGate:
     def _motion(
         self, targets: Targets, measured: Mapping[str, float], yielding: frozenset[str], now_ns: int
     ) -> _Motion:
-        start, elapsed_s = {}, self._period_s
+        start, elapsed_s, follows = {}, self._period_s, False
         for name in targets:
             last = self._memory.last.get(name)
             if last is not None and 0 <= now_ns - last[1] <= REFERENCE_AGE_S * 1e9:
-                start[name] = self._last(name, measured)
+                start[name], follows = self._last(name, measured), True
                 late_s = (now_ns - last[1]) / 1e9
                 elapsed_s = max(elapsed_s, min(late_s, LATE_MAX * self._period_s))
             else:
                 start[name] = measured[name]
         for name in yielding:
             start[name] = targets[name]
-        return _Motion(measured, start, elapsed_s, yielding)
+        unused_s = (1 + SPARE) * self._period_s
+        if follows:
+            unused_s = self._memory.spare_s + (now_ns - self._memory.passed_ns) / 1e9
+        return _Motion(measured, start, max(min(elapsed_s, unused_s), EPSILON), unused_s, yielding)
+
+    def _used_s(self, targets: Targets, motion: _Motion) -> float:
+        """How long the steps take at the greatest speeds."""
+        used = [
+            abs(value - motion.start[name]) / self.limits.speeds_rad_s[name]
+            for name, value in targets.items()
+            if name not in motion.yielding
+        ]
+        if self._kinematics is not None and self.limits.ee_speed_m_s < math.inf:
+            begin = self._tool({**motion.measured, **motion.start})
+            way = math.dist(begin, self._tool({**motion.measured, **targets}))
+            used.append(way / self.limits.ee_speed_m_s)
+        return max(used, default=0.0)
 
     def _joint_speed(self, targets: Targets, motion: _Motion, problems: list[str]) -> None:
         grippers = {joint.name for joint in self._robot.joints if joint.gripper}
@@ -258,7 +282,12 @@ class RobotGate:
                 targets[name] = min(max(motion.start[name] + math.copysign(longest, step), low), high)
             behind = abs(targets[name] - motion.measured[name])
             if behind > MAX_FOLLOWING_ERROR_RAD and name not in grippers:  # a grasp is meant to block
-                raise _Withheld(f"{name} is {behind:.2f} rad behind its target: it does not follow")
+                # withholding would keep up the pressure; a policy that goes on from its far target is withheld as too fast
+                problems.append(
+                    f"{name} is {behind:.2f} rad behind its target: it does not follow, and is let go"
+                )
+                low, high = self.limits.joints_rad[name]
+                targets[name] = motion.start[name] = min(max(motion.measured[name], low), high)
 
     def _tool_speed(self, targets: Targets, motion: _Motion, problems: list[str]) -> None:
         longest = min(self.limits.ee_speed_m_s * motion.elapsed_s, self.limits.ee_step_m)

@@ -8,6 +8,7 @@ up `CATCH_UP_MAX_S` of it and forgets the rest, so that no call takes longer tha
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from runner.clock import Clock, SystemClock
@@ -27,7 +28,7 @@ class So101MujocoTwin(HalBase):
     def __init__(
         self, *, start_pose_rad: Mapping[str, float] | None = None, clock: Clock | None = None
     ) -> None:
-        super().__init__(so101(simulated=True))
+        super().__init__(replace(so101(simulated=True), tells_efforts=True))
         self._clock = clock or SystemClock()
         self._start = {**self.description.rest_pose_rad, **(start_pose_rad or {})}
         self._model: Any = None

@@ -1,6 +1,7 @@
 """`vram-runner deploy` as a process: MuJoCo's twin, a camera that plays a file, goals over a socket, signals, the emergency stop."""
 
 import asyncio
+import contextlib
 import json
 import os
 import signal
@@ -13,7 +14,9 @@ from typing import Any
 import pytest
 
 from clients.runner import RunnerClient
-from schemas.errors import EstopRequested, UnknownSkill
+from runner.cli_deploy import claim
+from schemas.errors import AlreadyRunning, EstopRequested, UnknownSkill
+from schemas.robot import HalConfig, RobotEnvironment
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
 
@@ -214,6 +217,30 @@ def test_after_an_emergency_stop_a_task_is_not_restarted_and_the_robot_stays_con
     out, err = process.communicate(timeout=60)
     assert process.returncode == 2, err  # systemd's RestartPreventExitStatus
     assert json.loads(out)["success"] is False
+
+
+def test_a_port_has_one_runner_whatever_its_robots_are_called(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two files of one arm, copied and renamed, would both drive its motors."""
+    monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(tmp_path))
+    bus, link = tmp_path / "ttyACM0", tmp_path / "by-id"
+    bus.touch()
+    link.symlink_to(bus)
+
+    def robot(robot_id: str, port: Path) -> RobotEnvironment:
+        return RobotEnvironment(
+            robot_id=robot_id, hal=HalConfig(adapter="lerobot:so101_follower", transport={"port": str(port)})
+        )
+
+    async def scenario() -> None:
+        async with contextlib.AsyncExitStack() as stack:
+            claim(robot("left", bus), stack)
+            with pytest.raises(AlreadyRunning, match=f"by-id belongs to process {os.getpid()}"):
+                claim(robot("right", link), stack)
+            claim(robot("other", tmp_path / "ttyACM1"), stack)
+
+    asyncio.run(scenario())
 
 
 def test_a_robot_has_one_runner(start: Start, tmp_path: Path) -> None:

@@ -73,6 +73,21 @@ def test_the_dry_run_says_what_would_run_and_opens_nothing(dry_run: DryRun) -> N
     assert lines[-1] == "dry run: nothing was opened"
 
 
+def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_robot_moves(
+    dry_run: DryRun, tmp_path: Path
+) -> None:
+    folder = tmp_path / "skills" / "careful"
+    folder.mkdir(parents=True)
+    text = GRAB.read_text(encoding="utf-8") + "envelope: {human_in_loop_required: [grasp], max_force_n: 5}\n"
+    (folder / "rskill.yaml").write_text(text, encoding="utf-8")
+    sensors = "sensors: [{sensor_id: front, backend_params: {device: 0}}, {sensor_id: wrist, backend_params: {device: 1}}]\n"
+    _, out, err = dry_run(TWIN + sensors, skills=folder)
+    assert err == ""
+    said = [line for line in out.splitlines() if line.startswith("NOT KEPT")]
+    assert any("human_in_loop_required" in line and "so101-grab" in line for line in said)
+    assert any("max_force_n (this robot does not tell efforts)" in line for line in said)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -93,6 +108,10 @@ def test_the_dry_run_says_what_would_run_and_opens_nothing(dry_run: DryRun) -> N
             r"robot\.yaml:4: safety\.max_joint_speed_factor: must be above 0",
         ),
         (TWIN + "save_dir: out\n", r"robot\.yaml:3: save_dir: this version does not record"),
+        (
+            TWIN + "sensors:\n  - {sensor_id: joint_state, backend_params: {device: 0}}\n",
+            r"robot\.yaml:4: sensors\[0\]\.sensor_id: .* joint_state",
+        ),
         (TWIN + "rate_hz: 0\n", r"robot\.yaml:3: rate_hz: "),
         (
             TWIN + "task: {id: t}\nvla:\n  id: no/such\n",

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from runner.limits import Vector3
 from runner.protocols import Joint, RobotDescription
 from runner.robot_gate import LATE_MAX, MAX_FOLLOWING_ERROR_RAD, RobotGate
 from runner.safety import CLAMP_TOLERANCE_RAD
+from runner.skill_runner import WITHHELD_IN_A_ROW_MAX
 from schemas.control import ControlMode
 from schemas.errors import ConfigError
 from schemas.manifest.contracts import SafetyEnvelope
@@ -184,6 +186,25 @@ def test_steps_are_measured_from_the_last_target_while_it_is_young() -> None:
     assert allowed == pytest.approx((0.3, 1.0, 0.5))
 
 
+@pytest.mark.parametrize("early", [0.0, 0.03, 0.3, 0.5, 0.9])
+def test_ticks_that_come_late_and_then_early_make_no_joint_faster(early: float) -> None:
+    """A late tick may go farther, and the next one, which is in time, less far by as much: else a jittering loop moves faster than the limit."""
+    motors = {"turn": -2.9}
+    checked = RobotGate(ROBOT, rate_hz=30.0, sent=lambda: motors)
+    ms, begun = 1000.0, -2.9
+    for tick in range(60):
+        share = 1 + early if tick % 2 else 1 - early
+        ms += share * 1000 / 30
+        wanted = motors["turn"] + min(max(share, 1.0), LATE_MAX) * STEP
+        allowed, _ = checked.check(to(wanted, joint_names=("turn",)), at(motors["turn"], 1.0, 0.5, ms=ms))
+        motors["turn"] = row_of((allowed, ()))[0]
+        if motors["turn"] > 2.5:  # the way back
+            motors["turn"], begun = -2.9, begun - 5.4
+    moved = motors["turn"] - begun
+    assert moved <= 3.0 * (ms - 1000.0) / 1000 + 2 * STEP
+    assert moved >= 0.9 * 3.0 * (ms - 1000.0) / 1000
+
+
 def test_a_withheld_step_is_no_reference_for_the_next_one() -> None:
     checked = gate()
     for tick in range(20):  # a lost policy does not get to its far target by repeating it
@@ -207,15 +228,27 @@ def test_steps_that_were_dropped_for_being_late_do_not_add_up() -> None:
     assert row_of(shortened) == pytest.approx((0.15,))
 
 
-def test_a_joint_that_does_not_follow_is_not_pushed_further() -> None:
-    checked, turn, allowed = gate(), 0.0, True
-    for tick in range(30):  # blocked at 0: measured never changes
-        allowed = checked.check(to(turn + STEP, 1.0, 0.5), at(*HERE, ms=1000 + 100 * tick / 3))[0] is not None
-        if not allowed:
-            break
-        turn += STEP
-    assert not allowed
-    assert turn == pytest.approx(MAX_FOLLOWING_ERROR_RAD, abs=STEP)
+def test_a_joint_that_does_not_follow_is_let_go_and_not_pushed_again() -> None:
+    """Blocked at 0, by somebody perhaps. Whoever only stops sending leaves the motor pulling towards the last target."""
+    motors = dict(zip(NAMES, HERE, strict=True))
+    checked = RobotGate(ROBOT, rate_hz=30.0, sent=lambda: motors)
+    farthest, turn, withheld = 0.0, 0.0, 0
+    for tick in range(60):  # measured never changes
+        turn = min(turn + STEP, 1.5)
+        allowed, problems = checked.check(
+            to(turn, joint_names=("turn",)), at(*HERE, ms=1000 + 100 * tick / 3)
+        )
+        if allowed is None:
+            withheld += 1
+            continue
+        withheld = 0
+        motors["turn"] = allowed.rows[0][0]
+        farthest = max(farthest, motors["turn"])
+        if problems:
+            assert "it does not follow" in problems[0]
+    assert farthest == pytest.approx(MAX_FOLLOWING_ERROR_RAD, abs=STEP)
+    assert motors["turn"] == 0.0  # no pressure is left
+    assert withheld > WITHHELD_IN_A_ROW_MAX  # so the goal fails
 
 
 def test_a_measured_speed_beyond_all_limits_stops() -> None:
@@ -398,7 +431,17 @@ def test_what_is_asked_for_and_not_kept_is_told() -> None:
         "safety.max_ee_speed_m_s",
         "safety.max_force_n",
     }
-    assert gate(max_force_n=3.0, deadman_required=False).unkept == ()
+    assert gate(max_ee_speed_m_s=0.5, deadman_required=False).unkept == ()
+
+
+def test_a_limit_of_force_is_told_as_not_kept_where_no_effort_is_measured() -> None:
+    asked = {"max_force_n": 3.0, "max_torque_nm": 2.0, "contact_force_threshold_n": 5.0}
+    blind = gate(**asked).unkept
+    assert {line.split(" ")[0] for line in blind} == {f"safety.{key}" for key in asked}
+    feeling = replace(ROBOT, tells_efforts=True)
+    envelopes = {"safety": SafetyEnvelope(**asked)}
+    kept = RobotGate(feeling, rate_hz=30.0, kinematics=Planar(), envelopes=envelopes).unkept
+    assert kept == ("safety.contact_force_threshold_n (no robot here has contact sensors)",)
 
 
 def test_an_action_cannot_switch_a_check_off() -> None:
