@@ -108,7 +108,8 @@ async def run(args: argparse.Namespace) -> int:
         arbiter = None if alone else await connect_arbiter(args.arbiter, stack)
         recorder = None
         if args.video is not None:
-            recorder = Recorder(args.video, fps=1.0 / period_s / world.video_every)
+            patient = policy is not None and args.rate == 0  # nobody else waits for this world
+            recorder = Recorder(args.video, fps=1.0 / period_s / world.video_every, wait=patient)
             stack.callback(recorder.close)
         runner = SimRunner(
             world.make,

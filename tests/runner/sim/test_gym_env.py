@@ -14,6 +14,7 @@ pytest.importorskip("gymnasium")
 from runner.protocols import Act, Goal, Hold, SkillEnded, SkillKey  # noqa: E402
 from runner.sim.gym_config import GymConfig  # noqa: E402
 from runner.sim.gym_env import GymEnv  # noqa: E402
+from runner.sim.policies import policy_of  # noqa: E402
 from runner.sim.sim_runner import SimRunner  # noqa: E402
 from schemas.control import ControlMode  # noqa: E402
 from schemas.errors import ConfigError, EnvironmentFailed, ModelError  # noqa: E402
@@ -239,6 +240,26 @@ def test_a_mujoco_environment_of_gymnasium_is_driven_and_seen() -> None:
     assert runner.episodes[0].steps == result.n_ticks - 1 < 100
     assert runner.snapshot("render", 0.5).rgb.any()
     runner.deactivate()
+
+
+@pytest.mark.parametrize(
+    "env_id", ["Acrobot-v1", "Pendulum-v1", "Blackjack-v1", "FrozenLake-v1", "Taxi-v4", "Pusher-v5"]
+)
+def test_gymnasiums_own_environments_of_all_kinds_can_be_played(env_id: str) -> None:
+    runner = SimRunner(
+        lambda: GymEnv(env_id, render=False),
+        rate_hz=0,
+        episodes=2,
+        max_steps=10,
+        policy=policy_of("random").play,
+    )
+    runner.activate()
+    result = runner.run()
+    runner.deactivate()
+    assert runner.policy_error is None
+    assert list(runner.violations) == []
+    assert result.n_ticks == 2 + sum(episode.steps for episode in runner.episodes)
+    assert all(episode.total_reward is not None for episode in runner.episodes)
 
 
 # -- refusals -------------------------------------------------------------------------------------------------------
