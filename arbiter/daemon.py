@@ -43,6 +43,7 @@ from arbiter.rpc.peer import group_id, start_ticks
 from arbiter.rpc.server import RouterServer, make_private_folder, socket_path
 from arbiter.rpc.session import SessionSettings, SessionTable
 from schemas import otel
+from schemas.commands import TRACEPARENT_VARIABLE
 from schemas.config import ArbiterConfig, GpuConfig
 from schemas.endpoints import arbiter_endpoint, runtime_dir
 from schemas.errors import ConfigError
@@ -314,8 +315,8 @@ class Daemon:
             log.info("telemetry: Prometheus endpoint on loopback, port %d", installed.prometheus_port)
         from arbiter.host.traced import Traced
 
-        traced = Traced()
-        undo.callback(traced.close)
+        traced = Traced(self._environ.get(TRACEPARENT_VARIABLE))
+        undo.push(lambda _, error, __: traced.close(self._exit_code, error))
         return traced
 
     async def _open_cards(self, places: Places) -> tuple[GpuProbe, tuple[GpuInfo, ...]]:

@@ -344,7 +344,8 @@ class Residency:
 
     async def _load(self, lease: Lease | None) -> None:
         """Put the model on the card; on failure everything is taken back before the lease is."""
-        with tracing.span(telemetry.SPAN_SIDECAR_LOAD, attributes=self._labels()):
+        attributes = self._labels() | ({telemetry.ATTR_LEASE: lease.lease_id} if lease is not None else {})
+        with tracing.span(telemetry.SPAN_SIDECAR_LOAD, attributes=attributes):
             await self._load_measured(lease)
 
     async def _load_measured(self, lease: Lease | None) -> None:

@@ -10,12 +10,18 @@ from arbiter import telemetry
 from arbiter.host.otel import LeaseTelemetry
 from arbiter.host.otel_metrics import LeaseMetrics
 from schemas import telemetry as names
+from schemas import tracing
 
 
 class Traced:
-    """`leases` goes to the executor, `log_event` too; `watch` once the core is there, `close` before the SDK ends."""
+    """`leases` goes to the executor, `log_event` too; `watch` once the core is there, `close` before the SDK ends.
 
-    def __init__(self) -> None:
+    The daemon's own run is a span beside what it serves, `cli.command`.
+    """
+
+    def __init__(self, traceparent: str | None = None) -> None:
+        """`traceparent`: of who started the daemon."""
+        self._command = tracing.begin(names.SPAN_COMMAND, traceparent, {names.ATTR_COMMAND: "serve"})
         self._metrics = LeaseMetrics(metrics.get_meter(names.TRACER))
         self.leases = LeaseTelemetry(trace.get_tracer(names.TRACER), self._metrics)
 
@@ -26,6 +32,13 @@ class Traced:
     def watch(self, loop: asyncio.AbstractEventLoop, read: Callable[[], Mapping[str, Any] | None]) -> None:
         self._metrics.watch(loop, read)
 
-    def close(self) -> None:
+    def close(self, code: int = 0, error: BaseException | None = None) -> None:
+        """`code`: what the daemon exits with, unless it fails with `error`."""
         self._metrics.close()
         self.leases.close()
+        if error is None:
+            self._command.set_attribute(names.ATTR_EXIT_CODE, code)
+        else:
+            self._command.record_exception(error)
+            self._command.set_status(trace.Status(trace.StatusCode.ERROR, str(error)))
+        self._command.end()

@@ -38,8 +38,10 @@ def test_a_program_that_does_not_trace_does_not_import_the_api() -> None:
 
 def test_the_present_span_goes_along_unless_another_one_is_named() -> None:
     assert traces.present() is None
+    assert traces.environ() == {}
     with tracing.joined(PARENT):
         assert traces.present() == PARENT
+        assert traces.environ() == {"TRACEPARENT": PARENT}, "for a program that is started here"
         assert traces.along({"op": "x"}) == {"op": "x", "traceparent": PARENT}
         assert traces.along({"traceparent": OTHER}) == {"traceparent": OTHER}
         with traces.joined(

@@ -219,11 +219,27 @@ def judge(trace: Trace, collector: Collector) -> None:
     (loading,) = trace.below(load, telemetry.SPAN_SIDECAR_LOAD)
     assert loading.end_ns <= first.start_ns
 
+    (acquire,) = trace.below(load, telemetry.SPAN_ACQUIRE)
+    assert (acquire.service, acquire.attributes[telemetry.ATTR_CONSUMER]) == (ARBITER, "grab")
+    assert [len(trace.below(acquire, name)) for name in (telemetry.SPAN_QUEUE, telemetry.SPAN_LOAD)] == [1, 1]
+    (evict,) = trace.below(acquire, telemetry.SPAN_EVICT)
+    assert (evict.service, evict.attributes[telemetry.ATTR_CONSUMER]) == (ARBITER, "detector")
+    (verify,) = trace.below(evict, telemetry.SPAN_VERIFY)
+    assert verify.attributes[telemetry.ATTR_VERDICT] in ("verified", "residue")
+    (unloading,) = trace.below(evict, telemetry.SPAN_SIDECAR_UNLOAD)
+    assert unloading.service == DETECTOR, (
+        "the holder that has to leave does so in the trace of who needs its room"
+    )
+    assert unloading.end_ns <= loading.start_ns, "first out, then in"
+    assert {span.trace_id for span in (acquire, evict, verify, unloading, loading, detect)} == {
+        first.trace_id
+    }
+
     codes = {
         span.service: span.attributes[telemetry.ATTR_EXIT_CODE]
         for span in trace.named(telemetry.SPAN_COMMAND)
     }
-    assert codes == {REASONER: 1, RUNNER: 0, POLICY: 0, DETECTOR: 0}, "SIGTERM loses nothing"
+    assert codes == {REASONER: 1, RUNNER: 0, POLICY: 0, DETECTOR: 0, ARBITER: 0}, "SIGTERM loses nothing"
     others = {span.name for span in trace.spans if span.service == RUNNER and span.trace_id != first.trace_id}
     assert others == {telemetry.SPAN_COMMAND}, "a robot that waits records nothing"
     for service, metric in (
@@ -231,5 +247,6 @@ def judge(trace: Trace, collector: Collector) -> None:
         (RUNNER, telemetry.METRIC_GOALS),
         (POLICY, telemetry.METRIC_SIDECAR_LOAD),
         (REASONER, telemetry.METRIC_TOOL_CALLS),
+        (ARBITER, telemetry.METRIC_GRANTS),
     ):
         assert service in {point.service for point in collector.points(metric)}
