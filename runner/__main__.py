@@ -13,11 +13,11 @@ import sys
 from types import ModuleType
 
 from clients import logs
-from runner import cli_benchmark, cli_deploy, cli_estop, cli_sim
+from runner import cli_benchmark, cli_deploy, cli_estop, cli_replay, cli_sim
 from schemas.commands import command
 from schemas.errors import ConfigError, VramError
 
-COMMANDS: tuple[ModuleType, ...] = (cli_sim, cli_benchmark, cli_deploy, cli_estop)
+COMMANDS: tuple[ModuleType, ...] = (cli_sim, cli_benchmark, cli_deploy, cli_estop, cli_replay)
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:

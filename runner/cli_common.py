@@ -14,10 +14,13 @@ from typing import Any
 
 from clients.configs import configs_folder
 from runner import frames
+from runner.skill_runner import SkillRunner
 from schemas.endpoints import program_endpoint
 from schemas.errors import ArbiterUnreachable, ConfigError
 
 log = logging.getLogger("runner")
+
+AS_FAST_AS_POSSIBLE_HZ = 30.0  # simulated rate when nothing is paced
 
 
 def positive(text: str) -> float:
@@ -113,6 +116,33 @@ async def connect_arbiter(endpoint: str | None, stack: contextlib.AsyncExitStack
         raise ArbiterUnreachable(
             error.message, hint="start `vram-arbiter` first, or run with --no-arbiter", details=error.details
         ) from error
+
+
+async def record_into(
+    folder: Path, runner: SkillRunner, rate_hz: float, robot: str, stack: contextlib.AsyncExitStack
+) -> None:
+    """Record the runner's goals, from before its control thread starts until after it has ended. `rate_hz` 0: as fast as possible.
+
+    Raises ConfigError for a folder or a rate that nothing can be recorded with, AlreadyRunning when somebody else records there.
+    """
+    from runner.dataset.recorder import DatasetRecorder
+
+    recorder = DatasetRecorder(
+        folder,
+        rate_hz=rate_hz or AS_FAST_AS_POSSIBLE_HZ,
+        cameras=runner.camera_names(),
+        robot=robot,
+        patient=rate_hz == 0,
+    )
+    log.info("starting the dataset's writer")
+    try:
+        await asyncio.to_thread(recorder.start)
+    except asyncio.CancelledError:
+        recorder.abort()  # else the thread goes on waiting
+        raise
+    stack.push_async_callback(asyncio.to_thread, recorder.close)
+    runner.sink = recorder
+    runner.save_dir = str(recorder.root)
 
 
 def default_skills() -> Path:

@@ -22,6 +22,7 @@ from runner.cli_common import (
     connect_arbiter,
     default_skills,
     install_signals,
+    record_into,
     sidecar_endpoint,
     sidecars_given,
 )
@@ -136,6 +137,9 @@ class Deploy:
             arbiter = None if self._args.no_arbiter else await connect_arbiter(self._args.arbiter, stack)
             runner = self._runner(parts)
             runner.trace_ticks = self._args.trace_ticks
+            if (folder := self._file.robot.save_dir) is not None:
+                rate_hz, name = self._file.robot.rate_hz, self._file.robot.robot_id
+                await record_into(Path(folder), runner, rate_hz, name, stack)
             control = await self._start(runner, stack)
             if control is None:
                 return 0

@@ -11,12 +11,14 @@ import os
 from pathlib import Path
 
 from runner.cli_common import (
+    AS_FAST_AS_POSSIBLE_HZ,
     add_serving_flags,
     connect_arbiter,
     default_skills,
     install_signals,
     not_negative,
     positive_int,
+    record_into,
     sidecars_given,
     warm_up,
 )
@@ -27,7 +29,6 @@ from schemas.errors import ConfigError, InternalError
 log = logging.getLogger("runner")
 
 SERVES = True
-AS_FAST_AS_POSSIBLE_HZ = 30.0  # simulated rate when nothing is paced
 
 
 def add_world_flags(parser: argparse.ArgumentParser) -> None:
@@ -55,6 +56,10 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     sim.add_argument("--episodes", type=positive_int, help="of --policy; default 1")
     sim.add_argument("--seed", type=int, default=0, help="decides everything about the episode")
+    sim.add_argument(
+        "--record", type=Path, metavar="DIR",
+        help="write every goal as an episode of the LeRobotDataset in this folder; a new one, or one of an earlier recording",
+    )  # fmt: skip
     sim.add_argument("--video", type=Path, help="write the episode as H.264 video to this file")
     sim.add_argument(
         "--timings",
@@ -96,6 +101,10 @@ async def run(args: argparse.Namespace) -> int:
     )
     if args.episodes is not None and args.policy is None:
         raise ConfigError("--episodes is for --policy; goals end their episodes themselves")
+    if args.record is not None and (args.policy is not None or world.arm is None):
+        raise ConfigError(
+            "--record is for goals in our own scene", hint="leave out --policy, and --env or say --env so101"
+        )
     policy = None if args.policy is None else policy_of(args.policy)
     manifests = [] if policy is not None else read_manifests(args.skills or [default_skills()])
     given = sidecars_given(args.sidecar)
@@ -129,6 +138,8 @@ async def run(args: argparse.Namespace) -> int:
             runner.identity["policy"] = policy.name
             runner.recorder = recorder  # from its first step on: it may be over before anybody asks
         runner.trace_ticks = args.trace_ticks
+        if args.record is not None:
+            await record_into(args.record, runner, args.rate, str(runner.identity["robot"]), stack)
         control = await stack.enter_async_context(ControlThread(runner))
         await asyncio.to_thread(warm_up)
         await ready(control)

@@ -14,6 +14,8 @@ from pathlib import Path
 from runner.body import body_of
 from runner.catalogue import EXECUTABLE, Catalogue, Maker
 from runner.clock import Clock
+from runner.dataset.commit import check_folder
+from runner.dataset.recorder import whole_rate
 from runner.protocols import Hal, SensorReader
 from runner.robot_gate import RobotGate
 from runner.skills.sidecar_policy import wire_up
@@ -98,7 +100,11 @@ def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
     except ConfigError as error:
         raise file.merged([*errors, file.located(error, "hal")]) from error
     if robot.save_dir is not None:
-        errors.append(file.error(("save_dir", "this version does not record; leave it out")))
+        try:
+            whole_rate(robot.rate_hz)
+            check_folder(Path(robot.save_dir))
+        except ConfigError as error:
+            errors.append(file.error(("save_dir", str(error))))
     try:
         gate = RobotGate(
             hal.description,
@@ -261,6 +267,8 @@ def plan(file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Iterab
     if robot.task is not None and robot.vla is not None:
         limit = f", at most {robot.task.max_steps} ticks" if robot.task.max_steps else ""
         lines.append(("task", f"{robot.task.id}: {robot.vla.id} {robot.task.instruction!r}{limit}"))
+    if robot.save_dir is not None:
+        lines.append(("record", f"every goal, as an episode of the dataset in {robot.save_dir}"))
     if robot.max_ticks is not None:
         lines.append(("end", f"after {robot.max_ticks} ticks"))
     lines += facts

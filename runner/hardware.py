@@ -31,6 +31,7 @@ from runner.protocols import (
 from runner.skill_runner import Active, SkillRunner
 from runner.world_state import JOINT_STATE, WorldStateAggregator
 from schemas import telemetry, tracing
+from schemas.control import ControlMode
 from schemas.errors import (
     BadRequest,
     Cancelled,
@@ -40,6 +41,7 @@ from schemas.errors import (
     StateStale,
     VramError,
 )
+from schemas.world import Action
 
 log = logging.getLogger(__name__)
 
@@ -83,6 +85,7 @@ class HardwareRunner(SkillRunner):
         )
         self._halted = False
         self._stale_since_s: float | None = None
+        self._sent: dict[str, float] = {}  # the newest target of each joint, rad
 
     # -- life --------------------------------------------------------------------------------------------------------
     def activate(self) -> None:
@@ -246,6 +249,14 @@ class HardwareRunner(SkillRunner):
         known = name == JOINT_STATE or name in self._readers
         return self.aggregator.why(name) if known else "this robot has no such camera"
 
+    def _remember(self, action: Action) -> None:
+        if action.control_mode is ControlMode.JOINT_POSITION:
+            names = action.joint_names or self.hal.description.joint_names
+            self._sent.update(zip(names, action.rows[0], strict=True))
+
+    def _targets_now(self) -> Mapping[str, float]:
+        return self._sent
+
     def _safety_gate(self) -> SafetyGate:
         if self._gate is None:
             raise InternalError("an action without a skill")
@@ -256,6 +267,7 @@ class HardwareRunner(SkillRunner):
             return Applied(action_applied=False)
         try:
             self.hal.send_action(decision.action)  # 9
+            self._remember(decision.action)
         except EstopRequested as error:
             self._latched_by_hardware(error)
         except VramError as error:  # the motors keep their last target

@@ -73,6 +73,7 @@ class RunnerBase(ABC):
         self.tick_idx = 0
         self.deadline_misses = 0
         self.late_actions_withheld = 0
+        self.save_dir: str | None = None  # folder of the dataset that this run is recorded into
         self.traceparent: str | None = None  # of the goal that the ticks are for; they join its trace
         self.labels: dict[str, str] = {}  # of what the ticks measure: the goal's skill
         self.trace_ticks = 1.0  # share of the ticks that get spans, 0 to 1
@@ -111,6 +112,9 @@ class RunnerBase(ABC):
 
     def _success(self) -> bool | None:
         return None
+
+    def _ticked(self, decision: Decision, result: TickResult) -> None:  # noqa: B027 — not every runner is followed
+        """Called at the end of every tick, before a missed deadline may end the run; must not wait."""
 
     # -- the loop --
     @property
@@ -185,6 +189,7 @@ class RunnerBase(ABC):
             started_s, late_ms, result.tick_ms, result.inference_ms, result.hal_ms, reset=decision.reset
         )
         meters.measure(telemetry.METRIC_TICK, result.tick_ms, self.labels)
+        self._ticked(decision, result)
         if missed:  # 4
             self.deadline_misses += 1
             meters.count(telemetry.METRIC_DEADLINE_MISSES, self.labels)
@@ -231,6 +236,7 @@ class RunnerBase(ABC):
             p99_tick_ms=percentile(tick_ms, 0.99),
             trace_id=self._trace_id,
             metadata=self._metadata(),
+            save_dir=self.save_dir,
         )
 
     def _metadata(self) -> dict[str, Any]:

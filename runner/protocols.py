@@ -159,6 +159,32 @@ class SkillEnded:
     error: VramError | None = None
 
 
+# -- whoever follows a goal ------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class GoalTick:
+    """One tick in which a goal's skill was asked, when it is over. Nothing in it changes any more: it may be read on any thread.
+
+    `targets` are the joint targets in force now, rad by joint: a joint that got no new one keeps its last. A joint that nobody has
+    told anything yet is not among them. `base_velocity` is what the base was told for this tick (m/s, m/s, rad/s); None: it has none.
+    """
+
+    goal: Goal
+    world: WorldState
+    result: TickResult
+    targets: Mapping[str, float]
+    base_velocity: tuple[float, float, float] | None = None
+
+
+class TickSink(Protocol):
+    """Hears of every tick of a goal and of its end, on the control thread: it must take them over at once, and never wait."""
+
+    def tick(self, tick: GoalTick) -> None: ...
+
+    def goal_ended(self, goal: Goal, ended: SkillEnded | None) -> None:
+        """After the goal's last tick. None: the arm was taken back (canceled, or the deadline)."""
+        ...
+
+
 # -- robot, simulator, safety -----------------------------------------------------------------------------------------
 class SafetyGate(Protocol):
     """Decides on every single action before it reaches a motor."""

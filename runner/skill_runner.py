@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,16 +22,18 @@ from runner.protocols import (
     DeadlinePolicy,
     Done,
     Goal,
+    GoalTick,
     Hold,
     Progress,
     SafetyGate,
     Skill,
     SkillEnded,
     Stepped,
+    TickSink,
 )
 from schemas import meters, telemetry, tracing
 from schemas.errors import EstopRequested, InternalError, LimitExceeded, ModelError, VramError
-from schemas.world import Action, WorldState
+from schemas.world import Action, TickResult, WorldState
 
 log = logging.getLogger(__name__)
 
@@ -95,6 +97,11 @@ class SkillRunner(RunnerBase):
         self._stopping = False
         self._total = Tally()
         self._skills: dict[str, int] = {}  # goals by skill
+        self._asked: Active | None = None  # whose skill this tick asked
+        self._asked_ended: tuple[Goal, SkillEnded | None] | None = (
+            None  # told after the tick that it ended in
+        )
+        self.sink: TickSink | None = None  # hears of the goals' ticks; set it before the first goal
         self.world: WorldState | None = None  # the newest; replaced, never changed
         self.violations: deque[str] = deque(maxlen=VIOLATIONS_KEPT)
         self.progress = Progress(0.0, "idle")  # replaced whole: the event loop may read it any time
@@ -104,6 +111,10 @@ class SkillRunner(RunnerBase):
     @abstractmethod
     def _safety_gate(self) -> SafetyGate:
         """What every action passes before it reaches a motor."""
+
+    @abstractmethod
+    def camera_names(self) -> tuple[str, ...]:
+        """Observation cameras, the default one first."""
 
     def request_stop(self) -> None:
         """Any thread: the run ends before its next tick."""
@@ -162,9 +173,11 @@ class SkillRunner(RunnerBase):
 
     def end_skill(self) -> None:
         """Control thread: take the arm back without a word to anybody; it holds. Repeatable."""
-        self._active = None
+        active, self._active = self._active, None
         self.traceparent, self.labels = None, {}
         self.progress = Progress(0.0, "idle")
+        if active is not None:
+            self._tell_end(active, None)
 
     def _end(self, ended: SkillEnded) -> None:
         if (active := self._active) is None:
@@ -173,7 +186,42 @@ class SkillRunner(RunnerBase):
         self.traceparent, self.labels = None, {}
         self.progress = Progress(1.0 if ended.error is None else self.progress.fraction, "ended")
         data = {"ticks": self.tick_idx - active.began_tick, **active.tally.as_data(), **ended.data}
-        active.on_end(SkillEnded(data, ended.error))
+        full = SkillEnded(data, ended.error)
+        self._tell_end(active, full)
+        active.on_end(full)
+
+    # -- who follows the goals --------------------------------------------------------------------------------------------
+    @property
+    def _follows(self) -> bool:
+        """Whether somebody wants to know of every tick, with the frames of all cameras."""
+        return self.sink is not None
+
+    @abstractmethod
+    def _targets_now(self) -> Mapping[str, float]:
+        """Joint targets in force, rad by joint; without those that nobody has told anything yet."""
+
+    def _base_told(self, decision: Decision) -> tuple[float, float, float] | None:
+        """What the base was told in this tick (m/s, m/s, rad/s); None for a robot that has none."""
+        return None
+
+    def _tell_end(self, active: Active, ended: SkillEnded | None) -> None:
+        if self.sink is None:
+            return
+        if self._asked is active:  # its last tick is still to come
+            self._asked_ended = (active.goal, ended)
+        else:
+            self.sink.goal_ended(active.goal, ended)
+
+    def _ticked(self, decision: Decision, result: TickResult) -> None:
+        asked, self._asked = self._asked, None
+        over, self._asked_ended = self._asked_ended, None
+        if self.sink is None:
+            return
+        if asked is not None and self.world is not None:
+            told = self._base_told(decision)
+            self.sink.tick(GoalTick(asked.goal, self.world, result, dict(self._targets_now()), told))
+        if over is not None:
+            self.sink.goal_ended(*over)
 
     # -- one tick ------------------------------------------------------------------------------------------------------
     def _ask_skill(self, active: Active, world: WorldState, decision: Decision) -> None:
@@ -184,6 +232,7 @@ class SkillRunner(RunnerBase):
             problem = f"not done within {limit} ticks"
             self._end(SkillEnded({"truncated": True}, LimitExceeded(problem, details={"limit": "max_ticks"})))
             return
+        self._asked = active
         asked_s = self.clock.now_s()
         try:
             with tracing.span(telemetry.SPAN_INFERENCE):

@@ -128,6 +128,10 @@ class ArmEnvironment:
         return _joint_action(tuple(limits), [self._random.uniform(*limits[name]) for name in limits])
 
     @property
+    def targets(self) -> dict[str, float]:
+        return self._targets
+
+    @property
     def observation(self) -> dict[str, float]:
         """Measured joint angles in rad, by name."""
         return self.arm.joint_state()

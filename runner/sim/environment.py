@@ -63,6 +63,11 @@ class Environment(Protocol):
         ...
 
     @property
+    def targets(self) -> Mapping[str, float]:
+        """Joint targets in force, rad by joint; empty where actions are something else."""
+        ...
+
+    @property
     def cameras(self) -> tuple[str, ...]:
         """Cameras for skills, the default one first; known after the first reset."""
         ...

@@ -252,6 +252,10 @@ class GymEnv:
         return self._observation
 
     @property
+    def targets(self) -> dict[str, float]:
+        return {}  # its actions are its own affair
+
+    @property
     def cameras(self) -> tuple[str, ...]:
         return tuple(self._paths)
 

@@ -10,7 +10,7 @@ is broken off (`deactivate`, an environment that fails) is no episode: the next 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from pydantic import ValidationError
@@ -24,6 +24,7 @@ from runner.sim.environment import Environment, EnvStep
 from runner.sim.episodes import Episode, EpisodeView
 from runner.skill_runner import SkillRunner
 from schemas import telemetry, tracing
+from schemas.control import ControlMode
 from schemas.errors import (
     EnvironmentFailed,
     GoalRejected,
@@ -190,11 +191,10 @@ class SimRunner(SkillRunner):
         active = self._active
         frames: dict[str, SensorFrame] | None = None
         try:
-            if active is not None and active.skill.wants_frames():  # 3
+            if active is not None and (self._follows or active.skill.wants_frames()):  # 3
+                cameras = dict.fromkeys((*active.skill.cameras, *(self._cameras if self._follows else ())))
                 with tracing.span(telemetry.SPAN_SENSORS):
-                    frames = {
-                        camera: self._sensor_frame(self._render(camera)) for camera in active.skill.cameras
-                    }
+                    frames = {camera: self._sensor_frame(self._render(camera)) for camera in cameras}
         except EnvironmentFailed as error:
             self._broken_off(error)
             return Decision()
@@ -215,6 +215,18 @@ class SimRunner(SkillRunner):
         if active is not None:
             self._ask_skill(active, world, decision)  # 5, 6
         return decision
+
+    def _targets_now(self) -> Mapping[str, float]:
+        return self.env.targets
+
+    def _base_told(self, decision: Decision) -> tuple[float, float, float] | None:
+        if self.world is None or self.world.base_pose is None:
+            return None
+        action = decision.action
+        if action is None or action.control_mode is not ControlMode.BODY_TWIST:
+            return (0.0, 0.0, 0.0)  # a base that is told nothing stands still
+        vx, vy, _, _, _, wz = action.rows[0]
+        return (vx, vy, wz)
 
     def _safety_gate(self) -> SafetyGate:
         if self._gate is None:

@@ -22,7 +22,7 @@ CAMERAS = tuple(filter(None, os.environ.get("NOD_CAMERAS", "").split(",")))
 
 def makers(parts: Parts, arbiter: Arbiter | None) -> Mapping[Kind, Maker]:
     steps = int(STEPS) if STEPS else None
-    return {Kind.ROS_ACTION: lambda manifest: Nod(manifest, cameras=CAMERAS, steps=steps)}
+    return {Kind.ROS_ACTION: lambda manifest: Nod(manifest, cameras=CAMERAS, steps=steps, all_joints=True)}
 
 
 def main() -> int:

@@ -102,7 +102,7 @@ class Twin(KinematicTwin):
 
 
 class Nod(SkillBase):
-    """Moves the wrist a little with every step; ends after `steps`. `on_step` is asked first, with the world that the skill sees."""
+    """Moves the wrist a little with every step (`all_joints`: tells the others to stay); ends after `steps`. `on_step` is asked first, with the world that the skill sees."""
 
     def __init__(
         self,
@@ -111,8 +111,10 @@ class Nod(SkillBase):
         cameras: tuple[str, ...] = (),
         steps: int | None = None,
         on_step: Callable[[WorldState], None] | None = None,
+        all_joints: bool = False,
     ) -> None:
         super().__init__(manifest)
+        self.all_joints = all_joints
         self.cameras = cameras
         self.steps = steps
         self.on_step = on_step
@@ -135,12 +137,14 @@ class Nod(SkillBase):
             self.fraction = min(1.0, self.taken / self.steps)
             if self.taken > self.steps:
                 return Done({"nods": self.steps})
-        wrist = world.joint_state.position[world.joint_state.name.index("wrist_flex")]
+        told = dict(zip(world.joint_state.name, world.joint_state.position, strict=True))
+        told["wrist_flex"] += 0.01 if self.taken % 2 else -0.01
+        names = tuple(told) if self.all_joints else ("wrist_flex",)
         return Act(
             Action(
                 control_mode=ControlMode.JOINT_POSITION,
-                joint_targets=((wrist + (0.01 if self.taken % 2 else -0.01),),),
-                joint_names=("wrist_flex",),
+                joint_targets=(tuple(told[name] for name in names),),
+                joint_names=names,
                 stamp_ns=world.stamp_ns,
             )
         )

@@ -107,7 +107,11 @@ def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_ro
             TWIN + "safety:\n  max_joint_speed_factor: -1\n",
             r"robot\.yaml:4: safety\.max_joint_speed_factor: must be above 0",
         ),
-        (TWIN + "save_dir: out\n", r"robot\.yaml:3: save_dir: this version does not record"),
+        (TWIN + "save_dir: /\n", r"robot\.yaml:3: save_dir: / is not empty, and no dataset"),
+        (
+            TWIN + "save_dir: /tmp/none\nrate_hz: 12.5\n",
+            r"robot\.yaml:3: save_dir: a recording needs a whole number of ticks a second, not 12\.5",
+        ),
         (
             TWIN + "sensors:\n  - {sensor_id: joint_state, backend_params: {device: 0}}\n",
             r"robot\.yaml:4: sensors\[0\]\.sensor_id: .* joint_state",

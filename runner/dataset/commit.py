@@ -1,0 +1,231 @@
+"""What of a dataset's folder is finished: a commit after every episode, and the way back to the last one after a crash.
+
+Parquet and MP4 files are worthless until they are closed, so every episode gets files of its own, which never change again, and is
+committed by one rename: `.runner/commit.json` lists them with their sizes and keeps the three small files that do change. While an
+episode is being written `.runner/open` lies there; whoever finds it on opening was preceded by a crash, takes away what no commit
+lists, and says so. Knows neither lerobot nor the runner.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from schemas.errors import AlreadyRunning, ConfigError
+
+FOLDER = ".runner"
+COMMIT = "commit.json"
+OPEN = "open"
+EPISODES = "episodes.jsonl"
+LOCK = "lock"
+CACHE = "cache"  # of the libraries that write; worthless afterwards
+MUTABLE = ("meta/info.json", "meta/stats.json", "meta/tasks.parquet")
+DATA = ("data", "videos", "images", "meta/episodes")  # where files are only ever added
+SCRATCH = "tmp*"  # folders in which lerobot encodes videos
+LOCK_WAIT_S = 30.0  # a runner that was killed leaves a writer that still finishes its episode
+LOCK_POLL_S = 0.1
+
+Commit = dict[str, Any]
+
+
+def check_folder(root: Path) -> None:
+    """Raises ConfigError for a folder that nothing may be recorded into: somebody else's, or one that cannot be written."""
+    if (root / FOLDER).is_dir() or not root.exists():
+        parent = root if root.exists() else next(path for path in root.absolute().parents if path.exists())
+        if not parent.is_dir() or not os.access(parent, os.W_OK):
+            raise ConfigError(f"nothing can be recorded into {root}: {parent} cannot be written")
+        return
+    if not root.is_dir() or any(root.iterdir()):
+        raise ConfigError(
+            f"{root} is not empty, and no dataset that this program recorded",
+            hint="name a new folder, or one of an earlier recording to add to it",
+        )
+    if not os.access(root, os.W_OK):
+        raise ConfigError(f"nothing can be recorded into {root}: it cannot be written")
+
+
+@contextlib.contextmanager
+def locked(root: Path, wait_s: float = LOCK_WAIT_S) -> Iterator[None]:
+    """While inside, nobody else writes the dataset. Raises AlreadyRunning when somebody still does after `wait_s`."""
+    (root / FOLDER).mkdir(parents=True, exist_ok=True)
+    lock = os.open(root / FOLDER / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        until_s = time.monotonic() + wait_s
+        while True:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() >= until_s:
+                    raise AlreadyRunning(
+                        f"another process records into {root}", hint="wait until it has finished, or stop it"
+                    ) from None
+            time.sleep(LOCK_POLL_S)
+        yield
+    finally:
+        os.close(lock)
+
+
+def last(root: Path) -> Commit | None:
+    """The last commit; None when there was none yet. Raises ConfigError when it cannot be read."""
+    try:
+        commit: Commit = json.loads((root / FOLDER / COMMIT).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"{root / FOLDER / COMMIT} cannot be read: {error}",
+            hint="restore it, or record into a new folder",
+        ) from error
+    return commit
+
+
+def begin(root: Path) -> None:
+    """From now on files change; until the next commit a crash would leave them unfinished."""
+    _write(root / FOLDER / OPEN, b"")
+
+
+def commit(root: Path, episode: dict[str, Any] | None) -> None:
+    """What lies there now is finished, an episode with it; on disk before this returns."""
+    before = last(root) or {"episodes": 0, "files": {}, "notes_bytes": 0}
+    files = _files(root)
+    for name in files.keys() - before["files"].keys():
+        _flush(root / name)
+    notes_bytes = before["notes_bytes"]
+    if episode is not None:
+        line = json.dumps(episode, ensure_ascii=False).encode() + b"\n"
+        _note(root / FOLDER / EPISODES, notes_bytes, line)
+        notes_bytes += len(line)
+    record = {
+        "version": 1,
+        "episodes": before["episodes"] + (episode is not None),
+        "files": files,
+        "notes_bytes": notes_bytes,
+        "meta": {
+            name: base64.b64encode((root / name).read_bytes()).decode()
+            for name in MUTABLE
+            if (root / name).exists()
+        },
+    }
+    _write(root / FOLDER / COMMIT, json.dumps(record).encode())
+    (root / FOLDER / OPEN).unlink(missing_ok=True)
+
+
+def repair(root: Path) -> list[str]:
+    """Back to the last commit if a crash left the folder in between; says what was done. Raises ConfigError when a file of the
+    commit is missing or cut: then nothing is touched."""
+    record = last(root)
+    if record is None:
+        return _clear(root)
+    _verify(root, record)
+    if not (root / FOLDER / OPEN).exists():
+        return []
+    said = ["an episode was being written; it is lost"]
+    for name in sorted(_files(root).keys() - record["files"].keys()):
+        (root / name).unlink()
+        said.append(f"{name} was not finished: removed")
+    for path in (*root.glob(SCRATCH), root / "images"):
+        if path.is_dir():
+            shutil.rmtree(path)
+            said.append(f"{path.name} was not finished: removed")
+    for name in MUTABLE:
+        said += _restore(root / name, record["meta"].get(name), name)
+    notes = root / FOLDER / EPISODES
+    if notes.exists() and notes.stat().st_size > record["notes_bytes"]:
+        os.truncate(notes, record["notes_bytes"])
+    (root / FOLDER / OPEN).unlink()
+    return said
+
+
+def notes(root: Path) -> list[dict[str, Any]]:
+    """What was noted of each committed episode, by episode."""
+    record = last(root)
+    if record is None or not (root / FOLDER / EPISODES).exists():
+        return []
+    text = (root / FOLDER / EPISODES).read_bytes()[: record["notes_bytes"]].decode()
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def _clear(root: Path) -> list[str]:
+    """Before the first commit there are no episodes: what lies there is a beginning that a crash cut off."""
+    said = []
+    for path in (root / "meta", root / FOLDER / "creating"):
+        if path.exists():
+            shutil.rmtree(path)
+            said.append(f"{path.name} was not finished: removed")
+    return said
+
+
+def _verify(root: Path, record: Commit) -> None:
+    for name, size in record["files"].items():
+        path = root / name
+        if not path.is_file() or path.stat().st_size != size:
+            raise ConfigError(
+                f"{path} is missing or not as it was recorded ({size} bytes)",
+                hint="restore it, or record into a new folder",
+            )
+
+
+def _restore(path: Path, kept: str | None, name: str) -> list[str]:
+    try:
+        wanted = None if kept is None else base64.b64decode(kept, validate=True)
+    except binascii.Error as error:
+        raise ConfigError(f"the commit's copy of {name} is broken: {error}") from error
+    there = path.read_bytes() if path.exists() else None
+    if there == wanted:
+        return []
+    if wanted is None:
+        path.unlink()
+    else:
+        _write(path, wanted)
+    return [f"{name} is as it was after the last finished episode"]
+
+
+def _files(root: Path) -> dict[str, int]:
+    return {
+        path.relative_to(root).as_posix(): path.stat().st_size
+        for folder in DATA
+        for path in (root / folder).rglob("*")
+        if path.is_file()
+    }
+
+
+def _note(path: Path, at: int, line: bytes) -> None:
+    handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        os.ftruncate(handle, at)
+        os.pwrite(handle, line, at)
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Whole or not at all, and on disk."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.new")
+    with open(beside, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(beside, path)
+    _flush(path.parent)
+
+
+def _flush(path: Path) -> None:
+    """Onto the disk: a file's bytes and the name that its folder has for it, or a folder's names."""
+    for each in (path, path.parent) if path.is_file() else (path,):
+        handle = os.open(each, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,95 @@
+"""A tick as a row on its way to the dataset: plain values and the pictures' bytes. Nothing is filled in: a tick that lacks a part
+of the row is no row, and says why.
+
+Units are those of `schemas.world`: rad, m, s, and ms where a name says so. Knows no lerobot and no numpy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from runner.protocols import GoalTick
+from schemas.world import FrameEncoding, SensorFrame
+
+TIMINGS = ("tick", "sensors", "world_state", "inference", "safety", "hal")
+NO_CHUNK = -1  # chunk_index of a tick that was not played from a chunk
+COLOURS = frozenset(
+    {FrameEncoding.RGB8, FrameEncoding.BGR8, FrameEncoding.MONO8, FrameEncoding.JPEG, FrameEncoding.PNG}
+)
+
+Row = dict[str, Any]
+
+
+class Incomplete(Exception):
+    """This tick is no row of the dataset; the message says what it lacks."""
+
+
+def row_of(tick: GoalTick, cameras: Sequence[str]) -> tuple[Row, list[bytes]]:
+    """The row and its pictures, in the order of `cameras`. Raises Incomplete."""
+    world, result, goal = tick.world, tick.result, tick.goal
+    joints = world.joint_state.name
+    if not joints:
+        raise Incomplete("the robot has no joints")
+    if missing := [name for name in joints if name not in tick.targets]:
+        raise Incomplete(f"joint {missing[0]} has no target yet")
+    frames = [_colours(world.image_frames or {}, camera) for camera in cameras]
+    trace_id, span_id, sampled = trace_of((result.trace_context or {}).get("traceparent"))
+    row: Row = {
+        "goal_id": goal.goal_id,
+        "skill": f"{goal.rskill_id}@{goal.revision}" if goal.revision else goal.rskill_id,
+        "task": goal.prompt or goal.rskill_id,
+        "joints": list(joints),
+        "state": list(world.joint_state.position),
+        "action": [tick.targets[name] for name in joints],
+        "base_pose": _base_pose(tick),
+        "base_velocity": list(tick.base_velocity) if tick.base_velocity is not None else None,
+        "frames": [
+            {"camera": camera, "encoding": str(frame.encoding), "width": frame.width, "height": frame.height}
+            for camera, frame in zip(cameras, frames, strict=True)
+        ],
+        "ages_ms": [max(0.0, (world.stamp_ns - frame.stamp_monotonic_ns) / 1e6) for frame in frames],
+        "timings_ms": [getattr(result, f"{name}_ms") for name in TIMINGS],
+        "tick_idx": result.tick_idx,
+        "stamp_ns": result.stamp_ns,
+        "chunk_index": NO_CHUNK if result.chunk_index is None else result.chunk_index,
+        "action_applied": result.action_applied,
+        "deadline_missed": result.deadline_missed,
+        "violations": "; ".join(result.safety_violations),
+        "reward": result.reward,
+        "trace_id": trace_id,
+        "span_id": span_id,
+        "sampled": sampled,
+    }
+    return row, [frame.data or b"" for frame in frames]
+
+
+def trace_of(traceparent: str | None) -> tuple[str, str, bool]:
+    """Trace id, span id (hex) and whether the trace is kept, of a W3C traceparent; empty texts without one."""
+    parts = (traceparent or "").split("-")
+    if len(parts) < 4 or len(parts[1]) != 32 or len(parts[2]) != 16:
+        return "", "", False
+    try:
+        return parts[1], parts[2], bool(int(parts[3], 16) & 1)
+    except ValueError:
+        return "", "", False
+
+
+def _colours(frames: dict[str, SensorFrame], camera: str) -> SensorFrame:
+    frame = frames.get(camera)
+    if frame is None:
+        raise Incomplete(f"camera {camera} has no picture")
+    if frame.data is None or frame.encoding not in COLOURS:
+        raise Incomplete(f"the pictures of camera {camera} ({frame.encoding}) have no colours here")
+    return frame
+
+
+def _base_pose(tick: GoalTick) -> list[float] | None:
+    """x, y (m) and yaw (rad) of the base on its plane."""
+    pose = tick.world.base_pose
+    if pose is None:
+        return None
+    qx, qy, qz, qw = pose.quat_xyzw
+    yaw = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+    return [pose.xyz[0], pose.xyz[1], yaw]

@@ -1,0 +1,111 @@
+"""`vram-runner sim --record` and `deploy` with `save_dir`, as processes: goals become episodes, also the one that the runner was killed in."""
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from clients.runner import RunnerClient
+from runner import __main__ as program
+from runner.dataset import commit
+from runner.dataset.reader import read_frame
+
+pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(600)]
+
+ROOT = Path(__file__).parents[3]
+NOD = Path(__file__).parents[1] / "deploy_nod.py"
+RSKILL = "vram-arbiter/so101-navigate"
+TRACE = "0af7651916cd43dd8448eb211c80319c"
+SPAN = "b7ad6b7169203331"
+WAIT_S = 280.0
+
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    started: list[subprocess.Popen[str]] = []
+
+    def begin(*argv: str, **environ: str) -> subprocess.Popen[str]:
+        given = os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path), "OMP_NUM_THREADS": "1"} | environ
+        skills = ("--skills", str(ROOT / "configs/rskills/so101-navigate"), "--no-arbiter")
+        started.append(
+            subprocess.Popen(
+                [sys.executable, *argv, *skills], cwd=tmp_path, env=given, stdout=subprocess.PIPE, text=True
+            )
+        )
+        return started[-1]
+
+    yield begin
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def test_the_episode_of_a_killed_simulator_is_finished_by_its_writer(start: Start, tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    process = start("-m", "runner", "sim", "--record", str(root), "--rate", "0")
+
+    async def use() -> None:
+        async with (
+            asyncio.timeout(WAIT_S),
+            RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=WAIT_S) as client,
+        ):
+            goal = await client.send_goal(
+                RSKILL, goal_params={"turn_rad": 3.0}, traceparent=f"00-{TRACE}-{SPAN}-01"
+            )
+            async for feedback in goal.feedback():
+                if feedback["tick_idx"] >= 30 and (root / commit.FOLDER / commit.OPEN).exists():
+                    process.kill()
+                    return
+
+    asyncio.run(use())
+    process.wait(WAIT_S)
+    with commit.locked(root, WAIT_S):  # until the writer is done
+        pass
+    (note,) = commit.notes(root)
+    assert note["status"] == "runner_lost"
+    assert note["frames"] >= 2
+    last = read_frame(root, note["frames"] - 1)
+    assert last.tick["done"]
+    assert not last.tick["success"]
+    assert (last.trace_id, last.robot, sorted(last.pictures)) == (TRACE, "so101-mobile", ["front", "wrist"])
+    assert abs(last.base["velocity"]["wz"]) > 0
+    assert sorted(last.action) == sorted(last.state)
+    assert commit.repair(root) == []
+
+
+def test_a_deployment_records_into_its_save_dir(start: Start, tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    config = tmp_path / "robot.yaml"
+    config.write_text(
+        "robot_id: bench\nembodiment_tags: [so101_follower, mobile_base]\nhal: {adapter: so101_kinematic}\n"
+        f"task: {{id: nod, instruction: nod twice, max_steps: 400}}\nvla: {{id: {RSKILL}}}\nsave_dir: {root}\n"
+    )
+    process = start(str(NOD), "deploy", "--config", str(config), NOD_STEPS="12")
+    out, _ = process.communicate(timeout=WAIT_S)
+    assert process.returncode == 0
+    assert json.loads(out.splitlines()[-1])["save_dir"] == str(root)
+    (note,) = commit.notes(root)
+    assert (note["status"], note["goal_id"], note["task"]) == ("succeeded", "task", "nod twice")
+    assert note["frames"] >= 12
+    first, second = read_frame(root, 0), read_frame(root, 1)
+    assert first.tick["action_applied"]
+    assert second.tick["index"] == first.tick["index"] + 1
+    assert first.action["wrist_flex"] == pytest.approx(first.state["wrist_flex"] + 0.01, abs=1e-4)
+    assert read_frame(root, note["frames"] - 1).tick["success"]
+
+
+@pytest.mark.parametrize("flags", [("--policy", "random"), ("--env", "gym:CartPole-v1")])
+def test_what_has_no_goals_of_ours_is_not_recorded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: tuple[str, ...]
+) -> None:
+    assert program.main(["sim", "--no-arbiter", "--record", str(tmp_path / "set"), *flags]) == 2
+    assert "--record is for goals in our own scene" in capsys.readouterr().err
+    assert not (tmp_path / "set").exists()
