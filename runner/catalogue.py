@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from runner.protocols import Skill, SkillKey
 from schemas.body import Body
@@ -33,6 +33,15 @@ START_S = 90.0  # for what comes before the motion: others finish and leave, a m
 FILE_NAME = "rskill.yaml"
 
 Maker = Callable[[RSkillManifest], Skill]
+
+
+@runtime_checkable
+class Selective(Protocol):
+    """A maker that cannot make every skill of its kind."""
+
+    def refuses(self, manifest: RSkillManifest) -> str:
+        """Why it cannot make this one; empty: it can."""
+        ...
 
 
 def read_manifests(paths: Iterable[Path]) -> list[RSkillManifest]:
@@ -72,10 +81,16 @@ class Catalogue:
         self._refused = dict(refused or {})
         self._makers = {kind: maker for kind, maker in makers.items() if kind in EXECUTABLE}
         self._body = body
-        if body is not None:
-            for manifest in self._manifests.values():
-                if manifest.kind in EXECUTABLE and (why := body.misfit(manifest)):
-                    self._refused.setdefault(manifest.name, why)
+        for manifest in self._manifests.values():
+            if manifest.kind in EXECUTABLE and (why := self._misfit(manifest)):
+                self._refused.setdefault(manifest.name, why)
+
+    def _misfit(self, manifest: RSkillManifest) -> str:
+        """Why a skill that could be executed by its kind is not for this robot, or cannot be made here."""
+        if self._body is not None and (why := self._body.misfit(manifest)):
+            return why
+        maker = self._makers.get(manifest.kind)
+        return maker.refuses(manifest) if isinstance(maker, Selective) else ""
 
     def find(
         self, rskill_id: str, revision: str = ""

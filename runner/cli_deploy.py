@@ -43,7 +43,9 @@ from runner.goals import GoalServer
 from runner.hardware import HardwareRunner
 from runner.promptness import make_prompt
 from runner.protocols import DeadlinePolicy, Skill
+from runner.skills.ros_standins import TRAJECTORY, StandIn, StandIns
 from runner.skills.sidecar_policy import Arbiter
+from schemas.control import ControlMode
 from schemas.endpoints import program_endpoint, runtime_dir
 from schemas.errors import AlreadyRunning, RunnerUnreachable, VramError
 from schemas.goals import ResultPush
@@ -84,7 +86,7 @@ async def run(args: argparse.Namespace) -> int:
 
 
 def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
-    """Learnt policies, each in its sidecar."""
+    """Learnt policies, each in its sidecar, and what stands in for ROS 2 actions."""
     given = sidecars_given(args.sidecar)
 
     def make_makers(parts: Parts, arbiter: Arbiter | None) -> Mapping[Kind, Maker]:
@@ -104,7 +106,15 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
                 speeds_rad_s=limits.speeds_rad_s if wiring.rollout.targets_lead else None,
             )
 
-        return {Kind.VLA: make_policy}
+        def make_trajectory(manifest: RSkillManifest) -> Skill:
+            from runner.skills.trajectory import FollowJointTrajectory
+
+            limits = goal_gate(parts.gate, manifest, ()).limits
+            return FollowJointTrajectory(manifest, limits, period_s=1.0 / file.robot.rate_hz)
+
+        follow = StandIn(make_trajectory, frozenset({ControlMode.JOINT_POSITION}))
+        stand_ins = StandIns({TRAJECTORY: follow}, parts.hal.description.joint_names)
+        return {Kind.VLA: make_policy, Kind.ROS_ACTION: stand_ins}
 
     return make_makers
 

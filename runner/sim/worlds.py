@@ -16,6 +16,8 @@ from pydantic import ValidationError
 from runner.body import SIMULATED
 from runner.catalogue import Maker
 from runner.cli_common import sidecar_endpoint
+from runner.hal.so101 import so101
+from runner.limits import own_limits
 from runner.protocols import Skill
 from runner.sim.arm_env import ArmEnvironment
 from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
@@ -23,6 +25,7 @@ from runner.sim.env import SimEnv
 from runner.sim.environment import Environment
 from runner.sim.gym_config import RENDER, GymConfig
 from runner.sim.gym_env import GymEnv
+from runner.skills.ros_standins import NAVIGATE, TRAJECTORY, StandIn, StandIns
 from schemas.body import Body
 from schemas.control import ControlMode
 from schemas.errors import ConfigError, ManifestInvalid
@@ -120,6 +123,7 @@ def makers_of(
     from clients.sidecar.policy import PolicyClient
     from runner.skills.navigate import Navigate
     from runner.skills.sidecar_policy import SidecarPolicy, wire_up
+    from runner.skills.trajectory import FollowJointTrajectory
 
     def make_policy(manifest: RSkillManifest) -> Skill:
         if not world.joints:
@@ -134,7 +138,14 @@ def makers_of(
     scene = world.scene
     if scene is None:
         return {Kind.VLA: make_policy}
-    return {
-        Kind.VLA: make_policy,
-        Kind.ROS_ACTION: lambda manifest: Navigate(manifest, scene, period_s=period_s),
+    limits = own_limits(so101(simulated=True))
+    joint, twist = ControlMode.JOINT_POSITION, ControlMode.BODY_TWIST
+    known = {
+        NAVIGATE: StandIn(
+            lambda manifest: Navigate(manifest, scene, period_s=period_s), frozenset({twist, joint})
+        ),
+        TRAJECTORY: StandIn(
+            lambda manifest: FollowJointTrajectory(manifest, limits, period_s=period_s), frozenset({joint})
+        ),
     }
+    return {Kind.VLA: make_policy, Kind.ROS_ACTION: StandIns(known, world.joints)}

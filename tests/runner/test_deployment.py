@@ -127,7 +127,7 @@ def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_ro
         ),
         (
             TWIN + "embodiment_tags: [mobile_base]\ntask: {id: t}\nvla:\n  id: vram-arbiter/so101-navigate\n",
-            r"robot\.yaml:6: vla\.id: .* is a ros_action and cannot be executed: this runner has no ROS 2 action client",
+            r"robot\.yaml:6: vla\.id: .* is not offered here: this runner has no ROS 2 action client; it stands in for control_msgs/FollowJointTrajectory, not for nav2_msgs/NavigateToPose",
         ),
         (
             TWIN + "embodiment_tags: [any]\n",

@@ -1,0 +1,56 @@
+"""What this runner does itself in place of a ROS 2 server: by package and type of the interface. It has no ROS 2 action client.
+
+A `ros_action` that nothing here stands for is refused before a goal could ask for it, with what there is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+from runner.protocols import Skill
+from schemas.control import ControlMode
+from schemas.manifest import RSkillManifest
+
+NAVIGATE = "nav2_msgs/NavigateToPose"
+TRAJECTORY = "control_msgs/FollowJointTrajectory"
+
+
+@dataclass(frozen=True, slots=True)
+class StandIn:
+    """`drives` are the control modes that it sends, which the robot has to take."""
+
+    make: Callable[[RSkillManifest], Skill]
+    drives: frozenset[ControlMode]
+
+
+class StandIns:
+    """A maker of `ros_action` skills that refuses some. `joints` are the robot's, for manifests that name an order."""
+
+    def __init__(self, known: Mapping[str, StandIn], joints: Iterable[str]) -> None:
+        self._known = dict(known)
+        self._joints = tuple(joints)
+
+    def __call__(self, manifest: RSkillManifest) -> Skill:
+        return self._known[interface_of(manifest)].make(manifest)
+
+    def refuses(self, manifest: RSkillManifest) -> str:
+        """Why a skill cannot be made here; empty: it can."""
+        wanted = interface_of(manifest)
+        stand_in = self._known.get(wanted)
+        if stand_in is None:
+            return f"this runner has no ROS 2 action client; it stands in for {' and '.join(sorted(self._known)) or 'none'}, not for {wanted}"
+        for actuator in manifest.actuators_required:
+            if actuator.kind not in stand_in.drives:
+                drives = " and ".join(sorted(stand_in.drives))
+                return f"it drives by {actuator.kind}; the stand-in for {wanted} drives by {drives}"
+            order = actuator.control_mode_semantics.joint_order or ()
+            if missing := [name for name in order if name not in self._joints]:
+                return f"it moves {', '.join(missing)}; the robot has {', '.join(self._joints)}"
+        return ""
+
+
+def interface_of(manifest: RSkillManifest) -> str:
+    """`package/Type`, whether the manifest writes the type short, or as ROS does: `package/action/Type`."""
+    ros = manifest.ros_integration
+    return "" if ros is None else f"{ros.package}/{ros.interface_type.rpartition('/')[2]}"

@@ -1,0 +1,220 @@
+"""A joint trajectory, played by this runner: what `control_msgs/FollowJointTrajectory` asks of a ROS 2 controller, without ROS.
+
+Targets run straight from point to point, at most one period's worth a tick: a runner that is late plays slower, never faster. Whoever sends one is
+told before anything moves that a point is out of range or too fast. Safety is the gate's, as for every skill.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from runner.limits import Limits
+from runner.protocols import Act, Done, Goal, StepOutcome
+from runner.skills.base import SkillBase
+from runner.skills.motion import REACHED_RAD, joint_positions
+from runner.skills.navigate import merge
+from schemas.control import ControlMode
+from schemas.errors import BadRequest, GoalRejected
+from schemas.manifest import RSkillManifest
+from schemas.world import Action, WorldState
+
+POINTS_MAX = 2000
+JOINTS_MAX = 64
+LONGEST_S = 600.0
+ARRIVE_S = 1.5  # after the last point, when the goal does not say (`goal_time_tolerance`)
+SLACK = 1.001  # of a speed limit: times are rounded to nanoseconds
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Ros(BaseModel):
+    """A ROS message, as far as it is kept: what is not kept may be empty and nothing else."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Duration(_Ros):
+    sec: Annotated[int, Field(ge=0, le=int(LONGEST_S))] = 0
+    nanosec: Annotated[int, Field(ge=0, lt=10**9)] = 0
+
+    @property
+    def seconds(self) -> float:
+        return self.sec + self.nanosec / 1e9
+
+
+class Header(BaseModel):
+    """Ignored: a trajectory begins when its goal does."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+class Point(_Ros):
+    """Positions in rad, in the order of `joint_names`. The way between points is straight: velocities and the like are not kept."""
+
+    positions: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=JOINTS_MAX)]
+    velocities: Annotated[tuple[Finite, ...], Field(max_length=0)] = ()
+    accelerations: Annotated[tuple[Finite, ...], Field(max_length=0)] = ()
+    effort: Annotated[tuple[Finite, ...], Field(max_length=0)] = ()
+    time_from_start: Duration
+
+
+class JointTrajectory(_Ros):
+    header: Header = Header()
+    joint_names: Annotated[tuple[str, ...], Field(max_length=JOINTS_MAX)] = ()
+    points: Annotated[tuple[Point, ...], Field(max_length=POINTS_MAX)] = ()
+
+
+class Tolerance(_Ros):
+    """`position` (rad) at the last point; 0: as if not given."""
+
+    name: str
+    position: Annotated[Finite, Field(ge=0)] = 0.0
+    velocity: Annotated[Finite, Field(ge=0, le=0)] = 0.0
+    acceleration: Annotated[Finite, Field(ge=0, le=0)] = 0.0
+
+
+class TrajectoryParams(_Ros):
+    """`FollowJointTrajectory.Goal`."""
+
+    trajectory: JointTrajectory = JointTrajectory()
+    path_tolerance: Annotated[tuple[Tolerance, ...], Field(max_length=0)] = ()
+    goal_tolerance: Annotated[tuple[Tolerance, ...], Field(max_length=JOINTS_MAX)] = ()
+    goal_time_tolerance: Duration = Duration()
+
+
+def parse_trajectory(manifest: RSkillManifest, params: Mapping[str, Any]) -> TrajectoryParams:
+    """The goal's parameters over the manifest's defaults. Raises BadRequest, field by field."""
+    defaults = json.loads(manifest.ros_integration.default_goal_json) if manifest.ros_integration else {}
+    try:
+        return TrajectoryParams.model_validate(merge(defaults, params))
+    except ValidationError as error:
+        fields = [
+            {"path": ".".join(map(str, item["loc"])) or "goal_params", "problem": item["msg"]}
+            for item in error.errors(include_url=False, include_input=False)
+        ]
+        text = "; ".join(f"{field['path']}: {field['problem']}" for field in fields)
+        raise BadRequest(f"goal_params: {text}", details={"fields": fields}) from error
+
+
+def problem_of(asked: TrajectoryParams, limits: Limits) -> str:
+    """What of a trajectory this robot cannot do; empty: nothing. The way to the first point is not looked at: nobody knows yet where it begins."""
+    names, points = asked.trajectory.joint_names, asked.trajectory.points
+    if not names or not points:
+        return "trajectory: give joint_names and at least one point: an empty one moves nothing"
+    if len(set(names)) != len(names):
+        return "trajectory.joint_names: a joint is named twice"
+    known = ", ".join(limits.joints_rad)
+    for name in (*names, *(tolerance.name for tolerance in asked.goal_tolerance)):
+        if name not in limits.joints_rad:
+            return f"there is no joint {name}; the robot has {known}"
+    for index, point in enumerate(points):
+        if len(point.positions) != len(names):
+            return f"trajectory.points[{index}]: {len(point.positions)} positions for {len(names)} joints"
+        for name, position in zip(names, point.positions, strict=True):
+            low, high = limits.joints_rad[name]
+            if not low <= position <= high:
+                return f"trajectory.points[{index}]: {name} {position:g} rad is outside [{low:g}, {high:g}]"
+    if points[0].time_from_start.seconds <= 0:
+        return (
+            "trajectory.points[0]: time_from_start must be above 0: the arm is somewhere else when it begins"
+        )
+    for index, (here, there) in enumerate(pairwise(points), start=1):
+        if wrong := too_fast(names, here.positions, there.positions, _gap_s(here, there), limits):
+            return f"trajectory.points[{index}]: {wrong}"
+    return ""
+
+
+def too_fast(
+    names: tuple[str, ...], start: tuple[float, ...], end: tuple[float, ...], gap_s: float, limits: Limits
+) -> str:
+    """Which joint would have to be faster than it may; empty: none."""
+    if gap_s <= 0:
+        return "time_from_start must grow from point to point"
+    for name, a, b in zip(names, start, end, strict=True):
+        speed, most = abs(b - a) / gap_s, limits.speeds_rad_s.get(name, math.inf)
+        if speed > most * SLACK:
+            return f"{name} would have to make {speed:.2f} rad/s; at most {most:.2f}"
+    return ""
+
+
+def _gap_s(here: Point, there: Point) -> float:
+    return there.time_from_start.seconds - here.time_from_start.seconds
+
+
+class FollowJointTrajectory(SkillBase):
+    """One goal, one trajectory. Fails with `goal_rejected` when the arm does not arrive in time."""
+
+    def __init__(self, manifest: RSkillManifest, limits: Limits, *, period_s: float) -> None:
+        super().__init__(manifest)
+        self._limits = limits
+        self._period_s = period_s
+        self._asked: TrajectoryParams | None = None
+        self._start_at: tuple[float, ...] | None = None
+        self._ticks = 0
+
+    async def _start(self, goal: Goal) -> None:
+        self._asked, self._start_at, self._ticks = None, None, 0
+        asked = parse_trajectory(self.manifest, goal.params)
+        if problem := problem_of(asked, self._limits):
+            raise BadRequest(f"goal_params: {problem}", hint="nothing was moved")
+        self._asked = asked
+
+    def _step(self, world: WorldState) -> StepOutcome:
+        if self._asked is None:
+            raise BadRequest("a trajectory was stepped without a goal")
+        names, points = self._asked.trajectory.joint_names, self._asked.trajectory.points
+        measured = joint_positions(world, names)
+        here = tuple(measured[name] for name in names)
+        if self._start_at is None:
+            self._start_at = here
+            if wrong := too_fast(
+                names, here, points[0].positions, points[0].time_from_start.seconds, self._limits
+            ):
+                raise BadRequest(
+                    f"trajectory.points[0]: {wrong} from where the arm is", hint="nothing was moved"
+                )
+        self._ticks += 1
+        elapsed_s = self._ticks * self._period_s
+        last_s = points[-1].time_from_start.seconds
+        self.fraction = min(0.99, elapsed_s / last_s)
+        if elapsed_s - self._period_s >= last_s:  # the last point has been sent
+            errors = {n: abs(a - b) for n, a, b in zip(names, here, points[-1].positions, strict=True)}
+            if all(error <= self._tolerance_rad(name) for name, error in errors.items()):
+                return Done({"positions_rad": measured, "error_rad": round(max(errors.values()), 4)})
+            if elapsed_s > last_s + (self._asked.goal_time_tolerance.seconds or ARRIVE_S):
+                worst = max(errors, key=lambda name: errors[name])
+                raise GoalRejected(
+                    f"{worst} is {errors[worst]:.3f} rad from the last point",
+                    hint="something is in the way, or the trajectory is too fast for the arm",
+                )
+        return Act(
+            Action(
+                control_mode=ControlMode.JOINT_POSITION,
+                joint_targets=(self._target(elapsed_s),),
+                joint_names=names,
+                stamp_ns=world.stamp_ns,
+            )
+        )
+
+    def _tolerance_rad(self, name: str) -> float:
+        assert self._asked is not None, "only asked while a goal runs"
+        given = [one.position for one in self._asked.goal_tolerance if one.name == name and one.position > 0]
+        return min(given, default=REACHED_RAD)
+
+    def _target(self, elapsed_s: float) -> tuple[float, ...]:
+        assert self._asked is not None, "only asked while a goal runs"
+        assert self._start_at is not None, "the first step has looked"
+        before_s, before = 0.0, self._start_at
+        for point in self._asked.trajectory.points:
+            at_s = point.time_from_start.seconds
+            if elapsed_s < at_s:
+                share = (elapsed_s - before_s) / (at_s - before_s)
+                return tuple(a + share * (b - a) for a, b in zip(before, point.positions, strict=True))
+            before_s, before = at_s, point.positions
+        return before
