@@ -167,13 +167,19 @@ class ControlThread:
         self.runner.mailbox.post(work, lambda result, error: self._settle(future, result, error))
         return await future
 
-    async def run_skill(self, skill: Any, goal: Goal) -> SkillEnded:
-        """Give the arm to a started skill until it is done or fails. Cancelling takes the arm back: it holds."""
+    async def run_skill(
+        self, skill: Any, goal: Goal, on_begun: Callable[[], None] = lambda: None
+    ) -> SkillEnded:
+        """Give the arm to a started skill until it is done or fails. Cancelling takes the arm back: it holds.
+
+        `on_begun` is called (event loop) when it has the arm: until then the runner's progress is that of the goal before.
+        """
         ended: asyncio.Future[SkillEnded] = self._loop.create_future()
         try:
             await self.call(
                 lambda: self.runner.begin_skill(skill, goal, lambda end: self._settle(ended, end, None))
             )
+            on_begun()
             futures: list[asyncio.Future[Any]] = [ended, self.ended]
             await asyncio.wait(futures, return_when=asyncio.FIRST_COMPLETED)
             if not ended.done():

@@ -399,9 +399,12 @@ class GoalServer:
             running.phase = "starting"
             self._caption(running)
             await self._residency.start(skill, goal)
-        running.phase = "running"
-        self._caption(running)
-        return await self._control.run_skill(skill, goal)
+
+        def begun() -> None:
+            running.phase = "running"
+            self._caption(running)
+
+        return await self._control.run_skill(skill, goal, begun)
 
     async def _conclude(
         self, running: _Running, status: Status, error: VramError | None, data: dict[str, Any]

@@ -1,6 +1,7 @@
 """The goal server over real sockets with the real client: one goal at a time, exactly one result, whatever happens."""
 
 import asyncio
+import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -426,5 +427,37 @@ def test_the_emergency_stop_of_a_simulator_ends_its_goal_too(
         assert b.made[0].story == [f"start {prompt}", "finish"]
         with pytest.raises(EstopRequested, match="smoke"):
             await client.send_goal(RSKILL, prompt="end")
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_goal_runs_when_it_has_the_arm_and_not_before(bench: Any, endpoint: str, run_async: Run) -> None:
+    """Regression: until the control thread took it up, a goal was fed back with the progress of the goal before: ended, all of it done."""
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        first = await client.send_goal(RSKILL, prompt="end")
+        assert (await first.result(60))["success"]
+        assert b.runner.progress.state == "ended"
+        busy, go_on = threading.Event(), threading.Event()
+
+        def hold_up() -> None:
+            busy.set()
+            go_on.wait(60)
+
+        b.runner.mailbox.post(hold_up, lambda *_: None)
+        await asyncio.to_thread(busy.wait, 60)
+        second = await client.send_goal(RSKILL, prompt="wait")
+        feedback = aiter(second.feedback())
+        while (told := await anext(feedback))["state"] != "starting":
+            assert told["state"] == "acquiring"
+        told = await anext(feedback)  # said again, since nothing changes
+        assert (told["state"], told["progress"]) == ("starting", 0.0)
+        assert (await client.state())["phase"] == "starting"
+        go_on.set()
+        while (told := await anext(feedback))["state"] == "starting":
+            assert told["progress"] == 0.0
+        assert told["state"] == "running"
+        await second.cancel()
+        assert (await second.result(60))["status"] == "canceled"
 
     play(run_async, bench, endpoint, body)

@@ -52,10 +52,9 @@ async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
         async for feedback in grab.feedback():
             if feedback["state"] == "running":
                 break
-        while (found := leases(await rival.status(), "grab"))[0][0] == "loading":
-            await asyncio.sleep(0.01)  # the goal runs, its policy is on its way
-        ((state, uses),) = found
-        assert state == "held"
+        ((state, uses),) = leases(await rival.status(), "grab")
+        told = [(e["kind"], e.get("reason")) for e in (await rival.history())["events"]]
+        assert state == "held", f"no goal runs before its policy is ready: {told}"
         assert uses >= 1, "the goal is one use; an op under way is another"
         whole_card = LeaseSpec(
             consumer="rival",
