@@ -77,6 +77,8 @@ def test_a_handover_is_one_trace(make_arbiter: Make, collector: Collector) -> No
     assert revoke["traceparent"].split("-")[1:3] == [TRACE, evict.span_id]
     assert evict.attributes["vram.consumer"] == "detector"
     in_order(spans)
+    (run,) = collector.spans("cli.command")
+    assert (run.parent_id, run.attributes) == ("", {"cli.command": "serve", "process.exit.code": 0})
 
     lines = [json.loads(line) for line in arbiter.log.splitlines() if line.startswith("{")]
     named = {line["event"]["kind"]: line for line in lines if line.get("trace_id") == TRACE}
