@@ -189,16 +189,17 @@ class Tools:
                 if result is None or not result["success"]:
                     return Outcome(
                         "failed",
-                        f"no progress for {call.patience_s:g} s; the goal was cancelled",
+                        f"no progress for {call.patience_s:g} s; {_how_it_went(result)}",
                         "no_progress",
                     )
                 return _ended(result)
             return _ended(await waiting)
-        except (TimeoutError, RunnerUnreachable):
-            await _called_off(goal)
-            return Outcome(
-                "failed", f"no result within {limit_s:.0f} s; the goal was cancelled", "wait_timeout"
-            )
+        except TimeoutError:
+            how = _how_it_went(await _called_off(goal))
+            return Outcome("failed", f"no result within {limit_s:.0f} s; {how}", "wait_timeout")
+        except RunnerUnreachable as error:
+            how = _how_it_went(await _called_off(goal))
+            return Outcome("failed", f"{error.message}; {how}", error.code)
         except asyncio.CancelledError:
             await _called_off(goal)
             raise
@@ -348,6 +349,17 @@ async def _called_off(goal: Goal) -> ResultPush | None:
             return None
 
     return await asyncio.shield(asyncio.create_task(end()))
+
+
+def _how_it_went(result: ResultPush | None) -> str:
+    """What became of a goal that was called off: nobody says `cancelled` of one that may still move the arm."""
+    if result is None:
+        return "the goal was called off, but the runner has not said that it ended: it may still run"
+    return (
+        "the goal was cancelled"
+        if result["status"] == "canceled"
+        else f"it ended by then: {result['status']}"
+    )
 
 
 def _retrieve(task: "asyncio.Task[Any]") -> None:

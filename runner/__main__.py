@@ -15,7 +15,7 @@ from types import ModuleType
 from clients import logs
 from runner import cli_benchmark, cli_deploy, cli_estop, cli_replay, cli_sim
 from schemas.commands import command
-from schemas.errors import ConfigError, VramError
+from schemas.errors import ConfigError, EstopRequested, VramError
 
 COMMANDS: tuple[ModuleType, ...] = (cli_sim, cli_benchmark, cli_deploy, cli_estop, cli_replay)
 
@@ -48,7 +48,7 @@ def main(argv: list[str] | None = None) -> int:
             running.code = asyncio.run(args.run(args))
     except VramError as error:
         print(f"vram-runner: {error}", file=sys.stderr)
-        return 2 if isinstance(error, ConfigError) else 1
+        return 2 if isinstance(error, ConfigError | EstopRequested) else 1  # 2: a person has to act
     return running.code
 
 

@@ -39,6 +39,7 @@ from runner.deployment import (
     unkept,
     unused,
 )
+from runner.estop_mark import EstopMark
 from runner.goals import GoalServer
 from runner.hardware import HardwareRunner
 from runner.promptness import make_prompt
@@ -144,8 +145,10 @@ class Deploy:
         install_signals(self._stopping)
         async with contextlib.AsyncExitStack() as stack:
             claim(self._file.robot, stack)
+            mark = EstopMark(_robot_file("robot", self._file.robot.robot_id, "estop"))
+            mark.refuse_if_left()
             arbiter = None if self._args.no_arbiter else await connect_arbiter(self._args.arbiter, stack)
-            runner = self._runner(parts)
+            runner = self._runner(parts, mark)
             runner.trace_ticks = self._args.trace_ticks
             if (folder := self._file.robot.save_dir) is not None:
                 rate_hz, name = self._file.robot.rate_hz, self._file.robot.robot_id
@@ -166,6 +169,8 @@ class Deploy:
             )
             ended = await self._serve(server, runner)
         failed = control.ended.exception() is not None
+        if not failed:
+            mark.remove()
         return self._conclude(runner, ended, failed)
 
     # -- steps -------------------------------------------------------------------------------------------------------
@@ -190,7 +195,11 @@ class Deploy:
             "arbiter": arbiter is not None,
         }
 
-    def _runner(self, parts: Parts) -> HardwareRunner:
+    def _runner(self, parts: Parts, mark: EstopMark) -> HardwareRunner:
+        def latch(reason: str) -> None:
+            parts.gate.trip(reason)
+            mark.leave(reason)
+
         robot = self._file.robot
         ages = {sensor.sensor_id: sensor.max_age_ms for sensor in robot.sensors}
         return HardwareRunner(
@@ -201,7 +210,7 @@ class Deploy:
             deadline_policy=DeadlinePolicy(robot.deadline_overrun_policy),
             clock=self._clock,
             topics={s.sensor_id: s.publish_topic for s in robot.sensors if s.publish_topic},
-            on_estop=parts.gate.trip,
+            on_estop=latch,
         )
 
     async def _start(self, runner: HardwareRunner, stack: contextlib.AsyncExitStack) -> ControlThread | None:
@@ -281,11 +290,17 @@ def claim(robot: RobotEnvironment, stack: contextlib.AsyncExitStack) -> None:
         _claim(f"port {port}", os.path.realpath(str(port)), stack)
 
 
-def _claim(what: str, key: str, stack: contextlib.AsyncExitStack) -> None:
+def _robot_file(kind: str, key: str, suffix: str) -> Path:
+    """A file of this robot, or port, in the runtime folder, which is made."""
     folder = Path(runtime_dir(os.environ, os.getuid()))
     folder.mkdir(mode=0o750, parents=True, exist_ok=True)
-    path = folder / f"{what.partition(' ')[0]}-{re.sub(r'[^A-Za-z0-9._-]', '_', key)}.lock"
-    lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660)
+    return folder / f"{kind}-{re.sub(r'[^A-Za-z0-9._-]', '_', key)}.{suffix}"
+
+
+def _claim(what: str, key: str, stack: contextlib.AsyncExitStack) -> None:
+    lock = os.open(
+        _robot_file(what.partition(" ")[0], key, "lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660
+    )
     stack.callback(os.close, lock)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 from reasoner.cascade import Answered, Called, Thought, Turn, Words, conversation
-from reasoner.llm.http import RETRY_PAUSE_S, JsonHttp, check_installed
+from reasoner.llm.http import RETRY_PAUSE_S, JsonHttp, check_installed, without_credentials
 from reasoner.palette import Palette
 from reasoner.planner import Episode, Finish, benched
 from schemas.errors import BadRequest, ConfigError, LlmError, NotPermitted, UnknownOp
@@ -192,7 +192,7 @@ class LlmPlanner(ABC):
             return self._read(answer)
         except (ValueError, LookupError, TypeError, AttributeError) as error:
             raise LlmError(
-                f"{url} answered something that is no answer of this API: {error!r}",
+                f"{without_credentials(url)} answered something that is no answer of this API: {error!r}",
                 hint="is it the right backend?",
             ) from error
 

@@ -10,6 +10,7 @@ import json
 import logging
 from collections.abc import Mapping
 from typing import Any, Self
+from urllib.parse import urlsplit, urlunsplit
 
 from schemas import strictjson
 from schemas.errors import ConfigError, LlmError
@@ -56,29 +57,31 @@ class JsonHttp:
 
     async def post(self, url: str, body: Mapping[str, Any]) -> dict[str, Any]:
         """The answer's JSON object. Raises LlmError for everything that goes wrong."""
+        shown = without_credentials(url)
         content = json.dumps(body, ensure_ascii=False).encode(errors="replace")
         problem = ""
         for number in range(TRIES_MAX):
             if number:
-                log.warning("%s: %s; trying again", url, problem)
+                log.warning("%s: %s; trying again", shown, problem)
                 await asyncio.sleep(self._retry_pause_s * 2 ** (number - 1))
             try:
                 async with asyncio.timeout(self._timeout_s):
                     return await self._once(url, content)
             except TimeoutError as error:
                 raise LlmError(
-                    f"no answer from {url} within {self._timeout_s:g} s",
+                    f"no answer from {shown} within {self._timeout_s:g} s",
                     hint="raise VRAM_REASONER_LLM_TIMEOUT_S",
                 ) from error
             except _Busy as error:
                 problem = str(error)
         raise LlmError(
-            f"{url}: {problem}, {TRIES_MAX} times", hint="is the server running, and does it keep up?"
+            f"{shown}: {problem}, {TRIES_MAX} times", hint="is the server running, and does it keep up?"
         )
 
     async def _once(self, url: str, content: bytes) -> dict[str, Any]:
         import httpx  # only installed with the reasoner's extra
 
+        shown = without_credentials(url)
         if self._http is None:
             self._http = httpx.AsyncClient(
                 headers=self._headers, timeout=self._timeout_s, follow_redirects=False
@@ -87,26 +90,27 @@ class JsonHttp:
             async with self._http.stream(
                 "POST", url, content=content, headers={"content-type": "application/json"}
             ) as response:
-                answer = await self._read(url, response)
+                answer = await self._read(shown, response)
                 status = int(response.status_code)
         except httpx.TimeoutException as error:
             raise TimeoutError from error
         except httpx.TransportError as error:
             raise _Busy(f"{type(error).__name__}: {error}") from error
         except (httpx.HTTPError, httpx.InvalidURL) as error:
-            raise LlmError(f"{url}: {error}", hint="is VRAM_REASONER_LLM_BASE_URL right?") from error
+            raise LlmError(f"{shown}: {error}", hint="is VRAM_REASONER_LLM_BASE_URL right?") from error
         if status in RETRY_STATUSES:
             raise _Busy(f"HTTP status {status}: {_complaint(answer)}")
         if status != 200:
             raise LlmError(
-                f"{url}: HTTP status {status}: {_complaint(answer)}", hint="are address, key and model right?"
+                f"{shown}: HTTP status {status}: {_complaint(answer)}",
+                hint="are address, key and model right?",
             )
         try:
             value = strictjson.loads(answer, max_chars=ANSWER_MAX_BYTES)
         except ValueError as error:
-            raise LlmError(f"{url} answered something that is no JSON: {error}") from error
+            raise LlmError(f"{shown} answered something that is no JSON: {error}") from error
         if not isinstance(value, dict):
-            raise LlmError(f"{url} answered a JSON {type(value).__name__}, not an object")
+            raise LlmError(f"{shown} answered a JSON {type(value).__name__}, not an object")
         return value
 
     @staticmethod
@@ -119,6 +123,12 @@ class JsonHttp:
                 raise LlmError(f"{url} answered more than {ANSWER_MAX_BYTES} bytes")
             parts.append(part)
         return b"".join(parts)
+
+
+def without_credentials(url: str) -> str:
+    """The address as it may stand in a log or a result: without user, password and query."""
+    parts = urlsplit(url)
+    return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
 
 
 def _complaint(answer: bytes) -> str:

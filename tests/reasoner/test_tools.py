@@ -1,6 +1,7 @@
 """What each tool does on the wire, and which outcome each answer becomes: real sockets, real clients."""
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -256,3 +257,24 @@ def test_a_goal_without_an_end_is_given_up(a_runner: Any) -> None:
     outcome, cancelled = play(story)
     assert (outcome.status, outcome.code) == ("failed", "wait_timeout")
     assert len(cancelled) == 1
+
+
+def test_a_goal_whose_runner_is_gone_is_not_called_cancelled(
+    a_runner: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("reasoner.tools.CANCEL_S", 0.3)
+
+    async def story() -> Any:
+        async with contextlib.AsyncExitStack() as stack:
+            async with a_runner() as runner:
+                client = await stack.enter_async_context(
+                    RunnerClient(runner.endpoint, timeout_s=0.3, connect_timeout_s=0.3)
+                )
+                doing = asyncio.create_task(Tools(client, None, None)(GRAB))
+                await runner.accepted.wait()
+            return await doing
+
+    outcome = play(story)
+    assert (outcome.status, outcome.code) == ("failed", "runner_unreachable")
+    assert "it may still run" in outcome.text
+    assert "no result within" not in outcome.text

@@ -13,7 +13,7 @@ from runner.catalogue import Maker
 from runner.cli_deploy import Deploy
 from runner.deployment import Parts, read_deployment
 from runner.skills.sidecar_policy import Arbiter
-from schemas.errors import ConfigError, VramError
+from schemas.errors import ConfigError, EstopRequested, VramError
 from schemas.manifest import Kind
 
 STEPS = os.environ.get("NOD_STEPS")
@@ -32,7 +32,7 @@ def main() -> int:
         return asyncio.run(Deploy(args, read_deployment(args.config), makers).run())
     except VramError as error:
         print(error, file=sys.stderr)
-        return 2 if isinstance(error, ConfigError) else 1
+        return 2 if isinstance(error, ConfigError | EstopRequested) else 1
 
 
 if __name__ == "__main__":

@@ -219,6 +219,36 @@ def test_after_an_emergency_stop_a_task_is_not_restarted_and_the_robot_stays_con
     assert json.loads(out)["success"] is False
 
 
+def test_a_stopped_robot_does_not_move_again_because_its_runner_was_killed_and_restarted(
+    start: Start, tmp_path: Path
+) -> None:
+    mark = tmp_path / "robot-bench.estop"
+    first = start()
+
+    async def stop(client: RunnerClient) -> None:
+        await client.estop("a hand is in the way")
+
+    play(tmp_path, stop)
+    assert "a hand is in the way" in mark.read_text()
+    first.kill()  # as the kernel does when memory is short; systemd starts it again
+    first.communicate(timeout=60)
+    second = start()
+    _, err = second.communicate(timeout=60)
+    assert second.returncode == 2, err  # systemd's RestartPreventExitStatus
+    assert "a hand is in the way" in err
+    assert f"delete {mark}" in err
+    mark.unlink()
+    third = start()
+
+    async def stop_and_end(client: RunnerClient) -> None:
+        await client.estop("again")
+        third.send_signal(signal.SIGTERM)
+
+    play(tmp_path, stop_and_end)
+    third.communicate(timeout=60)
+    assert not mark.exists()  # a person ended it
+
+
 def test_a_port_has_one_runner_whatever_its_robots_are_called(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -73,6 +73,18 @@ def test_the_dry_run_says_what_would_run_and_opens_nothing(dry_run: DryRun) -> N
     assert lines[-1] == "dry run: nothing was opened"
 
 
+def test_the_mark_of_a_stop_that_nobody_looked_at_refuses_the_start_for_good(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(tmp_path))
+    (tmp_path / "robot-bench.estop").write_text("smoke\n")
+    file = tmp_path / "robot.yaml"
+    file.write_text(TWIN)
+    argv = ["deploy", "--config", str(file), "--skills", str(NAVIGATE), "--no-arbiter"]
+    assert main(argv) == 2  # systemd's RestartPreventExitStatus
+    assert "smoke" in capsys.readouterr().err
+
+
 def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_robot_moves(
     dry_run: DryRun, tmp_path: Path
 ) -> None:

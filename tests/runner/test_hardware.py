@@ -249,12 +249,16 @@ def test_the_emergency_stop_comes_before_anything_else(
 def test_a_stop_that_the_robot_latched_by_itself_is_the_runners_too(
     make: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
-    runner = make()
+    told: list[str] = []
+    runner = make(on_estop=told.append)
     runner.activate()
     ended = begin(runner, nod())
     with pytest.raises(EstopRequested):
         twin.estop("its button")
     assert not tick(runner, clock).action_applied
+    assert "its button" in told[0]
+    tick(runner, clock, 3)
+    assert len(told) == 1
     assert isinstance(ended[0].error, EstopRequested)
     assert runner.estop is ended[0].error
 

@@ -355,3 +355,22 @@ def test_the_environment_is_checked() -> None:
         {"VRAM_REASONER_LLM_MODEL": "m"}, base_url=AnthropicPlanner.default_base_url
     )
     assert cloud.base_url == "https://api.anthropic.com"
+
+
+def test_a_password_in_the_address_stands_in_no_message(
+    api: Any, stand_in: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    address = stand_in.url.replace("http://", "http://me:secret@") + api.base
+
+    async def once(config: LlmConfig) -> None:
+        async with api.planner(config, PALETTE, retry_pause_s=0.0) as planner:
+            await planner.decide(Episode("grab the red cube"))
+
+    stand_in.json({"not": "an answer"})
+    with pytest.raises(LlmError) as wrong:
+        asyncio.run(once(LlmConfig(address, "m", KEY)))
+    with pytest.raises(LlmError) as gone:
+        asyncio.run(once(LlmConfig("http://me:secret@127.0.0.1:9" + api.base, "m", KEY)))
+    for text in (str(wrong.value), str(gone.value), caplog.text):
+        assert "127.0.0.1" in text
+        assert "secret" not in text

@@ -1,0 +1,46 @@
+"""The emergency stop's mark on disk: a runner that crashed, or was killed, after somebody stopped its robot does not move it again because
+systemd starts it anew.
+
+Left the moment the stop latches, taken away when the program ends in order, which is a person's doing. Knows no robot.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from schemas.errors import EstopRequested
+
+log = logging.getLogger(__name__)
+
+
+class EstopMark:
+    """`path` is the mark of one robot; its folder exists."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def refuse_if_left(self) -> None:
+        """Raises EstopRequested when an earlier run has left it."""
+        try:
+            reason = self._path.read_text(encoding="utf-8", errors="replace").strip()
+        except FileNotFoundError:
+            return
+        raise EstopRequested(
+            f"an earlier run ended under its emergency stop, and not because somebody ended it: {reason}",
+            hint=f"look at the robot, then delete {self._path}",
+            details={"reason": reason},
+        )
+
+    def leave(self, reason: str) -> None:
+        """Any thread. Never raises: the stop itself must go on."""
+        try:
+            self._path.write_text(f"{reason}\n", encoding="utf-8", errors="replace")
+        except OSError as error:
+            log.error("the emergency stop is latched in this process only: %s", error)
+
+    def remove(self) -> None:
+        try:
+            self._path.unlink(missing_ok=True)
+        except OSError as error:
+            log.error("%s stays: %s", self._path, error)
