@@ -5,6 +5,7 @@ twice: look for the cube, so that the detector has the card; then grab, so that 
 SIGTERM, which has to lose nothing.
 """
 
+import asyncio
 import json
 import signal
 import subprocess
@@ -20,13 +21,16 @@ import pytest
 
 from arbiter.testing.collector import Collector, ReceivedSpan
 from arbiter.testing.process import ArbiterProcess
+from clients.runner import RunnerClient
+from clients.sidecar.base import SidecarClient
 from schemas import telemetry
+from schemas.errors import VramError
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(280)]
 
 ROOT = Path(__file__).parents[2]
 GRAB = ROOT / "configs/rskills/so101-grab"
-MOVES_S, STOP_S = 200.0, 60.0
+START_S, MOVES_S, STOP_S = 90.0, 120.0, 60.0
 ARBITER, RUNNER, REASONER = "vram-arbiter", "vram-runner", "vram-reasoner"
 DETECTOR, POLICY = "vram-sidecar-detector", "vram-sidecar-grab"
 DETECTOR_MANIFEST = """
@@ -130,7 +134,7 @@ def test_one_trace_runs_from_the_decision_to_the_first_action(
         stack.callback(programs.close)
         try:
             codes = played(arbiter, programs, collector, tmp_path)
-        except (AssertionError, subprocess.TimeoutExpired):
+        except (AssertionError, VramError, subprocess.TimeoutExpired):
             print(programs.log.read_text(errors="replace")[-6000:])
             raise
         assert codes == [1, 0, 0, 0], "the reasoner's task was broken off, the others ended in order"
@@ -155,6 +159,7 @@ def played(arbiter: ArbiterProcess, programs: Programs, collector: Collector, fo
     programs.start(echo, str(folder), *detector, *device)
     programs.start("-m", "sidecars", *grab, *device)
     programs.start("-m", "runner", "sim", "--seed", "1", "--skills", str(GRAB))
+    asyncio.run(all_up(arbiter.runtime))
     programs.start(
         "-m", "reasoner", "--task", "grab the red cube", "--planner", "openai", "--scene-vlm", "none"
     )
@@ -162,6 +167,15 @@ def played(arbiter: ArbiterProcess, programs: Programs, collector: Collector, fo
         lambda: bool(collector.spans(telemetry.SPAN_SEND)), "action that reaches the robot", MOVES_S
     )
     return programs.end()
+
+
+async def all_up(runtime: Path) -> None:
+    """Each serves: the clients of the programs themselves wait no longer for one that is just being started than for one that is gone."""
+    for name in ("detector", "grab"):
+        async with SidecarClient(f"ipc://{runtime}/{name}.sock") as sidecar:
+            await sidecar.ping(timeout_s=START_S)
+    async with RunnerClient(f"ipc://{runtime}/runner.sock") as runner:
+        await runner.ping(timeout_s=START_S)
 
 
 class Trace:

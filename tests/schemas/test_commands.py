@@ -88,3 +88,36 @@ def test_variables_that_make_no_sense_are_told_in_one_line(tmp_path: Path) -> No
         assert done.returncode == code, done.stderr
         assert "OTEL_EXPORTER_OTLP_ENDPOINT" in done.stderr
         assert "Traceback" not in done.stderr
+
+
+def test_the_quick_commands_send_nothing_and_the_others_do(tmp_path: Path) -> None:
+    """`vramctl status` is typed and polled too often to pay for an SDK."""
+    with Collector() as collector:
+        environ = {
+            "PYTHONPATH": str(ROOT),
+            "PATH": "/usr/bin",
+            "VRAM_ARBITER_RUNTIME": str(tmp_path),
+            **collector.environ(),
+        }
+        lines = (
+            "import sys\nfrom clients.cli.main import main\nsys.argv = ['vramctl', *sys.argv[1:]]\n"
+            "try: main()\nfinally: print([name for name in sys.modules if name == 'opentelemetry'], file=sys.stderr)"
+        )
+        said = {}
+        for name in ("status", "doctor"):
+            done = subprocess.run(
+                [sys.executable, "-c", lines, name],
+                env=environ,
+                capture_output=True,
+                text=True,
+                timeout=WAIT_S,
+            )
+            said[name] = (done.returncode, done.stderr.splitlines()[-1])
+        spans = collector.spans()
+    assert said == {"status": (3, "[]"), "doctor": (3, "['opentelemetry']")}
+    (span,) = spans
+    assert (span.service, span.name) == ("vramctl", telemetry.SPAN_COMMAND)
+    assert (span.attributes[telemetry.ATTR_COMMAND], span.attributes[telemetry.ATTR_EXIT_CODE]) == (
+        "doctor",
+        3,
+    )
