@@ -38,7 +38,7 @@ class Controlled(Protocol):
 
     def begin_skill(self, skill: Any, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None: ...
 
-    def end_skill(self) -> None: ...
+    def end_skill(self) -> dict[str, Any]: ...
 
 
 class Mailbox:
@@ -168,11 +168,16 @@ class ControlThread:
         return await future
 
     async def run_skill(
-        self, skill: Any, goal: Goal, on_begun: Callable[[], None] = lambda: None
+        self,
+        skill: Any,
+        goal: Goal,
+        on_begun: Callable[[], None] = lambda: None,
+        taken_back: Callable[[dict[str, Any]], None] = lambda data: None,
     ) -> SkillEnded:
         """Give the arm to a started skill until it is done or fails. Cancelling takes the arm back: it holds.
 
-        `on_begun` is called (event loop) when it has the arm: until then the runner's progress is that of the goal before.
+        `on_begun` is called (event loop) when it has the arm: until then the runner's progress is that of the goal before. `taken_back` hears
+        what became of a goal that was cancelled.
         """
         ended: asyncio.Future[SkillEnded] = self._loop.create_future()
         try:
@@ -189,6 +194,6 @@ class ControlThread:
             if not ended.done():  # cancelled, deadline, or the loop died: the mailbox keeps the order
                 ended.cancel()
                 try:
-                    await self.call(self.runner.end_skill)
+                    taken_back(await self.call(self.runner.end_skill))
                 except VramError:
                     log.debug("the control thread ended before the skill did")

@@ -97,6 +97,9 @@ class _Running:
     stopped_by: VramError | None = None
     skill: Skill | None = None
     phase: str = "acquiring"
+    so_far: dict[str, Any] = field(
+        default_factory=dict
+    )  # what became of its actions, once the arm was taken back
     began_s: float = 0.0
     sent: Progress | None = None
     sent_s: float = field(default=float("-inf"))
@@ -362,11 +365,12 @@ class GoalServer:
             data, error = dict(ended.data), ended.error
             status = "succeeded" if error is None else "failed"
         except TimeoutError:
-            status, error = "deadline", None
+            status, error, data = "deadline", None, running.so_far
         except VramError as raised:
             error = raised
         except asyncio.CancelledError:  # our own cancel, or the server's end: the result still goes out
             status, error = ("failed", running.stopped_by) if running.stopped_by else ("canceled", None)
+            data = running.so_far
         except Exception as raised:
             log.exception("goal %s failed", goal.goal_id)
             error = InternalError(f"{type(raised).__name__}: {raised}", hint="see the runner's log")
@@ -404,7 +408,7 @@ class GoalServer:
             running.phase = "running"
             self._caption(running)
 
-        return await self._control.run_skill(skill, goal, begun)
+        return await self._control.run_skill(skill, goal, begun, running.so_far.update)
 
     async def _conclude(
         self, running: _Running, status: Status, error: VramError | None, data: dict[str, Any]

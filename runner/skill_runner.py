@@ -171,13 +171,18 @@ class SkillRunner(RunnerBase):
         self._still = True
         self.progress = Progress(0.0, "running")
 
-    def end_skill(self) -> None:
-        """Control thread: take the arm back without a word to anybody; it holds. Repeatable."""
+    def end_skill(self) -> dict[str, Any]:
+        """Control thread: take the arm back; it holds. Says what became of the goal so far. Repeatable."""
         active, self._active = self._active, None
         self.traceparent, self.labels = None, {}
         self.progress = Progress(0.0, "idle")
-        if active is not None:
-            self._tell_end(active, None)
+        if active is None:
+            return {}
+        self._tell_end(active, None)
+        return self._account(active)
+
+    def _account(self, active: Active) -> dict[str, Any]:
+        return {"ticks": self.tick_idx - active.began_tick, **active.tally.as_data()}
 
     def _end(self, ended: SkillEnded) -> None:
         if (active := self._active) is None:
@@ -185,7 +190,7 @@ class SkillRunner(RunnerBase):
         self._active = None
         self.traceparent, self.labels = None, {}
         self.progress = Progress(1.0 if ended.error is None else self.progress.fraction, "ended")
-        data = {"ticks": self.tick_idx - active.began_tick, **active.tally.as_data(), **ended.data}
+        data = {**self._account(active), **ended.data}
         full = SkillEnded(data, ended.error)
         self._tell_end(active, full)
         active.on_end(full)

@@ -229,6 +229,11 @@ def test_cancel_takes_the_arm_back(bench: Any, endpoint: str, run_async: Run, pr
         assert (result["status"], result["success"]) == ("canceled", False)
         assert b.made[0].story[-1] == "finish"
         steps = b.made[0].steps
+        if prompt == "forever":  # it had the arm
+            assert result["data"]["ticks"] == steps
+            assert result["data"]["withheld"] == 0
+        else:
+            assert set(result["data"]) == {"elapsed_s"}
         await goal.cancel()  # late and harmless
         await client.state()
         assert b.made[0].steps == steps
