@@ -158,6 +158,11 @@ class Lease:
         return self._asked and not self._gone
 
     @property
+    def given_up(self) -> bool:
+        """The holder itself turned away from it (`give_up`)."""
+        return self._own_will
+
+    @property
     def state(self) -> LeaseState:
         if self._gone:
             return "gone"

@@ -358,12 +358,15 @@ class Residency:
         except BaseException as error:
             await self._worker.run(self._unload_blocking)
             if lease is not None:
-                if isinstance(error, OutOfMemory):
+                if isinstance(error, OutOfMemory) and not lease.given_up:
                     requested = int(
                         error.details.get("requested_bytes") or self._settings.footprint.load_peak_bytes
                     )
                     await lease.oom(requested, error.details.get("allocated_bytes"))
                 await lease.release()
+            if lease is not None and lease.given_up:
+                _log.info("the load was taken back")
+                raise self._unwanted() from None
             _log.error("loading failed: %s", error)
             raise
         model = {telemetry.ATTR_MODEL: self._settings.manifest.name}

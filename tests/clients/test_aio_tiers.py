@@ -88,6 +88,31 @@ async def test_a_standby_lease_returns_by_itself_when_there_is_room(
         assert (model.did[-1], detector.state) == ("unload", "gone")
 
 
+async def test_whoever_follows_a_lease_hears_where_it_went(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    model = Model()
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        detector = await on_standby(client, spec, model)
+        assert (detector.state, detector.given_up) == ("held", False)
+        policy = await client.acquire(spec("policy", 4), WAIT_S)
+        await policy.ready()
+        seen = [detector.state]
+        following = asyncio.create_task(detector.wait_change())
+        await policy.give_up()
+        assert policy.given_up
+        async with asyncio.timeout(WAIT_S):
+            while seen[-1] != "held":
+                seen.append(await following)
+                following = asyncio.create_task(detector.wait_change())
+            assert seen == ["standby", "loading", "held"]
+            await detector.give_up()
+            assert await following in ("revoking", "unloading", "gone")
+            await detector.wait_gone()
+            assert await detector.wait_change() == "gone", "nothing changes any more"
+        assert detector.given_up
+
+
 async def test_a_standby_lease_survives_the_daemon(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
 ) -> None:

@@ -142,3 +142,23 @@ def test_told_to_unload_while_it_waits_it_waits_no_longer(box, arbiter):
     policy.let_go()
     assert policy.client.reply(running, PATIENCE_S)["ok"]
     assert detector.detect()["ok"], "the next request asks anew"
+
+
+def test_told_to_unload_while_it_loads_it_takes_the_load_back(box, arbiter):
+    (box.runtime / "detector-model").mkdir()
+    switch = box.runtime / "detector-model" / "slow_load"
+    switch.touch()
+    detector = box.start("detector", footprint=BOTH)
+    waiting = detector.send_detect()
+    until(lambda: state(arbiter, "detector") == "loading")
+    with WireClient(f"ipc://{box.runtime}/detector.sock") as other:
+        unloading = other.send("unload")
+        assert other.reply(other.send("ping"), PATIENCE_S)["ok"], "it was heard behind the unload"
+        switch.unlink()
+        assert other.reply(unloading, PATIENCE_S)["ok"]
+    refused = detector.client.reply(waiting, PATIENCE_S)
+    assert (refused["ok"], refused["code"]) == (False, "not_resident")
+    until(lambda: state(arbiter, "detector") is None)
+    until(lambda: box.used() == 100_000_000)  # its context
+    assert "ERROR" not in detector.log
+    assert detector.detect()["ok"]
