@@ -182,7 +182,7 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
         charge_bytes=lease.load_peak_bytes,
         waited_ms=(core.now - lease.arrived_at) * 1e3,
         evicted=[e.consumer for e in lease.evicted],
-        by_itself=by_itself,
+        **({"by_itself": True} if by_itself else {}),
         reason=_why_now(lease, by_itself=by_itself),
     )
     gpu.blocked = policy.blocked(core, gpu)

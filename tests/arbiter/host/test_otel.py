@@ -439,6 +439,11 @@ def test_whatever_happens_spans_end_and_nest(busy: CoreDriver) -> None:
     engine = Arbiter(busy.settings, START_S)
     for now, event in busy.events:
         heard.hear(engine.handle(event, now), now)
+    states = {view["lease_id"]: view["state"] for view in engine.status(busy.now)["leases"]}
+    measured = {v.lease for gpu in engine._core.gpus.values() for v in gpu.verifications.values()}
+    assert {states.get(lease) for lease in heard.telemetry._acquires} <= {"queued", "loading"}
+    on_its_way = {lease for lease, state in states.items() if state in ("revoking", "unloading", "verifying")}
+    assert set(heard.telemetry._leaving) <= on_its_way | measured
     heard.telemetry.close()
     spans = heard.spans()
     kinds = {span.name for span in spans}
