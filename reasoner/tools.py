@@ -344,7 +344,9 @@ async def _called_off(goal: Goal) -> ResultPush | None:
                 return await goal.result()
         except (TimeoutError, VramError) as error:
             log.error(
-                "goal %s may still run: %s", goal.goal_id, error or "the runner did not say that it ended"
+                "goal %s may still run: %s",
+                goal.goal_id,
+                str(error) or "the runner did not say that it ended",
             )
             return None
 

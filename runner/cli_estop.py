@@ -29,5 +29,7 @@ async def run(args: argparse.Namespace) -> int:
         except RunnerUnreachable as error:
             hint = "if a robot moves, cut its power"
             raise RunnerUnreachable(error.message, hint=hint, details=error.details) from error
-    print(reply["message"])
+    print(
+        f"{reply.get('robot') or runner.endpoint}: {reply['message']}"
+    )  # which one: a machine may have several
     return 0

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
+import msgpack
 from pydantic import ValidationError
 
 from clients.serve import Message, Peer, RouterServer
@@ -62,6 +63,7 @@ RESULTS_KEPT = 64
 FEEDBACK_PERIOD_S = 0.2  # at most five a second
 ESTOP_S = 1.0  # a control loop that has not obeyed by then hangs
 READS_MAX = 16  # requests that wait for the control thread; more are refused, so that an emergency stop is always read
+LOOP_SILENT_S = 1.0  # a control loop that has not looked at the world for so long hangs
 FINISHING = "finishing"
 FINISH_S = 8.0  # a skill that has not finished by then is left to itself; nobody waits longer for a result
 FEEDBACK_QUIET_S = 1.0  # said again after this long even if nothing changed
@@ -150,6 +152,7 @@ class GoalServer:
             try:
                 await asyncio.wait([serving, stopping, ended], return_when=asyncio.FIRST_COMPLETED)
             finally:
+                self.stopping.set()  # whatever ended it: no goal is accepted any more
                 await self._cancel_running()
                 await self._residency.close()
                 for task in (serving, stopping, ended):
@@ -259,7 +262,8 @@ class GoalServer:
             raise RobotFault(
                 error.message, hint="cut the robot's power; the runner goes on trying", details=error.details
             )
-        return {"reason": reason, "message": error.message if error is not None else ""}
+        message = error.message if error is not None else ""
+        return {"reason": reason, "message": message, "robot": self._identity.get("robot")}
 
     def _accept(self, peer: Peer, request: SendGoal) -> Message:
         if self._robot.estop is not None:
@@ -323,7 +327,7 @@ class GoalServer:
     def _state(self) -> Message:
         robot, running = self._robot, self._running
         return {
-            "world": robot.world.model_dump(mode="json", exclude={"image_frames"}) if robot.world else None,
+            "world": self._world(),
             "goal": running.goal.goal_id if running else None,
             "rskill_id": running.goal.rskill_id if running else None,
             "phase": running.phase if running else "idle",
@@ -334,6 +338,17 @@ class GoalServer:
             "estop": robot.estop.message if robot.estop is not None else None,
             "cameras": list(robot.camera_names()),
         }
+
+    def _world(self) -> dict[str, Any] | None:
+        """The newest world state. What was fresh when the control loop last looked is not fresh while it hangs."""
+        robot = self._robot
+        if (world := robot.world) is None:
+            return None
+        told = world.model_dump(mode="json", exclude={"image_frames"})
+        limit_s = max(LOOP_SILENT_S, 3 / robot.rate_hz if robot.rate_hz else 0.0)
+        if (self._clock.now_ns() - world.stamp_ns) / 1e9 > limit_s:
+            told["diagnostics"] = dict.fromkeys(world.diagnostics, "stale")
+        return told
 
     # -- a goal --------------------------------------------------------------------------------------------------------
     async def _execute(self, running: _Running, make: Callable[[], Skill]) -> None:
@@ -389,7 +404,9 @@ class GoalServer:
             async with asyncio.timeout(FINISH_S):
                 await skill.finish()
         except (VramError, TimeoutError) as error:
-            log.warning("%s did not finish cleanly: %s", skill.key, error or f"not within {FINISH_S:.0f} s")
+            log.warning(
+                "%s did not finish cleanly: %s", skill.key, str(error) or f"not within {FINISH_S:.0f} s"
+            )
         except Exception:
             log.exception("%s did not finish cleanly", skill.key)
 
@@ -427,7 +444,7 @@ class GoalServer:
             success=status == "succeeded",
             code=error.code if error else "",
             message=message,
-            data={**data, "elapsed_s": round(self._clock.now_s() - running.began_s, 3)},
+            data={**_sendable(data), "elapsed_s": round(self._clock.now_s() - running.began_s, 3)},
         )
         self._results[goal.goal_id] = result
         while len(self._results) > RESULTS_KEPT:
@@ -498,6 +515,15 @@ def _refusal(request_id: int | None, error: VramError) -> Message:
 def _identity(request: SendGoal) -> str:
     """What makes a repeated goal the same goal."""
     return request.model_dump_json(exclude={"id", "traceparent"})
+
+
+def _sendable(data: dict[str, Any]) -> dict[str, Any]:
+    """A skill's own words, if a wire carries them; a result reaches its client whatever they are."""
+    try:
+        msgpack.packb(data)
+    except (TypeError, ValueError, OverflowError):
+        return {"unsendable": repr(data)[:500]}
+    return data
 
 
 def _text(key: object) -> str | None:

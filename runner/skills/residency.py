@@ -81,4 +81,6 @@ async def _release(skill: Skill, timeout_s: float) -> None:
         async with asyncio.timeout(timeout_s):
             await skill.release()
     except (VramError, TimeoutError) as error:  # its process may be gone
-        log.warning("%s did not release cleanly: %s", skill.key, error or f"not within {timeout_s:.0f} s")
+        log.warning(
+            "%s did not release cleanly: %s", skill.key, str(error) or f"not within {timeout_s:.0f} s"
+        )

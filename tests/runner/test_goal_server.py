@@ -64,7 +64,11 @@ class Told(SkillBase):
         self.steps += 1
         self.loop.call_soon_threadsafe(self.begun.set)
         match self.todo:
-            case "end" | "end slowly" | "end badly" if self.steps > 3:
+            case "end with a set":
+                return Done({"seen": {1, 2}})
+            case "end with a large number":
+                return Done({"seen": 2**70})
+            case "end" | "end, and leave slowly" | "end slowly" | "end badly" if self.steps > 3:
                 return Done({"steps": self.steps})
             case "evicted" if self.steps > 2:
                 raise Evicted("another model is there")
@@ -86,6 +90,9 @@ class Told(SkillBase):
 
     async def _release(self) -> None:
         self.story.append("release")
+        if self.todo == "end, and leave slowly":
+            self.finishing.set()
+            await self.finished.wait()
 
 
 class Bench:
@@ -192,6 +199,35 @@ def test_a_cancel_or_stop_while_a_goal_finishes_does_not_cost_its_result(
         if by == "cancel":
             again = await client.send_goal(RSKILL, prompt="end")
             assert (await again.result(60))["success"]
+
+    play(run_async, bench, endpoint, body)
+
+
+@pytest.mark.parametrize("what", ["set", "large number"])
+def test_a_result_that_no_wire_carries_still_reaches_the_client(
+    bench: Any, endpoint: str, run_async: Run, what: str
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt=f"end with a {what}")
+        result = await goal.result(60)
+        assert result["success"]
+        assert "seen" in result["data"]["unsendable"]
+        assert (await client.call("result", {"goal_id": goal.goal_id}))["status"] == "succeeded"
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_no_goal_is_accepted_once_the_control_loop_has_ended(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="end, and leave slowly")
+        assert (await goal.result(60))["success"]
+        b.runner.request_stop()
+        await b.made[0].finishing.wait()
+        with pytest.raises(GoalRejected, match="stopping"):
+            await client.send_goal(RSKILL, prompt="end")
+        b.made[0].finished.set()
 
     play(run_async, bench, endpoint, body)
 

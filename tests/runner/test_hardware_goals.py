@@ -69,7 +69,7 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
         )
         catalogue = Catalogue([skill.manifest], {Kind.ROS_ACTION: lambda manifest: skill})
         async with ControlThread(runner) as control:
-            server = GoalServer(endpoint, control, runner, catalogue, clock)
+            server = GoalServer(endpoint, control, runner, catalogue, clock, identity={"robot": "bench"})
             task = asyncio.create_task(server.serve())
             await server.bound.wait()
             try:
@@ -133,6 +133,23 @@ def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(bench: Any
     play(run_async, bench, body)
 
 
+def test_what_was_fresh_is_stale_while_the_loop_hangs(bench: Any, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        async def told() -> set[str]:
+            return set((await client.state())["world"]["diagnostics"].values())
+
+        await client.send_goal(RSKILL, prompt="hang in the step")
+        await b.skill.begun.wait()
+        async with asyncio.timeout(60):
+            while await told() != {"stale"}:
+                await asyncio.sleep(0.05)
+            b.skill.go_on.set()
+            while await told() != {"ok"}:
+                await asyncio.sleep(0.05)
+
+    play(run_async, bench, body)
+
+
 def test_the_command_line_stops_the_robot(
     bench: Any, run_async: Run, endpoint: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -143,7 +160,7 @@ def test_the_command_line_stops_the_robot(
         assert b.twin.story == ["connect", "halt"]
 
     play(run_async, bench, body)
-    assert "emergency stop: smoke; all joints stand still" in capfd.readouterr().out
+    assert "bench: emergency stop: smoke; all joints stand still" in capfd.readouterr().out
 
 
 @pytest.mark.parametrize("cause", [RobotFault("motor 2 does not answer"), TypeError("a driver's defect")])
