@@ -132,8 +132,21 @@ class SimRunner(SkillRunner):
         if self._policy is None:
             return
         player = self._policy(self.env, seed)
-        goal = Goal(f"episode-{self.episode_idx}", player.key.rskill_id)
-        self.begin_skill(player, goal, self._policy_ended)
+        name = player.key.rskill_id
+        span = tracing.begin(telemetry.SPAN_EPISODE, attributes={telemetry.ATTR_SKILL: name})
+        with tracing.inside(span):
+            goal = Goal(f"episode-{self.episode_idx}", name, traceparent=tracing.traceparent())
+
+        def ended(end: SkillEnded) -> None:
+            span.set_attribute(telemetry.ATTR_OUTCOME, "ok" if end.error is None else end.error.code)
+            span.end()
+            self._policy_ended(end)
+
+        try:
+            self.begin_skill(player, goal, ended)
+        except BaseException:
+            span.end()
+            raise
 
     def _policy_ended(self, ended: SkillEnded) -> None:
         if ended.error is not None and "episode" not in ended.data and not self._stopping:

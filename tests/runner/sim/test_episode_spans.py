@@ -1,0 +1,34 @@
+"""Episodes that a policy plays are traces of their own, with their ticks."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from arbiter.testing.collector import Collector
+from schemas import telemetry
+
+pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_each_episode_is_a_trace_with_its_ticks(tmp_path: Path) -> None:
+    pytest.importorskip("gymnasium", reason="needs the runner extra")
+    argv = [
+        "-m", "runner", "sim", "--env", "gym:Pendulum-v1", "--policy", "random", "--episodes", "2", "--max-steps", "4",
+        "--rate", "0", "--no-arbiter", "--no-realtime",
+    ]  # fmt: skip
+    with Collector() as collector:
+        environ = os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path)} | collector.environ()
+        done = subprocess.run(
+            [sys.executable, *argv], cwd=ROOT, env=environ, capture_output=True, text=True, timeout=120
+        )
+    assert done.returncode == 0, done.stderr[-3000:]
+    episodes = collector.spans(telemetry.SPAN_EPISODE)
+    assert len({span.trace_id for span in episodes}) == len(episodes) == 2
+    ticks = collector.spans(telemetry.SPAN_TICK)
+    assert [sum(tick.parent_id == span.span_id for tick in ticks) for span in episodes] == [4, 4]
+    assert len(ticks) == 8, "nothing is recorded of the resets"
