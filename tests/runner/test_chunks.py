@@ -157,3 +157,18 @@ def test_a_request_that_was_cancelled_or_timed_out_is_a_typed_error() -> None:
     policy.futures[-1].cancel()
     with pytest.raises(ModelError, match="in time"):
         player.next_row(None)
+
+
+class AnsweredAsOneLooks(concurrent.futures.Future[list[Row]]):
+    """Not there yet when one stops waiting, there when one looks whether it is."""
+
+    def done(self) -> bool:
+        if not super().done():
+            self.set_result([(1.0,)])
+        return super().done()
+
+
+@pytest.mark.parametrize("wait_s", [0.0, 0.001])
+def test_an_answer_that_comes_right_behind_the_wait_is_no_timeout(wait_s: float) -> None:
+    player = ChunkPlayer(lambda _: AnsweredAsOneLooks(), wait_s=wait_s)
+    assert player.next_row("o") == Played(0, (1.0,))
