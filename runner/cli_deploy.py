@@ -31,7 +31,6 @@ from runner.control import ControlThread
 from runner.deployment import (
     DeploymentFile,
     Parts,
-    goal_gate,
     make_parts,
     offered,
     plan,
@@ -97,7 +96,7 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
 
             description = parts.hal.description
             wiring = wire_up(manifest, description.joint_names, description.rest_pose_rad)
-            limits = goal_gate(parts.gate, manifest, ()).limits
+            limits = parts.gate.for_skill(manifest, ()).limits
             return SidecarPolicy(
                 manifest,
                 wiring,
@@ -110,7 +109,7 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
         def make_trajectory(manifest: RSkillManifest) -> Skill:
             from runner.skills.trajectory import FollowJointTrajectory
 
-            limits = goal_gate(parts.gate, manifest, ()).limits
+            limits = parts.gate.for_skill(manifest, ()).limits
             return FollowJointTrajectory(manifest, limits, period_s=1.0 / file.robot.rate_hz)
 
         follow = StandIn(make_trajectory, frozenset({ControlMode.JOINT_POSITION}))
@@ -205,7 +204,7 @@ class Deploy:
         return HardwareRunner(
             parts.hal,
             [(reader, ages[reader.sensor_id]) for reader in parts.readers],
-            lambda skill: goal_gate(parts.gate, skill.manifest, skill.cameras),
+            lambda skill: parts.gate.for_skill(skill.manifest, skill.cameras),
             rate_hz=robot.rate_hz,
             deadline_policy=DeadlinePolicy(robot.deadline_overrun_policy),
             clock=self._clock,

@@ -124,16 +124,11 @@ def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
     return Parts(hal, tuple(readers), gate)
 
 
-def goal_gate(gate: RobotGate, manifest: RSkillManifest, cameras: Iterable[str]) -> RobotGate:
-    """The gate for one goal. Raises ConfigError for an envelope that cannot be kept on this robot."""
-    return gate.tightened(f"envelope of {manifest.name}", manifest.envelope, frozenset(cameras))
-
-
 def unkept(parts: Parts, catalogue: Catalogue) -> tuple[str, ...]:
     """What the file's `safety`, and the envelope of any skill that goals may ask for, want and the gate does not keep."""
     found = dict.fromkeys(parts.gate.unkept)
     for manifest in catalogue.executable():
-        found |= dict.fromkeys(goal_gate(parts.gate, manifest, ()).unkept)
+        found |= dict.fromkeys(parts.gate.for_skill(manifest, ()).unkept)
     return tuple(found)
 
 
@@ -180,7 +175,7 @@ def misfits(robot: RobotEnvironment, parts: Parts, manifest: RSkillManifest) -> 
     """What of a skill does not fit this robot: its envelope; of a learnt policy its joints and cameras, too."""
     problems = []
     try:
-        goal_gate(parts.gate, manifest, ())
+        parts.gate.for_skill(manifest, ())
     except ConfigError as error:
         problems.append(("vla.id", error.message))
     if manifest.kind is not Kind.VLA:

@@ -50,7 +50,7 @@ FIRST_DATA_SLICE_S = 0.2  # how late a request to stop is noticed while waiting 
 FIRST_STATE_TRIES = 5  # a bus may lose its first answers
 STALE_FAIL_S = 1.0
 
-MakeGate = Callable[[Skill], SafetyGate]
+MakeGate = Callable[[Stepped], SafetyGate]
 """The gate for one goal: the robot's own, tightened by the skill's envelope."""
 
 
@@ -77,7 +77,6 @@ class HardwareRunner(SkillRunner):
         self.hal = hal
         self._readers = {reader.sensor_id: reader for reader, _ in readers}
         self._make_gate = make_gate
-        self._gate: SafetyGate | None = None
         self._on_estop = on_estop
         self._first_data_s = first_data_s
         self.aggregator = WorldStateAggregator(
@@ -138,11 +137,6 @@ class HardwareRunner(SkillRunner):
     def begin_skill(self, skill: Skill, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
         super().begin_skill(skill, goal, on_end)
         self._stale_since_s = None
-        try:
-            self._gate = self._make_gate(skill)
-        except BaseException:
-            self.end_skill()
-            raise
 
     def request_estop(self, reason: str) -> None:
         super().request_estop(reason)
@@ -259,10 +253,8 @@ class HardwareRunner(SkillRunner):
     def _targets_now(self) -> Mapping[str, float]:
         return self._sent
 
-    def _safety_gate(self) -> SafetyGate:
-        if self._gate is None:
-            raise InternalError("an action without a skill")
-        return self._gate
+    def _gate_of(self, skill: Stepped) -> SafetyGate:
+        return self._make_gate(skill)
 
     def _apply(self, decision: Decision) -> Applied:
         if self.obey_estop() is not None or decision.action is None:

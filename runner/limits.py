@@ -29,6 +29,8 @@ POSITIVE = (
     "max_torque_nm",
     "contact_force_threshold_n",
     "max_cartesian_step_m",
+    "max_base_linear_speed_m_s",
+    "max_base_angular_speed_rad_s",
 )
 """Fields that the gate keeps; a NaN or a zero among them would switch a check off or stop everything."""
 NEEDS_KINEMATICS = (
@@ -39,7 +41,6 @@ NEEDS_KINEMATICS = (
     "max_cartesian_step_m",
 )
 KEPT_ELSEWHERE = ("e_stop_topic", "e_stop_qos")  # `vram-runner estop` instead of a topic
-NO_BASE = ("max_base_linear_speed_m_s", "max_base_angular_speed_rad_s")  # base motion is refused altogether
 
 
 class Kinematics(Protocol):
@@ -114,6 +115,8 @@ class Limits:
     torque_nm: float = math.inf
     force_n: float = math.inf
     contact_force_n: float = math.inf
+    base_speed_m_s: float = 0.0
+    base_turn_rad_s: float = 0.0
     unkept: tuple[str, ...] = field(default=())
 
     @property
@@ -126,6 +129,8 @@ def own_limits(robot: RobotDescription) -> Limits:
     return Limits(
         joints_rad={joint.name: (joint.lower_rad, joint.upper_rad) for joint in robot.joints},
         speeds_rad_s={joint.name: joint.max_speed_rad_s for joint in robot.joints},
+        base_speed_m_s=robot.base.max_speed_m_s if robot.base is not None else 0.0,
+        base_turn_rad_s=robot.base.max_turn_rad_s if robot.base is not None else 0.0,
     )
 
 
@@ -153,6 +158,8 @@ def tighten(
         torque_nm=min(limits.torque_nm, envelope.max_torque_nm),
         force_n=min(limits.force_n, envelope.max_force_n),
         contact_force_n=min(limits.contact_force_n, envelope.contact_force_threshold_n),
+        base_speed_m_s=min(limits.base_speed_m_s, _or_inf(envelope.max_base_linear_speed_m_s)),
+        base_turn_rad_s=min(limits.base_turn_rad_s, _or_inf(envelope.max_base_angular_speed_rad_s)),
         unkept=(*limits.unkept, *_unkept(envelope, name, robot, kinematics)),
     )
     if kinematics is None:
@@ -162,7 +169,7 @@ def tighten(
         box=box,
         zones=(*limits.zones, *(_ZONE.validate_python(zone) for zone in envelope.no_go_zones)),
         ee_speed_m_s=min(limits.ee_speed_m_s, envelope.max_ee_speed_m_s),
-        ee_step_m=min(limits.ee_step_m, envelope.max_cartesian_step_m or math.inf),
+        ee_step_m=min(limits.ee_step_m, _or_inf(envelope.max_cartesian_step_m)),
     )
 
 
@@ -214,6 +221,10 @@ def _intersection(box: tuple[Vector3, Vector3], envelope: SafetyEnvelope) -> tup
     return _vector(map(max, box[0], low)), _vector(map(min, box[1], high))
 
 
+def _or_inf(limit: float | None) -> float:
+    return math.inf if limit is None else limit
+
+
 def _vector(values: Iterable[float]) -> Vector3:
     x, y, z = values
     return x, y, z
@@ -223,7 +234,7 @@ def _unkept(
     envelope: SafetyEnvelope, name: str, robot: RobotDescription, kinematics: Kinematics | None
 ) -> Sequence[str]:
     """Fields that somebody wrote down and that this gate does not keep."""
-    kept = {*POSITIVE, *NEEDS_KINEMATICS, *KEPT_ELSEWHERE, *NO_BASE}
+    kept = {*POSITIVE, *NEEDS_KINEMATICS, *KEPT_ELSEWHERE}
     found = [
         f"{name}.{key}"
         for key in SafetyEnvelope.model_fields

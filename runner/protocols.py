@@ -113,7 +113,10 @@ class Progress:
 
 
 class Stepped(Protocol):
-    """What the control loop needs of a skill while it has the robot."""
+    """What the control loop needs of a skill while it has the robot. Without a manifest nobody tightens the robot's own limits."""
+
+    @property
+    def manifest(self) -> RSkillManifest | None: ...
 
     @property
     def key(self) -> SkillKey: ...
@@ -206,6 +209,14 @@ class Joint:
 
 
 @dataclass(frozen=True, slots=True)
+class MobileBase:
+    """A platform that drives on a plane: its greatest speed (m/s) and turn (rad/s)."""
+
+    max_speed_m_s: float
+    max_turn_rad_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class RobotDescription:
     """What a skill and the safety gate must know of a robot. Joints in the order in which the robot names them."""
 
@@ -216,6 +227,7 @@ class RobotDescription:
     tells_efforts: bool = (
         False  # whether its joint state has efforts: limits of torque and force are kept by them
     )
+    base: MobileBase | None = None
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""A robot's gate: what `runner.safety` checks, and joint speed, workspace, no-go zones, tool speed, effort, and how fresh the state is.
+"""The gate before the motors, of a robot and of its simulation: joint ranges, joint and base speed, workspace, no-go zones, tool speed, effort, and how fresh the state is.
 
 Every action passes it, whoever made it. What is a little too much is shortened and said, what is far too much is withheld: the robot
 then keeps its last targets. It judges by the measured state; where that is stale or incomplete nothing moves. `Action.safety_overrides`
@@ -8,13 +8,14 @@ is not read: nobody who makes actions can switch a check off. Knows no skills, a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from runner.limits import EVERYWHERE, Kinematics, Limits, Vector3, outside_m, own_limits, tighten
 from runner.protocols import RobotDescription
-from runner.safety import CLAMP_TOLERANCE_RAD, Envelope
+from runner.safety import CLAMP_TOLERANCE_RAD, JointRanges
 from schemas.control import ControlMode
+from schemas.manifest import RSkillManifest
 from schemas.manifest.contracts import SafetyEnvelope
 from schemas.world import Action, WorldState
 
@@ -94,7 +95,7 @@ class RobotGate:
             if envelope is not None:
                 limits = tighten(limits, robot, envelope, name, kinematics)
         self.limits = limits
-        self._ranges = Envelope(limits.joints_rad)
+        self._ranges = JointRanges(limits.joints_rad)
 
     def tightened(
         self, name: str, envelope: SafetyEnvelope | None, needs: frozenset[str] | None = None
@@ -110,6 +111,12 @@ class RobotGate:
             now_ns=self._now_ns,
             _base=(self.limits, self._memory),
         )
+
+    def for_skill(self, manifest: RSkillManifest | None, cameras: Iterable[str]) -> RobotGate:
+        """The gate for one skill's goals. Raises ConfigError for an envelope that cannot be kept on this robot."""
+        if manifest is None:
+            return self.tightened("", None, frozenset(cameras))
+        return self.tightened(f"envelope of {manifest.name}", manifest.envelope, frozenset(cameras))
 
     @property
     def unkept(self) -> tuple[str, ...]:
@@ -131,11 +138,19 @@ class RobotGate:
         return allowed, tuple(problems)
 
     def _judge(self, action: Action, world: WorldState, problems: list[str]) -> Action:
-        """1. latch, freshness 2. form 3. ranges 4. measured state 5. efforts 6. joint speed 7. tool speed 8. workspace."""
+        """1. latch, freshness, form; a base's speed, and for an arm 2. ranges 3. measured state 4. efforts 5. joint speed 6. tool speed
+        7. workspace."""
         if self._memory.tripped:
             raise _Withheld(f"the emergency stop is latched: {self._memory.tripped}")
         self._fresh(world)
-        names = self._form(action)
+        if action.horizon != 1:
+            raise _Withheld(f"{action.horizon} steps at once: the gate passes one at a time")
+        if action.control_mode is ControlMode.BODY_TWIST:
+            self._base_speed(action)
+            return action
+        names = action.joint_names or self._robot.joint_names
+        if len(set(names)) != len(names):
+            raise _Withheld("a joint is commanded twice")
         allowed, found = self._ranges.check(action, world)
         problems += found
         if allowed is None:
@@ -174,15 +189,18 @@ class RobotGate:
         if age_s > MAX_STATE_AGE_S:
             raise _Withheld(f"the joint state is stale: {age_s:.2f} s old")
 
-    def _form(self, action: Action) -> tuple[str, ...]:
-        if action.control_mode is ControlMode.BODY_TWIST:
+    def _base_speed(self, action: Action) -> None:
+        if self._robot.base is None:
             raise _Withheld(f"{self._robot.name} has no base to drive")
-        if action.horizon != 1:
-            raise _Withheld(f"{action.horizon} steps at once: the gate passes one at a time")
-        names = action.joint_names or self._robot.joint_names
-        if len(set(names)) != len(names):
-            raise _Withheld("a joint is commanded twice")
-        return names
+        vx, vy, vz, wx, wy, wz = action.rows[0]
+        if vz or wx or wy:
+            raise _Withheld(f"{self._robot.name} drives on a plane: vz, wx and wy must be 0")
+        speed, turn = math.hypot(vx, vy), abs(wz)
+        if speed > self.limits.base_speed_m_s + EPSILON or turn > self.limits.base_turn_rad_s + EPSILON:
+            raise _Withheld(
+                f"base speed {speed:.2f} m/s, {turn:.2f} rad/s is beyond "
+                f"{self.limits.base_speed_m_s:.2f} m/s, {self.limits.base_turn_rad_s:.2f} rad/s"
+            )
 
     def _speed_is_sound(self, world: WorldState) -> None:
         for name, speed in zip(world.joint_state.name, world.joint_state.velocity, strict=False):

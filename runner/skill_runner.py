@@ -74,6 +74,7 @@ class Active:
     goal: Goal
     on_end: Callable[[SkillEnded], None]
     began_tick: int
+    gate: SafetyGate
     withheld_in_a_row: int = 0
     late_in_a_row: int = 0
     was_late: bool = False  # the action before
@@ -82,7 +83,7 @@ class Active:
 
 
 class SkillRunner(RunnerBase):
-    """A subclass provides `activate`, `_decide` (which calls `_ask_skill`), `_apply` and `_safety_gate`."""
+    """A subclass provides `activate`, `_decide` (which calls `_ask_skill`), `_apply` and `_gate_of`."""
 
     def __init__(
         self,
@@ -109,8 +110,8 @@ class SkillRunner(RunnerBase):
         self.estop: EstopRequested | None = None  # latched for the life of the process
 
     @abstractmethod
-    def _safety_gate(self) -> SafetyGate:
-        """What every action passes before it reaches a motor."""
+    def _gate_of(self, skill: Stepped) -> SafetyGate:
+        """What every action of this skill passes before it reaches a motor. Raises ConfigError for an envelope that cannot be kept."""
 
     @abstractmethod
     def camera_names(self) -> tuple[str, ...]:
@@ -156,7 +157,8 @@ class SkillRunner(RunnerBase):
 
     # -- the skill that has the arm --------------------------------------------------------------------------------------
     def begin_skill(self, skill: Skill, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
-        """Control thread. Raises InternalError when another skill has the arm, EstopRequested when the stop is latched."""
+        """Control thread. Raises InternalError when another skill has the arm, EstopRequested when the stop is latched, ConfigError when its
+        envelope cannot be kept."""
         self._give(skill, goal, on_end)
 
     def _give(self, skill: Stepped, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
@@ -164,7 +166,7 @@ class SkillRunner(RunnerBase):
             raise self.estop
         if self._active is not None:
             raise InternalError("another skill has the arm")
-        self._active = Active(skill, goal, on_end, self.tick_idx)
+        self._active = Active(skill, goal, on_end, self.tick_idx, self._gate_of(skill))
         key = str(skill.key)
         self._skills[key] = self._skills.get(key, 0) + 1
         self.traceparent, self.labels = goal.traceparent, {telemetry.ATTR_SKILL: goal.rskill_id}
@@ -280,7 +282,7 @@ class SkillRunner(RunnerBase):
     def _check(self, active: Active, action: Action, world: WorldState, decision: Decision) -> None:
         checked_s = self.clock.now_s()
         with tracing.span(telemetry.SPAN_SAFETY):
-            allowed, problems = self._safety_gate().check(action, world)
+            allowed, problems = active.gate.check(action, world)
         decision.safety_ms = (self.clock.now_s() - checked_s) * 1e3
         decision.safety_violations = problems
         decision.action = allowed

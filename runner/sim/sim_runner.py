@@ -82,7 +82,6 @@ class SimRunner(SkillRunner):
         self._video_every = video_every
         self._video_picture: Any = None
         self._env: Environment | None = None
-        self._gate: SafetyGate | None = None
         self._idle_ticks = 0
         self._reset_due = True
         self._next_seed: int | None = None
@@ -241,10 +240,8 @@ class SimRunner(SkillRunner):
         vx, vy, _, _, _, wz = action.rows[0]
         return (vx, vy, wz)
 
-    def _safety_gate(self) -> SafetyGate:
-        if self._gate is None:
-            raise InternalError("an action before the first reset")
-        return self._gate
+    def _gate_of(self, skill: Stepped) -> SafetyGate:
+        return self.env.gate(skill)
 
     def _apply(self, decision: Decision) -> Applied:
         if decision.reset:
@@ -289,7 +286,6 @@ class SimRunner(SkillRunner):
         self._video_picture = None
         seed = self._seed + self.episode_idx if self._next_seed is None else self._next_seed
         self.env.reset(seed)
-        self._gate = self.env.gate()
         if not self._cameras_given:
             self._cameras = self.env.cameras
         for camera in self._cameras:  # a first picture takes a second: rendering contexts, shaders

@@ -17,11 +17,12 @@ from runner.body import SIMULATED
 from runner.catalogue import Maker
 from runner.cli_common import sidecar_endpoint
 from runner.hal.so101 import so101
-from runner.limits import own_limits
-from runner.protocols import Skill
+from runner.hal.so101_kinematics import kinematics_for
+from runner.limits import Limits
+from runner.protocols import MobileBase, Skill
 from runner.sim.arm_env import ArmEnvironment
 from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
-from runner.sim.env import SimEnv
+from runner.sim.env import MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S, SimEnv
 from runner.sim.environment import Environment
 from runner.sim.gym_config import RENDER, GymConfig
 from runner.sim.gym_env import GymEnv
@@ -52,6 +53,7 @@ class World:
     identity: Mapping[str, Any] = field(default_factory=dict)
     scene: SceneConfig | None = None
     arm: SimEnv | None = None
+    limits_for: Callable[[RSkillManifest], Limits] | None = None  # what the gate lets a skill do, where it knows more than a space
 
 
 def so101_world(scene_file: Path | None) -> World:
@@ -62,9 +64,11 @@ def so101_world(scene_file: Path | None) -> World:
         raise ConfigError(f"the scene {scene_file} cannot be read: {error}") from error
     arm = SimEnv(scene)  # renders only on the control thread, from its first reset on
     cameras = tuple(name for name in OBSERVATION_CAMERAS if name in scene.cameras)
+    robot = so101(simulated=True, base=MobileBase(MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S))
+    environment = ArmEnvironment(arm, robot, kinematics=kinematics_for(robot), cameras=cameras)
     return World(
         name=SO101,
-        make=lambda: ArmEnvironment(arm, cameras=cameras),
+        make=lambda: environment,
         cameras=cameras,
         video_camera="overview",
         video_every=3,  # ten pictures a second at 30 Hz
@@ -74,6 +78,7 @@ def so101_world(scene_file: Path | None) -> World:
         identity={"robot": "so101-mobile", "scene": str(scene_file or "built-in")},
         scene=scene,
         arm=arm,
+        limits_for=environment.limits_for,
     )
 
 
@@ -133,19 +138,28 @@ def makers_of(
             )
         wiring = wire_up(manifest, world.joints, world.rest)
         client = PolicyClient(sidecar_endpoint(manifest.name, given, os.environ))
-        return SidecarPolicy(manifest, wiring, client, arbiter, period_s=period_s, wait_s=wait_s)
+        limits = None if world.limits_for is None else world.limits_for(manifest)
+        return SidecarPolicy(
+            manifest,
+            wiring,
+            client,
+            arbiter,
+            period_s=period_s,
+            wait_s=wait_s,
+            speeds_rad_s=limits.speeds_rad_s if limits and wiring.rollout.targets_lead else None,
+        )
 
-    scene = world.scene
-    if scene is None:
+    scene, limits_for = world.scene, world.limits_for
+    if scene is None or limits_for is None:
         return {Kind.VLA: make_policy}
-    limits = own_limits(so101(simulated=True))
     joint, twist = ControlMode.JOINT_POSITION, ControlMode.BODY_TWIST
     known = {
         NAVIGATE: StandIn(
             lambda manifest: Navigate(manifest, scene, period_s=period_s), frozenset({twist, joint})
         ),
         TRAJECTORY: StandIn(
-            lambda manifest: FollowJointTrajectory(manifest, limits, period_s=period_s), frozenset({joint})
+            lambda manifest: FollowJointTrajectory(manifest, limits_for(manifest), period_s=period_s),
+            frozenset({joint}),
         ),
     }
     return {Kind.VLA: make_policy, Kind.ROS_ACTION: StandIns(known, world.joints)}

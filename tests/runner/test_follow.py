@@ -8,7 +8,7 @@ from small_robots import FedCamera, Nod, Twin
 
 from runner.hardware import HardwareRunner
 from runner.protocols import Act, Done, Goal, GoalTick, Hold, SkillEnded
-from runner.safety import Envelope
+from runner.safety import JointRanges
 from runner.skills.base import SkillState
 from schemas.control import ControlMode
 from schemas.errors import ModelError
@@ -138,7 +138,7 @@ def test_a_robot_says_only_what_it_was_told_and_nothing_while_it_sees_nothing(
 ) -> None:
     twin, front, follower = Twin(clock), FedCamera("front", clock), Follower()
     limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
-    runner = HardwareRunner(twin, [(front, 100.0)], lambda _: Envelope(limits), clock=clock)
+    runner = HardwareRunner(twin, [(front, 100.0)], lambda _: JointRanges(limits), clock=clock)
     runner.sink = follower
     runner.activate()
     skill = Nod(load_manifest(navigate_manifest), cameras=("front",))

@@ -12,7 +12,7 @@ from runner.hal.so101 import so101
 from runner.hardware import FIRST_DATA_SLICE_S, FIRST_STATE_TRIES, HardwareRunner
 from runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded
 from runner.robot_gate import RobotGate
-from runner.safety import Envelope
+from runner.safety import JointRanges
 from runner.sensors import Feed
 from runner.skill_runner import WITHHELD_IN_A_ROW_MAX
 from runner.skills.base import SkillState
@@ -33,7 +33,7 @@ MakeRunner = Callable[..., HardwareRunner]
 
 
 def gate(skill: Skill) -> SafetyGate:
-    return Envelope(
+    return JointRanges(
         {joint.name: (joint.lower_rad, joint.upper_rad) for joint in so101(simulated=True).joints}
     )
 
@@ -198,7 +198,7 @@ def test_the_gate_is_made_for_the_skill_and_what_it_refuses_is_not_sent(
 
     def narrow(skill: Skill) -> SafetyGate:
         asked.append(skill)
-        return Envelope({"wrist_flex": (-0.1, 0.1)})
+        return JointRanges({"wrist_flex": (-0.1, 0.1)})
 
     runner = make(make_gate=narrow)
     runner.activate()

@@ -18,7 +18,7 @@ from runner.control import ControlThread
 from runner.goals import GoalServer
 from runner.hardware import HardwareRunner
 from runner.protocols import Goal
-from runner.safety import Envelope
+from runner.safety import JointRanges
 from schemas.errors import EstopRequested, FrameStale, InternalError, LimitExceeded, RobotFault
 from schemas.manifest import Kind, RSkillManifest, load_manifest
 from schemas.world import WorldState
@@ -63,7 +63,7 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
         runner = HardwareRunner(
             twin,
             [(camera, 100.0)],
-            lambda _: Envelope(limits),
+            lambda _: JointRanges(limits),
             rate_hz=200.0,
             clock=clock,
         )

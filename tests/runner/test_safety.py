@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from runner.safety import CLAMP_TOLERANCE_RAD, Envelope
+from runner.safety import CLAMP_TOLERANCE_RAD, JointRanges
 from schemas.control import ControlMode
 from schemas.world import Action, JointState, WorldState
 
@@ -22,11 +22,11 @@ def twist(vx: float, vy: float, wz: float) -> Action:
 
 @pytest.mark.parametrize("action", [joints(0.5, 1.0), joints(-1.0, 2.0, names=None), twist(0.3, 0.4, 1.2)])
 def test_what_is_inside_passes_unchanged(action: Action) -> None:
-    assert Envelope(LIMITS).check(action, WORLD) == (action, ())
+    assert JointRanges(LIMITS).check(action, WORLD) == (action, ())
 
 
 def test_a_small_excess_is_clamped_and_said() -> None:
-    allowed, problems = Envelope(LIMITS).check(joints(1.0 + CLAMP_TOLERANCE_RAD / 2, 1.0), WORLD)
+    allowed, problems = JointRanges(LIMITS).check(joints(1.0 + CLAMP_TOLERANCE_RAD / 2, 1.0), WORLD)
     assert allowed is not None
     assert allowed.joint_targets == ((1.0, 1.0),)
     assert "a: 1.075 rad" in problems[0]
@@ -46,7 +46,7 @@ def test_a_small_excess_is_clamped_and_said() -> None:
     ],
 )
 def test_what_is_outside_is_withheld(action: Action, said: str) -> None:
-    allowed, problems = Envelope(LIMITS).check(action, WORLD)
+    allowed, problems = JointRanges(LIMITS).check(action, WORLD)
     if not said:
         assert allowed == action  # a subset of the joints is fine
         return
@@ -56,7 +56,7 @@ def test_what_is_outside_is_withheld(action: Action, said: str) -> None:
 
 def test_nothing_moves_on_a_stale_state() -> None:
     stale = WORLD.model_copy(update={"diagnostics": {"joint_state": "stale"}})
-    allowed, problems = Envelope(LIMITS).check(joints(0.0, 0.0), stale)
+    allowed, problems = JointRanges(LIMITS).check(joints(0.0, 0.0), stale)
     assert allowed is None
     assert "stale" in problems[0]
 
@@ -74,4 +74,4 @@ def test_a_chunk_is_checked_row_by_row() -> None:
         joint_targets=((0.0, 0.0), (5.0, 0.0)),
         joint_names=("a", "b"),
     )
-    assert Envelope(LIMITS).check(chunk, WORLD)[0] is None
+    assert JointRanges(LIMITS).check(chunk, WORLD)[0] is None

@@ -13,7 +13,7 @@ from small_robots import FedCamera, Nod, Twin
 from runner.clock import SystemClock
 from runner.hardware import HardwareRunner
 from runner.protocols import Goal
-from runner.safety import Envelope
+from runner.safety import JointRanges
 from runner.skills.base import SkillState
 from schemas import telemetry
 from schemas.manifest import load_manifest
@@ -26,7 +26,7 @@ def main() -> None:
     clock = SystemClock()
     twin, camera = Twin(clock), FedCamera("front", clock)
     limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
-    runner = HardwareRunner(twin, [(camera, 1000.0)], lambda skill: Envelope(limits), clock=clock)
+    runner = HardwareRunner(twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock)
     runner.trace_ticks = 0.25
     runner.activate()
     skill = Nod(load_manifest(Path(sys.argv[1])), cameras=("front",))
