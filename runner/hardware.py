@@ -27,6 +27,7 @@ from runner.protocols import (
     SensorReader,
     Skill,
     SkillEnded,
+    Stepped,
 )
 from runner.skill_runner import Active, SkillRunner
 from runner.world_state import JOINT_STATE, WorldStateAggregator

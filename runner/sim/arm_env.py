@@ -22,7 +22,6 @@ from schemas.errors import EnvironmentFailed, InternalError, ModelError
 from schemas.manifest import RSkillManifest
 from schemas.world import Action, CameraModel, JointState, Pose, SensorFrame, WorldState
 
-
 SAMPLED_SHARE = 0.98  # of the longest step: rounding must not reach the gate
 
 
@@ -61,9 +60,7 @@ class SimulatedTime:
     def check(self, action: Action, world: WorldState) -> tuple[Action | None, tuple[str, ...]]:
         stamp_ns = round(self.arm.time_s * 1e9)
         joints = world.joint_state.model_copy(update={"stamp_ns": stamp_ns})
-        return self.gate.check(
-            action, world.model_copy(update={"stamp_ns": stamp_ns, "joint_state": joints})
-        )
+        return self.gate.check(action, world.model_copy(update={"stamp_ns": stamp_ns, "joint_state": joints}))
 
 
 class ArmEnvironment:

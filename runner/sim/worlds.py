@@ -53,7 +53,9 @@ class World:
     identity: Mapping[str, Any] = field(default_factory=dict)
     scene: SceneConfig | None = None
     arm: SimEnv | None = None
-    limits_for: Callable[[RSkillManifest], Limits] | None = None  # what the gate lets a skill do, where it knows more than a space
+    limits_for: Callable[[RSkillManifest], Limits] | None = (
+        None  # what the gate lets a skill do, where it knows more than a space
+    )
 
 
 def so101_world(scene_file: Path | None) -> World:

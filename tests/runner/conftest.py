@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from runner.protocols import DeadlinePolicy
+from runner.protocols import DeadlinePolicy, Joint, MobileBase, RobotDescription
 from runner.sim.arm_env import ArmEnvironment
 from runner.sim.sim_runner import SimRunner
 from schemas.world import CameraModel
@@ -41,6 +41,24 @@ class ManualClock:
 
     def advance(self, duration_s: float) -> None:
         self.time_s += duration_s
+
+
+KINEMATIC = RobotDescription(
+    "kinematic",
+    tuple(
+        Joint(
+            name,
+            -0.5 if name == "shoulder_pan" else -2.0,
+            0.5 if name == "shoulder_pan" else 2.0,
+            max_speed_rad_s=30.0,
+            gripper=name == "gripper",
+        )
+        for name in JOINTS
+    ),
+    rest_pose_rad={},
+    simulated=True,
+    base=MobileBase(max_speed_m_s=0.5, max_turn_rad_s=1.2),
+)
 
 
 class KinematicEnv:
@@ -83,9 +101,6 @@ class KinematicEnv:
 
     def joint_velocity(self) -> dict[str, float]:
         return dict.fromkeys(JOINTS, 0.0)
-
-    def joint_limits(self) -> dict[str, tuple[float, float]]:
-        return dict.fromkeys(JOINTS, (-2.0, 2.0))
 
     def base_pose(self) -> tuple[float, float, float]:
         return self.base
@@ -130,7 +145,7 @@ def make_runner(env: KinematicEnv) -> Callable[..., SimRunner]:
         options.setdefault("cameras", ())
         options.setdefault("deadline_policy", DeadlinePolicy.WARN)
         judge = options.pop("judge", None)
-        world = ArmEnvironment(env, judge=None if judge is None else lambda: judge(env))
+        world = ArmEnvironment(env, KINEMATIC, judge=None if judge is None else lambda: judge(env))
         return SimRunner(lambda: world, **options)
 
     return make

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,7 +15,8 @@ from runner.sim.episodes import episodes_of
 from runner.sim.sim_runner import SimRunner
 from runner.skill_runner import WITHHELD_IN_A_ROW_MAX
 from schemas.control import ControlMode
-from schemas.errors import EnvironmentFailed, Evicted, InternalError, ModelError
+from schemas.errors import ConfigError, EnvironmentFailed, Evicted, InternalError, ModelError
+from schemas.manifest.contracts import SafetyEnvelope
 from schemas.world import Action, WorldState
 
 Make = Callable[..., Any]
@@ -277,13 +279,62 @@ def test_a_defect_of_a_skill_does_not_take_the_loop_with_it(make_runner: Make, e
 
 def test_an_action_outside_the_envelope_is_withheld_and_recorded(make_runner: Make, env: Any) -> None:
     runner = make_runner(rate_hz=0)
-    ticks, ended = play(runner, [Act(joints(3.0)), Act(joints(2.1))], 3)
+    ticks, ended = play(runner, [Act(joints(3.0)), Act(joints(0.6))], 3)
     assert env.steps[0] == (None, None)
-    assert env.steps[1][0]["shoulder_pan"] == 2.0
+    assert env.steps[1][0]["shoulder_pan"] == 0.5
     assert [t.action_applied for t in ticks[:2]] == [False, True]
     assert "outside" in ticks[0].safety_violations[0]
     assert len(runner.violations) == 2
     assert (ended[0].data["withheld"], ended[0].data["clamped"]) == (1, 1)
+
+
+def test_the_gate_is_a_robots_and_each_skill_tightens_it(make_runner: Make, env: Any) -> None:
+    class Careful(Scripted):
+        manifest = SimpleNamespace(name="test/careful", envelope=SafetyEnvelope(max_joint_speed_factor=0.1))
+
+    runner = make_runner(rate_hz=0)
+    play(runner, [Act(joints(0.2))], 2)
+    assert env.joints["shoulder_pan"] == 0.2  # 6 rad/s; the arm makes 30
+    ended: list[SkillEnded] = []
+    runner.begin_skill(Careful(Act(joints(0.4)), Act(joints(-0.3))), GOAL, ended.append)
+    ticks = [runner.tick() for _ in range(3)]
+    assert env.joints["shoulder_pan"] == pytest.approx(
+        0.35
+    )  # 3 rad/s, with the tick between that sent nothing
+    assert "is beyond 3.00 rad/s" in ticks[0].safety_violations[0]
+    assert [tick.action_applied for tick in ticks] == [True, False, False]
+    assert (ended[0].data["clamped"], ended[0].data["withheld"]) == (1, 1)
+
+
+def test_an_envelope_that_cannot_be_kept_is_refused_before_anything_moves(make_runner: Make) -> None:
+    class Boxed(Scripted):
+        manifest = SimpleNamespace(
+            name="test/boxed", envelope=SafetyEnvelope(workspace_box_max_xyz=(0.3, 0.3, 0.3))
+        )
+
+    runner = make_runner(rate_hz=0)
+    runner.activate()
+    with pytest.raises(ConfigError, match="no kinematics"):
+        runner.begin_skill(Boxed(), GOAL, lambda _: None)
+    runner.begin_skill(Scripted(), GOAL, lambda _: None)  # nobody has the arm
+
+
+def test_speeds_are_judged_by_simulated_time(make_runner: Make, env: Any, clock: Any) -> None:
+    runner = make_runner(rate_hz=0, clock=clock)
+    thinks_s = iter([0.0, 5.0, 0.0])
+
+    class Slow(Scripted):
+        def step(self, world: WorldState) -> StepOutcome:
+            clock.advance(next(thinks_s))  # the policy thinks, the world waits
+            return super().step(world)
+
+    ended: list[SkillEnded] = []
+    runner.activate()
+    runner.tick()
+    runner.begin_skill(Slow(Act(joints(0.3)), Act(joints(-0.4)), Act(joints(-0.4))), GOAL, ended.append)
+    ticks = [runner.tick() for _ in range(3)]
+    assert [tick.action_applied for tick in ticks] == [True, True, True]
+    assert env.joints["shoulder_pan"] == -0.4
 
 
 def test_a_policy_that_is_lost_fails_its_goal(make_runner: Make) -> None:
@@ -355,7 +406,7 @@ def test_goals_and_runs_say_what_became_of_chunks_and_actions(make_runner: Make)
     script = [
         Act(joints(0.1), chunk_index=0),
         Act(joints(9.0), chunk_index=1, prefetched=True),
-        Act(joints(2.1), chunk_index=1),
+        Act(joints(0.6), chunk_index=1),
         Act(joints(0.1), chunk_index=2, prefetched=False),
         Act(joints(0.1), chunk_index=3, prefetched=True),
         Evicted("gone"),
@@ -414,17 +465,17 @@ def test_navigating_the_real_simulator_and_filming_it(
     import imageio_ffmpeg
 
     from runner.recorder import Recorder
-    from runner.sim.arm_env import ArmEnvironment
-    from runner.sim.config import SceneConfig
-    from runner.sim.env import SimEnv
     from runner.sim.sim_runner import SimRunner
+    from runner.sim.worlds import so101_world
     from runner.skills.navigate import Navigate
     from schemas.manifest import load_manifest
 
-    scene = SceneConfig()
-    env = SimEnv(scene)
+    world = so101_world(None)
+    env, scene = world.arm, world.scene
+    assert env is not None
+    assert scene is not None
     recorder = Recorder(tmp_path / "episode.mp4", fps=10)
-    runner = SimRunner(lambda: ArmEnvironment(env), cameras=("front",), seed=1, rate_hz=0, recorder=recorder)
+    runner = SimRunner(world.make, cameras=("front",), seed=1, rate_hz=0, recorder=recorder)
     skill = Navigate(load_manifest(navigate_manifest), scene, period_s=1 / 30)
     ended: list[SkillEnded] = []
     try:

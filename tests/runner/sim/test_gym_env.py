@@ -45,6 +45,9 @@ class Policy:
         return bool(self.cameras)
 
 
+ANYBODY = Policy(None)
+
+
 # -- observations ---------------------------------------------------------------------------------------------------
 def test_joints_are_only_those_that_the_file_names() -> None:
     env = GymEnv(POINT)
@@ -99,13 +102,13 @@ def test_every_number_of_a_discrete_goes_there_and_back() -> None:
     for wrong in (2, -1, 0.5, [0, 1], "left", float("nan")):
         with pytest.raises(ModelError):
             env.action_of(wrong)
-    assert env.gate().check(targets(0.0), NOWHERE)[0] is None
+    assert env.gate(ANYBODY).check(targets(0.0), NOWHERE)[0] is None
 
 
 def test_named_columns_are_sorted_into_the_environments_order() -> None:
     env = GymEnv(POINT, NAMED)
     env.reset(0)
-    allowed, problems = env.gate().check(targets(0.5, -0.25, names=("b", "a")), NOWHERE)
+    allowed, problems = env.gate(ANYBODY).check(targets(0.5, -0.25, names=("b", "a")), NOWHERE)
     assert (allowed, problems) == (targets(-0.25, 0.5), ())
     env.step(allowed)
     assert env.observation["agent_pos"][:2] == pytest.approx([-0.25, 0.5])
@@ -125,13 +128,13 @@ def test_named_columns_are_sorted_into_the_environments_order() -> None:
     ],
 )
 def test_what_does_not_fit_the_space_is_withheld(action: Action, said: str) -> None:
-    allowed, problems = GymEnv(POINT, NAMED).gate().check(action, NOWHERE)
+    allowed, problems = GymEnv(POINT, NAMED).gate(ANYBODY).check(action, NOWHERE)
     assert allowed is None
     assert said in problems[0]
 
 
 def test_an_aim_at_the_stop_is_clamped_and_said() -> None:
-    allowed, problems = GymEnv(POINT).gate().check(targets(1.05, 0.0), NOWHERE)
+    allowed, problems = GymEnv(POINT).gate(ANYBODY).check(targets(1.05, 0.0), NOWHERE)
     assert allowed == targets(1.0, 0.0)
     assert len(problems) == 1
 
