@@ -132,15 +132,15 @@ async def _stop_with(stopping: asyncio.Event, bench: Benchmark) -> None:
 
 
 def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
-    from runner.sim.arm_env import ArmEnvironment
     from runner.sim.benchmark import Benchmark
     from runner.sim.sim_runner import SimRunner
+    from runner.sim.worlds import so101_environment
 
     world, task, arm = entry.world, entry.task, entry.world.arm
     make, told = world.make, None
     if arm is not None and task is not None:
         prepare = task.prepare
-        environment = ArmEnvironment(
+        environment = so101_environment(
             arm,
             cameras=world.cameras or (),
             prepare=None if prepare is None else lambda seed: prepare(arm, seed),

@@ -1,4 +1,5 @@
-"""The gate before the motors, of a robot and of its simulation: joint ranges, joint and base speed, workspace, no-go zones, tool speed, effort, and how fresh the state is.
+"""The gate before the motors, of a robot and of its simulation: joint ranges, joint and base speed, workspace, no-go zones, tool speed,
+effort, and how fresh the state is.
 
 Every action passes it, whoever made it. What is a little too much is shortened and said, what is far too much is withheld: the robot
 then keeps its last targets. It judges by the measured state; where that is stale or incomplete nothing moves. `Action.safety_overrides`
@@ -196,7 +197,8 @@ class RobotGate:
         if vz or wx or wy:
             raise _Withheld(f"{self._robot.name} drives on a plane: vz, wx and wy must be 0")
         speed, turn = math.hypot(vx, vy), abs(wz)
-        if speed > self.limits.base_speed_m_s + EPSILON or turn > self.limits.base_turn_rad_s + EPSILON:
+        most, fastest = self.limits.base_speed_m_s + EPSILON, self.limits.base_turn_rad_s + EPSILON
+        if not (speed <= most and turn <= fastest):  # said so that a NaN is withheld, too
             raise _Withheld(
                 f"base speed {speed:.2f} m/s, {turn:.2f} rad/s is beyond "
                 f"{self.limits.base_speed_m_s:.2f} m/s, {self.limits.base_turn_rad_s:.2f} rad/s"

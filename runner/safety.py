@@ -1,11 +1,12 @@
 """The first of the gate's checks (`runner.robot_gate`): joint targets are within the joints' ranges.
 
 A small excess (a learnt policy aims at a stop) is clamped and said; a large one is withheld. Knows joint names and ranges, not
-robots or skills. That numbers are finite is the schema's matter: others cannot become an action.
+robots or skills.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -58,6 +58,12 @@ class World:
     )
 
 
+def so101_environment(arm: SimEnv, **task: Any) -> ArmEnvironment:
+    """Our scene behind the gate of a real arm. `task` as `ArmEnvironment` takes it: cameras, what an episode is about."""
+    robot = so101(simulated=True, base=MobileBase(MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S))
+    return ArmEnvironment(arm, robot, kinematics=kinematics_for(robot), **task)
+
+
 def so101_world(scene_file: Path | None) -> World:
     """Raises ConfigError for a scene that cannot be read."""
     try:
@@ -66,8 +72,7 @@ def so101_world(scene_file: Path | None) -> World:
         raise ConfigError(f"the scene {scene_file} cannot be read: {error}") from error
     arm = SimEnv(scene)  # renders only on the control thread, from its first reset on
     cameras = tuple(name for name in OBSERVATION_CAMERAS if name in scene.cameras)
-    robot = so101(simulated=True, base=MobileBase(MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S))
-    environment = ArmEnvironment(arm, robot, kinematics=kinematics_for(robot), cameras=cameras)
+    environment = so101_environment(arm, cameras=cameras)
     return World(
         name=SO101,
         make=lambda: environment,

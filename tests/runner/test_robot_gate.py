@@ -1,5 +1,6 @@
 """A robot's gate: speed, workspace, zones, effort, freshness; envelopes only tighten; nothing switches it off."""
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runner.limits import Vector3
-from runner.protocols import Joint, RobotDescription
+from runner.protocols import Joint, MobileBase, RobotDescription
 from runner.robot_gate import LATE_MAX, MAX_FOLLOWING_ERROR_RAD, RobotGate
 from runner.safety import CLAMP_TOLERANCE_RAD
 from runner.skill_runner import WITHHELD_IN_A_ROW_MAX
@@ -496,3 +497,40 @@ def test_whatever_is_asked_for_what_passes_is_inside(
         tools = [arm.points(dict(zip(NAMES, pose, strict=True)))["tool"] for pose in (here, row)]
         assert math.dist(*tools) <= ee_speed * LATE_MAX / 30 + 1e-6
         here = row
+
+
+# -- a base that drives -------------------------------------------------------------------------------------------------
+def driving(**envelope: Any) -> RobotGate:
+    robot = dataclasses.replace(ROBOT, base=MobileBase(max_speed_m_s=0.5, max_turn_rad_s=1.2))
+    asked = SafetyEnvelope(**envelope) if envelope else None
+    return RobotGate(robot, rate_hz=30.0, kinematics=Planar(), envelopes={"safety": asked})
+
+
+def twist(vx: float, vy: float, wz: float, vz: float = 0.0) -> Action:
+    return Action(control_mode=ControlMode.BODY_TWIST, body_twist=((vx, vy, vz, 0.0, 0.0, wz),))
+
+
+def test_a_base_drives_as_fast_as_it_may_and_not_faster() -> None:
+    assert driving().check(twist(0.3, 0.4, -1.2), at(*HERE)) == (twist(0.3, 0.4, -1.2), ())
+    for command in (twist(0.5, 0.5, 0.0), twist(0.0, 0.0, -1.5)):
+        allowed, problems = driving().check(command, at(*HERE))
+        assert allowed is None
+        assert "base speed" in problems[0]
+    allowed, problems = driving().check(twist(0.1, 0.0, 0.0, vz=0.1), at(*HERE))
+    assert (allowed, problems) == (None, ("planar drives on a plane: vz, wx and wy must be 0",))
+
+
+def test_an_envelope_slows_the_base_and_never_speeds_it_up() -> None:
+    slow = driving(max_base_linear_speed_m_s=0.2, max_base_angular_speed_rad_s=9.0)
+    assert (slow.limits.base_speed_m_s, slow.limits.base_turn_rad_s) == (0.2, 1.2)
+    assert slow.check(twist(0.3, 0.0, 0.0), at(*HERE))[0] is None
+    assert slow.check(twist(0.2, 0.0, 1.2), at(*HERE))[0] is not None
+
+
+def test_a_base_stands_on_a_stale_state_after_the_emergency_stop_and_for_what_is_no_number() -> None:
+    gate = driving()
+    assert gate.check(twist(0.1, 0.0, 0.0), at(*HERE, age_ms=500.0))[0] is None
+    row = (math.nan, 0.0, 0.0, 0.0, 0.0, 0.0)
+    assert gate.check(twist(0.1, 0.0, 0.0).model_copy(update={"body_twist": (row,)}), at(*HERE))[0] is None
+    gate.trip("hand in the way")
+    assert gate.check(twist(0.1, 0.0, 0.0), at(*HERE))[0] is None
