@@ -123,6 +123,12 @@ class KinematicEnv:
 
 
 @pytest.fixture
+def kinematic() -> RobotDescription:
+    """What the gate knows of `KinematicEnv`."""
+    return KINEMATIC
+
+
+@pytest.fixture
 def clock() -> ManualClock:
     return ManualClock()
 

@@ -9,7 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runner.protocols import Act, DeadlinePolicy, Done, Goal, Hold, SkillEnded, SkillKey, StepOutcome
+from runner.protocols import (
+    Act,
+    DeadlinePolicy,
+    Done,
+    Goal,
+    Hold,
+    RobotDescription,
+    SkillEnded,
+    SkillKey,
+    StepOutcome,
+)
 from runner.sim.arm_env import ArmEnvironment
 from runner.sim.episodes import episodes_of
 from runner.sim.sim_runner import SimRunner
@@ -147,7 +157,7 @@ def test_stopping_within_an_episode_leaves_no_phantom(make_runner: Make, env: An
     stop_after=st.integers(0, 40),
 )
 def test_every_reset_is_an_episode_that_is_played(
-    make_env: Any, lengths: list[int], max_steps: int | None, stop_after: int
+    make_env: Any, kinematic: RobotDescription, lengths: list[int], max_steps: int | None, stop_after: int
 ) -> None:
     """Whatever ends the episodes, and wherever the run is stopped and taken up again."""
     robot = make_env()
@@ -159,7 +169,10 @@ def test_every_reset_is_an_episode_that_is_played(
         return len(robot.steps) - begun[-1] >= lengths[robot.resets[-1]]
 
     runner = SimRunner(
-        lambda: ArmEnvironment(robot, judge=judge), rate_hz=0, episodes=len(lengths), max_steps=max_steps
+        lambda: ArmEnvironment(robot, kinematic, judge=judge),
+        rate_hz=0,
+        episodes=len(lengths),
+        max_steps=max_steps,
     )
     runner.activate()
     runner.run(max_ticks=stop_after)
