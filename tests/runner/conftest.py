@@ -122,7 +122,7 @@ class KinematicEnv:
         self.closed += 1
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def kinematic() -> RobotDescription:
     """What the gate knows of `KinematicEnv`."""
     return KINEMATIC
