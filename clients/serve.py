@@ -23,6 +23,7 @@ from schemas.defaults import IMAGE_MESSAGE_MAX_BYTES
 from schemas.errors import AlreadyRunning, BadFrame, ConfigError, MessageTooLarge, VramError
 
 Message = dict[str, Any]
+REASON_MAX_CHARS = 500
 MAX_DEPTH_BYTES = IMAGE_MESSAGE_MAX_BYTES + 64 * 1024  # an image plus its envelope
 
 
@@ -155,6 +156,13 @@ class RouterServer:
         frames = [peer.identity, b"", payload] if peer.delimiter else [peer.identity, payload]
         async with self._send_lock:
             await self._socket.send_multipart(frames)
+
+
+def reason_of(message: Message) -> str:
+    """The `reason` of a request that must never be refused for its words, as a stop: on one line, and not for ever."""
+    words = message.get("reason")
+    text = "" if words is None else str(words)[: 4 * REASON_MAX_CHARS]
+    return "".join(letter if letter.isprintable() else " " for letter in text).strip()[:REASON_MAX_CHARS]
 
 
 def _pid(frame: zmq.Frame) -> int | None:

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from pydantic import ValidationError
 
-from clients.serve import Message, Peer, RouterServer
+from clients.serve import Message, Peer, RouterServer, reason_of
 from clients.transport import Transport
 from reasoner.inbox import Cancel, Inbox, Said
 from schemas.errors import BadRequest, ReasonerUnreachable, UnknownOp, VramError, from_wire
@@ -68,6 +68,8 @@ def _parse(message: Message) -> Any:
         raise UnknownOp(
             f"unknown op {message.get('op')!r}", hint=f"one of {', '.join(OPS)}", details={"known": [*OPS]}
         )
+    if message["op"] == "cancel":  # nobody is refused a cancel for a long reason
+        return CancelEpisode(op="cancel", id=0, reason=reason_of(message))
     try:
         return REASONER_REQUEST.validate_python(message)
     except ValidationError as error:

@@ -21,7 +21,7 @@ from typing import Any, Literal, Protocol
 import msgpack
 from pydantic import ValidationError
 
-from clients.serve import Message, Peer, RouterServer
+from clients.serve import Message, Peer, RouterServer, reason_of
 from runner import frames
 from runner.catalogue import Catalogue
 from runner.clock import Clock
@@ -497,6 +497,10 @@ def _parse(message: Message) -> Any:
         raise UnknownOp(
             f"unknown op {message.get('op')!r}", hint=f"one of {', '.join(OPS)}", details={"known": [*OPS]}
         )
+    if (
+        message["op"] == "estop"
+    ):  # whatever else is in it: nobody is refused an emergency stop for a long reason
+        return EstopRunner(op="estop", id=0, reason=reason_of(message))
     try:
         return RUNNER_REQUEST.validate_python(message)
     except ValidationError as error:

@@ -243,7 +243,12 @@ def _joint(
     if unit is None or lower is None or upper is None or speed is None or lower >= upper:
         return "lower_rad must be below upper_rad"
     joint = Joint(name, lower, upper, speed, bool(gripper))
-    return joint, JointScale(unit, lower, upper, params.sign, params.offset_rad)
+    ends = lower, upper
+    if (
+        built_in is not None and params.unit is None
+    ):  # the file limits the joint; it does not move the ends of its percentages
+        ends = built_in.lower_rad, built_in.upper_rad
+    return joint, JointScale(unit, *ends, params.sign, params.offset_rad)
 
 
 def _bus_unit(robot: Any, name: str) -> JointUnit | None:

@@ -83,3 +83,18 @@ def test_a_cancel_over_the_socket_ends_an_episode_whose_planner_hangs(tmp_path: 
             return (await episode)["reason"]
 
     assert play(story) == "canceled: lunch"
+
+
+def test_a_cancel_is_not_refused_for_its_words(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/reasoner.sock"
+
+    async def story() -> list[Any]:
+        inbox = Inbox()
+        async with OperatorServer(endpoint, "tidy up", inbox):
+            await send(endpoint, {"op": "cancel", "reason": "the cat\n" * 1000, "by": "a newer client"})
+        return inbox.take()
+
+    (cancel,) = play(story)
+    assert isinstance(cancel, Cancel)
+    assert cancel.reason.startswith("the cat the cat")
+    assert len(cancel.reason) <= 500

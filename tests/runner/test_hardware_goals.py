@@ -206,6 +206,18 @@ def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_being_read
     play(run_async, bench, body)
 
 
+@pytest.mark.parametrize(
+    "fields", [{"reason": "x" * 10_000}, {"reason": 7, "by": "a newer client"}, {"reason": None}]
+)
+def test_a_stop_is_not_refused_for_its_words(bench: Any, run_async: Run, fields: dict[str, Any]) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        assert "stand still" in (await client.call("estop", fields))["message"]
+        assert b.runner.estop is not None
+        assert b.twin.story == ["connect", "halt"]
+
+    play(run_async, bench, body)
+
+
 def test_a_stop_that_nobody_hears_is_an_error(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["estop", "--endpoint", endpoint]) == 1
     assert "cut its power" in capsys.readouterr().err

@@ -34,21 +34,26 @@ def bus() -> Iterator[ServoBus]:
 
 
 @pytest.fixture
-def hal(bus: ServoBus, tmp_path: Path, clock: Any) -> Iterator[Hal]:
-    calibration = {
-        name: {"id": i, "drive_mode": 0, "homing_offset": 0, "range_min": 0, "range_max": 4095}
-        for i, name in enumerate(NAMES, 1)
-    }
-    (tmp_path / "arm.json").write_text(json.dumps(calibration), encoding="utf-8")
-    made = make_hal(config(bus, tmp_path), clock=clock)
+def hal(bus: ServoBus, calibrated: Path, clock: Any) -> Iterator[Hal]:
+    made = make_hal(config(bus, calibrated), clock=clock)
     made.connect()
     yield made
     made.disconnect()
 
 
-def config(bus: ServoBus, folder: Path) -> HalConfig:
+@pytest.fixture
+def calibrated(tmp_path: Path) -> Path:
+    calibration = {
+        name: {"id": i, "drive_mode": 0, "homing_offset": 0, "range_min": 0, "range_max": 4095}
+        for i, name in enumerate(NAMES, 1)
+    }
+    (tmp_path / "arm.json").write_text(json.dumps(calibration), encoding="utf-8")
+    return tmp_path
+
+
+def config(bus: ServoBus, folder: Path, **params: Any) -> HalConfig:
     transport = {"port": bus.path, "id": "arm", "calibration_dir": str(folder), "num_read_retries": 20}
-    return HalConfig(adapter="lerobot:so101_follower", transport=transport)
+    return HalConfig(adapter="lerobot:so101_follower", transport=transport, params=params)
 
 
 def to(**targets: float) -> Action:
@@ -83,6 +88,20 @@ def test_targets_reach_the_servos(hal: Hal, bus: ServoBus) -> None:
     assert bus.get(3, PRESENT) == pytest.approx(2047 - 0.5 * COUNTS_PER_RAD, abs=2)
     assert bus.get(6, PRESENT) == 0
     assert bus.get(1, PRESENT) == pytest.approx(2047, abs=1)  # was not named
+
+
+def test_a_range_that_the_file_narrows_limits_a_joint_and_does_not_stretch_it(
+    bus: ServoBus, calibrated: Path
+) -> None:
+    """lerobot counts the gripper in percent of its calibrated range: 0.8 rad are 0.8 rad, however far it may open here."""
+    hal = make_hal(config(bus, calibrated, joints={"gripper": {"upper_rad": 0.8}}))
+    hal.connect()
+    assert hal.description.joints[5].upper_rad == 0.8
+    low, high = RANGES_RAD["gripper"]
+    hal.send_action(to(gripper=0.8))
+    assert hal.read_state().position[5] == pytest.approx(0.8, abs=0.002)
+    assert bus.get(6, PRESENT) == pytest.approx(4095 * (0.8 - low) / (high - low), abs=2)
+    hal.disconnect()
 
 
 def test_the_stop_holds_and_the_end_lets_go(hal: Hal, bus: ServoBus) -> None:
