@@ -71,7 +71,7 @@ def as_text(recorded: Recorded, link: str | None) -> str:
         ("goal", f"{goal['goal_id']}: {goal['skill']} {_outcome(goal)}".rstrip()),
     ]
     if recorded.trace_id:
-        kept = "" if recorded.trace_sampled else " (not sampled: the collector does not have it)"
+        kept = "" if recorded.trace_sampled else " (not sampled: the collector has no span of this tick)"
         lines.append(("trace", f"{recorded.trace_id} span {recorded.span_id}{kept}"))
     else:
         lines.append(("trace", "none: no telemetry was configured"))

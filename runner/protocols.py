@@ -187,6 +187,10 @@ class TickSink(Protocol):
         """After the goal's last tick. None: the arm was taken back (canceled, or the deadline)."""
         ...
 
+    def facts(self) -> Mapping[str, Any]:
+        """Any thread: what became of the ticks so far, for the run's result."""
+        ...
+
 
 # -- robot, simulator, safety -----------------------------------------------------------------------------------------
 class SafetyGate(Protocol):

@@ -153,7 +153,9 @@ class SkillRunner(RunnerBase):
         return self._stopping
 
     def _metadata(self) -> dict[str, Any]:
-        return {**super()._metadata(), **self._total.as_data(), "goals_by_skill": dict(self._skills)}
+        recorded = {} if self.sink is None else {"recorded": dict(self.sink.facts())}
+        skills = {"goals_by_skill": dict(self._skills)}
+        return {**super()._metadata(), **self._total.as_data(), **skills, **recorded}
 
     # -- the skill that has the arm --------------------------------------------------------------------------------------
     def begin_skill(self, skill: Skill, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:

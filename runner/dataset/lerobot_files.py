@@ -157,6 +157,7 @@ class LerobotFiles:
         """Raises ConfigError when the folder's dataset has other columns or another rate: they cannot be one dataset."""
         from lerobot.datasets import LeRobotDataset
 
+        commit.repair(self._root)  # of an episode that could not be abandoned either
         if commit.last(self._root) is None:
             self._create(features)
         meta = self._meta()
@@ -207,11 +208,13 @@ class LerobotFiles:
     def abandon(self) -> None:
         """Forget the episode and what it left on disk; repeatable."""
         dataset, self._dataset = self._dataset, None
-        if dataset is not None:
-            dataset.clear_episode_buffer()
-            dataset.finalize()
         self._rows = 0
-        commit.repair(self._root)
+        try:
+            if dataset is not None:
+                dataset.clear_episode_buffer()
+                dataset.finalize()
+        finally:
+            commit.repair(self._root)
 
     # -- lerobot ---------------------------------------------------------------------------------------------------------
     def _meta(self) -> Any:

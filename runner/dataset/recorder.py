@@ -153,6 +153,16 @@ class DatasetRecorder:
             log.error("the dataset's writer ended with status %d", code)
         log.info("%s", self.summary())
 
+    def facts(self) -> dict[str, Any]:
+        """See `runner.protocols.TickSink`. `dropped` and `left_out` count ticks."""
+        return {
+            "episodes": self.episodes,
+            "frames": self.frames,
+            "dropped": self.dropped,
+            "left_out": sum(self.incomplete.values()),
+            "error": self.error.message if self.error is not None else None,
+        }
+
     def summary(self) -> str:
         """What was recorded, and what was not, in one line."""
         parts = [f"recorded {self.episodes} episodes, {self.frames} frames into {self.root}"]

@@ -32,6 +32,9 @@ class Follower:
     def goal_ended(self, goal: Goal, ended: SkillEnded | None) -> None:
         self.heard.append(("end", goal.goal_id, ended))
 
+    def facts(self) -> dict[str, Any]:
+        return {"heard": len(self.heard)}
+
     @property
     def order(self) -> list[tuple[str, str]]:
         return [(what, goal_id) for what, goal_id, _ in self.heard]
@@ -86,6 +89,7 @@ def test_each_tick_says_which_targets_are_in_force_and_the_end_comes_last(sim: t
     assert [tick.base_velocity for tick in follower.ticks][1:3] == [(0.0, 0.0, 0.0), (0.3, 0.0, 0.1)]
     assert [tick.result.action_applied for tick in follower.ticks] == [True, False, True, False]
     assert follower.heard[-1][2].error is None
+    assert runner.result().metadata["recorded"] == {"heard": 5}
 
 
 def test_an_error_ends_the_goal_after_its_own_tick(sim: tuple[Any, Follower]) -> None:

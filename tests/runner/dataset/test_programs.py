@@ -22,6 +22,7 @@ NOD = Path(__file__).parents[1] / "deploy_nod.py"
 RSKILL = "vram-arbiter/so101-navigate"
 TRACE = "0af7651916cd43dd8448eb211c80319c"
 SPAN = "b7ad6b7169203331"
+DEAF = {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://127.0.0.1:9"}  # spans are made; nobody takes them
 WAIT_S = 280.0
 
 Start = Callable[..., subprocess.Popen[str]]
@@ -50,7 +51,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 def test_the_episode_of_a_killed_simulator_is_finished_by_its_writer(start: Start, tmp_path: Path) -> None:
     root = tmp_path / "set"
-    process = start("-m", "runner", "sim", "--record", str(root), "--rate", "0")
+    process = start("-m", "runner", "sim", "--record", str(root), "--rate", "0", **DEAF)
 
     async def use() -> None:
         async with (
@@ -76,6 +77,10 @@ def test_the_episode_of_a_killed_simulator_is_finished_by_its_writer(start: Star
     assert last.tick["done"]
     assert not last.tick["success"]
     assert (last.trace_id, last.robot, sorted(last.pictures)) == (TRACE, "so101-mobile", ["front", "wrist"])
+    looked_at = min(note["frames"], 10)
+    spans = {read_frame(root, index).span_id for index in range(looked_at)}
+    assert len(spans) == looked_at  # each tick its own, none the caller's
+    assert SPAN not in spans
     assert abs(last.base["velocity"]["wz"]) > 0
     assert sorted(last.action) == sorted(last.state)
     assert commit.repair(root) == []
@@ -91,8 +96,10 @@ def test_a_deployment_records_into_its_save_dir(start: Start, tmp_path: Path) ->
     process = start(str(NOD), "deploy", "--config", str(config), NOD_STEPS="12")
     out, _ = process.communicate(timeout=WAIT_S)
     assert process.returncode == 0
-    assert json.loads(out.splitlines()[-1])["save_dir"] == str(root)
+    result = json.loads(out.splitlines()[-1])
     (note,) = commit.notes(root)
+    said = {"episodes": 1, "frames": note["frames"], "dropped": 0, "left_out": 0, "error": None}
+    assert (result["save_dir"], result["metadata"]["recorded"]) == (str(root), said)
     assert (note["status"], note["goal_id"], note["task"]) == ("succeeded", "task", "nod twice")
     assert note["frames"] >= 12
     first, second = read_frame(root, 0), read_frame(root, 1)

@@ -17,7 +17,7 @@ from runner import __main__ as program
 from runner.dataset import commit
 from runner.dataset.reader import read_frame
 from runner.dataset.recorder import QUEUE_TICKS, DatasetRecorder, whole_rate
-from schemas.errors import AlreadyRunning, BadRequest, ConfigError, InternalError
+from schemas.errors import AlreadyRunning, BadRequest, ConfigError, InternalError, VramError
 
 sys.path.insert(0, str(Path(__file__).parent))  # for the helper beside it
 
@@ -67,6 +67,7 @@ class Recorded:
     second: DatasetRecorder
     cut_off: bool  # after the first run
     said: str  # by the second one
+    blocked: VramError | None  # what it said of a goal whose files could not be written
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +98,12 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     try:
         with pytest.raises(AlreadyRunning), commit.locked(root, 0.0):
             pass
+        in_the_way = root / "data/chunk-000/file-002.parquet"
+        in_the_way.mkdir()
+        play(second, goal("blocked"), DONE, 2)
+        until(lambda: second.error is not None)
+        blocked = second.error
+        in_the_way.rmdir()
         play(second, goal("small"), DONE, 3, frames=small)
         play(second, goal("g3"), None, 3)
         play(second, goal("short"), DONE, 1)
@@ -105,7 +112,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     finally:
         second.close()
         logging.getLogger("runner.dataset").removeHandler(handler)
-    return Recorded(root, first, second, cut_off, said.getvalue())
+    return Recorded(root, first, second, cut_off, said.getvalue(), blocked)
 
 
 def test_lerobots_own_reader_finds_every_tick(
@@ -139,6 +146,8 @@ def test_a_run_says_what_it_recorded_and_what_not(recorded: Recorded) -> None:
     assert dict(first.incomplete) == {"joint grip has no target yet": 1}
     assert "1 ticks left out: joint grip has no target yet" in first.summary()
     assert (second.episodes, second.frames) == (2, 5)
+    assert first.facts()["left_out"] == 1
+    assert second.facts()["error"] == second.error.message
     notes = commit.notes(recorded.root)
     kept = [(note["goal_id"], note["status"], note["code"], note["incomplete"]) for note in notes]
     assert kept == [
@@ -155,6 +164,12 @@ def test_a_killed_writer_is_said_and_the_next_recording_mends(recorded: Recorded
     assert "NOT ALL WAS RECORDED" in recorded.first.summary()
     assert recorded.cut_off
     assert "an earlier recording was cut off: an episode was being written; it is lost" in recorded.said
+
+
+def test_a_disk_that_takes_nothing_costs_the_goal_and_no_more(recorded: Recorded) -> None:
+    assert isinstance(recorded.blocked, InternalError)
+    assert "file-002.parquet" in recorded.blocked.message
+    assert read_frame(recorded.root, 10).goal["goal_id"] == "g3"  # its files have the name that was taken
 
 
 def test_a_goal_with_other_columns_is_said_and_costs_only_itself(recorded: Recorded) -> None:
