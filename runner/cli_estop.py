@@ -1,10 +1,17 @@
-"""`vram-runner estop`: the emergency stop of a running runner. Exits 0 only when the motors have been told."""
+"""`vram-runner estop`: the emergency stop of the runners of this machine. Exits 0 only when their motors have been told.
+
+Whoever is in a hurry names no endpoint: the runner of this login and the system service's are both stopped, whichever there are.
+"""
 
 from __future__ import annotations
 
 import argparse
+import asyncio
+import os
+import sys
 
 from clients.runner import RunnerClient
+from schemas.endpoints import SYSTEM_RUNTIME, program_endpoint
 from schemas.errors import RunnerUnreachable
 
 ANSWER_S = 3.0  # the server itself waits a second for its control loop
@@ -16,20 +23,45 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "estop", help="stop a robot's motors; its runner refuses goals until it is started again"
     )
     estop.add_argument("--reason", default="", help="kept in the log and in every refusal")
-    estop.add_argument("--endpoint", help="the runner's endpoint; default ipc://RUNTIME/runner.sock")
+    estop.add_argument(
+        "--endpoint",
+        help="the runner's endpoint; default: those of ipc://RUNTIME/runner.sock and of the system's service that are there",
+    )
     return estop
 
 
 async def run(args: argparse.Namespace) -> int:
-    """Raises RunnerUnreachable when no runner answers, InternalError when its control loop does not, RobotFault when the motors
-    could not be told."""
-    async with RunnerClient(args.endpoint, timeout_s=ANSWER_S) as runner:
+    """0: all were told. Raises, when others have been told, RunnerUnreachable for one that does not answer, InternalError for one whose
+    control loop does not, RobotFault for one whose motors could not be told."""
+    endpoints = [args.endpoint] if args.endpoint else _there()
+    outcomes = await asyncio.gather(
+        *(_stop(endpoint, args.reason) for endpoint in endpoints), return_exceptions=True
+    )
+    errors = [outcome for outcome in outcomes if isinstance(outcome, BaseException)]
+    for text in outcomes:
+        if isinstance(text, str):
+            print(text)
+    for error in errors[1:]:
+        print(f"vram-runner: {error}", file=sys.stderr)
+    if errors:
+        raise errors[0]
+    return 0
+
+
+def _there() -> list[str]:
+    """The endpoints of runners that may be there: this login's, and the system service's."""
+    own = program_endpoint("runner", os.environ, os.getuid())
+    system = f"ipc://{SYSTEM_RUNTIME}/runner.sock"
+    # os.path: a folder that may not be looked into is no reason to stop nobody
+    there = [name for name in dict.fromkeys((own, system)) if os.path.exists(name.removeprefix("ipc://"))]
+    return there or [own]
+
+
+async def _stop(endpoint: str, reason: str) -> str:
+    async with RunnerClient(endpoint, timeout_s=ANSWER_S) as runner:
         try:
-            reply = await runner.estop(args.reason)
+            reply = await runner.estop(reason)
         except RunnerUnreachable as error:
             hint = "if a robot moves, cut its power"
             raise RunnerUnreachable(error.message, hint=hint, details=error.details) from error
-    print(
-        f"{reply.get('robot') or runner.endpoint}: {reply['message']}"
-    )  # which one: a machine may have several
-    return 0
+    return f"{reply.get('robot') or endpoint}: {reply['message']}"  # which one: there may be several

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 ENDPOINT_VARIABLE = "VRAM_ARBITER_ENDPOINT"
 RUNTIME_VARIABLE = "VRAM_ARBITER_RUNTIME"
+SYSTEM_RUNTIME = "/run/vram-arbiter"  # of the units in configs/systemd/system
 
 
 def runtime_dir(environ: Mapping[str, str], uid: int) -> str:

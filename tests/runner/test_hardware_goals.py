@@ -218,6 +218,27 @@ def test_a_stop_is_not_refused_for_its_words(bench: Any, run_async: Run, fields:
     play(run_async, bench, body)
 
 
+def test_whoever_names_no_endpoint_stops_the_system_service_too(
+    bench: Any, run_async: Run, endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
+) -> None:
+    monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(tmp_path / "of-this-login"))
+    monkeypatch.setattr("runner.cli_estop.SYSTEM_RUNTIME", endpoint.removeprefix("ipc://").rpartition("/")[0])
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
+        assert b.twin.story == ["connect", "halt"]
+        (tmp_path / "of-this-login").mkdir()
+        (
+            tmp_path / "of-this-login" / "runner.sock"
+        ).touch()  # nobody answers there: was that the robot that moves?
+        assert await asyncio.to_thread(main, ["estop"]) == 1
+        said = capfd.readouterr()
+        assert said.out.count("bench: emergency stop: smoke") == 2
+        assert "cut its power" in said.err
+
+    play(run_async, bench, body)
+
+
 def test_a_stop_that_nobody_hears_is_an_error(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["estop", "--endpoint", endpoint]) == 1
     assert "cut its power" in capsys.readouterr().err
