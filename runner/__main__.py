@@ -10,14 +10,14 @@ import argparse
 import asyncio
 import logging
 import sys
-from types import ModuleType
+from importlib import import_module
 
 from clients import logs
-from runner import cli_benchmark, cli_deploy, cli_estop, cli_replay, cli_sim
 from schemas.commands import command
 from schemas.errors import ConfigError, EstopRequested, VramError
 
-COMMANDS: tuple[ModuleType, ...] = (cli_sim, cli_benchmark, cli_deploy, cli_estop, cli_replay)
+COMMANDS = ("sim", "benchmark", "deploy", "estop", "replay")
+URGENT = "estop"  # it imports nothing of the others: a second of imports is a second of motion
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
@@ -26,7 +26,9 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         prog="vram-runner", description="Runs a robot's skills and serves goals and frames."
     )
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in COMMANDS:
+    given = sys.argv[1:] if argv is None else argv
+    for name in [URGENT] if given[:1] == [URGENT] else COMMANDS:
+        module = import_module(f"runner.cli_{name}")
         flags = module.add_parser(commands)
         flags.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
         flags.add_argument(

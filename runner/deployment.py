@@ -257,6 +257,8 @@ def plan(file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Iterab
     if robot.safety is not None:
         given = robot.safety.model_dump(exclude_unset=True)
         lines.append(("safety", ", ".join(f"{key} {value}" for key, value in given.items())))
+    else:
+        lines.append(("safety", "none given: only the joints' own ranges and speeds are limits"))
     lines += [("NOT KEPT", text) for text in unkept(parts, catalogue)]
     lines += [("skill", text) for text in catalogue.summary()]
     if robot.task is not None and robot.vla is not None:

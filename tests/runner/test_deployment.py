@@ -58,6 +58,8 @@ def test_the_dry_run_says_what_would_run_and_opens_nothing(dry_run: DryRun) -> N
     code, out, err = dry_run(text)
     assert (code, err) == (0, "")
     lines = out.splitlines()
+    assert "none given" not in out
+    assert "safety    none given" in dry_run(TWIN)[1]
     assert lines[0] == "robot     bench: so101 by so101_kinematic, simulated"
     assert sum(line.startswith("joint ") for line in lines) == 6
     assert "rate      50 Hz; late actions: drop" in lines

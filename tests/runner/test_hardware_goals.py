@@ -1,6 +1,8 @@
 """Goals on a robot over a real socket: the emergency stop, cancels, pictures. Control thread and server as `vram-runner deploy` has them."""
 
 import asyncio
+import subprocess
+import sys
 import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -237,6 +239,17 @@ def test_whoever_names_no_endpoint_stops_the_system_service_too(
         assert "cut its power" in said.err
 
     play(run_async, bench, body)
+
+
+def test_a_stop_does_not_wait_for_the_imports_of_other_commands(endpoint: str) -> None:
+    code = (
+        "import sys; from runner.__main__ import main; "
+        "code = main(['estop', '--endpoint', sys.argv[1]]); "
+        "print(code, sorted({'runner.cli_deploy', 'runner.cli_sim', 'schemas.manifest', 'numpy'} & set(sys.modules)))"
+    )
+    argv = [sys.executable, "-c", code, endpoint]
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "1 []"
 
 
 def test_a_stop_that_nobody_hears_is_an_error(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
