@@ -10,6 +10,7 @@ ARBITER = Path(__file__).parents[2] / "arbiter"
 READERS = {
     "host/history.py": "dates of events, and which events of earlier runs are old",
     "host/journal.py": "the epoch, only if both places that keep it were lost with a corrupt journal",
+    "host/otel.py": "dates of spans",
     "host/recorder.py": "dates in the event log",
     "replay/logfile.py": "names of its files",
     "replay/text.py": "dates for people",
