@@ -104,6 +104,7 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
                 arbiter,
                 period_s=1.0 / file.robot.rate_hz,
                 speeds_rad_s=limits.speeds_rad_s if wiring.rollout.targets_lead else None,
+                sent=parts.hal.sent,
             )
 
         def make_trajectory(manifest: RSkillManifest) -> Skill:

@@ -255,6 +255,10 @@ class Hal(Protocol):
 
     def send_action(self, action: Action) -> None: ...
 
+    def sent(self) -> Mapping[str, float]:
+        """The last target (rad) that the motors were really given, by joint; empty before the first action."""
+        ...
+
     def estop(self, reason: str) -> NoReturn: ...
 
 

@@ -13,7 +13,7 @@ import contextlib
 import logging
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -148,7 +148,8 @@ class SidecarPolicy(SkillBase):
     """`arbiter` None: nobody arbitrates, the sidecar loads at once. `wait_s` > 0 lets a simulated world wait for each chunk.
 
     `speeds_rad_s`, by joint: never command a step that is longer than this allows in one period. The safety gate withholds such leaps, and
-    rightly; they are meant only where the manifest says so (`targets_lead`). None sends the policy's targets as they are.
+    rightly; they are meant only where the manifest says so (`targets_lead`). None sends the policy's targets as they are. Steps begin where
+    the motors were really sent (`sent`, rad by joint): what is commanded may be dropped for being late, or shortened by the gate.
     """
 
     holds_gpu = True
@@ -164,6 +165,7 @@ class SidecarPolicy(SkillBase):
         wait_s: float = 0.0,
         revision: str = "",
         speeds_rad_s: Mapping[str, float] | None = None,
+        sent: Callable[[], Mapping[str, float]] | None = None,
     ) -> None:
         super().__init__(manifest, revision=revision)
         self._longest = (
@@ -171,6 +173,7 @@ class SidecarPolicy(SkillBase):
             if speeds_rad_s is not None
             else None
         )
+        self._sent = sent
         self._commanded: Row | None = None
         self.cameras = tuple(wiring.cameras)
         self._wiring = wiring
@@ -309,6 +312,9 @@ class SidecarPolicy(SkillBase):
         if self._longest is None:
             return row
         start = self._commanded or tuple(measured[name] for name in self._wiring.joints)
+        if self._commanded is not None and self._sent is not None:
+            sent = self._sent()
+            start = tuple(sent.get(name, measured[name]) for name in self._wiring.joints)
         self._commanded = tuple(
             here + min(max(target - here, -longest), longest)
             for here, target, longest in zip(start, row, self._longest, strict=True)

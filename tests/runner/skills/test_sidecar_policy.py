@@ -426,6 +426,24 @@ def test_a_policy_whose_targets_lead_goes_there_as_fast_as_the_robot_may(
     scenario(run_async, bench(Arbiter(), speeds_rad_s={"a": 3.0, "b": 1.5}), play)
 
 
+def test_a_policy_whose_targets_lead_steps_from_what_was_really_sent(
+    bench: Callable[..., Bench], run_async: Run
+) -> None:
+    """Late actions are dropped, others shortened: who counts them as made is soon so far ahead that the gate withholds all the rest."""
+    motors = {"a": 0.0, "b": 0.5}
+
+    async def play(b: Bench) -> None:
+        import numpy as np
+
+        b.sidecar.action = np.array([[0.9, -0.9]] * 3, dtype=np.float32)
+        await b.skill.start(GOAL)
+        rows, _ = await b.play()  # nothing of it reaches the motors
+        assert rows == [pytest.approx((3.0 * STEP_SHARE / 30, 0.5 - 1.5 * STEP_SHARE / 30))] * 7
+
+    made = bench(Arbiter(), speeds_rad_s={"a": 3.0, "b": 1.5}, sent=lambda: motors)
+    scenario(run_async, made, play)
+
+
 def test_a_chunk_that_is_asked_for_too_late_loads_nothing(
     bench: Callable[..., Bench], run_async: Run
 ) -> None:
