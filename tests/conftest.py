@@ -1,5 +1,6 @@
 """For every test of the product: a real arbiter daemon in a folder of its own, and Hypothesis's nightly profile."""
 
+import os
 import signal
 from collections.abc import Callable, Iterator
 
@@ -10,6 +11,8 @@ from arbiter.testing.process import ArbiterProcess
 from arbiter.testing.wire import WireClient
 
 machines.register()
+# MuJoCo reads it when it is first imported, by whichever test of this process that is.
+os.environ.setdefault("MUJOCO_GL", "egl")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell starts what runs in its background deaf to SIGINT, and so would be every program that a test interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -124,9 +124,31 @@ def test_check_says_ok_or_what_is_wrong(rskill, tmp_path, capsys):
     [
         (DETECTOR.replace("{labels: [x]}", "{labels: [x], engine: rtdetr_onnx}"), "engine"),
         (DETECTOR + "runtime: onnx\n", "runtime 'onnx'"),
-        (HEAD + "kind: wam\nweights_uri: hf://a/b\nactions: [grasp]\n", "kind 'wam'"),
+        (HEAD + "kind: wam\nweights_uri: hf://a/b\nactions: [grasp]\n", "kind 'wam' is not served"),
+        (
+            HEAD
+            + "kind: segmenter\nweights_uri: hf://a/b\nactions: [detect]\nsegmenter: {engine: sam2_hf}\n",
+            "kind 'segmenter' is not served",
+        ),
     ],
 )
 def test_what_no_sidecar_serves_is_said(text, told):
     with pytest.raises(ConfigError, match=told):
         make_adapter(parse_manifest(text), Weights("a/b"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "kind: playbook\nrole: s2\nactions: [plan]\n"
+        "playbook: {trigger: t, body_uri: ./P.md, composes_tools: [wait], done_predicate: d, max_steps: 3}\n",
+        "kind: ros_action\nactions: [reach]\n"
+        "actuators_required: [{kind: joint_position, control_mode_semantics: {mode: absolute}}]\n"
+        "ros_integration: {package: p, interface_type: T, interface_name: /t, default_goal_json: '{}'}\n",
+    ],
+)
+def test_a_kind_without_weights_is_no_sidecars_business(rskill, capsys, text):
+    rskill.write_text(HEAD + text)
+    flags = ["--name", "d", "--rskill", str(rskill), "--footprint", "2GB", "--device", "none", "--check"]
+    assert main(flags) == 1
+    assert "has no weights (sidecars serve detector, vlm, vla and reward skills)" in capsys.readouterr().err

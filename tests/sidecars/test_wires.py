@@ -9,7 +9,7 @@ import zmq
 
 from clients.serve import Peer
 from schemas.errors import CODES, BadRequest, ModelError, OutOfMemory, UnknownOp
-from schemas.sidecar import DetectOp, EndpointCall
+from schemas.sidecar import PICTURES_MAX, DetectOp, EndpointCall, ScoreOp
 from sidecars.images import decode, within
 from sidecars.wires import PENDING_MAX, Wire, error_reply, parse
 
@@ -306,3 +306,44 @@ def test_req_clients_of_the_field_are_answered(lone_box):
             assert "re" not in reply
     finally:
         socket.close()
+
+
+RAW = {
+    "op": "score",
+    "task": "t",
+    "frames": bytes(2 * 3 * 4 * 3),
+    "n": 2,
+    "width": 4,
+    "height": 3,
+    "num_bins": 100,
+}
+
+
+def test_pictures_to_judge_come_as_the_field_sends_them_or_as_pngs():
+    ops = frozenset({"score"})
+    assert parse(RAW, ops) == ScoreOp(**RAW)
+    assert parse({"op": "score", "images": [PNG, PNG]}, ops).images == [PNG, PNG]
+    with pytest.raises(UnknownOp):
+        parse(RAW, OPS)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        {"op": "score", "task": "t"},
+        {**RAW, "images": [PNG]},
+        {**RAW, "n": 3},
+        {**RAW, "width": None},
+        {**RAW, "frames": b"x"},
+        {**RAW, "n": 0, "frames": b""},
+        {**RAW, "n": PICTURES_MAX + 1, "width": 1, "height": 1, "frames": bytes(3 * (PICTURES_MAX + 1))},
+        {"op": "score", "images": [PNG] * (PICTURES_MAX + 1)},
+        {"op": "score", "images": [b"x"]},
+        {"op": "score", "images": PNG},
+        {"op": "score", "images": [PNG], "task": 7},
+        {"op": "score", "images": [PNG], "num_bins": 1},
+    ],
+)
+def test_pictures_that_do_not_add_up_are_refused(message):
+    with pytest.raises(BadRequest, match="score: "):
+        parse(message, frozenset({"score"}))
