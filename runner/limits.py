@@ -40,7 +40,7 @@ NEEDS_KINEMATICS = (
     "max_ee_speed_m_s",
     "max_cartesian_step_m",
 )
-KEPT_ELSEWHERE = ("e_stop_topic", "e_stop_qos")  # `vram-runner estop` instead of a topic
+OF_A_TOPIC = ("e_stop_topic", "e_stop_qos")  # told once, below
 
 
 class Kinematics(Protocol):
@@ -234,7 +234,7 @@ def _unkept(
     envelope: SafetyEnvelope, name: str, robot: RobotDescription, kinematics: Kinematics | None
 ) -> Sequence[str]:
     """Fields that somebody wrote down and that this gate does not keep."""
-    kept = {*POSITIVE, *NEEDS_KINEMATICS, *KEPT_ELSEWHERE}
+    kept = {*POSITIVE, *NEEDS_KINEMATICS, *OF_A_TOPIC}
     found = [
         f"{name}.{key}"
         for key in SafetyEnvelope.model_fields
@@ -246,6 +246,7 @@ def _unkept(
         ("max_torque_nm", robot.tells_efforts, "this robot does not tell efforts"),
         ("max_force_n", robot.tells_efforts, "this robot does not tell efforts"),
         ("max_force_n", kinematics is not None, "no kinematics of this robot"),
+        ("e_stop_topic", False, "no topic is listened to: `vram-runner estop` stops the robot"),
         ("contact_force_threshold_n", False, "no robot here has contact sensors"),
     )
     reasons: dict[str, str] = {}

@@ -435,6 +435,13 @@ def test_what_is_asked_for_and_not_kept_is_told() -> None:
     assert gate(max_ee_speed_m_s=0.5, deadman_required=False).unkept == ()
 
 
+def test_a_stop_button_that_nobody_listens_to_is_told() -> None:
+    """Whoever names a topic will press that button, and the robot would go on."""
+    assert gate(max_ee_speed_m_s=0.5, e_stop_topic="/cell/e_stop").unkept == (
+        "safety.e_stop_topic (no topic is listened to: `vram-runner estop` stops the robot)",
+    )
+
+
 def test_a_limit_of_force_is_told_as_not_kept_where_no_effort_is_measured() -> None:
     asked = {"max_force_n": 3.0, "max_torque_nm": 2.0, "contact_force_threshold_n": 5.0}
     blind = gate(**asked).unkept
