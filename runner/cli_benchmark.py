@@ -134,22 +134,21 @@ async def _stop_with(stopping: asyncio.Event, bench: Benchmark) -> None:
 def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
     from runner.sim.benchmark import Benchmark
     from runner.sim.sim_runner import SimRunner
-    from runner.sim.worlds import so101_environment
 
     world, task, arm = entry.world, entry.task, entry.world.arm
-    make, told = world.make, None
-    if arm is not None and task is not None:
+
+    def told() -> tuple[str, dict[str, Any]]:
+        return ("", {}) if arm is None or task is None else task.told(arm)
+
+    if arm is not None and task is not None and world.environment is not None:
         prepare = task.prepare
-        environment = so101_environment(
-            arm,
-            cameras=world.cameras or (),
+        world.environment.about(
             prepare=None if prepare is None else lambda seed: prepare(arm, seed),
             judge=lambda: task.judge(arm),
             steady=task.steady,
         )
-        make, told = (lambda: environment), (lambda: task.told(arm))
     runner = SimRunner(
-        make,
+        world.make,
         cameras=world.cameras,
         rate_hz=0,
         max_steps=args.max_steps,
@@ -163,7 +162,7 @@ def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
         runner,
         world=world.name,
         task=task.name if task is not None else None,
-        told=told or (lambda: ("", {})),
+        told=told,
         videos=args.out / "videos" if args.videos else None,
         video_every=world.video_every,
         episode_s=args.episode_seconds,

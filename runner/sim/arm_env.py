@@ -17,12 +17,13 @@ from runner.protocols import RobotDescription, SafetyGate, Stepped
 from runner.robot_gate import RobotGate
 from runner.sim.config import CONTROL_HZ
 from runner.sim.environment import EnvStep
+from runner.skills.motion import bounded
 from schemas.control import ControlMode
 from schemas.errors import EnvironmentFailed, InternalError, ModelError
 from schemas.manifest import RSkillManifest
 from schemas.world import Action, CameraModel, JointState, Pose, SensorFrame, WorldState
 
-SAMPLED_SHARE = 0.98  # of the longest step: rounding must not reach the gate
+REACH_SHARE = 0.98  # of the longest step: rounding must not reach the gate
 
 
 class MobileArm(Protocol):
@@ -88,7 +89,11 @@ class ArmEnvironment:
         self._targets: dict[str, float] = {}  # last joint targets, rad
         self._random = random.Random(0)
         self._limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in robot.joints}
-        self._gate = RobotGate(robot, rate_hz=CONTROL_HZ, kinematics=kinematics, sent=lambda: self._targets)
+        self._gate = RobotGate(robot, rate_hz=CONTROL_HZ, kinematics=kinematics, sent=self.sent)
+
+    def about(self, *, prepare: Callable[[int], None] | None, judge: Callable[[], bool], steady: int) -> None:
+        """From the next reset on episodes are about this."""
+        self._prepare, self._judge, self._steady = prepare, judge, steady
 
     def reset(self, seed: int) -> None:
         self.arm.reset(seed)
@@ -155,13 +160,25 @@ class ArmEnvironment:
         """From where the joints were last sent, as far as the gate lets them go in one step."""
         row = []
         for name, (low, high) in self._limits.items():
-            reach = SAMPLED_SHARE * self._gate.limits.speeds_rad_s[name] / CONTROL_HZ
+            reach = REACH_SHARE * self._gate.limits.speeds_rad_s[name] / CONTROL_HZ
             row.append(min(max(self._targets[name] + self._random.uniform(-reach, reach), low), high))
         return _joint_action(tuple(self._limits), row)
 
     @property
     def targets(self) -> dict[str, float]:
         return self._targets
+
+    def sent(self) -> Mapping[str, float]:
+        """The targets that the servos were really given."""
+        return self._targets
+
+    def toward(self, row: Sequence[float]) -> list[float]:
+        """Joint targets, or as much of the way there as the gate lets through in one step: for those whose targets lead the arm."""
+        most = self._gate.limits.speeds_rad_s
+        return [
+            bounded(self._targets[name], target, REACH_SHARE * most[name] / CONTROL_HZ)
+            for name, target in zip(self._limits, row, strict=True)
+        ]
 
     @property
     def observation(self) -> dict[str, float]:

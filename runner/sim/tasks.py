@@ -12,8 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from runner.hal.so101 import SERVO_SPEED_RAD_S
-from runner.sim.config import ARM_JOINTS, CONTROL_HZ
 from runner.sim.dataset import stand_before
 from runner.sim.env import SimEnv
 from runner.sim.expert import GrabExpert
@@ -26,7 +24,6 @@ HELD_STEPS: Final = 8  # a thing that is held this long, above the table, does n
 STANDS_M: Final = 0.03  # of the grasp spot: what the grab policy was trained to make up for
 AFTER_STEPS: Final = 8  # that the expert holds what it has lifted
 EXPERT: Final = "expert"
-LONGEST_RAD: Final = 0.98 * SERVO_SPEED_RAD_S / CONTROL_HZ  # of one step: rounding must not reach the gate
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,21 +88,14 @@ def task_of(manifest: RSkillManifest) -> Task:
 def expert_policy(arm: SimEnv) -> Policy:
     """The scripted grab that the demonstrations are made by. It reads the ground truth: the ceiling of a benchmark, nothing else."""
 
-    def make(world: Any, seed: int) -> Step:
+    def make(env: Any, seed: int) -> Step:
         expert = GrabExpert(arm, ArmKinematics(arm.config), arm.target)
         after = 0
 
         def act(_: Any) -> list[float] | None:
             nonlocal after
             after += expert.done
-            if after > AFTER_STEPS:
-                return None
-            # its targets lead far ahead of the arm: it goes there as fast as the gate allows, as a policy that learnt from it does
-            here = [world.targets[name] for name in ARM_JOINTS]
-            return [
-                a + min(max(b - a, -LONGEST_RAD), LONGEST_RAD)
-                for a, b in zip(here, expert.act(), strict=True)
-            ]
+            return None if after > AFTER_STEPS else env.toward(expert.act())
 
         return act
 

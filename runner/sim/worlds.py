@@ -18,7 +18,6 @@ from runner.catalogue import Maker
 from runner.cli_common import sidecar_endpoint
 from runner.hal.so101 import so101
 from runner.hal.so101_kinematics import kinematics_for
-from runner.limits import Limits
 from runner.protocols import MobileBase, Skill
 from runner.sim.arm_env import ArmEnvironment
 from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
@@ -39,7 +38,7 @@ OBSERVATION_CAMERAS: Final = ("front", "wrist")  # the first is the default one
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """`cameras` None: what the environment has. `arm` and `scene` are those of our own scene. `joints` are what a policy sees and moves, in
+    """`cameras` None: what the environment has. `arm`, `scene` and `environment` are those of our own scene. `joints` are what a policy sees and moves, in
     the policy's order; `rest` is where it begins (rad), None: wherever a reset leaves the world."""
 
     name: str
@@ -53,15 +52,7 @@ class World:
     identity: Mapping[str, Any] = field(default_factory=dict)
     scene: SceneConfig | None = None
     arm: SimEnv | None = None
-    limits_for: Callable[[RSkillManifest], Limits] | None = (
-        None  # what the gate lets a skill do, where it knows more than a space
-    )
-
-
-def so101_environment(arm: SimEnv, **task: Any) -> ArmEnvironment:
-    """Our scene behind the gate of a real arm. `task` as `ArmEnvironment` takes it: cameras, what an episode is about."""
-    robot = so101(simulated=True, base=MobileBase(MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S))
-    return ArmEnvironment(arm, robot, kinematics=kinematics_for(robot), **task)
+    environment: ArmEnvironment | None = None
 
 
 def so101_world(scene_file: Path | None) -> World:
@@ -72,7 +63,8 @@ def so101_world(scene_file: Path | None) -> World:
         raise ConfigError(f"the scene {scene_file} cannot be read: {error}") from error
     arm = SimEnv(scene)  # renders only on the control thread, from its first reset on
     cameras = tuple(name for name in OBSERVATION_CAMERAS if name in scene.cameras)
-    environment = so101_environment(arm, cameras=cameras)
+    robot = so101(simulated=True, base=MobileBase(MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S))
+    environment = ArmEnvironment(arm, robot, kinematics=kinematics_for(robot), cameras=cameras)
     return World(
         name=SO101,
         make=lambda: environment,
@@ -85,7 +77,7 @@ def so101_world(scene_file: Path | None) -> World:
         identity={"robot": "so101-mobile", "scene": str(scene_file or "built-in")},
         scene=scene,
         arm=arm,
-        limits_for=environment.limits_for,
+        environment=environment,
     )
 
 
@@ -145,7 +137,9 @@ def makers_of(
             )
         wiring = wire_up(manifest, world.joints, world.rest)
         client = PolicyClient(sidecar_endpoint(manifest.name, given, os.environ))
-        limits = None if world.limits_for is None else world.limits_for(manifest)
+        speeds, sent = None, None
+        if world.environment is not None and wiring.rollout.targets_lead:
+            speeds, sent = world.environment.limits_for(manifest).speeds_rad_s, world.environment.sent
         return SidecarPolicy(
             manifest,
             wiring,
@@ -153,11 +147,12 @@ def makers_of(
             arbiter,
             period_s=period_s,
             wait_s=wait_s,
-            speeds_rad_s=limits.speeds_rad_s if limits and wiring.rollout.targets_lead else None,
+            speeds_rad_s=speeds,
+            sent=sent,
         )
 
-    scene, limits_for = world.scene, world.limits_for
-    if scene is None or limits_for is None:
+    scene, environment = world.scene, world.environment
+    if scene is None or environment is None:
         return {Kind.VLA: make_policy}
     joint, twist = ControlMode.JOINT_POSITION, ControlMode.BODY_TWIST
     known = {
@@ -165,7 +160,9 @@ def makers_of(
             lambda manifest: Navigate(manifest, scene, period_s=period_s), frozenset({twist, joint})
         ),
         TRAJECTORY: StandIn(
-            lambda manifest: FollowJointTrajectory(manifest, limits_for(manifest), period_s=period_s),
+            lambda manifest: FollowJointTrajectory(
+                manifest, environment.limits_for(manifest), period_s=period_s
+            ),
             frozenset({joint}),
         ),
     }

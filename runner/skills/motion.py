@@ -26,6 +26,11 @@ def joint_positions(world: WorldState, names: tuple[str, ...]) -> dict[str, floa
     return {name: known[name] for name in names}
 
 
+def bounded(here: float, there: float, reach: float) -> float:
+    """From `here` towards `there`, `reach` at most."""
+    return here + min(max(there - here, -reach), reach)
+
+
 class JointRamp:
     """From where the joints are to `goal` (rad, by name) at a bounded speed. `done` when they arrived, or cannot go further."""
 
@@ -45,8 +50,7 @@ class JointRamp:
     def next_target(self) -> dict[str, float]:
         """The next joint targets; the goal itself once they are there."""
         self._target = {
-            name: here + min(max(self._goal[name] - here, -self._stride), self._stride)
-            for name, here in self._target.items()
+            name: bounded(here, self._goal[name], self._stride) for name, here in self._target.items()
         }
         return dict(self._target)
 

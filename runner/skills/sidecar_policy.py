@@ -24,7 +24,7 @@ from runner.pictures import as_rgb
 from runner.protocols import Act, Done, Goal, Hold, StepOutcome
 from runner.skills.base import SkillBase
 from runner.skills.chunks import ChunkPlayer, Row
-from runner.skills.motion import JointRamp, is_at, joint_positions
+from runner.skills.motion import JointRamp, bounded, is_at, joint_positions
 from schemas import telemetry, tracing
 from schemas.control import ControlMode
 from schemas.errors import (
@@ -316,7 +316,7 @@ class SidecarPolicy(SkillBase):
             sent = self._sent()
             start = tuple(sent.get(name, measured[name]) for name in self._wiring.joints)
         self._commanded = tuple(
-            here + min(max(target - here, -longest), longest)
+            bounded(here, target, longest)
             for here, target, longest in zip(start, row, self._longest, strict=True)
         )
         return self._commanded
