@@ -95,7 +95,11 @@ def expert_policy(arm: SimEnv) -> Policy:
         def act(_: Any) -> list[float] | None:
             nonlocal after
             after += expert.done
-            return None if after > AFTER_STEPS else env.toward(expert.act())
+            if after > AFTER_STEPS:
+                return None
+            return env.toward(
+                expert.act()
+            )  # its targets lead the arm, as those of a policy that learnt from it do
 
         return act
 
