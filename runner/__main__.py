@@ -1,4 +1,4 @@
-"""The runner's command line: a thin dispatcher, one module a command (`runner/cli_COMMAND.py`).
+"""The runner's command line: a thin dispatcher, one module a command (`runner/cli/COMMAND.py`).
 
 A command's module has `add_parser(commands)`, which returns its parser, and `async run(args)`, which returns the exit code: 0 ended on
 request, 1 failed, 2 wrong usage or configuration. `SERVES = True` says that it works for others, each in a trace of his own.
@@ -28,7 +28,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     commands = parser.add_subparsers(dest="command", required=True)
     given = sys.argv[1:] if argv is None else argv
     for name in [URGENT] if given[:1] == [URGENT] else COMMANDS:
-        module = import_module(f"runner.cli_{name}")
+        module = import_module(f"runner.cli.{name}")
         flags = module.add_parser(commands)
         flags.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
         flags.add_argument(

@@ -1,7 +1,7 @@
 """A deployment file, checked and taken apart: robot, cameras, skills and task that fit together, or every mistake by line and field.
 
 Nothing here opens a device, loads a model or moves anything; what can be wrong is said before any of that. Puts no program together:
-`runner.cli_deploy` does. Licences are looked at here, because a robot at work is commercial use unless somebody says otherwise.
+`runner.cli.deploy` does. Licences are looked at here, because a robot at work is commercial use unless somebody says otherwise.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from runner.clock import Clock
 from runner.dataset.commit import check_folder
 from runner.dataset.recorder import whole_rate
 from runner.protocols import Hal, SensorReader
-from runner.robot_gate import RobotGate
+from runner.safety.gate import RobotGate
 from runner.skills.sidecar_policy import wire_up
 from runner.world_state import JOINT_STATE
 from schemas.errors import ConfigError, ManifestInvalid, UnknownSkill

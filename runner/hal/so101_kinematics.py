@@ -9,8 +9,8 @@ import importlib.util
 from collections.abc import Mapping
 
 from runner.hal.so101 import NAME
-from runner.limits import Kinematics, Vector3
 from runner.protocols import RobotDescription
+from runner.safety.limits import Kinematics, Vector3
 from runner.sim.config import ARM_JOINTS
 from runner.sim.scene import GRASP_SITE, arm_spec, load_mujoco
 

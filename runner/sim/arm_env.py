@@ -12,9 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from runner.limits import Kinematics, Limits
 from runner.protocols import RobotDescription, SafetyGate, Stepped
-from runner.robot_gate import RobotGate
+from runner.safety.gate import RobotGate
+from runner.safety.limits import Kinematics, Limits
 from runner.sim.config import CONTROL_HZ
 from runner.sim.environment import EnvStep
 from runner.skills.motion import bounded

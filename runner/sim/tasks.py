@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
+from runner.sim.arm_env import ArmEnvironment
 from runner.sim.dataset import stand_before
 from runner.sim.env import SimEnv
 from runner.sim.expert import GrabExpert
@@ -85,10 +86,10 @@ def task_of(manifest: RSkillManifest) -> Task:
     return fitting[0]
 
 
-def expert_policy(arm: SimEnv) -> Policy:
+def expert_policy(arm: SimEnv, environment: ArmEnvironment) -> Policy:
     """The scripted grab that the demonstrations are made by. It reads the ground truth: the ceiling of a benchmark, nothing else."""
 
-    def make(env: Any, seed: int) -> Step:
+    def make(_: Any, seed: int) -> Step:
         expert = GrabExpert(arm, ArmKinematics(arm.config), arm.target)
         after = 0
 
@@ -97,7 +98,7 @@ def expert_policy(arm: SimEnv) -> Policy:
             after += expert.done
             if after > AFTER_STEPS:
                 return None
-            return env.toward(
+            return environment.toward(
                 expert.act()
             )  # its targets lead the arm, as those of a policy that learnt from it do
 

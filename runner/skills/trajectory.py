@@ -14,8 +14,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from runner.limits import Limits
 from runner.protocols import Act, Done, Goal, StepOutcome
+from runner.safety.limits import Limits
 from runner.skills.base import SkillBase
 from runner.skills.motion import REACHED_RAD, joint_positions
 from runner.skills.navigate import merge

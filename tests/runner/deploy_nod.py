@@ -10,7 +10,7 @@ from small_robots import Nod
 
 from runner.__main__ import parse
 from runner.catalogue import Maker
-from runner.cli_deploy import Deploy
+from runner.cli.deploy import Deploy
 from runner.deployment import Parts, read_deployment
 from runner.skills.sidecar_policy import Arbiter
 from schemas.errors import ConfigError, EstopRequested, VramError

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from clients.runner import RunnerClient
-from runner.cli_deploy import claim
+from runner.cli.deploy import claim
 from schemas.errors import AlreadyRunning, EstopRequested, UnknownSkill
 from schemas.robot import HalConfig, RobotEnvironment
 

@@ -8,7 +8,7 @@ from small_robots import FedCamera, Nod, Twin
 
 from runner.hardware import HardwareRunner
 from runner.protocols import Act, Done, Goal, GoalTick, Hold, SkillEnded
-from runner.safety import JointRanges
+from runner.safety.ranges import JointRanges
 from runner.skills.base import SkillState
 from schemas.control import ControlMode
 from schemas.errors import ModelError

@@ -11,8 +11,8 @@ from runner.clock import SystemClock
 from runner.hal.so101 import so101
 from runner.hardware import FIRST_DATA_SLICE_S, FIRST_STATE_TRIES, HardwareRunner
 from runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded
-from runner.robot_gate import RobotGate
-from runner.safety import JointRanges
+from runner.safety.gate import RobotGate
+from runner.safety.ranges import JointRanges
 from runner.sensors import Feed
 from runner.skill_runner import WITHHELD_IN_A_ROW_MAX
 from runner.skills.base import SkillState

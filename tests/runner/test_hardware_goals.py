@@ -20,7 +20,7 @@ from runner.control import ControlThread
 from runner.goals import GoalServer
 from runner.hardware import HardwareRunner
 from runner.protocols import Goal
-from runner.safety import JointRanges
+from runner.safety.ranges import JointRanges
 from schemas.errors import EstopRequested, FrameStale, InternalError, LimitExceeded, RobotFault
 from schemas.manifest import Kind, RSkillManifest, load_manifest
 from schemas.world import WorldState
@@ -224,7 +224,7 @@ def test_whoever_names_no_endpoint_stops_the_system_service_too(
     bench: Any, run_async: Run, endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
 ) -> None:
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(tmp_path / "of-this-login"))
-    monkeypatch.setattr("runner.cli_estop.SYSTEM_RUNTIME", endpoint.removeprefix("ipc://").rpartition("/")[0])
+    monkeypatch.setattr("runner.cli.estop.SYSTEM_RUNTIME", endpoint.removeprefix("ipc://").rpartition("/")[0])
 
     async def body(b: Bench, client: RunnerClient) -> None:
         assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
@@ -245,7 +245,7 @@ def test_a_stop_does_not_wait_for_the_imports_of_other_commands(endpoint: str) -
     code = (
         "import sys; from runner.__main__ import main; "
         "code = main(['estop', '--endpoint', sys.argv[1]]); "
-        "print(code, sorted({'runner.cli_deploy', 'runner.cli_sim', 'schemas.manifest', 'numpy'} & set(sys.modules)))"
+        "print(code, sorted({'runner.cli.deploy', 'runner.cli.sim', 'schemas.manifest', 'numpy'} & set(sys.modules)))"
     )
     argv = [sys.executable, "-c", code, endpoint]
     done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=True)

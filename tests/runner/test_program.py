@@ -12,7 +12,7 @@ import pytest
 
 from clients.runner import RunnerClient, RunnerUnreachable
 from runner.__main__ import main, parse
-from runner.cli_common import sidecar_endpoint, sidecars_given
+from runner.cli.common import sidecar_endpoint, sidecars_given
 from schemas.errors import ConfigError
 
 Run = Callable[[Any], Any]

@@ -13,7 +13,7 @@ from small_robots import FedCamera, Nod, Twin
 from runner.clock import SystemClock
 from runner.hardware import HardwareRunner
 from runner.protocols import Goal
-from runner.safety import JointRanges
+from runner.safety.ranges import JointRanges
 from runner.skills.base import SkillState
 from schemas import telemetry
 from schemas.manifest import load_manifest

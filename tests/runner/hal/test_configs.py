@@ -6,7 +6,7 @@ import pytest
 
 from runner.hal.factory import make_hal
 from runner.protocols import RobotDescription
-from runner.robot_gate import RobotGate
+from runner.safety.gate import RobotGate
 from schemas.robot import load_robot
 
 FOLDER = Path(__file__).parents[3] / "configs" / "robots"

@@ -8,7 +8,7 @@ import pytest
 from runner.hal.factory import make_hal
 from runner.hal.so101_kinematics import So101Kinematics, kinematics_for
 from runner.protocols import Hal, RobotDescription
-from runner.robot_gate import RobotGate
+from runner.safety.gate import RobotGate
 from runner.sim.config import SceneConfig
 from schemas.control import ControlMode
 from schemas.manifest.contracts import SafetyEnvelope

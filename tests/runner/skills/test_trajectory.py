@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runner.hal.so101 import so101
-from runner.limits import Limits, own_limits
 from runner.protocols import Act, Done, Goal, StepOutcome
+from runner.safety.limits import Limits, own_limits
 from runner.skills.ros_standins import NAVIGATE, TRAJECTORY, StandIn, StandIns, interface_of
 from runner.skills.trajectory import ARRIVE_S, FollowJointTrajectory
 from schemas.control import ControlMode

@@ -12,9 +12,9 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from runner.limits import EVERYWHERE, Kinematics, Limits, Vector3, outside_m, own_limits, tighten
 from runner.protocols import RobotDescription
-from runner.safety import CLAMP_TOLERANCE_RAD, JointRanges
+from runner.safety.limits import EVERYWHERE, Kinematics, Limits, Vector3, outside_m, own_limits, tighten
+from runner.safety.ranges import CLAMP_TOLERANCE_RAD, JointRanges
 from schemas.control import ControlMode
 from schemas.manifest import RSkillManifest
 from schemas.manifest.contracts import SafetyEnvelope
@@ -64,7 +64,7 @@ class _Withheld(Exception):
 
 
 class RobotGate:
-    """`envelopes` by the name that errors use for them; each only tightens the robot's own limits (see `runner.limits`).
+    """`envelopes` by the name that errors use for them; each only tightens the robot's own limits (see `runner.safety.limits`).
 
     `sent` gives the last target (rad) that the motors really got, by joint (`HalBase.sent`): an action that passes here can still be
     dropped for being late, and the next step must not begin where that one would have ended. Without it what passed counts as sent.

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.limits import Vector3
 from runner.protocols import Joint, MobileBase, RobotDescription
-from runner.robot_gate import LATE_MAX, MAX_FOLLOWING_ERROR_RAD, RobotGate
-from runner.safety import CLAMP_TOLERANCE_RAD
+from runner.safety.gate import LATE_MAX, MAX_FOLLOWING_ERROR_RAD, RobotGate
+from runner.safety.limits import Vector3
+from runner.safety.ranges import CLAMP_TOLERANCE_RAD
 from runner.skill_runner import WITHHELD_IN_A_ROW_MAX
 from schemas.control import ControlMode
 from schemas.errors import ConfigError

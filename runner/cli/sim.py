@@ -10,7 +10,7 @@ import logging
 import os
 from pathlib import Path
 
-from runner.cli_common import (
+from runner.cli.common import (
     AS_FAST_AS_POSSIBLE_HZ,
     add_serving_flags,
     connect_arbiter,

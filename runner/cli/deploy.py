@@ -17,7 +17,7 @@ from pathlib import Path
 
 from clients.runner import RunnerClient
 from runner.catalogue import Catalogue, Maker, read_manifests
-from runner.cli_common import (
+from runner.cli.common import (
     add_serving_flags,
     connect_arbiter,
     default_skills,
@@ -38,11 +38,11 @@ from runner.deployment import (
     unkept,
     unused,
 )
-from runner.estop_mark import EstopMark
 from runner.goals import GoalServer
 from runner.hardware import HardwareRunner
 from runner.promptness import make_prompt
 from runner.protocols import DeadlinePolicy, Skill
+from runner.safety.estop_mark import EstopMark
 from runner.skills.ros_standins import TRAJECTORY, StandIn, StandIns
 from runner.skills.sidecar_policy import Arbiter
 from schemas.control import ControlMode

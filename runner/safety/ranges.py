@@ -1,4 +1,4 @@
-"""The first of the gate's checks (`runner.robot_gate`): joint targets are within the joints' ranges.
+"""The first of the gate's checks (`runner.safety.gate`): joint targets are within the joints' ranges.
 
 A small excess (a learnt policy aims at a stop) is clamped and said; a large one is withheld. Knows joint names and ranges, not
 robots or skills.

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from runner.cli_common import (
+from runner.cli.common import (
     add_trace_flag,
     connect_arbiter,
     default_skills,
@@ -215,7 +215,7 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
     given = sidecars_given(args.sidecar)
     entries = []
     for world in worlds_of(args):
-        arm = world.arm
+        arm, environment = world.arm, world.environment
         makers = makers_of(world, given, arbiter, period_s=1.0 / CONTROL_HZ, wait_s=LOCKSTEP_WAIT_S)
         catalogue = Catalogue(manifests, makers, body=world.body)
         for name in dict.fromkeys(args.skill):
@@ -226,10 +226,10 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
             task = None if arm is None else given_task or GRAB
             if name != EXPERT:
                 policy = policies[name]
-            elif arm is None or task is not GRAB:
+            elif arm is None or environment is None or task is not GRAB:
                 raise ConfigError(f"--policy {EXPERT} grabs in so101, and does nothing else")
             else:
-                policy = expert_policy(arm)
+                policy = expert_policy(arm, environment)
             entries.append(Entry(world, name, task, lambda policy=policy: PolicyContestant(policy)))  # type: ignore[misc]
     return entries
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from runner.safety import CLAMP_TOLERANCE_RAD, JointRanges
+from runner.safety.ranges import CLAMP_TOLERANCE_RAD, JointRanges
 from schemas.control import ControlMode
 from schemas.world import Action, JointState, WorldState
 
