@@ -5,12 +5,14 @@ Only kinds that move something can be executed: a detector, a scene VLM or a rew
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from runner.protocols import Skill, SkillKey
 from schemas.body import Body
+from schemas.endpoints import program_endpoint
 from schemas.errors import ManifestInvalid, UnknownSkill
 from schemas.manifest import Kind, ManifestError, RSkillManifest, load_manifest
 
@@ -151,3 +153,10 @@ class Catalogue:
 
 def _why_not(kind: Kind) -> str:
     return NOT_EXECUTED.get(kind) or UNMADE[kind]
+
+
+def sidecar_endpoint(rskill_id: str, given: Mapping[str, str], environ: Mapping[str, str]) -> str:
+    """Where the policy of a skill is served: as given, else by its name, `OWNER/so101-grab` → `grab`."""
+    repository = rskill_id.rpartition("/")[2]
+    _, dash, rest = repository.partition("-")
+    return given.get(rskill_id) or program_endpoint(rest if dash else repository, environ, os.getuid())

@@ -8,14 +8,12 @@ import contextlib
 import logging
 import os
 import signal
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from clients.configs import configs_folder
 from runner import frames
 from runner.skill_runner import SkillRunner
-from schemas.endpoints import program_endpoint
 from schemas.errors import ArbiterUnreachable, ConfigError
 
 log = logging.getLogger("runner")
@@ -80,13 +78,6 @@ def add_serving_flags(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_trace_flag(parser)
     parser.add_argument("--max-seconds", type=positive, help="stop by itself after so many seconds")
-
-
-def sidecar_endpoint(rskill_id: str, given: Mapping[str, str], environ: Mapping[str, str]) -> str:
-    """Where the policy of a skill is served: as given, else by its name, `OWNER/so101-grab` → `grab`."""
-    repository = rskill_id.rpartition("/")[2]
-    _, dash, rest = repository.partition("-")
-    return given.get(rskill_id) or program_endpoint(rest if dash else repository, environ, os.getuid())
 
 
 def sidecars_given(flags: list[str]) -> dict[str, str]:

@@ -16,14 +16,13 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 
 from clients.runner import RunnerClient
-from runner.catalogue import Catalogue, Maker, read_manifests
+from runner.catalogue import Catalogue, Maker, read_manifests, sidecar_endpoint
 from runner.cli.common import (
     add_serving_flags,
     connect_arbiter,
     default_skills,
     install_signals,
     record_into,
-    sidecar_endpoint,
     sidecars_given,
 )
 from runner.clock import SystemClock

@@ -14,8 +14,7 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from runner.body import SIMULATED
-from runner.catalogue import Maker
-from runner.cli.common import sidecar_endpoint
+from runner.catalogue import Maker, sidecar_endpoint
 from runner.hal.so101 import so101
 from runner.hal.so101_kinematics import kinematics_for
 from runner.protocols import MobileBase, Skill

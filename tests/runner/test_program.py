@@ -12,7 +12,8 @@ import pytest
 
 from clients.runner import RunnerClient, RunnerUnreachable
 from runner.__main__ import main, parse
-from runner.cli.common import sidecar_endpoint, sidecars_given
+from runner.catalogue import sidecar_endpoint
+from runner.cli.common import sidecars_given
 from schemas.errors import ConfigError
 
 Run = Callable[[Any], Any]
