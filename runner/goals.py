@@ -60,6 +60,7 @@ from schemas.world import WorldState
 log = logging.getLogger(__name__)
 
 RESULTS_KEPT = 64
+LISTENERS_MAX = 16  # of one goal: a client that comes back again and again takes its own old places
 FEEDBACK_PERIOD_S = 0.2  # at most five a second
 ESTOP_S = 1.0  # a control loop that has not obeyed by then hangs
 READS_MAX = 16  # requests that wait for the control thread; more are refused, so that an emergency stop is always read
@@ -272,6 +273,7 @@ class GoalServer:
             if running.goal.goal_id == request.goal_id and running.key == _identity(request):
                 if all(peer.identity != known.identity for known in running.peers):
                     running.peers.append(peer)  # the same client on a new connection
+                    del running.peers[:-LISTENERS_MAX]
                 return {"goal_id": request.goal_id, "accepted": True}
             raise GoalRejected(
                 f"goal {running.goal.goal_id} ({running.goal.rskill_id}) is running",

@@ -3,7 +3,7 @@
 import asyncio
 import threading
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from clients.runner import RunnerClient
 from runner.catalogue import Catalogue, read_manifests
 from runner.clock import SystemClock
 from runner.control import ControlThread
-from runner.goals import GoalServer
+from runner.goals import LISTENERS_MAX, GoalServer
 from runner.protocols import Act, Done, Goal, Hold, StepOutcome
 from runner.sim.sim_runner import SimRunner
 from runner.skills.base import SkillBase
@@ -348,6 +348,24 @@ def test_the_same_goal_sent_again_is_the_same_goal(bench: Any, endpoint: str, ru
             assert (await again.result(60))["status"] == "canceled"
         assert (await goal.result(60))["status"] == "canceled"
         assert b.made[0].story == ["start forever", "finish"]
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_goal_sent_from_ever_new_connections_is_told_on_the_newest(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="forever", goal_id="same")
+        async with AsyncExitStack() as stack:
+            for _ in range(LISTENERS_MAX):
+                newest = await stack.enter_async_context(RunnerClient(endpoint))
+                again = await newest.send_goal(RSKILL, prompt="forever", goal_id="same")
+            assert b.server._running is not None
+            assert len(b.server._running.peers) == LISTENERS_MAX
+            await again.cancel()
+            assert (await again.result(60))["status"] == "canceled"
+        assert (await client.call("result", {"goal_id": goal.goal_id}))["status"] == "canceled"
 
     play(run_async, bench, endpoint, body)
 
