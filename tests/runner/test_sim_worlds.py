@@ -72,6 +72,17 @@ def test_a_scripted_policy_balances_gymnasiums_pole(
     assert (code, result["success"]) == (0, False)
 
 
+def test_the_video_of_gymnasiums_pole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import imageio_ffmpeg
+
+    pytest.importorskip("pygame", reason="needs the runner extra")
+    video = tmp_path / "pole.mp4"
+    flags = ("--policy", "random", "--max-steps", "20", "--video", str(video))
+    code, result, _ = sim(tmp_path, capsys, "--env", "gym:CartPole-v1", *flags)
+    assert code == 0
+    assert imageio_ffmpeg.count_frames_and_secs(str(video))[0] == result["n_ticks"] - 1
+
+
 def test_random_actions_in_our_own_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, result, _ = sim(tmp_path, capsys, "--policy", "random", "--max-steps", "5")
     assert (code, result["n_ticks"], result["success"]) == (0, 6, None)
