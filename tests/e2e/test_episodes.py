@@ -217,14 +217,16 @@ class Stage:
             while not (self.programs.runtime / "policy/holding").exists():
                 await asyncio.sleep(0.01)
 
-    async def detector_is_back(self, *, after: str = "use_ended") -> None:
+    async def detector_is_back(
+        self, *, after: str = "use_ended", verdicts: tuple[str, ...] = ("verified", "residue")
+    ) -> None:
         """By itself, once: granted after the policy's `after` and after its bytes were measured gone, and loaded."""
         ended = await self.until(after, "policy")
         gone = await self.until("verified", "policy")
         granted = await self.until("granted", "detector")
         ready = await self.until("ready", "detector")
         assert ended["seq"] < gone["seq"] < granted["seq"] < ready["seq"], self.events
-        assert gone["verdict"] in ("verified", "residue")
+        assert gone["verdict"] in verdicts, gone
         assert granted["reason"] == "back from standby: there is room and nobody waits"
         assert sum(e["kind"] == "granted" and e.get("consumer") == "detector" for e in self.events) == 1
         await self.detector.load()  # the arbiter's word is a moment ahead of the sidecar's
@@ -343,7 +345,8 @@ async def out_of_memory(stage: Stage) -> None:
         assert stage.detector_was_away()
     finally:
         stowaway.unlink()
-    await stage.detector_is_back(after="granted")
+    # whose the bytes are is contested where the stowaway came between two readings of the load
+    await stage.detector_is_back(after="granted", verdicts=("verified", "residue", "contested"))
 
 
 async def canceled_while_loading(stage: Stage) -> None:
