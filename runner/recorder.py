@@ -55,6 +55,7 @@ class Recorder:
 
     def _encode(self) -> None:
         writer: Any = None
+        size: tuple[int, ...] = ()
         try:
             while (item := self._queue.get()) is not None:
                 if self.error:
@@ -63,7 +64,11 @@ class Recorder:
                 rgb = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
                 try:
                     if writer is None:
-                        writer = self._open(rgb.shape[1], rgb.shape[0])
+                        writer, size = self._open(rgb.shape[1], rgb.shape[0]), rgb.shape
+                    if rgb.shape != size:  # ffmpeg counts bytes: every later picture would be garbled
+                        raise RuntimeError(
+                            f"the pictures were {size[1]} × {size[0]}, now one is {rgb.shape[1]} × {rgb.shape[0]}"
+                        )
                     writer.send(_caption(rgb, lines))
                     self.written += 1
                 except (OSError, RuntimeError) as error:  # ffmpeg missing, disk full: the robot goes on
@@ -72,6 +77,9 @@ class Recorder:
         finally:
             if writer is not None:
                 writer.close()
+                if not self.error and not _whole(self.path):  # ffmpeg says nothing of how it ended
+                    self.error = f"{self.path} could not be finished; is the disk full?"
+                    log.error("no video: %s", self.error)
 
     def _open(self, width: int, height: int) -> Any:
         import imageio_ffmpeg  # type: ignore[import-untyped]
@@ -86,6 +94,26 @@ class Recorder:
         )
         writer.send(None)
         return writer
+
+
+def _whole(path: Path) -> bool:
+    """Whether an MP4 file has its index, and ends where its last part does."""
+    try:
+        with path.open("rb") as file:
+            at, indexed, end = 0, False, path.stat().st_size
+            while at < end:
+                file.seek(at)
+                head = file.read(16)
+                size = int.from_bytes(head[:4])
+                if size == 1:  # a large part: its size stands behind its name
+                    size = int.from_bytes(head[8:16])
+                if size < 8:
+                    return False
+                indexed |= head[4:8] == b"moov"
+                at += size
+            return indexed and at == end
+    except OSError:
+        return False
 
 
 def _caption(rgb: Any, lines: tuple[str, ...]) -> Any:

@@ -97,10 +97,14 @@ class Cell:
         return self.successes / self.judged if self.judged else None
 
     def add(self, played: Played) -> None:
-        """In a world that judges, whoever fails by himself has failed, also before the first word of the world."""
+        """In a world that judges, whoever fails by himself has failed, also before the first word of the world; and so has an episode of
+        which it says nothing: some only ever speak of successes."""
         self.episodes.append(played)
         if self.judged:
-            self.episodes = [replace(one, success=False) if one.failed else one for one in self.episodes]
+            self.episodes = [
+                replace(one, success=False) if one.success is None and (one.failed or not one.error) else one
+                for one in self.episodes
+            ]
 
     def summary(self) -> dict[str, Any]:
         """Sums, as they go into the report."""
@@ -294,6 +298,8 @@ class Benchmark:
         error = ended[0].error if ended and "episode" not in ended[0].data else None
         if error is not None and not isinstance(error, ModelError | LimitExceeded):
             raise error  # the episode may not even be one
+        if runner.failure is not None:  # in the tick in which the contestant was done
+            raise runner.failure
         episode = runner.episodes[-1]
         return Played(
             seed,

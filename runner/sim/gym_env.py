@@ -51,6 +51,8 @@ class SpaceGate:
         if isinstance(row, str):
             return None, (row,)
         problems, withheld, values = [], False, []
+        if not all(map(math.isfinite, row)):  # copies of an action are not validated
+            return None, (f"an action with numbers that are not finite: {row}",)
         for index, (value, low, high) in enumerate(zip(row, self.low, self.high, strict=True)):
             excess = max(low - value, value - high, 0.0)
             if excess > 0:
@@ -169,11 +171,33 @@ class GymEnv:
             self._observation, info = self._env.reset(seed=seed)
         except Exception as error:
             raise self._failed("reset", error) from error
+        self._check_observation()
         self._last = EnvStep(success=self._success(info))
         if self._render_wanted is None:
             self._render_wanted = self._can_render()
         if self._render_wanted and RENDER not in self._paths.values() and not self.config.cameras:
             self._paths[RENDER] = RENDER
+
+    def _check_observation(self) -> None:
+        """What is read of it must be what its space promised. Raises EnvironmentFailed."""
+        try:
+            self._check_state(self._observation)
+        except ConfigError as error:
+            raise EnvironmentFailed(error.message) from error
+        space = self._env.observation_space
+        for camera, path in self._paths.items():
+            if path == RENDER:
+                continue
+            promised = _at(space, path)
+            try:
+                picture = _at(self._observation, path)
+                as_promised = picture.dtype == promised.dtype and picture.shape == promised.shape
+            except (KeyError, IndexError, TypeError, AttributeError):
+                as_promised = False
+            if not as_promised:
+                raise EnvironmentFailed(
+                    f"{self.env_id} observed no picture for {camera} as {promised} promises"
+                )
 
     def observe(self, stamp_ns: int, frames: Mapping[str, SensorFrame] | None) -> WorldState:
         joints, velocities = self.config.joints, self.config.velocities
@@ -196,15 +220,16 @@ class GymEnv:
             return EnvStep(success=self._last.success, moved=False)
         raw = self._raw(action)
         try:
-            self._observation, reward, terminated, truncated, info = self._env.step(raw)
+            self._observation, given, terminated, truncated, info = self._env.step(raw)
+            reward, terminated, truncated = float(given), bool(terminated), bool(truncated)
         except Exception as error:
             raise self._failed("step", error) from error
-        reward = float(reward)
+        self._check_observation()
         if not math.isfinite(reward):
             raise EnvironmentFailed(f"{self.env_id} gave the reward {reward}")
         self._steps += 1
         self._total_reward += reward
-        self._last = EnvStep(reward, bool(terminated), bool(truncated), self._success(info))
+        self._last = EnvStep(reward, terminated, truncated, self._success(info))
         return self._last
 
     def gate(self, skill: Stepped) -> SpaceGate:
@@ -314,8 +339,20 @@ class GymEnv:
         for key in (rest,) if kind == "info" else SUCCESS_KEYS:
             value = info.get(key) if isinstance(info, Mapping) else None
             if value is not None:
-                return bool(value)
+                return self._yes_or_no(key, value)
         return None
+
+    def _yes_or_no(self, key: str, value: Any) -> bool:
+        """A truth value or a whole number. Half a success is none, nor is a text or a NaN. Raises EnvironmentFailed."""
+        import numpy as np
+
+        plain = np.asarray(value)
+        if plain.size == 1 and plain.dtype.kind in "biuf" and float(plain.item()).is_integer():
+            return bool(plain.item())
+        raise EnvironmentFailed(
+            f"{self.env_id} says {value!r} of {key}, which is neither yes nor no",
+            hint="choose what a success is with `success`: info:KEY of a truth value, or return:NUMBER",
+        )
 
     def _failed(self, what: str, error: Exception) -> EnvironmentFailed:
         return EnvironmentFailed(f"{self.env_id}.{what}: {type(error).__name__}: {error}")

@@ -77,6 +77,7 @@ class SimRunner(SkillRunner):
         self._ends_with_skill = ends_with_skill or policy is not None
         self._policy = policy
         self.policy_error: VramError | None = None
+        self.failure: EnvironmentFailed | None = None  # by which the last episode was broken off
         self.recorder = recorder  # may be set while running
         self._video_camera = video_camera
         self._video_every = video_every
@@ -188,8 +189,9 @@ class SimRunner(SkillRunner):
         return result
 
     def _success(self) -> bool | None:
-        judged = [episode.success for episode in self._view.finished if episode.success is not None]
-        return all(judged) if judged else None
+        """In a world that judges at all, an episode without a word of success is none."""
+        said = [episode.success for episode in self._view.finished]
+        return all(said) if any(success is not None for success in said) else None
 
     def _metadata(self) -> dict[str, Any]:
         return {**super()._metadata(), "seed": self._seed, "episodes": self._view.count}
@@ -282,6 +284,7 @@ class SimRunner(SkillRunner):
     def _reset(self) -> Applied:
         """What was in the world before belongs to nobody any more. Raises EnvironmentFailed, which ends the run: no world, no ticks."""
         self._reset_due = self._had_skill = False
+        self.failure = None
         self._snapshots.clear()
         self._video_picture = None
         seed = self._seed + self.episode_idx if self._next_seed is None else self._next_seed
@@ -296,10 +299,13 @@ class SimRunner(SkillRunner):
     def _broken_off(self, error: EnvironmentFailed) -> Applied:
         """The episode never happened; its seed is played again. Raises when nobody had the world: then it fails by itself, every time."""
         log.error("episode %d is broken off: %s", self.episode_idx, error)
-        self.world = None
+        self.world, self.failure = None, error
         if not self._had_skill:
             raise error
         self._end(SkillEnded({}, error))
+        if self._policy is not None:  # also one that was done in this very tick
+            self.policy_error = self.policy_error or error
+            self.request_stop()
         self._reset_due = True
         return Applied(action_applied=False, episode_idx=self.episode_idx)
 
