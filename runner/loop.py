@@ -151,6 +151,8 @@ class RunnerBase(ABC):
         late_ms = max(0.0, started_s - due_s) * 1e3
         deadline_s = math.inf if self.period_s is None else due_s + self.period_s
         decision = self._decide(self.tick_idx)  # 1
+        if decision.reset:  # a scene is built, no action can come too late
+            deadline_s = math.inf
         withheld = self.clock.now_s() > deadline_s and self.deadline_policy is not DeadlinePolicy.WARN  # 2
         if withheld and decision.action is not None:
             decision.action = None

@@ -516,3 +516,20 @@ def test_navigating_the_real_simulator_and_filming_it(
     assert frames == recorder.written
     assert frames >= 10
     assert seconds == pytest.approx(frames / 10, abs=0.2)
+
+
+def test_a_scene_that_takes_long_to_build_misses_no_deadline(make_runner: Make, env: Any, clock: Any) -> None:
+    """There is no action that could come too late: `raise` would end every run before its first step."""
+    build = env.reset
+
+    def slowly(seed: int) -> None:
+        clock.advance(0.8)
+        build(seed)
+
+    env.reset = slowly
+    options = {"rate_hz": 10, "episodes": 2, "max_steps": 3, "clock": clock}
+    runner = make_runner(deadline_policy=DeadlinePolicy.RAISE, **options)
+    runner.activate()
+    result = runner.run()
+    assert (result.n_ticks, result.budget_violations) == (8, 0)
+    assert [episode.steps for episode in runner.episodes] == [3, 3]
