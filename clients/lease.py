@@ -279,7 +279,11 @@ class Lease:
             self._driver.pump()
         else:
             self._unloaded = True
-            await self._release(exiting=exiting)
+            try:
+                await self._release(exiting=exiting)
+            finally:  # whatever was answered: nothing is renewed from here on
+                self._end()
+            return
         self._end()
 
     async def give_up(self) -> None:
@@ -423,9 +427,9 @@ class Lease:
         except ArbiterUnreachable:
             return False  # stay resident: back in contact or fenced, whichever comes first
         except VramError as error:
-            if error.code not in GONE_CODES:
-                raise
-            await self._progress.wait(RETRY_UNLOADING_S)  # `lost` is told by the protocol
+            if error.code not in GONE_CODES:  # else `lost` is told by the protocol
+                log.warning("%s: its `unloading` was refused, it is said again: %s", self.lease_id, error)
+            await self._progress.wait(RETRY_UNLOADING_S)
             return False
         return True
 

@@ -351,19 +351,14 @@ class Residency:
     async def _load_measured(self, lease: Lease | None) -> None:
         began = time.monotonic()
         try:
-            await self._worker.run(self._load_blocking)
+            loads = await self._worker.run(self._load_blocking)
             measured = await self._worker.run(self._memory.used_bytes)
             if lease is not None:
                 await lease.ready(measured)
+            if loads != self._loads or (lease is not None and (lease.given_up or lease.state == "gone")):
+                raise self._unwanted()  # it was unloaded while the arbiter was told of it
         except BaseException as error:
-            await self._worker.run(self._unload_blocking)
-            if lease is not None:
-                if isinstance(error, OutOfMemory) and not lease.given_up:
-                    requested = int(
-                        error.details.get("requested_bytes") or self._settings.footprint.load_peak_bytes
-                    )
-                    await lease.oom(requested, error.details.get("allocated_bytes"))
-                await lease.release()
+            await self._take_back(lease, error)
             if lease is not None and lease.given_up:
                 _log.info("the load was taken back")
                 raise self._unwanted() from None
@@ -377,16 +372,38 @@ class Residency:
         self.state = "resident"
         _log.info("resident after %.2f s: %s bytes on the card", time.monotonic() - began, measured)
 
-    def _load_blocking(self) -> None:
-        """In the worker: real weights first, then what is missing to the footprint that they stand for, at the pace of a real load."""
+    async def _take_back(self, lease: Lease | None, error: BaseException) -> None:
+        """After a load that failed. Whatever else fails in it, the lease ends: it would be renewed for ever, for nothing."""
+        try:
+            await self._worker.run(self._unload_blocking)
+            if lease is not None and isinstance(error, OutOfMemory) and not lease.given_up:
+                requested = int(
+                    error.details.get("requested_bytes") or self._settings.footprint.load_peak_bytes
+                )
+                await lease.oom(requested, error.details.get("allocated_bytes"))
+        except VramError as failed:  # what is left on the card the arbiter will measure
+            _log.error("a load that failed was not taken back in order: %s", failed)
+        finally:
+            if lease is not None:
+                try:
+                    await lease.release()
+                except VramError as refused:
+                    _log.warning("the release of %s was refused: %s", lease.lease_id, refused)
+
+    def _load_blocking(self) -> int:
+        """In the worker: real weights first, then what is missing to the footprint that they stand for, at the pace of a real load.
+
+        Returns which of the loads and unloads it is.
+        """
         self._loads += 1
+        loads = self._loads
         settings, memory = self._settings, self._memory
         footprint = settings.footprint
         memory.touch()
         self._adapter.load(memory.torch_device)
         used = memory.used_bytes()
         if used is None or not (settings.device.startswith("fake:") or settings.stands_for):
-            return  # a real model weighs what it weighs
+            return loads  # a real model weighs what it weighs
         paces = [pace for pace in (settings.throttle_bytes_per_s, memory.throttle_bytes_per_s()) if pace]
         pace = min(paces, default=None)
         self._blocks = fill(
@@ -399,6 +416,7 @@ class Residency:
         if footprint.load_peak_bytes > footprint.steady_bytes:
             memory.free(memory.allocate("load peak", footprint.load_peak_bytes - footprint.steady_bytes))
             memory.empty_cache()
+        return loads
 
     # -- unloading ----------------------------------------------------------------------------------------------------
     async def _unload(self) -> None:

@@ -17,6 +17,7 @@ from schemas.errors import (
     ArbiterUnreachable,
     LeaseLost,
     LeaseRevoking,
+    LimitExceeded,
     StaleToken,
     UnknownGpu,
     VramError,
@@ -248,6 +249,55 @@ async def test_callbacks_that_raise_do_not_keep_the_lease(arbiter_daemon: Arbite
         await lease.ready()
         second = await client.acquire(spec("b", 5), WAIT_S)
         assert (lease.state, second.state) == ("gone", "loading")
+
+
+async def test_a_word_that_the_arbiter_refuses_is_said_again(
+    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: one `unloading` beyond the client's rate ended the task that leaves, and the holder stayed until it was killed for it."""
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        lease = await client.acquire(spec("a", 5))
+        await lease.ready()
+        said: list[int] = []
+        unloading, reply = client.protocol.holdings.unloading, client.reply
+
+        def counted(*arguments: Any) -> int:
+            said.append(unloading(*arguments))
+            return said[-1]
+
+        async def refused_once(number: int) -> dict[str, Any]:
+            answer = await reply(number)
+            if said == [number]:
+                raise LimitExceeded("too many messages", hint="wait")
+            return answer
+
+        monkeypatch.setattr(client.protocol.holdings, "unloading", counted)
+        monkeypatch.setattr(client, "reply", refused_once)
+        async with ArbiterClient(arbiter_daemon.endpoint, name="other") as other, asyncio.timeout(WAIT_S):
+            await (await other.acquire(spec("b", 5))).release()
+            await lease.wait_gone()
+        assert len(said) == 2
+
+
+async def test_a_release_that_is_refused_ends_the_lease_all_the_same(
+    arbiter_daemon: ArbiterProcess, spec: Spec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: its holder renewed nothing any more, and waited for ever for a lease that was neither held nor over."""
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        lease = await client.acquire(spec("a", 5))
+        reply = client.reply
+
+        async def refused(number: int) -> dict[str, Any]:
+            await reply(number)
+            raise LimitExceeded("too many messages", hint="wait")
+
+        monkeypatch.setattr(client, "reply", refused)
+        with pytest.raises(LimitExceeded):
+            await lease.release()
+        monkeypatch.undo()
+        assert lease.state == "gone"
+        async with asyncio.timeout(WAIT_S):
+            await lease.wait_gone()
 
 
 async def test_nobody_at_the_endpoint(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """A whole sidecar process around a model without weights: `python echo_sidecar.py FOLDER [flags of vram-sidecar]`.
 
-FOLDER tells it what to do: a file `fail_prepare` or `fail_load` makes that step fail, `slow_prepare` or `slow_load` makes it last. The query tells `run`: `hold NAME` waits until the
+FOLDER tells it what to do: a file `fail_prepare`, `fail_load` or `fail_unload` makes that step fail, `slow_prepare` or `slow_load` makes it last. The query tells `run`: `hold NAME` waits until the
 file NAME appears there, `fail` raises; anything else is echoed.
 """
 
@@ -39,6 +39,7 @@ class EchoAdapter:
 
     def unload(self) -> None:
         self._model = None
+        self._fail("unload")
 
     def run(self, call) -> dict[str, object]:
         if self._model is None:

@@ -149,6 +149,20 @@ def test_a_failed_start_takes_everything_back_and_can_be_tried_again(box, arbite
     assert "last_error" not in sidecar.ask("ping")
 
 
+def test_a_load_that_can_not_even_be_taken_back_keeps_no_lease(box, arbiter):
+    """Regression: after a fault of the card emptying its caches fails too, and the lease was renewed for ever for a load that no request ended."""
+    (box.runtime / "detector-model").mkdir()
+    switches = [box.runtime / "detector-model" / f"fail_{step}" for step in ("load", "unload")]
+    for switch in switches:
+        switch.touch()
+    sidecar = box.start("detector")
+    assert sidecar.detect()["code"] == "model_error"
+    from_outside(lambda: leases(arbiter) == {})
+    for switch in switches:
+        switch.unlink()
+    assert sidecar.detect()["ok"]
+
+
 def test_an_out_of_memory_while_loading_rolls_back_and_is_reported(box, arbiter):
     (box.runtime / "detector-model").mkdir()
     (box.runtime / "detector-model" / "slow_load").touch()

@@ -1,5 +1,7 @@
 """A sidecar that was evicted and is on standby: it comes back by itself, or as soon as it may when somebody wants it."""
 
+import os
+import signal
 from threading import Event
 from time import monotonic
 
@@ -161,4 +163,32 @@ def test_told_to_unload_while_it_loads_it_takes_the_load_back(box, arbiter):
     until(lambda: state(arbiter, "detector") is None)
     until(lambda: box.used() == 100_000_000)  # its context
     assert "ERROR" not in detector.log
+    assert detector.detect()["ok"]
+
+
+def test_a_load_that_is_taken_back_while_the_arbiter_is_told_of_it_is_not_resident(box, arbiter_daemon, arbiter):
+    """Regression: `ready` was answered behind the unload, and the sidecar said `resident`, with a token, of a model that was gone."""
+    (box.runtime / "detector-model").mkdir()
+    switch = box.runtime / "detector-model" / "slow_load"
+    switch.touch()
+    detector = box.start("detector", footprint="1GB,1GB,100MB")
+    waiting = detector.send_detect()
+    until(lambda: state(arbiter, "detector") == "loading")
+    os.kill(arbiter_daemon.pid, signal.SIGSTOP)
+    try:
+        switch.unlink()
+        until(lambda: box.used() == 1_000_000_000)
+        with WireClient(f"ipc://{box.runtime}/detector.sock") as other:
+            until(lambda: other.reply(other.send("ping"), PATIENCE_S)["state"] == "loading")
+            unloading = other.send("unload")
+            until(lambda: "unloaded in" in detector.log)
+            os.kill(arbiter_daemon.pid, signal.SIGCONT)
+            assert other.reply(unloading, PATIENCE_S)["ok"]
+    finally:
+        os.kill(arbiter_daemon.pid, signal.SIGCONT)
+    refused = detector.client.reply(waiting, PATIENCE_S)
+    assert (refused["ok"], refused.get("code")) == (False, "not_resident")
+    identity = detector.ask("ping")
+    assert (identity["state"], identity["token"]) == ("unloaded", None)
+    until(lambda: state(arbiter, "detector") is None)
     assert detector.detect()["ok"]
