@@ -1,5 +1,6 @@
 """Clients of the perception sidecars: open-vocabulary detector, scene VLM, reward model. They know images as PNG bytes only."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -103,6 +104,7 @@ class RewardClient(SidecarClient):
     ) -> Judgement:
         """How far along the task one camera's pictures show the robot to be; the newest `PICTURES_MAX` are sent. Raises as `DetectorClient.detect`."""
         fields = {"images": list(images_png)[-PICTURES_MAX:], "task": task}
+        sent = len(fields["images"])
         reply = await self.call("score", fields, token=token, timeout_s=timeout_s)
         try:
             found = Judgement(
@@ -112,9 +114,13 @@ class RewardClient(SidecarClient):
             )
         except (KeyError, TypeError, ValueError) as error:
             raise ModelError(f"the reward model's answer has a wrong shape: {error!r}") from error
-        values = (*found.progress, *found.success)
+        values = (*found.progress, *found.success, found.success_threshold)
         if not found.progress or not all(0.0 <= value <= 1.0 for value in values):
             raise ModelError("the reward model's answer is not in 0..1")
+        if len(found.progress) not in (1, sent) or len(found.success) not in (0, len(found.progress)):
+            raise ModelError(
+                f"the reward model judged {len(found.progress)} and {len(found.success)} of {sent} pictures"
+            )
         return found
 
 
@@ -123,4 +129,7 @@ def _detection(entry: dict[str, object]) -> Detection:
     if not isinstance(box, list) or len(box) != 4:
         raise ValueError(f"a box has four numbers, not {box!r}")
     x0, y0, x1, y1 = (float(side) for side in box)
-    return Detection(str(entry["label"]), float(str(entry["score"])), (x0, y0, x1, y1))
+    score = float(str(entry["score"]))
+    if not all(map(math.isfinite, (x0, y0, x1, y1))) or not 0.0 <= score <= 1.0:
+        raise ValueError(f"a box is finite and a score in 0..1, not {box!r}, {score!r}")
+    return Detection(str(entry["label"]), score, (x0, y0, x1, y1))

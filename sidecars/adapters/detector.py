@@ -1,10 +1,11 @@
 """Open-vocabulary detection through transformers' zero-shot classes (OWL-ViT, OWLv2, Grounding DINO, OmDet-Turbo)."""
 
 import inspect
+import math
 import re
 from typing import Any, Literal
 
-from schemas.errors import BadRequest
+from schemas.errors import BadRequest, ModelError
 from schemas.manifest import RSkillManifest
 from schemas.sidecar import DetectionResult, DetectOp
 from sidecars.adapters.base import ModelCall
@@ -114,7 +115,9 @@ def grounding_answer(found: list[DetectionResult], width: int, height: int) -> s
 
 
 def _detection(label: str, score: float, box: list[float], size: tuple[int, int]) -> DetectionResult | None:
-    """Cut to the picture; None if nothing is left of it."""
+    """Cut to the picture; None if nothing is left of it. Raises ModelError for what is no number: cutting would put the picture's edge there."""
+    if not all(map(math.isfinite, (score, *box))):
+        raise ModelError("the detector's box is no number", hint="its weights are broken")
     height, width = size
     x0, x1 = (min(float(width), max(0.0, x)) for x in (box[0], box[2]))
     y0, y1 = (min(float(height), max(0.0, y)) for y in (box[1], box[3]))

@@ -180,6 +180,8 @@ def test_no_answer_is_never_no_progress(
     [
         {}, {"progress": [], "success": [], "success_threshold": 0.5}, {"progress": [1.5], "success": [], "success_threshold": 0.5},
         {"progress": [0.5], "success": [float("nan")], "success_threshold": 0.5}, {"progress": "half", "success": [], "success_threshold": 0.5},
+        {"progress": [0.1, 0.2, 0.9], "success": [], "success_threshold": 0.5}, {"progress": [0.5], "success": [0.9, 0.9], "success_threshold": 0.5},
+        {"progress": [0.5], "success": [0.9], "success_threshold": float("nan")}, {"progress": [0.5], "success": [0.9], "success_threshold": -1.0},
     ],
 )  # fmt: skip
 def test_a_strange_answer_is_an_error(a_runner: Any, a_sidecar: Any, judgement: dict[str, Any]) -> None:

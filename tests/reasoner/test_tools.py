@@ -160,6 +160,32 @@ def test_looked_not_seen_answered_and_no_frame_are_four_things(a_runner: Any, a_
     assert play(story) == ["not_seen", "answered", "error", "no_frame", "no_frame"]
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"box": [float("nan"), 0, 2, 2]},
+        {"box": [0, 0, float("inf"), 2]},
+        {"score": float("nan")},
+        {"score": 7.0},
+    ],
+)
+def test_a_place_that_is_no_number_is_no_place(a_runner: Any, a_sidecar: Any, wrong: dict[str, Any]) -> None:
+    """Regression: it was `found` at (nan, nan) m from the base."""
+
+    async def story() -> Any:
+        async with (
+            a_runner() as runner,
+            RunnerClient(runner.endpoint) as client,
+            a_sidecar("lab/eye") as sidecar,
+            DetectorClient(sidecar.endpoint) as detector,
+        ):
+            sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]} | wrong]
+            return await Tools(client, detector, None)(LOOK)
+
+    outcome = play(story)
+    assert (outcome.status, outcome.code) == ("error", "model_error")
+
+
 def test_a_model_whose_licence_is_barred_is_not_asked(a_runner: Any, a_sidecar: Any) -> None:
     palette = Palette((Skill("lab/eye", "vlm", "", ("query",), barred="its licence"),))
 

@@ -166,7 +166,9 @@ def test_told_to_unload_while_it_loads_it_takes_the_load_back(box, arbiter):
     assert detector.detect()["ok"]
 
 
-def test_a_load_that_is_taken_back_while_the_arbiter_is_told_of_it_is_not_resident(box, arbiter_daemon, arbiter):
+def test_a_load_that_is_taken_back_while_the_arbiter_is_told_of_it_is_not_resident(
+    box, arbiter_daemon, arbiter
+):
     """Regression: `ready` was answered behind the unload, and the sidecar said `resident`, with a token, of a model that was gone."""
     (box.runtime / "detector-model").mkdir()
     switch = box.runtime / "detector-model" / "slow_load"

@@ -1,10 +1,12 @@
 """The detector behind transformers' zero-shot classes, loaded as in production from a tiny checkpoint."""
 
+import math
+
 import pytest
 
 from schemas.errors import BadRequest, ModelError
 from schemas.sidecar import DetectOp
-from sidecars.adapters.detector import DetectorAdapter, grounding_answer, split_query
+from sidecars.adapters.detector import DetectorAdapter, _detection, grounding_answer, split_query
 
 BLOCK = "actions: [detect]\ndetector: {labels: [cube], score_threshold: 0.0, max_side: 512}\n"
 
@@ -33,6 +35,16 @@ def test_the_fields_grounding_format():
     found = [{"label": "red cube", "score": 0.9, "box": [10.0, 30.0, 40.0, 60.0]}]
     assert grounding_answer(found, 80, 60) == "<ref>red cube</ref><box><125><500><500><1000></box>"
     assert grounding_answer([], 80, 60) == ""
+
+
+def test_a_box_that_is_no_number_is_not_made_one():
+    """Regression: cutting it to the picture put the picture's edge in its place."""
+    assert _detection("cube", 0.9, [-5.0, 3.0, 90.0, 9.0], (60, 80)) == {
+        "label": "cube", "score": 0.9, "box": [0.0, 3.0, 80.0, 9.0],
+    }  # fmt: skip
+    for score, left in ((0.9, math.nan), (math.nan, 1.0)):
+        with pytest.raises(ModelError, match="no number"):
+            _detection("cube", score, [left, 3.0, 9.0, 9.0], (60, 80))
 
 
 @pytest.mark.heavy
