@@ -1,6 +1,7 @@
 """Pictures from the wire: PNG or JPEG bytes from strangers to a bounded RGB picture."""
 
 import io
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from schemas.errors import BadRequest
@@ -14,14 +15,23 @@ FORMATS = ("PNG", "JPEG")
 
 def decode(data: bytes) -> "Image.Image":
     """Decode one picture. Raises BadRequest for anything that is no PNG or JPEG of at most `PIXELS_MAX` pixels."""
+    return decode_all([data])[0]
+
+
+def decode_all(images: Sequence[bytes]) -> list["Image.Image"]:
+    """Decode pictures that have at most `PIXELS_MAX` pixels together: all headers are read before any picture is, for a few kilobytes can
+    say gigabytes. Raises BadRequest as `decode`."""
     from PIL import Image, UnidentifiedImageError
 
     try:
-        picture = Image.open(io.BytesIO(data), formats=FORMATS)  # reads the header only
-        width, height = picture.size
-        if width * height > PIXELS_MAX:
-            raise BadRequest(f"an image of {width} x {height} pixels", hint=f"at most {PIXELS_MAX} pixels")
-        return picture.convert("RGB")
+        pictures = [Image.open(io.BytesIO(data), formats=FORMATS) for data in images]  # the headers only
+        if sum(picture.width * picture.height for picture in pictures) > PIXELS_MAX:
+            sizes = ", ".join(sorted({f"{picture.width} x {picture.height}" for picture in pictures}))
+            raise BadRequest(
+                f"{len(images)} pictures of {sizes} have more than {PIXELS_MAX} pixels",
+                hint="send fewer, or smaller ones",
+            )
+        return [picture.convert("RGB") for picture in pictures]
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise BadRequest(
             f"the image cannot be decoded: {error}", hint="send PNG (or JPEG) bytes of an RGB picture"

@@ -8,7 +8,7 @@ from schemas.errors import BadRequest, ModelError
 from schemas.manifest import RSkillManifest
 from schemas.sidecar import ScoreOp
 from sidecars.adapters.base import ModelCall
-from sidecars.images import PIXELS_MAX, decode
+from sidecars.images import decode_all
 from sidecars.weights import Weights, from_pretrained
 
 _OWN_MODELS = ("sidecars.compact_progress",)  # reward types of ours, by lerobot's naming convention
@@ -112,15 +112,10 @@ def _pictures(call: ScoreOp) -> Any:
         shape = (-1, call.height, call.width, BYTES_A_PIXEL)
         stack = np.frombuffer(call.frames, np.uint8).reshape(shape)[..., ::-1]
     else:
-        taken = [decode(image) for image in call.images]
+        taken = decode_all(call.images)
         if len({picture.size for picture in taken}) > 1:
             sizes = ", ".join(sorted({f"{picture.width} x {picture.height}" for picture in taken}))
             raise BadRequest(f"pictures of different sizes: {sizes}", hint="send one camera's pictures")
-        if len(taken) * taken[0].width * taken[0].height > PIXELS_MAX:
-            raise BadRequest(
-                f"{len(taken)} pictures have more than {PIXELS_MAX} pixels",
-                hint="send fewer, or smaller ones",
-            )
         stack = np.stack([np.asarray(picture) for picture in taken])
     return torch.from_numpy(np.ascontiguousarray(stack)).permute(0, 3, 1, 2).to(torch.float32)[None] / 255
 

@@ -100,6 +100,8 @@ def test_pictures_that_do_not_go_together_are_refused(shipped: RewardAdapter, pn
         score(shipped, b"no picture at all")
     with pytest.raises(BadRequest, match="pixels"):
         score(shipped, *[png(4000, 4000)] * 2)
+    with pytest.raises(BadRequest, match="pixels"):
+        score(shipped, *[png(4000, 4000)[:100]] * 2)  # looked at no further than their headers
 
 
 # -- a reward model that somebody else registers ----------------------------------------------------------------------
