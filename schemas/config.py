@@ -219,7 +219,7 @@ class TelemetryConfig(_Section):
         try:
             return None if value is None else checked_url(value, "endpoint")
         except ConfigError as error:
-            raise ValueError(f"{value!r} is no URL of a collector; {error.hint}") from None
+            raise ValueError(f"{error.message}; {error.hint}") from None
 
 
 class ArbiterConfig(_Section):

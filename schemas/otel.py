@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -187,7 +188,8 @@ def checked_url(text: str, name: str) -> str:
     except ValueError:
         good = False
     if not good:
-        raise ConfigError(f"{name}: {text!r} is no URL of a collector", hint=f"write {OTLP_DEFAULT}")
+        shown = text.rpartition("@")[2].partition("?")[0]  # no password, no token
+        raise ConfigError(f"{name}: {shown!r} is no URL of a collector", hint=f"write {OTLP_DEFAULT}")
     return text
 
 
@@ -254,34 +256,67 @@ def _install(
     service: str, planned: Plan, environ: Mapping[str, str], attributes: Mapping[str, str]
 ) -> Telemetry:
     """Everything that can fail comes first: a program whose telemetry is refused has no half of it."""
+    ends: list[Callable[[], object]] = []
     try:
-        from opentelemetry import metrics, trace
-        from opentelemetry.sdk.metrics import MeterProvider
-        from opentelemetry.sdk.resources import OTELResourceDetector, Resource
-        from opentelemetry.sdk.trace import TracerProvider
-        from opentelemetry.sdk.trace.export import BatchSpanProcessor
-    except ImportError as error:
-        raise _not_installed(error) from error
+        port = _make(service, planned, environ, attributes, ends)
+    except BaseException as error:
+        for end in ends:
+            end()
+        if isinstance(error, ImportError):
+            raise _not_installed(error) from error
+        if isinstance(
+            error, ValueError
+        ):  # the SDK read the rest of the environment, and says what is wrong there
+            raise ConfigError(
+                f"OpenTelemetry refuses its settings: {error}", hint="see the OTEL_ variables that are set"
+            ) from error
+        raise
+    return Telemetry(ends, port)
+
+
+def _make(
+    service: str,
+    planned: Plan,
+    environ: Mapping[str, str],
+    attributes: Mapping[str, str],
+    ends: list[Callable[[], object]],
+) -> int | None:
+    """Prometheus's port. What was begun is in `ends` as soon as it has; nothing of it is the process's own before all of it is there."""
+    from opentelemetry import metrics, trace
+    from opentelemetry.sdk.metrics import MeterProvider
+    from opentelemetry.sdk.resources import OTELResourceDetector, Resource
+    from opentelemetry.sdk.trace import TracerProvider
+    from opentelemetry.sdk.trace.export import BatchSpanProcessor
+
+    if planned.prometheus is not None:  # what is missing is found before any thread runs
+        import_module("opentelemetry.exporter.prometheus")
     own = {
         "service.name": service,
         "service.namespace": telemetry.TRACER,
         "service.instance.id": f"{socket.gethostname()}:{os.getpid()}",
         **attributes,
     }
+    _quieten()
     resource = Resource.create(own).merge(OTELResourceDetector().detect())  # what the environment says wins
     timeout_s = None if environ.get("OTEL_EXPORTER_OTLP_TIMEOUT") else EXPORT_S
-    spans = None if planned.traces is None else _span_exporter(planned.traces, timeout_s)
-    readers, port, ends = _readers(planned, timeout_s)
-    if spans is not None:
-        provider = TracerProvider(sampler=_sampler(planned), resource=resource, shutdown_on_exit=False)
-        provider.add_span_processor(BatchSpanProcessor(spans))
-        trace.set_tracer_provider(provider)
-        ends.append(provider.shutdown)
+    tracers = meters = None
+    if planned.traces is not None:
+        from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+
+        tracers = TracerProvider(sampler=_sampler(planned), resource=resource, shutdown_on_exit=False)
+        ends.append(tracers.shutdown)
+        tracers.add_span_processor(
+            BatchSpanProcessor(OTLPSpanExporter(endpoint=planned.traces, timeout=timeout_s))
+        )
+    readers, port = _readers(planned, timeout_s, ends)
     if readers:
         meters = MeterProvider(readers, resource=resource, shutdown_on_exit=False, views=_views())
-        metrics.set_meter_provider(meters)
         ends.append(meters.shutdown)
-    return Telemetry(ends, port)
+    if tracers is not None:
+        trace.set_tracer_provider(tracers)
+    if meters is not None:
+        metrics.set_meter_provider(meters)
+    return port
 
 
 def _not_installed(error: ImportError) -> ConfigError:
@@ -303,36 +338,22 @@ def _sampler(planned: Plan) -> Any:
     return sampling.ParentBased(root) if planned.sampler.startswith("parentbased_") else root
 
 
-def _span_exporter(url: str, timeout_s: float | None) -> Any:
-    try:
-        from opentelemetry.exporter.otlp.proto.http import trace_exporter
-    except ImportError as error:
-        raise _not_installed(error) from error
-    logging.getLogger(trace_exporter.__name__).addFilter(_SeldomFilter())
-    return trace_exporter.OTLPSpanExporter(endpoint=url, timeout=timeout_s)
-
-
 def _readers(
-    planned: Plan, timeout_s: float | None
-) -> tuple[list[Any], int | None, list[Callable[[], object]]]:
-    """(readers of metrics, Prometheus's port, what ends its server)."""
+    planned: Plan, timeout_s: float | None, ends: list[Callable[[], object]]
+) -> tuple[list[Any], int | None]:
+    """(readers of metrics, Prometheus's port)."""
     readers: list[Any] = []
     port: int | None = None
-    ends: list[Callable[[], object]] = []
-    exporter = None
-    try:
-        if planned.metrics is not None:
-            from opentelemetry.exporter.otlp.proto.http import metric_exporter
-            from opentelemetry.sdk.metrics.export import PeriodicExportingMetricReader
+    if planned.metrics is not None:
+        from opentelemetry.exporter.otlp.proto.http.metric_exporter import OTLPMetricExporter
+        from opentelemetry.sdk.metrics.export import PeriodicExportingMetricReader
 
-            logging.getLogger(metric_exporter.__name__).addFilter(_SeldomFilter())
-            exporter = metric_exporter.OTLPMetricExporter(endpoint=planned.metrics, timeout=timeout_s)
-        if planned.prometheus is not None:
-            from opentelemetry.exporter.prometheus import PrometheusMetricReader
-            from prometheus_client import CollectorRegistry, start_http_server
-    except ImportError as error:
-        raise _not_installed(error) from error
+        exporter = OTLPMetricExporter(endpoint=planned.metrics, timeout=timeout_s)
+        readers.append(PeriodicExportingMetricReader(exporter))
     if planned.prometheus is not None:
+        from opentelemetry.exporter.prometheus import PrometheusMetricReader
+        from prometheus_client import CollectorRegistry, start_http_server
+
         registry = CollectorRegistry()
         host, wanted = planned.prometheus
         try:
@@ -350,9 +371,7 @@ def _readers(
 
         ends.append(close_prometheus)
         readers.append(PrometheusMetricReader(scope_info_enabled=False, registry=registry))
-    if exporter is not None:
-        readers.append(PeriodicExportingMetricReader(exporter))
-    return readers, port, ends
+    return readers, port
 
 
 def _views() -> list[Any]:
@@ -362,6 +381,23 @@ def _views() -> list[Any]:
         View(instrument_name=name, aggregation=ExplicitBucketHistogramAggregation(bounds))
         for name, bounds in _BOUNDS.items()
     ]
+
+
+def _quieten() -> None:
+    """What the SDK and its exporters say of a collector comes seldom, and what they say of headers without the headers: those are secrets."""
+    for name in (
+        "opentelemetry.exporter.otlp.proto.http.trace_exporter",
+        "opentelemetry.exporter.otlp.proto.http.metric_exporter",
+        "opentelemetry.sdk._shared_internal",  # the queue of spans
+        "opentelemetry.sdk.metrics._internal.export",
+    ):
+        logging.getLogger(name).addFilter(_SeldomFilter())
+    logging.getLogger("opentelemetry.util.re").addFilter(_without_header)
+
+
+def _without_header(record: logging.LogRecord) -> bool:
+    record.args = ("(not shown)",) if record.args else None
+    return True
 
 
 class _SeldomFilter(logging.Filter):

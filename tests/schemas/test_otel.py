@@ -292,3 +292,67 @@ def test_ending_waits_for_nobody_longer_than_it_was_told() -> None:
     ends(0.5)  # again is nothing
     assert said == ["flushed"]
     never.set()
+
+
+@needs_sdk
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"OTEL_BSP_MAX_EXPORT_BATCH_SIZE": "4096"},  # more than the queue holds
+        {"OTEL_BSP_SCHEDULE_DELAY": "0"},
+        {"OTEL_METRIC_EXPORT_INTERVAL": "0"},
+        {"OTEL_METRICS_EXEMPLAR_FILTER": "sometimes"},
+        {"OTEL_SPAN_ATTRIBUTE_COUNT_LIMIT": "many"},
+    ],
+)
+def test_what_the_sdk_refuses_is_the_operators_error_and_leaves_no_half(wrong: dict[str, str]) -> None:
+    result = run(
+        "import schemas.otel as o\n"
+        "from schemas.errors import ConfigError\n"
+        "try:\n    o.set_up('robot', prometheus_port=0)\n"
+        "except ConfigError as error:\n    print(error)\n"
+        "from opentelemetry import metrics, trace\n"
+        "print(type(trace.get_tracer_provider()).__name__, type(metrics.get_meter_provider()).__name__)\n"
+        "import threading; print([x.name for x in threading.enumerate() if 'serve_forever' in x.name])\n",
+        {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, **wrong},
+    )
+    said, providers, servers = result.stdout.splitlines()
+    assert said.startswith("OpenTelemetry refuses its settings: "), result.stderr
+    assert (providers, servers) == ("ProxyTracerProvider _ProxyMeterProvider", "[]")
+
+
+@needs_sdk
+def test_no_secret_stands_in_a_message() -> None:
+    result = run(
+        "import logging; logging.basicConfig()\n"
+        "import schemas.otel as o\n"
+        "from schemas.config import ArbiterConfig\n"
+        "from schemas.errors import ConfigError\n"
+        "t = o.set_up('robot')\n"
+        "for url in ('htps://me:geheim@host', 'htps://host/?key=geheim'):\n"
+        "    try:\n        o.checked_url(url, 'it')\n"
+        "    except ConfigError as error:\n        print(error)\n"
+        "    try:\n        ArbiterConfig.model_validate({'telemetry': {'endpoint': url}})\n"
+        "    except ValueError as error:\n        print([e['msg'] for e in error.errors()])\n"
+        "t(0.1)\n",
+        {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_EXPORTER_OTLP_HEADERS": "geheim"},
+    )
+    assert result.returncode == 0, result.stderr
+    assert "Header format invalid" in result.stderr
+    assert result.stdout.count("no URL of a collector") == 4
+    assert "geheim" not in result.stdout + result.stderr
+
+
+@needs_sdk
+def test_a_full_queue_of_spans_is_complained_of_as_seldom_as_its_collector() -> None:
+    result = run(
+        "import logging; logging.basicConfig(format='%(message)s')\n"
+        "import schemas.otel as o\n"
+        "o.set_up('robot')\n"
+        "sdk = logging.getLogger('opentelemetry.sdk._shared_internal')\n"
+        "for n in range(3):\n"
+        "    sdk.warning('Queue full, dropping %s.', 'Span')\n"
+        "    sdk.error('Exception while exporting %s.', 'Span')\n",  # another one between: the SDK's own filter lets both pass
+        {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE},
+    )
+    assert result.stderr.count("Queue full") == 1, result.stderr
