@@ -13,6 +13,7 @@ import os
 import sys
 from dataclasses import dataclass
 
+from runner.clock import BUSY_TAIL_S
 from runner.control import ControlThread
 from schemas.errors import InternalError
 
@@ -20,6 +21,9 @@ log = logging.getLogger("runner")
 
 SWITCH_S = 0.0005  # Python hands the interpreter over every 5 ms; a thread that wakes for its tick must not wait that long
 REALTIME_PRIORITY = 1  # the lowest: before every ordinary program, behind all that is as urgent
+AWAKE_MAX = (
+    0.5  # of each period; the kernel stops a real-time thread that never sleeps for 50 ms of every second
+)
 NICE = -10  # of the ordinary threads: whoever holds the interpreter must not be kept from running while the loop waits for it
 
 
@@ -41,6 +45,11 @@ def settle_interpreter() -> None:
     gc.freeze()
 
 
+def leaves_room(rate_hz: float) -> bool:
+    """Whether a loop of this rate sleeps enough to go before other programs: it is awake for the end of every wait. 0: it never waits."""
+    return 0 < rate_hz * BUSY_TAIL_S <= AWAKE_MAX
+
+
 def hasten(*, realtime: bool = False) -> Promptness:
     """For the calling thread: real time if asked for and allowed, else a low nice value if allowed.
 
@@ -60,7 +69,7 @@ def hasten(*, realtime: bool = False) -> Promptness:
 async def make_prompt(control: ControlThread, *, first: bool) -> None:
     """Call it when the runner is ready to serve, from its event loop. `first`: the control thread and the caller's go before other programs.
 
-    Not for a loop that runs as fast as it can: it would leave nothing to the others.
+    Not for a loop that hardly sleeps (`leaves_room`): it would leave nothing to the others.
     """
     settle_interpreter()
     if not first:

@@ -188,7 +188,7 @@ def worlds_of(args: argparse.Namespace) -> list[World]:
             render = None if args.videos else False
             worlds.append(world_of(name, env_config=args.env_config, success=args.success, render=render))
             continue
-        for scene in args.scene or [None]:
+        for scene in dict.fromkeys(args.scene) or [None]:
             world = world_of(name, scene=scene)
             worlds.append(
                 world if scene is None else dataclasses.replace(world, name=f"{SO101}:{scene.stem}")
@@ -231,7 +231,22 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
             else:
                 policy = expert_policy(arm, environment)
             entries.append(Entry(world, name, task, lambda policy=policy: PolicyContestant(policy)))  # type: ignore[misc]
+    _check_names(entries)
     return entries
+
+
+def _check_names(entries: Sequence[Entry]) -> None:
+    """Raises ConfigError for cells whose videos would overwrite each other's, and that nobody could tell apart in the report."""
+    from runner.sim.benchmark import file_name
+
+    taken: dict[tuple[str, str], Entry] = {}
+    for entry in entries:
+        other = taken.setdefault((file_name(entry.world.name), file_name(entry.name)), entry)
+        if other is not entry:
+            raise ConfigError(
+                f"{entry.world.name}, {entry.name} and {other.world.name}, {other.name} would have one name",
+                hint="rename one of the files, or run them one after another with an --out each",
+            )
 
 
 # -- what comes of it ---------------------------------------------------------------------------------------------------

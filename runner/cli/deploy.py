@@ -39,7 +39,7 @@ from runner.deployment import (
 )
 from runner.goals import GoalServer
 from runner.hardware import HardwareRunner
-from runner.promptness import make_prompt
+from runner.promptness import leaves_room, make_prompt
 from runner.protocols import DeadlinePolicy, Skill
 from runner.safety.estop_mark import EstopMark
 from runner.skills.ros_standins import TRAJECTORY, StandIn, StandIns
@@ -155,7 +155,7 @@ class Deploy:
             control = await self._start(runner, stack)
             if control is None:
                 return 0
-            await make_prompt(control, first=self._args.realtime)
+            await make_prompt(control, first=self._args.realtime and leaves_room(self._file.robot.rate_hz))
             catalogue = self._offered(parts, manifests, arbiter)
             server = GoalServer(
                 self._endpoint,

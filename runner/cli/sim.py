@@ -83,7 +83,7 @@ async def run(args: argparse.Namespace) -> int:
     from runner.catalogue import Catalogue, read_manifests
     from runner.clock import SystemClock
     from runner.goals import GoalServer
-    from runner.promptness import make_prompt
+    from runner.promptness import leaves_room, make_prompt
     from runner.protocols import DeadlinePolicy
     from runner.recorder import Recorder
     from runner.sim.policies import policy_of
@@ -143,7 +143,7 @@ async def run(args: argparse.Namespace) -> int:
         control = await stack.enter_async_context(ControlThread(runner))
         await asyncio.to_thread(warm_up)
         await ready(control)
-        await make_prompt(control, first=args.realtime and args.rate > 0)
+        await make_prompt(control, first=args.realtime and leaves_room(args.rate))
         arm = world.arm
         server = GoalServer(
             args.endpoint or program_endpoint("runner", os.environ, os.getuid()),

@@ -274,6 +274,34 @@ def test_mistakes_are_said_in_one_line(
     assert len(told.splitlines()) == 1
 
 
+def test_two_cells_of_one_name_do_not_overwrite_each_others_videos(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenes = [tmp_path / folder / "table.yaml" for folder in ("near", "far")]
+    for scene in scenes:
+        scene.parent.mkdir()
+        scene.write_text("{}\n", encoding="utf-8")
+    flags = [word for scene in scenes for word in ("--scene", str(scene))]
+    out = tmp_path / "out"
+    assert main(
+        [
+            "benchmark",
+            "--no-arbiter",
+            "--policy",
+            "random",
+            "--episodes",
+            "1",
+            "--max-steps",
+            "1",
+            *flags,
+            "--out",
+            str(out),
+        ]
+    ) in (1, 2)
+    assert "would have one name" in capsys.readouterr().err
+    assert not out.exists()
+
+
 @pytest.mark.heavy
 @pytest.mark.e2e
 def test_a_signal_ends_it_with_a_report_of_what_was_played(tmp_path: Path) -> None:

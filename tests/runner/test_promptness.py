@@ -9,8 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from runner.clock import precise_sleep
 from runner.control import ControlThread
-from runner.promptness import NICE, SWITCH_S, Promptness, hasten, make_prompt
+from runner.promptness import NICE, SWITCH_S, Promptness, hasten, leaves_room, make_prompt
 
 ROOT = Path(__file__).parents[2]
 
@@ -85,3 +86,17 @@ def test_both_threads_are_asked_for_unless_the_loop_is_unpaced(make_runner: Call
     assert loop.realtime == may.realtime
     assert sockets == in_thread(hasten).nice
     assert sockets in (NICE, ours)
+
+
+def test_a_loop_that_hardly_sleeps_does_not_go_first() -> None:
+    """Its wait's last millisecond is spent awake: at 1000 Hz all of it, and a real-time thread would keep its core to itself."""
+    slept: list[float] = []
+    precise_sleep(1 / 1000, sleep=slept.append)
+    assert slept == []
+    assert [leaves_room(rate) for rate in (0.0, 30.0, 500.0, 501.0, 1000.0)] == [
+        False,
+        True,
+        True,
+        False,
+        False,
+    ]
