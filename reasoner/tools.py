@@ -10,6 +10,7 @@ import logging
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass
+from time import monotonic
 from typing import Any, Protocol
 
 from clients.runner import Goal, RunnerClient
@@ -43,6 +44,7 @@ from schemas.world import CameraModel
 log = logging.getLogger(__name__)
 
 FRAME_MAX_AGE_MS = 1000.0
+LOOK_AGAIN_S = 10.0  # a later answer is about a picture of then: an arm would reach for what stood there
 GOAL_GRACE_S = 60.0  # beyond the goal's own deadline: loading the skill's model is not part of the motion
 GOAL_MAX_S = 600.0  # when the manifest sets the deadline
 CANCEL_S = 10.0  # for a cancelled goal to end: it takes the arm back and finishes its use
@@ -118,7 +120,11 @@ class Tools:
         if (refusal := await self._not_permitted(self._detector)) is not None:
             return refusal
         frame = await self._frame(call.camera)
+        asked_s = monotonic()
         detections = await self._detector.detect(frame["data"], call.query)
+        if monotonic() - asked_s > LOOK_AGAIN_S:  # it waited for the card: by now it is there
+            frame = await self._frame(call.camera)
+            detections = await self._detector.detect(frame["data"], call.query)
         if (refusal := await self._not_permitted(self._detector)) is not None:
             return refusal  # it was replaced meanwhile
         if not detections:

@@ -11,7 +11,7 @@ from clients.runner import RunnerClient
 from clients.sidecar.perception import DetectorClient, SceneVlmClient
 from reasoner.inbox import Danger, Inbox
 from reasoner.palette import Palette, Skill
-from reasoner.tools import Tools
+from reasoner.tools import LOOK_AGAIN_S, Tools
 from reasoner.watch import watch
 from schemas.errors import (
     Evicted,
@@ -184,6 +184,37 @@ def test_a_place_that_is_no_number_is_no_place(a_runner: Any, a_sidecar: Any, wr
 
     outcome = play(story)
     assert (outcome.status, outcome.code) == ("error", "model_error")
+
+
+def test_what_was_seen_before_the_detector_was_loaded_is_no_place(
+    a_runner: Any, a_sidecar: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: a detector that waited two minutes for the card told where the thing had stood when it was asked."""
+    now = [100.0]
+    monkeypatch.setattr("reasoner.tools.monotonic", lambda: now[0])
+
+    async def story() -> tuple[str, list[str]]:
+        async with (
+            a_runner() as runner,
+            RunnerClient(runner.endpoint) as client,
+            a_sidecar("lab/eye") as sidecar,
+            DetectorClient(sidecar.endpoint) as detector,
+        ):
+            sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]}]
+            detect = detector.detect
+
+            async def loads_first(*arguments: Any) -> Any:
+                found = await detect(*arguments)
+                if sidecar.detections:  # meanwhile somebody takes it away
+                    sidecar.detections = []
+                    now[0] += 2 * LOOK_AGAIN_S
+                return found
+
+            monkeypatch.setattr(detector, "detect", loads_first)
+            return (await Tools(client, detector, None)(LOOK)).status, sidecar.asked
+
+    status, asked = play(story)
+    assert (status, asked.count("detect")) == ("not_seen", 2)
 
 
 def test_a_model_whose_licence_is_barred_is_not_asked(a_runner: Any, a_sidecar: Any) -> None:
