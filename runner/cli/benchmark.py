@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from runner.cli.common import (
     add_trace_flag,
+    check_output,
     connect_arbiter,
     default_skills,
     install_signals,
@@ -99,7 +100,9 @@ async def run(args: argparse.Namespace) -> int:
         if args.skill and not args.no_arbiter:
             arbiter = await connect_arbiter(args.arbiter, stack)
         entries = entries_of(args, arbiter)
-        args.out.mkdir(parents=True, exist_ok=True)
+        check_output("--out", args.out / REPORT)
+        if args.videos:
+            check_output("--out", args.out / "videos" / "any")
         await asyncio.to_thread(warm_up)
         stopping = asyncio.Event()
         install_signals(stopping)

@@ -13,6 +13,7 @@ from pathlib import Path
 from runner.cli.common import (
     AS_FAST_AS_POSSIBLE_HZ,
     add_serving_flags,
+    check_output,
     connect_arbiter,
     default_skills,
     install_signals,
@@ -105,6 +106,8 @@ async def run(args: argparse.Namespace) -> int:
         raise ConfigError(
             "--record is for goals in our own scene", hint="leave out --policy, and --env or say --env so101"
         )
+    check_output("--video", args.video)
+    check_output("--timings", args.timings)
     policy = None if args.policy is None else policy_of(args.policy)
     manifests = [] if policy is not None else read_manifests(args.skills or [default_skills()])
     given = sidecars_given(args.sidecar)
@@ -174,7 +177,10 @@ async def run(args: argparse.Namespace) -> int:
     log.info("%d ticks, %d late, p99 %.1f ms", result.n_ticks, result.budget_violations, result.p99_tick_ms)
     print(result.model_dump_json())
     if args.timings is not None:
-        runner.timings.write(args.timings)
+        try:
+            runner.timings.write(args.timings)
+        except OSError as error:
+            raise ConfigError(f"--timings {args.timings} cannot be written: {error}") from error
     if runner.policy_error is not None:
         raise runner.policy_error
     return 1 if control.ended.exception() is not None else 0

@@ -272,3 +272,23 @@ def test_a_served_policy_is_started_anew_for_every_seed_and_released(tmp_path: P
         ]
 
     run_async(scenario())
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["sim", "--rate", "0", "--max-steps", "1", "--timings", "{}/t.jsonl"],
+        ["sim", "--rate", "0", "--max-steps", "1", "--video", "{}/v.mp4"],
+        ["benchmark", "--episodes", "1", "--max-steps", "1", "--out", "{}"],
+    ],
+)
+def test_a_file_that_cannot_be_written_is_said_in_one_line_before_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], argv: list[str]
+) -> None:
+    (tmp_path / "file").write_text("no folder", encoding="utf-8")
+    words = [word.format(tmp_path / "file") for word in argv]
+    assert main([*words, "--env", "gym:CartPole-v1", "--policy", "random"]) in (1, 2)
+    out, said = capsys.readouterr()
+    assert out == ""
+    assert "cannot be written" in said
+    assert "Traceback" not in said
