@@ -32,6 +32,10 @@ FLUSH_S = 5.0
 """A program that ends waits at most so long for its collector."""
 EXPORT_S = 3.0
 """Time limit of one export, retries included, unless OTEL_EXPORTER_OTLP_TIMEOUT says otherwise. The SDK's own 10 s outlasts FLUSH_S."""
+SCRAPE_S = 5.0
+"""A reader of the Prometheus endpoint that says nothing for so long is hung up on."""
+SCRAPES_MAX = 8
+"""Readers at a time, a thread each; whoever comes on top is hung up on. A unit's TasksMax= is for the program's own threads."""
 SAY_AGAIN_S = 300.0
 """A collector that is away is complained of this often, not with every batch."""
 
@@ -363,6 +367,7 @@ def _readers(
                 f"no Prometheus endpoint on {host}:{wanted}: {error}",
                 hint="another program has the port; OTEL_EXPORTER_PROMETHEUS_PORT or the configuration names another one",
             ) from error
+        _bound(server)
         port = server.server_port
 
         def close_prometheus() -> None:
@@ -372,6 +377,34 @@ def _readers(
         ends.append(close_prometheus)
         readers.append(PrometheusMetricReader(scope_info_enabled=False, registry=registry))
     return readers, port
+
+
+def _bound(server: Any) -> None:
+    """No reader of the metrics holds a thread for ever: anybody on this machine may connect."""
+    slots = threading.BoundedSemaphore(SCRAPES_MAX)
+    begin, serve = server.process_request, server.process_request_thread
+
+    def admit(request: socket.socket, address: object) -> None:
+        if not slots.acquire(blocking=False):
+            server.shutdown_request(request)
+            return
+        try:
+            begin(request, address)
+        except BaseException:  # no thread could be made
+            slots.release()
+            raise
+
+    def served(request: socket.socket, address: object) -> None:
+        try:
+            request.settimeout(SCRAPE_S)
+            serve(request, address)
+        finally:
+            slots.release()
+
+    def left(request: socket.socket, address: object) -> None:
+        log.debug("a reader of the metrics was given up", exc_info=True)
+
+    server.process_request, server.process_request_thread, server.handle_error = admit, served, left
 
 
 def _views() -> list[Any]:
