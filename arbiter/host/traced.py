@@ -1,16 +1,51 @@
 """The daemon's telemetry put together, on the SDK that `schemas.otel` has installed. Imported only then."""
 
 import asyncio
-from collections.abc import Callable, Mapping
+import logging
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from opentelemetry import metrics, trace
 
 from arbiter import telemetry
+from arbiter.core.effects import Effect
 from arbiter.host.otel import LeaseTelemetry
 from arbiter.host.otel_metrics import LeaseMetrics
 from schemas import telemetry as names
 from schemas import tracing
+
+log = logging.getLogger(__name__)
+
+_NONE: Mapping[str, str] = {}
+
+
+class Harmless:
+    """`LeaseTelemetry` that cannot stop the daemon: a defect in it is said once, and it is not asked again."""
+
+    def __init__(self, leases: LeaseTelemetry) -> None:
+        self._leases: LeaseTelemetry | None = leases
+
+    def outgoing(self, effects: Sequence[Effect]) -> None:
+        self._ask(lambda leases: leases.outgoing(effects), None)
+
+    def revoke(self, body: Mapping[str, Any]) -> Mapping[str, Any]:
+        return self._ask(lambda leases: leases.revoke(body), body)
+
+    def observe(self, event: Mapping[str, Any]) -> Mapping[str, str]:
+        return self._ask(lambda leases: leases.observe(event), _NONE)
+
+    def close(self) -> None:
+        self._ask(lambda leases: leases.close(), None)
+
+    def _ask[T](self, ask: Callable[[LeaseTelemetry], T], otherwise: T) -> T:
+        if self._leases is None:
+            return otherwise
+        try:
+            return ask(self._leases)
+        except Exception:
+            self._leases = None
+            log.exception("spans and numbers of leases end here: a defect of ours; leases go on as before")
+            return otherwise
 
 
 class Traced:
@@ -23,7 +58,7 @@ class Traced:
         """`traceparent`: of who started the daemon."""
         self._command = tracing.begin(names.SPAN_COMMAND, traceparent, {names.ATTR_COMMAND: "serve"})
         self._metrics = LeaseMetrics(metrics.get_meter(names.TRACER))
-        self.leases = LeaseTelemetry(trace.get_tracer(names.TRACER), self._metrics)
+        self.leases = Harmless(LeaseTelemetry(trace.get_tracer(names.TRACER), self._metrics))
 
     def log_event(self, event: Mapping[str, Any]) -> None:
         """One event of the history: as spans and numbers, and as a line of the log that names its span."""

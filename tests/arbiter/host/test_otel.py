@@ -19,6 +19,7 @@ from arbiter.core.effects import Effect, Note, Push
 from arbiter.host import otel, otel_metrics
 from arbiter.host.otel import LeaseTelemetry
 from arbiter.host.otel_metrics import OTHERS, LeaseMetrics
+from arbiter.host.traced import Harmless
 from arbiter.testing.core_driver import START_S, CoreDriver
 from arbiter.testing.scenes import held, sent_away
 from schemas import defaults as d
@@ -545,3 +546,25 @@ def test_names_that_clients_invent_do_not_grow_the_metrics(heard: Listener, driv
     grants = heard.numbers("vram.lease.grants")
     assert len(grants) == otel_metrics.CONSUMERS_MAX + 1
     assert grants[(OTHERS,)] == 5
+
+
+def test_a_defect_in_telemetry_is_said_once_and_stops_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    class Broken(LeaseTelemetry):
+        def _fail(self, *_: Any) -> Any:
+            raise KeyError("a fact that nobody thought of")
+
+        outgoing = revoke = observe = close = _fail  # type: ignore[assignment]
+
+    provider = TracerProvider(shutdown_on_exit=False)
+    meters = MeterProvider([], shutdown_on_exit=False)
+    broken = Broken(provider.get_tracer("test"), LeaseMetrics(meters.get_meter("test")))
+    harmless = Harmless(broken)
+    body = {"push": "revoke", "lease_id": "L1"}
+    harmless.outgoing([])
+    assert harmless.revoke(body) is body
+    assert harmless.observe({"kind": "granted"}) == {}
+    harmless.close()
+    (said,) = [record for record in caplog.records if record.levelname == "ERROR"]
+    assert "a defect of ours" in said.getMessage()
+    assert Harmless(broken).revoke(body) is body
+    assert Harmless(broken).observe({"kind": "granted"}) == {}
