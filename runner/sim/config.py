@@ -99,8 +99,7 @@ class SceneConfig(BaseModel):
                 fovy_deg=42.0,
                 pos_m=(1.00, -1.10, 0.85),
                 look_at_m=(0.42, 0.0, 0.20),
-                shadows=True,
-                samples=4,
+                shadows=True,  # and no multisampling: together they cost a tick's slot where there is no GPU to render
             ),
         }
     )

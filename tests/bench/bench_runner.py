@@ -34,6 +34,8 @@ from schemas.errors import RunnerUnreachable, SidecarUnavailable
 ROOT = Path(__file__).parents[2]
 SKILLS = {"detector": "so101-detector", "grab": "so101-grab"}
 GRAB = "vram-arbiter/so101-grab"
+NAVIGATE = "vram-arbiter/so101-navigate"
+TURN_RAD = 6.0  # some eight seconds of driving
 RATE_HZ = 30.0
 JITTER_MAX_US = 2000.0
 NO_HOLD = "scheduling:\n  thrash_hold_max_s: 0\n"  # it would slow down on purpose what is measured here
@@ -89,28 +91,36 @@ class Measured:
     idle: list[Stretch]
     switching: list[Stretch]
     starting: list[Stretch]
+    driving: list[Stretch]
+    driving_beside: list[Stretch]
     switches_us: list[float]
     goals_us: list[float]
     cold_goals_us: list[float]
 
     def rows(self) -> list[RunnerRow]:
         alone, beside = self._within(self.idle), self._within(self.switching)
-        idle, busy, starting = (
-            list(itertools.chain.from_iterable(each)) for each in (alone, beside, self._within(self.starting))
-        )
+        idle, busy, starting = _all(alone), _all(beside), _all(self._within(self.starting))
         jitter = _compare("tick_jitter", _us(busy, "late_ms"), _us(idle, "late_ms"))
         assert jitter.p99_us is not None
         jitter.target, jitter.ok = "p99 < 2 ms", jitter.p99_us < JITTER_MAX_US
+        driven, driven_beside = self._within(self.driving), self._within(self.driving_beside)
         return [
             jitter,
+            _compare(
+                "tick_jitter while it drives and is filmed",
+                _us(_all(driven_beside), "late_ms"),
+                _us(_all(driven), "late_ms"),
+            ),
             _compare(
                 "tick_jitter while a sidecar starts (imports)",
                 _us(starting, "late_ms"),
                 _us(idle, "late_ms"),
             ),
             _compare("tick: time from one start to the next, off by", _uneven(beside), _uneven(alone)),
+            _compare("... while it drives and is filmed", _uneven(driven_beside), _uneven(driven)),
             _compare("tick: decide (world state, no skill; others' pictures)", _decide_us(busy), _decide_us(idle)),
             _compare("tick: apply (physics, a video that stands still)", _us(busy, "hal_ms"), _us(idle, "hal_ms")),
+            _compare("... while it drives and is filmed", _us(_all(driven_beside), "hal_ms"), _us(_all(driven), "hal_ms")),
             RunnerRow("switch: one sidecar out, the other in, asked", p50(self.switches_us), p99(self.switches_us)),
             RunnerRow("goal of one tick, policy resident", p50(self.goals_us), p99(self.goals_us)),
             RunnerRow("goal of one tick, policy to be loaded", p50(self.cold_goals_us), p99(self.cold_goals_us)),
@@ -122,6 +132,10 @@ class Measured:
         if not all(found):
             raise RuntimeError("no tick was noted: the runner did not run, or wrote no timings")
         return found
+
+
+def _all(stretches: Sequence[Sequence[Tick]]) -> list[Tick]:
+    return list(itertools.chain.from_iterable(stretches))
 
 
 def _us(ticks: Sequence[Tick], field: str) -> list[float]:
@@ -145,7 +159,7 @@ def _compare(name: str, busy: Sequence[float], idle: Sequence[float]) -> RunnerR
 
 # -- the run ------------------------------------------------------------------------------------------------------------
 async def _measure(daemon: ArbiterProcess, rounds: int, stretch_s: float) -> Measured:
-    found = Measured([], [], [], [], [], [], [])
+    found = Measured([], [], [], [], [], [], [], [], [])
     timings = daemon.runtime / "ticks.jsonl"
     video = daemon.runtime / "episode.mp4"
     words = ["runner", "sim", "--seed", "1", "--video", str(video), "--timings", str(timings)]
@@ -168,6 +182,7 @@ async def _measure(daemon: ArbiterProcess, rounds: int, stretch_s: float) -> Mea
                 while time.monotonic() - began < stretch_s:
                     found.switches_us += await _switch(runner, detector, grab)
                 found.switching.append((began, time.monotonic()))
+                await _drive(found, runner, detector, grab, stretch_s)
             found.starting.append(await _start_another(daemon, [process]))
             await _goals(found, runner, detector, grab, 3 * rounds)
     found.ticks = [json.loads(line) for line in timings.read_text().splitlines()]
@@ -182,6 +197,41 @@ async def _switch(runner: RunnerClient, detector: DetectorClient, grab: PolicyCl
     seen = time.perf_counter()
     await grab.load(timeout_s=BOOT_S)
     return [(seen - began) * 1e6, (time.perf_counter() - seen) * 1e6]
+
+
+async def _drive(
+    found: Measured, runner: RunnerClient, detector: DetectorClient, grab: PolicyClient, stretch_s: float
+) -> None:
+    """The robot turns on the spot, to and fro, and every third tick renders a picture for the video: first with nothing beside, then with switches."""
+
+    async def turn() -> None:
+        for way in itertools.cycle((TURN_RAD, -TURN_RAD)):
+            goal = await runner.send_goal(NAVIGATE, goal_params={"turn_rad": way})
+            result = await goal.result(BOOT_S)
+            if result["status"] != "succeeded":
+                raise RuntimeError(f"the robot does not drive: {result}")
+
+    async with asyncio.TaskGroup() as tasks:
+        driving = tasks.create_task(turn())
+        await asyncio.sleep(SETTLE_S)  # the arm folds first
+        began = time.monotonic()
+        await asyncio.sleep(stretch_s)
+        found.driving.append((began, time.monotonic()))
+        began = time.monotonic()
+        while time.monotonic() - began < stretch_s:
+            await _switch(runner, detector, grab)
+        found.driving_beside.append((began, time.monotonic()))
+        driving.cancel()
+    await _until_idle(runner)
+
+
+async def _until_idle(runner: RunnerClient) -> None:
+    """Take back the goal that the cancelled task left running."""
+    if (goal_id := (await runner.state())["goal"]) is not None:
+        await runner.call("cancel", {"goal_id": goal_id})
+    async with asyncio.timeout(END_S):
+        while (await runner.state())["goal"] is not None:
+            await asyncio.sleep(POLL_S)
 
 
 async def _goals(

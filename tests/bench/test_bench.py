@@ -88,7 +88,8 @@ def test_a_loop_that_stood_still_is_in_the_figures_however_long() -> None:
         return {"started_s": started_s, "late_ms": 0.0, "tick_ms": 1.0, "hal_ms": 0.5}
 
     ticks = [tick(at) for at in (0.0, 1 / 30, 5 + 1 / 30, 10.0, 10 + 1 / 30, 20.0, 20 + 1 / 30)]
-    found = Measured(ticks, [(10.0, 11.0)], [(0.0, 6.0)], [(20.0, 21.0)], [1.0], [1.0], [1.0])
+    alone, beside, starting = [(10.0, 11.0)], [(0.0, 6.0)], [(20.0, 21.0)]
+    found = Measured(ticks, alone, beside, starting, alone, beside, [1.0], [1.0], [1.0])
     (uneven,) = [row for row in found.rows() if "from one start to the next" in row.name]
     assert uneven.p99_us == pytest.approx(5e6, rel=0.05)
     assert uneven.idle_p99_us == pytest.approx(0.0, abs=1.0)
