@@ -24,6 +24,7 @@ from runner.cli.common import (
     sidecars_given,
     warm_up,
 )
+from runner.sim.config import CONTROL_HZ
 from schemas.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 log = logging.getLogger("runner")
 
 REPORT = "benchmark.json"
-CONTROL_HZ = 30.0  # what one step of a world stands for, towards skills that count time
 COLUMNS = ("world", "contestant", "success", "95 % interval", "steps", "reward", "errors")
 
 

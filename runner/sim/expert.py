@@ -11,6 +11,7 @@ import math
 from runner.sim.config import ARM_JOINTS, CONTROL_DT_S, REST_POSE
 from runner.sim.env import SimEnv
 from runner.sim.kinematics import ArmKinematics
+from runner.skills.motion import bounded
 
 OPEN_RAD = 0.80
 CLOSED_RAD = -0.10
@@ -156,8 +157,7 @@ class RestController:
     def act(self) -> list[float]:
         """The next joint target; the same pose again once at rest."""
         self._target = [
-            here + min(max(there - here, -self._stride), self._stride)
-            for here, there in zip(self._target, REST_POSE, strict=True)
+            bounded(here, there, self._stride) for here, there in zip(self._target, REST_POSE, strict=True)
         ]
         return list(self._target)
 

@@ -7,18 +7,17 @@ stand so that this point lies where the arm grasps), or `turn_rad`. The arm fold
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from runner.protocols import Act, Done, Goal, Hold, StepOutcome
 from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
 from runner.sim.navigate import PlanarController, Pose2D, standoff_pose, to_map
 from runner.skills.base import SkillBase
 from runner.skills.motion import JointRamp, is_at, joint_positions
+from runner.skills.ros_goals import parse_goal
 from schemas.control import ControlMode
 from schemas.errors import BadRequest, GoalRejected, ModelError
 from schemas.manifest import RSkillManifest
@@ -97,31 +96,6 @@ class NavigateParams(_Part):
         return self
 
 
-def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Deep merge: maps are merged, everything else of `over` replaces."""
-    merged = dict(base)
-    for key, value in over.items():
-        known = merged.get(key)
-        merged[key] = (
-            merge(known, value) if isinstance(known, Mapping) and isinstance(value, Mapping) else value
-        )
-    return merged
-
-
-def parse_params(manifest: RSkillManifest, params: Mapping[str, Any]) -> NavigateParams:
-    """The goal's parameters over the manifest's defaults. Raises BadRequest, field by field."""
-    defaults = json.loads(manifest.ros_integration.default_goal_json) if manifest.ros_integration else {}
-    try:
-        return NavigateParams.model_validate(merge(defaults, params))
-    except ValidationError as error:
-        fields = [
-            {"path": ".".join(map(str, item["loc"])) or "goal_params", "problem": item["msg"]}
-            for item in error.errors(include_url=False, include_input=False)
-        ]
-        text = "; ".join(f"{field['path']}: {field['problem']}" for field in fields)
-        raise BadRequest(f"goal_params: {text}", details={"fields": fields}) from error
-
-
 def base_pose(world: WorldState) -> Pose2D:
     """Where the base stands on the map. Raises ModelError when that is unknown or stale: never assumed."""
     if world.base_pose is None or "base_pose" in world.stale:
@@ -168,7 +142,7 @@ class Navigate(SkillBase):
 
     async def _start(self, goal: Goal) -> None:
         self._reset()
-        self._params = parse_params(self.manifest, goal.params)
+        self._params = parse_goal(NavigateParams, self.manifest, goal.params)
 
     def _step(self, world: WorldState) -> StepOutcome:
         if self._params is None:

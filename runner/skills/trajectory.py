@@ -6,19 +6,17 @@ told before anything moves that a point is out of range or too fast. Safety is t
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from runner.protocols import Act, Done, Goal, StepOutcome
 from runner.safety.limits import Limits
 from runner.skills.base import SkillBase
 from runner.skills.motion import REACHED_RAD, joint_positions
-from runner.skills.navigate import merge
+from runner.skills.ros_goals import parse_goal
 from schemas.control import ControlMode
 from schemas.errors import BadRequest, GoalRejected
 from schemas.manifest import RSkillManifest
@@ -88,20 +86,6 @@ class TrajectoryParams(_Ros):
     goal_time_tolerance: Duration = Duration()
 
 
-def parse_trajectory(manifest: RSkillManifest, params: Mapping[str, Any]) -> TrajectoryParams:
-    """The goal's parameters over the manifest's defaults. Raises BadRequest, field by field."""
-    defaults = json.loads(manifest.ros_integration.default_goal_json) if manifest.ros_integration else {}
-    try:
-        return TrajectoryParams.model_validate(merge(defaults, params))
-    except ValidationError as error:
-        fields = [
-            {"path": ".".join(map(str, item["loc"])) or "goal_params", "problem": item["msg"]}
-            for item in error.errors(include_url=False, include_input=False)
-        ]
-        text = "; ".join(f"{field['path']}: {field['problem']}" for field in fields)
-        raise BadRequest(f"goal_params: {text}", details={"fields": fields}) from error
-
-
 def problem_of(asked: TrajectoryParams, limits: Limits) -> str:
     """What of a trajectory this robot cannot do; empty: nothing. The way to the first point is not looked at: nobody knows yet where it begins."""
     names, points = asked.trajectory.joint_names, asked.trajectory.points
@@ -160,7 +144,7 @@ class FollowJointTrajectory(SkillBase):
 
     async def _start(self, goal: Goal) -> None:
         self._asked, self._start_at, self._ticks = None, None, 0
-        asked = parse_trajectory(self.manifest, goal.params)
+        asked = parse_goal(TrajectoryParams, self.manifest, goal.params)
         if problem := problem_of(asked, self._limits):
             raise BadRequest(f"goal_params: {problem}", hint="nothing was moved")
         self._asked = asked

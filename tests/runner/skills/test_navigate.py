@@ -9,7 +9,8 @@ import pytest
 
 from runner.protocols import Act, Done, Goal, StepOutcome
 from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
-from runner.skills.navigate import Navigate, parse_params
+from runner.skills.navigate import Navigate, NavigateParams
+from runner.skills.ros_goals import parse_goal
 from schemas.control import ControlMode
 from schemas.errors import BadRequest, GoalRejected, ModelError
 from schemas.manifest import load_manifest
@@ -160,4 +161,4 @@ def test_no_joint_state_no_motion(skill: Navigate, env: Any, run_async: Run) -> 
 )
 def test_wrong_parameters_are_named(navigate_manifest: Path, params: dict[str, Any], path: str) -> None:
     with pytest.raises(BadRequest, match=path.replace(".", r"\.")):
-        parse_params(load_manifest(navigate_manifest), params)
+        parse_goal(NavigateParams, load_manifest(navigate_manifest), params)

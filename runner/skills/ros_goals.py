@@ -1,0 +1,42 @@
+"""Goals of ROS actions as the stand-ins read them: the manifest's default goal with what was asked for laid over it, checked field by field.
+
+Pure; the message itself is a pydantic model of the stand-in's.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from schemas.errors import BadRequest
+from schemas.manifest import RSkillManifest
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Deep merge: maps are merged, everything else of `over` replaces."""
+    merged = dict(base)
+    for key, value in over.items():
+        known = merged.get(key)
+        merged[key] = (
+            merge(known, value) if isinstance(known, Mapping) and isinstance(value, Mapping) else value
+        )
+    return merged
+
+
+def parse_goal[Message: BaseModel](
+    message: type[Message], manifest: RSkillManifest, params: Mapping[str, Any]
+) -> Message:
+    """The goal's parameters over the manifest's defaults. Raises BadRequest, field by field."""
+    defaults = json.loads(manifest.ros_integration.default_goal_json) if manifest.ros_integration else {}
+    try:
+        return message.model_validate(merge(defaults, params))
+    except ValidationError as error:
+        fields = [
+            {"path": ".".join(map(str, item["loc"])) or "goal_params", "problem": item["msg"]}
+            for item in error.errors(include_url=False, include_input=False)
+        ]
+        text = "; ".join(f"{field['path']}: {field['problem']}" for field in fields)
+        raise BadRequest(f"goal_params: {text}", details={"fields": fields}) from error
