@@ -306,10 +306,12 @@ class Lease:
                 self._progress.changed()
             await self._progress.wait()
 
-    async def wait_change(self) -> LeaseState:
-        """Until its `state` is another than now (at once where it is over); says which. A state that lasts for a moment may be missed."""
-        before = self.state
-        while self.state == before and not self._over:
+    async def wait_change(self, seen: LeaseState) -> LeaseState:
+        """Until its `state` is another than the one that the caller saw last (at once where it is over); says which.
+
+        A state that lasts for a moment may be missed, but never the one that it ends in.
+        """
+        while self.state == seen and not self._over:
             await self._progress.wait()
         return self.state
 

@@ -241,8 +241,8 @@ class Residency:
         """Wait until a lease that is leaving has left, its bytes unloaded. Raises Loading when the time is over."""
         try:
             async with asyncio.timeout(_left_s(deadline)):
-                while lease.state in _LEAVING:
-                    await lease.wait_change()
+                while (leaving := lease.state) in _LEAVING:
+                    await lease.wait_change(leaving)
                 if lease.state == "gone":
                     await lease.wait_gone()
         except TimeoutError:
@@ -257,14 +257,14 @@ class Residency:
         Raises Loading or WaitTimeout when the time is over, or what the arbiter refuses with. A wait that ends so goes on in the background:
         the model was wanted, and comes back as soon as it may.
         """
-        while lease.state not in ("held", "gone"):
-            if lease.state == "loading":  # `_on_return` is at it, which takes as long as it takes
-                await lease.wait_change()
+        while (seen := lease.state) not in ("held", "gone"):
+            if seen == "loading":  # `_on_return` is at it, which takes as long as it takes
+                await lease.wait_change(seen)
                 continue
             try:
                 async with asyncio.timeout(_left_s(deadline)):
-                    if lease.state != "standby":
-                        await lease.wait_change()
+                    if seen != "standby":
+                        await lease.wait_change(seen)
                     elif (refused := await asyncio.shield(self._called_back(lease))) is not None:
                         raise refused
             except TimeoutError:
@@ -294,8 +294,7 @@ class Residency:
         try:
             await lease.reacquire()
         except BadState:  # it comes back by itself in this very moment
-            if lease.state == "standby":
-                await lease.wait_change()
+            await lease.wait_change("standby")
         except VramError as error:
             if lease.state == "standby":
                 return error

@@ -8,7 +8,7 @@ import pytest
 
 from arbiter.testing.process import ArbiterProcess
 from clients.aio import ArbiterClient
-from clients.lease import Lease, Use
+from clients.lease import Lease, LeaseState, Use
 from schemas.errors import (
     BadState,
     GangBroken,
@@ -88,28 +88,37 @@ async def test_a_standby_lease_returns_by_itself_when_there_is_room(
         assert (model.did[-1], detector.state) == ("unload", "gone")
 
 
+async def followed(lease: Lease, last: LeaseState) -> list[LeaseState]:
+    """The states of a lease from now on, up to `last`."""
+    seen = [lease.state]
+    while seen[-1] != last:
+        seen.append(await lease.wait_change(seen[-1]))
+    return seen
+
+
 async def test_whoever_follows_a_lease_hears_where_it_went(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     model = Model()
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client, asyncio.timeout(WAIT_S):
         detector = await on_standby(client, spec, model)
         assert (detector.state, detector.given_up) == ("held", False)
         policy = await client.acquire(spec("policy", 4), WAIT_S)
         await policy.ready()
-        seen = [detector.state]
-        following = asyncio.create_task(detector.wait_change())
-        await policy.give_up()
+        async with asyncio.TaskGroup() as group:
+            returning = group.create_task(followed(detector, "held"))
+            await asyncio.sleep(0)  # it follows
+            await policy.give_up()
         assert policy.given_up
-        async with asyncio.timeout(WAIT_S):
-            while seen[-1] != "held":
-                seen.append(await following)
-                following = asyncio.create_task(detector.wait_change())
-            assert seen == ["standby", "loading", "held"]
+        assert returning.result() == ["standby", "loading", "held"]
+        async with asyncio.TaskGroup() as group:
+            leaving = group.create_task(followed(detector, "gone"))
+            await asyncio.sleep(0)
             await detector.give_up()
-            assert await following in ("revoking", "unloading", "gone")
-            await detector.wait_gone()
-            assert await detector.wait_change() == "gone", "nothing changes any more"
+        assert leaving.result()[0] == "held"
+        assert set(leaving.result()[1:-1]) <= {"revoking", "unloading"}
+        assert await detector.wait_change("gone") == "gone", "nothing changes any more"
+        assert await detector.wait_change("held") == "gone", "the caller had not seen it"
         assert detector.given_up
 
 
