@@ -23,10 +23,18 @@ from clients.records import (
     token_of,
 )  # fmt: skip
 from schemas import defaults as d
-from schemas.errors import LeaseLost, LeaseRevoking, VramError, WaitTimeout, from_wire
+from schemas.errors import (
+    ArbiterUnreachable,
+    LeaseLost,
+    LeaseRevoking,
+    VramError,
+    WaitTimeout,
+    from_wire,
+)
 
 GONE_CODES = frozenset({"lease_lost", "lease_expired", "unknown_lease", "stale_token"})
 """Replies that say that the lease is no longer ours."""
+AWAY = ("standby", "parked")
 
 
 class Holdings:
@@ -95,7 +103,8 @@ class Holdings:
     ) -> int:
         """From here on nothing is held: no renewal. A lease that is gone already counts as released.
 
-        `asleep`: how it waits to come back (`standby`, `parked`), if the arbiter agrees; "" means never again.
+        `asleep`: how it waits to come back (`standby`, `parked`), if the arbiter agrees; "" means never again. Nobody else would let go of
+        the room of one that sleeps, so it is said again until the arbiter has heard it, however long that takes.
         """
         record.released = True
         self.held.pop(record.lease_id, None)
@@ -106,20 +115,14 @@ class Holdings:
             record.asleep = asleep
             self.asleep[record.lease_id] = record
         message = {"op": "release", **record.ref(), "exiting": exiting, "parked": asleep == "parked"}
+        if asleep:
+            return self._say_asleep(record, message, now, timeout_s)
 
         def let_go(reply: Message, at: float) -> None:
-            then = str(reply.get("next", ""))
-            if asleep and then not in ("standby", "parked"):
-                self._wake(record)
-            elif asleep:
-                record.asleep = then
-            elif then in ("standby", "parked"):
+            if str(reply.get("next", "")) in AWAY:
                 self._cancel(record, at)
 
-        def refused(_: VramError, __: float) -> None:
-            self._wake(record)
-
-        return self._connection.ask(message, now, timeout_s, on_reply=let_go, on_error=refused)
+        return self._connection.ask(message, now, timeout_s, on_reply=let_go)
 
     def reacquire(
         self, record: LeaseRecord, wait_timeout_s: float | None, now: float, traceparent: str | None = None
@@ -265,6 +268,41 @@ class Holdings:
                 self._gone(record, error)
 
         return self._connection.ask(message, now, timeout_s, on_reply=on_reply, on_error=refused, quiet=quiet)
+
+    def _say_asleep(
+        self, record: LeaseRecord, release: Message, now: float, timeout_s: float, *, quiet: bool = False
+    ) -> int:
+        """`quiet`: said again by ourselves, so that a refusal is told as the end of the lease. An answer that comes when it sleeps no more,
+        or again, is none to what it does now."""
+        token = record.token
+
+        def sleeps() -> bool:
+            return record.asleep != "" and record.token == token
+
+        def let_go(reply: Message, _: float) -> None:
+            then = str(reply.get("next", ""))
+            if not sleeps():
+                return
+            if then in AWAY:
+                record.asleep = then
+            else:
+                over(LeaseLost(f"{record.lease_id} may not come back", hint="acquire again"))
+
+        def refused(error: VramError, at: float) -> None:
+            if not sleeps():
+                return
+            if isinstance(error, ArbiterUnreachable):
+                self._say_asleep(record, release, at, timeout_s, quiet=True)
+            else:
+                over(error)
+
+        def over(error: VramError) -> None:
+            if quiet:
+                self._gone(record, error)
+            else:
+                self._wake(record)
+
+        return self._connection.ask(release, now, timeout_s, on_reply=let_go, on_error=refused, quiet=quiet)
 
     def _send_reacquire(self, record: LeaseRecord, now: float, *, quiet: bool = False) -> int:
         """`quiet`: said again by ourselves, so that a refusal is told as the end of the lease."""

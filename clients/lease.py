@@ -38,7 +38,8 @@ RETRY_UNLOADING_S = 0.25
 """Somebody else's use is still on the lease: the arbiter pushes when it ends; this only covers a lost push."""
 ANNOUNCE_TIMEOUT_S = 5.0
 RELEASE_TIMEOUT_S = 5.0
-"""A release that the arbiter does not hear ends by ttl there; a holder does not wait longer for it."""
+"""A holder does not wait longer for the arbiter to hear that it let go. Who left for good ends by ttl there; who wants to come back goes
+on telling it (`clients.holdings`)."""
 
 
 class Driver(Protocol):
@@ -269,7 +270,8 @@ class Lease:
     async def release(self, *, exiting: bool = False) -> None:
         """The bytes are freed already (`exiting`: the process ends now). Idempotent; a lease that is gone is released.
 
-        Without the arbiter it gives up after 5 s: the lease then ends by its ttl.
+        Without the arbiter it gives up after 5 s: the lease then ends by its ttl. (One that was evicted and wants to come back is not
+        released by its holder: it goes on telling the arbiter, however long that is away.)
         """
         self._asked = True
         if self._gone:
@@ -473,7 +475,7 @@ class Lease:
         try:
             await self._driver.reply(request)
         except ArbiterUnreachable:
-            log.warning("the arbiter did not hear the release of %s; it ends by its ttl", self.lease_id)
+            self._warn_unheard()
         except VramError as error:
             if error.code in GONE_CODES:
                 return
@@ -488,9 +490,15 @@ class Lease:
         """A lease that sleeps without the arbiter's word may turn out to be over."""
         try:
             await self._driver.reply(request)
+        except ArbiterUnreachable:
+            self._warn_unheard()
         finally:
             if self._record.released and not self._record.asleep and not self._over:
                 self._end()
+
+    def _warn_unheard(self) -> None:
+        then = "it is told until it has, to let it come back" if self._record.asleep else "it ends by its ttl"
+        log.warning("the arbiter did not hear the release of %s; %s", self.lease_id, then)
 
     async def _call(self, callback: Callable[..., Awaitable[None] | None], *arguments: object) -> None:
         try:

@@ -1,9 +1,12 @@
 """Leases that leave and come back, in the client's protocol: standby, parked, wanted again."""
 
-from protocol_wire import Wire, evict, view
+from typing import Any
+
+from protocol_wire import WELCOME, Wire, evict, view
 
 from clients import records as r
 from clients.connection import REQUEST_TIMEOUT_S
+from clients.records import Message
 from schemas.errors import ArbiterUnreachable, LeaseLost, WaitTimeout
 
 
@@ -106,4 +109,86 @@ def test_one_requests_end_that_drops_another_does_not_stop_the_clock(link: Wire)
     (gone,) = link.told()
     assert isinstance(gone, r.Gone)
     assert isinstance(gone.error, ArbiterUnreachable)
+    assert link.protocol.next_deadline() is None
+
+
+def left_unheard(link: Wire) -> r.LeaseRecord:
+    """Evicted, and the arbiter is gone for longer than anybody waits for its answer."""
+    record = link.hold()
+    link.push(
+        "revoke", lease_id=record.lease_id, token=list(record.token), reason="", wanted_by="", park=False
+    )
+    link.connection.contact_lost("test")
+    link.holdings.release(record, False, link.now, 5.0, asleep="standby")
+    link.told()
+    link.tick(5.1)
+    (unheard,) = link.told()
+    assert isinstance(unheard, r.Failed)
+    assert isinstance(unheard.error, ArbiterUnreachable)
+    return record
+
+
+def back_in_contact(link: Wire, record: r.LeaseRecord, *, kept: bool = True, **lease: Any) -> list[Message]:
+    """The arbiter is back and hears what is attached again; returns what else it is told."""
+    link.connection.connected(link.now)
+    link.reply(link.one("hello"), **WELCOME)
+    attach = link.one("reattach")
+    assert [(item["lease_id"], item["state"]) for item in attach["leases"]] == [(record.lease_id, "standby")]
+    link.reply(attach, leases=[{"lease_id": record.lease_id, "kept": kept, "lease": view(**lease)}])
+    return link.sent()
+
+
+def test_who_wants_to_come_back_says_that_it_left_until_it_is_heard(link: Wire) -> None:
+    """Regression: after 5 s without the arbiter a lease on standby was over for its holder, and kept its room at the arbiter."""
+    record = left_unheard(link)
+    link.tick(3600.0)
+    assert (record.asleep, link.told()) == ("standby", [])
+    (release,) = back_in_contact(link, record, token=list(record.token), state="verifying")
+    assert (release["op"], release["lease_id"], release["token"]) == (
+        "release", record.lease_id, list(record.token),
+    )  # fmt: skip
+    link.reply(release, state="verifying", next="standby")
+    assert link.told() == [r.Up(1)]
+    link.tick(60.0)
+    assert link.said("release") == [], "it was heard"
+    link.push("granted", lease=view(token=[2, 9]))
+    assert link.told() == [r.Returned(record)]
+
+
+def test_an_arbiter_that_will_not_have_it_back_is_believed_however_late(link: Wire) -> None:
+    record = left_unheard(link)
+    (release,) = back_in_contact(link, record, token=list(record.token), state="verifying")
+    link.reply(release, state="verifying", next="released")
+    up, gone = link.told()
+    assert (up, link.holdings.asleep) == (r.Up(1), {})
+    assert isinstance(gone, r.Gone)
+    assert isinstance(gone.error, LeaseLost)
+
+
+def test_an_answer_to_its_release_does_not_touch_a_lease_that_has_returned(link: Wire) -> None:
+    """The arbiter had heard it before it died, and granted the lease again: the old token is none any more."""
+    record = left_unheard(link)
+    (release,) = back_in_contact(link, record, token=[2, 9])
+    assert link.told() == [r.Returned(record), r.Up(1)]
+    link.refuse(release, "stale_token")
+    assert (link.told(), record.token) == ([], (2, 9))
+    assert link.holdings.held == {record.lease_id: record}
+
+
+def test_who_is_not_wanted_any_more_tells_of_its_leaving_no_longer(link: Wire) -> None:
+    record = left_unheard(link)
+    link.holdings.give_up_asleep(record, link.now)
+    link.tick(REQUEST_TIMEOUT_S)
+    assert link.protocol.next_deadline() is None
+
+
+def test_who_left_for_good_does_not_wait_for_an_arbiter_that_is_away(link: Wire) -> None:
+    """Its ttl ends it there."""
+    record = link.hold()
+    link.connection.contact_lost("test")
+    link.holdings.release(record, False, link.now, 5.0)
+    link.told()
+    link.tick(5.1)
+    (unheard,) = link.told()
+    assert isinstance(unheard, r.Failed)
     assert link.protocol.next_deadline() is None

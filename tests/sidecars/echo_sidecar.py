@@ -1,7 +1,7 @@
 """A whole sidecar process around a model without weights: `python echo_sidecar.py FOLDER [flags of vram-sidecar]`.
 
-FOLDER tells it what to do: a file `fail_prepare`, `fail_load` or `fail_unload` makes that step fail, `slow_prepare` or `slow_load` makes it last. The query tells `run`: `hold NAME` waits until the
-file NAME appears there, `fail` raises; anything else is echoed.
+FOLDER tells it what to do: a file `fail_prepare`, `fail_load` or `fail_unload` makes that step fail, `slow_prepare`,
+`slow_load` or `slow_unload` makes it last. The query tells `run`: `hold NAME` waits until the file NAME appears there, `fail` raises; anything else is echoed.
 """
 
 import sys
@@ -38,6 +38,7 @@ class EchoAdapter:
         self._model = device
 
     def unload(self) -> None:
+        self._last("unload")
         self._model = None
         self._fail("unload")
 

@@ -111,6 +111,26 @@ def test_the_arbiter_may_be_killed_while_it_is_away(box, arbiter_daemon, arbiter
         until(lambda: detector.state() == "resident")
 
 
+def test_it_comes_back_by_itself_although_the_arbiter_was_away_when_it_left(box, arbiter_daemon, arbiter):
+    """Regression: its release was said for 5 s; after a longer absence the lease was over here, and kept its room there for its ttl."""
+    detector = box.start("detector", *DETECTOR, footprint=BOTH)
+    policy = box.start("policy", "--min-residency-s", "0", footprint=BOTH)
+    left = detector.ask("load")["lease_id"]
+    switch = detector.folder / "slow_unload"
+    switch.touch()
+    waiting = policy.send_detect()
+    until(lambda: state(arbiter, "detector") == "unloading")
+    arbiter_daemon.kill()
+    switch.unlink()
+    until(lambda: "did not hear the release" in detector.log)
+    assert detector.ask("ping")["standby"]
+    arbiter_daemon.start()
+    assert policy.client.reply(waiting, PATIENCE_S)["ok"]
+    policy.ask("unload")
+    until(lambda: detector.state() == "resident")
+    assert detector.ask("ping")["lease_id"] == left
+
+
 def test_a_model_that_a_goal_uses_is_not_idle(box, arbiter):
     """Regression: an idle policy was let go of in the middle of a goal whose arm was still on its way to the start pose."""
     policy = box.start("policy", "--idle-release-s", "0.1", "--log-level", "debug", footprint=BOTH)
