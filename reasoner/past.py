@@ -30,6 +30,10 @@ class Taken:
     at_s: float
     image: bytes
 
+    @property
+    def age_s(self) -> float:
+        return _now_s() - self.at_s
+
 
 class Past:
     """`look` gives the camera's newest picture, or raises. `run` looks at `rate_hz` until cancelled; `add` takes a picture that somebody else got."""

@@ -7,8 +7,9 @@ at the runner. Nothing here names bytes, leases or victims: loading and leaving 
 
 import asyncio
 import logging
+import math
 import uuid
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Protocol
@@ -44,7 +45,11 @@ from schemas.world import CameraModel
 log = logging.getLogger(__name__)
 
 FRAME_MAX_AGE_MS = 1000.0
-LOOK_AGAIN_S = 10.0  # a later answer is about a picture of then: an arm would reach for what stood there
+LOOKED_AT_MAX_S = (
+    5.0  # a picture's age when a model begins to look at it; one that waited for the card is not looked at
+)
+PLACE_MAX_S = 10.0  # a later answer says where something stood: an arm would reach for that
+LOOKS_MAX = 3  # with a new picture each, for one answer: behind the first wait the model is there
 GOAL_GRACE_S = 60.0  # beyond the goal's own deadline: loading the skill's model is not part of the motion
 GOAL_MAX_S = 600.0  # when the manifest sets the deadline
 CANCEL_S = 10.0  # for a cancelled goal to end: it takes the arm back and finishes its use
@@ -119,12 +124,12 @@ class Tools:
             return Outcome("refused", "no detector is provided", "not_permitted")
         if (refusal := await self._not_permitted(self._detector)) is not None:
             return refusal
-        frame = await self._frame(call.camera)
-        asked_s = monotonic()
-        detections = await self._detector.detect(frame["data"], call.query)
-        if monotonic() - asked_s > LOOK_AGAIN_S:  # it waited for the card: by now it is there
-            frame = await self._frame(call.camera)
-            detections = await self._detector.detect(frame["data"], call.query)
+        detector = self._detector
+        frame, detections = await _look(
+            lambda: self._frame(call.camera),
+            lambda frame: detector.detect(frame["data"], call.query, fresh_s=_good_for_s(frame["age_ms"])),
+            answer_max_s=PLACE_MAX_S,
+        )
         if (refusal := await self._not_permitted(self._detector)) is not None:
             return refusal  # it was replaced meanwhile
         if not detections:
@@ -161,8 +166,11 @@ class Tools:
             return Outcome("refused", "no scene VLM is provided", "not_permitted")
         if (refusal := await self._not_permitted(self._scene_vlm)) is not None:
             return refusal
-        frame = await self._frame(call.camera)
-        answer = await self._scene_vlm.query(frame["data"], call.question)
+        vlm = self._scene_vlm
+        frame, answer = await _look(
+            lambda: self._frame(call.camera),
+            lambda frame: vlm.query(frame["data"], call.question, fresh_s=_good_for_s(frame["age_ms"])),
+        )
         if (refusal := await self._not_permitted(self._scene_vlm)) is not None:
             return refusal
         return Outcome("answered", answer, data={"camera": frame["camera"], "question": call.question})
@@ -174,10 +182,18 @@ class Tools:
         reward, past = self._judge.reward, self._judge.past
         if (refusal := await self._not_permitted(reward)) is not None:
             return refusal
-        newest = await past.look()
-        shown = past.since(newest.at_s - call.window_s)
         task = call.task or self._judge.task
-        judged = await reward.score([taken.image for taken in shown], task)
+
+        async def shown_now() -> list[Taken]:
+            newest = await past.look()
+            return past.since(newest.at_s - call.window_s)
+
+        shown, judged = await _look(
+            shown_now,
+            lambda shown: reward.score(
+                [taken.image for taken in shown], task, fresh_s=_good_for_s(shown[-1].age_s * 1e3)
+            ),
+        )
         if (refusal := await self._not_permitted(reward)) is not None:
             return refusal
         return _opinion(task, shown, judged)
@@ -272,6 +288,36 @@ class Tools:
 
     async def _frame(self, camera: str) -> FrameReply:
         return await self._runner.frame(camera, max_age_ms=FRAME_MAX_AGE_MS, encoding="png")
+
+
+async def _look[P, A](
+    take: Callable[[], Awaitable[P]],
+    ask: Callable[[P], Awaitable[A]],
+    *,
+    answer_max_s: float = math.inf,
+) -> tuple[P, A]:
+    """A picture and what a model says of it. One that grew too old before the model looked, or whose answer took longer than `answer_max_s`, is
+    asked about again with a new one, `LOOKS_MAX` in all. Raises FrameStale then, what `take` raises at once, and what `ask` raises else."""
+    for _ in range(LOOKS_MAX):
+        taken = await take()
+        asked_s = monotonic()
+        try:
+            answer = await ask(taken)
+        except FrameStale as error:
+            stale = error
+            continue
+        if (took_s := monotonic() - asked_s) <= answer_max_s:
+            return taken, answer
+        stale = FrameStale(
+            f"the answer took {took_s:.0f} s, which is more than {answer_max_s:g} s: it is not about now",
+            hint="look again, or use a faster model",
+        )
+    raise stale
+
+
+def _good_for_s(age_ms: float) -> float:
+    """How much longer a picture may wait to be looked at."""
+    return max(0.0, LOOKED_AT_MAX_S - age_ms / 1e3)
 
 
 def _opinion(task: str, shown: list[Taken], judged: Judgement) -> Outcome:

@@ -5,6 +5,7 @@ Op family (detector, scene VLM, reward)   {"op": "ping" | "load" | "detect" | "q
 Endpoint family (policy)             {"endpoint": "ping" | "load" | "reset" | "get_action" | "unload" | "shutdown", "data": …}
                                      → the result | {"error": "Type: message", "code": …, …}
 
+`detect`, `query` and `score` may carry "fresh_s": pictures that had to wait longer (for the card, a load, another request) are not looked at.
 Every request may carry "id" (echoed as "re": a DEALER may have several under way; REQ clients leave it out), "token" ([epoch, serial]: refuse with
 `evicted` unless it is the sidecar's current one) and "traceparent". Images are PNG bytes of RGB. Arrays are `{"__ndarray_class__": true, "as_npy": bytes}`
 (numpy's .npy format, pickle never allowed).
@@ -52,7 +53,14 @@ class ShutdownOp(_Call):
     op: Literal["shutdown"]
 
 
-class DetectOp(_Call):
+class _Look(_Call):
+    """About pictures. Without `fresh_s` it does not matter how long they wait, as for the field's clients."""
+
+    fresh_s: Seconds | None = None
+    """From the request's arrival on, the model has to begin to look within so long; else `frame_stale`, and nothing was looked at."""
+
+
+class DetectOp(_Look):
     """Find `query` (several separated by ` . ` or commas, as the field writes them) in an image."""
 
     op: Literal["detect"]
@@ -64,7 +72,7 @@ class DetectOp(_Call):
     score_threshold: Annotated[float, Field(ge=0, le=1)] | None = None
 
 
-class QueryOp(_Call):
+class QueryOp(_Look):
     op: Literal["query"]
     image: ImageBytes
     question: Question
@@ -72,7 +80,7 @@ class QueryOp(_Call):
     max_new_tokens: Annotated[int, Field(ge=1, le=8192)] = 256
 
 
-class ScoreOp(_Call):
+class ScoreOp(_Look):
     """How far along `task` the robot is at each of one camera's pictures, oldest first.
 
     Either `images` (PNG or JPEG bytes), or as the field writes it: `frames`, `n` raw pictures of `height` × `width` × 3 bytes, BGR, one after another.

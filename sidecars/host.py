@@ -15,6 +15,7 @@ from typing import Any
 from clients.aio import ArbiterClient
 from clients.serve import RouterServer
 from schemas.errors import VramError
+from schemas.sidecar import EndpointCall
 from sidecars.adapters.base import ModelAdapter, ModelCall
 from sidecars.device.memory import DeviceMemory
 from sidecars.residency import Residency
@@ -132,7 +133,8 @@ class SidecarHost:
         residency = self._here
         if name == "reset" and call.token is None and residency.state != "resident":
             return {"ok": True}  # a model that is not there has nothing to forget, and no reason to load
-        return await residency.run(name, call.token, lambda: self._adapter.run(call))
+        fresh_s = None if isinstance(call, EndpointCall) else call.fresh_s
+        return await residency.run(name, call.token, lambda: self._adapter.run(call), fresh_s=fresh_s)
 
     @property
     def _here(self) -> Residency:

@@ -20,6 +20,7 @@ from schemas import meters, telemetry, tracing
 from schemas.errors import (
     BadState,
     Evicted,
+    FrameStale,
     LeaseExpired,
     LeaseLost,
     LeaseRevoking,
@@ -114,14 +115,21 @@ class Residency:
                 await self._unload()
 
     async def run(
-        self, label: str, token: Token | None, work: Callable[[], dict[str, Any]]
+        self,
+        label: str,
+        token: Token | None,
+        work: Callable[[], dict[str, Any]],
+        *,
+        fresh_s: float | None = None,
     ) -> dict[str, Any]:
         """Run one op of the model as a use of the lease.
 
         With a `token` the caller holds the lease by a use of its own: anything but the current one raises Evicted. Without, the model is made
-        resident first, also if it was evicted a moment ago.
+        resident first, also if it was evicted a moment ago. Raises FrameStale when the work could not begin within `fresh_s`: the model is
+        there by then, for a request with a newer picture.
         """
-        deadline = time.monotonic() + self._settings.wait_timeout_s
+        came_s = time.monotonic()
+        deadline = came_s + self._settings.wait_timeout_s
         while True:
             if token is None:
                 await self.load(max(0.0, deadline - time.monotonic()))
@@ -130,7 +138,9 @@ class Residency:
             lease, loads = self.lease, self._loads
             try:
                 async with self._use(lease, label, handed=token is not None):
-                    return await self._worker.run(lambda: self._guarded(loads, work))  # noqa: B023  awaited in this very pass
+                    return await self._worker.run(
+                        lambda: self._guarded(loads, came_s, fresh_s, work)  # noqa: B023  awaited in this very pass
+                    )
             except _GONE as error:
                 if token is not None:
                     raise self._evicted() from error
@@ -480,10 +490,19 @@ class Residency:
             self._running -= 1
             self._last_use_s = time.monotonic()
 
-    def _guarded(self, loads: int, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """In the worker: an unload may have come between the check and this moment."""
+    def _guarded(
+        self, loads: int, came_s: float, fresh_s: float | None, work: Callable[[], dict[str, Any]]
+    ) -> dict[str, Any]:
+        """In the worker: an unload may have come between the check and this moment, and what is to be looked at may have become old."""
         if loads != self._loads:
             raise self._evicted()
+        waited_s = time.monotonic() - came_s
+        if fresh_s is not None and waited_s > fresh_s:
+            raise FrameStale(
+                f"the picture waited {waited_s:.1f} s for {self._settings.name}, {fresh_s:.1f} s are accepted",
+                hint="ask again about a new one: the model is there now",
+                details={"waited_s": waited_s},
+            )
         return work()
 
 

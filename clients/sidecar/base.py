@@ -10,6 +10,7 @@ import contextlib
 import itertools
 import socket
 from collections.abc import Mapping, Sequence
+from time import monotonic
 from typing import Any, Self, cast
 
 from clients import traces
@@ -91,13 +92,18 @@ class SidecarClient:
         *,
         token: Sequence[int] | None = None,
         timeout_s: float | None = None,
+        fresh_s: float | None = None,
     ) -> Any:
         """One request, connecting and starting the sidecar first where needed. It carries the present span, if there is one.
 
+        `fresh_s`: from now on, what was sent has to be looked at within so long; else FrameStale.
         Raises the type of the reply's code (Evicted, NotResident, Loading, OutOfMemory, ModelError, …) or SidecarUnavailable.
         """
+        began_s = monotonic()
         await self._ensure()
         message = traces.along(fields)
+        if fresh_s is not None:
+            message["fresh_s"] = max(0.0, fresh_s - (monotonic() - began_s))
         if token is not None:
             message["token"] = [int(token[0]), int(token[1])]
         return await self._exchange(op, message, self._timeout_s if timeout_s is None else timeout_s)

@@ -36,10 +36,12 @@ class DetectorClient(SidecarClient):
         score_threshold: float | None = None,
         token: Sequence[int] | None = None,
         timeout_s: float | None = None,
+        fresh_s: float | None = None,
     ) -> list[Detection]:
         """Everything that matches, best first. An empty list means: the detector looked and found nothing.
 
-        Raises Evicted, NotResident, WaitTimeout, OutOfMemory, ModelError, SidecarUnavailable: it did not look.
+        Raises Evicted, NotResident, WaitTimeout, OutOfMemory, ModelError, SidecarUnavailable, and FrameStale when it could not look within
+        `fresh_s` (seconds from now): it did not look.
         """
         fields = {
             "image": image_png,
@@ -47,7 +49,7 @@ class DetectorClient(SidecarClient):
             "max_side": max_side,
             "score_threshold": score_threshold,
         }
-        reply = await self.call("detect", fields, token=token, timeout_s=timeout_s)
+        reply = await self.call("detect", fields, token=token, timeout_s=timeout_s, fresh_s=fresh_s)
         try:
             found = [_detection(entry) for entry in reply["detections"]]
         except (KeyError, TypeError, ValueError) as error:
@@ -67,6 +69,7 @@ class SceneVlmClient(SidecarClient):
         max_new_tokens: int = 256,
         token: Sequence[int] | None = None,
         timeout_s: float | None = None,
+        fresh_s: float | None = None,
     ) -> str:
         """The model's answer, as it wrote it. Raises as `DetectorClient.detect`."""
         fields = {
@@ -75,7 +78,7 @@ class SceneVlmClient(SidecarClient):
             "max_side": max_side,
             "max_new_tokens": max_new_tokens,
         }
-        reply = await self.call("query", fields, token=token, timeout_s=timeout_s)
+        reply = await self.call("query", fields, token=token, timeout_s=timeout_s, fresh_s=fresh_s)
         answer = reply.get("answer") if isinstance(reply, dict) else None
         if not isinstance(answer, str):
             raise ModelError("the scene VLM's reply has no answer")
@@ -101,11 +104,12 @@ class RewardClient(SidecarClient):
         *,
         token: Sequence[int] | None = None,
         timeout_s: float | None = None,
+        fresh_s: float | None = None,
     ) -> Judgement:
         """How far along the task one camera's pictures show the robot to be; the newest `PICTURES_MAX` are sent. Raises as `DetectorClient.detect`."""
         fields = {"images": list(images_png)[-PICTURES_MAX:], "task": task}
         sent = len(fields["images"])
-        reply = await self.call("score", fields, token=token, timeout_s=timeout_s)
+        reply = await self.call("score", fields, token=token, timeout_s=timeout_s, fresh_s=fresh_s)
         try:
             found = Judgement(
                 tuple(float(value) for value in reply["progress"]),

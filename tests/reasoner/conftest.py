@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from clients.serve import Message, Peer, RouterServer
-from schemas.errors import BadRequest, GoalRejected, VramError
+from schemas.errors import BadRequest, FrameStale, GoalRejected, VramError
 from schemas.goals import RUNNER_REQUEST, CancelGoal, GetFrame, GetResult, GetSkills, GetState, SendGoal
 
 
@@ -121,6 +121,8 @@ class Sidecar:
             "success_threshold": 0.5,
         }
         self.messages: list[Message] = []
+        self.late = 0
+        """So many requests about pictures that it comes to too late."""
         self._server = RouterServer(
             endpoint, lambda error: {"ok": False, "error": str(error), "code": error.code}
         )
@@ -137,11 +139,13 @@ class Sidecar:
         if op == "ping":
             reply |= {"model": "m", "revision": "", "kind": "vlm", "rskill": self.rskill, "pid": 1, "boot_id": "b",
                       "state": "unloaded"}  # fmt: skip
-        elif self.error is not None:
-            wire = self.error.to_wire()
+        elif (error := self.error) is not None or (op != "load" and self.late):
+            if error is None:
+                error, self.late = FrameStale("it waited"), self.late - 1
+            wire = error.to_wire()
             reply |= {
                 "ok": False,
-                "error": f"{type(self.error).__name__}: {self.error.message}",
+                "error": f"{type(error).__name__}: {error.message}",
                 "code": wire["code"],
             }
         elif op == "load":

@@ -13,7 +13,7 @@ from reasoner.loop import run_episode
 from reasoner.palette import Palette, Skill
 from reasoner.past import KEPT_MAX, SHOWN_MAX, Past, Taken, spread
 from reasoner.planner import Episode, Finish
-from reasoner.tools import Judge, Tools
+from reasoner.tools import LOOKED_AT_MAX_S, Judge, Tools
 from schemas.errors import BadRequest, Evicted, FrameStale, ModelError, NotPermitted, OutOfMemory, VramError
 from schemas.goals import FrameReply
 from schemas.tools import PROGRESS_WINDOW_MAX_S, ExecuteRskill, QueryTaskProgress, ToolCall
@@ -145,6 +145,16 @@ def test_an_opinion_is_said_with_what_it_is_worth(a_runner: Any, a_sidecar: Any)
     assert (outcome.data["progress"], outcome.data["task"]) == ([0.2, 0.7], TASK)
     assert asked[0]["task"] == TASK, "without words of its own the call is about the present task"
     assert 1 <= len(asked[0]["images"]) <= SHOWN_MAX
+
+
+def test_pictures_that_waited_for_the_card_are_taken_anew(a_runner: Any, a_sidecar: Any) -> None:
+    def late(runner: Any, sidecar: Any) -> None:
+        sidecar.late = 1
+        sidecar.judgement |= {"progress": [0.5], "success": []}
+
+    outcome, asked = ask(a_runner, a_sidecar, late)
+    assert (outcome.status, len(asked)) == ("answered", 2)
+    assert all(0.0 < message["fresh_s"] < LOOKED_AT_MAX_S for message in asked)
 
 
 def test_what_the_model_does_not_say_is_not_said(a_runner: Any, a_sidecar: Any) -> None:

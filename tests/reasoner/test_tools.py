@@ -11,7 +11,7 @@ from clients.runner import RunnerClient
 from clients.sidecar.perception import DetectorClient, SceneVlmClient
 from reasoner.inbox import Danger, Inbox
 from reasoner.palette import Palette, Skill
-from reasoner.tools import LOOK_AGAIN_S, Tools
+from reasoner.tools import LOOKED_AT_MAX_S, LOOKS_MAX, PLACE_MAX_S, Tools
 from reasoner.watch import watch
 from schemas.errors import (
     Evicted,
@@ -186,6 +186,61 @@ def test_a_place_that_is_no_number_is_no_place(a_runner: Any, a_sidecar: Any, wr
     assert (outcome.status, outcome.code) == ("error", "model_error")
 
 
+def test_a_place_that_is_always_of_long_ago_is_none(
+    a_runner: Any, a_sidecar: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: the second answer was taken for one of now, however long it had taken."""
+    now = [100.0]
+    monkeypatch.setattr("reasoner.tools.monotonic", lambda: now[0])
+
+    async def story() -> tuple[Any, list[str]]:
+        async with (
+            a_runner() as runner,
+            RunnerClient(runner.endpoint) as client,
+            a_sidecar("lab/eye") as sidecar,
+            DetectorClient(sidecar.endpoint) as detector,
+        ):
+            sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]}]
+            detect = detector.detect
+
+            async def slow(*arguments: Any, **options: Any) -> Any:
+                now[0] += 2 * PLACE_MAX_S
+                return await detect(*arguments, **options)
+
+            monkeypatch.setattr(detector, "detect", slow)
+            return await Tools(client, detector, None)(LOOK), sidecar.asked
+
+    outcome, asked = play(story)
+    assert (outcome.status, outcome.code) == ("no_frame", "frame_stale")
+    assert asked.count("detect") == LOOKS_MAX
+
+
+@pytest.mark.parametrize("call", [LOOK, ASK])
+@pytest.mark.parametrize("late", [0, LOOKS_MAX - 1, LOOKS_MAX])
+def test_a_picture_that_waited_for_the_card_is_not_looked_at_and_a_new_one_is(
+    a_runner: Any, a_sidecar: Any, call: Any, late: int
+) -> None:
+    """Regression: only the detector's was looked at again, by the time that the answer took."""
+
+    async def story() -> tuple[str, list[float]]:
+        async with (
+            a_runner() as runner,
+            RunnerClient(runner.endpoint) as client,
+            a_sidecar("lab/eye") as sidecar,
+            DetectorClient(sidecar.endpoint) as detector,
+            SceneVlmClient(sidecar.endpoint) as vlm,
+        ):
+            sidecar.late = late
+            outcome = await Tools(client, detector, vlm)(call)
+            limits = [message["fresh_s"] for message in sidecar.messages if "fresh_s" in message]
+            return outcome.status, limits
+
+    looked = "not_seen" if call is LOOK else "answered"
+    found, limits = play(story)
+    assert (found, len(limits)) == ("no_frame" if late == LOOKS_MAX else looked, min(late + 1, LOOKS_MAX))
+    assert all(0.0 < limit < LOOKED_AT_MAX_S for limit in limits), "what the picture's age left of it"
+
+
 def test_what_was_seen_before_the_detector_was_loaded_is_no_place(
     a_runner: Any, a_sidecar: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -203,11 +258,11 @@ def test_what_was_seen_before_the_detector_was_loaded_is_no_place(
             sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]}]
             detect = detector.detect
 
-            async def loads_first(*arguments: Any) -> Any:
-                found = await detect(*arguments)
+            async def loads_first(*arguments: Any, **options: Any) -> Any:
+                found = await detect(*arguments, **options)
                 if sidecar.detections:  # meanwhile somebody takes it away
                     sidecar.detections = []
-                    now[0] += 2 * LOOK_AGAIN_S
+                    now[0] += 2 * PLACE_MAX_S
                 return found
 
             monkeypatch.setattr(detector, "detect", loads_first)

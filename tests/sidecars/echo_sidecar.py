@@ -2,6 +2,7 @@
 
 FOLDER tells it what to do: a file `fail_prepare`, `fail_load` or `fail_unload` makes that step fail, `slow_prepare`,
 `slow_load` or `slow_unload` makes it last. The query tells `run`: `hold NAME` waits until the file NAME appears there, `fail` raises; anything else is echoed.
+`query` is answered with what stands behind the picture's first eight bytes.
 """
 
 import sys
@@ -9,12 +10,13 @@ import threading
 from pathlib import Path
 
 from schemas.errors import BadRequest
+from schemas.sidecar import QueryOp
 from sidecars.__main__ import main
 
 
 class EchoAdapter:
     kind = "detector"
-    ops = frozenset({"detect", "get_action", "reset"})
+    ops = frozenset({"detect", "query", "get_action", "reset"})
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -45,6 +47,8 @@ class EchoAdapter:
     def run(self, call) -> dict[str, object]:
         if self._model is None:
             raise RuntimeError("run without a model")
+        if isinstance(call, QueryOp):
+            return {"ok": True, "answer": call.image[8:].decode()}
         query = getattr(call, "query", "get_action")
         if query == "fail":
             raise RuntimeError("the model fails as told")
