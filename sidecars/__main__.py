@@ -193,12 +193,13 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--idle-release-s",
         type=_number(float, 0.1, 86_400),
-        help="let go of a model that no request and no goal used for so long; default: never",
+        help="let go of a model that no request and no goal used for so long, so that one on standby comes back; default: never",
     )
     add(
         "--standby",
         action="store_true",
-        help="once evicted, load again by itself when there is room and nobody waits",
+        help="once evicted, load again by itself when there is room and nobody waits; it asks nobody to leave, so give what it leaves for "
+        "(a policy) --idle-release-s",
     )
     add(
         "--nice",

@@ -111,6 +111,8 @@ class SidecarHost:
         }
         if residency.on_standby:
             found["standby"] = True
+        if residency.wanted:
+            found["wanted"] = True
         if residency.last_error is not None:
             found["last_error"] = f"{residency.last_error.code}: {residency.last_error.message}"
         return found

@@ -156,6 +156,11 @@ class Residency:
         """Evicted, and it comes back by itself."""
         return self.lease is not None and self.lease.state == "standby"
 
+    @property
+    def wanted(self) -> bool:
+        """Somebody waits for the model, or its lease is called back for somebody who did; `unload` ends both."""
+        return self._turn.locked() or (self._calling is not None and not self._calling.done())
+
     async def leave(self) -> bool:
         """End of the process: after the op that runs, everything goes, the context included.
 

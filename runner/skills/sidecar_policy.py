@@ -40,6 +40,7 @@ from schemas.errors import (
     StaleToken,
     UnknownLease,
     VramError,
+    WaitTimeout,
 )
 from schemas.manifest import RSkillManifest
 from schemas.sidecar import LoadResult
@@ -235,10 +236,10 @@ class SidecarPolicy(SkillBase):
         """A goal that is over before the model is there takes its load back: nobody else leaves the card for it."""
         try:
             return await self._client.load(timeout_s=goal.deadline_s or None)
-        except asyncio.CancelledError:
+        except (asyncio.CancelledError, WaitTimeout):  # a policy on standby is called back behind its request
             with contextlib.suppress(VramError, TimeoutError):
                 async with asyncio.timeout(WITHDRAW_S):
-                    if (await self._client.ping())["state"] in ("waiting", "loading"):
+                    if (await self._client.ping()).get("wanted"):
                         await self._client.unload()
             raise
 

@@ -22,10 +22,14 @@ import pytest
 from arbiter.testing.fakegpu_check import check_log
 from arbiter.testing.process import ArbiterProcess
 from clients.aio import ArbiterClient
-from clients.runner import Goal, RunnerClient
+from clients.runner import Goal as AcceptedGoal
+from clients.runner import RunnerClient
 from clients.sidecar.perception import DetectorClient
 from clients.sidecar.policy import PolicyClient
+from runner.protocols import Goal
+from runner.skills.sidecar_policy import SidecarPolicy, wire_up
 from schemas.errors import GoalRejected, UnknownSkill, WaitTimeout
+from schemas.manifest import parse_manifest
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(295)]
 
@@ -89,13 +93,13 @@ class Programs:
     def up(self) -> None:
         for flag in ("hold", "holding", "fail", "fail_load", "slow_load"):
             self.tell(flag, False)
-        self._sidecar("detector", DETECTOR_BYTES, "--standby", "--min-residency-s", "0")
-        self._sidecar("policy", POLICY_BYTES, "--idle-release-s", "0.2", "--min-residency-s", "1")
+        self.sidecar("detector", DETECTOR_BYTES, "--standby", "--min-residency-s", "0")
+        self.sidecar("policy", POLICY_BYTES, "--idle-release-s", "0.2", "--min-residency-s", "1")
         skills = [str(self.runtime / "policy"), str(ROOT / "configs/rskills/so101-navigate")]
         self.start("runner", "-m", "runner", "sim", "--skills", *skills, "--seed", "1")
 
-    def _sidecar(self, name: str, size: int, *flags: str) -> None:
-        folder = self.runtime / name
+    def sidecar(self, model: str, size: int, *flags: str, name: str = "") -> None:
+        name, folder = name or model, self.runtime / model
         self.start(
             name, str(HERE / "episode_sidecar.py"), str(folder), "--name", name, "--rskill", f"{folder}/rskill.yaml",
             "--device", f"fake:{self.arbiter.card}", "--footprint", f"{size},{size},{CONTEXT_BYTES}", *flags,
@@ -202,7 +206,7 @@ class Stage:
     async def leases(self) -> dict[str, str]:
         return {view["consumer"]: view["state"] for view in (await self.arbiter.status())["leases"]}
 
-    async def goal_under_way(self, *, held: bool = True, deadline_s: float = DEADLINE_S) -> Goal:
+    async def goal_under_way(self, *, held: bool = True, deadline_s: float = DEADLINE_S) -> AcceptedGoal:
         """A goal that has its policy resident and in use, `held` inside a call of the model, and the detector away."""
         self.programs.tell("hold", held)
         goal = await self.runner.send_goal(SKILL, prompt="hold still", deadline_s=deadline_s)
@@ -397,6 +401,42 @@ def test_after_a_goal_the_detector_is_back_by_itself(
     programs: Programs, end: Callable[[Stage], Coroutine[Any, Any, None]]
 ) -> None:
     programs.play(end)
+
+
+async def called_back(stage: Stage) -> None:
+    """Of a policy that is on standby itself: its lease waits to come back, behind a look, when its goal is over."""
+    programs, manifest = stage.programs, parse_manifest(MANIFESTS["policy"])
+    programs.sidecar("policy", POLICY_BYTES, "--standby", "--min-residency-s", "0", name="spare")
+    joints = tuple(JOINTS.strip("[]").split(", "))
+    where = f"ipc://{programs.runtime}/spare.sock"
+    async with PolicyClient(where, connect_timeout_s=BOOT_S) as sidecar:
+        skill = SidecarPolicy(manifest, wire_up(manifest, joints, None), sidecar, stage.arbiter, period_s=0.1)
+        goal = Goal("g", SKILL, prompt="hold still", deadline_s=DEADLINE_S)
+        await skill.start(goal)
+        await skill.finish()
+        looking = await stage.detector.load()
+        assert await stage.leases() == {"spare": "standby", "detector": "held"}
+        assert (looking["lease_id"], looking["token"]) != (None, None)
+        async with stage.arbiter.use(looking["lease_id"] or "", looking["token"] or ()):
+            starting = asyncio.create_task(skill.start(goal))
+            while (await stage.leases())["spare"] != "queued":
+                await asyncio.sleep(0.02)
+            starting.cancel()
+            await asyncio.wait([starting])
+            assert starting.cancelled()
+            while "spare" in await stage.leases():
+                await asyncio.sleep(0.02)
+        while (await stage.leases()).get("detector") != "held":  # it had been asked to leave
+            await asyncio.sleep(0.02)
+        assert sum((e["kind"], e.get("consumer")) == ("granted", "spare") for e in stage.events) == 1
+
+
+def test_a_policy_is_called_back_from_standby_only_as_long_as_its_goal_wants_it(programs: Programs) -> None:
+    """Regression: the detector left the card for a goal that had been canceled, and stayed away."""
+    try:
+        programs.play(called_back)
+    finally:
+        programs.kill("spare")
 
 
 # -- while it runs -------------------------------------------------------------------------------------------------------

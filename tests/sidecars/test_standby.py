@@ -76,6 +76,7 @@ def test_a_request_whose_time_ends_does_not_end_the_standby(box, arbiter):
     late = detector.ask("load", timeout_s=0.2)
     assert (late["ok"], late["code"]) == (False, "wait_timeout")
     assert "vramctl why detector" in late["hint"]
+    assert detector.ask("ping")["wanted"], "it was wanted, and is on its way"
     assert state(arbiter, "policy") in ("held", "revoking"), "nobody is made to leave in the middle of a step"
     policy.let_go()
     assert policy.client.reply(running, PATIENCE_S)["ok"]
@@ -164,6 +165,25 @@ def test_told_to_unload_while_it_waits_it_waits_no_longer(box, arbiter):
     policy.let_go()
     assert policy.client.reply(running, PATIENCE_S)["ok"]
     assert detector.detect()["ok"], "the next request asks anew"
+
+
+def test_told_to_unload_while_it_is_called_back_it_is_called_back_no_longer(box, arbiter):
+    """Regression: it did not say that somebody waits for it, so a runner whose goal was canceled did not take its load back."""
+    detector, policy = sent_away(box, arbiter)
+    assert "wanted" not in detector.ask("ping"), "coming back by itself it is wanted by nobody"
+    running = policy.hold()
+    waiting = detector.send_detect()
+    until(lambda: state(arbiter, "detector") == "queued")
+    with WireClient(f"ipc://{box.runtime}/detector.sock") as other:
+        identity = other.reply(other.send("ping"), PATIENCE_S)
+        assert (identity["state"], identity["standby"], identity["wanted"]) == ("unloaded", True, True)
+        assert other.reply(other.send("unload"), PATIENCE_S)["ok"]
+    refused = detector.client.reply(waiting, PATIENCE_S)
+    assert (refused["ok"], refused["code"]) == (False, "not_resident")
+    assert "wanted" not in detector.ask("ping")
+    until(lambda: state(arbiter, "detector") is None)
+    policy.let_go()
+    assert policy.client.reply(running, PATIENCE_S)["ok"]
 
 
 def test_told_to_unload_while_it_loads_it_takes_the_load_back(box, arbiter):

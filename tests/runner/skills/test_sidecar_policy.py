@@ -22,6 +22,7 @@ from schemas.errors import (
     ManifestInvalid,
     ModelError,
     VramError,
+    WaitTimeout,
 )
 from schemas.manifest import RSkillManifest, parse_manifest
 from schemas.world import FrameEncoding, JointState, SensorFrame, WorldState
@@ -73,6 +74,7 @@ class Sidecar:
         self.load_error: VramError | None = None
         self.arbitrated = True
         self.state = "resident"
+        self.wanted = False  # somebody waits for the model
         self.loads: asyncio.Event | None = None  # set once a load has come, which is never answered
 
     @asynccontextmanager
@@ -120,6 +122,8 @@ class Sidecar:
         elif endpoint == "ping":
             reply = {"ok": True, "model": "m", "revision": "", "kind": "vla", "rskill": "test/arm-grab", "pid": 1,
                      "boot_id": "b", "state": self.state}  # fmt: skip
+            if self.wanted:
+                reply["wanted"] = True
         else:
             reply = {"ok": True}
         if "id" in message:
@@ -466,20 +470,37 @@ def test_a_chunk_that_is_asked_for_too_late_loads_nothing(
     scenario(run_async, bench(Arbiter()), play)
 
 
-@pytest.mark.parametrize(("state", "taken_back"), [("waiting", True), ("loading", True), ("resident", False)])
+@pytest.mark.parametrize("wanted", [True, False])
+@pytest.mark.parametrize("state", ["unloaded", "waiting", "resident"])
 def test_a_goal_that_is_over_before_its_policy_is_there_takes_the_load_back(
-    bench: Callable[..., Bench], run_async: Run, state: str, taken_back: bool
+    bench: Callable[..., Bench], run_async: Run, state: str, wanted: bool
 ) -> None:
-    """Regression: the sidecar went on and made others leave the card for a goal that had been canceled."""
+    """Regressions: the sidecar went on and made others leave the card for a goal that had been canceled; also one that was called back
+    from standby, or left in that moment, and said neither `waiting` nor `loading`."""
 
     async def play(b: Bench) -> None:
-        b.sidecar.state, b.sidecar.loads = state, asyncio.Event()
+        b.sidecar.state, b.sidecar.wanted, b.sidecar.loads = state, wanted, asyncio.Event()
         starting = asyncio.create_task(b.skill.start(GOAL))
         await b.sidecar.loads.wait()
         starting.cancel()
         with pytest.raises(asyncio.CancelledError):
             await starting
-        assert ("unload" in b.sidecar.calls) == taken_back
+        assert ("unload" in b.sidecar.calls) == wanted
+
+    scenario(run_async, bench(Arbiter()), play)
+
+
+def test_a_policy_that_does_not_come_in_time_is_not_wanted_any_more(
+    bench: Callable[..., Bench], run_async: Run
+) -> None:
+    """A sidecar that was called back from standby goes on waiting behind the request whose time ended."""
+
+    async def play(b: Bench) -> None:
+        b.sidecar.state, b.sidecar.wanted = "unloaded", True
+        b.sidecar.load_error = WaitTimeout("no room in time")
+        with pytest.raises(WaitTimeout):
+            await b.skill.start(GOAL)
+        assert b.sidecar.calls == ["load", "unload"]
 
     scenario(run_async, bench(Arbiter()), play)
 
