@@ -19,6 +19,7 @@ from typing import Any
 from arbiter.core import (
     deadlock,
     eviction,
+    expiry,
     explain,
     figures,
     gangs,
@@ -27,6 +28,7 @@ from arbiter.core import (
     invariants,
     measure,
     operators,
+    readings,
     recovery,
     requests,
     resizing,
@@ -146,11 +148,11 @@ class Arbiter:
                 on_died(core, event.process)
             # 1.3 the machine
             case MemorySampled():
-                measure.on_sample(core, event)
+                readings.on_sample(core, event)
                 growth.on_sample(core, event)
                 recovery.account_for_the_empty(core, event)
             case ProbeFailed():
-                measure.on_probe_failed(core, event)
+                readings.on_probe_failed(core, event)
             case JournalFailed():
                 on_journal_failed(core, event)
             case Recovered():
@@ -227,7 +229,7 @@ class Arbiter:
             kind, subject = due
             match kind:
                 case "ttl":
-                    measure.on_expiry_due(core, subject)
+                    expiry.on_expiry_due(core, subject)
                 case "wait":
                     requests.on_wait_timeout(core, subject)
                 case "revoke":
@@ -239,7 +241,7 @@ class Arbiter:
                 case "verify":
                     measure.on_poll_due(core, subject)
                 case "probe":
-                    measure.on_probe_due(core, subject)
+                    readings.on_probe_due(core, subject)
                 case "gang":
                     gangs.on_due(core, subject)
                 case "users":

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 
 from arbiter.core import costs, eviction, explain, families, gangs, growth, placement, policy, standby
 from arbiter.core.lease import Lease, LeaseState
-from arbiter.core.measure import note_pressure
+from arbiter.core.readings import note_pressure
 from arbiter.core.state import Core, Gpu
 from schemas.ids import LeaseId
 

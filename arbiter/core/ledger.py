@@ -217,7 +217,9 @@ class GpuLedger:
 
     def filled_bytes(self, process: ProcessKey) -> int:
         """What is booked for a process without what is only kept for leases of it that are not granted yet."""
-        account = self.accounts[process]
+        account = self.accounts.get(process)
+        if account is None:
+            return 0
         return max(account.charged_bytes - self._unfilled_bytes(account), account.residue_bytes)
 
     def _filled(self, account: Account) -> int:

@@ -10,8 +10,8 @@ from typing import Any
 
 from arbiter.core import eviction, explain, standby
 from arbiter.core.events import OperatorAsked
+from arbiter.core.expiry import expire
 from arbiter.core.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState, Order
-from arbiter.core.measure import expire
 from arbiter.core.requests import client_of, ended_error
 from arbiter.core.state import Core, Refused
 from schemas.ids import LeaseId

@@ -8,8 +8,9 @@ from dataclasses import replace
 
 from arbiter.core import families, standby
 from arbiter.core.events import BYE, ClientConnected, ClientLeft, JournalFailed
+from arbiter.core.expiry import lose
 from arbiter.core.lease import AWAY, EXPIRING, Lease, LeaseState
-from arbiter.core.measure import begin_for_residue, bereave, lose
+from arbiter.core.measure import begin_for_residue, bereave
 from arbiter.core.recovery import account_for
 from arbiter.core.requests import cancel_waiter, let_go
 from arbiter.core.state import Client, Core, Refused

@@ -79,43 +79,82 @@ class Verification:
         return {} if self.lease is None else {self.lease: self.kept_bytes}
 
 
+@dataclass(frozen=True, slots=True)
+class Others:
+    """What everybody else on the card may account for in a reading (`others.since_baseline`)."""
+
+    grown_bytes: int
+    """They may have taken so much since the baseline, by right: up to what they are charged. From the lists of both readings; where one
+    has no list, from the charges that began to be filled since. 0 without a baseline."""
+    left_bytes: int
+    """The most that may have gone from the card since the baseline with those of them who leave, have left, shrink, or are no longer
+    listed. 0 without a baseline."""
+    loading_bytes: int
+    """Charged for loads under way, and not seen to be there yet. 0 where lists say who grew."""
+    unfilled_bytes: int
+    """Charged for reservations that sub-leases are carved out of without another look at the card. 0 where the reading has a list."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Comparison:
+    """A reading beside the three targets that stand at the head of this file."""
+
+    used_bytes: int  # the card's total in the reading
+    ledger_bound_bytes: int  # a.
+    delta_bound_bytes: int | None  # b.; None: there is nothing to compare with
+    held_bytes: int | None  # what the reading shows of the process; None: it cannot say
+    expected_bytes: int  # c.: the most that this may be
+
+    def short_bytes(self) -> int:
+        """What did not come back; below 0: more came back than had to."""
+        short_bytes = self.used_bytes - self.ledger_bound_bytes
+        if self.delta_bound_bytes is not None:
+            short_bytes = max(short_bytes, self.used_bytes - self.delta_bound_bytes)
+        return short_bytes
+
+    def on_target(self, tolerance_bytes: int) -> bool:
+        """Does all that can be checked hold?"""
+        evident = self.held_bytes is None or self.held_bytes <= self.expected_bytes + tolerance_bytes
+        return evident and self.short_bytes() <= tolerance_bytes
+
+
 def judge(
-    v: Verification,
-    ledger: GpuLedger,
-    sample: MemorySampled,
-    grown_bytes: int,
-    unfilled_bytes: int,
-    tolerance_bytes: int,
-    loading_bytes: int = 0,
-    left_bytes: int = 0,
+    v: Verification, ledger: GpuLedger, sample: MemorySampled, others: Others, tolerance_bytes: int
 ) -> Judgement | None:
-    """Judge a counting reading. None: not yet. `grown_bytes`: what others may have grown since the baseline, by right.
-
-    `unfilled_bytes` of the charges are reservations. Where nothing but the ledger bound can be checked they must not hide what is still
-    there: what comes back to a reservation is carved out again without another look. `loading_bytes` are charged for a load under way, and
-    hide nothing either way. `left_bytes`: what others who leave, or have left, may have taken off the card since the baseline.
-    """
-    used = sample.used_bytes
-    stable = v.last_used_bytes is not None and abs(used - v.last_used_bytes) <= tolerance_bytes
-    v.last_used_bytes = used
-    expected = ledger.process_after_bytes(v.process, v.going(), dead=v.vanishes)
-    held = process_bytes(sample, v.process)
-    bound_a = ledger.total_after_bytes(v.process, v.going(), dead=v.vanishes) + ledger.driver_bytes()
-    bound_a -= loading_bytes + _doubtful_bytes(v, ledger, sample, expected, left_bytes, tolerance_bytes)
-    bound_b = _delta_bound(v, ledger, expected, grown_bytes)
-    if bound_b is None:
-        bound_a -= unfilled_bytes
-    short_bytes = max(used - bound_a, 0 if bound_b is None else used - bound_b)
-    evident = held is None or held <= expected + tolerance_bytes
-    v.settling = short_bytes <= tolerance_bytes and evident and sample.taken_at >= v.not_before
-    if short_bytes <= tolerance_bytes and evident:
+    """Judge a counting reading, and remember it for the one that has to agree. None: not yet."""
+    found = _compare(v, ledger, sample, others, tolerance_bytes)
+    stable = v.last_used_bytes is not None and abs(found.used_bytes - v.last_used_bytes) <= tolerance_bytes
+    v.last_used_bytes = found.used_bytes
+    on_target = found.on_target(tolerance_bytes)
+    v.settling = on_target and sample.taken_at >= v.not_before
+    if on_target:
         return Judgement(Verdict.VERIFIED, True, v.kept_bytes) if stable and v.settling else None
-    if not v.overdue:
-        return None
-    return _late(v, ledger, sample, expected, held, short_bytes, bound_a, bound_b, tolerance_bytes)
+    return _late(v, ledger, sample, found, tolerance_bytes) if v.overdue else None
 
 
-def _delta_bound(v: Verification, ledger: GpuLedger, expected: int, grown_bytes: int) -> int | None:
+# -- what a reading should show ----------------------------------------------------------------------------------------
+def _compare(
+    v: Verification, ledger: GpuLedger, sample: MemorySampled, others: Others, tolerance_bytes: int
+) -> _Comparison:
+    """Loads under way hide nothing: neither bound allows for bytes that may not have come yet.
+
+    Nor do reservations where nothing but the ledger bound can be checked: what comes back to one is carved out again without another look.
+    """
+    expected = ledger.process_after_bytes(v.process, v.going(), dead=v.vanishes)
+    ledger_bound = ledger.total_after_bytes(v.process, v.going(), dead=v.vanishes) + ledger.driver_bytes()
+    ledger_bound -= others.loading_bytes
+    ledger_bound -= _doubtful_bytes(v, ledger, sample, expected, others.left_bytes, tolerance_bytes)
+    delta_bound = _delta_bound(v, ledger, expected)
+    if delta_bound is None:
+        ledger_bound -= others.unfilled_bytes
+    else:
+        delta_bound += others.grown_bytes - others.loading_bytes
+    held = process_bytes(sample, v.process)
+    return _Comparison(sample.used_bytes, ledger_bound, delta_bound, held, expected)
+
+
+def _delta_bound(v: Verification, ledger: GpuLedger, expected: int) -> int | None:
+    """What the baseline showed, less what the process held then and should not any more. None: no baseline can tell."""
     if v.baseline is None:
         return None
     held_then = process_bytes(v.baseline, v.process)
@@ -123,7 +162,7 @@ def _delta_bound(v: Verification, ledger: GpuLedger, expected: int, grown_bytes:
         if not v.baseline_comparable:
             return None
         held_then = _may_hold(v, ledger, v.baseline)
-    return v.baseline.used_bytes - (held_then - expected) + grown_bytes
+    return v.baseline.used_bytes - (held_then - expected)
 
 
 def _doubtful_bytes(
@@ -154,44 +193,45 @@ def _may_hold(v: Verification, ledger: GpuLedger, sample: MemorySampled) -> int:
     return min(ledger.filled_bytes(v.process), sample.used_bytes if hidden is None else hidden)
 
 
+# -- the time is up ------------------------------------------------------------------------------------------------------
 def _late(
-    v: Verification,
-    ledger: GpuLedger,
-    sample: MemorySampled,
-    expected: int,
-    held: int | None,
-    short_bytes: int,
-    bound_a: int,
-    bound_b: int | None,
-    tolerance_bytes: int,
+    v: Verification, ledger: GpuLedger, sample: MemorySampled, found: _Comparison, tolerance_bytes: int
 ) -> Judgement:
-    """The time is up. Say whose bytes these are, as far as this backend can tell."""
-    if held is not None:
+    """Say whose bytes these are, as far as this backend can tell."""
+    held = found.held_bytes
+    if held is None:
+        return _late_by_total(v, sample, found, tolerance_bytes)
+    if held > found.expected_bytes + tolerance_bytes:
         name = next(
             (use.name for use in sample.processes or () if use.process.pid == v.process.pid), v.consumer
         )
-        if held > expected + tolerance_bytes:
-            culprits = ((v.process.pid, name, held),)
-            if v.alive:
-                return _residue(v, sample, held, culprits)
-            return Judgement(Verdict.CONTESTED, False, held, culprits)
-        grown = grown_since(v, ledger, sample)
-        missing = _missing_bytes(v, ledger, sample, bound_a, bound_b)
-        if v.alive and is_hidden(sample, v.process):
-            stays = _may_hold(v, ledger, sample)
-            if bound_b is not None:
-                stays = min(stays, expected + missing)
-            if stays > expected + tolerance_bytes:
-                return _residue(v, sample, stays)
-        # a driver leaves a dying process out of its list before it has freed its bytes: what nobody has taken may be on its way still
-        freeing = not v.alive and sample.taken_at < v.deadline_at + DYING_S
-        return Judgement(Verdict.CONTESTED, not freeing or missing <= tolerance_bytes, v.kept_bytes, grown)
-    if bound_b is None:
+        culprits = ((v.process.pid, name, held),)
+        if v.alive:
+            return _residue(v, sample, held, culprits)
+        return Judgement(Verdict.CONTESTED, False, held, culprits)
+    missing = _missing_bytes(v, ledger, sample, found)
+    if v.alive and is_hidden(sample, v.process):
+        stays = _may_hold(v, ledger, sample)
+        if found.delta_bound_bytes is not None:
+            stays = min(stays, found.expected_bytes + missing)
+        if stays > found.expected_bytes + tolerance_bytes:
+            return _residue(v, sample, stays)
+    # a driver leaves a dying process out of its list before it has freed its bytes: what nobody has taken may be on its way still
+    freeing = not v.alive and sample.taken_at < v.deadline_at + DYING_S
+    resolved = not freeing or missing <= tolerance_bytes
+    return Judgement(Verdict.CONTESTED, resolved, v.kept_bytes, _grown_since(v, ledger, sample))
+
+
+def _late_by_total(
+    v: Verification, sample: MemorySampled, found: _Comparison, tolerance_bytes: int
+) -> Judgement:
+    """The reading names nobody: only the total can tell."""
+    if found.delta_bound_bytes is None:
         return Judgement(Verdict.UNVERIFIABLE, False, v.kept_bytes)
     if v.alive:
-        return _residue(v, sample, expected + short_bytes)
+        return _residue(v, sample, found.expected_bytes + found.short_bytes())
     # a dead process holds nothing for ever: if the ledger explains the card, what is left belongs to others
-    return Judgement(Verdict.CONTESTED, sample.used_bytes <= bound_a + tolerance_bytes, 0)
+    return Judgement(Verdict.CONTESTED, found.used_bytes <= found.ledger_bound_bytes + tolerance_bytes, 0)
 
 
 def _residue(
@@ -201,21 +241,21 @@ def _residue(
     return Judgement(Verdict.RESIDUE, sample.taken_at >= v.fenced_at, stays, culprits)
 
 
-def _missing_bytes(
-    v: Verification, ledger: GpuLedger, sample: MemorySampled, bound_a: int, bound_b: int | None
-) -> int:
+def _missing_bytes(v: Verification, ledger: GpuLedger, sample: MemorySampled, found: _Comparison) -> int:
     """What did not come back, less what others visibly took beyond what they are charged; up to that they may grow, and were allowed for."""
-    if bound_b is None or v.baseline is None:
-        return sample.used_bytes - bound_a
+    if found.delta_bound_bytes is None or v.baseline is None:
+        return found.used_bytes - found.ledger_bound_bytes
     taken = 0
     for use in sample.processes or ():
         if use.process.pid != v.process.pid:
             then = process_bytes(v.baseline, use.process) or 0
             taken += max(0, (use.used_bytes or 0) - max(then, ledger.booked_by(use.process)))
-    return max(sample.used_bytes - bound_a, sample.used_bytes - bound_b - taken)
+    return max(
+        found.used_bytes - found.ledger_bound_bytes, found.used_bytes - found.delta_bound_bytes - taken
+    )
 
 
-def grown_since(
+def _grown_since(
     v: Verification, ledger: GpuLedger, sample: MemorySampled
 ) -> tuple[tuple[int, str, int], ...]:
     """Others that hold more than at the baseline, the largest first: (pid, name, bytes grown)."""
