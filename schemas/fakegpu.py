@@ -257,10 +257,13 @@ def _first(error: ValidationError) -> str:
     return f"{'.'.join(str(part) for part in problem['loc']) or 'the text'}: {problem['msg']}"
 
 
-def parse_stat(text: str) -> tuple[bool, int]:
-    """(alive, start_ticks) of the text of /proc/PID/stat. A zombie is dead: the kernel has taken its memory already."""
-    fields = text.rpartition(")")[2].split()
-    return fields[0] not in "ZXx", int(fields[19])
+def parse_stat(stat: bytes) -> tuple[bool, int]:
+    """(alive, start_ticks) of /proc/PID/stat. A zombie is dead: the kernel has taken its memory already.
+
+    Bytes, because the name in it is cut after 15 of them, perhaps in the middle of a letter.
+    """
+    fields = stat.rpartition(b")")[2].split()
+    return fields[0] not in b"ZXx", int(fields[19])
 
 
 # -- transitions -----------------------------------------------------------------------------------------------------

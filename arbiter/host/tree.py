@@ -47,15 +47,12 @@ class Known:
         )
 
 
-NOBODY = Known(frozenset(), frozenset())
-
-
 def read_kin(pid: int) -> Kin | None:
     """From /proc/PID/stat; None if there is no such process or it cannot be seen from here."""
     try:
-        text = Path(f"/proc/{pid}/stat").read_text(errors="replace")
-        name, _, rest = text.partition("(")[2].rpartition(")")
-        return Kin(ProcessKey(pid, parse_stat(text)[1]), int(rest.split()[1]), name)
+        stat = Path(f"/proc/{pid}/stat").read_bytes()
+        name, _, rest = stat.partition(b"(")[2].rpartition(b")")
+        return Kin(ProcessKey(pid, parse_stat(stat)[1]), int(rest.split()[1]), name.decode(errors="replace"))
     except (OSError, IndexError, ValueError):
         return None
 

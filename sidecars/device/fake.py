@@ -128,7 +128,7 @@ class FakeMemory:
 def _start_ticks(pid: int) -> int | None:
     """Start time of a living process; None if it is dead."""
     try:
-        alive, start_ticks = fakegpu.parse_stat(Path(f"/proc/{pid}/stat").read_text())
+        alive, start_ticks = fakegpu.parse_stat(Path(f"/proc/{pid}/stat").read_bytes())
     except (FileNotFoundError, ProcessLookupError):
         return None
     return start_ticks if alive else None

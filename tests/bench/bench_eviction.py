@@ -79,7 +79,7 @@ def give_back(card: Path, lag_s: float) -> float:
 
 
 def _me() -> dict[str, object]:
-    _, ticks = fakegpu.parse_stat(Path("/proc/self/stat").read_text())
+    _, ticks = fakegpu.parse_stat(Path("/proc/self/stat").read_bytes())
     return {"pid": os.getpid(), "start_ticks": ticks, "name": "bench"}
 
 

@@ -9,7 +9,7 @@ import os
 import threading
 import time
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from arbiter.core.events import ProcessUse
@@ -180,16 +180,7 @@ def _tail(log: Path) -> str:
 
 def _alive(key: ProcessKey) -> bool:
     try:
-        alive, start_ticks = fakegpu.parse_stat(Path(f"/proc/{key.pid}/stat").read_text())
+        alive, start_ticks = fakegpu.parse_stat(Path(f"/proc/{key.pid}/stat").read_bytes())
     except (FileNotFoundError, ProcessLookupError):
         return False
     return alive and key.start_ticks in (0, start_ticks)
-
-
-def card_texts(folder: Path) -> Mapping[str, str]:
-    """All texts of a card, read under its lock: for tests and for people who look inside."""
-    with locked(folder):
-        names = [
-            name for name in os.listdir(folder) if name == fakegpu.CARD_FILE or fakegpu.is_process_file(name)
-        ]
-        return {name: (folder / name).read_text() for name in names}

@@ -69,7 +69,7 @@ class PidMap:
 def process_key(proc: Path, pid: int) -> ProcessKey:
     """With the start time if the process can be seen from here."""
     try:
-        return ProcessKey(pid, parse_stat((proc / str(pid) / "stat").read_text())[1])
+        return ProcessKey(pid, parse_stat((proc / str(pid) / "stat").read_bytes())[1])
     except (OSError, IndexError, ValueError):
         return ProcessKey(pid, 0)
 

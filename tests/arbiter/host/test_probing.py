@@ -12,7 +12,7 @@ import pytest
 from arbiter.core import events as ev
 from arbiter.host.gpu.probe import Card, Reading
 from arbiter.host.probing import Prober, within
-from arbiter.host.tree import NOBODY, Known, read_kin
+from arbiter.host.tree import Known, read_kin
 from schemas.errors import NoGpu, ProbeFailed
 from schemas.ids import GpuId, ProcessKey
 
@@ -51,7 +51,7 @@ Posted = "asyncio.Queue[ev.Event]"
 def probing(
     test: Callable[[Prober, ScriptedProbe, Posted], Awaitable[None]],
     deadline_s: float = PATIENCE_S,
-    known: Callable[[GpuId], Known] = lambda _: NOBODY,
+    known: Callable[[GpuId], Known] = lambda _: Known(frozenset(), frozenset()),
 ) -> None:
     async def run() -> None:
         probe = ScriptedProbe()

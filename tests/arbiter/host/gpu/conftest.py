@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -31,3 +32,26 @@ def nvml(nvml_library: Path, tmp_path: Path) -> Iterator[NvmlStub]:
     stub.write()
     yield stub
     stub.write()  # lets a hanging call return
+
+
+NAMED = """
+open("/proc/self/comm", "wb").write("abcdefghijklmnü".encode())
+print("named", flush=True)
+input()
+"""
+
+
+@pytest.fixture
+def half_a_letter() -> Iterator[int]:
+    """The pid of a process whose name the kernel cut after 15 bytes, in the middle of a letter."""
+    with subprocess.Popen(
+        [sys.executable, "-c", NAMED],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    ) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == b"named\n"
+        assert b"(abcdefghijklmn\xc3)" in Path(f"/proc/{child.pid}/stat").read_bytes()
+        yield child.pid
+        child.kill()

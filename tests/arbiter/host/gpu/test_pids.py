@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from arbiter.host.gpu.pids import INITIAL_NAMESPACE, PidMap
+from arbiter.rpc.peer import start_ticks
 from schemas.ids import ProcessKey
 
 
@@ -56,6 +57,15 @@ def test_in_a_container_a_host_pid_leads_to_one_of_ours(container: tuple[Path, P
     assert PidMap(host_proc=host, proc=own).translate(500) == (ProcessKey(7, 1111), "detector -m serve")
 
 
+def test_in_a_container_a_name_that_ends_in_half_a_letter_makes_no_stowaway(
+    container: tuple[Path, Path],
+) -> None:
+    own, host = container
+    for stat in (own / "7" / "stat", host / "500" / "stat"):
+        stat.write_bytes(stat.read_bytes().replace(b"detector", b"abcdefghijklmn\xc3"))
+    assert PidMap(host_proc=host, proc=own).translate(500)[0] == ProcessKey(7, 1111)
+
+
 def test_in_a_container_others_are_never_taken_for_one_of_ours(
     container: tuple[Path, Path], caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -90,3 +100,9 @@ def test_this_very_process_is_found_with_the_real_proc() -> None:
     assert key.pid == os.getpid()
     assert key.start_ticks > 0
     assert "py" in name
+
+
+def test_a_name_that_is_cut_in_the_middle_of_a_letter_hides_no_start_time(half_a_letter: int) -> None:
+    key, _ = PidMap("own").translate(half_a_letter)
+    assert key == ProcessKey(half_a_letter, start_ticks(half_a_letter) or 0)
+    assert key.start_ticks > 0
