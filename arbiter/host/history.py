@@ -26,7 +26,8 @@ FLUSH_S = 0.2
 SKIPPED_AFTER_CRASH = 2000
 """Numbers left out after a start that no stop preceded: those of the last, unwritten events may be known to subscribers."""
 BUFFER_MAX = 20_000
-"""Events waiting for a disk that does not answer; beyond this the oldest are dropped and counted."""
+"""Events with the thread, and again as many waiting for it, while a disk does not answer; beyond this the oldest are dropped. The gap in
+their numbers shows it."""
 PRUNE_EVERY_EVENTS = 2000
 CLOSE_S = 5.0
 AT_ONCE = frozenset({"operator"})
@@ -64,6 +65,8 @@ class History:
         self._ring: deque[Event] = deque(maxlen=RING_EVENTS)
         self._buffer: deque[Event] = deque(maxlen=BUFFER_MAX)
         self._work: queue.SimpleQueue[Sequence[Event] | _Question | None] = queue.SimpleQueue()
+        self._handed = 0  # events given to the thread; the loop alone counts
+        self._taken = 0  # of those, by the thread; it alone counts
         self._thread: threading.Thread | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -126,7 +129,7 @@ class History:
 
     def close(self) -> None:
         """Write what is left and end the thread."""
-        self._flush()
+        self._flush(last=True)
         if self._timer is not None:
             self._timer.cancel()
         if self._thread is not None:
@@ -135,13 +138,18 @@ class History:
             self._thread = None
         self._loop = None
 
-    def _flush(self) -> None:
+    def _flush(self, *, last: bool = False) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        if self._buffer and self._thread is not None:
+        if not self._buffer or self._thread is None:
+            return
+        if last or self._handed - self._taken + len(self._buffer) <= BUFFER_MAX:
+            self._handed += len(self._buffer)
             self._work.put(tuple(self._buffer))
             self._buffer.clear()
+        elif self._loop is not None:  # the thread hangs in a write
+            self._timer = self._loop.call_later(FLUSH_S, self._flush)
 
     # -- the thread ----------------------------------------------------------------------------------------------
     def _run(self, store: "_Store") -> None:
@@ -155,6 +163,7 @@ class History:
                     }
                     self._answer(work.done, body)
                 else:
+                    self._taken += len(work)
                     owed.extend(work)
                     store.add(tuple(owed))
                     owed.clear()

@@ -1,13 +1,14 @@
 """Events are numbered for ever, found in memory or on disk, and bounded by number and age."""
 
 import asyncio
+import threading
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from arbiter.host import history as module
-from arbiter.host.history import CLEAN_END, RING_EVENTS, SKIPPED_AFTER_CRASH, History
+from arbiter.host.history import BUFFER_MAX, CLEAN_END, RING_EVENTS, SKIPPED_AFTER_CRASH, History
 
 PATIENCE_S = 60.0
 
@@ -174,3 +175,41 @@ def test_without_a_disk_it_lives_in_memory(tmp_path: Path) -> None:
         assert (await read(history))["events"][0]["seq"] == 6
 
     with_history(tmp_path, test)
+
+
+class HangingDisk:
+    """A store whose first write hangs until it is let go; from then on it takes what it is given."""
+
+    def __init__(self) -> None:
+        self.hangs, self.goes_on = threading.Event(), threading.Event()
+        self.written: list[int] = []
+
+    def add(self, events: Sequence[Mapping[str, Any]]) -> None:
+        self.hangs.set()
+        assert self.goes_on.wait(PATIENCE_S)
+        self.written += [event["seq"] for event in events]
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_disk_that_hangs_lets_no_more_pile_up_than_the_bound() -> None:
+    disk = HangingDisk()
+
+    async def run() -> None:
+        history = History(cast(Any, disk), 0)
+        history.start(asyncio.get_running_loop())
+        history.append("operator", {})
+        assert await asyncio.to_thread(disk.hangs.wait, PATIENCE_S)
+        for _ in range(4 * BUFFER_MAX):
+            history.append("operator", {})  # each asks to be written at once
+        disk.goes_on.set()
+        newest = history.last_seq
+        async with asyncio.timeout(PATIENCE_S):
+            while not disk.written or disk.written[-1] != newest:
+                await asyncio.sleep(0.01)
+        history.close()
+        assert len(disk.written) <= 2 * BUFFER_MAX + 1
+        assert disk.written == sorted(disk.written), "in order, with a gap in their numbers"
+
+    asyncio.run(run())
