@@ -93,7 +93,6 @@ class RouterServer:
         self._drain_scheduled = False
         self._resting: asyncio.TimerHandle | None = None
         self._early: deque[list[zmq.Frame]] = deque()
-        self.dropped = 0
 
     def bind(self) -> None:
         """Bind with mode 0660 from the first instant. The caller holds the lock. Raises ConfigError."""
@@ -155,7 +154,6 @@ class RouterServer:
         except zmq.ZMQError as error:
             if error.errno not in (errno.EHOSTUNREACH, errno.EAGAIN):
                 raise
-            self.dropped += 1
             return False
         finally:
             self._schedule_drain()

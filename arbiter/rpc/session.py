@@ -89,7 +89,6 @@ class Session:
     heard_at: float
     seq: int = 0
     leased: bool = False  # it asked for a lease at least once: never dropped for being silent
-    undelivered: int = 0
 
 
 class SessionTable:
@@ -335,8 +334,7 @@ class SessionTable:
             del self._moved[old]
 
     def _send(self, session: Session, payload: bytes) -> None:
-        if not self._wire.send(session.routing_id, session.delimiter, payload):
-            session.undelivered += 1
+        self._wire.send(session.routing_id, session.delimiter, payload)
 
     def _refuse_raw(
         self, routing_id: bytes, delimiter: bool, request_id: int | None, error: VramError

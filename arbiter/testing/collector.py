@@ -112,10 +112,6 @@ class Collector:
                     f"metrics: {sorted({p.metric for p in self._points})}"
                 )
 
-    def wait_for_span(self, name: str, count: int = 1) -> list[ReceivedSpan]:
-        self.wait(lambda: len(self.spans(name)) >= count, f"{count} span(s) {name}")
-        return self.spans(name)
-
     def _take(self, path: str, body: bytes) -> None:
         spans = decode_spans(body) if path == "/v1/traces" else []
         points = decode_points(body) if path == "/v1/metrics" else []
