@@ -110,9 +110,10 @@ class Residency:
             self._obtaining.cancel()
         elif self.lease is not None:
             await self.lease.give_up()
-        elif self.state == "resident":
-            async with self._turn:
-                await self._unload()
+        elif self._client is None:
+            async with self._turn:  # a load that is under way takes itself back
+                if self.state == "resident":
+                    await self._unload()
 
     async def run(
         self,
@@ -233,6 +234,10 @@ class Residency:
         try:
             lease = await self._obtaining
             self.state, self.lease = "loading", lease
+            if unloads != self._unloads:  # told so in the moment of the grant
+                if lease is not None:
+                    await lease.release()
+                raise self._unwanted()
             await self._load(lease)
         except BaseException as error:
             self.state = "unloaded"
@@ -363,17 +368,21 @@ class Residency:
             await self._load_measured(lease)
 
     async def _load_measured(self, lease: Lease | None) -> None:
-        began = time.monotonic()
+        began, unloads = time.monotonic(), self._unloads
+
+        def given_up() -> bool:
+            return unloads != self._unloads if lease is None else lease.given_up
+
         try:
             loads = await self._worker.run(self._load_blocking)
             measured = await self._worker.run(self._memory.used_bytes)
             if lease is not None:
                 await lease.ready(measured)
-            if loads != self._loads or (lease is not None and (lease.given_up or lease.state == "gone")):
+            if loads != self._loads or given_up() or (lease is not None and lease.state == "gone"):
                 raise self._unwanted()  # it was unloaded while the arbiter was told of it
         except BaseException as error:
             await self._take_back(lease, error)
-            if lease is not None and lease.given_up:
+            if given_up():
                 _log.info("the load was taken back")
                 raise self._unwanted() from None
             _log.error("loading failed: %s", error)
