@@ -164,11 +164,20 @@ class SkillEnded:
 
 # -- whoever follows a goal ------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
+class Transition:
+    """A step of a world that is no robot: what it showed before, and what it was sent, by name, in its own units. `sent` empty: time stood still."""
+
+    shown: Mapping[str, float]
+    sent: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
 class GoalTick:
     """One tick in which a goal's skill was asked, when it is over. Nothing in it changes any more: it may be read on any thread.
 
     `targets` are the joint targets in force now, rad by joint: a joint that got no new one keeps its last. A joint that nobody has
     told anything yet is not among them. `base_velocity` is what the base was told for this tick (m/s, m/s, rad/s); None: it has none.
+    `transition` stands for joint state and targets where there is no robot.
     """
 
     goal: Goal
@@ -176,6 +185,7 @@ class GoalTick:
     result: TickResult
     targets: Mapping[str, float]
     base_velocity: tuple[float, float, float] | None = None
+    transition: Transition | None = None
 
 
 class TickSink(Protocol):

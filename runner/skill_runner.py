@@ -30,6 +30,7 @@ from runner.protocols import (
     SkillEnded,
     Stepped,
     TickSink,
+    Transition,
 )
 from schemas import meters, telemetry, tracing
 from schemas.errors import EstopRequested, InternalError, LimitExceeded, ModelError, VramError
@@ -213,6 +214,10 @@ class SkillRunner(RunnerBase):
         """What the base was told in this tick (m/s, m/s, rad/s); None for a robot that has none."""
         return None
 
+    def _transition(self) -> Transition | None:
+        """This tick's step of a world that is no robot."""
+        return None
+
     def _tell_end(self, active: Active, ended: SkillEnded | None) -> None:
         if self.sink is None:
             return
@@ -227,8 +232,8 @@ class SkillRunner(RunnerBase):
         if self.sink is None:
             return
         if asked is not None and self.world is not None:
-            told = self._base_told(decision)
-            self.sink.tick(GoalTick(asked.goal, self.world, result, dict(self._targets_now()), told))
+            told, targets = self._base_told(decision), dict(self._targets_now())
+            self.sink.tick(GoalTick(asked.goal, self.world, result, targets, told, self._transition()))
         if over is not None:
             self.sink.goal_ended(*over)
 

@@ -9,12 +9,15 @@ import logging
 import os
 import signal
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from clients.configs import configs_folder
 from runner import frames
 from runner.skill_runner import SkillRunner
 from schemas.errors import ArbiterUnreachable, ConfigError
+
+if TYPE_CHECKING:
+    from runner.dataset.recorder import DatasetRecorder
 
 log = logging.getLogger("runner")
 
@@ -123,7 +126,7 @@ async def connect_arbiter(endpoint: str | None, stack: contextlib.AsyncExitStack
 
 async def record_into(
     folder: Path, runner: SkillRunner, rate_hz: float, robot: str, stack: contextlib.AsyncExitStack
-) -> None:
+) -> DatasetRecorder:
     """Record the runner's goals, from before its control thread starts until after it has ended. `rate_hz` 0: as fast as possible.
 
     Raises ConfigError for a folder or a rate that nothing can be recorded with, AlreadyRunning when somebody else records there.
@@ -133,7 +136,7 @@ async def record_into(
     recorder = DatasetRecorder(
         folder,
         rate_hz=rate_hz or AS_FAST_AS_POSSIBLE_HZ,
-        cameras=runner.camera_names(),
+        cameras=runner.camera_names,
         robot=robot,
         patient=rate_hz == 0,
     )
@@ -146,6 +149,7 @@ async def record_into(
     stack.push_async_callback(asyncio.to_thread, recorder.close)
     runner.sink = recorder
     runner.save_dir = str(recorder.root)
+    return recorder
 
 
 def default_skills() -> Path:

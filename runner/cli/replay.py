@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from runner.dataset.reader import Recorded, read_frame
+from runner.dataset.rows import ROBOT
 from schemas.errors import ConfigError
 
 TRACE_URL_VARIABLE = "VRAM_TRACE_URL"
@@ -91,10 +92,14 @@ def as_text(recorded: Recorded, link: str | None) -> str:
     lines.append(("times", ", ".join(f"{name} {ms:.2f} ms" for name, ms in recorded.timings_ms.items())))
     if tick["violations"]:
         lines.append(("safety", tick["violations"]))
-    lines += [
-        ("joint", f"{name}: at {value:+.4f} rad, told {recorded.action[name]:+.4f}")
-        for name, value in recorded.state.items()
-    ]
+    if recorded.units == ROBOT:
+        lines += [
+            ("joint", f"{name}: at {value:+.4f} rad, told {recorded.action[name]:+.4f}")
+            for name, value in recorded.state.items()
+        ]
+    else:  # a world's own numbers, and what it was sent: neither need have anything to do with the other
+        lines += [("shown", f"{name}: {value:+.4g}") for name, value in recorded.state.items()]
+        lines += [("sent", f"{name}: {value:+.4g}") for name, value in recorded.action.items()]
     lines += [
         ("base", f"{what}: " + ", ".join(f"{name} {value:+.3f}" for name, value in values.items()))
         for what, values in recorded.base.items()

@@ -59,7 +59,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     sim.add_argument("--seed", type=int, default=0, help="decides everything about the episode")
     sim.add_argument(
         "--record", type=Path, metavar="DIR",
-        help="write every goal as an episode of the LeRobotDataset in this folder; a new one, or one of an earlier recording",
+        help="write every goal, or episode of --policy, as an episode of the LeRobotDataset in this folder; a new one, or one of an earlier recording",
     )  # fmt: skip
     sim.add_argument("--video", type=Path, help="write the episode as H.264 video to this file")
     sim.add_argument(
@@ -102,10 +102,6 @@ async def run(args: argparse.Namespace) -> int:
     )
     if args.episodes is not None and args.policy is None:
         raise ConfigError("--episodes is for --policy; goals end their episodes themselves")
-    if args.record is not None and (args.policy is not None or world.arm is None):
-        raise ConfigError(
-            "--record is for goals in our own scene", hint="leave out --policy, and --env or say --env so101"
-        )
     check_output("--video", args.video)
     check_output("--timings", args.timings)
     policy = None if args.policy is None else policy_of(args.policy)
@@ -115,6 +111,7 @@ async def run(args: argparse.Namespace) -> int:
     wait_s = LOCKSTEP_WAIT_S if args.lockstep or args.rate == 0 else 0.0
     clock = SystemClock()
 
+    dataset = None
     async with contextlib.AsyncExitStack() as stack:
         alone = args.no_arbiter or policy is not None  # such a policy holds no memory of a card
         arbiter = None if alone else await connect_arbiter(args.arbiter, stack)
@@ -142,7 +139,7 @@ async def run(args: argparse.Namespace) -> int:
             runner.recorder = recorder  # from its first step on: it may be over before anybody asks
         runner.trace_ticks = args.trace_ticks
         if args.record is not None:
-            await record_into(args.record, runner, args.rate, str(runner.identity["robot"]), stack)
+            dataset = await record_into(args.record, runner, args.rate, str(runner.identity["robot"]), stack)
         control = await stack.enter_async_context(ControlThread(runner))
         await asyncio.to_thread(warm_up)
         await ready(control)
@@ -183,6 +180,8 @@ async def run(args: argparse.Namespace) -> int:
             raise ConfigError(f"--timings {args.timings} cannot be written: {error}") from error
     if runner.policy_error is not None:
         raise runner.policy_error
+    if policy is not None and dataset is not None and dataset.error is not None:
+        raise dataset.error  # it was played for the recording; goals are served whatever becomes of theirs
     return 1 if control.ended.exception() is not None else 0
 
 

@@ -34,17 +34,15 @@ def features_of(row: Row) -> Features:
 
     Only cameras' columns may have `image` in their names: lerobot takes the statistics of all such for those of pictures.
     """
-    joints = row["joints"]
-    features: Features = {
-        "observation.state": _vector("float32", joints),
-        "action": _vector("float32", joints),
-    }
+    features: Features = {"action": _vector("float32", row["action_names"])}
+    if row["state_names"]:  # a world may show nothing but pictures
+        features = {"observation.state": _vector("float32", row["state_names"])} | features
     for frame in row["frames"]:
         height, width = frame["height"], frame["width"]
         if height % 2 or width % 2:
             raise ConfigError(
                 f"camera {frame['camera']} gives {width} × {height} pixels; a video needs even numbers",
-                hint="choose another size for it",
+                hint="choose another size for it, or leave it out",
             )
         features[_camera(frame["camera"])] = {
             "dtype": "video",

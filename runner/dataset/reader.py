@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from runner.dataset import commit
-from runner.dataset.rows import NO_CHUNK
+from runner.dataset.rows import NO_CHUNK, ROBOT
 from schemas.errors import BadRequest, ConfigError
 
 EPISODE_COLUMNS = ("episode_index", "length", "dataset_from_index", "dataset_to_index")
@@ -21,7 +21,7 @@ EPISODE_COLUMNS = ("episode_index", "length", "dataset_from_index", "dataset_to_
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """One frame. `state` and `action` are by joint (rad), `timings_ms` by part of the tick, `pictures` where they are: by camera the
+    """One frame. `state` and `action` are by joint (rad), or with `units` "own" by what their world calls its numbers; `timings_ms` by part of the tick, `pictures` where they are: by camera the
     video's path and the second in it."""
 
     root: str
@@ -39,6 +39,7 @@ class Recorded:
     timings_ms: Mapping[str, float]
     state: Mapping[str, float]
     action: Mapping[str, float]
+    units: str
     base: Mapping[str, Any]
     pictures: Mapping[str, Mapping[str, Any]]
     complete: bool  # False: a recording is under way, or was cut off
@@ -128,7 +129,12 @@ def _recorded(
     features = info["features"]
 
     def named(column: str) -> dict[str, float]:
-        return dict(zip(features[column]["names"], row[column], strict=True)) if column in features else {}
+        if column not in features:
+            return {}
+        values = row[column]  # of a single number lerobot makes a column of plain numbers
+        return dict(
+            zip(features[column]["names"], values if isinstance(values, list) else [values], strict=True)
+        )
 
     pictures = {}
     for name, feature in features.items():
@@ -173,6 +179,7 @@ def _recorded(
         timings_ms=named("tick.timings_ms"),
         state=named("observation.state"),
         action=named("action"),
+        units=str(note.get("units", ROBOT)),
         base={"pose": named("base_pose"), "velocity": named("base_velocity")},
         pictures=pictures,
         complete=not (root / commit.FOLDER / commit.OPEN).exists(),

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter, deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,11 +55,18 @@ def whole_rate(rate_hz: float) -> int:
 class DatasetRecorder:
     """`start()`, then `tick` and `goal_ended` on the control thread, then `close()`. Everything else may be read at any time.
 
+    `cameras` is asked for every tick, on a thread of its own: some worlds know theirs after their first reset.
     `patient`: wait for room instead of dropping; only where no tick has a deadline.
     """
 
     def __init__(
-        self, root: Path, *, rate_hz: float, cameras: tuple[str, ...], robot: str, patient: bool = False
+        self,
+        root: Path,
+        *,
+        rate_hz: float,
+        cameras: Callable[[], Sequence[str]],
+        robot: str,
+        patient: bool = False,
     ) -> None:
         self.root = root.absolute()
         self._fps = whole_rate(rate_hz)
@@ -83,6 +91,7 @@ class DatasetRecorder:
         self.incomplete: Counter[str] = Counter()  # ticks that were no row, by reason
         self.episodes = 0  # of this run
         self.frames = 0
+        self.skipped = 0  # goals of too few ticks to be an episode
         self.error: VramError | None = None  # the last thing that was not recorded
 
     # -- life ------------------------------------------------------------------------------------------------------------
@@ -154,10 +163,11 @@ class DatasetRecorder:
         log.info("%s", self.summary())
 
     def facts(self) -> dict[str, Any]:
-        """See `runner.protocols.TickSink`. `dropped` and `left_out` count ticks."""
+        """See `runner.protocols.TickSink`. `dropped` and `left_out` count ticks, `skipped` goals."""
         return {
             "episodes": self.episodes,
             "frames": self.frames,
+            "skipped": self.skipped,
             "dropped": self.dropped,
             "left_out": sum(self.incomplete.values()),
             "error": self.error.message if self.error is not None else None,
@@ -166,6 +176,8 @@ class DatasetRecorder:
     def summary(self) -> str:
         """What was recorded, and what was not, in one line."""
         parts = [f"recorded {self.episodes} episodes, {self.frames} frames into {self.root}"]
+        if self.skipped:
+            parts.append(f"{self.skipped} goals were too short for an episode")
         if self.dropped:
             parts.append(f"{self.dropped} ticks were dropped: the writer was too slow")
         parts += [f"{count} ticks left out: {reason}" for reason, count in self.incomplete.items()]
@@ -219,7 +231,7 @@ class DatasetRecorder:
         while (item := self._next()) is not None:
             try:
                 if isinstance(item, GoalTick):
-                    row, pictures = row_of(item, self._cameras)
+                    row, pictures = row_of(item, self._cameras())
                     wire.send(peer, {"kind": "row", **row}, pictures)
                 else:
                     wire.send(peer, {"kind": "end", **self._note(item, reasons)})
@@ -301,6 +313,7 @@ class DatasetRecorder:
                 self.frames += said["frames"]
                 log.info("goal %s is episode %d, %d frames", said["goal_id"], said["episode"], said["frames"])
             case "skipped":
+                self.skipped += 1
                 log.warning("goal %s is not recorded: %s", said["goal_id"], said["reason"])
             case "failed":
                 self._note_loss(from_wire(said["error"]))

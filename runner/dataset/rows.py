@@ -1,7 +1,7 @@
 """A tick as a row on its way to the dataset: plain values and the pictures' bytes. Nothing is filled in: a tick that lacks a part
 of the row is no row, and says why.
 
-Units are those of `schemas.world`: rad, m, s, and ms where a name says so. Knows no lerobot and no numpy.
+Units are those of `schemas.world`: rad, m, s, and ms where a name says so; those of a world that is no robot are its own. Knows no lerobot and no numpy.
 """
 
 from __future__ import annotations
@@ -10,10 +10,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from runner.protocols import GoalTick
+from runner.protocols import GoalTick, Transition
 from schemas.world import FrameEncoding, SensorFrame
 
 TIMINGS = ("tick", "sensors", "world_state", "inference", "safety", "hal")
+ROBOT, OWN = "rad", "own"  # units of state and action: a robot's, or whatever its world has
+NUMBERS_MAX = 4096  # of a state; beyond that it is a picture of some kind
 NO_CHUNK = -1  # chunk_index of a tick that was not played from a chunk
 COLOURS = frozenset(
     {FrameEncoding.RGB8, FrameEncoding.BGR8, FrameEncoding.MONO8, FrameEncoding.JPEG, FrameEncoding.PNG}
@@ -29,20 +31,18 @@ class Incomplete(Exception):
 def row_of(tick: GoalTick, cameras: Sequence[str]) -> tuple[Row, list[bytes]]:
     """The row and its pictures, in the order of `cameras`. Raises Incomplete."""
     world, result, goal = tick.world, tick.result, tick.goal
-    joints = world.joint_state.name
-    if not joints:
-        raise Incomplete("the robot has no joints")
-    if missing := [name for name in joints if name not in tick.targets]:
-        raise Incomplete(f"joint {missing[0]} has no target yet")
+    state, action = _joints(tick) if tick.transition is None else _step(tick.transition)
     frames = [_colours(world.image_frames or {}, camera) for camera in cameras]
     trace_id, span_id, sampled = trace_of((result.trace_context or {}).get("traceparent"))
     row: Row = {
         "goal_id": goal.goal_id,
         "skill": f"{goal.rskill_id}@{goal.revision}" if goal.revision else goal.rskill_id,
         "task": goal.prompt or goal.rskill_id,
-        "joints": list(joints),
-        "state": list(world.joint_state.position),
-        "action": [tick.targets[name] for name in joints],
+        "units": ROBOT if tick.transition is None else OWN,
+        "state_names": list(state),
+        "state": list(state.values()),
+        "action_names": list(action),
+        "action": list(action.values()),
         "base_pose": _base_pose(tick),
         "base_velocity": list(tick.base_velocity) if tick.base_velocity is not None else None,
         "frames": [
@@ -63,6 +63,30 @@ def row_of(tick: GoalTick, cameras: Sequence[str]) -> tuple[Row, list[bytes]]:
         "sampled": sampled,
     }
     return row, [frame.data or b"" for frame in frames]
+
+
+def _joints(tick: GoalTick) -> tuple[dict[str, float], dict[str, float]]:
+    """Measured joints and their targets (rad)."""
+    joints = tick.world.joint_state
+    if not joints.name:
+        raise Incomplete("the robot has no joints")
+    if missing := [name for name in joints.name if name not in tick.targets]:
+        raise Incomplete(f"joint {missing[0]} has no target yet")
+    state = dict(zip(joints.name, joints.position, strict=True))
+    return state, {name: tick.targets[name] for name in state}
+
+
+def _step(step: Transition) -> tuple[dict[str, float], dict[str, float]]:
+    """What a world that is no robot showed, and was sent."""
+    if not step.sent:
+        raise Incomplete("nothing was sent: the world stood still")
+    if len(step.shown) > NUMBERS_MAX:
+        raise Incomplete(
+            f"the world shows {len(step.shown)} numbers, at most {NUMBERS_MAX} are recorded: name some as `joints`"
+        )
+    if unsaid := [name for name, value in step.shown.items() if not math.isfinite(value)]:
+        raise Incomplete(f"{unsaid[0]} is not finite")
+    return dict(step.shown), dict(step.sent)
 
 
 def trace_of(traceparent: str | None) -> tuple[str, str, bool]:

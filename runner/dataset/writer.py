@@ -99,7 +99,7 @@ class EpisodeWriter:
         last["next.done"][0] = True
         last["next.success"][0] = note.get("status") == "succeeded"
         self._files.add(last)
-        about = {key: first[key] for key in ("goal_id", "skill", "task", "trace_id")}
+        about = {key: first[key] for key in ("goal_id", "skill", "task", "trace_id", "units")}
         broken = {"incomplete": note.get("incomplete", 0) + self._broken}
         index = self._files.finish({**about, **note, **broken})
         self._goal = self._last = None

@@ -120,6 +120,14 @@ class ArmEnvironment:
             image_frames=dict(frames) if frames is not None else None,
         )
 
+    def shown(self) -> None:
+        """Its joint state says all."""
+
+    @property
+    def acted(self) -> dict[str, float]:
+        """Nothing: `targets` are what it was told."""
+        return {}
+
     def step(self, action: Action | None) -> EnvStep:
         """Joints that an action leaves out keep their last target: a closed gripper stays closed."""
         arm, base = _commands(action)

@@ -41,6 +41,16 @@ class Environment(Protocol):
         """The state now, with the frames that the caller took. Raises pydantic's ValidationError for numbers that are not finite."""
         ...
 
+    def shown(self) -> Mapping[str, float] | None:
+        """What it observes, in numbers, by name and in its own units, for recordings; None for a robot: that is its joint state. Raises
+        EnvironmentFailed."""
+        ...
+
+    @property
+    def acted(self) -> Mapping[str, float]:
+        """What the last step was given, by name and in its own units; empty for a robot, and where time stood still."""
+        ...
+
     def step(self, action: Action | None) -> EnvStep:
         """One period with a one-step action that has passed `gate`; None holds."""
         ...

@@ -27,14 +27,16 @@ VECTOR_MODES: Final = (
 )
 
 Index = Annotated[int, Field(ge=0)]
+type Held = int | float | tuple[Held, ...] | dict[str, Held]
 
 
 class GymConfig(BaseModel):
-    """Paths into a Dict observation are written with dots (`pixels.top`); an empty path is the whole observation.
+    """Paths into a Dict or Tuple observation are written with dots (`pixels.top`, `views.0`); an empty path is the whole observation.
 
-    `joints` and `velocities` name entries of the vector at `state`: a list in its order, or a map from name to index (rad and rad/s).
-    `actions` names the entries of a Box action, in its order; `control_mode` says what they are. `hold` is the action that waits: without
-    one the world stands still while nobody acts. `success` is `info:KEY` or `return:NUMBER` (rewards of the episode, summed).
+    `joints` and `velocities` name entries of the vector at `state`: a list in its order, or a map from name to index (rad and rad/s). Where
+    several parts are at `state`, their numbers follow each other in the space's order. `actions` names the numbers of an action, in their
+    order (`runner.sim.gym_spaces`); `control_mode` says what they are. `hold` is the action that waits, as the environment itself takes it:
+    without one the world stands still while nobody acts. `success` is `info:KEY` or `return:NUMBER` (rewards of the episode, summed).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -47,7 +49,7 @@ class GymConfig(BaseModel):
     control_mode: ControlMode = ControlMode.JOINT_POSITION
     actions: tuple[str, ...] = ()
     embodiment_tags: tuple[EmbodimentTag, ...] = ()  # which robot it is; skills for others are refused then
-    hold: int | tuple[float, ...] | None = None
+    hold: Held | None = None
     success: str = ""
 
     @field_validator("joints", "velocities", mode="before")
@@ -63,7 +65,7 @@ class GymConfig(BaseModel):
     @classmethod
     def _vector(cls, mode: ControlMode) -> ControlMode:
         if mode not in VECTOR_MODES:
-            raise ValueError(f"a Box action is one of {', '.join(VECTOR_MODES)}")
+            raise ValueError(f"an action of several numbers is one of {', '.join(VECTOR_MODES)}")
         return mode
 
     @field_validator("success")

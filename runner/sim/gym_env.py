@@ -1,38 +1,42 @@
 """`GymEnv`: any gymnasium environment by its id, as an `Environment`.
 
-Actions. A Box is one row of numbers in the environment's own units, in its order, in the field of the configured `control_mode`; with
-`actions` in its file an action may name its columns, in any order. A Discrete of n is `composite_mode`: [-1, 1] cut into n equal parts.
-Other spaces are refused. What is out of a Box by at most 5 % of its range is clamped and said, more is withheld.
+Actions. What `runner.sim.gym_spaces` can write as a row of numbers, in the field of the configured `control_mode`; an action may name its columns,
+in any order, as the file's `actions` do or as the parts are called. A Discrete that is all there is to an action is `composite_mode`. Other
+spaces are refused. What is out of the limits by at most 5 % of the range is clamped and said, more is withheld.
 
-Observations. Pictures (uint8, height × width × 3) become cameras, the file's `joints` the joint state; everything else only scripted policies see.
-The environment's code is foreign: whatever it raises becomes EnvironmentFailed.
+Observations. Pictures (uint8, height × width × 3) become cameras, the file's `joints` the joint state; everything else only scripted policies see,
+and recordings. The environment's code is foreign: whatever it raises becomes EnvironmentFailed.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import os
 import random
-from collections.abc import Iterator, Mapping
+import reprlib
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from runner.protocols import Stepped
 from runner.sim.environment import EnvStep
 from runner.sim.gym_config import RENDER, SUCCESS_KEYS, GymConfig
+from runner.sim.gym_spaces import ActionRow, Leaf, NoNumbers, leaves
 from schemas.control import ControlMode
 from schemas.errors import ConfigError, EnvironmentFailed, ModelError
 from schemas.world import PAYLOAD_OF_MODE, Action, JointState, SensorFrame, WorldState
 
 log = logging.getLogger(__name__)
 
-CLAMP_SHARE = 0.05  # of a Box's range: an aim at the stop; beyond it a mistake
+CLAMP_SHARE = 0.05  # of a number's range: an aim at the stop; beyond it a mistake
 
 
 @dataclass(frozen=True, slots=True)
 class SpaceGate:
-    """The limits of an action space, as a gate. Infinite limits hold nothing back; `low` of a Discrete is empty."""
+    """The limits of an action space, as a gate."""
 
     mode: ControlMode
     low: tuple[float, ...]
@@ -45,36 +49,36 @@ class SpaceGate:
             return None, (f"this environment takes {self.mode}, not {action.control_mode}",)
         if action.horizon != 1:
             return None, (f"one step at a time, not {action.horizon}",)
-        if self.mode is ControlMode.COMPOSITE_MODE:
-            return action, ()
         row = self.in_order(action)
         if isinstance(row, str):
             return None, (row,)
         problems, withheld, values = [], False, []
         if not all(map(math.isfinite, row)):  # copies of an action are not validated
             return None, (f"an action with numbers that are not finite: {row}",)
-        for index, (value, low, high) in enumerate(zip(row, self.low, self.high, strict=True)):
+        for name, value, low, high in zip(self.names, row, self.low, self.high, strict=True):
             excess = max(low - value, value - high, 0.0)
             if excess > 0:
-                name = self.names[index] if self.names else f"action[{index}]"
                 problems.append(f"{name}: {value:.4g} is outside [{low:.4g}, {high:.4g}]")
                 withheld |= excess > CLAMP_SHARE * (high - low)
             values.append(min(max(value, low), high))
         if withheld:
             return None, tuple(problems)
-        update = {PAYLOAD_OF_MODE[self.mode]: (tuple(values),), "joint_names": None}
+        payload = tuple(values) if self.mode is ControlMode.COMPOSITE_MODE else (tuple(values),)
+        update = {PAYLOAD_OF_MODE[self.mode]: payload, "joint_names": None}
         return action.model_copy(update=update), tuple(problems)
 
     def in_order(self, action: Action) -> tuple[float, ...] | str:
         """The row in the environment's order, or why there is none."""
+        if self.mode is ControlMode.COMPOSITE_MODE:
+            return (action.rows[0],)
         row: tuple[float, ...] = action.rows[0]
         if len(row) != len(self.low):
             return f"{len(row)} numbers for an action of {len(self.low)}"
         if action.joint_names is None:
             return row
         if set(action.joint_names) != set(self.names):
-            known = ", ".join(self.names) or "none: its file names no `actions`"
-            return f"actions are named {', '.join(action.joint_names)}; the environment knows {known}"
+            given, known = ", ".join(action.joint_names), ", ".join(self.names)
+            return f"actions are named {given}; the environment knows {known}"
         named = dict(zip(action.joint_names, row, strict=True))
         return tuple(named[name] for name in self.names)
 
@@ -94,34 +98,44 @@ class GymEnv:
         self._total_reward = 0.0
         self._steps = 0
         self._observation: Any = None
+        self._sent: dict[str, float] = {}
         try:
+            self._row = self._action_row()
             self._gate = self._make_gate()
             self._hold = None if self.config.hold is None else self._held(self.config.hold)
-            self._paths = self._cameras_of(self._env.observation_space)
-            self._check_state(self._env.observation_space.sample())
+            self._observed = self._parts_observed()
+            self._views = (
+                self._views_of()
+            )  # camera → its part of the observation; None: what `render()` gives
+            self._state = self._state_parts()
+            self._shown = self._shown_parts()
         except BaseException:
             self.close()
             raise
 
     # -- what the spaces say -----------------------------------------------------------------------------------------------
+    def _action_row(self) -> ActionRow:
+        try:
+            return ActionRow(self._env.action_space)
+        except NoNumbers as error:
+            raise ConfigError(
+                f"{self.env_id} takes actions that are no row of numbers: {error}",
+                hint="Box, Discrete, MultiDiscrete and MultiBinary can be driven, also in Dict and Tuple; wrap the environment to change others",
+            ) from error
+
     def _make_gate(self) -> SpaceGate:
         from gymnasium import spaces
 
-        space = self._env.action_space
-        if isinstance(space, spaces.Discrete):
-            return SpaceGate(ControlMode.COMPOSITE_MODE, (), (), ())
-        if not isinstance(space, spaces.Box):
+        row, names = self._row, self.config.actions
+        if names and len(names) != len(row.names):
             raise ConfigError(
-                f"{self.env_id} takes actions of {space}",
-                hint="Box and Discrete can be driven; wrap the environment to flatten others",
+                f"{len(names)} names in `actions` for {self.env_id}'s actions of {len(row.names)}"
             )
-        low, high = (tuple(map(float, bound.reshape(-1))) for bound in (space.low, space.high))
-        names = self.config.actions
-        if names and len(names) != len(low):
-            raise ConfigError(f"{len(names)} names in `actions` for {self.env_id}'s actions of {len(low)}")
-        return SpaceGate(self.config.control_mode, low, high, names)
+        single = isinstance(self._env.action_space, spaces.Discrete)
+        mode = ControlMode.COMPOSITE_MODE if single else self.config.control_mode
+        return SpaceGate(mode, row.low, row.high, names or row.names)
 
-    def _held(self, raw: int | tuple[float, ...]) -> Action:
+    def _held(self, raw: Any) -> Action:
         try:
             action = self.action_of(raw)
         except ModelError as error:
@@ -130,41 +144,69 @@ class GymEnv:
             raise ConfigError(f"`hold` is no action of {self.env_id}: {problems[0]}")
         return action
 
-    def _cameras_of(self, space: Any) -> dict[str, str]:
-        found = dict(_pictures(space))
+    def _parts_observed(self) -> dict[str, Leaf]:
+        parts = list(leaves(self._env.observation_space))
+        if twice := [path for path, count in Counter(part.path for part in parts).items() if count > 1]:
+            raise ConfigError(f"two parts of {self.env_id}'s observation are called {twice[0]}")
+        return {part.path: part for part in parts}
+
+    def _views_of(self) -> dict[str, Leaf | None]:
+        """Pictures are called by the last key of their path; those that share it, and those without one, by all of it."""
+        pictures = {path: part for path, part in self._observed.items() if part.picture}
+        views: dict[str, Leaf | None] = {}
         for name, path in self.config.cameras.items():
-            if path != RENDER and path not in found.values():
-                known = ", ".join([*found.values(), RENDER])
+            if path != RENDER and path not in pictures:
                 raise ConfigError(
                     f"camera {name}: {self.env_id} observes no picture at {path!r}",
-                    hint=f"choose from {known}",
+                    hint=f"choose from {', '.join([*pictures, RENDER])}",
                 )
-        return dict(self.config.cameras) or found
+            views[name] = pictures.get(path)
+        last = {path: part.keys[-1] if part.keys else PIXELS for path, part in pictures.items()}
+        count = Counter(last.values())
+        found = {
+            last[path] if count[last[path]] == 1 and isinstance(last[path], str) else path: part
+            for path, part in pictures.items()
+        }
+        return views or {**found}
 
-    def _check_state(self, observation: Any) -> None:
+    def _state_parts(self) -> tuple[Leaf, ...]:
+        """Where the joints are. Raises ConfigError when they are nowhere."""
         if not self.config.joints:
-            return
-        vector = self._vector(observation)
-        for name, index in (*self.config.joints.items(), *self.config.velocities.items()):
-            if index >= len(vector):
+            return ()
+        at, hint = (
+            self.config.state,
+            "`state` is the path of the vector that holds the joints, or of parts that do",
+        )
+        parts = tuple(
+            p for path, p in self._observed.items() if not at or path == at or path.startswith(f"{at}.")
+        )
+        if not parts:
+            raise ConfigError(f"{self.env_id} has no numbers at {at!r}: there is no such part", hint=hint)
+        for part in parts:
+            if part.picture and part.path != at:
                 raise ConfigError(
-                    f"joint {name} has index {index} in the {len(vector)} numbers at {self.config.state!r}"
+                    f"{self.env_id} has no numbers at {at!r}: {part.path} is a picture", hint=hint
                 )
-
-    def _vector(self, observation: Any) -> Any:
-        import numpy as np
-
         try:
-            return np.asarray(_at(observation, self.config.state), dtype=float).reshape(-1)
-        except (KeyError, TypeError, ValueError) as error:
-            raise ConfigError(
-                f"{self.env_id} has no numbers at {self.config.state!r}: {error}",
-                hint="`state` is the path of the vector that holds the joints",
-            ) from error
+            size = sum(part.size for part in parts)
+        except NoNumbers as error:
+            raise ConfigError(f"{self.env_id} has no numbers at {at!r}: {error}", hint=hint) from error
+        for name, index in (*self.config.joints.items(), *self.config.velocities.items()):
+            if index >= size:
+                raise ConfigError(f"joint {name} has index {index} in the {size} numbers at {at!r}")
+        return parts
+
+    def _shown_parts(self) -> tuple[Leaf, ...]:
+        shown = []
+        for part in self._observed.values():
+            with contextlib.suppress(NoNumbers):
+                if part.size and not part.bytes_in_a_plane:
+                    shown.append(part)
+        return tuple(shown)
 
     # -- Environment -------------------------------------------------------------------------------------------------------
     def reset(self, seed: int) -> None:
-        self._steps, self._total_reward = 0, 0.0
+        self._steps, self._total_reward, self._sent = 0, 0.0, {}
         # not the same seed: both draw from the same kind of generator, and random actions would be the world's own random numbers
         self._env.action_space.seed(random.Random(f"actions-{seed}").getrandbits(31))
         try:
@@ -175,50 +217,73 @@ class GymEnv:
         self._last = EnvStep(success=self._success(info))
         if self._render_wanted is None:
             self._render_wanted = self._can_render()
-        if self._render_wanted and RENDER not in self._paths.values() and not self.config.cameras:
-            self._paths[RENDER] = RENDER
+        if self._render_wanted and not self.config.cameras:
+            self._views.setdefault(RENDER, None)
 
     def _check_observation(self) -> None:
         """What is read of it must be what its space promised. Raises EnvironmentFailed."""
         try:
-            self._check_state(self._observation)
-        except ConfigError as error:
-            raise EnvironmentFailed(error.message) from error
-        space = self._env.observation_space
-        for camera, path in self._paths.items():
-            if path == RENDER:
+            for part in self._state:
+                part.numbers(self._observation)
+        except NoNumbers as error:
+            raise EnvironmentFailed(
+                f"{self.env_id} observed something else than promised: {error}"
+            ) from error
+        for camera, view in self._views.items():
+            if view is None:
                 continue
-            promised = _at(space, path)
             try:
-                picture = _at(self._observation, path)
-                as_promised = picture.dtype == promised.dtype and picture.shape == promised.shape
-            except (KeyError, IndexError, TypeError, AttributeError):
+                picture = view.of(self._observation)
+                as_promised = picture.dtype == view.space.dtype and picture.shape == view.space.shape
+            except (NoNumbers, AttributeError):
                 as_promised = False
             if not as_promised:
                 raise EnvironmentFailed(
-                    f"{self.env_id} observed no picture for {camera} as {promised} promises"
+                    f"{self.env_id} observed no picture for {camera} as {view.space} promises"
                 )
 
     def observe(self, stamp_ns: int, frames: Mapping[str, SensorFrame] | None) -> WorldState:
         joints, velocities = self.config.joints, self.config.velocities
-        vector = self._vector(self._observation) if joints else ()
+        vector = [number for part in self._state for number in part.numbers(self._observation)]
         return WorldState(
             stamp_ns=stamp_ns,
             joint_state=JointState(
                 name=tuple(joints),
-                position=tuple(float(vector[index]) for index in joints.values()),
-                velocity=tuple(float(vector[velocities[name]]) for name in joints) if velocities else (),
+                position=tuple(vector[index] for index in joints.values()),
+                velocity=tuple(vector[velocities[name]] for name in joints) if velocities else (),
                 stamp_ns=stamp_ns,
             ),
             image_frames=dict(frames) if frames is not None else None,
         )
 
+    def shown(self) -> dict[str, float]:
+        """The joints (rad) where the file names some; else every number that is observed beside pictures, in its own units."""
+        joints, parts = self.config.joints, self._state or self._shown
+        try:
+            numbers = [number for part in parts for number in part.numbers(self._observation)]
+        except NoNumbers as error:
+            raise EnvironmentFailed(
+                f"{self.env_id} observed something else than promised: {error}"
+            ) from error
+        if joints:
+            return {name: numbers[index] for name, index in joints.items()}
+        return dict(zip((name for part in parts for name in part.names("observation")), numbers, strict=True))
+
+    @property
+    def acted(self) -> dict[str, float]:
+        """The numbers of the last step's action as they passed the gate, by the names that actions have here."""
+        return self._sent
+
     def step(self, action: Action | None) -> EnvStep:
+        self._sent = {}
         if action is None:
             action = self._hold
         if action is None:
             return EnvStep(success=self._last.success, moved=False)
-        raw = self._raw(action)
+        row = self._gate.in_order(action)
+        if isinstance(row, str):
+            raise EnvironmentFailed(f"an action that the gate has not seen: {row}")
+        raw = self._row.element(row)
         try:
             self._observation, given, terminated, truncated, info = self._env.step(raw)
             reward, terminated, truncated = float(given), bool(terminated), bool(truncated)
@@ -227,6 +292,7 @@ class GymEnv:
         self._check_observation()
         if not math.isfinite(reward):
             raise EnvironmentFailed(f"{self.env_id} gave the reward {reward}")
+        self._sent = dict(zip(self._gate.names, row, strict=True))
         self._steps += 1
         self._total_reward += reward
         self._last = EnvStep(reward, terminated, truncated, self._success(info))
@@ -241,38 +307,14 @@ class GymEnv:
         return self._gate
 
     def action_of(self, raw: Any) -> Action:
-        """A number of a Discrete, or the numbers of a Box in its order (any shape that has as many)."""
-        import numpy as np
-
-        space, mode = self._env.action_space, self._gate.mode
+        """What the environment itself takes: a number of a Discrete, the numbers of a Box (any shape that has as many), a map for a Dict."""
+        mode = self._gate.mode
         try:
-            values = [float(value) for value in np.asarray(raw, dtype=float).reshape(-1)]
-        except (TypeError, ValueError) as error:
-            raise ModelError(f"{raw!r} is no action of {self.env_id}: {error}") from error
-        if not all(map(math.isfinite, values)):
-            raise ModelError(f"an action with numbers that are not finite: {values}")
-        if mode is ControlMode.COMPOSITE_MODE:
-            chosen = round(values[0] - space.start) if len(values) == 1 else -1
-            if not 0 <= chosen < space.n or values[0] != chosen + space.start:
-                raise ModelError(f"{raw!r} is no action of {self.env_id}: {space}")
-            return Action(control_mode=mode, composite_mode=(-1 + (2 * chosen + 1) / int(space.n),))
-        if len(values) != len(self._gate.low):
-            raise ModelError(f"{len(values)} numbers for {self.env_id}'s actions of {len(self._gate.low)}")
-        return Action.model_validate({"control_mode": mode, PAYLOAD_OF_MODE[mode]: (tuple(values),)})
-
-    def _raw(self, action: Action) -> Any:
-        """What `gymnasium.Env.step` takes."""
-        import numpy as np
-
-        space = self._env.action_space
-        if self._gate.mode is ControlMode.COMPOSITE_MODE:
-            chosen = min(math.floor((action.rows[0] + 1) / 2 * int(space.n)), int(space.n) - 1)
-            return int(space.start) + chosen
-        row = self._gate.in_order(action)
-        if isinstance(row, str):
-            raise EnvironmentFailed(f"an action that the gate has not seen: {row}")
-        values = np.asarray(row, dtype=float).reshape(space.shape)
-        return (np.round(values) if np.issubdtype(space.dtype, np.integer) else values).astype(space.dtype)
+            row = tuple(self._row.row_of(raw))
+        except NoNumbers as error:
+            raise ModelError(f"{reprlib.repr(raw)} is no action of {self.env_id}: {error}") from error
+        payload = row if mode is ControlMode.COMPOSITE_MODE else (row,)
+        return Action.model_validate({"control_mode": mode, PAYLOAD_OF_MODE[mode]: payload})
 
     def sample(self) -> Action:
         return self.action_of(self._env.action_space.sample())
@@ -288,7 +330,7 @@ class GymEnv:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        return tuple(self._paths)
+        return tuple(self._views)
 
     @property
     def clock_text(self) -> str:
@@ -298,11 +340,10 @@ class GymEnv:
     def render(self, camera: str) -> Any:
         import numpy as np
 
-        path = self._paths.get(camera, RENDER if camera == RENDER else None)
-        if path is None:
+        if camera not in self._views and camera != RENDER:
             raise KeyError(camera)
-        if path != RENDER:
-            return np.ascontiguousarray(_at(self._observation, path))
+        if (view := self._views.get(camera)) is not None:
+            return np.ascontiguousarray(view.of(self._observation))
         try:
             picture = self._env.render()
         except Exception as error:
@@ -358,6 +399,7 @@ class GymEnv:
         return EnvironmentFailed(f"{self.env_id}.{what}: {type(error).__name__}: {error}")
 
 
+PIXELS = "pixels"  # an observation that is nothing but a picture
 WORLDLESS = WorldState(stamp_ns=0, joint_state=JointState(name=(), position=(), stamp_ns=0))
 
 
@@ -384,21 +426,3 @@ def _make(env_id: str, config: GymConfig, *, pictures: bool) -> Any:
             f"the environment {env_id} cannot be made: {type(error).__name__}: {error}",
             hint="gym:ID takes the ids that gymnasium knows, or MODULE:ID, where importing MODULE registers it",
         ) from error
-
-
-def _pictures(space: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """Name and path of the pictures of an observation space; the name is the last part of the path."""
-    from gymnasium import spaces
-
-    if isinstance(space, spaces.Dict):
-        for key, part in space.spaces.items():
-            yield from _pictures(part, f"{path}.{key}" if path else str(key))
-    elif isinstance(space, spaces.Box) and space.dtype.name == "uint8" and space.shape[2:] == (3,):
-        yield path.rpartition(".")[2] or "pixels", path
-
-
-def _at(observation: Any, path: str) -> Any:
-    """Raises KeyError or TypeError for a path that leads nowhere."""
-    for key in path.split(".") if path else ():
-        observation = observation[key]
-    return observation

@@ -1,7 +1,7 @@
 """Policies that need no model: `random`, and `scripted:MODULE` or `scripted:FILE.py`. For trying worlds out, and as the floor of a benchmark.
 
 A script has a function `make(env, seed)` that returns `act(world)`: called once a tick, with the world state, it returns an `Action`, or whatever
-`env.action_of` turns into one (a number for a Discrete, a row for a Box or the arm's joints), or None when it is done. `env.observation` is
+`env.action_of` turns into one (a number for a Discrete, a row for a Box or the arm's joints, a map for a Dict), or None when it is done. `env.observation` is
 what the environment itself observes. Its code is foreign: what it raises becomes ModelError.
 """
 

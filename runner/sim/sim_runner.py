@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from runner.clock import Clock
 from runner.frames import Snapshot
 from runner.loop import Applied, Decision
-from runner.protocols import DeadlinePolicy, Goal, SafetyGate, SkillEnded, Stepped
+from runner.protocols import DeadlinePolicy, Goal, SafetyGate, SkillEnded, Stepped, Transition
 from runner.recorder import Recorder
 from runner.sim.environment import Environment, EnvStep
 from runner.sim.episodes import Episode, EpisodeView
@@ -88,6 +88,7 @@ class SimRunner(SkillRunner):
         self._next_seed: int | None = None
         self._had_skill = False  # in this episode
         self._snapshots: dict[str, Snapshot] = {}
+        self._shown: Mapping[str, float] | None = None  # by a world that is no robot, before this tick's step
         self._view = EpisodeView()
 
     # -- life --------------------------------------------------------------------------------------------------------
@@ -135,7 +136,7 @@ class SimRunner(SkillRunner):
         name = player.key.rskill_id
         span = tracing.begin(telemetry.SPAN_EPISODE, attributes={telemetry.ATTR_SKILL: name})
         with tracing.inside(span):
-            goal = Goal(f"episode-{self.episode_idx}", name, traceparent=tracing.traceparent())
+            goal = Goal(f"seed-{seed}", name, traceparent=tracing.traceparent())
 
         def ended(end: SkillEnded) -> None:
             span.set_attribute(telemetry.ATTR_OUTCOME, "ok" if end.error is None else end.error.code)
@@ -209,6 +210,7 @@ class SimRunner(SkillRunner):
                 cameras = dict.fromkeys((*active.skill.cameras, *(self._cameras if self._follows else ())))
                 with tracing.span(telemetry.SPAN_SENSORS):
                     frames = {camera: self._sensor_frame(self._render(camera)) for camera in cameras}
+                    self._shown = self.env.shown() if self._follows else None
         except EnvironmentFailed as error:
             self._broken_off(error)
             return Decision()
@@ -232,6 +234,9 @@ class SimRunner(SkillRunner):
 
     def _targets_now(self) -> Mapping[str, float]:
         return self.env.targets
+
+    def _transition(self) -> Transition | None:
+        return None if self._shown is None else Transition(self._shown, dict(self.env.acted))
 
     def _base_told(self, decision: Decision) -> tuple[float, float, float] | None:
         if self.world is None or self.world.base_pose is None:

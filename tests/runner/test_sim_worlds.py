@@ -14,6 +14,7 @@ from clients.runner import RunnerClient
 from clients.serve import Message, Peer, RouterServer
 from clients.sidecar import npy
 from runner.__main__ import main
+from runner.dataset.reader import read_frame
 from schemas.errors import UnknownSkill
 
 pytestmark = pytest.mark.heavy
@@ -44,7 +45,7 @@ action_contract: {dim: 2}
 policy_extras: {rollout_steps: 600, stop_when_still: false}
 """
 WORLD = """
-kwargs: {mark: [0.25, -0.5]}
+kwargs: {mark: [0.25, -0.5], width: 34}
 state: agent_pos
 joints: [a, b]
 actions: [a, b]
@@ -188,7 +189,7 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
             str(tmp_path / "world.yaml"),
         ),
         *("--skills", str(tmp_path / "rskill.yaml"), "--no-arbiter", "--rate", "0"),
-        *("--sidecar", f"test/point-seek=ipc://{tmp_path}/policy.sock"),
+        *("--sidecar", f"test/point-seek=ipc://{tmp_path}/policy.sock", "--record", str(tmp_path / "set")),
     ]
     environ = os.environ | {
         "VRAM_ARBITER_RUNTIME": str(tmp_path),
@@ -206,7 +207,7 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
         ):
             assert (await client.call("ping"))["robot"] == POINT
             frame = await client.call("frame", {"encoding": "png", "max_age_ms": 60_000.0})
-            assert (frame["camera"], frame["width"], frame["height"]) == ("front", 33, 24)
+            assert (frame["camera"], frame["width"], frame["height"]) == ("front", 34, 24)
             goal = await client.send_goal("test/point-seek", prompt="go there")
             result = await goal.result(60)
             assert (result["status"], result["data"]["success"], result["data"]["steps"]) == (
@@ -215,7 +216,7 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
                 1,
             )
             assert sidecar.observations[0]["observation.state"].tolist() == [0.0, 0.0]
-            assert sidecar.observations[0]["observation.images.front"].shape == (24, 33, 3)
+            assert sidecar.observations[0]["observation.images.front"].shape == (24, 34, 3)
             sidecar.aim = (0.9, 0.9)
             result = await (await client.send_goal("test/point-seek", prompt="go there")).result(60)
             assert (result["status"], result["code"]) == ("failed", "limit_exceeded")
@@ -236,6 +237,12 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
         result = json.loads(out.splitlines()[-1])
         assert process.returncode == 0
         assert (result["success"], result["metadata"]["episodes"]) == (False, 2)
+        told = result["metadata"]["recorded"]
+        assert (told["episodes"], told["frames"], told["skipped"]) == (1, 20, 1)  # one step is no episode
+        second = read_frame(tmp_path / "set", 1)
+        assert (second.goal["code"], second.task) == ("limit_exceeded", "go there")
+        assert second.state == second.action == pytest.approx({"a": 0.9, "b": 0.9})
+        assert list(second.pictures) == ["front"]
     finally:
         if process.poll() is None:
             process.kill()

@@ -7,16 +7,20 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from runner import __main__ as program
+from runner.cli.replay import as_text
 from runner.dataset import commit
+from runner.dataset.lerobot_files import LerobotFiles, features_of, frame_of
 from runner.dataset.reader import read_frame
 from runner.dataset.recorder import QUEUE_TICKS, DatasetRecorder, whole_rate
+from runner.dataset.rows import row_of
+from runner.protocols import Transition
 from schemas.errors import AlreadyRunning, BadRequest, ConfigError, InternalError, VramError
 
 sys.path.insert(0, str(Path(__file__).parent))  # for the helper beside it
@@ -33,7 +37,7 @@ FIRST, SECOND = goal("g1", "grab the cube"), goal("g2", "put it down")
 
 
 def recorder(root: Path, **options: Any) -> DatasetRecorder:
-    given: dict[str, Any] = {"rate_hz": 30.0, "cameras": ("front",), "robot": "bench"}
+    given: dict[str, Any] = {"rate_hz": 30.0, "cameras": lambda: ("front",), "robot": "bench"}
     return DatasetRecorder(root, **given | options)
 
 
@@ -146,7 +150,7 @@ def test_a_run_says_what_it_recorded_and_what_not(recorded: Recorded) -> None:
     assert dict(first.incomplete) == {"joint grip has no target yet": 1}
     assert "1 ticks left out: joint grip has no target yet" in first.summary()
     assert (second.episodes, second.frames) == (2, 5)
-    assert first.facts()["left_out"] == 1
+    assert (first.facts()["left_out"], first.facts()["skipped"], second.facts()["skipped"]) == (1, 0, 1)
     assert second.facts()["error"] == second.error.message
     notes = commit.notes(recorded.root)
     kept = [(note["goal_id"], note["status"], note["code"], note["incomplete"]) for note in notes]
@@ -190,6 +194,23 @@ def test_a_frame_leads_back_to_its_tick_and_trace(recorded: Recorded) -> None:
     assert Path(found.pictures["front"]["path"]).is_file()
     assert found.complete
     assert read_frame(recorded.root, 2, episode=1) == found
+
+
+def test_a_state_or_an_action_of_one_number_is_replayed(tmp_path: Path) -> None:
+    """lerobot makes a column of plain numbers of it, not of lists."""
+    files = LerobotFiles(tmp_path, fps=30, robot="bench")
+    rows = [
+        row_of(replace(tick(index), transition=Transition({"gap": 0.5 * index}, {"push": -1.0})), ())[0]
+        for index in range(2)
+    ]
+    features = features_of(rows[0])
+    files.begin(features)
+    for row in rows:
+        files.add(frame_of(row, (), features))
+    files.finish({"units": rows[0]["units"]})
+    found = read_frame(tmp_path, 1)
+    assert (found.units, dict(found.state), dict(found.action)) == ("own", {"gap": 0.5}, {"push": -1.0})
+    assert "shown    gap: +0.5\nsent     push: -1" in as_text(found, None)
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,14 @@
 import socket
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from runner.dataset import wire
-from runner.dataset.rows import NO_CHUNK, Incomplete, row_of, trace_of
+from runner.dataset.rows import NO_CHUNK, NUMBERS_MAX, Incomplete, row_of, trace_of
+from runner.protocols import GoalTick, Transition
 from schemas.world import FrameEncoding
 
 sys.path.insert(0, str(Path(__file__).parent))  # for the helper beside it
@@ -18,8 +20,12 @@ from ticks import TRACE, goal, picture, span_of, tick
 
 def test_a_row_says_what_was_measured_and_what_was_told() -> None:
     row, pictures = row_of(tick(3, safety_violations=("too fast",), deadline_missed=True), ("front",))
-    assert (row["joints"], row["state"], row["action"]) == (
+    assert (row["units"], row["state_names"], row["action_names"]) == (
+        "rad",
         ["pan", "grip"],
+        ["pan", "grip"],
+    )
+    assert (row["state"], row["action"]) == (
         pytest.approx([0.3, 0.5]),
         pytest.approx([0.35, 0.4]),
     )
@@ -53,6 +59,31 @@ def test_a_goal_without_a_prompt_is_called_by_its_skill() -> None:
 def test_what_lacks_a_part_is_no_row(made: object, reason: str) -> None:
     with pytest.raises(Incomplete, match=reason):
         row_of(made, ("front",))  # type: ignore[arg-type]  # made by the cases above
+
+
+def stepped(shown: dict[str, float], sent: dict[str, float]) -> GoalTick:
+    return replace(tick(0), transition=Transition(shown, sent))
+
+
+def test_a_world_that_is_no_robot_has_its_own_numbers() -> None:
+    row, _ = row_of(stepped({"gap": 0.5, "speed": 2.0}, {"push": -0.5}), ())
+    assert (row["units"], row["state_names"], row["state"]) == ("own", ["gap", "speed"], [0.5, 2.0])
+    assert (row["action_names"], row["action"]) == (["push"], [-0.5])
+
+
+@pytest.mark.parametrize(
+    ("shown", "sent", "reason"),
+    [
+        ({"gap": 0.5}, {}, "nothing was sent: the world stood still"),
+        ({"gap": 0.5, "speed": float("nan")}, {"push": 1.0}, "speed is not finite"),
+        ({str(n): 0.0 for n in range(NUMBERS_MAX + 1)}, {"push": 1.0}, "at most 4096 are recorded"),
+    ],
+)
+def test_a_step_that_lacks_a_part_is_no_row(
+    shown: dict[str, float], sent: dict[str, float], reason: str
+) -> None:
+    with pytest.raises(Incomplete, match=reason):
+        row_of(stepped(shown, sent), ())
 
 
 @pytest.mark.parametrize("text", [None, "", "00-abc-def-01", f"00-{TRACE}-{'0' * 15}1-zz", "nonsense"])

@@ -98,7 +98,9 @@ def test_random_actions_are_not_the_worlds_own_random_numbers() -> None:
 def test_every_number_of_a_discrete_goes_there_and_back() -> None:
     env = GymEnv("CartPole-v1", render=False)
     for number in (0, 1):
-        assert env._raw(env.action_of(number)) == number
+        allowed, problems = env.gate(ANYBODY).check(env.action_of(number), NOWHERE)
+        assert (allowed, problems) == (env.action_of(number), ())
+        assert env._row.element((env.action_of(number).rows[0],)) == number
     for wrong in (2, -1, 0.5, [0, 1], "left", float("nan")):
         with pytest.raises(ModelError):
             env.action_of(wrong)
