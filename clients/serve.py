@@ -25,6 +25,8 @@ from schemas.errors import AlreadyRunning, BadFrame, ConfigError, MessageTooLarg
 Message = dict[str, Any]
 REASON_MAX_CHARS = 500
 MAX_DEPTH_BYTES = IMAGE_MESSAGE_MAX_BYTES + 64 * 1024  # an image plus its envelope
+LINGER_S = 3.0
+"""How long a server that ends waits until its last answers are with the kernel; only peers that do not read cost so long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,15 +60,27 @@ class RouterServer:
         self._slots = asyncio.Semaphore(concurrent_max)
         self._queue_max = queue_max
         self._tasks: set[asyncio.Task[None]] = set()
-        self._stack = contextlib.ExitStack()
+        self._stack = contextlib.AsyncExitStack()
         self._send_lock = asyncio.Lock()
         self._socket: zmq.asyncio.Socket | None = None
 
     async def __aenter__(self) -> Self:
+        try:
+            self._open()
+        except BaseException:
+            await self._stack.aclose()
+            raise
+        return self
+
+    def _open(self) -> None:
         if self.endpoint.startswith("ipc://"):
             self._claim(Path(self.endpoint.removeprefix("ipc://")))
-        socket: zmq.asyncio.Socket = zmq.asyncio.Context.instance().socket(zmq.ROUTER)
-        self._stack.callback(socket.close, 0)
+        context = (
+            zmq.asyncio.Context()
+        )  # of its own: that it has ended is all that libzmq says of what was sent
+        self._stack.push_async_callback(asyncio.to_thread, context.term)
+        socket: zmq.asyncio.Socket = context.socket(zmq.ROUTER)
+        self._stack.callback(socket.close, round(LINGER_S * 1000))
         socket.setsockopt(
             zmq.MAXMSGSIZE, 4 * MAX_DEPTH_BYTES
         )  # beyond this libzmq drops the peer; below we can answer
@@ -78,13 +92,13 @@ class RouterServer:
         finally:
             os.umask(old_umask)
         self._socket = socket
-        return self
 
     async def __aexit__(self, *_: object) -> None:
+        """What was sent by now reaches its peer, though the process ends behind this. Then the endpoint is anybody's."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        self._stack.close()
+        await self._stack.aclose()
 
     def _claim(self, path: Path) -> None:
         """Binding steals an existing ipc path without a word: a locked file beside it tells a living owner from a stale socket."""
@@ -95,7 +109,6 @@ class RouterServer:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             owner = os.pread(lock, 32, 0).decode(errors="replace").strip()
-            self._stack.close()
             raise AlreadyRunning(
                 f"{path} is served by process {owner or '?'}", hint="stop it first"
             ) from None

@@ -1,5 +1,6 @@
 """A telemetry collector for tests: takes OTLP over HTTP on loopback and hands out what came, decoded. Needs the extra `telemetry`."""
 
+import socket
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,6 +9,8 @@ from types import TracebackType
 from typing import Any, Self
 
 WAIT_S = 60.0
+EXPORTERS_MAX = 128
+"""Connections that the kernel takes while nobody here has the time to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +49,57 @@ class Point:
     count: int = 0
 
 
+class _Server(ThreadingHTTPServer):
+    """Knows which of its connections are open, and when one of our own has had its turn: the kernel hands them over in the order they came.
+
+    An exporter waits for a few seconds, then its program may end: what it sent lies in the kernel and is still to be read.
+    """
+
+    request_queue_size = EXPORTERS_MAX
+
+    def __init__(self, handler: type[BaseHTTPRequestHandler]) -> None:
+        super().__init__(("127.0.0.1", 0), handler)
+        self._changed = threading.Condition()
+        self._open: set[object] = set()
+        self._markers: dict[object, set[object] | None] = {}
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        with self._changed:
+            if client_address in self._markers:
+                self._markers[client_address] = set(self._open)
+                self._changed.notify_all()
+                self.shutdown_request(request)
+                return
+            self._open.add(client_address)
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            with self._changed:
+                self._open.discard(client_address)
+                self._changed.notify_all()
+
+    def settle(self) -> None:
+        """Until everything is read of whoever connected before this call. Raises AssertionError."""
+        with socket.socket() as marker:
+            marker.bind(("127.0.0.1", 0))
+            name = marker.getsockname()
+            with self._changed:
+                self._markers[name] = None
+            marker.connect(self.server_address[:2])
+
+            def read() -> bool:
+                before = self._markers[name]
+                return before is not None and not before & self._open
+
+            with self._changed:
+                settled = self._changed.wait_for(read, WAIT_S)
+                del self._markers[name]
+        assert settled, f"the collector has not read in {WAIT_S} s what it was sent"
+
+
 class Collector:
     """`with Collector() as collector:` then start programs with `**collector.environ()`."""
 
@@ -53,6 +107,8 @@ class Collector:
         self._spans: list[ReceivedSpan] = []
         self._points: list[Point] = []
         self._came = threading.Condition()
+        self._waiting = threading.local()
+        self._over = False
         collector = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -67,7 +123,7 @@ class Collector:
             def log_message(self, format: str, *args: object) -> None:
                 pass  # the test says what it finds wrong
 
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server = _Server(Handler)
         self._thread = threading.Thread(target=self._server.serve_forever, name="collector", daemon=True)
 
     @property
@@ -89,28 +145,42 @@ class Collector:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if kind is None:
+            self._server.settle()
+        self._over = True
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
 
     def spans(self, name: str | None = None) -> list[ReceivedSpan]:
-        """All that came until now, in the order of their ends as exported."""
+        """All that was sent until now, in the order of their ends as exported."""
+        self._settle()
         with self._came:
             return [span for span in self._spans if name is None or span.name == name]
 
     def points(self, metric: str) -> list[Point]:
-        """Every report of a metric, oldest first: each export repeats the running totals."""
+        """Every report of a metric that was sent until now, oldest first: each export repeats the running totals."""
+        self._settle()
         with self._came:
             return [point for point in self._points if point.metric == metric]
 
     def wait(self, condition: Callable[[], bool], what: str, timeout_s: float = WAIT_S) -> None:
         """Until `condition()` holds, looked at whenever something came. Raises AssertionError with what was waited for and what came."""
-        with self._came:
-            if not self._came.wait_for(condition, timeout_s):
-                raise AssertionError(
-                    f"no {what} within {timeout_s} s; spans: {sorted({s.name for s in self._spans})}, "
-                    f"metrics: {sorted({p.metric for p in self._points})}"
-                )
+        self._waiting.now = True
+        try:
+            with self._came:
+                if not self._came.wait_for(condition, timeout_s):
+                    raise AssertionError(
+                        f"no {what} within {timeout_s} s; spans: {sorted({s.name for s in self._spans})}, "
+                        f"metrics: {sorted({p.metric for p in self._points})}"
+                    )
+        finally:
+            self._waiting.now = False
+
+    def _settle(self) -> None:
+        """Not while `wait` looks: it looks again whenever something came, and what comes needs its lock."""
+        if not self._over and not getattr(self._waiting, "now", False):
+            self._server.settle()
 
     def _take(self, path: str, body: bytes) -> None:
         spans = decode_spans(body) if path == "/v1/traces" else []

@@ -40,6 +40,7 @@ BOOT_S = 180.0  # for a program's imports there
 SCENARIO_S = 250.0
 SKILL = "test/arm-policy"
 DEADLINE_S = 120.0  # of goals that shall not meet it
+CALL_BEGINS_S = 12.0  # of the one that shall, within a call of its model: until then that has begun on a starved machine, too
 GB = 10**9
 DETECTOR_BYTES, POLICY_BYTES, CONTEXT_BYTES = 5 * GB, 4 * GB, GB // 10
 JOINTS = "[shoulder_pan, shoulder_lift, elbow_flex, wrist_flex, wrist_roll, gripper]"
@@ -298,9 +299,11 @@ async def rejected(stage: Stage) -> None:
 
 async def past_its_deadline(stage: Stage) -> None:
     """The result is out, but a call of the model still runs: its bytes are on the card, so the detector stays away until they are measured gone."""
-    async with PolicyClient(f"ipc://{stage.programs.runtime}/policy.sock") as policy:
+    async with PolicyClient(
+        f"ipc://{stage.programs.runtime}/policy.sock", connect_timeout_s=BOOT_S
+    ) as policy:
         await policy.load()  # what the deadline is met by is the call alone
-    goal = await stage.goal_under_way(deadline_s=4.0)
+    goal = await stage.goal_under_way(deadline_s=CALL_BEGINS_S)
     assert (await goal.result(WAIT_S))["status"] == "deadline"
     await stage.until("use_ended", "policy")
     assert (stage.programs.runtime / "policy/holding").exists()
@@ -358,7 +361,10 @@ async def canceled_while_loading(stage: Stage) -> None:
     stage.programs.tell("slow_load", True)
     goal = await stage.runner.send_goal(SKILL, prompt="hold still", deadline_s=DEADLINE_S)
     await stage.until("granted", "policy")
-    await goal.cancel()
+    async with PolicyClient(f"ipc://{stage.programs.runtime}/policy.sock") as policy:
+        await goal.cancel()
+        while (await policy.ping(timeout_s=WAIT_S))["state"] != "unloading":  # the runner has told it
+            await asyncio.sleep(0.01)
     stage.programs.tell("slow_load", False)
     assert (await goal.result(WAIT_S))["status"] == "canceled"
     await stage.detector_is_back(after="granted")
@@ -459,11 +465,19 @@ def test_who_wants_to_look_in_the_middle_of_a_goal_is_told_to_wait(programs: Pro
 
 
 async def one_after_the_other(stage: Stage) -> None:
-    async with PolicyClient(f"ipc://{stage.programs.runtime}/policy.sock") as policy:
-        loaded = await policy.load()
-    assert loaded["lease_id"] is not None
-    assert loaded["token"] is not None
-    async with stage.arbiter.use(loaded["lease_id"], loaded["token"]):  # no moment in which it could be idle
+    np = pytest.importorskip("numpy")
+    stage.programs.tell("hold", True)
+    async with AsyncExitStack() as stack:
+        policy = await stack.enter_async_context(
+            PolicyClient(f"ipc://{stage.programs.runtime}/policy.sock", connect_timeout_s=BOOT_S)
+        )
+        call = asyncio.create_task(policy.get_action({"observation.state": np.zeros(6)}))
+        await stage.holding()
+        held = await policy.ping(timeout_s=WAIT_S)
+        assert held["token"] is not None
+        await stack.enter_async_context(stage.arbiter.use(held["lease_id"], held["token"]))
+        stage.programs.tell("hold", False)  # from one use to the next: no moment in which it could be idle
+        await call
         for prompt in ("hold still", "go on holding still"):
             goal = await stage.runner.send_goal(SKILL, prompt=prompt, deadline_s=DEADLINE_S)
             assert (await goal.result(WAIT_S))["status"] == "succeeded"
@@ -494,12 +508,12 @@ async def slow_start(stage: Stage) -> None:
     stage.programs.tell("slow_load", True)
     goal = await stage.runner.send_goal(SKILL, prompt="hold still", deadline_s=DEADLINE_S)
     await stage.until("granted", "policy")
-    phases = []
+    phases: list[str] = []
     async for feedback in goal.feedback():
         phases.append(feedback["state"])
         if feedback["state"] == "running":
             break
-        if feedback["state"] == "starting":
+        if phases.count("starting") == 1:  # it may be told again behind the load's end
             assert (await stage.leases())["policy"] == "loading"
             stage.programs.tell("slow_load", False)
     assert set(phases) <= {"acquiring", "starting", "running"}

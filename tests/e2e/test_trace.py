@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from arbiter.testing.collector import Collector, ReceivedSpan
 from arbiter.testing.process import ArbiterProcess
@@ -158,7 +159,7 @@ def played(arbiter: ArbiterProcess, programs: Programs, collector: Collector, fo
     grab = ["--name", "grab", "--rskill", str(GRAB / "rskill.yaml"), "--footprint", "4.3GB,4.3GB,450MiB"]
     programs.start(echo, str(folder), *detector, *device)
     programs.start("-m", "sidecars", *grab, *device)
-    programs.start("-m", "runner", "sim", "--seed", "1", "--skills", str(GRAB))
+    programs.start("-m", "runner", "sim", "--seed", "1", "--skills", str(endless(folder)))
     asyncio.run(all_up(arbiter.runtime))
     programs.start(
         "-m", "reasoner", "--task", "grab the red cube", "--planner", "openai", "--scene-vlm", "none"
@@ -167,6 +168,17 @@ def played(arbiter: ArbiterProcess, programs: Programs, collector: Collector, fo
         lambda: bool(collector.spans(telemetry.SPAN_SEND)), "action that reaches the robot", MOVES_S
     )
     return programs.end()
+
+
+def endless(folder: Path) -> Path:
+    """The grab as a goal that does not end by itself, however late the SIGTERM comes."""
+    manifest = yaml.safe_load((GRAB / "rskill.yaml").read_text())
+    manifest["policy_extras"] |= {"rollout_steps": 100_000, "stop_when_still": False}
+    manifest["latency_budget"]["max_execution_s"] = 3600.0
+    skill = folder / GRAB.name
+    skill.mkdir()
+    (skill / "rskill.yaml").write_text(yaml.safe_dump(manifest))
+    return skill
 
 
 async def all_up(runtime: Path) -> None:

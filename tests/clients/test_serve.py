@@ -1,0 +1,55 @@
+"""The server of the small programs, at its end: nobody is left without the answer that he was given."""
+
+import asyncio
+from pathlib import Path
+
+import pytest
+import zmq
+
+from arbiter.testing.wire import WireClient
+from clients.serve import Message, Peer, RouterServer
+from schemas.errors import AlreadyRunning, VramError
+
+ANSWER = bytes(16 << 20)  # far more than the kernel takes in one go
+
+
+def refused(error: VramError) -> Message:
+    return {"error": error.code}
+
+
+def test_the_last_answer_reaches_its_peer_though_the_server_ends_behind_it(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/s.sock"
+
+    async def answer_and_end() -> None:
+        answered = asyncio.Event()
+        async with RouterServer(endpoint, refused) as server:
+
+            async def handle(peer: Peer, message: Message) -> None:
+                await server.send(peer, {"re": message["id"], "data": ANSWER})
+                answered.set()
+
+            serving = asyncio.create_task(server.serve(handle))
+            await answered.wait()
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+
+    with WireClient(endpoint) as client:
+        request = client.send("ask")
+        asyncio.run(answer_and_end())
+        assert client.reply(request)["data"] == ANSWER
+
+
+def test_an_endpoint_is_free_when_its_server_has_ended_and_when_it_never_began(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/s.sock"
+
+    async def one_after_the_other() -> None:
+        for _ in range(3):
+            async with RouterServer(endpoint, refused):
+                with pytest.raises(AlreadyRunning):
+                    await RouterServer(endpoint, refused).__aenter__()
+        nowhere = RouterServer(f"ipc://{tmp_path}/{'x' * 120}", refused)
+        for _ in range(2):  # too long for a socket: what was begun is taken back
+            with pytest.raises(zmq.ZMQError):
+                await nowhere.__aenter__()
+
+    asyncio.run(one_after_the_other())
