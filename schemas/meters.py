@@ -10,7 +10,7 @@ from functools import cache
 
 from opentelemetry import metrics
 
-from schemas import telemetry
+from schemas import exported, telemetry
 
 Labels = Mapping[str, str]
 
@@ -25,13 +25,13 @@ _UNITS = {
 
 def count(name: str, labels: Labels | None = None, times: int = 1) -> None:
     """Something happened `times` times."""
-    _counter(name).add(times, labels)
+    _counter(name).add(times, exported.labels(labels))
 
 
 def measure(name: str, value: float, labels: Labels | None = None) -> None:
     """One value of a distribution, in the unit of its name. What is no number, or negative, is no measurement and left out."""
     if math.isfinite(value) and value >= 0:
-        _histogram(name).record(value, labels)
+        _histogram(name).record(value, exported.labels(labels))
 
 
 @cache

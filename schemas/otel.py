@@ -19,7 +19,7 @@ from importlib import import_module
 from typing import Any
 from urllib.parse import urlsplit
 
-from schemas import telemetry
+from schemas import exported, telemetry
 from schemas.errors import ConfigError
 
 log = logging.getLogger(__name__)
@@ -31,7 +31,8 @@ PROMETHEUS_PORT = 9464
 FLUSH_S = 5.0
 """A program that ends waits at most so long for its collector."""
 EXPORT_S = 3.0
-"""Time limit of one export, retries included, unless OTEL_EXPORTER_OTLP_TIMEOUT says otherwise. The SDK's own 10 s outlasts FLUSH_S."""
+"""Time limit of one export, retries included, unless OTEL_EXPORTER_OTLP_TIMEOUT or the signal's own says otherwise. The SDK's own 10 s outlasts FLUSH_S."""
+EXPORT_MAX_S = 86_400.0
 SCRAPE_S = 5.0
 """A reader of the Prometheus endpoint that says nothing for so long is hung up on."""
 SCRAPES_MAX = 8
@@ -68,6 +69,8 @@ class Plan:
     prometheus: tuple[str, int] | None = None  # loopback address, port; 0: any free one
     sampler: str = "parentbased_traceidratio"
     ratio: float = 1.0  # 0..1, of the traces that begin here
+    traces_timeout_s: float = EXPORT_S
+    metrics_timeout_s: float = EXPORT_S
 
     @property
     def on(self) -> bool:
@@ -128,7 +131,7 @@ def set_up(
     if not planned.on:
         return Telemetry()
     if _installed is None:
-        _installed = _install(service, planned, environ, attributes or {})
+        _installed = _install(service, planned, attributes or {})
         atexit.register(_installed)
     return _installed
 
@@ -156,7 +159,10 @@ def plan(
     if urls["TRACES"] or urls["METRICS"]:
         _check_protocol(environ)
     sampler, ratio = _sampling(environ, sample_ratio)
-    return Plan(urls["TRACES"], urls["METRICS"], prometheus, sampler, ratio)
+    limits_s = {signal: _timeout_s(environ, signal) if url else EXPORT_S for signal, url in urls.items()}
+    return Plan(
+        urls["TRACES"], urls["METRICS"], prometheus, sampler, ratio, limits_s["TRACES"], limits_s["METRICS"]
+    )
 
 
 def _exporters(environ: Mapping[str, str], name: str, known: Sequence[str]) -> tuple[str, ...] | None:
@@ -195,6 +201,24 @@ def checked_url(text: str, name: str) -> str:
         shown = text.rpartition("@")[2].partition("?")[0]  # no password, no token
         raise ConfigError(f"{name}: {shown!r} is no URL of a collector", hint=f"write {OTLP_DEFAULT}")
     return text
+
+
+def _timeout_s(environ: Mapping[str, str], signal: str) -> float:
+    """Of one export, as the SDK reads it: the signal's own variable before the common one, and in seconds."""
+    for name in (f"OTEL_EXPORTER_OTLP_{signal}_TIMEOUT", "OTEL_EXPORTER_OTLP_TIMEOUT"):
+        if not (text := environ.get(name, "").strip()):
+            continue
+        try:
+            value = float(text)
+        except ValueError:
+            value = 0.0
+        if not 0.0 < value <= EXPORT_MAX_S:
+            raise ConfigError(
+                f"{name}: {text!r} is no number of seconds for an export",
+                hint=f"more than 0 and at most {EXPORT_MAX_S:g}, e.g. 10",
+            )
+        return value
+    return EXPORT_S
 
 
 def _check_protocol(environ: Mapping[str, str]) -> None:
@@ -256,13 +280,11 @@ def _ratio(text: str, name: str) -> float:
 
 
 # -- the SDK: nothing above this line imports it ------------------------------------------------------------------------
-def _install(
-    service: str, planned: Plan, environ: Mapping[str, str], attributes: Mapping[str, str]
-) -> Telemetry:
+def _install(service: str, planned: Plan, attributes: Mapping[str, str]) -> Telemetry:
     """Everything that can fail comes first: a program whose telemetry is refused has no half of it."""
     ends: list[Callable[[], object]] = []
     try:
-        port = _make(service, planned, environ, attributes, ends)
+        port = _make(service, planned, attributes, ends)
     except BaseException as error:
         for end in ends:
             end()
@@ -281,7 +303,6 @@ def _install(
 def _make(
     service: str,
     planned: Plan,
-    environ: Mapping[str, str],
     attributes: Mapping[str, str],
     ends: list[Callable[[], object]],
 ) -> int | None:
@@ -301,18 +322,17 @@ def _make(
         **attributes,
     }
     _quieten()
-    resource = Resource.create(own).merge(OTELResourceDetector().detect())  # what the environment says wins
-    timeout_s = None if environ.get("OTEL_EXPORTER_OTLP_TIMEOUT") else EXPORT_S
+    named = Resource.create(own).merge(OTELResourceDetector().detect())  # what the environment says wins
+    resource = Resource(exported.attributes(named.attributes), named.schema_url)
     tracers = meters = None
     if planned.traces is not None:
         from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
 
         tracers = TracerProvider(sampler=_sampler(planned), resource=resource, shutdown_on_exit=False)
         ends.append(tracers.shutdown)
-        tracers.add_span_processor(
-            BatchSpanProcessor(OTLPSpanExporter(endpoint=planned.traces, timeout=timeout_s))
-        )
-    readers, port = _readers(planned, timeout_s, ends)
+        exporter = OTLPSpanExporter(endpoint=planned.traces, timeout=planned.traces_timeout_s)
+        tracers.add_span_processor(BatchSpanProcessor(exported.Legible(exporter)))
+    readers, port = _readers(planned, ends)
     if readers:
         meters = MeterProvider(readers, resource=resource, shutdown_on_exit=False, views=_views())
         ends.append(meters.shutdown)
@@ -342,9 +362,7 @@ def _sampler(planned: Plan) -> Any:
     return sampling.ParentBased(root) if planned.sampler.startswith("parentbased_") else root
 
 
-def _readers(
-    planned: Plan, timeout_s: float | None, ends: list[Callable[[], object]]
-) -> tuple[list[Any], int | None]:
+def _readers(planned: Plan, ends: list[Callable[[], object]]) -> tuple[list[Any], int | None]:
     """(readers of metrics, Prometheus's port)."""
     readers: list[Any] = []
     port: int | None = None
@@ -352,7 +370,7 @@ def _readers(
         from opentelemetry.exporter.otlp.proto.http.metric_exporter import OTLPMetricExporter
         from opentelemetry.sdk.metrics.export import PeriodicExportingMetricReader
 
-        exporter = OTLPMetricExporter(endpoint=planned.metrics, timeout=timeout_s)
+        exporter = OTLPMetricExporter(endpoint=planned.metrics, timeout=planned.metrics_timeout_s)
         readers.append(PeriodicExportingMetricReader(exporter))
     if planned.prometheus is not None:
         from opentelemetry.exporter.prometheus import PrometheusMetricReader

@@ -1,5 +1,6 @@
 """Telemetry is asked for in standard words, refused with words that help, and costs nothing when it is not asked for."""
 
+import ast
 import importlib.util
 import os
 import socket
@@ -82,6 +83,18 @@ def run(code: str, environ: Mapping[str, str]) -> subprocess.CompletedProcess[st
             Plan(traces=OTLP_DEFAULT + "/v1/traces", sampler="always_off"),
         ),
         ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_SDK_DISABLED": "True"}, Plan()),
+        (
+            {
+                "OTEL_EXPORTER_OTLP_ENDPOINT": BASE,
+                "OTEL_EXPORTER_OTLP_TIMEOUT": "7",
+                "OTEL_EXPORTER_OTLP_TRACES_TIMEOUT": " 0.5 ",
+            },
+            Plan(BASE + "/v1/traces", BASE + "/v1/metrics", traces_timeout_s=0.5, metrics_timeout_s=7.0),
+        ),
+        (
+            {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_OTLP_TIMEOUT": "soon"},
+            Plan(prometheus=("127.0.0.1", 9464)),  # nothing is exported by OTLP: the variable is not read
+        ),
     ],
 )
 def test_the_standard_variables_mean_what_they_say(environ: Mapping[str, str], wanted: Plan) -> None:
@@ -118,6 +131,15 @@ def test_a_configuration_wins_over_the_environment() -> None:
         ({"OTEL_TRACES_EXPORTER": "otlp", "OTEL_TRACES_SAMPLER": "sometimes"}, "parentbased_traceidratio"),
         ({"OTEL_TRACES_EXPORTER": "otlp", "OTEL_TRACES_SAMPLER_ARG": "2"}, "0 (no trace) to 1 (all)"),
         ({"OTEL_TRACES_EXPORTER": "otlp", "OTEL_TRACES_SAMPLER_ARG": "nan"}, "OTEL_TRACES_SAMPLER_ARG"),
+        *(
+            ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, name: odd}, f"{name}: {odd!r} is no number of seconds")
+            for name in (
+                "OTEL_EXPORTER_OTLP_TIMEOUT",
+                "OTEL_EXPORTER_OTLP_TRACES_TIMEOUT",
+                "OTEL_EXPORTER_OTLP_METRICS_TIMEOUT",
+            )
+            for odd in ("0", "-1", "nan", "inf", "10s", "1e300")
+        ),
     ],
 )
 def test_what_makes_no_sense_is_named(environ: Mapping[str, str], words: str) -> None:
@@ -341,6 +363,21 @@ def test_what_the_sdk_refuses_is_the_operators_error_and_leaves_no_half(wrong: d
     said, providers, servers = result.stdout.splitlines()
     assert said.startswith("OpenTelemetry refuses its settings: "), result.stderr
     assert (providers, servers) == ("ProxyTracerProvider _ProxyMeterProvider", "[]")
+
+
+@needs_sdk
+def test_an_operators_time_limits_win_over_ours() -> None:
+    """Regression: a limit for one signal was overridden by our 3 s."""
+    result = run(
+        "import gc\n"
+        "import schemas.otel as o\n"
+        "t = o.set_up('robot')\n"
+        "from opentelemetry.exporter.otlp.common.http import _OTLPHTTPClient as C\n"
+        "print({c._kind: c._timeout for c in gc.get_objects() if isinstance(c, C)})\n"
+        "t(0.1)\n",
+        {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_EXPORTER_OTLP_METRICS_TIMEOUT": "0.25"},
+    )
+    assert ast.literal_eval(result.stdout) == {"spans": 3.0, "metrics": 0.25}, result.stderr
 
 
 @needs_sdk
