@@ -8,13 +8,14 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
+from schemas.traceparent import Traceparent
 from schemas.wire import Name, Seconds
 
 
 class _Call(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     id: Annotated[int, Field(ge=0, lt=1 << 53)]
-    traceparent: Annotated[str, Field(max_length=64)] | None = None
+    traceparent: Traceparent = None
 
 
 class SendGoal(_Call):

@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
+from schemas.traceparent import Traceparent
 from schemas.wire import Seconds, TokenPair
 
 ImageBytes = Annotated[bytes, Field(min_length=8, max_length=16 * 1024 * 1024)]
@@ -31,7 +32,7 @@ class _Call(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     id: int | None = None
     token: TokenPair | None = None
-    traceparent: Annotated[str, Field(max_length=64)] | None = None
+    traceparent: Traceparent = None
 
 
 class PingOp(_Call):

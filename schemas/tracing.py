@@ -13,6 +13,7 @@ from opentelemetry.context import Context
 from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
 from schemas import telemetry
+from schemas.traceparent import read as read_traceparent
 
 Attributes = Mapping[str, str | int | float]
 
@@ -117,4 +118,5 @@ def note(attributes: Attributes) -> None:
 
 
 def _of(traceparent: str) -> Context:
-    return _W3C.extract({"traceparent": traceparent})
+    read = read_traceparent(traceparent)
+    return _W3C.extract({"traceparent": read}) if read else Context()

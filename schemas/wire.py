@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from schemas import defaults as d
+from schemas.traceparent import Traceparent
 
 Name = Annotated[str, Field(min_length=1, max_length=d.NAME_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]+$")]
 LeaseIdText = Annotated[str, Field(min_length=1, max_length=64)]
@@ -81,7 +82,7 @@ class LeaseSpec(_Frozen):
 
 class _Request(_Frozen):
     id: Annotated[int, Field(ge=0, lt=1 << 53)]
-    traceparent: Annotated[str, Field(max_length=64)] | None = None
+    traceparent: Traceparent = None
 
 
 class Hello(_Request):

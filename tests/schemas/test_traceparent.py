@@ -1,0 +1,78 @@
+"""A caller's traceparent is read as W3C says, by one rule, wherever it comes in: one that is none begins a new trace and refuses nothing."""
+
+from typing import Any
+
+import pytest
+
+from schemas import tracing
+from schemas.goals import RUNNER_REQUEST
+from schemas.sidecar import ENDPOINT_REQUEST, OP_REQUEST
+from schemas.traceparent import read
+from schemas.wire import REQUEST
+
+TRACE, SPAN = "0af7651916cd43dd8448eb211c80319c", "b7ad6b7169203331"
+GOOD = f"00-{TRACE}-{SPAN}-01"
+
+READ: list[tuple[object, str | None]] = [
+    (GOOD, GOOD),
+    (f"00-{TRACE}-{SPAN}-00", f"00-{TRACE}-{SPAN}-00"),
+    (f"00-{TRACE}-{SPAN}-03", f"00-{TRACE}-{SPAN}-03"),
+    (f" \t{GOOD} ", GOOD),
+    # a later version: what this one knows of it, and no flag but `sampled`
+    (f"01-{TRACE}-{SPAN}-01", GOOD),
+    (f"cc-{TRACE}-{SPAN}-ff-what-the-future-will-be-like", GOOD),
+    (f"cc-{TRACE}-{SPAN}-fe-", f"00-{TRACE}-{SPAN}-00"),
+    (f"cc-{TRACE}-{SPAN}-01-" + "x" * 400, GOOD),
+    (f"cc-{TRACE}-{SPAN}-01-" + "x" * 1000, None),
+    (f"cc-{TRACE}-{SPAN}-01.what", None),
+    # none
+    (f"{GOOD}-what", None),
+    (f"{GOOD}-", None),
+    (f"ff-{TRACE}-{SPAN}-01", None),
+    (f"00-{'0' * 32}-{SPAN}-01", None),
+    (f"00-{TRACE}-{'0' * 16}-01", None),
+    (f"00-{TRACE.upper()}-{SPAN}-01", None),
+    (f"00-{TRACE}-{SPAN.upper()}-01", None),
+    (f"00-{TRACE}-{SPAN}-0A", None),
+    (f"CC-{TRACE}-{SPAN}-01", None),
+    (f"00-{TRACE[1:]}-{SPAN}-01", None),
+    (f"00-{TRACE}-{SPAN}", None),
+    (f"0٠-{TRACE}-{SPAN}-01", None),
+    (f"{GOOD}\n", None),
+    (f"x{GOOD}", None),
+    ("", None),
+    ("?" * 1_000_000, None),
+    ("\ud800", None),
+    (None, None),
+    (7, None),
+    (b"00-", None),
+    ([GOOD], None),
+    ({"traceparent": GOOD}, None),
+]
+
+
+@pytest.mark.parametrize(("given", "kept"), READ)
+def test_it_is_read_as_w3c_says(given: object, kept: str | None) -> None:
+    assert read(given) == kept
+
+
+@pytest.mark.parametrize(("given", "kept"), READ)
+def test_no_request_is_refused_for_it(given: object, kept: str | None) -> None:
+    """Regression: a goal, an acquire and a question to a sidecar were refused for a traceparent of more than 64 characters."""
+    image = b"\x89PNG\r\n\x1a\n"
+    messages: list[tuple[Any, dict[str, Any]]] = [
+        (REQUEST, {"op": "status", "id": 1}),
+        (RUNNER_REQUEST, {"op": "goal", "id": 1, "goal_id": "g", "rskill_id": "a/b"}),
+        (OP_REQUEST, {"op": "detect", "image": image, "query": "cube"}),
+        (ENDPOINT_REQUEST, {"endpoint": "reset"}),
+    ]
+    for wire, message in messages:
+        assert wire.validate_python({**message, "traceparent": given}).traceparent == kept
+
+
+@pytest.mark.parametrize(("given", "kept"), [case for case in READ if isinstance(case[0], str)])
+def test_a_span_joins_the_callers_trace_by_the_same_rule(given: str, kept: str | None) -> None:
+    """Also where none was validated: TRACEPARENT of a program's environment."""
+    with tracing.joined(given):
+        found = tracing.traceparent()
+        assert (found and found[:53]) == (kept and kept[:53])
