@@ -25,7 +25,8 @@ from typing import Any, Self
 from clients import inside, traces
 from clients import records as r
 from clients.connection import REQUEST_TIMEOUT_S
-from clients.lease import Callbacks, ForeignUse, Lease, OnLost, OnReturn, OnRevoke, SafePointEta, Unload
+from clients.lease import Callbacks, ForeignUse, Lease, OnLost, OnReturn, OnRevoke, SafePointEta
+from clients.leaving import Unload
 from clients.protocol import ClientProtocol
 from clients.reach import START, obstacle
 from clients.transport import Transport
@@ -312,7 +313,7 @@ class ArbiterClient:
         finally:
             self._subscribers.discard(queue)
 
-    # -- for leases (`clients.lease.Driver`) -------------------------------------------------------------------------
+    # -- for leases (`clients.leaving.Driver`) -----------------------------------------------------------------------
     def now(self) -> float:
         return time.monotonic()
 

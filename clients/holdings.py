@@ -5,7 +5,7 @@ the arbiter may have given its bytes away. A lease on standby or parked is `asle
 again by a push, or by the reply to `reacquire`, and the same record goes on under a new token. However a lease ends without
 our doing, the owner hears `Gone`.
 
-It must not know how the first grant came about (`clients.waits`), nor callbacks and safe points (`clients.lease`).
+It must not know how the first grant came about (`clients.waits`), nor callbacks (`clients.lease`) and safe points (`clients.leaving`).
 """
 
 from collections.abc import Iterable, Iterator

@@ -439,7 +439,7 @@ class Consumer(Program):
     async def _unload(self, holding: Holding) -> None:
         """Called by the library at the safe point, or after a loss."""
         used = self.cast.used_by_others(holding)
-        alone = holding.lease._own_will and not self.client.connected  # nobody is there who could refuse
+        alone = holding.lease.given_up and not self.client.connected  # nobody is there who could refuse
         if used and holding.lease.state != "gone" and not alone:
             self.world.fail(f"{holding.lease.lease_id} unloads while {used} use it")
         card, key = self.world.cards[holding.gpu], self.process.key
