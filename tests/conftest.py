@@ -1,4 +1,4 @@
-"""For every test of the product: a real arbiter daemon in a folder of its own, and Hypothesis's nightly profile."""
+"""For every test of the product: a real arbiter daemon in a folder of its own, and Hypothesis's profiles."""
 
 import os
 import signal

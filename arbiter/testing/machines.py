@@ -1,19 +1,23 @@
-"""How long the rule machines of the core walk: a little in every test run, always the same way; far and at random in the profile `nightly`.
+"""How properties are tried: a little in every test run, always the same way and on however slow a machine; far and at random in the night.
 
-HYPOTHESIS_PROFILE or pytest's `--hypothesis-profile` chooses it; `make nightly` splits its histories over the cores (`tests/nightly`). A
-machine takes part with `TestThis.settings = walk(60)`, and in the night with a line in `tests/nightly/nightly_run.py`.
+`steady`, the profile of a usual run, gives no example a time limit: a machine that stands still for a moment is no failure, and what fails once fails
+again. HYPOTHESIS_PROFILE or pytest's `--hypothesis-profile` chooses `nightly`; `make nightly` splits its histories over the cores
+(`tests/nightly`). A rule machine takes part with `TestThis.settings = walk(60)`, and in the night with a line in `tests/nightly/nightly_run.py`.
 """
 
 import os
 
 from hypothesis import HealthCheck, Phase, settings
 
-NIGHTLY = "nightly"
+STEADY, NIGHTLY = "steady", "nightly"
 NIGHTLY_EXAMPLES = 100_000
 
 
 def register(nightly_examples: int = NIGHTLY_EXAMPLES) -> None:
-    """Make the nightly profile known, and load the profile that HYPOTHESIS_PROFILE names."""
+    """Make both profiles known, and load the one that HYPOTHESIS_PROFILE names; `steady` if it names none."""
+    settings.register_profile(
+        STEADY, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow], print_blob=True
+    )
     settings.register_profile(
         NIGHTLY,
         max_examples=nightly_examples,
@@ -22,8 +26,7 @@ def register(nightly_examples: int = NIGHTLY_EXAMPLES) -> None:
         deadline=None,
         print_blob=True,
     )
-    if chosen := os.environ.get("HYPOTHESIS_PROFILE"):
-        settings.load_profile(chosen)
+    settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE") or STEADY)
 
 
 def walk(examples: int, *, nightly_share: float = 1.0) -> settings:
