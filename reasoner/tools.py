@@ -52,6 +52,7 @@ PLACE_MAX_S = 10.0  # a later answer says where something stood: an arm would re
 LOOKS_MAX = 3  # with a new picture each, for one answer: behind the first wait the model is there
 GOAL_GRACE_S = 60.0  # beyond the goal's own deadline: loading the skill's model is not part of the motion
 GOAL_MAX_S = 600.0  # when the manifest sets the deadline
+HEARD_LATE_S = 0.5  # for feedback that came while this process stood still; without it a goal that goes on would be called off
 CANCEL_S = 10.0  # for a cancelled goal to end: it takes the arm back and finishes its use
 IDENTITY_S = 10.0  # for a perception sidecar to say which model it serves
 PROGRESS_TOLERANCE = 0.0
@@ -368,21 +369,28 @@ async def _stands_still(goal: Goal, call: ExecuteRskill) -> bool:
     assert call.patience_s is not None, "only watched with patience"
     tolerance = PROGRESS_TOLERANCE if call.progress_tolerance is None else call.progress_tolerance
     best: float | None = None
+    time_s = asyncio.get_running_loop().time
     feedback = aiter(goal.feedback())
+    coming = asyncio.ensure_future(anext(feedback))
     deadline_s: float | None = None
-    while True:
-        try:
-            async with asyncio.timeout_at(deadline_s):
-                item = await anext(feedback)
-        except TimeoutError:
-            return True
-        except StopAsyncIteration:
-            return False
-        if item["state"] in BEFORE_MOTION:
-            continue
-        if best is None or item["progress"] > best + tolerance:
-            best = item["progress"]
-            deadline_s = asyncio.get_running_loop().time() + call.patience_s
+    over = False
+    try:
+        while True:
+            left_s = None if deadline_s is None else max(0.0, deadline_s - time_s())
+            if not (await asyncio.wait({coming}, timeout=left_s))[0]:
+                if over:
+                    return True
+                over, deadline_s = True, time_s() + HEARD_LATE_S
+                continue
+            item = coming.result()
+            coming = asyncio.ensure_future(anext(feedback))
+            if item["state"] not in BEFORE_MOTION and (best is None or item["progress"] > best + tolerance):
+                best, over, deadline_s = item["progress"], False, time_s() + call.patience_s
+    except StopAsyncIteration:
+        return False
+    finally:
+        coming.cancel()
+        coming.add_done_callback(_retrieve)
 
 
 async def _called_off(goal: Goal) -> ResultPush | None:

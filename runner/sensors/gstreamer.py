@@ -28,6 +28,7 @@ log = logging.getLogger(__name__)
 
 START_S = 10.0  # the longest that opening a source and, for a file, decoding its first picture may take
 STOP_S = 2.0  # how long `stop` waits for a driver; its thread then ends by itself, deaf
+CLOCK_LOOKS = 5  # at both clocks, to know how far apart they are: the closest pair counts
 POLL_NS = 50_000_000  # how soon a stop or an error of a source without pictures is noticed
 NANOSECONDS_MAX = 2**64 - 1  # GStreamer's word for "no time known"
 
@@ -236,6 +237,7 @@ class _Run:
         # the machine's monotonic clock, so that times of buffers become times of the runner
         self._time = self._gst.SystemClock.obtain()
         self._pipeline.use_clock(self._time)
+        self._ahead_ns = self._clocks_apart_ns()
         self._bus = self._pipeline.get_bus()
         self._wanted = self._gst.MessageType.ERROR | self._gst.MessageType.EOS
         self._sink.set_property("caps", self._gst.Caps.from_string(CAPS[params.encoding]))
@@ -289,7 +291,8 @@ class _Run:
         buffer, caps = sample.get_buffer(), sample.get_caps()
         if buffer.has_flags(gst.BufferFlags.CORRUPTED) or buffer.has_flags(gst.BufferFlags.GAP):
             return None  # half a picture, or one that was made up to fill a hole
-        age_ns = self._age_ns(sample.get_segment(), buffer)
+        now_ns, wall_ns = self._clock.now_ns(), self._clock.wall_ns()
+        taken_ns = self._taken_ns(sample.get_segment(), buffer, now_ns)
         if encoding == "jpeg":
             shape = caps.get_structure(0)
             (wide, width), (high, height) = shape.get_int("width"), shape.get_int("height")
@@ -300,8 +303,8 @@ class _Run:
             width, height, data = self._pixels(caps, buffer, _BYTES[encoding])
         return SensorFrame(
             sensor_id=self._sensor_id,
-            stamp_monotonic_ns=self._clock.now_ns() - age_ns,
-            stamp_wall_ns=self._clock.wall_ns() - age_ns,
+            stamp_monotonic_ns=taken_ns,
+            stamp_wall_ns=wall_ns - (now_ns - taken_ns),
             encoding=FrameEncoding(encoding),
             width=width,
             height=height,
@@ -327,13 +330,22 @@ class _Run:
         starts = range(offset, offset + stride * info.height, stride)
         return info.width, info.height, b"".join(view[start : start + row] for start in starts)
 
-    def _age_ns(self, segment: Any, buffer: Any) -> int:
-        """How long ago the picture was taken by its own stamp; 0 if it has none or one of the future."""
+    def _clocks_apart_ns(self) -> int:
+        """The runner's clock less GStreamer's. Measured once: a thread that is stopped between looking at the one and at the other for each
+        picture would make it younger than it is."""
+        looks = []
+        for _ in range(CLOCK_LOOKS):
+            before_ns, theirs_ns = self._clock.now_ns(), int(self._time.get_time())
+            looks.append((self._clock.now_ns() - before_ns, before_ns - theirs_ns))
+        return min(looks)[1]
+
+    def _taken_ns(self, segment: Any, buffer: Any, now_ns: int) -> int:
+        """When the picture was taken by its own stamp, on the runner's clock; `now_ns` if it has none or one of the future."""
         running = segment.to_running_time(self._gst.Format.TIME, buffer.pts)
         base = self._pipeline.get_base_time()
         if NANOSECONDS_MAX in (buffer.pts, running, base):
-            return 0
-        return max(0, int(self._time.get_time() - (base + running)))
+            return now_ns
+        return min(now_ns, int(base + running) + self._ahead_ns)
 
 
 def _words(message: Any) -> str:

@@ -156,14 +156,18 @@ class RosImageReader(SlotReader):
         try:
             while not guard.read():
                 waitset.wait(duration(seconds=WAIT_S))
-                self._look_at_publishers(feed, reader)
-                self._take(feed, reader)
+                self._attend(feed, reader)
         except DDSException as error:
             feed.end(f"DDS failed: {error}")
         finally:
             feed.end(
                 "the thread of its reader broke down; its log says why"
             )  # if nothing else was said before
+
+    def _attend(self, feed: Feed, reader: Any) -> None:
+        """What has come since the last time: publishers that came or went, then pictures."""
+        self._look_at_publishers(feed, reader)
+        self._take(feed, reader)
 
     def _look_at_publishers(self, feed: Feed, reader: Any) -> None:
         from cyclonedds.core import DDSStatus
@@ -175,6 +179,8 @@ class RosImageReader(SlotReader):
         refused = reader.get_requested_incompatible_qos_status()
         if matched.current_count:
             return
+        # what those who left have sent before comes before the word that they are gone: a picture says that somebody is there
+        self._take(feed, reader)
         if matched.current_count_change < 0:
             feed.interrupt(f"nobody publishes on {self._topic} any more")
         if refused.total_count_change:

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from clients.runner import RunnerClient
+from clients.runner import Goal, RunnerClient
 from clients.sidecar.perception import DetectorClient, SceneVlmClient
 from reasoner.inbox import Danger, Inbox
 from reasoner.palette import Palette, Skill
-from reasoner.tools import LOOKED_AT_MAX_S, LOOKS_MAX, PLACE_MAX_S, Tools
+from reasoner.tools import LOOKED_AT_MAX_S, LOOKS_MAX, PLACE_MAX_S, Tools, _stands_still
 from reasoner.watch import watch
 from schemas.errors import (
     Evicted,
@@ -110,6 +110,31 @@ def test_patience_counts_motion_and_not_the_wait_for_the_card(a_runner: Any) -> 
     outcome, cancelled = play(lambda: story(patient, loads))
     assert outcome.status == "succeeded"
     assert cancelled == []
+
+
+def test_progress_that_was_told_while_the_reasoner_stood_still_counts() -> None:
+    """Regression: the time was up and the feedback there, both at once; the goal was called off for no progress."""
+
+    async def story() -> bool:
+        loop, goal = asyncio.get_running_loop(), Goal(RunnerClient("ipc:///nobody"), "g")
+
+        def feed(progress: float) -> None:
+            goal.fed({"push": "feedback", "goal_id": "g", "progress": progress, "state": "running", "tick_idx": 0, "detail": ""})  # fmt: skip
+
+        patient = ExecuteRskill(rskill_id="lab/grab", patience_s=5.0, progress_tolerance=0.05)
+        watching = asyncio.create_task(_stands_still(goal, patient))
+        feed(0.2)
+        for _ in range(5):  # it has heard of it
+            await asyncio.sleep(0)
+        loop.time = lambda now=loop.time: now() + 6.0  # type: ignore[method-assign,misc]  # nothing ran for six seconds
+        loop.call_soon_threadsafe(feed, 0.4)
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert not watching.done()
+        goal.ended({"push": "result", "goal_id": "g", "status": "succeeded", "success": True, "code": "", "message": "", "data": {}})  # fmt: skip
+        return await watching
+
+    assert play(story) is False
 
 
 @pytest.mark.parametrize(
@@ -337,8 +362,8 @@ def test_an_unknown_component_and_a_prompt(a_runner: Any) -> None:
 def test_an_emergency_stop_and_a_runner_that_is_gone_reach_the_inbox(a_runner: Any) -> None:
     async def story() -> list[Any]:
         inbox = Inbox()
-        async with a_runner() as runner, RunnerClient(runner.endpoint, connect_timeout_s=0.2) as client:
-            watching = asyncio.create_task(watch(client, inbox, period_s=0.01, answer_s=0.2))
+        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+            watching = asyncio.create_task(watch(client, inbox, period_s=0.01, answer_s=60.0))
             await client.state()
             assert inbox.take() == []
             runner.diagnostics = {"front": "stale", "joint_state": "ok"}
@@ -379,11 +404,10 @@ def test_a_goal_whose_runner_is_gone_is_not_called_cancelled(
     async def story() -> Any:
         async with contextlib.AsyncExitStack() as stack:
             async with a_runner() as runner:
-                client = await stack.enter_async_context(
-                    RunnerClient(runner.endpoint, timeout_s=0.3, connect_timeout_s=0.3)
-                )
+                client = await stack.enter_async_context(RunnerClient(runner.endpoint))
                 doing = asyncio.create_task(Tools(client, None, None)(GRAB))
                 await runner.accepted.wait()
+                client._timeout_s = client._connect_timeout_s = 0.3  # of no use any more: nobody will answer
             return await doing
 
     outcome = play(story)
