@@ -109,7 +109,10 @@ class _Running:
 
 
 class GoalServer:
-    """`await GoalServer(...).serve()` until `shutdown` or cancellation; then the running goal is canceled and answered."""
+    """`await GoalServer(...).serve()` until `shutdown` or cancellation; then the running goal is canceled and answered.
+
+    `estop_s`: a control loop that has not obeyed an emergency stop by then is said to hang.
+    """
 
     def __init__(
         self,
@@ -123,6 +126,7 @@ class GoalServer:
         identity: dict[str, Any] | None = None,
         on_bound: Callable[[], None] | None = None,
         stopping: asyncio.Event | None = None,
+        estop_s: float = ESTOP_S,
     ) -> None:
         self._endpoint = endpoint
         self._control = control
@@ -132,6 +136,7 @@ class GoalServer:
         self._ground_truth = ground_truth
         self._identity = identity or {}
         self._on_bound = on_bound
+        self._estop_s = estop_s
         self._residency = Residency()
         self._running: _Running | None = None
         self._results: OrderedDict[str, ResultPush] = OrderedDict()
@@ -252,11 +257,11 @@ class GoalServer:
             running.stopped_by = error
             self._stop(running)
         try:
-            async with asyncio.timeout(ESTOP_S):
+            async with asyncio.timeout(self._estop_s):
                 error = await self._control.call(self._robot.obey_estop)
         except TimeoutError:
             raise InternalError(
-                f"the control loop has not obeyed the emergency stop within {ESTOP_S:.0f} s",
+                f"the control loop has not obeyed the emergency stop within {self._estop_s:.0f} s",
                 hint="cut the robot's power; the loop hangs, and moves nothing if it comes back",
             ) from None
         if error is not None and not error.details.get("told", True):

@@ -33,9 +33,10 @@ class FedCamera(SlotReader):
         self.feed = None
 
     def show(self) -> None:
-        assert self.feed is not None
+        if (feed := self.feed) is None:  # stopped, by another thread than the one that looks
+            return
         self.deliver(
-            self.feed,
+            feed,
             SensorFrame(
                 sensor_id=self.sensor_id,
                 stamp_monotonic_ns=self.clock.now_ns(),
@@ -48,7 +49,7 @@ class FedCamera(SlotReader):
         )
 
     def read_latest(self, max_age_ms: float | None = None) -> SensorFrame:
-        if self.always and self.feed is not None:
+        if self.always:
             self.show()
         return super().read_latest(max_age_ms)
 

@@ -15,7 +15,7 @@ import pytest
 
 from clients.runner import RunnerClient
 from runner.cli.deploy import claim
-from schemas.errors import AlreadyRunning, EstopRequested, UnknownSkill
+from schemas.errors import AlreadyRunning, EstopRequested, InternalError, UnknownSkill
 from schemas.robot import HalConfig, RobotEnvironment
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
@@ -49,12 +49,17 @@ def start(tmp_path: Path, video: Path) -> Iterator[Start]:
     started: list[subprocess.Popen[str]] = []
 
     def begin(
-        *flags: str, more: str = "", loop: bool = True, steps: str = "", cameras: str = "front"
+        *flags: str,
+        more: str = "",
+        loop: bool = True,
+        fps: int = FPS,
+        steps: str = "",
+        cameras: str = "front",
     ) -> subprocess.Popen[str]:
         config = tmp_path / "robot.yaml"
         config.write_text(
             "robot_id: bench\nembodiment_tags: [so101_follower, mobile_base]\nhal: {adapter: so101_mujoco}\n"
-            f"sensors:\n  - {{sensor_id: front, max_age_ms: 2000, backend_params: {{path: {video}, loop: {str(loop).lower()}}}}}\n"
+            f"sensors:\n  - {{sensor_id: front, max_age_ms: 2000, backend_params: {{path: {video}, loop: {str(loop).lower()}, fps: {fps}}}}}\n"
             + more
         )
         environ = os.environ | {
@@ -103,6 +108,23 @@ async def under_way(client: RunnerClient, ticks: int = 5) -> Any:
     raise AssertionError(await goal.result(1))
 
 
+async def all_fresh(client: RunnerClient) -> None:
+    """Until nothing is stale: on a busy machine it may be for some ticks."""
+    while set((await client.state())["world"]["diagnostics"].values()) != {"ok"}:
+        await asyncio.sleep(0.05)
+
+
+async def stopped(client: RunnerClient, reason: str) -> None:
+    """Until the motors have been told. A loop that stands still for a second is told of as one that hangs, and obeys when it goes on."""
+    while True:
+        try:
+            await client.estop(reason)
+            return
+        except InternalError as error:
+            if "has not obeyed" not in error.message:
+                raise
+
+
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_cancels_the_goal_and_ends_in_order(
     start: Start, tmp_path: Path, how: signal.Signals
@@ -114,8 +136,8 @@ def test_a_signal_cancels_the_goal_and_ends_in_order(
         picture = await client.frame(max_age_ms=5000, encoding="png")
         assert (picture["camera"], picture["width"], picture["height"]) == ("front", WIDTH, HEIGHT)
         goal = await under_way(client)
-        state = await client.state()
-        assert state["world"]["diagnostics"] == {"front": "ok", "joint_state": "ok"}
+        assert set((await client.state())["world"]["diagnostics"]) == {"front", "joint_state"}
+        await all_fresh(client)
         process.send_signal(how)
         assert (await goal.result(60))["status"] == "canceled"
 
@@ -162,7 +184,7 @@ def test_a_run_without_a_task_ends_after_its_ticks(start: Start) -> None:
 
 
 def test_a_camera_file_that_ends_withholds_and_fails_the_goal(start: Start, tmp_path: Path) -> None:
-    start(loop=False)
+    start(loop=False, fps=10)  # three seconds: long enough for the runner to have seen it
 
     async def body(client: RunnerClient) -> None:
         goal = await client.send_goal(RSKILL, prompt="nod")
@@ -180,9 +202,13 @@ def test_the_emergency_stop_of_a_real_process(start: Start, tmp_path: Path) -> N
     async def body(client: RunnerClient) -> None:
         goal = await under_way(client)
         argv = [sys.executable, "-m", "runner", "estop", "--reason", "test", "--endpoint", client.endpoint]
-        stopped = await asyncio.create_subprocess_exec(*argv, cwd=ROOT, stdout=subprocess.PIPE)
-        said, _ = await stopped.communicate()
-        assert stopped.returncode == 0
+        said, complaint = b"", b"has not obeyed"
+        while b"has not obeyed" in complaint:  # within a second, which a busy machine may need for less
+            program = await asyncio.create_subprocess_exec(
+                *argv, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            )
+            said, complaint = await program.communicate()
+        assert program.returncode == 0, complaint
         assert b"emergency stop: test; the servos hold the present pose" in said
         assert (await goal.result(60))["code"] == "estop_requested"
         with pytest.raises(EstopRequested):
@@ -204,7 +230,7 @@ def test_after_an_emergency_stop_a_task_is_not_restarted_and_the_robot_stays_con
         await client.ping(timeout_s=60)
         while (await client.state())["goal"] is None:
             pass
-        await client.estop("test")
+        await stopped(client, "test")
         while (await client.state())["goal"] is not None:
             pass
         ticks = (await client.state())["ticks"]
@@ -226,7 +252,7 @@ def test_a_stopped_robot_does_not_move_again_because_its_runner_was_killed_and_r
     first = start()
 
     async def stop(client: RunnerClient) -> None:
-        await client.estop("a hand is in the way")
+        await stopped(client, "a hand is in the way")
 
     play(tmp_path, stop)
     assert "a hand is in the way" in mark.read_text()
@@ -241,7 +267,7 @@ def test_a_stopped_robot_does_not_move_again_because_its_runner_was_killed_and_r
     third = start()
 
     async def stop_and_end(client: RunnerClient) -> None:
-        await client.estop("again")
+        await stopped(client, "again")
         third.send_signal(signal.SIGTERM)
 
     play(tmp_path, stop_and_end)

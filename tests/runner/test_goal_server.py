@@ -74,7 +74,9 @@ class Told(SkillBase):
                 raise Evicted("another model is there")
             case "defect":
                 raise ZeroDivisionError("oops")
-        row = (0.01 * self.steps,) * 2
+        row = (
+            0.01 * (self.steps % 20),
+        ) * 2  # to and fro within the joints' ranges: "forever" is as long as a test is
         names = ("shoulder_pan", "wrist_roll")
         if self.steps % 2:
             return Hold("thinking")
@@ -123,6 +125,7 @@ def bench(
                 catalogue,
                 SystemClock(),
                 ground_truth=lambda: {"target": "red cube"},
+                estop_s=60.0,  # a machine that stands still for a second is no loop that hangs
             )
             task = asyncio.create_task(server.serve())
             await server.bound.wait()
@@ -372,7 +375,7 @@ def test_a_goal_sent_from_ever_new_connections_is_told_on_the_newest(
 
 def test_reads(bench: Any, endpoint: str, run_async: Run) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
-        assert (await client.ping())["goal_id"] is None
+        assert (await client.ping(timeout_s=60))["goal_id"] is None
         assert (await client.ground_truth())["target"] == "red cube"
         installed = await client.skills()
         assert installed["body"] is None, "this bench takes any skill"
@@ -419,7 +422,7 @@ def test_bad_input_gets_an_answer_and_harms_nothing(
             assert reply["error"]["message"]
         finally:
             socket.close(0)
-        assert (await client.ping())["ok"]
+        assert (await client.ping(timeout_s=60))["ok"]
 
     play(run_async, bench, endpoint, body)
 
@@ -441,7 +444,7 @@ def test_a_second_runner_on_the_same_socket_is_refused(bench: Any, endpoint: str
             second = GoalServer(endpoint, control, b.runner, b.server._catalogue, SystemClock())
             with pytest.raises(AlreadyRunning):
                 await second.serve()
-            assert (await client.ping())["ok"]
+            assert (await client.ping(timeout_s=60))["ok"]
 
     run_async(scenario())
 
@@ -478,7 +481,7 @@ def test_the_emergency_stop_of_a_simulator_ends_its_goal_too(
     async def body(b: Bench, client: RunnerClient) -> None:
         goal = await client.send_goal(RSKILL, prompt=prompt)
         while not b.made:
-            await client.ping()
+            await client.ping(timeout_s=60)
         await b.made[0].begun.wait()
         assert "emergency stop: smoke" in (await client.estop("smoke"))["message"]
         result = await goal.result(60)

@@ -370,8 +370,9 @@ class Distant(FedCamera):
         super().deliver(feed, frame.model_copy(update={"stamp_monotonic_ns": taken_ns}))
 
 
-def test_it_starts_on_a_camera_whose_pictures_take_their_time(twin: Twin) -> None:
+def test_it_starts_on_a_camera_whose_pictures_take_their_time() -> None:
     clock, over = SystemClock(), threading.Event()
+    twin = Twin(clock)
     far = Distant("far", clock, 60_000.0, always=False)
     runner = HardwareRunner(twin, [(far, 60_000.0)], gate, clock=clock, first_data_s=50.0)
 

@@ -57,8 +57,10 @@ class Bench:
 
 @pytest.fixture
 def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
+    """`estop_s`: short only where the control loop hangs. A machine that stands still for a second is no loop that hangs."""
+
     @asynccontextmanager
-    async def serving() -> AsyncIterator[tuple[Bench, RunnerClient]]:
+    async def serving(estop_s: float = 60.0) -> AsyncIterator[tuple[Bench, RunnerClient]]:
         clock = SystemClock()
         twin, camera, skill = Twin(clock), FedCamera("front", clock), Told(load_manifest(navigate_manifest))
         limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
@@ -71,7 +73,9 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
         )
         catalogue = Catalogue([skill.manifest], {Kind.ROS_ACTION: lambda manifest: skill})
         async with ControlThread(runner) as control:
-            server = GoalServer(endpoint, control, runner, catalogue, clock, identity={"robot": "bench"})
+            server = GoalServer(
+                endpoint, control, runner, catalogue, clock, identity={"robot": "bench"}, estop_s=estop_s
+            )
             task = asyncio.create_task(server.serve())
             await server.bound.wait()
             try:
@@ -86,12 +90,26 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
     return serving
 
 
-def play(run_async: Run, bench: Callable[..., Any], body: Callable[[Bench, RunnerClient], Any]) -> None:
+def play(
+    run_async: Run, bench: Callable[..., Any], body: Callable[[Bench, RunnerClient], Any], **options: Any
+) -> None:
     async def scenario() -> None:
-        async with bench() as (b, client):
+        async with bench(**options) as (b, client):
             await body(b, client)
 
     run_async(scenario())
+
+
+async def diagnosed(client: RunnerClient, as_what: str) -> None:
+    """Until the joints and the camera are called this. What is fresh is stale for some ticks wherever the machine stood still."""
+    while (await client.state())["world"]["diagnostics"] != {"front": as_what, "joint_state": as_what}:
+        await asyncio.sleep(0.05)
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command waits as long as the tests do: whether the motors are told is what counts here, not how soon."""
+    monkeypatch.setattr("runner.cli.estop.ANSWER_S", 60.0)
 
 
 @pytest.mark.parametrize("prompt", ["nod", "hang in the start"])
@@ -109,10 +127,7 @@ def test_the_stop_fails_the_goal_and_refuses_new_ones(bench: Any, run_async: Run
             await client.send_goal(RSKILL, prompt="nod")
         state = await client.state()
         assert "a hand is in the way" in state["estop"]
-        assert state["world"]["diagnostics"] == {
-            "front": "ok",
-            "joint_state": "ok",
-        }  # it can still be looked at
+        await diagnosed(client, "ok")  # it can still be looked at
         again = await client.estop("once more")
         assert "a hand is in the way" in again["message"]
         assert len(b.twin.sent) == sent
@@ -129,29 +144,25 @@ def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(bench: Any
         with pytest.raises(EstopRequested):
             await client.send_goal(RSKILL)
         b.skill.go_on.set()
-        assert "stand still" in (await client.estop())["message"]
+        while "stand still" not in (await client.state())["estop"]:
+            await asyncio.sleep(0.01)
         assert b.twin.sent == []  # what the step came back with was not sent
 
-    play(run_async, bench, body)
+    play(run_async, bench, body, estop_s=0.5)
 
 
 def test_what_was_fresh_is_stale_while_the_loop_hangs(bench: Any, run_async: Run) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
-        async def told() -> set[str]:
-            return set((await client.state())["world"]["diagnostics"].values())
-
         await client.send_goal(RSKILL, prompt="hang in the step")
         await b.skill.begun.wait()
-        async with asyncio.timeout(60):
-            while await told() != {"stale"}:
-                await asyncio.sleep(0.05)
-            b.skill.go_on.set()
-            while await told() != {"ok"}:
-                await asyncio.sleep(0.05)
+        await diagnosed(client, "stale")
+        b.skill.go_on.set()
+        await diagnosed(client, "ok")
 
     play(run_async, bench, body)
 
 
+@pytest.mark.usefixtures("patient")
 def test_the_command_line_stops_the_robot(
     bench: Any, run_async: Run, endpoint: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -165,6 +176,7 @@ def test_the_command_line_stops_the_robot(
     assert "bench: emergency stop: smoke; all joints stand still" in capfd.readouterr().out
 
 
+@pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("cause", [RobotFault("motor 2 does not answer"), TypeError("a driver's defect")])
 def test_a_stop_that_did_not_reach_the_motors_is_no_success_and_is_tried_again(
     bench: Any, run_async: Run, endpoint: str, capfd: pytest.CaptureFixture[str], cause: Exception
@@ -205,7 +217,7 @@ def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_being_read
         assert any(isinstance(answer, LimitExceeded) for answer in answers)
         assert b.twin.sent == []
 
-    play(run_async, bench, body)
+    play(run_async, bench, body, estop_s=0.5)
 
 
 @pytest.mark.parametrize(
@@ -277,7 +289,9 @@ def test_a_goal_is_limited_in_ticks(bench: Any, run_async: Run) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
         goal = await client.send_goal(RSKILL, prompt="nod", max_ticks=4)
         result = await goal.result(60)
-        assert (result["status"], result["code"], result["data"]["ticks"]) == ("failed", "limit_exceeded", 4)
+        assert (result["status"], result["code"]) == ("failed", "limit_exceeded")
+        assert result["data"]["ticks"] >= 4  # more where the machine stood still, and the skill was not asked
+        assert b.skill.taken <= 4
 
     play(run_async, bench, body)
 
@@ -288,7 +302,7 @@ def test_pictures_go_out_in_their_colours_and_a_dead_camera_gives_none(bench: An
         import cv2
         import numpy as np
 
-        reply = await client.frame("front", encoding="png")
+        reply = await client.frame("front", max_age_ms=60_000, encoding="png")
         picture = cv2.imdecode(np.frombuffer(reply["data"], dtype=np.uint8), cv2.IMREAD_COLOR)
         assert picture.tolist() == [[[255, 0, 0], [0, 0, 255]]]
         b.camera.stop()

@@ -259,7 +259,7 @@ def test_a_served_policy_is_started_anew_for_every_seed_and_released(tmp_path: P
     (tmp_path / "world.yaml").write_text(WORLD, encoding="utf-8")
     endpoint = f"ipc://{tmp_path}/policy.sock"
     world = world_of(POINT, env_config=tmp_path / "world.yaml", render=False)
-    makers = makers_of(world, {"test/point-seek": endpoint}, None, period_s=1 / 30, wait_s=2.0)
+    makers = makers_of(world, {"test/point-seek": endpoint}, None, period_s=1 / 30, wait_s=60.0)
     manifest = parse_manifest(MANIFEST + 'default_prompt: "go there"\n')
     runner = SimRunner(world.make, rate_hz=0, ends_with_skill=True)
 

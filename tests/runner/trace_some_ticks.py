@@ -4,13 +4,13 @@ import json
 import sys
 from pathlib import Path
 
+from manual_clock import ManualClock
 from opentelemetry import trace
 from opentelemetry.sdk.trace import TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from small_robots import FedCamera, Nod, Twin
 
-from runner.clock import SystemClock
 from runner.hardware import HardwareRunner
 from runner.protocols import Goal
 from runner.safety.ranges import JointRanges
@@ -23,7 +23,7 @@ def main() -> None:
     exporter, provider = InMemorySpanExporter(), TracerProvider()
     provider.add_span_processor(SimpleSpanProcessor(exporter))
     trace.set_tracer_provider(provider)
-    clock = SystemClock()
+    clock = ManualClock()
     twin, camera = Twin(clock), FedCamera("front", clock)
     limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
     runner = HardwareRunner(twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock)

@@ -94,7 +94,7 @@ def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(tmp_path:
                 return (await client.state())["goal"]
 
             # an operator speaks while a goal runs; the model is asked and hangs; the goal's result passes it by
-            stand_in.json(openai(TURN, goal_params={"turn_rad": 2.0}))
+            stand_in.json(openai(TURN, goal_params={"turn_rad": 6.2}))
             stand_in.hangs()
             stand_in.json(openai("finish", success=True, reason="turned"))
             async with programs.reasoner("openai") as reasoner:

@@ -55,6 +55,10 @@ class ServoBus:
     def torque(self, servo: int) -> bool:
         return bool(self.registers[servo][TORQUE])
 
+    @property
+    def silent(self) -> bool:
+        return self._silent.is_set()
+
     def cut(self) -> None:
         """From now on nobody answers."""
         self._silent.set()

@@ -25,11 +25,18 @@ COUNTS_PER_RAD = 4095 / (2 * math.pi)  # as lerobot counts
 
 
 @pytest.fixture
-def bus() -> Iterator[ServoBus]:
+def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[ServoBus]:
+    """The driver waits for a servo as long as it may answer; the 50 ms of real ones say nothing on a busy machine."""
     pytest.importorskip(
         "scservo_sdk", reason="Feetech's driver is missing: pip install 'vram-arbiter[so101]'"
     )
     with ServoBus() as servos:
+
+        def wait_as_long_as_it_lives(port: Any, packet_length: int) -> None:
+            port.packet_start_time = port.getCurrentTime()
+            port.packet_timeout = 1.0 if servos.silent else 60_000.0  # ms
+
+        monkeypatch.setattr("lerobot.motors.feetech.feetech.patch_setPacketTimeout", wait_as_long_as_it_lives)
         yield servos
 
 

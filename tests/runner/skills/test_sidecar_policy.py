@@ -163,8 +163,8 @@ class Bench:
         self, manifest: RSkillManifest, endpoint: str, arbiter: Arbiter | None, **options: Any
     ) -> None:
         self.sidecar, self.arbiter = Sidecar(), arbiter
-        self.client = PolicyClient(endpoint, timeout_s=5.0)
-        options.setdefault("wait_s", 5.0)
+        self.client = PolicyClient(endpoint, timeout_s=60.0)
+        options.setdefault("wait_s", 60.0)
         wiring: Wiring = wire_up(manifest, JOINTS, REST)
         self.skill = SidecarPolicy(manifest, wiring, self.client, arbiter, period_s=1 / 30, **options)
         self.position = dict(REST)
@@ -473,10 +473,11 @@ def test_a_chunk_that_is_asked_for_too_late_loads_nothing(
 @pytest.mark.parametrize("wanted", [True, False])
 @pytest.mark.parametrize("state", ["unloaded", "waiting", "resident"])
 def test_a_goal_that_is_over_before_its_policy_is_there_takes_the_load_back(
-    bench: Callable[..., Bench], run_async: Run, state: str, wanted: bool
+    bench: Callable[..., Bench], run_async: Run, state: str, wanted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regressions: the sidecar went on and made others leave the card for a goal that had been canceled; also one that was called back
     from standby, or left in that moment, and said neither `waiting` nor `loading`."""
+    monkeypatch.setattr("runner.skills.sidecar_policy.WITHDRAW_S", 60.0)
 
     async def play(b: Bench) -> None:
         b.sidecar.state, b.sidecar.wanted, b.sidecar.loads = state, wanted, asyncio.Event()
