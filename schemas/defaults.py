@@ -26,10 +26,8 @@ TERMINATE_GRACE_S = 5.0  # between SIGTERM and SIGKILL, for holders that agreed 
 # Measurement
 VERIFY_TIMEOUT_S = 10.0
 VERIFY_POLL_S = (0.005, 0.020, 0.050)  # pauses between readings after a release: 5 → 20 → 50 ms
-VERIFY_POLL_UNTIL_S = (
-    2.0,
-    5.0,
-)  # how long each but the last is kept; drivers take 0.5-1.5 s, and this is what is waited for
+# how long each pause but the last is kept; drivers take 0.5-1.5 s, and this is what is waited for
+VERIFY_POLL_UNTIL_S = (2.0, 5.0)
 VERIFY_CONFIRM_S = 0.002  # after a reading that is on target: the second one, which has to agree
 VERIFY_READING_SHARE = 0.5  # a slow card is not read more than this share of the time
 VERIFY_SLOW_POLL_S = 0.5  # after a verdict that does not allow a grant

@@ -45,9 +45,8 @@ def _begin(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: st
     )
     gpu.evictions.append(holder.eviction)
     parks = core.host.book(holder.id, holder.spec.park_bytes)
-    if (
-        holder.spec.standby or parks
-    ):  # a restart must not take a release that was asked for as one that was wished for
+    if holder.spec.standby or parks:
+        # a restart must not take a release that was asked for as one that was wished for
         core.record_lease(holder)
 
 

@@ -16,9 +16,8 @@ from arbiter.core.state import Core, Gpu, Refused
 from schemas import defaults
 from schemas.ids import GpuId, LeaseId, ProcessKey
 
-SEARCH_MAX = (
-    4096  # placements that are looked at; a gang on more cards than that is placed as far as this goes
-)
+SEARCH_MAX = 4096
+"""Placements that are looked at; a gang that could be placed in more ways is placed as far as this goes."""
 
 type _Placement = dict[GpuId, list[Lease]]
 

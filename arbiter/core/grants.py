@@ -2,7 +2,7 @@
 
 Per card, in this order (the numbers stand in `_serve`):
   1. under pressure: ask idle holders to leave, grant nothing
-  2. a gang loads here: its next member; blocked (recovering, reading unknown, a load under way): grant nothing, ask nobody
+  2. a gang loads here: its next member; blocked (recovering, drained, reading unknown, a load under way): grant nothing, ask nobody
   3. nobody waits: whoever is on standby and fits may come back, asking nobody to leave
   4. the head is one of a gang: all of it or nothing, on all its cards (`gangs`); nobody passes it
   5. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a head for which another card is

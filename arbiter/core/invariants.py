@@ -6,10 +6,10 @@ defect of the tables. Tests' drivers and the simulation run it after every event
 
 Numbers are those of ARCHITECTURE.md:
   1. approved bytes never exceed capacity − reserve, and a grant fits together with stowaways at its moment
-  2. nobody is resident beside an exclusive lease
+  2. nobody is resident beside an exclusive lease, nor comes before its bytes are measured gone; one lease at a time loads on a card
   3. nothing that is in use unloads
-  4. bytes stay charged until a verdict: whoever is resident is charged, whoever is charged is resident or under measurement,
-     whoever is away is neither; parked weights never exceed the budget of host RAM
+  4. bytes stay charged until a verdict: whoever is resident is charged, whoever is charged is resident, under measurement or of a gang that
+     loads, whoever is away is neither; a tree's bytes never exceed its root's grant, parked weights never exceed the budget of host RAM
   5. tokens only grow
   6. every waiter is in a queue, has a timer if it has a bound, and its card has a next reading scheduled
   7. of a gang, until it is complete or broken, all that wait are charged or none

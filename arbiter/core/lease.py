@@ -59,7 +59,6 @@ TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
 )
 """State → states that may follow. Everything else is illegal."""
 
-TERMINAL = frozenset(state for state, following in TRANSITIONS.items() if not following)
 LEAVING = frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING})
 AWAY = frozenset({_S.PARKED, _S.STANDBY})
 """States of a lease that lives on without bytes on a card: nobody renews it, it waits for nothing with a bound."""
@@ -123,9 +122,8 @@ class Eviction:
     verdict_at: float | None = None
     verdict: str = ""
     order: Order | None = None  # an operator wanted it
-    traceparent: str | None = (
-        None  # of whoever waits: goes with every `revoke`, so that the unloading is seen where it is waited for
-    )
+    # of whoever waits: goes with every `revoke`, so that the unloading is seen where it is waited for
+    traceparent: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,9 +174,8 @@ class Estate:
 
     booked_bytes: int
     approved_bytes: int
-    shares: dict[LeaseId, Share] = field(
-        default_factory=dict
-    )  # also of sub-leases that are over and not measured gone
+    # also of sub-leases that are over and not measured gone
+    shares: dict[LeaseId, Share] = field(default_factory=dict)
     borne: dict[ProcessKey, int] = field(default_factory=dict)  # residues that former sub-leases left
     told: bool = False  # asked to leave, it heard that its last sub-lease has
 
@@ -235,9 +232,7 @@ class Lease:
     steady_seen_bytes: int = 0  # largest reading, or the holder's word, since it is ready
     drifted: set[str] = field(default_factory=set)  # parts of the footprint that a note was said about
     uses: dict[tuple[ProcessKey, UseId], Use] = field(default_factory=dict)  # busy ones
-    yielded: dict[tuple[ProcessKey, UseId], Use] = field(
-        default_factory=dict
-    )  # pausing ones, nobody waits for them
+    yielded: dict[tuple[ProcessKey, UseId], Use] = field(default_factory=dict)  # pausing: nobody waits
     granted_at: float = 0.0
     ready_at: float = 0.0
     last_used_at: float = 0.0

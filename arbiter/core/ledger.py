@@ -141,9 +141,6 @@ class GpuLedger:
         """Is anything charged for this lease, be it nothing but a zero?"""
         return lease in self._owner
 
-    def is_debt(self, lease: LeaseId) -> bool:
-        return self.accounts[self._owner[lease]].charges[lease].debt
-
     def drift_bytes(self, process: ProcessKey) -> int:
         """How far a process was seen above what is booked for it."""
         account = self.accounts[process]

@@ -35,7 +35,7 @@ def steps(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
 def _of_gang(core: Core, gpu: Gpu, gang: Gang) -> list[Step]:
     """While it gathers or loads. Its members wait for each other, and for the memory of the one before."""
     if gang.phase == "gathering":
-        ends_at = core.timers.at(("gang", gang.name))
+        ends_at = core.timers.due(("gang", gang.name))
         return [] if ends_at is None else [_given_up(core, gang, ends_at, "if the rest has not come back")]
     found = [_load_ends(core, lease) for lease in gpu.in_state(LeaseState.LOADING)]
     if not found:
@@ -149,7 +149,7 @@ def _leaving(core: Core, gpu: Gpu, waiter: Lease, holder: Lease) -> Step:
 
 
 def _next_reading(core: Core, gpu: Gpu, because: str) -> Step:
-    times = [core.timers.at((kind, gpu.info.id)) for kind in ("verify", "probe")]
+    times = [core.timers.due((kind, gpu.info.id)) for kind in ("verify", "probe")]
     at = min((time for time in times if time is not None), default=None)
     return _step(core, "read", None, at, "reads the card again", because)
 

@@ -1,6 +1,6 @@
 """Pure decisions about one card: does it fit, is the measurement willing, who should leave, who may pass the head.
 
-Nothing here changes anything but one timer (`wake_when_evictable`).
+Nothing here changes anything but when a card is looked at again (`wake_when_evictable`, `is_best_place`).
 """
 
 from bisect import bisect_left

@@ -219,9 +219,8 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
     core.hand_to(lease, client.id)
     if not lease.attached:
         lease.attached = True
-        lease.ready_at = (
-            core.now
-        )  # its residency begins anew: who marked uses on it may still be on the way back
+        # its residency begins anew: who marked uses on it may still be on the way back
+        lease.ready_at = core.now
         if lease.gpu is not None:
             core.gpu_of(lease).residents.recent[lease.id] = lease
     if item.away:

@@ -52,11 +52,10 @@ class Settings:
     """A name of `core.scheduling.SCHEDULING`."""
     learnt: dict[str, dict[str, float]] = field(default_factory=dict)
     """Durations learnt by earlier runs, per consumer: {"drain_s", "unload_s", "verify_s", "load_s"}; basis of ETAs."""
+    footprints: dict[str, dict[str, list[int]]] = field(default_factory=dict)
+    """Footprints measured by earlier runs, as `core.footprints.Footprints.kept` gave them."""
 
     @property
     def scheduling(self) -> Scheduling:
         """Raises KeyError for a name that the table does not have."""
         return SCHEDULING[self.policy]
-
-    footprints: dict[str, dict[str, list[int]]] = field(default_factory=dict)
-    """Footprints measured by earlier runs, as `core.footprints.Footprints.kept` gave them."""

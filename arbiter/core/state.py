@@ -108,9 +108,7 @@ class Gpu:
     gang: Gang | None = None  # it is loading here
     estates: dict[LeaseId, Lease] = field(default_factory=dict)  # leases that sub-leases were carved out of
     debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
-    shrinking: dict[LeaseId, Lease] = field(
-        default_factory=dict
-    )  # a measurement of theirs is awaited (`growth`)
+    shrinking: dict[LeaseId, Lease] = field(default_factory=dict)  # their measurement is awaited (`growth`)
 
     def in_state(self, *states: LeaseState) -> list[Lease]:
         return self.residents.in_state(*states)
@@ -155,18 +153,14 @@ class Core:
         self.last_token = Token(settings.epoch, 0)
         self.users: dict[ProcessKey, dict[tuple[LeaseId, UseId], Lease]] = {}  # whose busy uses are where
         self.gangs: dict[str, Gang] = {}
-        self.suspects: set[ProcessKey] = (
-            set()
-        )  # began to use or to wait with the event being handled (`deadlock`)
-        self.unanswered: list[Lease] = []  # acquires of the event being handled
-        self.granted: list[
-            tuple[Token, GpuId | None]
-        ] = []  # by the event being handled; invariants look at it
+        # of the event being handled: who began to use or to wait (`deadlock`), acquires, grants (`invariants`)
+        self.suspects: set[ProcessKey] = set()
+        self.unanswered: list[Lease] = []
+        self.granted: list[tuple[Token, GpuId | None]] = []
         self.last_client_at = now
         self.drain: Order | None = None  # an operator wants no new grants
-        self.recovering: set[LeaseId] | None = (
-            None  # None: serving; else the leases still to be accounted for
-        )
+        # None: serving; else the leases still to be accounted for
+        self.recovering: set[LeaseId] | None = None
         self.footprints = Footprints()
         self.footprints.restore(settings.footprints)
         self.reuse: dict[str, Reuse] = {}  # by consumer

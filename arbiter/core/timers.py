@@ -29,10 +29,6 @@ class Timers:
     def clear(self, key: TimerKey) -> None:
         self._due.pop(key, None)
 
-    def at(self, key: TimerKey) -> float | None:
-        """When this one is due; None: it is not set."""
-        return self._due.get(key)
-
     def next_at(self) -> float | None:
         """When the earliest timer is due."""
         while self._heap:

@@ -39,9 +39,8 @@ class LockFile:
                 details={"pid": int(text) if text.isdecimal() else None, "lock": str(self._path)},
             ) from error
         self._fd = fd
-        with contextlib.suppress(
-            OSError
-        ):  # a full disk: the lock holds, only the pid for the other's message is missing
+        # a full disk: the lock holds, only the pid for the other's message is missing
+        with contextlib.suppress(OSError):
             os.ftruncate(fd, 0)
             os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
 

@@ -268,9 +268,8 @@ class LeaseTelemetry:
                 names.ATTR_REASON: str(asked["reason"])[:REASON_CHARS],
             },
         )
-        self._end_leaving(
-            lease_id, at_ns
-        )  # it was never measured: asked again, the earlier way out has no end of its own
+        # it was never measured: asked again, the earlier way out has no end of its own
+        self._end_leaving(lease_id, at_ns)
         self._leave(lease_id, at_ns).evict = span
 
     def _leave(self, lease_id: str, at_ns: int) -> _Leaving:

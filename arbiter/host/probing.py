@@ -144,10 +144,8 @@ class _Reader:
             )
         else:
             self._fail(outcome)
-        if (
-            self._again and self._state == "idle"
-        ):  # else whoever handled this answer asked again: that one serves all
-            self._begin()
+        if self._again and self._state == "idle":
+            self._begin()  # else whoever handled this answer asked again: that one serves all
 
     # -- the thread ----------------------------------------------------------------------------------------------
     def _run(self) -> None:

@@ -77,9 +77,8 @@ class Recorder:
         self._wall = wall
         self._buffer: deque[_Item] = deque()
         self._work: queue.SimpleQueue[Sequence[_Item] | None] = queue.SimpleQueue()
-        self._queued = (
-            0  # events handed to the thread and not written yet; only ever compared, so a race costs nothing
-        )
+        # events handed to the thread and not written yet; only ever compared, so a race costs nothing
+        self._queued = 0
         self._segment = 0
         self._retry_at: float | None = None  # recording has stopped until then
         self._troubled = False  # and that was said

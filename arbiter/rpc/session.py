@@ -117,9 +117,8 @@ class SessionTable:
         self._of_process: dict[ProcessKey, dict[ClientId, Session]] = {}
         self._subscribers: dict[ClientId, Session] = {}
         self._instances: dict[tuple[ProcessKey, str], ClientId] = {}
-        self._moved: dict[
-            ClientId, ClientId
-        ] = {}  # the connection that each instance had before → the one that it has
+        # the connection that each instance had before → the one that it has
+        self._moved: dict[ClientId, ClientId] = {}
         self._strangers_budget = float(settings.rate_per_s)
         self._strangers_at = clock()
         self._too_fast = LimitExceeded(

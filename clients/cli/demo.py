@@ -182,9 +182,8 @@ async def _boot(
     if arbiter:
         source = gpu if gpu == "nvml" else f"fake:{runtime}/fakegpu"
         config = runtime / "arbiter.yaml"
-        config.write_text(
-            f'gpu:\n  capacity_bytes: {{"0": {BUDGET}}}\n'
-        )  # a larger real card is budgeted like the small one
+        # a larger real card is budgeted like the small one
+        config.write_text(f'gpu:\n  capacity_bytes: {{"0": {BUDGET}}}\n')
         await programs.start("arbiter", "arbiter", "--gpu", source, "--config", str(config))
         client = await stack.enter_async_context(_arbiter_client(runtime))
     device = "cuda" if gpu == "nvml" else f"fake:{runtime}/fakegpu"

@@ -14,9 +14,8 @@ PROGRAM = "arbiter.replay"
 
 def run(arguments: Sequence[str]) -> int:
     """Start `python -m arbiter.replay ARGUMENTS` on this terminal and return its exit code (128+n if signal n ended it)."""
-    before = signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C is the program's; it is waited for in any case
+    # Ctrl-C is the program's; it is waited for in any case
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         code = subprocess.run(
             [sys.executable, "-m", PROGRAM, *arguments],

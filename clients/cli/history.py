@@ -107,9 +107,8 @@ def _start(wanted: Wanted, last_seq: int, endpoint: str | None) -> int:
         return _before(wanted.since_wall_s, last_seq, endpoint)
     if wanted.kinds or wanted.consumers:
         return 0
-    return max(
-        0, last_seq - wanted.limit - GAP_MAX
-    )  # numbers have gaps: the start of the tail cannot be computed
+    # numbers have gaps: the start of the tail cannot be computed
+    return max(0, last_seq - wanted.limit - GAP_MAX)
 
 
 def _before(wall_s: float, last_seq: int, endpoint: str | None) -> int:

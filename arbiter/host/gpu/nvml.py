@@ -150,9 +150,8 @@ class NvmlProbe:
             try:
                 info = nvml.nvmlDeviceGetMemoryInfo(handle, version=nvml.nvmlMemory_v2)
             except (nvml.NVMLError_NotSupported, nvml.NVMLError_FunctionNotFound):
-                info = nvml.nvmlDeviceGetMemoryInfo(
-                    handle
-                )  # driver < 510: `used` includes the reserve, and it cannot be told apart
+                # driver < 510: `used` includes the reserve, and it cannot be told apart
+                info = nvml.nvmlDeviceGetMemoryInfo(handle)
                 return int(info.used), int(info.total), 0
         except nvml.NVMLError as error:
             raise ProbeFailed(

@@ -62,9 +62,9 @@ def test_a_residue_is_never_more_than_what_was_charged() -> None:
 def test_debts_stay_charged_and_are_told_apart() -> None:
     books = ledger()
     books.charge(LA, A, 300, 300, 1.0)
-    assert not books.is_debt(LA)
+    assert not books.charge_of(LA).debt
     books.to_debt(LA)
-    assert books.is_debt(LA)
+    assert books.charge_of(LA).debt
     assert books.total_bytes() == 300
     books.bury(A)
     assert books.drop(LA, 0, 0, 2.0) == 0
