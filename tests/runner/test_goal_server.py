@@ -16,7 +16,8 @@ from clients.runner import RunnerClient
 from runner.catalogue import Catalogue, read_manifests
 from runner.clock import SystemClock
 from runner.control import ControlThread
-from runner.goals import LISTENERS_MAX, GoalServer
+from runner.goals import GoalServer
+from runner.one_goal import LISTENERS_MAX
 from runner.protocols import Act, Done, Goal, Hold, StepOutcome
 from runner.sim.sim_runner import SimRunner
 from runner.skills.base import SkillBase
@@ -364,8 +365,8 @@ def test_a_goal_sent_from_ever_new_connections_is_told_on_the_newest(
             for _ in range(LISTENERS_MAX):
                 newest = await stack.enter_async_context(RunnerClient(endpoint))
                 again = await newest.send_goal(RSKILL, prompt="forever", goal_id="same")
-            assert b.server._running is not None
-            assert len(b.server._running.peers) == LISTENERS_MAX
+            assert b.server._goals._running is not None
+            assert len(b.server._goals._running.peers) == LISTENERS_MAX
             await again.cancel()
             assert (await again.result(60))["status"] == "canceled"
         assert (await client.call("result", {"goal_id": goal.goal_id}))["status"] == "canceled"
