@@ -131,14 +131,18 @@ class Collector:
         return f"http://127.0.0.1:{self._server.server_port}"
 
     def environ(self, schedule_ms: int = 50) -> dict[str, str]:
-        """Variables that send a program's telemetry here, spans after at most so many milliseconds."""
+        """Variables that send a program's telemetry here, spans after at most so many milliseconds. A machine too busy to listen is no
+        collector that is away."""
         return {
             "OTEL_EXPORTER_OTLP_ENDPOINT": self.endpoint,
+            "OTEL_EXPORTER_OTLP_TIMEOUT": str(WAIT_S),
             "OTEL_BSP_SCHEDULE_DELAY": str(schedule_ms),
             "OTEL_METRIC_EXPORT_INTERVAL": "200",
         }
 
     def __enter__(self) -> Self:
+        decode_spans(b"")  # imports what it needs, while nobody waits for an answer
+        decode_points(b"")
         self._thread.start()
         return self
 

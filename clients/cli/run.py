@@ -13,6 +13,7 @@ import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from clients import traces
 from clients.aio import ArbiterClient
@@ -79,15 +80,18 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
             on_lost=lost,
         )
         lease = await _tell_why(client, asyncio.ensure_future(acquiring), lease_spec(spec).consumer)
-        try:
-            child = await asyncio.create_subprocess_exec(program, *spec.command[1:], env=_environ(lease))
-        except OSError as error:
-            print(f"vramctl run: {program}: {error.strerror}", file=sys.stderr)
-            await lease.release()
-            return NOT_STARTED
-        await lease.ready()
-        code = await _wait(child)
-        await lease.release(exiting=True)
+        with _Forwarding() as signals:
+            try:
+                child = await asyncio.create_subprocess_exec(program, *spec.command[1:], env=_environ(lease))
+            except OSError as error:
+                print(f"vramctl run: {program}: {error.strerror}", file=sys.stderr)
+                await lease.release()
+                return NOT_STARTED
+            signals.to(child)
+            ready = client.spawn(lease.ready(), f"ready {lease.lease_id}")
+            code = await child.wait()
+            ready.cancel()
+            await lease.release(exiting=True)
     return code if code >= 0 else 128 - code
 
 
@@ -104,22 +108,36 @@ async def _tell_why(client: ArbiterClient, acquiring: asyncio.Future[Lease], con
         acquiring.cancel()
 
 
-async def _wait(child: asyncio.subprocess.Process) -> int:
-    """Signals go to the child, whose end is ours. Ctrl-C reaches it from the terminal; we only have to outlive it."""
-    loop = asyncio.get_running_loop()
-    for number in FORWARDED:
-        loop.add_signal_handler(number, _forward, child, number)
-    loop.add_signal_handler(signal.SIGINT, lambda: None)
-    try:
-        return await child.wait()
-    finally:
+class _Forwarding:
+    """Signals go to the program, whose end is ours: from before it starts, so that none ends us while it runs. Ctrl-C reaches it from the
+    terminal; we only have to outlive it."""
+
+    def __init__(self) -> None:
+        self._child: asyncio.subprocess.Process | None = None
+        self._early: list[signal.Signals] = []
+
+    def __enter__(self) -> Self:
+        loop = asyncio.get_running_loop()
+        for number in FORWARDED:
+            loop.add_signal_handler(number, self._forward, number)
+        loop.add_signal_handler(signal.SIGINT, lambda: None)
+        return self
+
+    def __exit__(self, *_: object) -> None:
         for number in (*FORWARDED, signal.SIGINT):
-            loop.remove_signal_handler(number)
+            asyncio.get_running_loop().remove_signal_handler(number)
 
+    def to(self, child: asyncio.subprocess.Process) -> None:
+        """It has started."""
+        self._child = child
+        for number in self._early:
+            self._forward(number)
 
-def _forward(child: asyncio.subprocess.Process, number: signal.Signals) -> None:
-    if child.returncode is None:
-        child.send_signal(number)
+    def _forward(self, number: signal.Signals) -> None:
+        if self._child is None:
+            self._early.append(number)
+        elif self._child.returncode is None:
+            self._child.send_signal(number)
 
 
 def _environ(lease: Lease) -> dict[str, str]:

@@ -166,9 +166,10 @@ class SidecarClient:
         return True
 
     async def _boot(self, spec: SpawnSpec) -> None:
-        """Start it and wait for its first answer or its end, whichever comes first."""
-        child = self.child if self.child is not None and self.child.alive else Child(spec)
-        self.child = child
+        """Start it and wait for its first answer or its end, whichever comes first. A child of ours that lives and is silent is waited for:
+        it still boots, or is dying, and then it is replaced."""
+        started = self.child is None or not self.child.alive
+        child = self.child = Child(spec) if self.child is None or started else self.child
         exited = asyncio.create_task(child.exited.wait())
         answered: asyncio.Task[bool] | None = None
         loop = asyncio.get_running_loop()
@@ -183,7 +184,12 @@ class SidecarClient:
                     return
                 answered.cancel()
                 if await child.wait(REBIRTH_S):
-                    await self._bury_or_raise()
+                    if started:
+                        await self._bury_or_raise()
+                    else:
+                        await self._bury()
+                        self._drop("the sidecar ended")
+                        await self._boot(spec)
                     return
             raise SidecarUnavailable(
                 f"the sidecar did not answer within {spec.boot_timeout_s:g} s of its start",
@@ -201,7 +207,7 @@ class SidecarClient:
         failure = self.child.failure()
         await self._bury()
         self._drop("the sidecar ended")
-        if not await self._answers():
+        if not await self._answers(self._connect_timeout_s if self._somebody_listens() else PROBE_S):
             raise failure
 
     async def _bury(self) -> None:

@@ -89,7 +89,7 @@ def test_events_can_be_iterated(client: SyncArbiterClient, spec: Spec) -> None:
         seen.set()
 
     threading.Thread(target=follow, daemon=True).start()
-    while not seen.is_set():  # the subscription may begin after the first of these leases
+    while not seen.wait(0.05):  # the subscription may begin after the first of these leases
         with client.lease(spec("a", 1)) as lease:
             lease.ready()
     assert "released" in kinds

@@ -329,11 +329,12 @@ def test_a_collector_that_is_away_is_complained_of_once_and_holds_up_no_end() ->
 
 
 def test_ending_waits_for_nobody_longer_than_it_was_told() -> None:
-    never = threading.Event()
+    never, flushed = threading.Event(), threading.Event()
     said: list[str] = []
-    ends = Telemetry([lambda: never.wait(), lambda: said.append("flushed")])
+    ends = Telemetry([never.wait, lambda: (said.append("flushed"), flushed.set())])
     ends(0.5)
     ends(0.5)  # again is nothing
+    assert flushed.wait(60.0)
     assert said == ["flushed"]
     never.set()
 

@@ -290,10 +290,13 @@ def test_watch_prints_plain_lines_where_there_is_no_terminal(
         assert output is not None
         threading.Thread(target=lambda: lines.put(output.readline()), daemon=True).start()
         deadline = time.monotonic() + PATIENCE_S
-        while lines.empty() and time.monotonic() < deadline:  # the subscription may begin after some of these
+        line = ""
+        while not line and time.monotonic() < deadline:  # the subscription may begin after some of these
             with client.lease(spec("a", 1)) as lease:
                 lease.ready()
-        assert "  a L1-" in lines.get_nowait()
+            with contextlib.suppress(queue.Empty):
+                line = lines.get(timeout=0.05)
+        assert "  a L1-" in line
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE_S) in (0, 130)
     finally:

@@ -6,10 +6,14 @@ Usage: server_process.py ENDPOINT [crash | silent | slow]. `crash` prints and ex
 import asyncio
 import os
 import sys
+import time
 from typing import Any
 
 from clients.serve import Peer, RouterServer
 from schemas.errors import CODES, VramError
+
+DYING_S = 1.5
+"""A process that held gigabytes of a card hangs up long before the kernel says that it has ended."""
 
 
 def failure(error: VramError) -> dict[str, Any]:
@@ -41,6 +45,11 @@ async def main(endpoint: str, mode: str) -> None:
                 case "detect" if message["query"] in CODES:
                     reply = failure(CODES[message["query"]]("as asked", hint="h", details={"n": 1}))
                 case "detect" if message["query"] == "die":
+                    os._exit(9)
+                case "detect" if message["query"] == "die slowly":
+                    assert server._socket is not None
+                    server._socket.close(0)
+                    time.sleep(DYING_S)
                     os._exit(9)
                 case "detect" if message["query"] == "hang":
                     return

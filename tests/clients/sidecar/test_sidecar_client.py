@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from clients.sidecar import base
 from clients.sidecar.base import SidecarClient
 from clients.sidecar.perception import Detection, DetectorClient, SceneVlmClient
 from clients.sidecar.policy import PolicyClient
@@ -113,6 +114,18 @@ async def test_a_killed_child_is_replaced(detector: DetectorClient) -> None:
     assert await detector.detect(PNG, "x")
 
 
+async def test_a_child_that_takes_its_time_to_die_is_replaced_all_the_same(detector: DetectorClient) -> None:
+    """Regression: it was waited for as for one that boots, and its old end was the next call's error."""
+    await detector.detect(PNG, "x")
+    first = detector.child
+    assert first is not None
+    with pytest.raises(SidecarUnavailable, match="hung up"):
+        await detector.detect(PNG, "die slowly")
+    assert await detector.detect(PNG, "x")
+    assert detector.child is not None
+    assert detector.child.pid != first.pid
+
+
 async def test_a_boot_that_fails_says_why(endpoint: str) -> None:
     client = DetectorClient(endpoint, spawn=SpawnSpec(command(endpoint, "crash")))
     with pytest.raises(SidecarUnavailable, match="exit code 3: cannot find the weights") as failed:
@@ -148,6 +161,32 @@ async def test_two_clients_starting_one_sidecar_end_up_with_one(endpoint: str) -
         assert two.identity is not None
         assert one.identity["pid"] == two.identity["pid"]
         assert [one.child is None, two.child is None].count(True) == 1
+
+
+async def test_a_sidecar_that_owns_the_endpoint_and_is_slow_is_waited_for(
+    endpoint: str, foreign: Callable[[], subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: our own child found the endpoint taken and ended, and that was the error, unless its owner answered within a second."""
+    monkeypatch.setattr(base, "PROBE_S", 0.05)
+    owner = foreign()
+    async with SidecarClient(endpoint, connect_timeout_s=60.0) as waiting:
+        await waiting.load()
+    owner.send_signal(signal.SIGSTOP)
+    try:
+        spec = SpawnSpec(command(endpoint))
+        async with DetectorClient(endpoint, spawn=spec, connect_timeout_s=60.0) as client:
+            found = asyncio.create_task(client.detect(PNG, "x"))
+            async with asyncio.timeout(60.0):
+                while (child := client.child) is None:
+                    await asyncio.sleep(0.01)
+                await child.exited.wait()
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(asyncio.shield(found), 20 * base.PROBE_S)
+            owner.send_signal(signal.SIGCONT)
+            assert await found
+            assert client.child is None
+    finally:
+        owner.send_signal(signal.SIGCONT)
 
 
 async def test_nobody_there_and_nothing_to_start(endpoint: str) -> None:

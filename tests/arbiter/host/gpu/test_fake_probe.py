@@ -12,6 +12,7 @@ from schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
 from schemas.ids import GpuId
 
 GIB = 2**30
+PATIENCE_S = 60.0
 
 
 def edit(folder, **changes):
@@ -90,7 +91,7 @@ def test_a_hang_ends_with_the_fault_or_with_close(probe, folder):
     thread.join(0.2)
     assert thread.is_alive()
     probe.close()
-    thread.join(5)
+    thread.join(PATIENCE_S)
     assert isinstance(outcome[0], ProbeFailed)
 
 
@@ -152,7 +153,7 @@ def test_readings_wait_for_the_lock(probe, folder):
         thread = threading.Thread(target=read)
         thread.start()
         assert not done.wait(0.1)
-    assert done.wait(5)
+    assert done.wait(PATIENCE_S)
     thread.join()
 
 

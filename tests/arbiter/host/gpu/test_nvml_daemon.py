@@ -16,7 +16,9 @@ pytestmark = pytest.mark.e2e
 pytest.importorskip("pynvml")
 ME = os.getpid()
 PATIENCE_S = 60.0
-CONFIG = "probe: {deadline_s: 0.4, period_s: 0.1}\nverify: {timeout_s: 3.0, slow_poll_s: 0.1}\n"
+CONFIG = "probe: {deadline_s: 60.0, period_s: 0.1}\nverify: {timeout_s: 3.0, slow_poll_s: 0.1}\n"
+HANGS = CONFIG.replace("deadline_s: 60.0", "deadline_s: 0.4")
+"""A busy machine misses this deadline now and then, too."""
 Make = Callable[..., ArbiterProcess]
 
 
@@ -95,6 +97,7 @@ def test_a_cycle_with_release_lag(client: WireClient, daemon: ArbiterProcess, nv
     assert (verdict["before_bytes"], verdict["after_bytes"]) == (5 * GIB, 0)
 
 
+@pytest.mark.parametrize("daemon", [HANGS], indirect=True)
 def test_a_call_that_hangs_is_unknown_blocks_and_recovers(client: WireClient, nvml: NvmlStub) -> None:
     assert client.ask("subscribe")["ok"]
     on = held(client, nvml, 5 * GIB)
