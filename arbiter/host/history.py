@@ -28,6 +28,8 @@ SKIPPED_AFTER_CRASH = 2000
 BUFFER_MAX = 20_000
 """Events with the thread, and again as many waiting for it, while a disk does not answer; beyond this the oldest are dropped. The gap in
 their numbers shows it."""
+QUESTIONS_MAX = 256
+"""Questions about older events that wait for the thread; who asks beyond this hears at once that the disk does not answer."""
 PRUNE_EVERY_EVENTS = 2000
 CLOSE_S = 5.0
 AT_ONCE = frozenset({"operator"})
@@ -67,6 +69,7 @@ class History:
         self._work: queue.SimpleQueue[Sequence[Event] | _Question | None] = queue.SimpleQueue()
         self._handed = 0  # events given to the thread; the loop alone counts
         self._taken = 0  # of those, by the thread; it alone counts
+        self._asked = self._answered = 0  # questions, counted in the same way
         self._thread: threading.Thread | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -125,6 +128,16 @@ class History:
             done({"events": found[:limit], "last_seq": self._last_seq})
             return
         self._flush()
+        if self._asked - self._answered >= QUESTIONS_MAX:
+            done(
+                {
+                    "events": [],
+                    "last_seq": self._last_seq,
+                    "problem": "the disk of the history does not answer",
+                }
+            )
+            return
+        self._asked += 1
         self._work.put(_Question(after, limit, kinds, done))
 
     def close(self) -> None:
@@ -149,6 +162,9 @@ class History:
             self._work.put(tuple(self._buffer))
             self._buffer.clear()
         elif self._loop is not None:  # the thread hangs in a write
+            self.problem = (
+                self.problem or "the disk of the history does not answer: what does not fit in memory is lost"
+            )
             self._timer = self._loop.call_later(FLUSH_S, self._flush)
 
     # -- the thread ----------------------------------------------------------------------------------------------
@@ -157,6 +173,7 @@ class History:
         while (work := self._work.get()) is not None:
             try:
                 if isinstance(work, _Question):
+                    self._answered += 1
                     body = {
                         "events": store.find(work.after, work.limit, work.kinds),
                         "last_seq": self._last_seq,

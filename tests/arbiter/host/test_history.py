@@ -8,7 +8,14 @@ from pathlib import Path
 from typing import Any, cast
 
 from arbiter.host import history as module
-from arbiter.host.history import BUFFER_MAX, CLEAN_END, RING_EVENTS, SKIPPED_AFTER_CRASH, History
+from arbiter.host.history import (
+    BUFFER_MAX,
+    CLEAN_END,
+    QUESTIONS_MAX,
+    RING_EVENTS,
+    SKIPPED_AFTER_CRASH,
+    History,
+)
 
 PATIENCE_S = 60.0
 
@@ -189,6 +196,9 @@ class HangingDisk:
         assert self.goes_on.wait(PATIENCE_S)
         self.written += [event["seq"] for event in events]
 
+    def find(self, after: int, limit: int, kinds: tuple[str, ...]) -> list[Mapping[str, Any]]:
+        return [{"seq": after + 1}]
+
     def close(self) -> None:
         pass
 
@@ -203,13 +213,41 @@ def test_a_disk_that_hangs_lets_no_more_pile_up_than_the_bound() -> None:
         assert await asyncio.to_thread(disk.hangs.wait, PATIENCE_S)
         for _ in range(4 * BUFFER_MAX):
             history.append("operator", {})  # each asks to be written at once
+        assert "does not answer" in history.problem
         disk.goes_on.set()
         newest = history.last_seq
         async with asyncio.timeout(PATIENCE_S):
-            while not disk.written or disk.written[-1] != newest:
+            while not disk.written or disk.written[-1] != newest or history.problem:
                 await asyncio.sleep(0.01)
         history.close()
         assert len(disk.written) <= 2 * BUFFER_MAX + 1
         assert disk.written == sorted(disk.written), "in order, with a gap in their numbers"
+
+    asyncio.run(run())
+
+
+def test_who_asks_a_disk_that_hangs_hears_so_beyond_the_bound() -> None:
+    disk = HangingDisk()
+    answers: list[Mapping[str, Any]] = []
+
+    async def run() -> None:
+        history = History(cast(Any, disk), 0)
+        history.start(asyncio.get_running_loop())
+        for _ in range(RING_EVENTS + 2):
+            history.append("operator", {})
+        assert await asyncio.to_thread(disk.hangs.wait, PATIENCE_S)
+        for _ in range(QUESTIONS_MAX + 1):
+            history.read(0, 1, (), answers.append)
+        assert [answer["problem"] for answer in answers] == ["the disk of the history does not answer"]
+        disk.goes_on.set()
+        async with asyncio.timeout(PATIENCE_S):
+            while len(answers) <= QUESTIONS_MAX:
+                await asyncio.sleep(0.01)
+            assert all(answer["events"] == [{"seq": 1}] for answer in answers[1:])
+            history.read(0, 1, (), answers.append)
+            while len(answers) <= QUESTIONS_MAX + 1:
+                await asyncio.sleep(0.01)
+        assert "problem" not in answers[-1], "there is room again"
+        history.close()
 
     asyncio.run(run())
