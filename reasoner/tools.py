@@ -9,16 +9,17 @@ import asyncio
 import logging
 import math
 import uuid
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Protocol
 
 from clients.runner import Goal, RunnerClient
 from clients.sidecar.base import SidecarClient
-from clients.sidecar.perception import DetectorClient, Judgement, RewardClient, SceneVlmClient
+from clients.sidecar.perception import Detection, DetectorClient, Judgement, RewardClient, SceneVlmClient
 from reasoner.palette import Palette
 from reasoner.past import Past, Taken
+from reasoner.places import SAME_M
 from reasoner.planner import Outcome
 from schemas.errors import (
     BadRequest,
@@ -56,6 +57,7 @@ HEARD_LATE_S = 0.5  # for feedback that came while this process stood still; wit
 CANCEL_S = 10.0  # for a cancelled goal to end: it takes the arm back and finishes its use
 IDENTITY_S = 10.0  # for a perception sidecar to say which model it serves
 PROGRESS_TOLERANCE = 0.0
+THINGS_MAX = 8  # told of one look, best first
 BEFORE_MOTION = frozenset({"acquiring", "starting"})  # waiting for the card is no lack of progress
 
 
@@ -139,7 +141,7 @@ class Tools:
                 f"{call.query} is not in view of {frame['camera']}",
                 data={"camera": frame["camera"]},
             )
-        best = max(detections, key=lambda detection: detection.score)
+        best, *others = sorted(detections, key=lambda detection: -detection.score)
         data: dict[str, Any] = {
             "camera": frame["camera"],
             "box": list(best.box),
@@ -155,12 +157,17 @@ class Tools:
                 data,
             )
         data["point_base_m"] = point
-        x, y, z = point
-        return Outcome(
-            "found",
-            f"{call.query} at ({x:.3f}, {y:.3f}, {z:.3f}) m from the base, score {best.score:.2f}",
-            data=data,
-        )
+        data["seen"] = seen = _things(frame, [best, *others])
+        if (pose := frame.get("camera_model", {}).get("base_pose")) is not None:
+            data["base_pose"] = list(pose)
+        places = [
+            "({:.3f}, {:.3f}, {:.3f}) m from the base, score {:.2f}".format(
+                *one["point_base_m"], one["score"]
+            )
+            for one in seen
+        ]
+        also = f"; less likely at {', or at '.join(places[1:])}" if len(places) > 1 else ""
+        return Outcome("found", f"{call.query} at {places[0]}{also}", data=data)
 
     async def _query(self, call: QueryScene) -> Outcome:
         if self._scene_vlm is None:
@@ -352,6 +359,16 @@ def point_on_plane(frame: FrameReply, box: tuple[float, float, float, float]) ->
     model = CameraModel.model_validate(frame["camera_model"])
     point = model.ground_point((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
     return None if point is None else list(point)
+
+
+def _things(frame: FrameReply, detections: Sequence[Detection]) -> list[dict[str, Any]]:
+    """Detections, best first, as things with their places: several boxes may lie on one thing, whose best box counts."""
+    things: list[dict[str, Any]] = []
+    for detection in detections:
+        point = point_on_plane(frame, detection.box)
+        if point is not None and all(math.dist(point, thing["point_base_m"]) > SAME_M for thing in things):
+            things.append({"point_base_m": point, "score": detection.score, "box": list(detection.box)})
+    return things[:THINGS_MAX]
 
 
 def _ended(result: ResultPush) -> Outcome:

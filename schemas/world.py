@@ -124,11 +124,14 @@ class CameraModel(_Frozen):
 
     `K` is the 3 × 3 intrinsic matrix in pixels, `T_base_camera` the 4 × 4 pose of the camera (x right, y down, z forward) in the
     robot's base frame, `support_plane_z` the height of the table or floor in that frame, in metres.
+    `base_pose` is where the base stood by its own odometry when the picture was taken: x, y (metres) and yaw (rad); None: it cannot drive, or
+    does not know.
     """
 
     K: Matrix3
     T_base_camera: Matrix4
     support_plane_z: Finite = 0.0
+    base_pose: Vector3 | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -7,15 +7,16 @@ which model is resident when is the arbiter's business.
 import json
 import re
 from collections.abc import Generator
-from dataclasses import dataclass
 
 from reasoner.palette import Palette
+from reasoner.places import Places, Point
 from reasoner.planner import Episode, Finish, Outcome, says_yes
 from schemas.errors import BadRequest
 from schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall, Wait
 
 ATTEMPTS_MAX = 3
 LOOKS_MAX = 3  # repeats of a locate that gave no answer about the scene
+PLACES_MAX = 3  # to stand before in one attempt
 TURNS_RAD = (0.35, -0.70, 0.35)  # look left, look right, back to the middle
 NAVIGATE_DEADLINE_S = 60.0
 GRAB_DEADLINE_S = 120.0  # counts from acceptance: waiting for the card and loading are in it
@@ -39,15 +40,6 @@ def object_of(task: str) -> str:
             hint='say, for example, "grab the red cube", or use a language model',
         )
     return match[1].lower()
-
-
-@dataclass(frozen=True, slots=True)
-class Point:
-    """A place in the frame of the mobile base, metres."""
-
-    x: float
-    y: float
-    z: float
 
 
 class ScriptedPlanner:
@@ -89,16 +81,14 @@ def _script(thing: str, navigate: str, grab: str, *, can_query: bool) -> Script:
     for attempt in range(1, ATTEMPTS_MAX + 1):
         if attempt > 1:
             yield _turn(navigate, 0.0, "fold the arm, which hides the table after a grab")
-        found = yield from _find(thing, navigate)
-        if isinstance(found, str):
-            return Finish(False, found)
-        arrived = yield _drive(navigate, found, f"stand in front of the {thing}")
-        if arrived.status != "succeeded":
-            reason = f"could not drive to the {thing}: {arrived.text}"
+        places = Places()
+        lost = yield from _find(thing, navigate, places)
+        if lost:
+            return Finish(False, lost)
+        stuck = yield from _approach(thing, navigate, places)
+        if stuck:
+            reason = stuck
             continue
-        closer = yield from _locate(thing)
-        if isinstance(closer, Point):
-            yield _drive(navigate, closer, "correct what the view from afar got wrong")
         outcome = yield ExecuteRskill(
             rskill_id=grab,
             prompt=f"grab the {thing}",
@@ -117,12 +107,12 @@ def _script(thing: str, navigate: str, grab: str, *, can_query: bool) -> Script:
     return Finish(False, reason)
 
 
-def _find(thing: str, navigate: str) -> Generator[ToolCall, Outcome, Point | str]:
-    """Look; where a detector that really looked does not see it, turn and look again. A text says why there is no point."""
+def _find(thing: str, navigate: str, places: Places) -> Generator[ToolCall, Outcome, str]:
+    """Look; where a detector that really looked does not see it, turn and look again. Says why there is no place; empty: there is."""
     for turn in (*TURNS_RAD, None):
-        looked = yield from _locate(thing)
-        if isinstance(looked, Point):
-            return looked
+        looked = yield from _locate(thing, places)
+        if looked.status == "found":
+            return ""
         if looked.status != "not_seen":
             return f"could not look for the {thing}: {looked.text}"
         if turn is not None:
@@ -130,14 +120,39 @@ def _find(thing: str, navigate: str) -> Generator[ToolCall, Outcome, Point | str
     return f"the {thing} was not seen"
 
 
-def _locate(thing: str) -> Generator[ToolCall, Outcome, Point | Outcome]:
-    """Where it stands, or the last outcome: only `not_seen` says something about the scene, everything else is tried again."""
+def _approach(thing: str, navigate: str, places: Places) -> Generator[ToolCall, Outcome, str]:
+    """Stand before the likeliest place. Looks from there may speak for another one: then it is that one's turn, at most `PLACES_MAX` in all.
+
+    Says why it does not stand there; empty: it does.
+    """
+    place = places.best()
+    why = f"stand in front of the {thing}"
+    for _ in range(PLACES_MAX):
+        assert place is not None, "only called when something was found"
+        arrived = yield _drive(navigate, places.from_base(place), why)
+        if arrived.status != "succeeded":
+            return f"could not drive to the {thing}: {arrived.text}"
+        looked = yield from _locate(thing, places)
+        if looked.status != "found":
+            return ""  # what was seen from afar has to do
+        best = places.best()
+        if best is place or best is None or not places.joined:
+            yield _drive(
+                navigate, places.from_base(best or place), "correct what the view from afar got wrong"
+            )
+            return ""
+        place, why = best, f"both views together say that the {thing} is here"
+    return ""
+
+
+def _locate(thing: str, places: Places) -> Generator[ToolCall, Outcome, Outcome]:
+    """Note where it may stand. The last outcome: only `not_seen` says something about the scene, everything else is tried again."""
     outcome = Outcome("error", "never looked")
     for _ in range(LOOKS_MAX):
         outcome = yield LocateInView(query=thing, rationale=f"where is the {thing}?")
         if outcome.status == "found":
-            return Point(*outcome.data["point_base_m"])
-        if outcome.status == "not_seen":
+            places.add(outcome.data)
+        if outcome.status in ("found", "not_seen"):
             break
     return outcome
 

@@ -27,6 +27,7 @@ class Runner:
         self.skills: list[dict[str, Any]] = []
         self.diagnostics: dict[str, str] = {}
         self.frame_error: VramError | None = None
+        self.camera_model: dict[str, Any] | None = None
         self.ends_on_cancel = True
         self.heard = asyncio.Event()
         """An op that is not answered has come."""
@@ -90,8 +91,9 @@ class Runner:
             case GetFrame():
                 if self.frame_error is not None:
                     raise self.frame_error
+                model = {} if self.camera_model is None else {"camera_model": self.camera_model}
                 return {"camera": request.camera or "front", "encoding": "png", "data": b"\x89PNG\r\n\x1a\n", "width": 4,
-                        "height": 4, "stamp_monotonic_ns": 1, "age_ms": 1.0}  # fmt: skip
+                        "height": 4, "stamp_monotonic_ns": 1, "age_ms": 1.0, **model}  # fmt: skip
             case GetState():
                 return {
                     "goal": self.goal.goal_id if self.goal else None,

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from reasoner.llm.scripted import ScriptedPlanner, object_of
+from reasoner.llm.scripted import PLACES_MAX, ScriptedPlanner, object_of
 from reasoner.loop import REPEATS_MAX, Result, run_episode
 from reasoner.palette import Palette, Skill
 from reasoner.planner import Episode, Finish, Outcome
@@ -207,3 +207,61 @@ def test_a_planner_that_repeats_itself_or_fails_ends_the_episode() -> None:
     assert repeated["status"] == "failure"
     assert len(repeated["steps"]) == REPEATS_MAX
     assert "no answer" in asyncio.run(run_episode("x", Mute(), PALETTE, dispatch))["reason"]
+
+
+def sees(base_pose: list[float] | None, *things: tuple[float, float, float]) -> Outcome:
+    """What `locate_in_view` says of things at (x, y) from the base, with their scores, best first."""
+    seen = [{"point_base_m": [x, y, 0.2], "score": score, "box": [0, 0, 9, 9]} for x, y, score in things]
+    data = {"point_base_m": seen[0]["point_base_m"], "seen": seen}
+    return Outcome("found", "there", data=data if base_pose is None else data | {"base_pose": base_pose})
+
+
+def looks_of(*looks: Outcome) -> Callable[[ToolCall, int], Outcome]:
+    def world(call: ToolCall, before: int) -> Outcome:
+        match call:
+            case LocateInView():
+                return looks[min(before, len(looks) - 1)]
+            case QueryScene():
+                return YES
+            case _:
+                return DONE
+
+    return world
+
+
+def drives(calls: list[ToolCall]) -> list[tuple[float, float]]:
+    points = [
+        call.goal_params["target_point"]
+        for call in calls
+        if isinstance(call, ExecuteRskill) and call.rskill_id == NAVIGATE.id
+    ]
+    return [(round(point["x"], 3), round(point["y"], 3)) for point in points]
+
+
+def test_a_look_from_near_at_another_thing_is_no_correction() -> None:
+    """Regression: from near a ball got a little more than the cube before which the robot stood, and it drove 23 cm away to the ball."""
+    far = sees([0.0, 0.0, 0.0], (0.7, -0.3, 0.62))
+    near = sees([0.375, -0.3, 0.0], (0.285, 0.23, 0.63), (0.33, 0.01, 0.60))
+    result, calls = play(looks_of(far, near))
+    assert drives(calls) == [(0.7, -0.3), (0.33, 0.01)]
+    assert (result["status"], result["attempts"]) == ("success", 1)
+
+
+def test_two_looks_that_speak_for_another_place_make_it_that_ones_turn() -> None:
+    far = sees([0.0, 0.0, 0.0], (0.7, -0.3, 0.5), (0.7, 0.0, 0.45))
+    near = sees([0.375, -0.3, 0.0], (0.325, 0.3, 0.8))
+    there = sees([0.375, 0.0, 0.0], (0.32, 0.0, 0.9))
+    _, calls = play(looks_of(far, near, there))
+    assert drives(calls) == [(0.7, -0.3), (0.325, 0.3), (0.32, 0.0)]
+
+
+def test_without_odometry_the_newest_look_counts() -> None:
+    _, calls = play(looks_of(sees(None, (0.7, -0.3, 0.9)), sees(None, (0.3, 0.1, 0.5))))
+    assert drives(calls) == [(0.7, -0.3), (0.3, 0.1)]
+
+
+def test_places_that_outdo_each_other_do_not_make_it_drive_for_ever() -> None:
+    looks = [sees([0.0, 0.0, 0.0], (0.5 + 0.2 * n, 0.0, 0.5 + 0.1 * n)) for n in range(9)]
+    result, calls = play(looks_of(*looks))
+    assert len(drives(calls)) == PLACES_MAX
+    assert result["attempts"] == 1

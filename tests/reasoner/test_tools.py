@@ -11,6 +11,7 @@ from clients.runner import Goal, RunnerClient
 from clients.sidecar.perception import DetectorClient, SceneVlmClient
 from reasoner.inbox import Danger, Inbox
 from reasoner.palette import Palette, Skill
+from reasoner.planner import Outcome
 from reasoner.tools import LOOKED_AT_MAX_S, LOOKS_MAX, PLACE_MAX_S, Tools, _stands_still
 from reasoner.watch import watch
 from schemas.errors import (
@@ -25,6 +26,7 @@ from schemas.errors import (
     WaitTimeout,
 )
 from schemas.tools import EmitPrompt, ExecuteRskill, LifecycleTransition, LocateInView, QueryScene
+from schemas.world import CameraModel
 
 GRAB = ExecuteRskill(rskill_id="lab/grab", prompt="grab it", deadline_s=30)
 LOOK = LocateInView(query="red cube")
@@ -183,6 +185,43 @@ def test_looked_not_seen_answered_and_no_frame_are_four_things(a_runner: Any, a_
             return [*found, seen.status, (await tools(LOOK)).status, (await tools(ASK)).status]
 
     assert play(story) == ["not_seen", "answered", "error", "no_frame", "no_frame"]
+
+
+def test_a_look_tells_all_places_best_first_and_where_the_base_stood(a_runner: Any, a_sidecar: Any) -> None:
+    """Boxes that lie on one thing are that one thing."""
+    down = CameraModel(
+        K=((100.0, 0.0, 50.0), (0.0, 100.0, 50.0), (0.0, 0.0, 1.0)),
+        T_base_camera=(
+            (1.0, 0.0, 0.0, 0.0),
+            (0.0, -1.0, 0.0, 0.0),
+            (0.0, 0.0, -1.0, 1.0),
+            (0.0, 0.0, 0.0, 1.0),
+        ),
+        base_pose=(0.4, -0.2, 0.1),
+    )
+
+    async def story() -> Outcome:
+        async with (
+            a_runner() as runner,
+            RunnerClient(runner.endpoint) as client,
+            a_sidecar("lab/eye") as sidecar,
+            DetectorClient(sidecar.endpoint) as detector,
+        ):
+            runner.camera_model = down.model_dump(mode="json")
+            sidecar.detections = [
+                {"label": "red cube", "score": 0.6, "box": [18, 38, 22, 42]},
+                {"label": "red cube", "score": 0.5, "box": [79, 58, 83, 62]},
+                {"label": "red cube", "score": 0.7, "box": [78, 58, 82, 62]},
+            ]
+            return await Tools(client, detector, None)(LOOK)
+
+    outcome = play(story)
+    assert outcome.status == "found"
+    seen = [(*one["point_base_m"][:2], one["score"]) for one in outcome.data["seen"]]
+    assert [pytest.approx(one) for one in seen] == [(0.3, -0.1, 0.7), (-0.3, 0.1, 0.6)]
+    assert outcome.data["point_base_m"] == outcome.data["seen"][0]["point_base_m"]
+    assert outcome.data["base_pose"] == [0.4, -0.2, 0.1]
+    assert "less likely at (-0.300, 0.100" in outcome.text
 
 
 @pytest.mark.parametrize(
