@@ -82,7 +82,7 @@ class Residency:
             self._prepared = asyncio.create_task(self._worker.run(self._prepare_blocking, abandon=True))
 
     async def load(self, timeout_s: float | None = None) -> bool:
-        """Make the model resident; False if it was. `timeout_s` bounds the wait for the lease, not the loading.
+        """Make the model resident; False if it was. `timeout_s` bounds the wait for the lease, not imports and loading.
 
         Raises what the arbiter denies with (WaitTimeout, VramInsufficient …), OutOfMemory, ModelError.
         """
@@ -337,12 +337,15 @@ class Residency:
             self.last_error = None
 
     async def _obtain(self, deadline: float | None) -> Lease | None:
-        """The host work done, and a lease granted. `unload` cancels it, which gives the place in the queue back."""
+        """The host work done, and a lease granted. `unload` cancels it, which gives the place in the queue back.
+
+        Imports take half a minute and more on a busy machine; the lease is waited for from then on, for as long as was left before.
+        """
         assert self._prepared is not None
+        wait_s = _left_s(deadline)
         await asyncio.shield(self._prepared)
         if self._client is None:
             return None
-        wait_s = _left_s(deadline)
         if wait_s == 0.0:
             raise WaitTimeout(
                 f"{self._settings.name}: no time left to wait for the lease", hint="wait longer"

@@ -239,7 +239,7 @@ class SidecarPolicy(SkillBase):
         except (asyncio.CancelledError, WaitTimeout):  # a policy on standby is called back behind its request
             with contextlib.suppress(VramError, TimeoutError):
                 async with asyncio.timeout(WITHDRAW_S):
-                    if (await self._client.ping()).get("wanted"):
+                    if (await self._client.ping(timeout_s=WITHDRAW_S)).get("wanted"):
                         await self._client.unload()
             raise
 

@@ -22,6 +22,7 @@ import pytest
 from arbiter.testing.fakegpu_check import check_log
 from arbiter.testing.process import ArbiterProcess
 from clients.aio import ArbiterClient
+from clients.cli.quick import UNREACHABLE
 from clients.runner import Goal as AcceptedGoal
 from clients.runner import RunnerClient
 from clients.sidecar.perception import DetectorClient
@@ -168,7 +169,7 @@ class Stage:
     async def open(cls, programs: Programs, stack: AsyncExitStack) -> "Stage":
         stage, where = cls(programs), f"ipc://{programs.runtime}"
         stage.arbiter = await stack.enter_async_context(
-            ArbiterClient(programs.arbiter.endpoint, name="witness")
+            ArbiterClient(programs.arbiter.endpoint, name="witness", connect_timeout_s=WAIT_S)
         )
         stage.runner = await stack.enter_async_context(
             RunnerClient(f"{where}/runner.sock", connect_timeout_s=BOOT_S)
@@ -252,10 +253,13 @@ def programs() -> Iterator[Programs]:
 # -- how a goal ends -----------------------------------------------------------------------------------------------------
 async def done(stage: Stage) -> None:
     goal = await stage.goal_under_way()
-    shown = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "clients", "status", env=stage.programs.arbiter.environ, stdout=asyncio.subprocess.PIPE
-    )  # fmt: skip
-    said = (await shown.communicate())[0].decode()
+    for _ in range(20):  # an operator asks again where nobody answered in the seconds that he is made to wait
+        shown = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "clients", "status", env=stage.programs.arbiter.environ, stdout=asyncio.subprocess.PIPE
+        )  # fmt: skip
+        said = (await shown.communicate())[0].decode()
+        if shown.returncode != UNREACHABLE:
+            break
     (line,) = [line for line in said.splitlines() if " detector " in line]
     assert " standby " in line, said
     why = (await stage.arbiter.why("detector"))["leases"][0]["text"]

@@ -50,8 +50,8 @@ detector: {labels: [cube]}
 DECISIONS = (
     ("locate_in_view", {"query": "red cube"}),
     ("execute_rskill__vram-arbiter__so101-grab", {"prompt": "grab the red cube"}),
-    ("finish", {"success": True, "reason": "grabbed"}),
 )
+"""In their order; asked again while the last one is carried out, it says that again."""
 
 
 @contextmanager
@@ -62,7 +62,7 @@ def language_model() -> Iterator[str]:
         def do_POST(self) -> None:
             asked = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
             done = sum(message["role"] == "tool" for message in asked["messages"])
-            name, arguments = DECISIONS[done]
+            name, arguments = DECISIONS[min(done, len(DECISIONS) - 1)]
             function = {"name": name, "arguments": json.dumps(arguments)}
             call = {"id": "c", "type": "function", "function": function}
             message = {"role": "assistant", "content": None, "tool_calls": [call]}
@@ -230,13 +230,18 @@ def judge(trace: Trace, collector: Collector) -> None:
     assert tool.attributes[telemetry.ATTR_TOOL] == "execute_rskill"
     assert goal.attributes[telemetry.ATTR_SKILL] == "vram-arbiter/so101-grab"
     assert goal.attributes[telemetry.ATTR_OUTCOME] == "canceled", "the reasoner took it with itself"
-    (plan,) = trace.below(turn, telemetry.SPAN_PLAN)
-    assert plan.attributes[telemetry.ATTR_OUTCOME] == "execute_rskill"
+    plans = trace.below(
+        turn, telemetry.SPAN_PLAN
+    )  # several where news came meanwhile, as of a picture that is late
+    assert "execute_rskill" in [plan.attributes[telemetry.ATTR_OUTCOME] for plan in plans]
 
     look, _ = trace.below(task, telemetry.SPAN_REASONER_TICK)
     (seen,) = trace.below(look, telemetry.SPAN_TOOL)
-    (detect,) = trace.below(seen, telemetry.SPAN_SIDECAR_REQUEST)
-    assert (detect.service, detect.attributes[telemetry.ATTR_OUTCOME]) == (DETECTOR, "ok")
+    detect, *again = trace.below(
+        seen, telemetry.SPAN_SIDECAR_REQUEST
+    )  # again if it loads longer than a picture is good
+    assert {span.service for span in (detect, *again)} == {DETECTOR}
+    assert (again or [detect])[-1].attributes[telemetry.ATTR_OUTCOME] == "ok"
     assert [span.service for span in trace.below(detect, telemetry.SPAN_SIDECAR_LOAD)] == [DETECTOR]
 
     (activation,) = trace.below(goal, telemetry.SPAN_ACTIVATE)

@@ -230,6 +230,25 @@ def test_a_wait_for_the_lease_is_bounded(box):
     holder.let_go()
 
 
+def test_imports_are_no_wait_for_the_lease(box, arbiter):
+    """Regression: on a slow machine the first request of a model with large imports was denied its lease without the arbiter being asked."""
+    (box.runtime / "detector-model").mkdir()
+    switch = box.runtime / "detector-model" / "slow_prepare"
+    switch.touch()
+    holder = box.start("holder", footprint="5GB,5GB,100MB")
+    running = holder.hold()
+    sidecar = box.start("detector", footprint="5GB,5GB,100MB")
+    asked = monotonic()
+    waiting = sidecar.client.send("load", timeout_s=0.2)
+    from_outside(lambda: sidecar.state() == "waiting" and monotonic() > asked + 0.2)
+    switch.unlink()
+    denied = sidecar.client.reply(waiting, PATIENCE_S)
+    assert (denied["ok"], denied["code"]) == (False, "wait_timeout")
+    assert [blocker["consumer"] for blocker in denied["details"]["why"]["blockers"]] == ["holder"]
+    holder.let_go()
+    assert holder.client.reply(running, PATIENCE_S)["ok"]
+
+
 def test_what_can_never_fit_is_said_at_once(box):
     sidecar = box.start("huge", footprint="80GB")
     assert sidecar.detect()["code"] == "vram_insufficient"

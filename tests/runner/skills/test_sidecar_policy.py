@@ -75,6 +75,7 @@ class Sidecar:
         self.arbitrated = True
         self.state = "resident"
         self.wanted = False  # somebody waits for the model
+        self.late_s = 0.0  # how long it lets a ping wait
         self.loads: asyncio.Event | None = None  # set once a load has come, which is never answered
 
     @asynccontextmanager
@@ -120,6 +121,7 @@ class Sidecar:
             action = np.array([[number, i] for i in range(3)], dtype=np.float32) / 100
             reply = {"action": npy.pack(self.action if self.action is not None else action)}
         elif endpoint == "ping":
+            await asyncio.sleep(self.late_s)
             reply = {"ok": True, "model": "m", "revision": "", "kind": "vla", "rskill": "test/arm-grab", "pid": 1,
                      "boot_id": "b", "state": self.state}  # fmt: skip
             if self.wanted:
@@ -487,6 +489,25 @@ def test_a_goal_that_is_over_before_its_policy_is_there_takes_the_load_back(
         with pytest.raises(asyncio.CancelledError):
             await starting
         assert ("unload" in b.sidecar.calls) == wanted
+
+    scenario(run_async, bench(Arbiter()), play)
+
+
+def test_a_load_is_taken_back_from_a_sidecar_that_is_slow_to_answer(
+    bench: Callable[..., Bench], run_async: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: it was asked for a second whether anybody wants the model, and kept it for nobody."""
+    monkeypatch.setattr("runner.skills.sidecar_policy.WITHDRAW_S", 60.0)
+
+    async def play(b: Bench) -> None:
+        b.sidecar.wanted, b.sidecar.loads = True, asyncio.Event()
+        starting = asyncio.create_task(b.skill.start(GOAL))
+        await b.sidecar.loads.wait()
+        b.sidecar.late_s = 1.2
+        starting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await starting
+        assert b.sidecar.calls == ["load", "unload"]
 
     scenario(run_async, bench(Arbiter()), play)
 
