@@ -27,6 +27,7 @@ from clients import records as r
 from clients.connection import REQUEST_TIMEOUT_S
 from clients.lease import Callbacks, ForeignUse, Lease, OnLost, OnReturn, OnRevoke, SafePointEta
 from clients.leaving import Unload
+from clients.patience import answered
 from clients.protocol import ClientProtocol
 from clients.reach import START, obstacle
 from clients.transport import Transport
@@ -102,7 +103,7 @@ class ArbiterClient:
         self._greeted = asyncio.get_running_loop().create_future()
         self._open()
         try:
-            await asyncio.wait_for(self._greeted, self._connect_timeout_s)
+            await answered(self._greeted, self._connect_timeout_s)
         except TimeoutError:
             self._shut()
             silent = f"no arbiter answers at {self.endpoint} within {self._connect_timeout_s:g} s"

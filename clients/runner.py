@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Mapping
 from typing import Any, Literal, Self, cast
 
 from clients import traces
+from clients.patience import answered
 from clients.transport import Transport
 from schemas.endpoints import program_endpoint
 from schemas.errors import BadState, GoalRejected, RunnerUnreachable, from_wire
@@ -193,7 +194,7 @@ class RunnerClient:
                 raise RunnerUnreachable(
                     f"{self.endpoint} takes no more requests", hint="it hangs; restart it"
                 )
-            return await asyncio.wait_for(answer, timeout_s)
+            return await answered(answer, timeout_s)
         except TimeoutError:
             raise RunnerUnreachable(
                 f"no runner answers {op} at {self.endpoint} within {timeout_s:g} s",

@@ -14,6 +14,7 @@ from time import monotonic
 from typing import Any, Self, cast
 
 from clients import traces
+from clients.patience import answered
 from clients.sidecar.spawn import Child, SpawnSpec
 from clients.transport import Transport
 from schemas.errors import ModelError, SidecarUnavailable, VramError, from_wire
@@ -229,7 +230,7 @@ class SidecarClient:
                 raise SidecarUnavailable(
                     f"{self.endpoint} takes no more requests", hint="it hangs; restart it"
                 )
-            reply = await asyncio.wait_for(answer, timeout_s)
+            reply = await answered(answer, timeout_s)
         except TimeoutError:
             if transport is self._transport and op != "ping":
                 self._drop(f"{op} was not answered")  # a fresh socket never sees the late answer

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import msgpack
 import pytest
@@ -137,6 +138,31 @@ def test_a_client_that_is_back_before_the_self_test_is_answered(folder: Path) ->
 
         asyncio.run(serve())
     assert heard == [b"early"]
+
+
+class Stopped:
+    """A socket whose process is stopped in its first wait: the time is over when it goes on, and nothing has come."""
+
+    def __init__(self, socket: "zmq.Socket[bytes]") -> None:
+        self._socket = socket
+        self.waits = 0
+
+    def poll(self, timeout_ms: int) -> int:
+        self.waits += 1
+        return 0 if self.waits == 1 else int(self._socket.poll(timeout_ms))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._socket, name)
+
+
+def test_a_process_that_is_held_up_in_its_self_test_starts(folder: Path) -> None:
+    """Regression: two seconds without the processor, and the daemon did not start."""
+    server = RouterServer(folder / "a.sock", LIMIT, None)
+    held_up = Stopped(server._socket)
+    server._socket = held_up  # type: ignore[assignment]  # it stands for it
+    server.bind()
+    assert held_up.waits > 1
+    server.close()
 
 
 def test_a_req_socket_is_served_too(serving: Serving) -> None:

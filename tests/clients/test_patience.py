@@ -1,0 +1,175 @@
+"""A client that did not run for a while does not take that for the silence of whom it asked. Real sockets, processes that are really stopped."""
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clients.aio import ArbiterClient
+from clients.patience import answered
+from clients.runner import RunnerClient
+from clients.serve import Message, Peer, RouterServer
+from clients.sidecar.base import SidecarClient
+
+PATIENCE_S = 60.0
+LIMIT_S = 0.5
+WELCOME = {"ok": True, "epoch": 1, "version": 1}
+CLIENT = f"""
+import asyncio, sys
+from clients.sidecar.base import SidecarClient
+
+async def ask():
+    async with SidecarClient(sys.argv[1]) as client:
+        print((await client.ping(timeout_s={LIMIT_S}))["word"])
+
+asyncio.run(ask())
+"""
+
+
+class Answering:
+    """A server in a thread of its own, so that it answers while the client's loop stands still."""
+
+    def __init__(self, endpoint: str, before: Callable[[Peer], None], after: Callable[[Peer], None]) -> None:
+        self.endpoint = endpoint
+        self._before, self._after = before, after
+        self._stopped: asyncio.Event | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._up = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()))
+        self._thread.start()
+        assert self._up.wait(PATIENCE_S)
+
+    async def _serve(self) -> None:
+        self._loop, self._stopped = asyncio.get_running_loop(), asyncio.Event()
+        async with RouterServer(self.endpoint, lambda error: {"error": error.to_wire()}) as server:
+
+            async def handle(peer: Peer, message: Message) -> None:
+                self._before(peer)
+                await server.send(peer, {"re": message["id"], "word": "here", **WELCOME})
+                self._after(peer)
+
+            serving = asyncio.create_task(server.serve(handle))
+            self._up.set()
+            await self._stopped.wait()
+            serving.cancel()
+
+    def close(self) -> None:
+        assert self._loop is not None
+        assert self._stopped is not None
+        self._loop.call_soon_threadsafe(self._stopped.set)
+        self._thread.join(PATIENCE_S)
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[..., str]]:
+    """`serve(before, after)`: the endpoint of a server that calls these with its peer before and after it answers."""
+    with tempfile.TemporaryDirectory(prefix="va") as folder:
+        made: list[Answering] = []
+
+        def start(
+            before: Callable[[Peer], None] = lambda _: None, after: Callable[[Peer], None] = lambda _: None
+        ) -> str:
+            made.append(Answering(f"ipc://{folder}/s.sock", before, after))
+            return made[-1].endpoint
+
+        yield start
+        for server in made:
+            server.close()
+
+
+async def connect(endpoint: str) -> None:
+    async with ArbiterClient(endpoint, name="t", connect_timeout_s=LIMIT_S):
+        pass
+
+
+async def ping_runner(endpoint: str) -> None:
+    async with RunnerClient(endpoint) as client:
+        await client.ping(timeout_s=LIMIT_S)
+
+
+async def ping_sidecar(endpoint: str) -> None:
+    async with SidecarClient(endpoint) as client:
+        await client.ping(timeout_s=LIMIT_S)
+
+
+@pytest.mark.parametrize("ask", [connect, ping_runner, ping_sidecar])
+def test_an_answer_that_came_while_the_loop_stood_still_counts(serve: Callable[..., str], ask: Any) -> None:
+    """Regression: a program that imported something for longer than its time limit said that nobody had answered."""
+    said = threading.Event()
+    endpoint = serve(after=lambda _: said.set())
+
+    def stand_still() -> None:
+        assert said.wait(PATIENCE_S)
+        time.sleep(2 * LIMIT_S)
+
+    async def run() -> None:
+        asking = asyncio.create_task(ask(endpoint))
+        asyncio.get_running_loop().call_soon(stand_still)  # behind the question
+        await asking
+
+    asyncio.run(run())
+
+
+def test_an_answer_that_came_while_the_process_was_stopped_counts(serve: Callable[..., str]) -> None:
+    stopped: list[int] = []
+
+    def stop(peer: Peer) -> None:
+        assert peer.pid is not None
+        if not stopped:
+            os.kill(peer.pid, signal.SIGSTOP)
+            stopped.append(peer.pid)
+            time.sleep(3 * LIMIT_S)
+
+    def go_on(peer: Peer) -> None:
+        assert peer.pid is not None
+        os.kill(peer.pid, signal.SIGCONT)
+
+    endpoint = serve(stop, go_on)
+    child = subprocess.Popen(
+        [sys.executable, "-c", CLIENT, endpoint],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        out, err = child.communicate(timeout=PATIENCE_S)
+    finally:
+        child.kill()
+        child.wait()
+    assert (out, child.returncode) == ("here\n", 0), err
+    assert stopped == [child.pid]
+
+
+def test_silence_is_silence() -> None:
+    async def run() -> None:
+        never: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        with pytest.raises(TimeoutError):
+            await answered(never, 0.05)
+        assert never.cancelled()
+        failing: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        failing.set_exception(ZeroDivisionError())
+        with pytest.raises(ZeroDivisionError):
+            await answered(failing, 60.0)
+
+    asyncio.run(run())
+
+
+def test_who_turns_away_leaves_nothing_open() -> None:
+    async def run() -> None:
+        never: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        asking = asyncio.create_task(answered(never, PATIENCE_S))
+        await asyncio.sleep(0)
+        asking.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await asking
+        assert never.cancelled()
+
+    asyncio.run(run())
