@@ -84,7 +84,7 @@ async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
         assert await asyncio.to_thread(programs.runner.wait, 60) == 0
         async with asyncio.timeout(60):
             while any(uses(await watcher.status())):
-                await watcher.ping()
+                await watcher.ping(timeout_s=60)
 
 
 def test_the_policy_moves_the_arm_and_a_signal_ends_its_use(

@@ -62,12 +62,13 @@ async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
             footprint=Footprint(load_peak_bytes=6_000_000_000, steady_bytes=6_000_000_000, residue_bytes=0),
         )
         waiting = asyncio.create_task(rival.acquire(whole_card))
-        async for feedback in grab.feedback():
-            assert not waiting.done() or feedback["progress"] == 1.0, "granted while the goal was running"
         result = await grab.result(60)
         assert result["status"] == "succeeded", result
         assert result["data"]["withheld"] == 0
         lease = await asyncio.wait_for(waiting, 60)
+        events = (await rival.history(kinds=("use_ended", "granted")))["events"]
+        story = [e["kind"] for e in events if e.get("label") == GRAB or e["consumer"] == "rival"]
+        assert story == ["use_ended", "granted"], "not while the goal was running"
         assert leases(await rival.status(), "grab") == []
         truth = await runner.ground_truth()
         assert truth["held"] == target  # evicting the policy does not open the gripper
