@@ -1,5 +1,6 @@
 """For every test of the product: a real arbiter daemon in a folder of its own, and Hypothesis's profiles."""
 
+import logging
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -16,6 +17,17 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell starts what runs in its background deaf to SIGINT, and so would be every program that a test interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def own_log() -> Iterator[None]:
+    """A program that a test runs in this process sets up the log of the whole process: no test is to see more or less for it."""
+    root = logging.getLogger()
+    level, handlers = root.level, list(root.handlers)
+    yield
+    root.setLevel(level)
+    for handler in [handler for handler in root.handlers if handler not in handlers]:
+        root.removeHandler(handler)
 
 
 @pytest.fixture

@@ -44,6 +44,8 @@ class JsonHttp:
         self._timeout_s = timeout_s
         self._retry_pause_s = retry_pause_s
         self._http: Any = None
+        # its line for each request has the whole address in it, with a password or a key; what went wrong is in our errors
+        logging.getLogger("httpx").setLevel(logging.WARNING)
 
     async def __aenter__(self) -> Self:
         return self

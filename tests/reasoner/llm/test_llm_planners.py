@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -360,7 +361,9 @@ def test_the_environment_is_checked() -> None:
 def test_a_password_in_the_address_stands_in_no_message(
     api: Any, stand_in: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """Regression: each request was a line of httpx's in the log of a reasoner at its usual level, with the whole address."""
     address = stand_in.url.replace("http://", "http://me:secret@") + api.base
+    caplog.set_level(logging.DEBUG)
 
     async def once(config: LlmConfig) -> None:
         async with api.planner(config, PALETTE, retry_pause_s=0.0) as planner:
