@@ -15,7 +15,10 @@ ROOT = Path(__file__).parents[2]
 SKILLS = ROOT / "configs/rskills"
 SKILL = SKILLS / "so101-grab/rskill.yaml"
 GRAB = "vram-arbiter/so101-grab"
-SCENARIO_S = 200.0
+SCENARIO_S = 280.0
+GOAL_S = (
+    200.0  # of a goal, with its policy's first load: on a busy machine importing torch alone takes a minute
+)
 
 
 def need_checkpoint() -> None:
@@ -48,7 +51,7 @@ class GrabPrograms:
 
         try:
             asyncio.run(bounded())
-        except (AssertionError, TimeoutError):
+        except Exception:
             print(self.log.read_text(errors="replace")[-4000:])
             raise
 

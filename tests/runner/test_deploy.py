@@ -116,6 +116,7 @@ async def all_fresh(client: RunnerClient) -> None:
 
 async def stopped(client: RunnerClient, reason: str) -> None:
     """Until the motors have been told. A loop that stands still for a second is told of as one that hangs, and obeys when it goes on."""
+    await client.call("ping")  # it may have to come up first
     while True:
         try:
             await client.estop(reason)

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from grab_programs import GRAB, SKILL, GrabPrograms, need_checkpoint
+from grab_programs import GOAL_S, GRAB, SKILL, GrabPrograms, need_checkpoint
 
 from arbiter.testing.process import ArbiterProcess
 from clients.aio import ArbiterClient
 from clients.runner import RunnerClient
 
-pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(340)]
 
 
 def deployed(arbiter: ArbiterProcess) -> GrabPrograms:
@@ -70,7 +70,7 @@ async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
     ):
         assert (await runner.call("ping"))["arbiter"] is True
         begun = await runner.state()
-        goal = await runner.send_goal(GRAB, prompt="grab the red cube")
+        goal = await runner.send_goal(GRAB, prompt="grab the red cube", deadline_s=GOAL_S)
         async for feedback in goal.feedback():
             if feedback["state"] == "running":
                 break

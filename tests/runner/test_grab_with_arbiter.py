@@ -10,14 +10,14 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from grab_programs import GRAB, SKILLS, GrabPrograms, need_checkpoint
+from grab_programs import GOAL_S, GRAB, SKILLS, GrabPrograms, need_checkpoint
 
 from arbiter.testing.process import ArbiterProcess
 from clients.aio import ArbiterClient
 from clients.runner import RunnerClient
 from schemas.wire import Footprint, LeaseSpec
 
-pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(340)]
 
 NAVIGATE = "vram-arbiter/so101-navigate"
 
@@ -48,7 +48,7 @@ async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
         assert (await drive.result(60))["success"]
         assert leases(await rival.status(), "grab") == []  # driving takes no lease
 
-        grab = await runner.send_goal(GRAB, prompt=f"grab the {target}")
+        grab = await runner.send_goal(GRAB, prompt=f"grab the {target}", deadline_s=GOAL_S)
         async for feedback in grab.feedback():
             if feedback["state"] == "running":
                 break
@@ -75,7 +75,7 @@ async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
         assert truth["held_above_table"][target]
         await lease.release()
 
-        again = await runner.send_goal(GRAB, prompt=f"grab the {target}")
+        again = await runner.send_goal(GRAB, prompt=f"grab the {target}", deadline_s=GOAL_S)
         async for feedback in again.feedback():
             if feedback["state"] == "running":
                 break
