@@ -19,7 +19,7 @@ class EnvStep:
     """What one step came to. None: this environment does not say.
 
     `moved` False: time stood still, because there was no action and this world has no way to wait. `success` is what is so now, not only
-    at the end.
+    at the end. `unearned`: whoever does nothing has this success, as long as the episode goes on; it takes one that is played to its end.
     """
 
     reward: float | None = None
@@ -27,6 +27,7 @@ class EnvStep:
     truncated: bool = False
     success: bool | None = None
     moved: bool = True
+    unearned: bool = False
 
 
 class Environment(Protocol):

@@ -99,7 +99,10 @@ class GymEnv:
         self._steps = 0
         self._observation: Any = None
         self._sent: dict[str, float] = {}
+        kind, _, least = self.config.success.partition(":")
+        self._unearned = kind == "return" and float(least) <= 0  # whoever does nothing has that return
         try:
+            self._check_spaces()
             self._row = self._action_row()
             self._gate = self._make_gate()
             self._hold = None if self.config.hold is None else self._held(self.config.hold)
@@ -114,6 +117,15 @@ class GymEnv:
             raise
 
     # -- what the spaces say -----------------------------------------------------------------------------------------------
+    def _check_spaces(self) -> None:
+        from gymnasium import Space
+
+        for what in ("action_space", "observation_space"):
+            if not isinstance(getattr(self._env, what, None), Space):
+                raise ConfigError(
+                    f"{self.env_id} has no {what}: nobody could know what it takes and what it shows"
+                )
+
     def _action_row(self) -> ActionRow:
         try:
             return ActionRow(self._env.action_space)
@@ -208,8 +220,9 @@ class GymEnv:
     def reset(self, seed: int) -> None:
         self._steps, self._total_reward, self._sent = 0, 0.0, {}
         # not the same seed: both draw from the same kind of generator, and random actions would be the world's own random numbers
-        self._env.action_space.seed(random.Random(f"actions-{seed}").getrandbits(31))
+        actions_seed = random.Random(f"actions-{seed}").getrandbits(31)
         try:
+            self._env.action_space.seed(actions_seed)
             self._observation, info = self._env.reset(seed=seed)
         except Exception as error:
             raise self._failed("reset", error) from error
@@ -279,7 +292,7 @@ class GymEnv:
         if action is None:
             action = self._hold
         if action is None:
-            return EnvStep(success=self._last.success, moved=False)
+            return EnvStep(success=self._last.success, moved=False, unearned=self._unearned)
         row = self._gate.in_order(action)
         if isinstance(row, str):
             raise EnvironmentFailed(f"an action that the gate has not seen: {row}")
@@ -295,7 +308,7 @@ class GymEnv:
         self._sent = dict(zip(self._gate.names, row, strict=True))
         self._steps += 1
         self._total_reward += reward
-        self._last = EnvStep(reward, terminated, truncated, self._success(info))
+        self._last = EnvStep(reward, terminated, truncated, self._success(info), unearned=self._unearned)
         return self._last
 
     def gate(self, skill: Stepped) -> SpaceGate:
@@ -317,7 +330,11 @@ class GymEnv:
         return Action.model_validate({"control_mode": mode, PAYLOAD_OF_MODE[mode]: payload})
 
     def sample(self) -> Action:
-        return self.action_of(self._env.action_space.sample())
+        try:
+            drawn = self._env.action_space.sample()
+        except Exception as error:
+            raise self._failed("action_space.sample", error) from error
+        return self.action_of(drawn)
 
     @property
     def observation(self) -> Any:
@@ -343,17 +360,19 @@ class GymEnv:
         if camera not in self._views and camera != RENDER:
             raise KeyError(camera)
         if (view := self._views.get(camera)) is not None:
-            return np.ascontiguousarray(view.of(self._observation))
+            return np.array(
+                view.of(self._observation), order="C"
+            )  # a copy: some environments draw over their last one
         try:
             picture = self._env.render()
         except Exception as error:
             raise self._failed("render", error) from error
-        if not isinstance(picture, np.ndarray) or picture.ndim != 3 or picture.shape[2] != 3:
+        if not isinstance(picture, np.ndarray) or picture.shape[2:] != (3,) or picture.dtype != np.uint8:
             raise EnvironmentFailed(
-                f"{self.env_id} renders no picture",
+                f"{self.env_id} renders no picture (uint8, height × width × 3)",
                 hint="it needs the render mode rgb_array; leave videos out, or name a camera of its observation",
             )
-        return np.ascontiguousarray(picture, dtype=np.uint8)
+        return np.array(picture, order="C")
 
     def _can_render(self) -> bool:
         try:

@@ -263,6 +263,7 @@ class SimRunner(SkillRunner):
         steps = before + step.moved
         self._idle_ticks = 0 if self._active is not None else self._idle_ticks + 1
         truncated = step.truncated or (self._max_steps is not None and steps >= self._max_steps)
+        played_out = step.terminated or truncated
         truncated |= self._ends_with_skill and self._had_skill and self._active is None
         applied = Applied(
             action_applied=decision.action is not None,
@@ -271,7 +272,7 @@ class SimRunner(SkillRunner):
             reward=step.reward,
             terminated=step.terminated,
             truncated=truncated and not step.terminated,
-            success=step.success,
+            success=step.success and (played_out or not truncated or not step.unearned),
         )
         over = bool(applied.terminated or applied.truncated)
         if step.moved:  # where time stood still there is nothing new to see

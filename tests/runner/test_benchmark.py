@@ -103,6 +103,29 @@ def test_a_policy_with_a_defect_fails_and_one_that_gives_up_is_judged(run_async:
 
 
 @pytest.mark.heavy
+@pytest.mark.parametrize(
+    ("least", "steps", "success"), [(-100, 0, False), (-100, 3, False), (-100, 6, True), (-1, 6, False)]
+)
+def test_who_leaves_before_it_costs_anything_has_not_succeeded(
+    run_async: Run, least: int, steps: int, success: bool
+) -> None:
+    """Rewards of a pendulum are costs: whoever does nothing has the greatest return."""
+    config = GymConfig(success=f"return:{least}")
+    runner = SimRunner(
+        lambda: GymEnv("Pendulum-v1", config, render=False), rate_hz=0, ends_with_skill=True, max_steps=5
+    )
+
+    def make(env: Any, seed: int) -> Any:
+        left = [[0.0]] * steps
+        return lambda world: left.pop() if left else None
+
+    cell: Cell = run_async(
+        Benchmark(runner, world="pendulum").run(PolicyContestant(Policy("quits", make)), (0,))
+    )
+    assert [(e.success, e.steps, e.truncated) for e in cell.episodes] == [(success, min(steps, 5), True)]
+
+
+@pytest.mark.heavy
 def test_nobody_judges_a_world_that_says_nothing(run_async: Run) -> None:
     cell: Cell = run_async(Counted(told=False).bench.run(PolicyContestant(policy_of(SEEK)), (12, 13)))
     assert [(e.success, e.error) for e in cell.episodes] == [(None, ""), (None, "model_error")]

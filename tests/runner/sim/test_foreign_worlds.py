@@ -18,7 +18,7 @@ from runner.sim.gym_config import GymConfig  # noqa: E402
 from runner.sim.gym_env import GymEnv  # noqa: E402
 from runner.sim.policies import Policy, PolicyPlayer  # noqa: E402
 from runner.sim.sim_runner import SimRunner  # noqa: E402
-from schemas.errors import EnvironmentFailed  # noqa: E402
+from schemas.errors import ConfigError, EnvironmentFailed  # noqa: E402
 
 Run = Callable[[Any], Any]
 ROOT = Path(__file__).parents[3]
@@ -215,3 +215,89 @@ for room in (20_000, 1 << 20):
         [sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True, check=True, cwd=ROOT
     )
     assert ran.stdout.split() == ["12", "True", "12", "False"]
+
+
+class Sketch(gymnasium.Env[Any, Any]):
+    """Draws over its last picture, as simulators do; renders what it is told to."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 — gymnasium's own way
+
+    def __init__(self, render_mode: str | None = None, film: Any = None) -> None:
+        self.render_mode = render_mode
+        self.film = np.zeros((8, 8, 3), np.uint8) if film is None else film
+        self.eye = np.zeros((8, 8, 3), np.uint8)
+        self.action_space = gymnasium.spaces.Discrete(2)
+        self.observation_space = gymnasium.spaces.Dict(eye=gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.eye[:] = 0
+        return {"eye": self.eye}, {}
+
+    def step(self, action: Any) -> Any:
+        self.eye += 9
+        self.film += 9
+        return {"eye": self.eye}, 0.0, False, False, {}
+
+    def render(self) -> Any:
+        return self.film
+
+
+if "test/Sketch-v0" not in gymnasium.registry:
+    gymnasium.register("test/Sketch-v0", Sketch)
+
+
+def test_a_picture_that_was_taken_does_not_change_any_more() -> None:
+    env = GymEnv("test/Sketch-v0")
+    env.reset(0)
+    taken = [env.render(camera) for camera in ("eye", "render")]
+    env.step(env.action_of(1))
+    assert [int(picture.max()) for picture in taken] == [0, 0]
+    assert [int(env.render(camera).max()) for camera in ("eye", "render")] == [9, 9]
+
+
+@pytest.mark.parametrize(
+    "film", [np.full((8, 8, 3), 0.7), np.full((8, 8, 3), 300), np.zeros((8, 8), np.uint8)]
+)
+def test_what_is_rendered_in_other_numbers_is_not_made_a_picture(film: Any) -> None:
+    """0.7 of white would be black, 300 would be dark."""
+    env = GymEnv("test/Sketch-v0", GymConfig(kwargs={"film": film}))
+    env.reset(0)
+    assert env.cameras == ("eye",)
+    with pytest.raises(EnvironmentFailed, match="renders no picture"):
+        env.render("render")
+
+
+class Silent(gymnasium.Env[Any, Any]):
+    """Says nothing of what it takes or shows."""
+
+
+class Broken(Sketch):
+    """Its action space can do nothing."""
+
+    def __init__(self, render_mode: str | None = None, works: str = "") -> None:
+        super().__init__(render_mode)
+        for name in {"seed", "sample"} - {works}:
+            setattr(self.action_space, name, self._raise)
+
+    def _raise(self, *_: Any) -> Any:
+        raise RuntimeError("no dice")
+
+
+for name, kind in (("test/Silent-v0", Silent), ("test/Broken-v0", Broken)):
+    if name not in gymnasium.registry:
+        gymnasium.register(name, kind)
+
+
+def test_an_environment_without_spaces_is_refused() -> None:
+    with pytest.raises(ConfigError, match="test/Silent-v0 has no action_space"):
+        GymEnv("test/Silent-v0")
+
+
+def test_an_action_space_that_fails_is_the_environments_failure() -> None:
+    with pytest.raises(EnvironmentFailed, match=r"Broken-v0.reset: RuntimeError: no dice"):
+        GymEnv("test/Broken-v0", render=False).reset(0)
+    env = GymEnv("test/Broken-v0", GymConfig(kwargs={"works": "seed"}), render=False)
+    env.reset(0)
+    with pytest.raises(EnvironmentFailed, match=r"action_space.sample: RuntimeError: no dice"):
+        env.sample()
