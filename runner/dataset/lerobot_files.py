@@ -44,6 +44,10 @@ def features_of(row: Row) -> Features:
                 f"camera {frame['camera']} gives {width} × {height} pixels; a video needs even numbers",
                 hint="choose another size for it, or leave it out",
             )
+        if _camera(frame["camera"]) in features:
+            raise ConfigError(
+                f"two cameras would have the column {_camera(frame['camera'])}", hint="rename one of them"
+            )
         features[_camera(frame["camera"])] = {
             "dtype": "video",
             "shape": (height, width, 3),

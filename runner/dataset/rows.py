@@ -16,6 +16,7 @@ from schemas.world import FrameEncoding, SensorFrame
 TIMINGS = ("tick", "sensors", "world_state", "inference", "safety", "hal")
 ROBOT, OWN = "rad", "own"  # units of state and action: a robot's, or whatever its world has
 NUMBERS_MAX = 4096  # of a state; beyond that it is a picture of some kind
+LARGEST = 3.4028234663852886e38  # of the columns' float32
 NO_CHUNK = -1  # chunk_index of a tick that was not played from a chunk
 COLOURS = frozenset(
     {FrameEncoding.RGB8, FrameEncoding.BGR8, FrameEncoding.MONO8, FrameEncoding.JPEG, FrameEncoding.PNG}
@@ -58,6 +59,7 @@ def row_of(tick: GoalTick, cameras: Sequence[str]) -> tuple[Row, list[bytes]]:
         "deadline_missed": result.deadline_missed,
         "violations": "; ".join(result.safety_violations),
         "reward": result.reward,
+        "success": result.success,
         "trace_id": trace_id,
         "span_id": span_id,
         "sampled": sampled,
@@ -84,8 +86,9 @@ def _step(step: Transition) -> tuple[dict[str, float], dict[str, float]]:
         raise Incomplete(
             f"the world shows {len(step.shown)} numbers, at most {NUMBERS_MAX} are recorded: name some as `joints`"
         )
-    if unsaid := [name for name, value in step.shown.items() if not math.isfinite(value)]:
-        raise Incomplete(f"{unsaid[0]} is not finite")
+    for name, value in (*step.shown.items(), *step.sent.items()):
+        if not abs(value) <= LARGEST:  # nor for NaN
+            raise Incomplete(f"{name} is {value:g}, which no column can hold")
     return dict(step.shown), dict(step.sent)
 
 

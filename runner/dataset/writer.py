@@ -40,6 +40,7 @@ class EpisodeWriter:
         self._goal: Row | None = None  # first row of the goal that is being recorded
         self._features: Features = {}
         self._last: dict[str, Any] | None = None  # written when it is known whether it is the episode's last
+        self._judged: bool | None = None  # what the world said of the last row; None: nobody judges
         self._broken = 0  # rows of it with a picture that cannot be read
         self._refused = ""  # goal of whose rows nothing can be made
 
@@ -62,7 +63,7 @@ class EpisodeWriter:
             return
         if self._last is not None:
             self._files.add(self._last)
-        self._last = frame
+        self._last, self._judged = frame, row["success"]
         if self._files.rows + 1 >= self._rows_max:
             self._close({"status": "continued"})
 
@@ -97,9 +98,10 @@ class EpisodeWriter:
             )
             return
         last["next.done"][0] = True
-        last["next.success"][0] = note.get("status") == "succeeded"
+        last["next.success"][0] = note.get("status") == "succeeded" and self._judged is not False
         self._files.add(last)
         about = {key: first[key] for key in ("goal_id", "skill", "task", "trace_id", "units")}
+        about["judged"] = self._judged
         broken = {"incomplete": note.get("incomplete", 0) + self._broken}
         index = self._files.finish({**about, **note, **broken})
         self._goal = self._last = None

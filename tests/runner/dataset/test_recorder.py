@@ -4,6 +4,7 @@ import io
 import logging
 import os
 import signal
+import socket
 import sys
 import time
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from runner.dataset.lerobot_files import LerobotFiles, features_of, frame_of
 from runner.dataset.reader import read_frame
 from runner.dataset.recorder import QUEUE_TICKS, DatasetRecorder, whole_rate
 from runner.dataset.rows import row_of
+from runner.dataset.writer import EpisodeWriter
 from runner.protocols import Transition
 from schemas.errors import AlreadyRunning, BadRequest, ConfigError, InternalError, VramError
 
@@ -196,6 +198,19 @@ def test_a_frame_leads_back_to_its_tick_and_trace(recorded: Recorded) -> None:
     assert read_frame(recorded.root, 2, episode=1) == found
 
 
+def test_what_its_world_calls_a_failure_is_no_success(tmp_path: Path) -> None:
+    """A skill that was done all the same; where nobody judges, its own word counts."""
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        writer = EpisodeWriter(theirs, LerobotFiles(tmp_path, fps=30, robot="bench"))
+        for said in (False, True, None):
+            for index in range(2):
+                writer.row(*row_of(tick(index, of=goal(str(said)), frames={}, success=said), ()))
+            writer.ended({"goal_id": str(said), "status": "succeeded"})
+    assert [read_frame(tmp_path, 1, episode).tick["success"] for episode in range(3)] == [False, True, True]
+    assert [note["judged"] for note in commit.notes(tmp_path)] == [False, True, None]
+
+
 def test_a_state_or_an_action_of_one_number_is_replayed(tmp_path: Path) -> None:
     """lerobot makes a column of plain numbers of it, not of lists."""
     files = LerobotFiles(tmp_path, fps=30, robot="bench")
@@ -243,6 +258,18 @@ def test_the_command_prints_the_frame_and_opens_its_trace(
     assert program.main(["replay", "--dataset", str(tmp_path), "--frame", "0"]) == 2
     assert program.main(["replay", "--dataset", root, "--frame", "0", "--trace-url", "http://x"]) == 2
     assert "is no dataset that this program recorded" in capsys.readouterr().err
+
+
+def test_two_cameras_of_one_column_are_refused() -> None:
+    """A column has no `/`: the pictures of the one would have been the other's."""
+    frames = {name: picture(name, 10) for name in ("arm/top", "arm_top")}
+    with pytest.raises(ConfigError, match=r"two cameras would have the column observation\.images\.arm_top"):
+        features_of(row_of(tick(0, frames=frames), tuple(frames))[0])
+
+
+def test_a_world_of_nothing_but_pictures_has_no_state() -> None:
+    row, _ = row_of(replace(tick(0), transition=Transition({}, {"push": 1.0})), ("front",))
+    assert "observation.state" not in features_of(row)
 
 
 # -- what cannot be recorded -----------------------------------------------------------------------------------------------

@@ -75,7 +75,8 @@ def test_a_world_that_is_no_robot_has_its_own_numbers() -> None:
     ("shown", "sent", "reason"),
     [
         ({"gap": 0.5}, {}, "nothing was sent: the world stood still"),
-        ({"gap": 0.5, "speed": float("nan")}, {"push": 1.0}, "speed is not finite"),
+        ({"gap": 0.5, "speed": float("nan")}, {"push": 1.0}, "speed is nan, which no column can hold"),
+        ({"gap": 0.5}, {"push": 1e39}, r"push is 1e\+39, which no column can hold"),
         ({str(n): 0.0 for n in range(NUMBERS_MAX + 1)}, {"push": 1.0}, "at most 4096 are recorded"),
     ],
 )
