@@ -96,9 +96,12 @@ class ArmEnvironment:
         self._prepare, self._judge, self._steady = prepare, judge, steady
 
     def reset(self, seed: int) -> None:
-        self.arm.reset(seed)
-        if self._prepare is not None:
-            self._prepare(seed)
+        try:
+            self.arm.reset(seed)
+            if self._prepare is not None:
+                self._prepare(seed)
+        except ValueError as error:  # objects that do not fit, a model that cannot be built
+            raise EnvironmentFailed(f"the scene of seed {seed} cannot be set up: {error}") from error
         self._in_a_row = 0
         self._targets = self.arm.joint_state()
         self._random = random.Random(f"actions-{seed}")

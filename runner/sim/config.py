@@ -9,15 +9,18 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, Literal
 
-import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from schemas.errors import ConfigError
+from schemas.yamltext import config_error, parse_yaml, problems_of
 
 ARM_JOINTS: Final = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 BASE_JOINTS: Final = ("base_x", "base_y", "base_yaw")
 CONTROL_HZ: Final = 30.0
 CONTROL_DT_S: Final = 1.0 / CONTROL_HZ
+WHOLE: Final = 1e-6  # steps in a control period; what a decimal fraction in a file is off
 
 COLOURS: Final[dict[str, tuple[float, float, float]]] = {
     "red": (0.82, 0.07, 0.07),
@@ -39,9 +42,9 @@ class CameraSpec(BaseModel):
     `parent` is `base` (mobile base), `gripper` (the arm's last link) or `world`.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    parent: str
+    parent: Literal["base", "gripper", "world"]
     width_px: int = Field(ge=16, le=1920)
     height_px: int = Field(ge=16, le=1080)
     fovy_deg: float = Field(gt=1.0, lt=150.0)
@@ -56,7 +59,7 @@ class CameraSpec(BaseModel):
 class SceneConfig(BaseModel):
     """Everything a seed does not decide."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     table_top_z_m: float = 0.20
     table_edge_x_m: float = 0.62
@@ -72,7 +75,7 @@ class SceneConfig(BaseModel):
     start_x_m: tuple[float, float] = (-0.03, 0.03)
     start_y_m: float = 0.05
     start_yaw_rad: float = 0.06
-    timestep_s: float = 1.0 / 480.0
+    timestep_s: float = Field(default=1.0 / 480.0, gt=0.0, le=CONTROL_DT_S)
     cameras: dict[str, CameraSpec] = Field(
         default_factory=lambda: {
             "front": CameraSpec(
@@ -104,13 +107,27 @@ class SceneConfig(BaseModel):
         }
     )
 
+    @field_validator("timestep_s")
+    @classmethod
+    def _divides(cls, timestep_s: float) -> float:
+        steps = CONTROL_DT_S / timestep_s
+        if abs(steps - round(steps)) > WHOLE:
+            raise ValueError(f"1/{CONTROL_HZ:g} s must be a whole number of steps, not {steps:.4g}")
+        return timestep_s
+
     @classmethod
     def load(cls, path: Path | None = None) -> SceneConfig:
-        """The scene of a YAML file (keys as the fields), or the built-in one. Raises pydantic's ValidationError."""
+        """The scene of a YAML file (keys as the fields), or the built-in one. Raises ConfigError with the file's name, line and field."""
         if path is None:
             return cls()
-        raw: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return cls.model_validate(raw or {})
+        try:
+            source = parse_yaml(path.read_text(encoding="utf-8"), str(path))
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"the scene {path} cannot be read: {error}") from error
+        try:
+            return cls.model_validate(source.data)
+        except ValidationError as error:
+            raise config_error(str(path), problems_of(error, source, {(): set(cls.model_fields)})) from error
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -343,7 +343,10 @@ class SimRunner(SkillRunner):
         if self._video_picture is None or self._idle_ticks < STILL_AFTER_TICKS:
             try:
                 self._video_picture = self.env.render(self._video_camera)
-            except EnvironmentFailed as error:  # the episode goes on
+            except (
+                EnvironmentFailed,
+                KeyError,
+            ) as error:  # the episode goes on; KeyError: there is no such camera
                 log.error("no more pictures for the video: %s", error)
                 self.recorder = None
                 return

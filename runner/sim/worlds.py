@@ -11,8 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from pydantic import ValidationError
-
 from runner.body import SIMULATED
 from runner.catalogue import Maker, sidecar_endpoint
 from runner.hal.so101 import so101
@@ -32,6 +30,7 @@ from schemas.manifest import Kind, RSkillManifest
 
 SO101: Final = "so101"
 GYM: Final = "gym:"
+OVERVIEW: Final = "overview"  # for people; where a scene has none, another camera
 OBSERVATION_CAMERAS: Final = ("front", "wrist")  # the first is the default one
 
 
@@ -56,10 +55,7 @@ class World:
 
 def so101_world(scene_file: Path | None) -> World:
     """Raises ConfigError for a scene that cannot be read."""
-    try:
-        scene = SceneConfig.load(scene_file)
-    except (OSError, ValidationError, ValueError) as error:
-        raise ConfigError(f"the scene {scene_file} cannot be read: {error}") from error
+    scene = SceneConfig.load(scene_file)
     arm = SimEnv(scene)  # renders only on the control thread, from its first reset on
     cameras = tuple(name for name in OBSERVATION_CAMERAS if name in scene.cameras)
     robot = so101(simulated=True, base=MobileBase(MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S))
@@ -68,7 +64,7 @@ def so101_world(scene_file: Path | None) -> World:
         name=SO101,
         make=lambda: environment,
         cameras=cameras,
-        video_camera="overview",
+        video_camera=next((name for name in (OVERVIEW, *scene.cameras) if name in scene.cameras), OVERVIEW),
         video_every=3,  # ten pictures a second at 30 Hz
         joints=ARM_JOINTS,
         rest=dict(zip(ARM_JOINTS, REST_POSE, strict=True)),

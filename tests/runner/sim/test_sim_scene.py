@@ -9,10 +9,14 @@ import pytest
 pytest.importorskip("mujoco")
 import numpy as np
 
+from runner.hal.so101 import so101
+from runner.sim.arm_env import ArmEnvironment
 from runner.sim.config import ARM_JOINTS, COLOURS, REST_POSE, SHAPES, SceneConfig, vocabulary
 from runner.sim.env import SimEnv
 from runner.sim.layout import make_layout
 from runner.sim.navigate import standoff_pose
+from runner.sim.worlds import so101_world
+from schemas.errors import ConfigError, EnvironmentFailed
 
 pytestmark = pytest.mark.heavy
 
@@ -30,6 +34,44 @@ def test_scene_file_says_the_defaults() -> None:
     written, built_in = SceneConfig.load(SCENE_FILE).model_dump(), SceneConfig().model_dump()
     assert written.pop("timestep_s") == pytest.approx(built_in.pop("timestep_s"))
     assert written == built_in
+
+
+CAMERA = "{parent: %s, width_px: 64, height_px: 48, fovy_deg: 43.0, pos_m: [0, 0, 1], look_at_m: [1, 0, 0]}"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("cameras: [unclosed\n", r"scene.yaml:\d+: not valid YAML"),
+        ("- a list\n", r"scene.yaml"),
+        ("object_count: 3\ntimestep_s: 0\n", r"scene.yaml:2: timestep_s"),
+        ("timestep_s: 0.1\n", r"scene.yaml:1: timestep_s"),  # not one step in a control period
+        ("timestep_s: 0.0025\n", r"scene.yaml:1: timestep_s: .*a whole number of steps, not 13.33"),
+        ("table_edge_x_m: .nan\n", r"scene.yaml:1: table_edge_x_m"),
+        ("object_conut: 3\n", r"scene.yaml:1: object_conut: unknown key.*object_count"),
+        (f"cameras:\n  front: {CAMERA % 'moon'}\n", r"scene.yaml:2: cameras.front.parent"),
+    ],
+)
+def test_mistakes_in_a_scene_file_are_named_by_line(tmp_path: Path, text: str, said: str) -> None:
+    file = tmp_path / "scene.yaml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=said):
+        so101_world(file)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        so101_world(tmp_path / "none.yaml")
+
+
+def test_a_scene_without_an_overview_is_filmed_by_another_camera(tmp_path: Path) -> None:
+    file = tmp_path / "scene.yaml"
+    file.write_text(f"cameras:\n  side: {CAMERA % 'world'}\n", encoding="utf-8")
+    assert (so101_world(file).video_camera, so101_world(file).cameras) == ("side", ())
+    assert so101_world(None).video_camera == "overview"
+
+
+def test_a_scene_whose_objects_do_not_fit_is_the_environments_failure() -> None:
+    crowded = SimEnv(SceneConfig(object_count=8, zone_half_width_m=0.05))
+    with pytest.raises(EnvironmentFailed, match=r"the scene of seed 3 cannot be set up: 8 objects"):
+        ArmEnvironment(crowded, so101(simulated=True)).reset(3)
 
 
 @pytest.mark.parametrize("seed", range(20))
