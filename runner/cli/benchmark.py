@@ -188,7 +188,7 @@ def worlds_of(args: argparse.Namespace) -> list[World]:
     worlds = []
     for name in names:
         if name != SO101:
-            render = None if args.videos else False
+            render = None if args.videos or args.skill else False  # a skill may look through `render`
             worlds.append(world_of(name, env_config=args.env_config, success=args.success, render=render))
             continue
         for scene in dict.fromkeys(args.scene) or [None]:

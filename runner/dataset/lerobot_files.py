@@ -220,13 +220,15 @@ class LerobotFiles:
 
     # -- lerobot ---------------------------------------------------------------------------------------------------------
     def _meta(self) -> Any:
+        from datasets.exceptions import DatasetsError
         from lerobot.datasets import LeRobotDatasetMetadata
 
         try:
             return LeRobotDatasetMetadata(REPO_ID, root=self._root)
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, DatasetsError) as error:
             raise ConfigError(
-                f"the dataset in {self._root} cannot be read: {error}", hint="record into a new folder"
+                f"the dataset in {self._root} cannot be read: {error.__cause__ or error}",
+                hint="record into a new folder",
             ) from error
 
     def _create(self, features: Features) -> None:

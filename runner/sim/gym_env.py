@@ -214,6 +214,9 @@ class GymEnv:
             with contextlib.suppress(NoNumbers):
                 if part.size and not part.bytes_in_a_plane:
                     shown.append(part)
+        names = Counter(name for part in shown for name in part.names("observation"))
+        if twice := [name for name, count in names.items() if count > 1]:
+            raise ConfigError(f"two numbers of {self.env_id}'s observation are called {twice[0]}")
         return tuple(shown)
 
     # -- Environment -------------------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """`vram-runner benchmark`: rates with their interval, one reset a seed, errors that are no verdicts, videos, and a report whatever happens."""
 
+import argparse
 import asyncio
 import json
 import os
@@ -15,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runner.__main__ import main
+from runner.cli.benchmark import add_parser, worlds_of
 from runner.sim.benchmark import Benchmark, Cell, PolicyContestant, file_name, wilson
 from runner.sim.gym_config import GymConfig
 from runner.sim.gym_env import GymEnv
@@ -295,6 +297,21 @@ def test_mistakes_are_said_in_one_line(
     told = capsys.readouterr().err
     assert said in told
     assert len(told.splitlines()) == 1
+
+
+@pytest.mark.heavy
+def test_without_videos_a_skill_sees_what_it_saw_with_them() -> None:
+    parser = argparse.ArgumentParser()
+    add_parser(parser.add_subparsers())
+    for flags, cameras in (
+        (["--skill", "any"], ("top", "render")),
+        (["--skill", "any", "--no-videos"], ("top", "render")),
+        (["--policy", "random", "--no-videos"], ("top",)),  # it looks through no camera: nothing is rendered
+    ):
+        (world,) = worlds_of(parser.parse_args(["benchmark", "--env", POINT, *flags]))
+        env = world.make()
+        env.reset(0)
+        assert env.cameras == cameras
 
 
 def test_two_cells_of_one_name_do_not_overwrite_each_others_videos(

@@ -3,6 +3,7 @@
 import io
 import logging
 import os
+import shutil
 import signal
 import socket
 import sys
@@ -182,6 +183,19 @@ def test_a_goal_with_other_columns_is_said_and_costs_only_itself(recorded: Recor
     assert isinstance(recorded.second.error, ConfigError)
     assert "recorded with other columns: observation.images.front" in recorded.second.error.message
     assert "goal short is not recorded: 1 rows are no episode" in recorded.said
+
+
+def test_a_damaged_dataset_is_said_and_not_touched(recorded: Recorded, tmp_path: Path) -> None:
+    """A page that cannot be unpacked: the file's end, which is read first, is whole."""
+    root = tmp_path / "set"
+    shutil.copytree(recorded.root, root)
+    (damaged, *_) = sorted((root / "meta/episodes").rglob("*.parquet"))
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[:100] + bytes(300) + whole[400:])
+    with pytest.raises(ConfigError, match="cannot be read"):
+        LerobotFiles(root, fps=30, robot="bench").totals()
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_frame(root, 0)
 
 
 # -- replay ----------------------------------------------------------------------------------------------------------

@@ -242,6 +242,9 @@ def test_two_parts_that_cannot_be_told_apart_are_refused() -> None:
     twice = spaces.Dict({"a.b": PICTURE, "a": spaces.Dict(b=PICTURE)})
     with pytest.raises(ConfigError, match=r"two parts .* are called a\.b"):
         plain(spaces.Discrete(2), twice)
+    twice = spaces.Dict({"a": spaces.Box(0, 1, (2,)), "a.0": spaces.Discrete(2)})
+    with pytest.raises(ConfigError, match=r"two numbers .* are called a\.0"):
+        plain(spaces.Discrete(2), twice)
 
 
 # -- the loop and the benchmark on them -------------------------------------------------------------------------------------
