@@ -19,6 +19,7 @@ import msgpack
 import zmq
 import zmq.asyncio
 
+from clients.packing import pack
 from schemas.defaults import IMAGE_MESSAGE_MAX_BYTES
 from schemas.errors import AlreadyRunning, BadFrame, ConfigError, MessageTooLarge, VramError
 
@@ -165,7 +166,7 @@ class RouterServer:
     async def send(self, peer: Peer, message: Message) -> None:
         """Answer or push. A peer that is gone or too slow gets nothing."""
         assert self._socket is not None
-        payload = msgpack.packb(message, use_bin_type=True)
+        payload = pack(message)
         frames = [peer.identity, b"", payload] if peer.delimiter else [peer.identity, payload]
         async with self._send_lock:
             await self._socket.send_multipart(frames)

@@ -13,6 +13,8 @@ import msgpack
 import zmq
 import zmq.utils.monitor
 
+from clients.packing import pack
+
 log = logging.getLogger(__name__)
 
 DRAIN_MAX = 256  # messages in one go, then the loop's other work gets its turn
@@ -52,7 +54,7 @@ class Transport:
     def send(self, message: dict[str, Any]) -> bool:
         """Queue one message. False: the queue is full, the other side does not read."""
         try:
-            self._socket.send(msgpack.packb(message, use_bin_type=True), zmq.NOBLOCK)
+            self._socket.send(pack(message), zmq.NOBLOCK)
         except zmq.Again:
             return False
         self._schedule_drain()

@@ -14,8 +14,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
-import msgpack
-
+from clients.packing import pack
 from clients.serve import Message, Peer
 from runner.catalogue import Catalogue
 from runner.clock import Clock
@@ -323,7 +322,7 @@ def _identity(request: SendGoal) -> str:
 def _sendable(data: dict[str, Any]) -> dict[str, Any]:
     """A skill's own words, if a wire carries them; a result reaches its client whatever they are."""
     try:
-        msgpack.packb(data)
+        pack(data)
     except (TypeError, ValueError, OverflowError):
         return {"unsendable": repr(data)[:500]}
     return data

@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 from clients.cli import text
+from clients.packing import pack
 from schemas.defaults import WIRE_VERSION
 from schemas.endpoints import arbiter_endpoint
 
@@ -70,7 +71,7 @@ def ask(
             "instance": f"vramctl-{os.getpid()}",
         }
         for message in (hello | {"role": role}, {"op": op, "id": 2, **fields}):
-            socket.send(msgpack.packb(message))
+            socket.send(pack(message))
         deadline = time.monotonic() + timeout_s
         if not socket.poll(min(DOUBT_MS, int(1000 * timeout_s))):
             _look(where)

@@ -7,8 +7,9 @@ import pytest
 import zmq
 
 from arbiter.testing.wire import WireClient
+from clients.runner import RunnerClient
 from clients.serve import Message, Peer, RouterServer
-from schemas.errors import AlreadyRunning, VramError
+from schemas.errors import AlreadyRunning, RobotFault, VramError
 
 ANSWER = bytes(16 << 20)  # far more than the kernel takes in one go
 
@@ -37,6 +38,34 @@ def test_the_last_answer_reaches_its_peer_though_the_server_ends_behind_it(tmp_p
         request = client.send("ask")
         asyncio.run(answer_and_end())
         assert client.reply(request)["data"] == ANSWER
+
+
+def test_words_that_utf8_has_no_bytes_for_reach_the_other_side(tmp_path: Path) -> None:
+    """Regression: undecodable bytes of a command line or a file name ended the caller with a traceback, and left whoever had asked without an
+    answer."""
+    endpoint = f"ipc://{tmp_path}/s.sock"
+
+    async def there_and_back() -> tuple[Message, str]:
+        heard: list[Message] = []
+        async with RouterServer(endpoint, refused) as server:
+
+            async def handle(peer: Peer, message: Message) -> None:
+                heard.append(message)
+                error = RobotFault("no file \udcff")
+                answer = {"ok": True} if message["op"] == "ping" else {"ok": False, "error": error.to_wire()}
+                await server.send(peer, {"re": message["id"], **answer})
+
+            serving = asyncio.create_task(server.serve(handle))
+            async with RunnerClient(endpoint) as client:
+                with pytest.raises(RobotFault) as raised:
+                    await client.estop("smoke \udcff")
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+        return heard[-1], raised.value.message
+
+    stopped, said = asyncio.run(there_and_back())
+    assert (stopped["op"], stopped["reason"]) == ("estop", "smoke \\udcff")
+    assert said == "no file \\udcff"
 
 
 def test_an_endpoint_is_free_when_its_server_has_ended_and_when_it_never_began(tmp_path: Path) -> None:
