@@ -6,6 +6,8 @@ scene are data inside a JSON text, cut to `ANSWER_MAX_CHARS`; only an operator's
 """
 
 import json
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +22,8 @@ from schemas.tools import (
     skill_tool_name,
 )
 
-ANSWER_MAX_CHARS = 2000
+ANSWER_MAX_CHARS = 2000  # of the words; of the data, which are lists of numbers mostly, twice as many
+ITEMS_MAX = 64
 
 MEANING: dict[Status, str] = {
     "found": "the detector looked and sees it",
@@ -104,7 +107,7 @@ def _notes(notes: list[Note], after: int) -> list[Turn]:
 
 
 def _step(number: int, step: Step, palette: Palette) -> list[Turn]:
-    text = json.dumps(told(step.call, step.outcome), ensure_ascii=False)
+    text = json.dumps(told(step.call, step.outcome), ensure_ascii=False, allow_nan=False)
     return [
         _called(number, step.call, palette),
         Answered(_id(number), text, step.outcome.status in ("refused", "error")),
@@ -122,7 +125,35 @@ def told(call: ToolCall, outcome: Outcome) -> dict[str, Any]:
     }
     if outcome.code:
         fields["code"] = outcome.code
-    return fields | ({"data": dict(outcome.data)} if outcome.data else {})
+    return fields | ({"data": _told_data(outcome.data)} if outcome.data else {})
+
+
+def _told_data(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A skill's or a model's own data, as JSON can say it and no longer than an answer may be; what is left out is said to be."""
+    fields: dict[str, Any] = {}
+    left = 2 * ANSWER_MAX_CHARS
+    for key, value in _sayable(data).items():
+        length = len(json.dumps(value, ensure_ascii=False))
+        fields[key] = value if length <= left else f"… left out: {length} characters"
+        left -= min(length, left)
+    return fields
+
+
+def _sayable(value: Any) -> Any:
+    match value:
+        case None | bool() | int():
+            return value
+        case float():
+            return value if math.isfinite(value) else str(value)
+        case list() | tuple():
+            more = [f"… and {len(value) - ITEMS_MAX} more"] if len(value) > ITEMS_MAX else []
+            return [_sayable(item) for item in value[:ITEMS_MAX]] + more
+        case Mapping():
+            return {_short(str(key)): _sayable(value[key]) for key in list(value)[:ITEMS_MAX]}
+        case bytes():
+            return f"{len(value)} bytes"
+        case _:
+            return _short(str(value))
 
 
 def _called(number: int, call: ToolCall, palette: Palette) -> Called:

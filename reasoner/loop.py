@@ -264,7 +264,7 @@ class _Loop:
                 self._finish = decision
             case StopGoal() if self._acting is not None:
                 log.info("stop_goal %s", describe(decision))
-                self._acting.cancel()
+                self._call_off()
             case Wait():
                 pass
             case _:
@@ -302,11 +302,16 @@ class _Loop:
         self._thinking = None
         self.episode.running = None
 
+    def _call_off(self) -> None:
+        """Once: a second cancellation would end the wait for the goal's end."""
+        if self._acting is not None and not self._acting.cancelling():
+            self._acting.cancel()
+
     async def _stop_acting(self) -> None:
         """A goal does not outlive its episode."""
         if self._acting is None or self._call is None:
             return
-        self._acting.cancel()
+        self._call_off()
         await asyncio.wait({self._acting}, timeout=STOP_MAX_S)
         if not self._acting.done():
             log.error("%s did not end within %.0f s of its cancellation", self._call.tool, STOP_MAX_S)

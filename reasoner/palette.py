@@ -221,7 +221,10 @@ class Palette:
         """Read a call by the name under which it was offered, or by the tool's own. Raises UnknownOp and BadRequest."""
         for skill in self.skills:
             if skill_tool_name(skill.id) == name:
-                return parse_skill_call(skill.id, arguments)
+                call = parse_skill_call(skill.id, arguments)
+                if call.goal_params and not skill.goal_params_schema:
+                    raise BadRequest(f"{name}: takes no goal_params", hint="leave them out")
+                return call
         return parse_tool_call(name, arguments)
 
 

@@ -73,10 +73,7 @@ class Episode:
 
     def attempts(self, manipulation: frozenset[str]) -> int:
         """How many goals of the skills named in `manipulation` were executed."""
-        return sum(
-            isinstance(step.call, ExecuteRskill) and step.call.rskill_id in manipulation
-            for step in self.steps
-        )
+        return sum(_executed(step, manipulation) for step in self.steps)
 
     def confirmed(self, manipulation: frozenset[str]) -> bool:
         """Whether the scene VLM's newest yes or no after the newest manipulation was a yes."""
@@ -84,9 +81,19 @@ class Episode:
             asked = isinstance(step.call, QueryScene) and step.outcome.status == "answered"
             if asked and step.outcome.text.strip().lower().startswith(("yes", "no")):
                 return says_yes(step.outcome.text)
-            if isinstance(step.call, ExecuteRskill) and step.call.rskill_id in manipulation:
+            if _executed(step, manipulation):
                 return False
         return False
+
+
+def _executed(step: Step, manipulation: frozenset[str]) -> bool:
+    """Whether the robot was asked to do it: what was refused here never was."""
+    call = step.call
+    return (
+        isinstance(call, ExecuteRskill)
+        and call.rskill_id in manipulation
+        and step.outcome.status != "refused"
+    )
 
 
 class Planner(Protocol):

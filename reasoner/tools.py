@@ -23,6 +23,7 @@ from reasoner.places import SAME_M
 from reasoner.planner import Outcome
 from schemas.errors import (
     BadRequest,
+    BadState,
     Evicted,
     FrameStale,
     GoalRejected,
@@ -55,6 +56,7 @@ GOAL_GRACE_S = 60.0  # beyond the goal's own deadline: loading the skill's model
 GOAL_MAX_S = 600.0  # when the manifest sets the deadline
 HEARD_LATE_S = 0.5  # for feedback that came while this process stood still; without it a goal that goes on would be called off
 CANCEL_S = 10.0  # for a cancelled goal to end: it takes the arm back and finishes its use
+ASK_AGAIN_S = 0.2  # whether a goal has ended whose result goes to nobody
 IDENTITY_S = 10.0  # for a perception sidecar to say which model it serves
 PROGRESS_TOLERANCE = 0.0
 THINGS_MAX = 8  # told of one look, best first
@@ -227,7 +229,9 @@ class Tools:
         except TimeoutError:
             how = _how_it_went(await _called_off(goal))
             return Outcome("failed", f"no result within {limit_s:.0f} s; {how}", "wait_timeout")
-        except RunnerUnreachable as error:
+        except BadRequest:
+            raise  # the runner knows no such goal (any more)
+        except VramError as error:  # it is gone, or cannot say how the goal goes
             how = _how_it_went(await _called_off(goal))
             return Outcome("failed", f"{error.message}; {how}", error.code)
         except asyncio.CancelledError:
@@ -255,12 +259,24 @@ class Tools:
             raise
 
     async def _cancel_unheard(self, goal_id: str) -> None:
+        """And its end is heard, within `CANCEL_S`."""
         try:
-            await self._runner.call("cancel", {"goal_id": goal_id}, timeout_s=CANCEL_S)
+            async with asyncio.timeout(CANCEL_S):
+                await self._runner.call("cancel", {"goal_id": goal_id}, timeout_s=CANCEL_S)
+                await self._until_ended(goal_id)
         except BadRequest:
             pass  # it never was accepted
-        except VramError as error:
-            log.error("goal %s may run: %s", goal_id, error)
+        except (VramError, TimeoutError) as error:
+            log.error("goal %s may run: %s", goal_id, str(error) or "the runner did not say that it ended")
+
+    async def _until_ended(self, goal_id: str) -> None:
+        while True:
+            try:
+                await self._runner.call("result", {"goal_id": goal_id})
+            except BadState:  # it runs
+                await asyncio.sleep(ASK_AGAIN_S)
+            else:
+                return
 
     async def _transition(self, call: LifecycleTransition) -> Outcome:
         """`configure` asks whether it is there, `activate` loads, `deactivate` and `cleanup` unload; never beside a goal.

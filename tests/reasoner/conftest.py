@@ -29,6 +29,7 @@ class Runner:
         self.frame_error: VramError | None = None
         self.camera_model: dict[str, Any] | None = None
         self.ends_on_cancel = True
+        self.result_error: VramError | None = None
         self.heard = asyncio.Event()
         """An op that is not answered has come."""
         self._server = RouterServer(
@@ -104,7 +105,7 @@ class Runner:
             case GetSkills():
                 return {"skills": self.skills, "resident": None}
             case GetResult():
-                raise BadRequest("asked too early")
+                raise self.result_error or BadRequest("asked too early")
         return {}
 
 

@@ -3,12 +3,15 @@
 import json
 import typing
 
+import pytest
+
 from reasoner.cascade import ANSWER_MAX_CHARS, MEANING, Answered, Called, Words, conversation, told
 from reasoner.palette import Palette, Skill
 from reasoner.planner import UNSTARTABLE_MAX, Episode, Note, Outcome, Status, Step, benched
 from schemas.tools import ExecuteRskill, LocateInView, QueryScene
 
 PALETTE = Palette((Skill("lab/grab", "vla", "grab", ("grasp",)),))
+GRAB = ExecuteRskill(rskill_id="lab/grab")
 
 
 def test_every_status_has_a_meaning_of_its_own() -> None:
@@ -60,3 +63,35 @@ def test_a_skill_is_benched_after_three_starts_in_a_row_that_failed_and_for_good
     assert benched([gone, gone, step(""), gone, gone]) == frozenset()
     assert benched([gone, step("oom"), gone, gone]) == frozenset()
     assert benched([gone] * UNSTARTABLE_MAX) == {"lab/grab"}
+
+
+def test_what_a_skill_or_a_model_says_can_always_be_told_and_has_an_end() -> None:
+    """Regression: bytes in a goal's own data ended the reasoner, and a detector's label of a megabyte was told whole, again with every question."""
+    data = {
+        "raw": b"\x00\xff",
+        7: {b"key": {1, 2}},
+        "label": "x" * 1_000_000,
+        "path": list(range(100_000)),
+        "nan": float("nan"),
+    }
+    episode = Episode("grab", [Step(GRAB, Outcome("failed", "no", data=data))])
+    (*_, answered) = conversation(episode, PALETTE)
+    assert isinstance(answered, Answered)
+    assert len(answered.text) < 4 * ANSWER_MAX_CHARS
+    strict = json.loads(answered.text, parse_constant=lambda text: pytest.fail(f"{text} is no JSON"))
+    assert strict["data"]["label"].startswith("xxx")
+
+
+def test_what_was_refused_was_no_attempt_and_disproves_nothing() -> None:
+    """Regression: a grab that was refused counted as one, and took back what the scene model had confirmed."""
+    steps = [
+        Step(GRAB, Outcome("succeeded", "")),
+        Step(QueryScene(question="held?"), Outcome("answered", "Yes.")),
+        Step(GRAB, Outcome("refused", "it could not be started several times")),
+    ]
+    episode = Episode("grab", steps)
+    assert episode.attempts(frozenset({GRAB.rskill_id})) == 1
+    assert episode.confirmed(frozenset({GRAB.rskill_id}))
+    episode.steps.append(Step(GRAB, Outcome("failed", "slipped")))
+    assert episode.attempts(frozenset({GRAB.rskill_id})) == 2
+    assert not episode.confirmed(frozenset({GRAB.rskill_id}))

@@ -248,3 +248,11 @@ def test_names_under_which_a_skill_is_called() -> None:
     assert first != second
     assert found.parse(first, "{}") == ExecuteRskill(rskill_id="lab/skill.v2")
     assert found.parse(second, "{}") == ExecuteRskill(rskill_id="lab/skill_v2")
+
+
+def test_a_skill_that_describes_no_parameters_takes_none() -> None:
+    """Regression: what no function had offered was sent to the robot."""
+    found = Palette((Skill("lab/b", "vla", "", ("grasp",)),))
+    with pytest.raises(BadRequest, match="takes no goal_params"):
+        found.parse("execute_rskill__lab__b", {"goal_params": {"speed": 9}})
+    assert found.check(found.parse("execute_rskill__lab__b", {"goal_params": {}})) is None

@@ -9,15 +9,19 @@ import pytest
 
 from clients.runner import Goal, RunnerClient
 from clients.sidecar.perception import DetectorClient, SceneVlmClient
-from reasoner.inbox import Danger, Inbox
+from reasoner.inbox import Cancel, Danger, Inbox, Said
+from reasoner.loop import run_episode
 from reasoner.palette import Palette, Skill
-from reasoner.planner import Outcome
+from reasoner.planner import Episode, Finish, Outcome
 from reasoner.tools import LOOKED_AT_MAX_S, LOOKS_MAX, PLACE_MAX_S, Tools, _stands_still
 from reasoner.watch import watch
 from schemas.errors import (
+    BadState,
     Evicted,
     FrameStale,
+    InternalError,
     LeaseRevoking,
+    LimitExceeded,
     Loading,
     ModelError,
     NotResident,
@@ -25,7 +29,15 @@ from schemas.errors import (
     VramError,
     WaitTimeout,
 )
-from schemas.tools import EmitPrompt, ExecuteRskill, LifecycleTransition, LocateInView, QueryScene
+from schemas.tools import (
+    EmitPrompt,
+    ExecuteRskill,
+    LifecycleTransition,
+    LocateInView,
+    QueryScene,
+    StopGoal,
+    ToolCall,
+)
 from schemas.world import CameraModel
 
 GRAB = ExecuteRskill(rskill_id="lab/grab", prompt="grab it", deadline_s=30)
@@ -453,3 +465,49 @@ def test_a_goal_whose_runner_is_gone_is_not_called_cancelled(
     assert (outcome.status, outcome.code) == ("failed", "runner_unreachable")
     assert "it may still run" in outcome.text
     assert "no result within" not in outcome.text
+
+
+class Stopper:
+    """Grabs, and stops that when anybody says anything."""
+
+    async def decide(self, episode: Episode) -> ToolCall | Finish:
+        return GRAB if episode.running is None else StopGoal()
+
+
+def test_a_goal_that_is_cancelled_twice_is_waited_for_all_the_same(a_runner: Any) -> None:
+    """Regression: the second cancel (a person's, behind the planner's) ended the wait for its end."""
+
+    async def story() -> tuple[str, list[str]]:
+        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+            runner.ends_on_cancel, runner.result_error = False, BadState("it is still running")
+            inbox = Inbox()
+            palette = Palette((Skill("lab/grab", "vla", "", ("grasp",)),))
+            episode = asyncio.create_task(
+                run_episode("x", Stopper(), palette, Tools(client, None, None), inbox=inbox)
+            )
+            await runner.accepted.wait()
+            inbox.put(Said("stop it"))
+            while not runner.cancelled:
+                await asyncio.sleep(0.01)
+            inbox.put(Cancel("at once"))
+            await asyncio.wait({episode}, timeout=0.3)  # what is tested is that time passes without an end
+            waits = not episode.done()
+            runner.result_error = None
+            await runner.end("canceled")
+            result = await episode
+            return ("waited" if waits else "left it running"), [step["status"] for step in result["steps"]]
+
+    assert play(story) == ("waited", ["canceled"])
+
+
+@pytest.mark.parametrize("ended", [InternalError("a defect"), LimitExceeded("too many")])
+def test_a_goal_whose_result_cannot_be_asked_for_is_called_off(a_runner: Any, ended: VramError) -> None:
+    """Regression: the goal went on without anybody who waited for it."""
+
+    async def story() -> tuple[str, str, int]:
+        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+            runner.result_error = ended
+            outcome = await Tools(client, None, None)(GRAB)
+            return outcome.status, outcome.code, len(runner.cancelled)
+
+    assert play(story) == ("failed", ended.code, 1)
