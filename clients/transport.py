@@ -14,6 +14,7 @@ import zmq
 import zmq.utils.monitor
 
 from clients.packing import pack
+from schemas.errors import ConfigError
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +25,10 @@ MESSAGE_LIMIT_BYTES = 64 * 1024 * 1024  # a reply is never near it; libzmq hangs
 
 
 class Transport:
-    """Open from construction to `close`. `received(message)` and `hung_up()` are called on the loop."""
+    """Open from construction to `close`. `received(message)` and `hung_up()` are called on the loop.
+
+    Raises ConfigError for a text that is no address; whether anybody is there shows only later.
+    """
 
     def __init__(
         self,
@@ -45,9 +49,17 @@ class Transport:
         self._socket.setsockopt(zmq.MAXMSGSIZE, MESSAGE_LIMIT_BYTES)
         self._monitor: zmq.Socket[bytes] = self._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
         self._monitor.setsockopt(zmq.LINGER, 0)
+        try:
+            self._socket.connect(endpoint)
+        except zmq.ZMQError as error:
+            self._socket.disable_monitor()
+            self._monitor.close(0)
+            self._socket.close(0)
+            raise ConfigError(
+                f"{endpoint} is no endpoint: {error.strerror}", hint="write ipc:///absolute/path.sock"
+            ) from error
         loop.add_reader(self._socket.fileno(), self._drain)
         loop.add_reader(self._monitor.fileno(), self._drain_monitor)
-        self._socket.connect(endpoint)
         self._schedule_drain()
         loop.call_soon(self._drain_monitor)  # libzmq only signals a reader that found nothing once
 

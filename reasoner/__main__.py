@@ -140,6 +140,7 @@ async def _run(arguments: argparse.Namespace) -> Result:
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, task.cancel)
     async with contextlib.AsyncExitStack() as stack:
+        llm = _checked(arguments)
         playbook = load_playbook(arguments.playbook) if arguments.playbook else None
         if playbook is not None and arguments.planner not in LLM_PLANNERS:
             raise ConfigError(
@@ -178,7 +179,7 @@ async def _run(arguments: argparse.Namespace) -> Result:
         if playbook is not None:
             palette = playbook.narrow(palette)
         judge = await _judge(arguments, reward, manifests, stack) if reward is not None else None
-        planner = await _planner(arguments, palette, playbook, stack)
+        planner = await _planner(arguments, llm, palette, playbook, stack)
         watching = asyncio.create_task(watch(eyes, inbox))
         stack.callback(watching.cancel)
         return await run_episode(
@@ -210,18 +211,30 @@ async def _judge(
     return Judge(reward, past, arguments.task)
 
 
+def _checked(arguments: argparse.Namespace) -> LlmConfig | None:
+    """What would otherwise be found out after the runner was waited for, or after the whole episode. Raises ConfigError."""
+    if not arguments.task.strip():
+        raise ConfigError("--task says nothing", hint='e.g. --task "grab the red cube"')
+    path: Path | None = arguments.result
+    if path is not None and (path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK)):
+        raise ConfigError(f"--result {path} cannot be written", hint="name a file in a folder of your own")
+    if arguments.planner == "scripted":
+        return None
+    return LlmConfig.from_environ(os.environ, base_url=LLM_PLANNERS[arguments.planner].default_base_url)
+
+
 async def _planner(
     arguments: argparse.Namespace,
+    llm: LlmConfig | None,
     palette: Palette,
     playbook: Playbook | None,
     stack: contextlib.AsyncExitStack,
 ) -> Planner:
-    if arguments.planner == "scripted":
+    if llm is None:
         return ScriptedPlanner(arguments.task, palette)
     kind = LLM_PLANNERS[arguments.planner]
-    config = LlmConfig.from_environ(os.environ, base_url=kind.default_base_url)
     procedure = playbook.procedure if playbook is not None else ""
-    return await stack.enter_async_context(kind(config, palette, procedure=procedure))
+    return await stack.enter_async_context(kind(llm, palette, procedure=procedure))
 
 
 def _endpoint(given: str | None, name: str) -> str:

@@ -13,8 +13,9 @@ import sys
 from importlib import import_module
 
 from clients import logs
+from schemas import terminal
 from schemas.commands import command
-from schemas.errors import ConfigError, EstopRequested, VramError
+from schemas.errors import ConfigError, EstopRequested, ManifestInvalid, VramError
 
 COMMANDS = ("sim", "benchmark", "deploy", "estop", "replay")
 URGENT = "estop"  # it imports nothing of the others: a second of imports is a second of motion
@@ -38,6 +39,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
+@terminal.program
 def main(argv: list[str] | None = None) -> int:
     """Console script `vram-runner`."""
     args = parse(argv)
@@ -50,7 +52,9 @@ def main(argv: list[str] | None = None) -> int:
             running.code = asyncio.run(args.run(args))
     except VramError as error:
         print(f"vram-runner: {error}", file=sys.stderr)
-        return 2 if isinstance(error, ConfigError | EstopRequested) else 1  # 2: a person has to act
+        return (
+            2 if isinstance(error, ConfigError | ManifestInvalid | EstopRequested) else 1
+        )  # 2: a person has to act
     return running.code
 
 

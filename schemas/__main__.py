@@ -11,10 +11,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from schemas import terminal
 from schemas.export import documents
 from schemas.manifest import ManifestError, load_manifest
 
 
+@terminal.program
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse, call, print. Returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m schemas", description=__doc__.splitlines()[0])

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from schemas import defaults as d
 from schemas.errors import ConfigError
 from schemas.otel import checked_url
-from schemas.units import ByteSize
+from schemas.units import ByteSize, parse_bytes
 from schemas.yamltext import Path, config_error, parse_yaml, problems_of
 
 Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
@@ -45,6 +45,9 @@ class GpuConfig(_Section):
             raise ValueError(
                 f"{value!r} is no source of cards; write auto, nvml, unified, fake:8GiB or fake:FOLDER"
             )
+        sizes = value.removeprefix("fake:") if value.startswith("fake:") and "/" not in value else ""
+        if sizes and not all(parse_bytes(size) for size in sizes.split(",")):
+            raise ValueError(f"{value!r} is a card without memory; write fake:8GiB")
         return value
 
 

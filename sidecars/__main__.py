@@ -1,6 +1,6 @@
 """`vram-sidecar`: serve one model. Reads the flags, puts a host together, runs it.
 
-Exit codes: 0 ended in order; 1 could not start or failed; 2 the flags are wrong.
+Exit codes: 0 ended in order; 1 could not start or failed, another try may succeed; 2 flags, files or environment are wrong: a person has to act.
 """
 
 import argparse
@@ -14,10 +14,10 @@ from pathlib import Path
 from clients import logs
 from clients.configs import configs_folder
 from schemas import defaults as d
-from schemas import telemetry
+from schemas import telemetry, terminal
 from schemas.commands import command
 from schemas.endpoints import arbiter_endpoint, program_endpoint
-from schemas.errors import ConfigError, VramError
+from schemas.errors import ConfigError, NoGpu, VramError
 from schemas.fakegpu import CARD_FILE, FOLDER_VARIABLE, parse_config
 from schemas.manifest import ManifestError, RSkillManifest
 from sidecars.adapters.base import ModelAdapter
@@ -46,6 +46,7 @@ _ENVIRONMENT = {  # of the model libraries, before they are imported: what they 
 AdapterFor = Callable[[RSkillManifest, Weights], ModelAdapter]
 
 
+@terminal.program
 def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adapter) -> int:
     """Entry point of `vram-sidecar` and `python -m sidecars`. `adapter_for` lets a program serve a model of its own."""
     flags = _parser().parse_args(arguments)
@@ -69,7 +70,7 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
             os._exit(0)  # the interpreter would wait for an import of many seconds that nobody needs any more
     except (VramError, ManifestError) as error:
         print(f"vram-sidecar: {error}", file=sys.stderr)
-        return 1
+        return 2 if isinstance(error, ConfigError | ManifestError) else 1
     return 0
 
 
@@ -140,24 +141,26 @@ def _device(text: str | None) -> str:
 
 
 def _gpu_of(device: str) -> str:
-    """Which card to lease: on a simulated one its own, so that lease and bytes cannot differ. Raises ConfigError."""
+    """Which card to lease: on a simulated one its own, so that lease and bytes cannot differ. Raises NoGpu."""
     if not device.startswith("fake:"):
         return "any"
     path = Path(device.removeprefix("fake:")) / CARD_FILE
     try:
         return parse_config(path.read_text()).uuid
     except OSError as error:
-        raise ConfigError(
+        raise NoGpu(  # it may come: the arbiter makes the card when it starts
             f"{path} cannot be read: {error.strerror}", hint="start the arbiter with --gpu fake:8GiB"
         ) from error
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="vram-sidecar", description="Serve one model, under a lease of the VRAM arbiter."
+        prog="vram-sidecar",
+        description="Serve one model, under a lease of the VRAM arbiter.",
+        epilog="exit codes: 0 ended in order \u00b7 1 could not start or failed, another try may succeed \u00b7 2 flags, files or environment are wrong",
     )
     add = parser.add_argument
-    add("--name", required=True, help="consumer name and socket name, e.g. detector")
+    add("--name", required=True, type=_name, help="consumer name and socket name, e.g. detector")
     add("--rskill", required=True, type=Path, metavar="FILE", help="the skill's rskill.yaml")
     add(
         "--device",
@@ -213,9 +216,21 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _name(text: str) -> str:
+    """What the arbiter takes as a consumer, and the runtime folder as a file in it."""
+    if not text or not text.isprintable() or "/" in text or len(text) > d.NAME_MAX_CHARS:
+        raise argparse.ArgumentTypeError(
+            f"must be 1 to {d.NAME_MAX_CHARS} characters that can be printed, without /"
+        )
+    return text
+
+
 def _number[T: (int, float)](kind: type[T], low: float, high: float) -> Callable[[str], T]:
     def read(text: str) -> T:
-        value = kind(text)
+        try:
+            value = kind(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
         if not low <= value <= high:
             raise argparse.ArgumentTypeError(f"must be {low:g} to {high:g}")
         return value

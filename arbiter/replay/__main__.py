@@ -1,6 +1,6 @@
 """`python -m arbiter.replay`: what `vramctl replay` and `vramctl simulate` start. Parse, call, print.
 
-Exit codes: 0 identical or done, 1 a divergence or an input that cannot be read, 2 wrong usage.
+Exit codes: 0 identical or done, 1 a divergence or an input that cannot be read, 2 wrong usage; 130 Ctrl-C, 141 the reader of the output left.
 """
 
 import argparse
@@ -14,6 +14,7 @@ from arbiter.core.scheduling import DEFAULT, SCHEDULING
 from arbiter.replay import compare, runner, text
 from arbiter.replay.codec import to_json
 from arbiter.replay.outcome import Outcome, as_plain
+from schemas import terminal
 from schemas.errors import ConfigError, VramError
 
 DONE, NO = 0, 1
@@ -73,6 +74,7 @@ def _count(written: str) -> int:
     return int(written)
 
 
+@terminal.program
 def main(argv: Sequence[str] | None = None) -> int:
     flags = parser().parse_args(argv)
     policies = list(compare.POLICIES) if "all" in flags.policy else list(dict.fromkeys(flags.policy))

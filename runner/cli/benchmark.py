@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from runner.cli.common import (
     add_trace_flag,
     check_output,
+    check_sidecars,
     connect_arbiter,
     default_skills,
     install_signals,
@@ -216,6 +217,8 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
     policies = {name: policy_of(name) for name in dict.fromkeys(args.policy) if name != EXPERT}
     manifests = read_manifests(args.skills or [default_skills()]) if args.skill else []
     given = sidecars_given(args.sidecar)
+    if args.skill:
+        check_sidecars(given, manifests)
     entries = []
     for world in worlds_of(args):
         arm, environment = world.arm, world.environment

@@ -8,6 +8,7 @@ import contextlib
 import logging
 import os
 import signal
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from clients.configs import configs_folder
 from runner import frames
 from runner.skill_runner import SkillRunner
 from schemas.errors import ArbiterUnreachable, ConfigError
+from schemas.manifest import Kind, RSkillManifest
 
 if TYPE_CHECKING:
     from runner.dataset.recorder import DatasetRecorder
@@ -89,6 +91,17 @@ def sidecars_given(flags: list[str]) -> dict[str, str]:
     if wrong := [flag for flag, (name, _, where) in zip(flags, pairs, strict=True) if not name or not where]:
         raise ConfigError(f"--sidecar {wrong[0]} is not of the form RSKILL=ENDPOINT")
     return {name: where for name, _, where in pairs}
+
+
+def check_sidecars(given: Mapping[str, str], manifests: Iterable[RSkillManifest]) -> None:
+    """An address for a skill that is not installed is a typing error; its skill would be looked for elsewhere. Raises ConfigError."""
+    installed = [manifest.name for manifest in manifests if manifest.kind is Kind.VLA]
+    for name in given:
+        if name not in installed:
+            raise ConfigError(
+                f"--sidecar {name}: no such policy is installed",
+                hint=f"there is {', '.join(installed) or 'none'}",
+            )
 
 
 def check_output(flag: str, path: Path | None) -> None:

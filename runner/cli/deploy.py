@@ -19,6 +19,7 @@ from clients.runner import RunnerClient
 from runner.catalogue import Catalogue, Maker, read_manifests, sidecar_endpoint
 from runner.cli.common import (
     add_serving_flags,
+    check_sidecars,
     connect_arbiter,
     default_skills,
     install_signals,
@@ -174,6 +175,7 @@ class Deploy:
 
     # -- steps -------------------------------------------------------------------------------------------------------
     def _offered(self, parts: Parts, manifests: list[RSkillManifest], arbiter: Arbiter | None) -> Catalogue:
+        check_sidecars(sidecars_given(self._args.sidecar), manifests)
         makers = self._make_makers(parts, arbiter)
         return offered(self._file, parts, manifests, makers, self._args.allow_noncommercial)
 

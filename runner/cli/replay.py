@@ -120,6 +120,8 @@ def _outcome(goal: Mapping[str, object]) -> str:
 
 
 def _index(text: str) -> int:
+    if not text.removeprefix("-").isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of a frame or an episode")
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"{text} is negative")

@@ -14,6 +14,7 @@ from runner.cli.common import (
     AS_FAST_AS_POSSIBLE_HZ,
     add_serving_flags,
     check_output,
+    check_sidecars,
     connect_arbiter,
     default_skills,
     install_signals,
@@ -107,6 +108,8 @@ async def run(args: argparse.Namespace) -> int:
     policy = None if args.policy is None else policy_of(args.policy)
     manifests = [] if policy is not None else read_manifests(args.skills or [default_skills()])
     given = sidecars_given(args.sidecar)
+    if policy is None:
+        check_sidecars(given, manifests)
     period_s = 1.0 / (args.rate or AS_FAST_AS_POSSIBLE_HZ)
     wait_s = LOCKSTEP_WAIT_S if args.lockstep or args.rate == 0 else 0.0
     clock = SystemClock()

@@ -43,6 +43,27 @@ def test_usage(tmp_path: Path) -> None:
     assert "a playbook is read by a language model (--planner openai or anthropic)" in ended.stderr
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--task", " "], "--task says nothing"),
+        (["--task", "x", "--result", "/proc/none/result.json"], "--result /proc/none/result.json cannot be written"),
+        (["--task", "x", "--planner", "openai"], "VRAM_REASONER_LLM_BASE_URL and VRAM_REASONER_LLM_MODEL not set"),
+        (["--task", "x", "--runner", "runner.sock"], "runner.sock is no endpoint"),
+        (["--say", "x", "--listen", "reasoner.sock"], "reasoner.sock is no endpoint"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_from_the_start_is_said_at_the_start(
+    tmp_path: Path, arguments: list[str], said: str
+) -> None:
+    """Before the runner is waited for, and before an episode whose result could not be written."""
+    there = ["--listen", f"ipc://{tmp_path}/reasoner.sock", *NOBODY]
+    ended = reasoner(tmp_path, *there, *arguments)
+    assert ended.returncode == 2
+    assert said in ended.stderr
+    assert ended.stderr.count("\n") == 1, ended.stderr
+
+
 def written(folder: Path) -> None:
     (folder / "rskill.yaml").write_text(
         'name: acme/search\nversion: "0.1.0"\nlicense: mit\nrole: s2\nkind: playbook\nembodiment_tags: [any]\nchunk_size: 1\n'

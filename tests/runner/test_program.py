@@ -123,11 +123,22 @@ def test_wrong_flags_are_usage_errors(capsys: pytest.CaptureFixture[str]) -> Non
         (["--scene", "none.yaml"], "none.yaml"),
         (["--skills", "none"], "none"),
         (["--sidecar", "grab"], "RSKILL=ENDPOINT"),
+        (
+            ["--sidecar", "vram-arbiter/so101-grap=ipc:///x"],
+            "--sidecar vram-arbiter/so101-grap: no such policy",
+        ),
+        (["--skills", "/nonexistent"], "cannot be read"),
     ],
 )
 def test_wrong_files_are_named(capsys: pytest.CaptureFixture[str], flags: list[str], said: str) -> None:
-    assert main(["sim", "--no-arbiter", *flags]) in (1, 2)
+    assert main(["sim", "--no-arbiter", *flags]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_an_address_that_is_none_is_said_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of all programs the one that stops motors ended with a traceback."""
+    assert main(["estop", "--endpoint", "runner.sock"]) == 2
+    assert "runner.sock is no endpoint" in capsys.readouterr().err
 
 
 def test_where_a_sidecar_is() -> None:

@@ -112,7 +112,7 @@ def test_check_says_ok_or_what_is_wrong(rskill, tmp_path, capsys):
     assert main(flags) == 0
     assert "ok: test/model from a/b as detector" in capsys.readouterr().out
     rskill.write_text(DETECTOR.replace("labels", "lables"))
-    assert main(flags) == 1
+    assert main(flags) == 2
     assert "lables" in capsys.readouterr().err
     with pytest.raises(SystemExit) as caught:
         main([*flags, "--priority", "101"])
@@ -150,5 +150,23 @@ def test_what_no_sidecar_serves_is_said(text, told):
 def test_a_kind_without_weights_is_no_sidecars_business(rskill, capsys, text):
     rskill.write_text(HEAD + text)
     flags = ["--name", "d", "--rskill", str(rskill), "--footprint", "2GB", "--device", "none", "--check"]
-    assert main(flags) == 1
+    assert main(flags) == 2
     assert "has no weights (sidecars serve detector, vlm, vla and reward skills)" in capsys.readouterr().err
+
+
+def test_what_only_a_person_can_mend_is_not_started_again_and_what_may_come_is(rskill, tmp_path, capsys):
+    """systemd starts a sidecar again unless it ended with 2."""
+    flags = ["--name", "d", "--rskill", str(rskill), "--footprint", "2GB", "--check"]
+    assert main([*flags, "--device", "none", "--standby", "--idle-release-s", "5"]) == 2
+    assert main([*flags, "--device", "gpu"]) == 2
+    assert main([*flags, "--device", "none", "--rskill", str(tmp_path / "none.yaml")]) == 2
+    assert main([*flags, "--device", f"fake:{tmp_path}"]) == 1, "the arbiter makes the card when it starts"
+    assert "start the arbiter with --gpu fake:8GiB" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["", "../x", "a\nb", "x" * 1000])
+def test_a_name_that_nobody_could_use_is_refused_at_once(rskill, capsys, name):
+    with pytest.raises(SystemExit) as caught:
+        main(["--name", name, "--rskill", str(rskill), "--footprint", "2GB", "--device", "none", "--check"])
+    assert caught.value.code == 2
+    assert "argument --name: must be" in capsys.readouterr().err
