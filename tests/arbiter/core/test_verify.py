@@ -36,6 +36,7 @@ def test_two_equal_readings_after_the_release_are_enough() -> None:
     )
     (note,) = driver.notes("verified")
     assert (note["verdict"], note["before_bytes"], note["after_bytes"]) == ("verified", 5 * GIB, 450 * MIB)
+    assert note["ms"] == pytest.approx(5.0, abs=0.001), "from the release on"
     assert driver.gpu()["charged_bytes"] == 450 * MIB
 
 
@@ -72,12 +73,15 @@ def test_readings_are_dense_while_memory_usually_comes_back_and_rarer_later() ->
 
 
 def test_a_consumer_that_is_known_to_take_longer_is_looked_at_densely_for_longer() -> None:
-    driver = CoreDriver(8 * GIB, settings={"learnt": {"det": {"verify_s": 4.0}}})
+    driver = CoreDriver(8 * GIB, settings={"learnt": {"det": {"verify_s": 4.0}}, "probe_period_s": 1000.0})
     driver.card.lag_s = 4.2
     det, lease = held(driver, "det", 5)
+    driver.advance(0.1)
     det.unload(lease)
+    began = driver.now
     took = driver.until(lambda: driver.state(lease) == "over", step_s=0.001)
     assert 4.2 < took <= 4.212
+    assert set(pauses(driver, began)[1:-1]) == {5.0}, "for half as long again as it took before"
 
 
 def test_a_card_that_is_slow_to_read_is_not_read_all_the_time() -> None:
@@ -295,6 +299,20 @@ def test_others_that_grew_are_named_and_charged_as_stowaways() -> None:
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
 
 
+def test_what_nobody_in_the_list_explains_is_not_charged_to_who_is_in_it() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, residue_bytes=100 * MIB)
+    det.unloading(lease)
+    driver.card.unlisted.add(STRANGER)
+    driver.card.set(STRANGER, 1 * GIB, driver.now)
+    det.hold(100 * MIB)
+    det.release(lease)
+    driver.advance(11.0)
+    assert verdicts(driver) == [("contested", True)]
+    assert driver.notes("verified")[0]["culprits"] == []
+    assert driver.gpu()["charged_bytes"] == 100 * MIB
+
+
 def test_a_dead_process_that_the_driver_still_lists_stays_charged() -> None:
     driver = CoreDriver(8 * GIB)
     driver.card.lag_s = 15.0
@@ -381,6 +399,7 @@ def test_expired_bytes_stay_charged_until_measured_gone_and_not_before_the_holde
     driver.advance(10.1)
     assert driver.state(lease) == "over"
     assert driver.notes("expired")[0]["consumer"] == "hung"
+    assert driver.pushes("lost", lease)[0]["error"]["message"] == f"{lease} was not renewed for 10 s"
     hung.hold(450 * MIB)
     driver.advance(4.5)
     assert driver.state(waiter) == "queued", "it may still be loading until it fences itself"
