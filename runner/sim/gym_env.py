@@ -31,6 +31,7 @@ from schemas.world import PAYLOAD_OF_MODE, Action, JointState, SensorFrame, Worl
 
 log = logging.getLogger(__name__)
 
+SHOWN_MAX = 4096  # numbers of a part that is recorded; beyond that it is a picture of some kind: a depth map, a point cloud
 CLAMP_SHARE = 0.05  # of a number's range: an aim at the stop; beyond it a mistake
 
 
@@ -112,6 +113,7 @@ class GymEnv:
             )  # camera → its part of the observation; None: what `render()` gives
             self._state = self._state_parts()
             self._shown = self._shown_parts()
+            self._said_what_is_shown = bool(self.config.joints)  # whoever names some wants no more
         except BaseException:
             self.close()
             raise
@@ -209,10 +211,11 @@ class GymEnv:
         return parts
 
     def _shown_parts(self) -> tuple[Leaf, ...]:
+        """Whatever is made of numbers, but for pictures of any kind."""
         shown = []
         for part in self._observed.values():
             with contextlib.suppress(NoNumbers):
-                if part.size and not part.bytes_in_a_plane:
+                if 0 < part.size <= SHOWN_MAX and not part.bytes_in_a_plane:
                     shown.append(part)
         names = Counter(name for part in shown for name in part.names("observation"))
         if twice := [name for name, count in names.items() if count > 1]:
@@ -275,6 +278,12 @@ class GymEnv:
     def shown(self) -> dict[str, float]:
         """The joints (rad) where the file names some; else every number that is observed beside pictures, in its own units."""
         joints, parts = self.config.joints, self._state or self._shown
+        if not self._said_what_is_shown:
+            self._said_what_is_shown = True
+            kept = {*(part.path for part in parts), *(view.path for view in self._views.values() if view)}
+            if left := [part for path, part in self._observed.items() if path not in kept]:
+                text = ", ".join(f"{part.path or 'itself'} ({type(part.space).__name__})" for part in left)
+                log.warning("%s: not recorded of its observation: %s", self.env_id, text)
         try:
             numbers = [number for part in parts for number in part.numbers(self._observation)]
         except NoNumbers as error:

@@ -24,6 +24,7 @@ from schemas.world import Action, JointState, WorldState  # noqa: E402
 
 HAND = "gym_worlds:test/Hand-v0"
 NAMES = ("arm.0", "arm.1", "gripper", "lamps.0", "lamps.1", "walk.0.0", "walk.0.1", "walk.1")
+PICTURE = spaces.Box(0, 255, (8, 8, 3), np.uint8)
 NOWHERE = WorldState(stamp_ns=0, joint_state=JointState(name=(), position=(), stamp_ns=0))
 
 
@@ -210,7 +211,16 @@ def test_a_part_that_is_shorter_than_promised_does_not_shift_the_others() -> Non
         env.reset(0)
 
 
-PICTURE = spaces.Box(0, 255, (8, 8, 3), np.uint8)
+def test_what_is_left_out_of_a_recording_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    observed = spaces.Dict(
+        a=spaces.Box(-1, 1, (2,)), depth=spaces.Box(0, 9, (64, 65)), heat=spaces.Box(0, 255, (4, 4), np.uint8),
+        order=spaces.Text(3), top=PICTURE,
+    )  # fmt: skip
+    env = plain(spaces.Discrete(2), observed)
+    env.reset(0)
+    assert [list(env.shown()) for _ in range(2)] == [["a.0", "a.1"]] * 2
+    (said,) = caplog.messages
+    assert said.endswith("not recorded of its observation: depth (Box), heat (Box), order (Text)")
 
 
 def test_pictures_in_a_tuple_are_cameras() -> None:
