@@ -11,7 +11,7 @@ from collections.abc import Generator
 from reasoner.palette import Palette
 from reasoner.places import Places, Point
 from reasoner.planner import Episode, Finish, Outcome, says_yes
-from schemas.errors import BadRequest
+from schemas.errors import BadRequest, UnknownSkill
 from schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall, Wait
 
 ATTEMPTS_MAX = 3
@@ -24,6 +24,7 @@ GRASP_CAMERA = "wrist"  # looks at the fingers: what they hold cannot hide behin
 
 NO_ANSWER = "the scene VLM gave no answer"
 
+_HOLDS = re.compile(r"\bhold(?:s|ing)\s+(?!nothing\b|anything\b|no\b)", re.IGNORECASE)
 _TASK = re.compile(
     r"\s*(?:grab|grasp|pick up|pick|fetch|take|lift)\s+(?:the\s+|a\s+|an\s+)?(.+?)\s*\.?\s*", re.IGNORECASE
 )
@@ -50,6 +51,7 @@ class ScriptedPlanner:
             object_of(task),
             palette.first("navigate").id,
             palette.first("grasp").id,
+            place=_optional(palette, "place"),
             can_query=palette.can_query,
         )
         self._decided_after = -1  # steps: a decision that was thrown away is given again
@@ -70,7 +72,14 @@ class ScriptedPlanner:
         return self._decision
 
 
-def _script(thing: str, navigate: str, grab: str, *, can_query: bool) -> Script:
+def _optional(palette: Palette, action: str) -> str | None:
+    try:
+        return palette.first(action).id
+    except UnknownSkill:
+        return None
+
+
+def _script(thing: str, navigate: str, grab: str, *, place: str | None, can_query: bool) -> Script:
     if can_query:
         yield QueryScene(
             question="What is the gripper holding?",
@@ -104,6 +113,12 @@ def _script(thing: str, navigate: str, grab: str, *, can_query: bool) -> Script:
         if held:
             return Finish(True, f"the scene VLM confirms: {answer}")
         reason = f"not grasped after attempt {attempt}: {answer}"
+        if place is not None and attempt < ATTEMPTS_MAX and _HOLDS.search(answer):
+            yield ExecuteRskill(
+                rskill_id=place,
+                deadline_s=NAVIGATE_DEADLINE_S,
+                rationale="a thing in the hand would be looked at, and dropped before the next grasp",
+            )
     return Finish(False, reason)
 
 

@@ -111,7 +111,9 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
             from runner.skills.trajectory import FollowJointTrajectory
 
             limits = parts.gate.for_skill(manifest, ()).limits
-            return FollowJointTrajectory(manifest, limits, period_s=1.0 / file.robot.rate_hz)
+            return FollowJointTrajectory(
+                manifest, limits, period_s=1.0 / file.robot.rate_hz, sent=parts.hal.sent
+            )
 
         follow = StandIn(make_trajectory, frozenset({ControlMode.JOINT_POSITION}))
         stand_ins = StandIns({TRAJECTORY: follow}, parts.hal.description.joint_names)

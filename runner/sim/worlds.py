@@ -156,7 +156,7 @@ def makers_of(
         ),
         TRAJECTORY: StandIn(
             lambda manifest: FollowJointTrajectory(
-                manifest, environment.limits_for(manifest), period_s=period_s
+                manifest, environment.limits_for(manifest), period_s=period_s, sent=environment.sent
             ),
             frozenset({joint}),
         ),

@@ -7,6 +7,7 @@ told before anything moves that a point is out of range or too fast. Safety is t
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Annotated
 
@@ -132,10 +133,22 @@ def _gap_s(here: Point, there: Point) -> float:
 
 
 class FollowJointTrajectory(SkillBase):
-    """One goal, one trajectory. Fails with `goal_rejected` when the arm does not arrive in time."""
+    """One goal, one trajectory. Fails with `goal_rejected` when the arm does not arrive in time.
 
-    def __init__(self, manifest: RSkillManifest, limits: Limits, *, period_s: float) -> None:
+    `sent` gives the targets in force (rad by joint), from which it begins; without it, and for joints that it does not name, it begins where they are. A
+    gripper that holds something never gets to where it was told: from where it is it would let go for a moment.
+    """
+
+    def __init__(
+        self,
+        manifest: RSkillManifest,
+        limits: Limits,
+        *,
+        period_s: float,
+        sent: Callable[[], Mapping[str, float]] | None = None,
+    ) -> None:
         super().__init__(manifest)
+        self._sent = sent
         self._limits = limits
         self._period_s = period_s
         self._asked: TrajectoryParams | None = None
@@ -156,9 +169,10 @@ class FollowJointTrajectory(SkillBase):
         measured = joint_positions(world, names)
         here = tuple(measured[name] for name in names)
         if self._start_at is None:
-            self._start_at = here
+            told = {} if self._sent is None else self._sent()
+            self._start_at = tuple(told.get(name, measured[name]) for name in names)
             if wrong := too_fast(
-                names, here, points[0].positions, points[0].time_from_start.seconds, self._limits
+                names, self._start_at, points[0].positions, points[0].time_from_start.seconds, self._limits
             ):
                 raise BadRequest(
                     f"trajectory.points[0]: {wrong} from where the arm is", hint="nothing was moved"

@@ -265,3 +265,37 @@ def test_places_that_outdo_each_other_do_not_make_it_drive_for_ever() -> None:
     result, calls = play(looks_of(*looks))
     assert len(drives(calls)) == PLACES_MAX
     assert result["attempts"] == 1
+
+
+PLACE = Skill("lab/put-down", "ros_action", "put down", ("place",))
+
+
+def grabs_and_places(answer: Outcome) -> list[str]:
+    """Which arm skills follow each other when the scene VLM always says this."""
+
+    def world(call: ToolCall, _: int) -> Outcome:
+        return FOUND if isinstance(call, LocateInView) else answer if isinstance(call, QueryScene) else DONE
+
+    _, calls = play(world, Palette((NAVIGATE, GRAB, PLACE, DETECTOR)))
+    return [
+        call.rskill_id for call in calls if isinstance(call, ExecuteRskill) and call.rskill_id != NAVIGATE.id
+    ]
+
+
+def test_what_the_hand_holds_is_put_down_before_it_looks_again() -> None:
+    """Regression: it looked with the thing in the hand, found that, drove to where it seemed to stand and dropped it into the way of the next grasp."""
+    holds = Outcome("answered", "No, the gripper holds the red ball.")
+    assert grabs_and_places(holds) == [GRAB.id, PLACE.id, GRAB.id, PLACE.id, GRAB.id]
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        NO,
+        Outcome("answered", "No, it is not holding anything."),
+        Outcome("error", "CUDA out of memory", "oom"),
+    ],
+)
+def test_a_hand_of_which_nobody_says_that_it_holds_something_puts_nothing_down(answer: Outcome) -> None:
+    """It would press on what it has missed, which stands there."""
+    assert grabs_and_places(answer) == [GRAB.id] * 3

@@ -81,6 +81,23 @@ def test_the_way_is_straight_from_point_to_point() -> None:
     assert len(targets) in (60, 61), "two seconds, and no longer"
 
 
+def test_a_gripper_that_holds_something_is_not_let_go_when_a_trajectory_begins() -> None:
+    """Regression: it began where the gripper was, which is not where it had been told to be: what it held fell down."""
+    skill = FollowJointTrajectory(
+        MOVE, LIMITS, period_s=PERIOD_S, sent=lambda: {"gripper": -0.1, "elbow_flex": 0.0}
+    )
+    params = trajectory((0.3, -0.1), (0.3, 0.6), names=("elbow_flex", "gripper"))
+    asyncio.run(skill.start(Goal("g", MOVE.name, params=params)))
+    grips = []
+    for _ in range(60):
+        outcome = skill.step(world(gripper=0.3))
+        assert isinstance(outcome, Act)
+        ((_, grip),) = outcome.action.joint_targets or ()
+        grips.append(grip)
+    assert grips[:30] == pytest.approx([-0.1] * 30), "as it was told, although it stands at 0.3"
+    assert grips[-1] == pytest.approx(0.6)
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     points=st.lists(st.floats(-1.6, 1.6), min_size=1, max_size=6),
