@@ -117,10 +117,10 @@ class Leaving:
             self._task = self._driver.spawn(self._leave(), f"leave {self._record.lease_id}")
 
     async def park(self) -> None:
-        """Leave of the holder's own will, to come back; returns when it sleeps or is over."""
-        self._park_now = True
+        """Leave of the holder's own will, to come back; returns when the arbiter has said how: it sleeps, or is over."""
+        token, self._park_now = self._record.token, True
         self.start()
-        while not (self.over or self._record.asleep):
+        while not self.over and self._record.token == token and (self.unloading or not self._record.asleep):
             await self.progress.wait()
 
     async def give_up(self) -> None:

@@ -188,6 +188,28 @@ async def test_weights_are_parked_where_the_budget_has_room(
         assert (model.did[-1], detector.state) == ("unload", "gone")
 
 
+async def test_who_parks_hears_how_it_ended_not_how_it_was_meant(
+    make_arbiter: Callable[..., ArbiterProcess], spec: Spec
+) -> None:
+    """Regression: whatever happened on the lease while the arbiter was asked ended the wait, and it was `parked`, and gone a moment later."""
+    arbiter = make_arbiter(config="host:\n  park_budget_bytes: 0\n").start()
+    model = Model()
+    async with ArbiterClient(arbiter.endpoint, name="t") as client, asyncio.timeout(WAIT_S):
+        detector = await client.acquire(
+            spec("detector", 5, park_bytes=5 * GIB),
+            unload=model.unload,
+            park=model.park,
+            on_return=model.load,
+        )
+        await detector.ready()
+        parking = asyncio.create_task(detector.park())
+        while not parking.done():
+            detector.revoke_asked({}, False)  # as the arbiter says it again and again while somebody waits
+            await asyncio.sleep(0)
+        await parking
+        assert (detector.state, model.did) == ("gone", ["park", "unload"])
+
+
 async def test_a_yielded_use_lets_the_holder_go_and_says_so_at_its_end(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
