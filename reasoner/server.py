@@ -11,6 +11,7 @@ from typing import Any, Self
 
 from pydantic import ValidationError
 
+from clients.patience import answered
 from clients.serve import Message, Peer, RouterServer, reason_of
 from clients.transport import Transport
 from reasoner.inbox import Cancel, Inbox, Said
@@ -99,7 +100,7 @@ async def send(endpoint: str, request: Mapping[str, Any], *, timeout_s: float = 
     transport = Transport(endpoint, asyncio.get_running_loop(), received, hung_up)
     try:
         transport.send({"id": 1, **request})
-        reply = await asyncio.wait_for(answer, timeout_s)
+        reply = await answered(answer, timeout_s)
     except TimeoutError:
         raise ReasonerUnreachable(
             f"no reasoner answers at {endpoint} within {timeout_s:g} s", hint="does an episode run?"

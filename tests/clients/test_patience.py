@@ -19,6 +19,7 @@ from clients.patience import answered
 from clients.runner import RunnerClient
 from clients.serve import Message, Peer, RouterServer
 from clients.sidecar.base import SidecarClient
+from reasoner import server as reasoner
 
 PATIENCE_S = 60.0
 LIMIT_S = 0.5
@@ -101,7 +102,11 @@ async def ping_sidecar(endpoint: str) -> None:
         await client.ping(timeout_s=LIMIT_S)
 
 
-@pytest.mark.parametrize("ask", [connect, ping_runner, ping_sidecar])
+async def ask_reasoner(endpoint: str) -> None:
+    await reasoner.send(endpoint, {"op": "state"}, timeout_s=LIMIT_S)
+
+
+@pytest.mark.parametrize("ask", [connect, ping_runner, ping_sidecar, ask_reasoner])
 def test_an_answer_that_came_while_the_loop_stood_still_counts(serve: Callable[..., str], ask: Any) -> None:
     """Regression: a program that imported something for longer than its time limit said that nobody had answered."""
     said = threading.Event()
