@@ -154,7 +154,7 @@ class Holdings:
         record.token, record.view = token, view
         record.confirmed_at = record.renewed_at = self._connection.asked_at  # as for the first grant
         record.held = record.released = False
-        record.measured_bytes = record.revoke = record.server_uses = None
+        record.measured_bytes = record.revoke = None
         self.hold(record)
         self._connection.tell(Returned(record))
 
@@ -173,7 +173,6 @@ class Holdings:
         record = self.held.get(push["lease_id"])
         if record is not None and record.token == token_of(push):
             first, record.revoke = record.revoke is None, push
-            record.server_uses = push.get("uses")
             self._connection.tell(RevokeAsked(record, push, first))
 
     def lost(self, push: Message) -> None:

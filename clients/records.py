@@ -67,7 +67,7 @@ class Denied:
 
 @dataclass(frozen=True, slots=True)
 class RevokeAsked:
-    """Asked to leave, or told again; `record.server_uses` is what the arbiter counts now (None: it did not say)."""
+    """Asked to leave, or told again."""
 
     record: "LeaseRecord"
     push: Message
@@ -144,7 +144,6 @@ class LeaseRecord:
     measured_bytes: int | None = None
     uses: set[str] = field(default_factory=set)
     revoke: Message | None = None
-    server_uses: int | None = None
     released: bool = False
     asleep: str = ""  # `standby` or `parked`: evicted, and may come back under the same id
     wanted: bool = False  # asleep, and its owner waits for its return

@@ -76,15 +76,13 @@ class RouterServer:
     def _open(self) -> None:
         if self.endpoint.startswith("ipc://"):
             self._claim(Path(self.endpoint.removeprefix("ipc://")))
-        context = (
-            zmq.asyncio.Context()
-        )  # of its own: that it has ended is all that libzmq says of what was sent
+        # a context of its own: that it has ended is all that libzmq says of what was sent
+        context = zmq.asyncio.Context()
         self._stack.push_async_callback(asyncio.to_thread, context.term)
         socket: zmq.asyncio.Socket = context.socket(zmq.ROUTER)
         self._stack.callback(socket.close, round(LINGER_S * 1000))
-        socket.setsockopt(
-            zmq.MAXMSGSIZE, 4 * MAX_DEPTH_BYTES
-        )  # beyond this libzmq drops the peer; below we can answer
+        # beyond this libzmq drops the peer; below we can answer
+        socket.setsockopt(zmq.MAXMSGSIZE, 4 * MAX_DEPTH_BYTES)
         socket.setsockopt(zmq.SNDHWM, self._queue_max)
         socket.setsockopt(zmq.RCVHWM, self._queue_max)
         old_umask = os.umask(0o117)

@@ -83,7 +83,6 @@ ATTR_WANTED_BY = "vram.wanted_by"  # spans only: the consumer that needs the roo
 ATTR_SKILL = "rskill.id"
 ATTR_REVISION = "rskill.revision"
 ATTR_GOAL = "rskill.goal_id"  # spans only
-ATTR_ROBOT = "robot.model"
 ATTR_TOOL = "reasoner.tool"
 ATTR_OPERATION = "sidecar.operation"
 ATTR_OUTCOME = "outcome"
