@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 from clients import logs
+from clients.outputs import check_output
 from clients.runner import RunnerClient
 from clients.sidecar.perception import DetectorClient, RewardClient, SceneVlmClient
 from reasoner.inbox import Inbox
@@ -31,11 +32,20 @@ from reasoner.watch import watch
 from schemas.body import read_body
 from schemas.commands import command
 from schemas.endpoints import program_endpoint
-from schemas.errors import ConfigError, ReasonerUnreachable, RunnerUnreachable, SidecarUnavailable, VramError
+from schemas.errors import (
+    BadRequest,
+    ConfigError,
+    ReasonerUnreachable,
+    RunnerUnreachable,
+    SidecarUnavailable,
+    VramError,
+)
 from schemas.manifest import RSkillManifest
 
 LLM_PLANNERS: dict[str, type[LlmPlanner]] = {"openai": OpenAiPlanner, "anthropic": AnthropicPlanner}
 MANAGED = ("detector", "scene-vlm", "reward")
+
+TASK_MAX_CHARS = 4000  # with what a planner says around it, a tool's text
 
 EXIT_FAILED, EXIT_USAGE, EXIT_UNREACHABLE = 1, 2, 3
 
@@ -111,6 +121,8 @@ def _main(arguments: argparse.Namespace) -> None:
         if arguments.task is None:
             asyncio.run(_speak(arguments))
             return
+        _check_task(arguments.task)
+        check_output("--result", arguments.result)
         result = asyncio.run(_run(arguments))
     except (RunnerUnreachable, SidecarUnavailable, ReasonerUnreachable) as error:
         sys.exit(_complain(error, EXIT_UNREACHABLE))
@@ -121,6 +133,16 @@ def _main(arguments: argparse.Namespace) -> None:
     if arguments.result is not None:
         arguments.result.write_text(json.dumps(result, indent=2) + "\n")
     sys.exit(0 if result["status"] == "success" else EXIT_FAILED)
+
+
+def _check_task(task: str) -> None:
+    """Raises BadRequest for one that no planner could work with."""
+    if len(task) > TASK_MAX_CHARS:
+        raise BadRequest(f"the task has more than {TASK_MAX_CHARS} characters", hint="say it shorter")
+    try:
+        task.encode()
+    except UnicodeEncodeError:
+        raise BadRequest("the task is no text: it has bytes that are not UTF-8") from None
 
 
 def _complain(error: VramError, code: int) -> int:

@@ -59,6 +59,8 @@ class Skill:
     goal_params_schema: Mapping[str, Any] | None = None
     barred: str = ""
     """Why it must not be used although its kind could be; empty: it may."""
+    longest_s: float = 0.0
+    """Of its motion, as its manifest says; 0: it does not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,6 +251,7 @@ def palette_of(
             tuple(str(action) for action in manifest.actions),
             manifest.goal_params_schema,
             _barred(manifest, allow_noncommercial) or body.misfit(manifest),
+            manifest.latency_budget.max_execution_s or 0.0,
         )
         for manifest in manifests
     )

@@ -53,7 +53,8 @@ LOOKED_AT_MAX_S = (
 PLACE_MAX_S = 10.0  # a later answer says where something stood: an arm would reach for that
 LOOKS_MAX = 3  # with a new picture each, for one answer: behind the first wait the model is there
 GOAL_GRACE_S = 60.0  # beyond the goal's own deadline: loading the skill's model is not part of the motion
-GOAL_MAX_S = 600.0  # when the manifest sets the deadline
+GOAL_MAX_S = 600.0  # when the manifest sets the deadline, and sets none that is longer
+START_S = 90.0  # what the runner adds to a manifest's time of motion, to get there
 HEARD_LATE_S = 0.5  # for feedback that came while this process stood still; without it a goal that goes on would be called off
 CANCEL_S = 10.0  # for a cancelled goal to end: it takes the arm back and finishes its use
 ASK_AGAIN_S = 0.2  # whether a goal has ended whose result goes to nobody
@@ -210,7 +211,7 @@ class Tools:
 
     async def _execute(self, call: ExecuteRskill) -> Outcome:
         goal = await self._send(call)
-        limit_s = call.deadline_s + self._goal_grace_s if call.deadline_s else GOAL_MAX_S
+        limit_s = waits_s(call, self._palette, self._goal_grace_s)
         patience = asyncio.create_task(_stands_still(goal, call)) if call.patience_s is not None else None
         waiting = asyncio.create_task(goal.result(timeout_s=limit_s))
         try:
@@ -297,6 +298,8 @@ class Tools:
                 {"goal": goal},
             )
         if call.transition == "activate":
+            if (refusal := await self._not_permitted(component)) is not None:
+                return refusal
             loaded = await component.load()
             return Outcome("done", f"{call.node} is resident" + ("" if loaded["loaded"] else " as before"))
         await component.unload()
@@ -395,6 +398,14 @@ def _ended(result: ResultPush) -> Outcome:
         result["code"] or ("deadline" if status == "deadline" else ""),
         dict(result["data"]),
     )
+
+
+def waits_s(call: ExecuteRskill, palette: Palette | None, grace_s: float) -> float:
+    """How long a goal's result is waited for: its own deadline and `grace_s`, or what its manifest allows, and never less than `GOAL_MAX_S` then."""
+    if call.deadline_s:
+        return call.deadline_s + grace_s
+    known = palette.executable.get(call.rskill_id) if palette is not None else None
+    return max(GOAL_MAX_S, known.longest_s + START_S + grace_s if known is not None else 0.0)
 
 
 async def _stands_still(goal: Goal, call: ExecuteRskill) -> bool:

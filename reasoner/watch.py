@@ -22,7 +22,17 @@ LOST_MAX = 3  # answers missed in a row
 async def watch(
     runner: RunnerClient, inbox: Inbox, *, period_s: float = PERIOD_S, answer_s: float = ANSWER_S
 ) -> None:
-    """Until it has said that the episode must stop, or is cancelled."""
+    """Until it has said that the episode must stop, or is cancelled. Whatever ends it is such a reason."""
+    try:
+        await _watch(runner, inbox, period_s, answer_s)
+    except Exception as error:
+        log.exception("the watch over the robot failed")
+        inbox.put(
+            Danger(f"nobody looks after the robot any more: {type(error).__name__}: {error}", stop=True)
+        )
+
+
+async def _watch(runner: RunnerClient, inbox: Inbox, period_s: float, answer_s: float) -> None:
     lost = 0
     told: set[str] = set()  # stale components that the planner has heard of
     while True:

@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
+from urllib.parse import urlsplit
 
 from reasoner.cascade import Answered, Called, Thought, Turn, Words, conversation
 from reasoner.llm.http import RETRY_PAUSE_S, JsonHttp, check_installed, without_credentials
@@ -73,24 +74,41 @@ class LlmConfig:
             raise ConfigError(
                 f"{' and '.join(missing)} not set", hint="export them, or use the scripted planner"
             )
-        if not url.startswith(("http://", "https://")):
-            raise ConfigError(f"{PREFIX}BASE_URL is no http(s) address: {url!r}")
+        if not _is_address(url):
+            shown = url.rpartition("@")[2].partition("?")[0]  # no password, no token
+            raise ConfigError(f"{PREFIX}BASE_URL is no http(s) address: {shown!r}")
         return cls(
             url.rstrip("/"),
             environ[PREFIX + "MODEL"],
-            environ.get(PREFIX + "API_KEY", ""),
+            _key(environ),
             _number(environ, "TIMEOUT_S", TIMEOUT_S, "seconds"),
-            int(_number(environ, "MAX_TOKENS", MAX_TOKENS, "tokens")),
+            int(_number(environ, "MAX_TOKENS", MAX_TOKENS, "tokens", least=1.0)),
         )
 
 
-def _number(environ: Mapping[str, str], name: str, default: float, what: str) -> float:
+def _is_address(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        return False
+
+
+def _key(environ: Mapping[str, str]) -> str:
+    """Without the white space that a file has around it. What no header carries is refused here: whoever sends it would show it."""
+    key = environ.get(PREFIX + "API_KEY", "").strip()
+    if not (key.isascii() and all(letter.isprintable() for letter in key)):
+        raise ConfigError(f"{PREFIX}API_KEY has letters that no key has", hint="printable ASCII on one line")
+    return key
+
+
+def _number(environ: Mapping[str, str], name: str, default: float, what: str, least: float = 0.0) -> float:
     text = environ.get(PREFIX + name) or str(default)
     try:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not (math.isfinite(number) and number > 0):
+    if not (math.isfinite(number) and number > 0 and number >= least):
         raise ConfigError(f"{PREFIX}{name} is no number of {what}: {text!r}")
     return number
 

@@ -13,9 +13,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clients.outputs import check_output
 from runner.cli.common import (
     add_trace_flag,
-    check_output,
     check_sidecars,
     connect_arbiter,
     default_skills,

@@ -10,10 +10,10 @@ import logging
 import os
 from pathlib import Path
 
+from clients.outputs import check_output
 from runner.cli.common import (
     AS_FAST_AS_POSSIBLE_HZ,
     add_serving_flags,
-    check_output,
     check_sidecars,
     connect_arbiter,
     default_skills,

@@ -129,3 +129,19 @@ def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: A
     assert "Turn left first." in body["system"]
     assert [tool["name"] for tool in body["tools"]] == ["execute_rskill__lab__go", "finish"]
     assert "Traceback" not in err
+
+
+def test_a_task_that_is_no_text_and_a_result_that_has_no_place_are_said_before_anything_moves(
+    tmp_path: Path,
+) -> None:
+    """Regression: an undecodable byte, or a task of many pages, ended in a traceback; a result file that could not be written in one
+    behind the episode."""
+    for task in ("grab the \udcff cube", "grab the " + "very " * 2000 + "red cube"):
+        ended = reasoner(tmp_path, "--task", task, *NOBODY)
+        assert (ended.returncode, "Traceback" in ended.stderr) == (2, False), ended.stderr
+        assert ended.stderr.startswith("vram-reasoner: the task ")
+    (tmp_path / "file").touch()
+    for place in (tmp_path / "file" / "r.json", tmp_path):
+        ended = reasoner(tmp_path, "--task", "grab the cube", "--result", str(place), *NOBODY)
+        assert (ended.returncode, "Traceback" in ended.stderr) == (2, False), ended.stderr
+        assert f"--result {place} cannot be written" in ended.stderr

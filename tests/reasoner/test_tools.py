@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -13,7 +13,7 @@ from reasoner.inbox import Cancel, Danger, Inbox, Said
 from reasoner.loop import run_episode
 from reasoner.palette import Palette, Skill
 from reasoner.planner import Episode, Finish, Outcome
-from reasoner.tools import LOOKED_AT_MAX_S, LOOKS_MAX, PLACE_MAX_S, Tools, _stands_still
+from reasoner.tools import GOAL_MAX_S, LOOKED_AT_MAX_S, LOOKS_MAX, PLACE_MAX_S, Tools, _stands_still, waits_s
 from reasoner.watch import watch
 from schemas.errors import (
     BadState,
@@ -511,3 +511,51 @@ def test_a_goal_whose_result_cannot_be_asked_for_is_called_off(a_runner: Any, en
             return outcome.status, outcome.code, len(runner.cancelled)
 
     assert play(story) == ("failed", ended.code, 1)
+
+
+def test_a_model_whose_licence_is_barred_is_not_loaded_either(a_runner: Any, a_sidecar: Any) -> None:
+    """Regression: it was not asked, but `lifecycle_transition` put it on the card."""
+
+    async def story() -> tuple[str, str, list[str]]:
+        async with (
+            a_runner() as runner,
+            RunnerClient(runner.endpoint) as client,
+            a_sidecar("lab/eye") as sidecar,
+            DetectorClient(sidecar.endpoint) as detector,
+        ):
+            palette = Palette((Skill("lab/eye", "detector", "", ("detect",), barred="its licence"),))
+            tools = Tools(client, detector, None, palette=palette, components={"detector": detector})
+            outcome = await tools(LifecycleTransition(node="detector", transition="activate"))
+            return outcome.status, outcome.code, sidecar.asked
+
+    status, code, asked = play(story)
+    assert (status, code) == ("refused", "not_permitted")
+    assert "load" not in asked
+
+
+def test_a_skill_may_take_as_long_as_its_manifest_says() -> None:
+    """Regression: a goal without a deadline of its own was called off after ten minutes, also where its manifest allows an hour."""
+    skills = (
+        Skill("lab/dig", "vla", "", ("grasp",), longest_s=3600.0),
+        Skill("lab/grab", "vla", "", ("grasp",)),
+    )
+    palette = Palette(skills)
+    assert waits_s(ExecuteRskill(rskill_id="lab/dig"), palette, 60.0) > 3600.0 + 90.0
+    assert waits_s(ExecuteRskill(rskill_id="lab/grab"), palette, 60.0) == GOAL_MAX_S
+    assert waits_s(ExecuteRskill(rskill_id="lab/dig", deadline_s=5.0), palette, 60.0) == 65.0
+    assert waits_s(ExecuteRskill(rskill_id="lab/other"), None, 60.0) == GOAL_MAX_S
+
+
+def test_nobody_looking_after_the_robot_ends_the_episode() -> None:
+    """Regression: an answer that nobody had thought of ended the watch without a word, and an emergency stop behind it was not noticed."""
+
+    class Strange:
+        async def call(self, op: str, **_: Any) -> dict[str, Any]:
+            return {"estop": None, "world": {"diagnostics": ["stale"]}}
+
+    inbox = Inbox()
+    play(lambda: watch(cast(RunnerClient, Strange()), inbox))
+    (danger,) = inbox.take()
+    assert isinstance(danger, Danger)
+    assert danger.stop
+    assert "nobody looks after the robot" in danger.text

@@ -377,3 +377,26 @@ def test_a_password_in_the_address_stands_in_no_message(
     for text in (str(wrong.value), str(gone.value), caplog.text):
         assert "127.0.0.1" in text
         assert "secret" not in text
+
+
+def test_a_key_that_no_header_carries_is_refused_and_not_shown() -> None:
+    """Regression: a key with an odd byte stood in the log, or ended the reasoner with a traceback; so did an address that is none."""
+    complete = {"VRAM_REASONER_LLM_BASE_URL": "http://x/v1/", "VRAM_REASONER_LLM_MODEL": "m"}
+    for key in ("secret\nkey", "sécret", "secret\x00", "secret\udcff", "my secret\rkey"):
+        with pytest.raises(ConfigError, match="VRAM_REASONER_LLM_API_KEY") as caught:
+            LlmConfig.from_environ(complete | {"VRAM_REASONER_LLM_API_KEY": key})
+        assert "ecret" not in str(caught.value)
+    as_read_from_a_file = complete | {"VRAM_REASONER_LLM_API_KEY": " secret\n"}
+    assert LlmConfig.from_environ(as_read_from_a_file).api_key == "secret"
+    for url in (
+        "htps://me:secret@host",
+        "http://me:secret@[bad",
+        "http://me:secret@host:99999",
+        "http://",
+        "http:///v1",
+    ):
+        with pytest.raises(ConfigError, match="VRAM_REASONER_LLM_BASE_URL is no http") as caught:
+            LlmConfig.from_environ(complete | {"VRAM_REASONER_LLM_BASE_URL": url})
+        assert "secret" not in str(caught.value)
+    with pytest.raises(ConfigError, match="MAX_TOKENS is no number"):
+        LlmConfig.from_environ(complete | {"VRAM_REASONER_LLM_MAX_TOKENS": "0.5"})
