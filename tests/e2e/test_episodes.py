@@ -262,7 +262,7 @@ class Stage:
         assert granted["reason"] == "back from standby: there is room and nobody waits"
         assert sum(e["kind"] == "granted" and e.get("consumer") == "detector" for e in self.events) == 1
         await self.detector.load()  # the arbiter's word is a moment ahead of the sidecar's
-        assert (await self.detector.ping())["token"] == granted["token"]
+        assert (await self.detector.ping(timeout_s=WAIT_S))["token"] == granted["token"]
         assert await self.leases() == {"detector": "held"}
 
     def detector_was_away(self) -> bool:
@@ -526,11 +526,11 @@ def test_the_next_goal_with_other_words_loads_nothing_and_lets_nothing_back_in_b
 
 
 async def without_a_gpu(stage: Stage) -> None:
-    before = await stage.detector.ping()
+    before = await stage.detector.ping(timeout_s=WAIT_S)
     goal = await stage.runner.send_goal("vram-arbiter/so101-navigate", goal_params={"turn_rad": 0.1})
     assert (await goal.result(WAIT_S))["status"] == "succeeded"
     assert await stage.leases() == {"detector": "held"}
-    assert (await stage.detector.ping())["token"] == before["token"]
+    assert (await stage.detector.ping(timeout_s=WAIT_S))["token"] == before["token"]
 
 
 def test_a_goal_without_a_gpu_sends_nobody_away(programs: Programs) -> None:

@@ -82,7 +82,7 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
                 assert await reasoner.wait() == 1, "the planner said that it was no success"
 
             # resident under a lease of its own, at the weight that it stands for
-            identity = await reward.ping()
+            identity = await reward.ping(timeout_s=60.0)
             assert (identity["state"], identity["kind"], identity["pid"]) == (
                 "resident",
                 "reward",
@@ -103,7 +103,7 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
                 granted = await asyncio.to_thread(arbiter.acquire, "vla", 6 * GB, wait_timeout_s=60.0)
                 assert granted["ok"], granted
                 push = await asyncio.to_thread(arbiter.push, "granted", 60.0)
-                assert (await reward.ping())["state"] == "unloaded"
+                assert (await reward.ping(timeout_s=60.0))["state"] == "unloaded"
                 with pytest.raises(Evicted):
                     await reward.score([picture], "grab the red cube", token=token)
                 assert arbiter.ask(
