@@ -7,6 +7,7 @@ Only `ipc://` and loopback `tcp://` endpoints are bound; an ipc socket gets mode
 
 import asyncio
 import contextlib
+import errno
 import fcntl
 import os
 import stat
@@ -43,19 +44,54 @@ Handler = Callable[[Peer, Message], Awaitable[None]]
 ErrorReply = Callable[[VramError], Message]
 
 
+def check_free(endpoint: str) -> None:
+    """Before a server has moved or recorded anything: may it serve there? Claims nothing; who serves in the end is decided when it binds.
+
+    Raises what `RouterServer` does.
+    """
+    _check_form(endpoint)
+    if not endpoint.startswith("ipc://"):
+        return
+    path = Path(endpoint.removeprefix("ipc://"))
+    try:
+        lock = os.open(_lock_of(path), os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return  # nobody served there yet; what else is wrong with it binding will say
+    try:
+        _lock(lock, path)
+    finally:
+        os.close(lock)
+
+
+def _check_form(endpoint: str) -> None:
+    if not endpoint.startswith(("ipc://", "tcp://127.0.0.1:", "tcp://localhost:")):
+        raise ConfigError(f"cannot serve on {endpoint}", hint="use ipc://PATH or tcp://127.0.0.1:PORT")
+
+
+def _lock_of(path: Path) -> str:
+    return f"{path}.lock"
+
+
+def _lock(lock: int, path: Path) -> None:
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        owner = os.pread(lock, 32, 0).decode(errors="replace").strip()
+        raise AlreadyRunning(f"{path} is served by process {owner or '?'}", hint="stop it first") from None
+
+
 class RouterServer:
     """`async with RouterServer(endpoint, on_error) as server: await server.serve(handler)`.
 
     Each message is handled in a task of its own, so that a slow one never delays `ping` or `revoke`; at most `concurrent_max` run, then reading
     stops and ZeroMQ's own queue holds the rest (high-water mark `queue_max` per peer).
-    Raises ConfigError for a foreign endpoint, AlreadyRunning when a living server owns it.
+    Raises ConfigError for a foreign endpoint, or one where nothing can be bound, AlreadyRunning when a living server owns it.
     """
 
     def __init__(
         self, endpoint: str, on_error: ErrorReply, *, concurrent_max: int = 64, queue_max: int = 256
     ) -> None:
-        if not endpoint.startswith(("ipc://", "tcp://127.0.0.1:", "tcp://localhost:")):
-            raise ConfigError(f"cannot serve on {endpoint}", hint="use ipc://PATH or tcp://127.0.0.1:PORT")
+        _check_form(endpoint)
         self.endpoint = endpoint
         self._on_error = on_error
         self._slots = asyncio.Semaphore(concurrent_max)
@@ -68,6 +104,16 @@ class RouterServer:
     async def __aenter__(self) -> Self:
         try:
             self._open()
+        except (OSError, zmq.ZMQError) as error:
+            await self._stack.aclose()
+            if error.errno == errno.EADDRINUSE:
+                raise AlreadyRunning(
+                    f"{self.endpoint} is served by another process", hint="stop it first"
+                ) from error
+            raise ConfigError(
+                f"cannot serve on {self.endpoint}: {os.strerror(error.errno or errno.EINVAL)}",
+                hint="use a short path in a folder of your own",
+            ) from error
         except BaseException:
             await self._stack.aclose()
             raise
@@ -102,15 +148,9 @@ class RouterServer:
     def _claim(self, path: Path) -> None:
         """Binding steals an existing ipc path without a word: a locked file beside it tells a living owner from a stale socket."""
         path.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
-        lock = os.open(f"{path}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660)
+        lock = os.open(_lock_of(path), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660)
         self._stack.callback(os.close, lock)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            owner = os.pread(lock, 32, 0).decode(errors="replace").strip()
-            raise AlreadyRunning(
-                f"{path} is served by process {owner or '?'}", hint="stop it first"
-            ) from None
+        _lock(lock, path)
         os.ftruncate(lock, 0)
         os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
         if path.exists() and stat.S_ISSOCK(path.stat().st_mode):

@@ -5,7 +5,9 @@ tells of a hang-up at once, where heartbeats would take seconds. It knows nothin
 """
 
 import asyncio
+import errno
 import logging
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -56,7 +58,8 @@ class Transport:
             self._monitor.close(0)
             self._socket.close(0)
             raise ConfigError(
-                f"{endpoint} is no endpoint: {error.strerror}", hint="write ipc:///absolute/path.sock"
+                f"{endpoint} is no endpoint: {os.strerror(error.errno or errno.EINVAL)}",
+                hint="write ipc:///absolute/path.sock",
             ) from error
         loop.add_reader(self._socket.fileno(), self._drain)
         loop.add_reader(self._monitor.fileno(), self._drain_monitor)

@@ -82,6 +82,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 async def run(args: argparse.Namespace) -> int:
     """Build everything, serve until a signal, `shutdown`, `--max-seconds` or the last of `--episodes`, end in order."""
+    from clients.serve import check_free
     from runner.catalogue import Catalogue, read_manifests
     from runner.clock import SystemClock
     from runner.goals import GoalServer
@@ -110,6 +111,8 @@ async def run(args: argparse.Namespace) -> int:
     given = sidecars_given(args.sidecar)
     if policy is None:
         check_sidecars(given, manifests)
+    endpoint = args.endpoint or program_endpoint("runner", os.environ, os.getuid())
+    check_free(endpoint)  # before a world begins, and a recording of it
     period_s = 1.0 / (args.rate or AS_FAST_AS_POSSIBLE_HZ)
     wait_s = LOCKSTEP_WAIT_S if args.lockstep or args.rate == 0 else 0.0
     clock = SystemClock()
@@ -149,7 +152,7 @@ async def run(args: argparse.Namespace) -> int:
         await make_prompt(control, first=args.realtime and leaves_room(args.rate))
         arm = world.arm
         server = GoalServer(
-            args.endpoint or program_endpoint("runner", os.environ, os.getuid()),
+            endpoint,
             control,
             runner,
             Catalogue(

@@ -1,15 +1,15 @@
 """The server of the small programs, at its end: nobody is left without the answer that he was given."""
 
 import asyncio
+import os
 from pathlib import Path
 
 import pytest
-import zmq
 
 from arbiter.testing.wire import WireClient
 from clients.runner import RunnerClient
-from clients.serve import Message, Peer, RouterServer
-from schemas.errors import AlreadyRunning, RobotFault, VramError
+from clients.serve import Message, Peer, RouterServer, check_free
+from schemas.errors import AlreadyRunning, ConfigError, RobotFault, VramError
 
 ANSWER = bytes(16 << 20)  # far more than the kernel takes in one go
 
@@ -76,9 +76,14 @@ def test_an_endpoint_is_free_when_its_server_has_ended_and_when_it_never_began(t
             async with RouterServer(endpoint, refused):
                 with pytest.raises(AlreadyRunning):
                     await RouterServer(endpoint, refused).__aenter__()
+                with pytest.raises(AlreadyRunning, match=f"is served by process {os.getpid()}"):
+                    check_free(endpoint)
+            check_free(endpoint)
         nowhere = RouterServer(f"ipc://{tmp_path}/{'x' * 120}", refused)
         for _ in range(2):  # too long for a socket: what was begun is taken back
-            with pytest.raises(zmq.ZMQError):
+            with pytest.raises(ConfigError, match="x: File name too long"):
                 await nowhere.__aenter__()
+        with pytest.raises(ConfigError, match="none/s: No such file"):
+            await RouterServer("ipc:///proc/none/s", refused).__aenter__()
 
     asyncio.run(one_after_the_other())

@@ -1,5 +1,6 @@
 """`python -m runner sim` as a process: ready means ready, signals end it in order, mistakes are said."""
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -133,6 +134,17 @@ def test_wrong_flags_are_usage_errors(capsys: pytest.CaptureFixture[str]) -> Non
 def test_wrong_files_are_named(capsys: pytest.CaptureFixture[str], flags: list[str], said: str) -> None:
     assert main(["sim", "--no-arbiter", *flags]) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.heavy
+def test_a_second_runner_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It played, and left what it had played in the dataset, until it found out."""
+    with open(tmp_path / "runner.sock.lock", "w") as first:
+        fcntl.flock(first, fcntl.LOCK_EX)
+        there = ["--endpoint", f"ipc://{tmp_path}/runner.sock", "--record", str(tmp_path / "set")]
+        assert main(["sim", *there, "--env", "gym:CartPole-v1", "--policy", "random", "--rate", "0"]) == 1
+    assert "is served by process" in capsys.readouterr().err
+    assert not (tmp_path / "set").exists()
 
 
 def test_an_address_that_is_none_is_said_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
