@@ -33,9 +33,12 @@ class EstopMark:
         )
 
     def leave(self, reason: str) -> None:
-        """Any thread. Never raises: the stop itself must go on."""
+        """Any thread. Never raises: the stop itself must go on. The first reason stays, as in the gate: it is why somebody has to look."""
         try:
-            self._path.write_text(f"{reason}\n", encoding="utf-8", errors="replace")
+            with self._path.open("x", encoding="utf-8", errors="replace") as mark:
+                mark.write(f"{reason}\n")
+        except FileExistsError:
+            return
         except OSError as error:
             log.error("the emergency stop is latched in this process only: %s", error)
 
