@@ -10,11 +10,12 @@ import argparse
 import asyncio
 import logging
 import sys
+from contextlib import nullcontext
 from importlib import import_module
 
 from clients import logs
 from schemas import terminal
-from schemas.commands import command
+from schemas.commands import Command, command
 from schemas.errors import ConfigError, EstopRequested, ManifestInvalid, VramError
 
 COMMANDS = ("sim", "benchmark", "deploy", "estop", "replay")
@@ -48,7 +49,13 @@ def main(argv: list[str] | None = None) -> int:
     )
     logging.getLogger("OpenGL").setLevel(logging.WARNING)  # it announces an accelerator that nobody needs
     try:
-        with command("vram-runner", args.command, serves=args.serves) as running:
+        # a stop has no span: no variable of the telemetry, and no port that the runner itself has, may refuse it
+        urgent = args.command == URGENT
+        with (
+            nullcontext(Command())
+            if urgent
+            else command("vram-runner", args.command, serves=args.serves) as running
+        ):
             running.code = asyncio.run(args.run(args))
     except VramError as error:
         print(f"vram-runner: {error}", file=sys.stderr)

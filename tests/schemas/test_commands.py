@@ -1,6 +1,7 @@
 """`cli.command`: how a program's life and end are recorded, also when a signal ends it, and that nothing is when nobody asked."""
 
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -79,7 +80,7 @@ def test_variables_that_make_no_sense_are_told_in_one_line(tmp_path: Path) -> No
     for argv, code in (
         (["clients", "history"], 2),
         (["reasoner", "--say", "x"], 2),
-        (["runner", "estop"], 2),
+        (["runner", "replay", "--dataset", "x", "--frame", "0"], 2),
     ):
         done = subprocess.run(
             [sys.executable, "-m", *argv], env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin", **nowhere},
@@ -88,6 +89,25 @@ def test_variables_that_make_no_sense_are_told_in_one_line(tmp_path: Path) -> No
         assert done.returncode == code, done.stderr
         assert "OTEL_EXPORTER_OTLP_ENDPOINT" in done.stderr
         assert "Traceback" not in done.stderr
+
+
+def test_an_emergency_stop_is_not_refused_for_the_telemetrys_sake(tmp_path: Path) -> None:
+    """A variable for all programs of the machine; and the port that it names is the runner's own, whose robot shall stop."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        for said in (
+            {"OTEL_EXPORTER_OTLP_ENDPOINT": "collector"},
+            {
+                "OTEL_METRICS_EXPORTER": "prometheus",
+                "OTEL_EXPORTER_PROMETHEUS_PORT": str(taken.getsockname()[1]),
+            },
+        ):
+            done = subprocess.run(
+                [sys.executable, "-m", "runner", "estop", "--endpoint", f"ipc://{tmp_path}/runner.sock"],
+                env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin", **said},
+                capture_output=True, text=True, timeout=WAIT_S,
+            )  # fmt: skip
+            assert done.returncode == 1, done.stderr
+            assert "no runner answers estop" in done.stderr, "it asked"
 
 
 def test_the_quick_commands_send_nothing_and_the_others_do(tmp_path: Path) -> None:
