@@ -24,7 +24,7 @@ GRASP_CAMERA = "wrist"  # looks at the fingers: what they hold cannot hide behin
 
 NO_ANSWER = "the scene VLM gave no answer"
 
-_HOLDS = re.compile(r"\bhold(?:s|ing)\s+(?!nothing\b|anything\b|no\b)", re.IGNORECASE)
+_HOLDS = re.compile(r"(?<!\bnot )(?<!n't )\bhold(?:s|ing)?\s+(?!nothing\b|anything\b|no\b)", re.IGNORECASE)
 _TASK = re.compile(
     r"\s*(?:grab|grasp|pick up|pick|fetch|take|lift)\s+(?:the\s+|a\s+|an\s+)?(.+?)\s*\.?\s*", re.IGNORECASE
 )

@@ -293,6 +293,8 @@ def test_what_the_hand_holds_is_put_down_before_it_looks_again() -> None:
     [
         NO,
         Outcome("answered", "No, it is not holding anything."),
+        Outcome("answered", "No, the gripper is not holding the red cube."),
+        Outcome("answered", "No. It doesn't hold the red cube."),
         Outcome("error", "CUDA out of memory", "oom"),
     ],
 )
