@@ -146,7 +146,7 @@ def test_a_model_that_a_goal_uses_is_not_idle(box, arbiter):
 
 def test_standby_and_idle_release_contradict_each_other(box):
     sidecar = box.spawn("detector", "--standby", "--idle-release-s", "1")
-    assert sidecar.process.wait(PATIENCE_S) == 1
+    assert sidecar.process.wait(PATIENCE_S) == 2
     assert "choose one" in sidecar.log
 
 
