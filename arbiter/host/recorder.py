@@ -77,8 +77,8 @@ class Recorder:
         self._wall = wall
         self._buffer: deque[_Item] = deque()
         self._work: queue.SimpleQueue[Sequence[_Item] | None] = queue.SimpleQueue()
-        # events handed to the thread and not written yet; only ever compared, so a race costs nothing
-        self._queued = 0
+        self._handed = 0  # events given to the thread; the loop alone counts
+        self._written = 0  # of those, done with; the thread alone counts
         self._segment = 0
         self._retry_at: float | None = None  # recording has stopped until then
         self._troubled = False  # and that was said
@@ -101,7 +101,7 @@ class Recorder:
                 self._retry_at = None
                 self._begin_anew("resumed", now)
             return
-        if len(self._buffer) + self._queued >= BUFFER_MAX:
+        if len(self._buffer) + self._handed - self._written >= BUFFER_MAX:
             self._buffer.clear()
             self._stopped(f"more than {BUFFER_MAX} events wait for the disk")
             return
@@ -140,7 +140,7 @@ class Recorder:
         if self._buffer:
             items = tuple(self._buffer)
             self._buffer.clear()
-            self._queued += len(items)
+            self._handed += len(items)
             self._work.put(items)
 
     def _stopped(self, reason: str) -> None:
@@ -172,7 +172,7 @@ class Recorder:
                 self._files.close()
                 self._on_loop(partial(self._stopped, f"{type(error).__name__}: {error}"))
             finally:
-                self._queued -= len(items)
+                self._written += len(items)
         self._files.close()
 
     def _on_loop(self, call: Callable[[], None]) -> None:
