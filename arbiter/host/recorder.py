@@ -87,6 +87,11 @@ class Recorder:
         self._thread: threading.Thread | None = None
         self._files = _Files(state_dir / FOLDER, wall(), settings, version, max_bytes, file_bytes)
 
+    @property
+    def behind(self) -> int:
+        """Events that were handed to the thread and are not on the disk yet."""
+        return self._handed - self._written
+
     def start(self, loop: asyncio.AbstractEventLoop, made_at: float) -> None:
         """The engine was made at this (monotonic) moment and has handled nothing yet."""
         self._loop = loop
@@ -101,7 +106,7 @@ class Recorder:
                 self._retry_at = None
                 self._begin_anew("resumed", now)
             return
-        if len(self._buffer) + self._handed - self._written >= BUFFER_MAX:
+        if len(self._buffer) + self.behind >= BUFFER_MAX:
             self._buffer.clear()
             self._stopped(f"more than {BUFFER_MAX} events wait for the disk")
             return

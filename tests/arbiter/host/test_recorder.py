@@ -57,7 +57,7 @@ class Recorded:
         """Everything recorded so far is on the disk, or was given up."""
         self.recorder._flush()
         async with asyncio.timeout(PATIENCE_S):
-            while self.recorder._queued:
+            while self.recorder.behind:
                 await asyncio.sleep(0)
 
     def files(self) -> list[Path]:
