@@ -25,9 +25,8 @@ def program[**P](main: Callable[P, int]) -> Callable[P, int]:
         except BrokenPipeError:
             if not _reader_left():
                 raise
-            os.dup2(
-                os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-            )  # the interpreter flushes once more
+            # the interpreter flushes once more
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return READER_LEFT
         except KeyboardInterrupt:
             return INTERRUPTED

@@ -108,9 +108,8 @@ class GymEnv:
             self._gate = self._make_gate()
             self._hold = None if self.config.hold is None else self._held(self.config.hold)
             self._observed = self._parts_observed()
-            self._views = (
-                self._views_of()
-            )  # camera → its part of the observation; None: what `render()` gives
+            # camera → its part of the observation; None: what `render()` gives
+            self._views = self._views_of()
             self._state = self._state_parts()
             self._shown = self._shown_parts()
             self._said_what_is_shown = bool(self.config.joints)  # whoever names some wants no more
@@ -372,9 +371,8 @@ class GymEnv:
         if camera not in self._views and camera != RENDER:
             raise KeyError(camera)
         if (view := self._views.get(camera)) is not None:
-            return np.array(
-                view.of(self._observation), order="C"
-            )  # a copy: some environments draw over their last one
+            # a copy: some environments draw over their last one
+            return np.array(view.of(self._observation), order="C")
         try:
             picture = self._env.render()
         except Exception as error:

@@ -61,6 +61,15 @@ async def on_standby(client: ArbiterClient, spec: Spec, model: Model) -> Lease:
     return detector
 
 
+async def parkable(client: ArbiterClient, spec: Spec, model: Model) -> Lease:
+    """A detector that is resident, and may keep its weights in host RAM when it leaves."""
+    detector = await client.acquire(
+        spec("detector", 5, park_bytes=5 * GIB), unload=model.unload, park=model.park, on_return=model.load
+    )
+    await detector.ready()
+    return detector
+
+
 async def states(client: ArbiterClient) -> dict[str, str]:
     return {lease["consumer"]: lease["state"] for lease in (await client.status())["leases"]}
 
@@ -167,13 +176,7 @@ async def test_weights_are_parked_where_the_budget_has_room(
     arbiter = make_arbiter(config="host:\n  park_budget_bytes: 6GiB\n").start()
     model = Model()
     async with ArbiterClient(arbiter.endpoint, name="t") as client:
-        detector = await client.acquire(
-            spec("detector", 5, park_bytes=5 * GIB),
-            unload=model.unload,
-            park=model.park,
-            on_return=model.load,
-        )
-        await detector.ready()
+        detector = await parkable(client, spec, model)
         policy = await client.acquire(spec("policy", 4, park_bytes=5 * GIB), WAIT_S, unload=model.unload)
         await policy.ready()
         assert (detector.state, model.did) == ("parked", ["park"])
@@ -195,13 +198,7 @@ async def test_who_parks_hears_how_it_ended_not_how_it_was_meant(
     arbiter = make_arbiter(config="host:\n  park_budget_bytes: 0\n").start()
     model = Model()
     async with ArbiterClient(arbiter.endpoint, name="t") as client, asyncio.timeout(WAIT_S):
-        detector = await client.acquire(
-            spec("detector", 5, park_bytes=5 * GIB),
-            unload=model.unload,
-            park=model.park,
-            on_return=model.load,
-        )
-        await detector.ready()
+        detector = await parkable(client, spec, model)
         parking = asyncio.create_task(detector.park())
         while not parking.done():
             detector.revoke_asked({}, False)  # as the arbiter says it again and again while somebody waits

@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from typing import Any, cast
 
 import pytest
@@ -151,6 +151,19 @@ def test_progress_that_was_told_while_the_reasoner_stood_still_counts() -> None:
     assert play(story) is False
 
 
+@contextlib.asynccontextmanager
+async def looking(a_runner: Any, a_sidecar: Any) -> AsyncIterator[tuple[Any, Any, DetectorClient, Tools]]:
+    """A runner with a camera, one sidecar that is both models, its detector's client, and the tools over all of them."""
+    async with (
+        a_runner() as runner,
+        RunnerClient(runner.endpoint) as client,
+        a_sidecar("lab/eye") as sidecar,
+        DetectorClient(sidecar.endpoint) as detector,
+        SceneVlmClient(sidecar.endpoint) as vlm,
+    ):
+        yield runner, sidecar, detector, Tools(client, detector, vlm)
+
+
 @pytest.mark.parametrize(
     ("error", "status"),
     [
@@ -164,15 +177,8 @@ def test_a_model_that_did_not_look_never_says_that_nothing_is_there(
     """The defect of the field: an evicted detector answered `found: false`."""
 
     async def story() -> list[Any]:
-        async with (
-            a_runner() as runner,
-            RunnerClient(runner.endpoint) as client,
-            a_sidecar("lab/eye") as sidecar,
-            DetectorClient(sidecar.endpoint) as detector,
-            SceneVlmClient(sidecar.endpoint) as vlm,
-        ):
+        async with looking(a_runner, a_sidecar) as (_, sidecar, _, tools):
             sidecar.error = error
-            tools = Tools(client, detector, vlm)
             return [await tools(LOOK), await tools(ASK)]
 
     for outcome in play(story):
@@ -181,14 +187,7 @@ def test_a_model_that_did_not_look_never_says_that_nothing_is_there(
 
 def test_looked_not_seen_answered_and_no_frame_are_four_things(a_runner: Any, a_sidecar: Any) -> None:
     async def story() -> list[str]:
-        async with (
-            a_runner() as runner,
-            RunnerClient(runner.endpoint) as client,
-            a_sidecar("lab/eye") as sidecar,
-            DetectorClient(sidecar.endpoint) as detector,
-            SceneVlmClient(sidecar.endpoint) as vlm,
-        ):
-            tools = Tools(client, detector, vlm)
+        async with looking(a_runner, a_sidecar) as (runner, sidecar, _, tools):
             found = [(await tools(LOOK)).status, (await tools(ASK)).status]
             sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]}]
             seen = await tools(LOOK)
@@ -213,19 +212,14 @@ def test_a_look_tells_all_places_best_first_and_where_the_base_stood(a_runner: A
     )
 
     async def story() -> Outcome:
-        async with (
-            a_runner() as runner,
-            RunnerClient(runner.endpoint) as client,
-            a_sidecar("lab/eye") as sidecar,
-            DetectorClient(sidecar.endpoint) as detector,
-        ):
+        async with looking(a_runner, a_sidecar) as (runner, sidecar, _, tools):
             runner.camera_model = down.model_dump(mode="json")
             sidecar.detections = [
                 {"label": "red cube", "score": 0.6, "box": [18, 38, 22, 42]},
                 {"label": "red cube", "score": 0.5, "box": [79, 58, 83, 62]},
                 {"label": "red cube", "score": 0.7, "box": [78, 58, 82, 62]},
             ]
-            return await Tools(client, detector, None)(LOOK)
+            return await tools(LOOK)
 
     outcome = play(story)
     assert outcome.status == "found"
@@ -249,14 +243,9 @@ def test_a_place_that_is_no_number_is_no_place(a_runner: Any, a_sidecar: Any, wr
     """Regression: it was `found` at (nan, nan) m from the base."""
 
     async def story() -> Any:
-        async with (
-            a_runner() as runner,
-            RunnerClient(runner.endpoint) as client,
-            a_sidecar("lab/eye") as sidecar,
-            DetectorClient(sidecar.endpoint) as detector,
-        ):
+        async with looking(a_runner, a_sidecar) as (_, sidecar, _, tools):
             sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]} | wrong]
-            return await Tools(client, detector, None)(LOOK)
+            return await tools(LOOK)
 
     outcome = play(story)
     assert (outcome.status, outcome.code) == ("error", "model_error")
@@ -270,12 +259,7 @@ def test_a_place_that_is_always_of_long_ago_is_none(
     monkeypatch.setattr("reasoner.tools.monotonic", lambda: now[0])
 
     async def story() -> tuple[Any, list[str]]:
-        async with (
-            a_runner() as runner,
-            RunnerClient(runner.endpoint) as client,
-            a_sidecar("lab/eye") as sidecar,
-            DetectorClient(sidecar.endpoint) as detector,
-        ):
+        async with looking(a_runner, a_sidecar) as (_, sidecar, detector, tools):
             sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]}]
             detect = detector.detect
 
@@ -284,7 +268,7 @@ def test_a_place_that_is_always_of_long_ago_is_none(
                 return await detect(*arguments, **options)
 
             monkeypatch.setattr(detector, "detect", slow)
-            return await Tools(client, detector, None)(LOOK), sidecar.asked
+            return await tools(LOOK), sidecar.asked
 
     outcome, asked = play(story)
     assert (outcome.status, outcome.code) == ("no_frame", "frame_stale")
@@ -299,15 +283,9 @@ def test_a_picture_that_waited_for_the_card_is_not_looked_at_and_a_new_one_is(
     """Regression: only the detector's was looked at again, by the time that the answer took."""
 
     async def story() -> tuple[str, list[float]]:
-        async with (
-            a_runner() as runner,
-            RunnerClient(runner.endpoint) as client,
-            a_sidecar("lab/eye") as sidecar,
-            DetectorClient(sidecar.endpoint) as detector,
-            SceneVlmClient(sidecar.endpoint) as vlm,
-        ):
+        async with looking(a_runner, a_sidecar) as (_, sidecar, _, tools):
             sidecar.late = late
-            outcome = await Tools(client, detector, vlm)(call)
+            outcome = await tools(call)
             limits = [message["fresh_s"] for message in sidecar.messages if "fresh_s" in message]
             return outcome.status, limits
 
@@ -325,12 +303,7 @@ def test_what_was_seen_before_the_detector_was_loaded_is_no_place(
     monkeypatch.setattr("reasoner.tools.monotonic", lambda: now[0])
 
     async def story() -> tuple[str, list[str]]:
-        async with (
-            a_runner() as runner,
-            RunnerClient(runner.endpoint) as client,
-            a_sidecar("lab/eye") as sidecar,
-            DetectorClient(sidecar.endpoint) as detector,
-        ):
+        async with looking(a_runner, a_sidecar) as (_, sidecar, detector, tools):
             sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]}]
             detect = detector.detect
 
@@ -342,7 +315,7 @@ def test_what_was_seen_before_the_detector_was_loaded_is_no_place(
                 return found
 
             monkeypatch.setattr(detector, "detect", loads_first)
-            return (await Tools(client, detector, None)(LOOK)).status, sidecar.asked
+            return (await tools(LOOK)).status, sidecar.asked
 
     status, asked = play(story)
     assert (status, asked.count("detect")) == ("not_seen", 2)
