@@ -232,6 +232,7 @@ class Daemon:
             self._core_failed,
             slept_s=SuspendWatch().slept_s,
             record=None if recorder is None else recorder.record,
+            sample=lambda gpu: prober.sample(gpu),
         )
         prober = Prober(
             probe,

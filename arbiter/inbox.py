@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 from arbiter.core.effects import Effect
 from arbiter.core.events import Event, Resumed, Tick
+from schemas.ids import GpuId
 
 log = logging.getLogger(__name__)
 
@@ -23,6 +24,11 @@ HELD_UP_S = 1.0
 silence counts: the core is told that it slept."""
 TIMER_FLOOR_S = 0.0002
 """A deadline that has passed is served this soon, and not in a busy loop."""
+
+FRESH_S = 1.0
+"""Time limit for the reading that an answer waits for. After it the answer shows the old reading with its age."""
+QUESTIONS_MAX = 1024
+"""Answers that wait for a reading at a time. One more is given at once, with the reading that there is."""
 
 
 class Core(Protocol):
@@ -35,6 +41,8 @@ class Core(Protocol):
     def status(self, now: float) -> dict[str, Any]: ...
 
     def why(self, consumer: str, now: float) -> dict[str, Any]: ...
+
+    def stale(self, now: float) -> list[GpuId]: ...
 
     def figures(self) -> dict[str, Any]: ...
 
@@ -49,7 +57,8 @@ class Inbox:
     `perform` runs the effects of one event; it may post events, which are handled after it returned. `failed` is called once with the
     exception if the core raises: its state can no longer be trusted, so nothing is handled after that. `slept_s` tells for how long the
     machine was suspended since it was last asked; the core hears of it, and of a stop of this process alone, before any other event.
-    `record` is told of every event and what came of it (None: the core raised), before anything is performed.
+    `record` is told of every event and what came of it (None: the core raised), before anything is performed. `sample` begins a
+    reading of a GPU, which ends in an event (`MemorySampled` or `ProbeFailed`).
     """
 
     def __init__(
@@ -60,6 +69,7 @@ class Inbox:
         clock: Callable[[], float] = time.monotonic,
         slept_s: Callable[[], float] = lambda: 0.0,
         record: Callable[[float, Event, Sequence[Effect] | None], None] | None = None,
+        sample: Callable[[GpuId], None] = lambda gpu: None,
     ) -> None:
         self._core = core
         self._perform = perform
@@ -74,6 +84,9 @@ class Inbox:
         self._deadline: float | None = None
         self._wakes_at: float | None = None  # when the timer is to fire
         self._handled = 0
+        self._sample = sample
+        self._questions: list[Callable[[], None]] = []  # answered after the next reading
+        self._questions_timer: asyncio.TimerHandle | None = None
 
     def post(self, event: Event) -> None:
         """Handle an event now, or right after the one that is being handled."""
@@ -91,7 +104,24 @@ class Inbox:
                 self._handle(self._queue.popleft())
         finally:
             self._busy = False
+        if self._questions and not self._core.stale(self._clock()):
+            self._answer()
         self._arm()
+
+    def when_read(self, answer: Callable[[], None]) -> None:
+        """Call `answer` once every GPU has a fresh reading, or after FRESH_S. It is called at once if all readings are fresh.
+
+        An idle daemon reads its GPUs seldom: without this, `status` shows what was there minutes ago as the present.
+        """
+        stale = [] if self._closed else self._core.stale(self._clock())
+        if not stale or len(self._questions) >= QUESTIONS_MAX:
+            answer()
+            return
+        self._questions.append(answer)
+        if len(self._questions) == 1:  # later questions wait for the same readings
+            self._questions_timer = asyncio.get_running_loop().call_later(FRESH_S, self._answer)
+            for gpu in stale:
+                self._sample(gpu)
 
     def status(self) -> dict[str, Any]:
         return self._core.status(self._clock())
@@ -126,6 +156,7 @@ class Inbox:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
+        self._forget_questions()
 
     def _handle(self, event: Event) -> None:
         now, effects = self._clock(), None
@@ -142,6 +173,17 @@ class Inbox:
             if effects is None and self._record is not None:
                 self._record(now, event, None)
             self._failed(error)
+
+    def _answer(self) -> None:
+        for answer in self._forget_questions():
+            answer()
+
+    def _forget_questions(self) -> list[Callable[[], None]]:
+        questions, self._questions = self._questions, []
+        if self._questions_timer is not None:
+            self._questions_timer.cancel()
+            self._questions_timer = None
+        return questions
 
     def _state(self) -> str:
         try:

@@ -112,6 +112,11 @@ class Arbiter:
         self._core.now = max(self._core.now, now)
         return explain.why(self._core, consumer)
 
+    def stale(self, now: float) -> list[GpuId]:
+        """GPUs that have to be read before their state can be shown (`readings.stale`)."""
+        self._core.now = max(self._core.now, now)
+        return readings.stale(self._core)
+
     def figures(self) -> dict[str, Any]:
         """The present in numbers (`figures.figures`)."""
         return figures.figures(self._core)

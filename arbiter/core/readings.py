@@ -64,6 +64,17 @@ def on_probe_due(core: Core, gpu_id: str) -> None:
     core.wake(gpu)  # an old sample no longer carries a grant
 
 
+def stale(core: Core) -> list[GpuId]:
+    """Return the GPUs whose newest reading, successful or not, is older than one that may gate a grant."""
+    oldest = core.now - core.settings.sample_max_age_s
+    return [
+        gpu.info.id
+        for gpu in core.gpus.values()
+        if (gpu.sample is None or gpu.sample.taken_at < oldest)
+        and (gpu.failed_at is None or gpu.failed_at < oldest)
+    ]
+
+
 def note_pressure(core: Core, gpu: Gpu) -> None:
     """Say when pressure begins and when it ends."""
     pressure_bytes = gpu.ledger.pressure_bytes()

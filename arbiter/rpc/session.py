@@ -48,6 +48,10 @@ class Decisions(Protocol):
 
     def post(self, event: ev.Event) -> None: ...
 
+    def when_read(self, answer: Callable[[], None]) -> None:
+        """Call `answer` once the GPUs were read, or when the time limit for that has passed."""
+        ...
+
     def status(self) -> dict[str, Any]: ...
 
     def why(self, consumer: str) -> dict[str, Any]: ...
@@ -351,9 +355,12 @@ class SessionTable:
             case w.Ping():
                 self.reply(client, re, {"server": self._settings.server})
             case w.Status():
-                self.reply(client, re, {**self._decisions.status(), "problems": self._problems()})
+                self._decisions.when_read(
+                    lambda: self.reply(client, re, {**self._decisions.status(), "problems": self._problems()})
+                )
             case w.Why():
-                self.reply(client, re, self._decisions.why(request.consumer))
+                consumer = request.consumer
+                self._decisions.when_read(lambda: self.reply(client, re, self._decisions.why(consumer)))
             case w.History():
                 _check_kinds(request.kinds)
                 after = max(0, min(request.after, (1 << 63) - 1))

@@ -7,6 +7,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -20,6 +21,7 @@ from schemas.ids import ProcessKey
 
 pytestmark = pytest.mark.e2e
 GIB = 1 << 30
+PATIENCE_S = 60.0
 
 Make = Callable[..., ArbiterProcess]
 
@@ -279,3 +281,35 @@ def test_a_hanging_driver_does_not_hold_up_the_stop(make_arbiter: Make) -> None:
         set_fault(arbiter, "hang")
         watcher.push("event", where=lambda push: push["event"]["kind"] == "probe_failed")
         assert arbiter.stop() == 0
+
+
+def test_status_of_an_idle_daemon_reads_the_gpu_before_it_answers(make_arbiter: Make) -> None:
+    """After idleness `status` showed 5.4 GiB of a process without a lease as free memory, for up to 11 minutes."""
+    config = "probe:\n  period_s: 3600\n  sample_max_age_s: 0.05\n"
+    arbiter = make_arbiter(config=config).start()
+    with contextlib.closing(WireClient(arbiter.endpoint)) as client:
+        client.hello()
+        assert client.ask("status")["gpus"][0]["stowaway_bytes"] == 0
+        occupy(arbiter, 5 * GIB)
+        deadline = time.monotonic() + PATIENCE_S
+        while not (gpu := client.ask("status")["gpus"][0])["stowaway_bytes"]:
+            assert time.monotonic() < deadline, f"an old reading is shown: {gpu}"
+        assert (gpu["stowaway_bytes"], gpu["measured_used_bytes"]) == (5 * GIB, 5 * GIB)
+
+
+def test_status_of_a_gpu_that_does_not_answer_is_answered_with_the_age_of_its_reading(
+    make_arbiter: Make,
+) -> None:
+    config = "probe:\n  period_s: 3600\n  sample_max_age_s: 0.05\n  deadline_s: 3600\n"
+    arbiter = make_arbiter(config=config).start()
+    with contextlib.closing(WireClient(arbiter.endpoint)) as client:
+        client.hello()
+        assert client.ask("status")["ok"]
+        path = arbiter.card / fakegpu.CARD_FILE
+        hanging = fakegpu.parse_config(path.read_text()).model_copy(
+            update={"faults": fakegpu.Faults(probe="hang")}
+        )
+        path.write_text(fakegpu.dump_config(hanging))
+        while client.ask("status")["gpus"][0]["sample_age_s"] <= 0.05:
+            pass  # asked before the first reading was old
+        assert client.ask("ping")["ok"], "the loop was not blocked"

@@ -7,8 +7,8 @@ from typing import Any
 
 from arbiter.core.effects import Effect, Note
 from arbiter.core.events import ClientLeft, Event, Resumed, Tick
-from arbiter.inbox import Inbox
-from schemas.ids import ClientId
+from arbiter.inbox import QUESTIONS_MAX, Inbox
+from schemas.ids import ClientId, GpuId
 
 PATIENCE_S = 60.0
 
@@ -26,6 +26,7 @@ class ScriptedCore:
         self.deadline: float | None = None
         self.ticked = asyncio.Event()
         self.broken = False
+        self.unread: list[GpuId] = []
 
     def handle(self, event: Event, now: float) -> list[Effect]:
         if self.broken:
@@ -44,6 +45,9 @@ class ScriptedCore:
         if self.broken:
             raise KeyError("state")
         return {"now": now}
+
+    def stale(self, now: float) -> list[GpuId]:
+        return self.unread
 
     def why(self, consumer: str, now: float) -> dict[str, Any]:
         return {"consumer": consumer, "now": now}
@@ -251,5 +255,55 @@ def test_everything_that_is_handled_is_recorded_before_it_is_performed() -> None
         now, event, effects = told[2]
         assert (event, effects, str(told[3])) == (left("b"), None, "invariant 1")
         assert now >= core.times[0]
+
+    asyncio.run(run())
+
+
+def test_a_question_waits_for_a_fresh_reading_of_every_gpu() -> None:
+    """An idle daemon answered `status` from a reading of minutes ago: a stowaway of 5.4 GiB was shown as free memory."""
+
+    async def run() -> None:
+        core, asked, answered = ScriptedCore(), list[GpuId](), list[str]()
+        inbox = Inbox(core, lambda effects: None, lambda error: None, sample=asked.append)
+        core.unread = [GpuId("gpu-0"), GpuId("gpu-1")]
+        inbox.when_read(lambda: answered.append("first"))
+        inbox.when_read(lambda: answered.append("second"))
+        assert asked == core.unread, "one reading of each GPU serves both questions"
+        core.unread = [GpuId("gpu-1")]
+        inbox.post(left("the reading of one"))
+        assert answered == []
+        core.unread = []
+        inbox.post(left("the reading of the other"))
+        assert answered == ["first", "second"]
+        inbox.when_read(lambda: answered.append("third"))
+        assert (answered[2:], len(asked)) == (["third"], 2), "a fresh reading is not taken again"
+        inbox.close()
+
+    asyncio.run(run())
+
+
+def test_a_gpu_that_does_not_answer_keeps_no_question_waiting() -> None:
+    """The answer then shows the reading that there is, with its age."""
+
+    async def run() -> None:
+        core, answered = ScriptedCore(), asyncio.Event()
+        inbox = Inbox(core, lambda effects: None, lambda error: None)
+        core.unread = [GpuId("gpu-0")]
+        inbox.when_read(answered.set)
+        await asyncio.wait_for(answered.wait(), PATIENCE_S)
+        inbox.close()
+
+    asyncio.run(run())
+
+
+def test_questions_that_wait_are_bounded() -> None:
+    async def run() -> None:
+        core, answered = ScriptedCore(), list[int]()
+        inbox = Inbox(core, lambda effects: None, lambda error: None)
+        core.unread = [GpuId("gpu-0")]
+        for _ in range(QUESTIONS_MAX + 1):
+            inbox.when_read(lambda: answered.append(1))
+        assert answered == [1], "the one beyond the limit is answered at once"
+        inbox.close()
 
     asyncio.run(run())

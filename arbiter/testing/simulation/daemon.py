@@ -96,7 +96,14 @@ class SimDaemon:
         settings = machine.settings(epoch)
         try_records(self.journal, settings)
         self.core = Arbiter(settings, clock.now)
-        self._inbox = Inbox(self.core, self._perform, self._failed, lambda: clock.now, self._slept)
+        self._inbox = Inbox(
+            self.core,
+            self._perform,
+            self._failed,
+            lambda: clock.now,
+            self._slept,
+            sample=lambda gpu: self._prober.sample(gpu),
+        )
         self._prober = SimProber(clock, self.loop, machine.cards, machine.probe_faults, self._post)
         self.sessions = SessionTable(
             SessionSettings(

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.events import OperatorAsked
+from arbiter.core.events import OperatorAsked, ProbeFailed
 from arbiter.core.lease import Lease
 from arbiter.core.recovery import spec_from_record
 from arbiter.testing.core_driver import CoreDriver, answer, refusal
@@ -468,3 +468,14 @@ def test_a_record_of_before_the_ladder_waits() -> None:
     record = dict(driver.journal[f"lease:{lease}"]["spec"])
     del record["on_overstay"]
     assert spec_from_record(record).on_overstay == "wait"
+
+
+def test_a_gpu_is_stale_when_its_newest_reading_may_gate_no_grant() -> None:
+    driver = CoreDriver(8 * GIB)
+    arbiter, age_s = driver.arbiter, driver.settings.sample_max_age_s
+    driver.consumer("det")
+    assert arbiter.stale(driver.now) == []
+    driver.card.silent = True
+    assert arbiter.stale(driver.now + age_s + 0.1) == [driver.card.gpu]
+    driver.post(ProbeFailed(driver.card.gpu, driver.now + age_s, "no answer"))
+    assert arbiter.stale(driver.now + age_s + 0.1) == [], "a failed reading is news as well"

@@ -41,6 +41,9 @@ class Recording:
     def post(self, event: ev.Event) -> None:
         self.events.append(event)
 
+    def when_read(self, answer: Callable[[], None]) -> None:
+        answer()
+
     def status(self) -> dict[str, Any]:
         return {}
 
@@ -79,6 +82,9 @@ class RealCore:
             self.executor.perform(self.arbiter.handle(self._queue.popleft(), self.plant.now))
             self.arbiter.check_all()
         self._busy = False
+
+    def when_read(self, answer: Callable[[], None]) -> None:
+        answer()
 
     def status(self) -> dict[str, Any]:
         return self.arbiter.status(self.plant.now)

@@ -45,6 +45,9 @@ class Bench:
     def post(self, event: ev.Event) -> None:
         self.events.append(event)
 
+    def when_read(self, answer: Callable[[], None]) -> None:
+        answer()
+
     def status(self) -> dict[str, Any]:
         return {"phase": "serving"}
 
