@@ -42,6 +42,8 @@ RESIDUE_BYTES = 450 * MIB  # a live CUDA process keeps its context
 # Limits
 MESSAGE_MAX_BYTES = 1 * MIB
 IMAGE_MESSAGE_MAX_BYTES = 16 * MIB  # sidecar and runner wires only
+VALUES_MAX = 6144  # msgpack values of one message, at every depth: at most 4 ms of decoding and validating
+LISTED_MAX = 256  # keys of one map, items of one list
 SESSIONS_MAX = 1024
 WAITERS_MAX = 16_384
 LEASES_PER_CLIENT_MAX = 64

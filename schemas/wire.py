@@ -26,6 +26,8 @@ TokenPair = Annotated[tuple[int, int], Field(description="[epoch, serial]")]
 Seconds = Annotated[float, Field(ge=0, le=86_400 * 365, allow_inf_nan=False)]
 Reason = Annotated[str, Field(max_length=d.REASON_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]*$")]
 Bytes = Annotated[int, Field(ge=0, le=1 << 50)]
+UseIds = Annotated[tuple[Name, ...], Field(max_length=d.USES_PER_LEASE_MAX, fail_fast=True)]
+"""Lists end at their first wrong item: a message with thousands of wrong ones must not cost an error for each."""
 
 
 class _Frozen(BaseModel):
@@ -138,7 +140,7 @@ class Yield(_OnLease):
 
 class Renew(_Request):
     op: Literal["renew"]
-    leases: Annotated[tuple[LeaseRef, ...], Field(max_length=d.LEASES_PER_CLIENT_MAX)]
+    leases: Annotated[tuple[LeaseRef, ...], Field(max_length=d.LEASES_PER_CLIENT_MAX, fail_fast=True)]
 
 
 class RevokeAck(_OnLease):
@@ -191,14 +193,14 @@ class ReattachLease(_Frozen):
     spec: LeaseSpec
     state: Literal["loading", "held", "standby", "parked"]  # standby, parked: `token` is the last one
     measured_bytes: Bytes | None = None
-    use_ids: Annotated[tuple[Name, ...], Field(max_length=d.USES_PER_LEASE_MAX)] = ()
+    use_ids: UseIds = ()
 
 
 class Reattach(_Request):
     """After a reconnect: what this client still holds. The reply says per lease `kept` or why not."""
 
     op: Literal["reattach"]
-    leases: Annotated[tuple[ReattachLease, ...], Field(max_length=d.LEASES_PER_CLIENT_MAX)]
+    leases: Annotated[tuple[ReattachLease, ...], Field(max_length=d.LEASES_PER_CLIENT_MAX, fail_fast=True)]
 
 
 class Oom(_Request):
@@ -224,7 +226,7 @@ class History(_Request):
     op: Literal["history"]
     after: int = 0  # sequence number of the last event already seen
     limit: Annotated[int, Field(ge=1, le=5000)] = 500
-    kinds: tuple[str, ...] = ()
+    kinds: Annotated[tuple[str, ...], Field(max_length=d.LISTED_MAX, fail_fast=True)] = ()
 
 
 class Subscribe(_Request):

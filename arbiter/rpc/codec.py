@@ -1,18 +1,24 @@
-"""Bytes ↔ requests. Nothing that a peer sends makes this raise anything but a typed error.
+"""Bytes ↔ requests. Nothing that a peer sends makes this raise anything but a typed error, at a bounded cost.
 
-Must not know sockets, sessions or the core. Requests are validated by `schemas.wire`; replies and pushes are plain maps.
+A message is counted before it is built (`msgpack_codec`), and validation stops at the first wrong item of a list, so the worst
+message of 1 MiB costs a few milliseconds. Must not know sockets, sessions or the core. Requests are validated by `schemas.wire`;
+replies and pushes are plain maps.
 """
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import msgpack
 from pydantic import ValidationError
 
-from schemas.errors import BadFrame, BadRequest, MessageTooLarge, UnknownOp, VramError
+from schemas.errors import BadRequest, UnknownOp, VramError
+from schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
 from schemas.wire import OPS, REQUEST, Request
 
 FIELDS_MAX = 20  # problems listed in one reply; the peer's text is never echoed at length
+KEYS_MAX = 64
+"""Keys of one map: every unknown key makes validation build one more error. The largest map of the wire has 20."""
 _OPS = frozenset(OPS)
 _validate = REQUEST.validator.validate_python  # the adapter's own method only adds options that we do not use
 
@@ -28,24 +34,10 @@ class Undecodable(Exception):
 
 def decode(payload: bytes | memoryview, size_max: int) -> Request:
     """One frame to one request. Raises Undecodable with BadFrame, MessageTooLarge, UnknownOp or BadRequest."""
-    if len(payload) > size_max:
-        too_large = MessageTooLarge(
-            f"the message has {len(payload)} bytes, the limit is {size_max}",
-            hint="send less in one message",
-            details={"size_bytes": len(payload), "limit_bytes": size_max},
-        )
-        raise Undecodable(too_large, None)
     try:
-        message = msgpack.unpackb(payload, raw=False, strict_map_key=True)
-    except (ValueError, msgpack.UnpackException, RecursionError) as error:
-        raise Undecodable(
-            BadFrame(f"the frame is not one msgpack value: {error or type(error).__name__}"), None
-        ) from error
-    if not isinstance(message, dict):
-        kind = type(message).__name__
-        raise Undecodable(
-            BadFrame(f"a request is a msgpack map, not {kind}", hint='{"op": …, "id": n, …}'), None
-        )
+        message = unpack_map(payload, _limits(size_max))
+    except VramError as error:
+        raise Undecodable(error, None) from error
     request_id = _id(message)
     op = message.get("op")
     if not isinstance(op, str):
@@ -64,13 +56,15 @@ def decode(payload: bytes | memoryview, size_max: int) -> Request:
 
 def id_of(payload: bytes | memoryview, size_max: int) -> int | None:
     """The id that a request is answered to, without looking at the rest of it; None where none can be read."""
-    if len(payload) > size_max:
-        return None
     try:
-        message = msgpack.unpackb(payload, raw=False, strict_map_key=True)
-    except (ValueError, msgpack.UnpackException, RecursionError):
+        return _id(unpack_map(payload, _limits(size_max)))
+    except VramError:
         return None
-    return _id(message) if isinstance(message, dict) else None
+
+
+@lru_cache(maxsize=8)
+def _limits(size_max: int) -> UnpackLimits:
+    return UnpackLimits(message_max_bytes=size_max, keys_max=KEYS_MAX)
 
 
 def _id(message: Mapping[Any, Any]) -> int | None:
