@@ -33,10 +33,6 @@ FLUSH_S = 5.0
 EXPORT_S = 3.0
 """Time limit of one export, retries included, unless OTEL_EXPORTER_OTLP_TIMEOUT or the signal's own says otherwise. The SDK's own 10 s outlasts FLUSH_S."""
 EXPORT_MAX_S = 86_400.0
-SCRAPE_S = 5.0
-"""A reader of the Prometheus endpoint that says nothing for so long is hung up on."""
-SCRAPES_MAX = 8
-"""Readers at a time, a thread each; whoever comes on top is hung up on. A unit's TasksMax= is for the program's own threads."""
 SAY_AGAIN_S = 300.0
 """A collector that is away is complained of this often, not with every batch."""
 
@@ -374,55 +370,24 @@ def _readers(planned: Plan, ends: list[Callable[[], object]]) -> tuple[list[Any]
         readers.append(PeriodicExportingMetricReader(exporter))
     if planned.prometheus is not None:
         from opentelemetry.exporter.prometheus import PrometheusMetricReader
-        from prometheus_client import CollectorRegistry, start_http_server
+        from prometheus_client import CollectorRegistry
+
+        from schemas import scrapes
 
         registry = CollectorRegistry()
         host, wanted = planned.prometheus
         try:
-            server, _ = start_http_server(wanted, addr=host, registry=registry)
+            server = scrapes.ScrapeServer(host, wanted, scrapes.page_of(registry))
         except OSError as error:
             raise ConfigError(
                 f"no Prometheus endpoint on {host}:{wanted}: {error}",
                 hint="another program has the port; OTEL_EXPORTER_PROMETHEUS_PORT or the configuration names another one",
             ) from error
-        _bound(server)
-        port = server.server_port
-
-        def close_prometheus() -> None:
-            server.shutdown()
-            server.server_close()
-
-        ends.append(close_prometheus)
+        ends.append(server.close)
+        server.start()
+        port = server.port
         readers.append(PrometheusMetricReader(scope_info_enabled=False, registry=registry))
     return readers, port
-
-
-def _bound(server: Any) -> None:
-    """No reader of the metrics holds a thread for ever: anybody on this machine may connect."""
-    slots = threading.BoundedSemaphore(SCRAPES_MAX)
-    begin, serve = server.process_request, server.process_request_thread
-
-    def admit(request: socket.socket, address: object) -> None:
-        if not slots.acquire(blocking=False):
-            server.shutdown_request(request)
-            return
-        try:
-            begin(request, address)
-        except BaseException:  # no thread could be made
-            slots.release()
-            raise
-
-    def served(request: socket.socket, address: object) -> None:
-        try:
-            request.settimeout(SCRAPE_S)
-            serve(request, address)
-        finally:
-            slots.release()
-
-    def left(request: socket.socket, address: object) -> None:
-        log.debug("a reader of the metrics was given up", exc_info=True)
-
-    server.process_request, server.process_request_thread, server.handle_error = admit, served, left
 
 
 def _views() -> list[Any]:
