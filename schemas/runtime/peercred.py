@@ -1,0 +1,110 @@
+"""The process at the other end of a unix socket, as the kernel names it.
+
+SO_PEERCRED holds the credentials of the moment of connecting. A pid alone is reused, so a pidfd is
+opened at once and
+the start time is read while the pidfd shows the process alive: the three name one process for ever.
+"""
+
+import os
+import select
+import socket
+import struct
+from dataclasses import dataclass
+
+from schemas.ids import ProcessKey
+
+SO_PEERPIDFD = 77
+"""Linux ≥ 6.5, asm-generic/socket.h; the socket module of Python 3.12 does not name it."""
+_UCRED = struct.Struct("iII")  # pid, uid, gid (unix(7))
+
+
+class PeerGone(Exception):
+    """The process that connected has ended, or another one has its pid now."""
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """The process that connected. `pidfd` stays open as long as one of its connections; dup() it to
+    keep it.
+
+    `process.pid` is 0, and `pidfd` -1, for a process of a pid namespace that cannot be seen from
+    here.
+    """
+
+    process: ProcessKey
+    uid: int
+    gid: int
+    pidfd: int
+
+
+def credentials(sock: socket.socket) -> tuple[int, int, int]:
+    """Return pid, uid and gid of the peer of a connected unix socket."""
+    pid, uid, gid = _UCRED.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size))
+    return pid, uid, gid
+
+
+def identify(sock: socket.socket) -> Peer:
+    """Return the process at the other end of an accepted unix socket, with a pidfd that the caller
+    closes.
+
+    Raises PeerGone, and OSError where no descriptor is left.
+    """
+    pid, uid, gid = credentials(sock)
+    if pid == 0:
+        return Peer(ProcessKey(0, 0), uid, gid, -1)
+    try:
+        pidfd = sock.getsockopt(socket.SOL_SOCKET, SO_PEERPIDFD)
+        certain = True
+    except OSError as error:
+        if isinstance(error, ProcessLookupError):
+            raise PeerGone(f"process {pid} has ended") from None
+        pidfd, certain = _open(pid), False
+    try:
+        os.set_inheritable(pidfd, False)
+        ticks = start_ticks(pid)
+        # alive now: /proc/PID was its own until here, not that of a process with the same pid
+        if ticks is None or _ended(pidfd):
+            raise PeerGone(f"process {pid} has ended")
+        if not certain and uid not in _uids(pid):
+            raise PeerGone(f"pid {pid} belongs to another process now")
+    except BaseException:
+        os.close(pidfd)
+        raise
+    return Peer(ProcessKey(pid, ticks), uid, gid, pidfd)
+
+
+def start_ticks(pid: int) -> int | None:
+    """Field 22 of /proc/PID/stat; None if there is no such process. Field 2 may hold spaces and
+    parentheses.
+    """
+    try:
+        with open(f"/proc/{pid}/stat", "rb") as file:
+            stat = file.read()
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    return int(stat[stat.rindex(b")") + 2 :].split()[19])
+
+
+def _open(pid: int) -> int:
+    try:
+        return os.pidfd_open(pid)
+    except ProcessLookupError:
+        raise PeerGone(f"process {pid} has ended") from None
+
+
+def _ended(pidfd: int) -> bool:
+    poll = select.poll()
+    poll.register(pidfd, select.POLLIN)
+    return bool(poll.poll(0))
+
+
+def _uids(pid: int) -> set[int]:
+    """Real, effective, saved and file-system uid."""
+    try:
+        with open(f"/proc/{pid}/status", "rb") as file:
+            for line in file:
+                if line.startswith(b"Uid:"):
+                    return {int(word) for word in line.split()[1:]}
+    except (FileNotFoundError, ProcessLookupError):
+        pass
+    return set()

@@ -1,0 +1,307 @@
+"""ZMTP 3.1 for a ROUTER, without I/O: bytes in, events and bytes out.
+
+Implements the server side of https://rfc.zeromq.org/spec/37/ with the NULL mechanism, for DEALER
+and REQ peers of any
+ZeroMQ library from version 4.0 on. Every length is checked before a byte of it is kept: memory is
+bounded by
+`Limits.message_max_bytes` and one read of the caller, whatever a peer sends. Must not know sockets,
+loops or what a
+message means.
+"""
+
+import struct
+from dataclasses import dataclass
+
+SIGNATURE = b"\xff\x00\x00\x00\x00\x00\x00\x00\x01\x7f"
+GREETING_BYTES = 64
+MECHANISM = b"NULL".ljust(20, b"\x00")
+GREETING = SIGNATURE + b"\x03\x01" + MECHANISM + bytes(32)
+"""What a server says first: signature, version 3.1, mechanism, as-server 0, filler."""
+
+MORE, LONG, COMMAND = 0x01, 0x02, 0x04
+COMMAND_MAX_BYTES = 1024
+"""READY with the longest identity (255 bytes) and a few properties of its own; PING has at most 23
+bytes.
+"""
+CONTEXT_MAX_BYTES = 16
+"""Longest context of a PING, which its PONG repeats (specification, "Connection heartbeating")."""
+FRAMES_MAX = 8
+"""Frames of one message. A DEALER sends one, a REQ two; a few more are answered, without end they
+are an attack.
+"""
+PEER_TYPES = frozenset((b"DEALER", b"REQ"))
+
+_LONG_SIZE = struct.Struct(">Q")
+_PROPERTY_SIZE = struct.Struct(">I")
+
+_READY_BODY = b"\x05READY\x0bSocket-Type\x00\x00\x00\x06ROUTER\x08Identity\x00\x00\x00\x00"
+READY = bytes((COMMAND, len(_READY_BODY))) + _READY_BODY
+
+
+class ZmtpError(Exception):
+    """The peer broke the protocol or a limit that cannot be answered; the connection has to end.
+    The text says how.
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Sizes in bytes. A message over `message_max_bytes` is skipped and reported, over
+    `skip_max_bytes` it is an error.
+    """
+
+    message_max_bytes: int
+    skip_max_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """The handshake has ended; messages may be sent from here on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    """A PING, answered in `outgoing`, or a PONG. An event, so that the caller can bound the work of
+    one turn.
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One complete message. `delimiter`: an empty frame stood before the payload, as a REQ sends it
+    and expects it back.
+
+    `payload` is the last frame; empty where the frames were neither `[payload]` nor `["",
+    payload]`.
+    """
+
+    payload: bytes | bytearray
+    delimiter: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Oversize:
+    """A message of `size` bytes, over the limit of `limit` bytes, was skipped without being
+    kept.
+    """
+
+    size: int
+    limit: int
+    delimiter: bool
+
+
+Event = Ready | Heartbeat | Message | Oversize
+
+
+class ServerConnection:
+    """One connection as a ROUTER sees it.
+
+    `feed` bytes, call `next_event` until it returns None, and send what `outgoing` returns. After a
+    ZmtpError nothing
+    may be called any more but `outgoing`.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
+        self._data: bytes = b""
+        self._at = 0
+        self._outgoing = bytearray(GREETING)
+        self._greeted = False
+        self._ready = False
+        # the frame under way
+        self._body: bytes | bytearray | None = None  # None: its header is not complete
+        self._missing = 0
+        self._flags = 0
+        # the message under way
+        self._frames = 0
+        self._size = 0
+        self._skipping = False
+        self._delimiter = False
+        self._payload: bytes | bytearray = b""
+
+    @property
+    def kept_bytes(self) -> int:
+        """Bytes held for this connection: fed and not parsed, and the message under way."""
+        body = 0 if self._body is None else len(self._body)
+        return len(self._data) - self._at + body + len(self._payload)
+
+    @property
+    def unread_bytes(self) -> int:
+        """Bytes fed that `next_event` has not looked at."""
+        return len(self._data) - self._at
+
+    def feed(self, data: bytes) -> None:
+        """Take bytes from the peer, behind those that are unread."""
+        self._data = data if self._at == len(self._data) else self._data[self._at :] + data
+        self._at = 0
+
+    def outgoing(self) -> bytes:
+        """Return the bytes to send to the peer, once."""
+        data = bytes(self._outgoing)
+        self._outgoing.clear()
+        return data
+
+    def next_event(self) -> Event | None:
+        """Return the next event; None where more bytes are needed. Raises ZmtpError."""
+        if not self._greeted and not self._read_greeting():
+            return None
+        while True:
+            if self._body is None and not self._read_header():
+                return None
+            if not self._read_body():
+                return None
+            event = self._end_frame()
+            if event is not None:
+                return event
+
+    # -- greeting ------------------------------------------------------------------------------
+    def _read_greeting(self) -> bool:
+        have = self._data[self._at : self._at + GREETING_BYTES]
+        # what is wrong is said as soon as it is there: a client of another protocol may never send
+        # 64 bytes
+        if have[:1] not in (b"", b"\xff") or (len(have) >= 10 and have[9] & 1 == 0):
+            raise ZmtpError("not a ZMTP greeting")
+        if len(have) >= 11 and have[10] < 3:
+            raise ZmtpError(f"the peer speaks ZMTP {have[10]}.x, 3.0 or newer is needed")
+        if len(have) < GREETING_BYTES:
+            return False
+        if have[12:32] != MECHANISM:
+            raise ZmtpError("the peer asks for another security mechanism than NULL")
+        self._at += GREETING_BYTES
+        self._greeted = True
+        self._outgoing += READY
+        return True
+
+    # -- frames --------------------------------------------------------------------------------
+    def _read_header(self) -> bool:
+        """Read flags and size of the next frame; check both before a byte of its body is kept."""
+        data, at = self._data, self._at
+        if at >= len(data):
+            return False
+        flags = data[at]
+        if flags & LONG:
+            if len(data) - at < 9:
+                return False
+            (size,) = _LONG_SIZE.unpack_from(data, at + 1)
+            self._at = at + 9
+        else:
+            if len(data) - at < 2:
+                return False
+            size = data[at + 1]
+            self._at = at + 2
+        if flags & ~(MORE | LONG | COMMAND) or flags & (MORE | COMMAND) == MORE | COMMAND:
+            raise ZmtpError(f"frame flags {flags:#04x} are not allowed")
+        self._flags, self._missing, self._body = flags, size, b""
+        if flags & COMMAND:
+            if size > COMMAND_MAX_BYTES:
+                raise ZmtpError(f"a command of {size} bytes, at most {COMMAND_MAX_BYTES} are allowed")
+        elif not self._ready:
+            raise ZmtpError("a message before READY")
+        else:
+            self._begin_message_frame(size)
+        return True
+
+    def _begin_message_frame(self, size: int) -> None:
+        self._frames += 1
+        self._size += size
+        if self._frames > FRAMES_MAX:
+            raise ZmtpError(f"a message of more than {FRAMES_MAX} frames")
+        if self._size > self.limits.skip_max_bytes:
+            raise ZmtpError(
+                f"a message of {self._size} bytes or more, at most {self.limits.skip_max_bytes} are read"
+            )
+        if self._size > self.limits.message_max_bytes:
+            self._skipping = True
+            self._payload = b""
+
+    def _read_body(self) -> bool:
+        """Move what is there of the body; True once it is complete."""
+        at = self._at
+        taken = min(self._missing, len(self._data) - at)
+        if not self._skipping or self._flags & COMMAND:
+            if taken == self._missing and not self._body:  # all of it in one read, as usual
+                self._body = self._data[at : at + taken]
+            else:
+                if not isinstance(self._body, bytearray):
+                    self._body = bytearray()
+                self._body += memoryview(self._data)[at : at + taken]
+        self._at += taken
+        self._missing -= taken
+        return self._missing == 0
+
+    def _end_frame(self) -> Event | None:
+        body = self._body
+        assert body is not None
+        self._body = None
+        if self._flags & COMMAND:
+            return self._command(bytes(body))
+        more = bool(self._flags & MORE)
+        if self._frames == 1 and more and not body and not self._skipping:
+            self._delimiter = True
+        self._payload = b"" if self._skipping else body
+        if more:
+            return None
+        form_known = self._frames == 1 or (self._frames == 2 and self._delimiter)
+        event: Event
+        if self._skipping:
+            event = Oversize(self._size, self.limits.message_max_bytes, self._delimiter)
+        else:
+            event = Message(self._payload if form_known else b"", self._delimiter)
+        self._frames = self._size = 0
+        self._skipping = self._delimiter = False
+        self._payload = b""
+        return event
+
+    # -- commands ------------------------------------------------------------------------------
+    def _command(self, body: bytes) -> Event:
+        if not body or len(body) < 1 + body[0]:
+            raise ZmtpError("a command without a name")
+        name, rest = body[1 : 1 + body[0]], body[1 + body[0] :]
+        if not self._ready:
+            if name == b"ERROR":
+                raise ZmtpError("the peer refused the handshake")
+            if name != b"READY":
+                raise ZmtpError("a command before READY")
+            _check_properties(rest)
+            self._ready = True
+            return Ready()
+        if name == b"PING":
+            if not 2 <= len(rest) <= 2 + CONTEXT_MAX_BYTES:
+                raise ZmtpError(f"a PING of {len(rest)} bytes")
+            pong = b"\x04PONG" + rest[2:]
+            self._outgoing += bytes((COMMAND, len(pong))) + pong
+            return Heartbeat()
+        if name == b"PONG" and len(rest) <= CONTEXT_MAX_BYTES:
+            return Heartbeat()
+        raise ZmtpError(f"an unexpected command {name[:32].decode('latin-1')!a}")
+
+
+def encode(payload: bytes, delimiter: bool) -> bytes:
+    """Return one message as it goes over the wire, behind an empty frame where the peer is a
+    REQ.
+    """
+    head = b"\x01\x00" if delimiter else b""
+    if len(payload) < 256:
+        return head + bytes((0, len(payload))) + payload
+    return head + b"\x02" + _LONG_SIZE.pack(len(payload)) + payload
+
+
+def _check_properties(data: bytes) -> None:
+    """Check READY's properties: well-formed, and the socket type of a peer that a ROUTER serves.
+    Raises ZmtpError.
+    """
+    at, found = 0, None
+    while at < len(data):
+        name_end = at + 1 + data[at]
+        if data[at] == 0 or len(data) < name_end + 4:
+            raise ZmtpError("a malformed property in READY")
+        (size,) = _PROPERTY_SIZE.unpack_from(data, name_end)
+        value_end = name_end + 4 + size
+        if len(data) < value_end:
+            raise ZmtpError("a malformed property in READY")
+        # names are case-insensitive (specification, "The NULL security mechanism")
+        if data[at + 1 : name_end].lower() == b"socket-type":
+            found = data[name_end + 4 : value_end]
+        at = value_end
+    if found not in PEER_TYPES:
+        raise ZmtpError("the peer's socket is neither a DEALER nor a REQ")

@@ -1,0 +1,218 @@
+"""`schemas.runtime.zmtp`: recorded bytes of real peers, every refusal, and bounds that hold for any input."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas.runtime.zmtp import (
+    COMMAND_MAX_BYTES,
+    FRAMES_MAX,
+    GREETING,
+    READY,
+    Event,
+    Heartbeat,
+    Limits,
+    Message,
+    Oversize,
+    Ready,
+    ServerConnection,
+    ZmtpError,
+    encode,
+)
+
+LIMITS = Limits(message_max_bytes=1000, skip_max_bytes=4000)
+
+# what pyzmq 27.1 (libzmq 4.3.5) sent to a unix socket: greeting, READY, "hello", a heartbeat
+PEER_GREETING = bytes.fromhex("ff00000000000000017f03014e554c4c") + bytes(48)
+DEALER_READY = b"\x04)\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER\x08Identity\x00\x00\x00\x00"
+REQ_READY = b"\x04&\x05READY\x0bSocket-Type\x00\x00\x00\x03REQ\x08Identity\x00\x00\x00\x00"
+DEALER_HELLO = b"\x00\x05hello"
+REQ_HELLO = b"\x01\x00\x00\x05hello"
+PING = b"\x04\x07\x04PING\x00\x00"
+
+
+def events(connection: ServerConnection, data: bytes) -> list[Event]:
+    connection.feed(data)
+    found = []
+    while (event := connection.next_event()) is not None:
+        found.append(event)
+    return found
+
+
+def greeted(ready: bytes = DEALER_READY) -> ServerConnection:
+    connection = ServerConnection(LIMITS)
+    assert events(connection, PEER_GREETING + ready) == [Ready()]
+    connection.outgoing()
+    return connection
+
+
+def command(name: bytes, rest: bytes = b"") -> bytes:
+    body = bytes((len(name),)) + name + rest
+    return bytes((4, len(body))) + body
+
+
+def ready(*properties: tuple[bytes, bytes]) -> bytes:
+    return command(
+        b"READY",
+        b"".join(bytes((len(name),)) + name + len(value).to_bytes(4) + value for name, value in properties),
+    )
+
+
+@pytest.mark.parametrize(
+    ("recorded", "delimiter"),
+    [(DEALER_READY + DEALER_HELLO, False), (REQ_READY + REQ_HELLO, True)],
+    ids=["DEALER", "REQ"],
+)
+@pytest.mark.parametrize("piece", [1, 7, 1000])
+def test_recorded_peers_are_understood_in_pieces_of_any_size(
+    recorded: bytes, delimiter: bool, piece: int
+) -> None:
+    data = PEER_GREETING + recorded + PING
+    connection = ServerConnection(LIMITS)
+    found = [e for at in range(0, len(data), piece) for e in events(connection, data[at : at + piece])]
+    assert found == [Ready(), Message(b"hello", delimiter), Heartbeat()]
+    assert connection.outgoing() == GREETING + READY + b"\x04\x05\x04PONG"
+    assert connection.outgoing() == b""
+    assert connection.kept_bytes == 0
+
+
+def test_the_greeting_goes_out_first_and_ready_only_to_a_zmtp_peer() -> None:
+    connection = ServerConnection(LIMITS)
+    assert connection.outgoing() == GREETING
+    assert connection.next_event() is None
+    assert connection.outgoing() == b""
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"GET / HTTP/1.1\r\n", "not a ZMTP greeting"),
+        (b"\xff\x00\x00\x00\x00\x00\x00\x00\x01\x00", "not a ZMTP greeting"),
+        (PEER_GREETING[:10] + b"\x01", "ZMTP 1"),
+        (PEER_GREETING[:12] + b"CURVE".ljust(20, b"\x00") + bytes(32), "security mechanism"),
+        (PEER_GREETING + DEALER_HELLO, "a message before READY"),
+        (PEER_GREETING + PING, "a command before READY"),
+        (PEER_GREETING + command(b"ERROR", b"\x00"), "refused the handshake"),
+        (PEER_GREETING + ready(), "neither a DEALER nor a REQ"),
+        (PEER_GREETING + ready((b"Socket-Type", b"PUB")), "neither a DEALER nor a REQ"),
+        (PEER_GREETING + command(b"READY", b"\x00"), "malformed property"),
+        (PEER_GREETING + command(b"READY", b"\x0bSocket-Type\x00\x00\xff\xffDEALER"), "malformed property"),
+        (PEER_GREETING + command(b"READY", b"\x0bSocket"), "malformed property"),
+        (PEER_GREETING + b"\x04\x00", "without a name"),
+        (PEER_GREETING + b"\x04\x01\x05", "without a name"),
+        (PEER_GREETING + b"\x06" + (COMMAND_MAX_BYTES + 1).to_bytes(8), "a command of"),
+        (PEER_GREETING + DEALER_READY + DEALER_READY, "unexpected command 'READY'"),
+        (PEER_GREETING + DEALER_READY + command(b"SUBSCRIBE"), "unexpected command 'SUBSCRIBE'"),
+        (PEER_GREETING + DEALER_READY + command(b"\x1b[2J"), r"'\\x1b\[2J'"),
+        (PEER_GREETING + DEALER_READY + command(b"PING"), "a PING of 0 bytes"),
+        (PEER_GREETING + DEALER_READY + command(b"PING", bytes(19)), "a PING of 19 bytes"),
+        (PEER_GREETING + DEALER_READY + b"\x08\x00", "flags 0x08"),
+        (PEER_GREETING + DEALER_READY + b"\x05\x00", "flags 0x05"),
+        (PEER_GREETING + DEALER_READY + b"\x01\x00" * (FRAMES_MAX + 1), "more than 8 frames"),
+        (PEER_GREETING + DEALER_READY + b"\x02" + b"\xff" * 8, "at most 4000 are read"),
+        (
+            PEER_GREETING
+            + DEALER_READY
+            + b"\x03"
+            + (2001).to_bytes(8)
+            + bytes(2001)
+            + b"\x03"
+            + (2000).to_bytes(8),
+            "at most 4000",
+        ),
+    ],
+)
+def test_what_breaks_the_protocol_is_refused(data: bytes, reason: str) -> None:
+    connection = ServerConnection(LIMITS)
+    with pytest.raises(ZmtpError, match=reason):
+        events(connection, data)
+
+
+def test_names_of_properties_are_case_insensitive_and_unknown_ones_are_allowed() -> None:
+    connection = ServerConnection(LIMITS)
+    data = PEER_GREETING + ready((b"X-Version", b"1"), (b"socket-type", b"DEALER"))
+    assert events(connection, data) == [Ready()]
+
+
+def test_an_identity_of_the_peer_is_read_over() -> None:
+    """libzmq's ROUTER aborted on an identity that equals its next automatic routing id."""
+    connection = ServerConnection(LIMITS)
+    data = PEER_GREETING + ready((b"Socket-Type", b"DEALER"), (b"Identity", b"\x00\x00\x00\x00\x01"))
+    assert events(connection, data) == [Ready()]
+
+
+@pytest.mark.parametrize("delimiter", [False, True])
+def test_a_message_over_the_limit_is_skipped_unkept_and_the_next_one_is_read(delimiter: bool) -> None:
+    connection = greeted()
+    head = (b"\x01\x00" if delimiter else b"") + b"\x02" + (3000).to_bytes(8)
+    assert events(connection, head) == []
+    for _ in range(30):
+        assert connection.kept_bytes == 0
+        found = events(connection, bytes(100))
+    assert found == [Oversize(3000, 1000, delimiter)]
+    assert events(connection, DEALER_HELLO) == [Message(b"hello", False)]
+
+
+def test_the_limit_counts_all_frames_of_a_message() -> None:
+    """libzmq's ZMQ_MAXMSGSIZE is per frame: frames with MORE grew the daemon to 1,454 MiB."""
+    connection = greeted()
+    frame = b"\x03" + (600).to_bytes(8) + bytes(600)
+    assert events(connection, frame + frame) == []
+    assert connection.kept_bytes == 0
+    assert events(connection, b"\x00\x00") == [Oversize(1200, 1000, False)]
+
+
+def test_an_envelope_of_another_form_arrives_as_an_empty_payload() -> None:
+    """The server answers it with a typed error instead of guessing which frame was meant."""
+    connection = greeted()
+    assert events(connection, b"\x01\x01a\x00\x01b") == [Message(b"", False)]
+    assert events(connection, b"\x01\x00\x01\x00\x00\x01b") == [Message(b"", True)]
+    assert events(connection, b"\x01\x00\x00\x01b") == [Message(b"b", True)]
+
+
+def test_a_ping_is_answered_with_its_context_and_a_pong_is_not() -> None:
+    connection = greeted()
+    assert events(connection, command(b"PING", b"\x00\x64context") + command(b"PONG")) == [
+        Heartbeat(),
+        Heartbeat(),
+    ]
+    assert connection.outgoing() == b"\x04\x0c\x04PONGcontext"
+
+
+@given(
+    payloads=st.lists(st.binary(max_size=700), max_size=6),
+    delimiter=st.booleans(),
+    pieces=st.lists(st.integers(1, 400), max_size=20),
+)
+def test_what_is_encoded_is_read_again(payloads: list[bytes], delimiter: bool, pieces: list[int]) -> None:
+    data = b"".join(encode(payload, delimiter) for payload in payloads)
+    connection, found, at = greeted(), [], 0
+    for piece in [*pieces, len(data)]:
+        found += events(connection, data[at : at + piece])
+        at += piece
+    assert found == [Message(payload, delimiter) for payload in payloads]
+
+
+@given(
+    data=st.lists(
+        st.one_of(
+            st.binary(max_size=80),
+            st.sampled_from([PEER_GREETING, DEALER_READY, REQ_READY, DEALER_HELLO, REQ_HELLO, PING]),
+            st.builds(lambda size: b"\x02" + size.to_bytes(8), st.integers(0, 5000)),
+            st.builds(bytes, st.integers(0, 3000)),
+        ),
+        max_size=12,
+    )
+)
+def test_any_bytes_give_events_or_one_error_and_little_is_kept(data: list[bytes]) -> None:
+    connection = ServerConnection(LIMITS)
+    events(connection, PEER_GREETING)
+    try:
+        for piece in data:
+            for event in events(connection, piece):
+                if isinstance(event, Message):
+                    assert len(event.payload) <= LIMITS.message_max_bytes
+            assert connection.kept_bytes <= LIMITS.message_max_bytes + COMMAND_MAX_BYTES
+            assert len(connection.outgoing()) <= len(GREETING) + len(READY) + 2 * len(piece)
+    except ZmtpError:
+        pass
