@@ -152,6 +152,10 @@ class ArbiterUnreachable(TransientError):
     code = "arbiter_unreachable"
 
 
+class UntrustedServer(OperatorError):
+    code = "untrusted_server"  # another user's process serves the socket: details.uid, user, endpoint
+
+
 class AlreadyRunning(OperatorError):
     code = "already_running"
 

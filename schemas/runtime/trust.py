@@ -1,0 +1,90 @@
+"""Which user serves a socket, by the kernel's word, and whether a client may believe it.
+
+A client trusts root, its own user, the unit's user for the program it asks (`SERVICE_USERS`) and the users named in
+`VRAM_ARBITER_SERVER_USERS`. A folder that others may write, or a socket left by another user, is then no danger: the check is
+about the process that listens, not about files. It must not know what is said on the socket.
+"""
+
+import os
+import pwd
+import socket
+import struct
+from collections.abc import Mapping
+from typing import Final, Literal
+
+from schemas.errors import ConfigError, UntrustedServer
+
+USERS_VARIABLE: Final = "VRAM_ARBITER_SERVER_USERS"
+ROOT: Final = 0
+
+Program = Literal["arbiter", "runner", "sidecar"]
+SERVICE_USERS: Final[Mapping[Program, str]] = {
+    "arbiter": "vram-arbiter",
+    "runner": "vram-robot",
+    "sidecar": "vram-sidecar",
+}
+"""The users of configs/systemd. Only root can make a user of such a name."""
+
+_UCRED = struct.Struct("iII")  # pid, uid, gid
+
+
+def check_server(connected: socket.socket, program: Program, where: str) -> None:
+    """Check the process that listens at the other end of a connected unix socket, before anything is sent or believed.
+
+    `where` names the endpoint in the error. Raises UntrustedServer, ConfigError for a `VRAM_ARBITER_SERVER_USERS` that names
+    unknown users.
+    """
+    check_uid(server_uid(connected), program, where)
+
+
+def server_uid(connected: socket.socket) -> int:
+    """The uid of the process that called listen() on the other end of a connected unix socket (SO_PEERCRED)."""
+    _, uid, _ = _UCRED.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size))
+    return int(uid)
+
+
+def frame_uid(peer_address: object) -> int | None:
+    """The uid in libzmq's `Peer-Address` of a frame (`localhost:UID:GID:PID` on ipc), None where it names none."""
+    parts = peer_address.rsplit(":", 3) if isinstance(peer_address, str) else []
+    return int(parts[1]) if len(parts) == 4 and all(part.isdecimal() for part in parts[1:]) else None
+
+
+def check_uid(uid: int, program: Program, where: str, environ: Mapping[str, str] | None = None) -> None:
+    """Raises UntrustedServer unless a `program` that `uid` serves may be believed."""
+    if trusts(uid, program, environ):
+        return
+    user = _name_of(uid)
+    raise UntrustedServer(
+        f"{where} is served by uid {uid}{f' ({user})' if user else ''}, not by a user that may serve the {program}",
+        hint=f"nothing was asked of it and nothing it says is believed; if it may serve, set {USERS_VARIABLE}={uid}",
+        details={"endpoint": where, "uid": uid, "user": user, "program": program},
+    )
+
+
+def trusts(uid: int, program: Program, environ: Mapping[str, str] | None = None) -> bool:
+    """Whether a `program` that `uid` serves may be believed. Raises ConfigError as `check_server` does."""
+    if uid in (ROOT, os.geteuid()):
+        return True
+    if _name_of(uid) == SERVICE_USERS[program]:
+        return True
+    chosen = (os.environ if environ is None else environ).get(USERS_VARIABLE, "")
+    return uid in [_uid_of(user.strip()) for user in chosen.split(",") if user.strip()]
+
+
+def _name_of(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return ""
+
+
+def _uid_of(user: str) -> int:
+    if user.isdecimal():
+        return int(user)
+    try:
+        return pwd.getpwnam(user).pw_uid
+    except KeyError:
+        raise ConfigError(
+            f"{USERS_VARIABLE} names {user!r}, which is not a user of this machine",
+            hint="write user names or uids, separated by commas",
+        ) from None

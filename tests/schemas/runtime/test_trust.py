@@ -1,0 +1,79 @@
+"""Clients ask the kernel which user serves a socket: a false server was believed by everything that asked it."""
+
+import os
+import pwd
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from schemas.errors import ConfigError, UntrustedServer, from_wire
+from schemas.runtime.trust import SERVICE_USERS, check_server, check_uid, frame_uid, trusts
+
+FOREIGN = 54_321
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can start a server of another user")
+FALSE_SERVER = Path(__file__).with_name("false_server.py")
+
+
+def test_root_and_the_own_user_are_trusted(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as server, socket.socket(socket.AF_UNIX) as client:
+        server.bind(str(tmp_path / "s"))
+        server.listen()
+        client.connect(str(tmp_path / "s"))
+        check_server(client, "runner", "here")
+    assert trusts(0, "arbiter")
+
+
+@as_root
+def test_the_kernel_names_the_user_who_listens(tmp_path: Path) -> None:
+    nobody = pwd.getpwnam("nobody").pw_uid
+    os.chown(tmp_path, nobody, -1)
+    command = [sys.executable, str(FALSE_SERVER), str(tmp_path), "s", str(nobody)]
+    with (
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child,
+        socket.socket(socket.AF_UNIX) as client,
+    ):
+        assert child.stdout is not None
+        child.stdout.readline()
+        client.connect(str(tmp_path / "s"))
+        with pytest.raises(UntrustedServer, match=rf"served by uid {nobody} \(nobody\)") as raised:
+            check_server(client, "runner", f"ipc://{tmp_path}/s")
+        child.communicate()
+    again = from_wire(raised.value.to_wire())
+    assert isinstance(again, UntrustedServer)
+    assert again.details["uid"] == nobody
+
+
+def test_users_can_be_named() -> None:
+    named = {"VRAM_ARBITER_SERVER_USERS": f"root, {FOREIGN}"}
+    check_uid(FOREIGN, "arbiter", "x", named)
+    with pytest.raises(UntrustedServer, match=f"VRAM_ARBITER_SERVER_USERS={FOREIGN + 1}"):
+        check_uid(FOREIGN + 1, "arbiter", "x", named)
+    with pytest.raises(ConfigError, match="'no-such-user', which is not a user"):
+        trusts(FOREIGN, "arbiter", {"VRAM_ARBITER_SERVER_USERS": "no-such-user"})
+
+
+def test_the_units_users_are_those_that_are_trusted() -> None:
+    """Only for their own program: a sidecar, which reads foreign weights, is not believed as the arbiter."""
+    units = Path(__file__).parents[3] / "configs/systemd/system"
+    for program, user in SERVICE_USERS.items():
+        unit = units / ("vram-arbiter.service" if program == "arbiter" else f"vram-{program}@.service")
+        assert f"User={user}" in unit.read_text().splitlines()
+    assert len(set(SERVICE_USERS.values())) == len(SERVICE_USERS)
+
+
+@pytest.mark.parametrize(
+    ("address", "uid"),
+    [
+        ("localhost:0:0:17", 0),
+        ("localhost:1000:1000:17", 1000),
+        ("127.0.0.1", None),
+        ("", None),
+        (None, None),
+        ("a:-1:2:3", None),
+    ],
+)
+def test_the_uid_of_a_frame(address: str | None, uid: int | None) -> None:
+    assert frame_uid(address) == uid
