@@ -20,6 +20,7 @@ from schemas.errors import (
     ProbeFailed,
     VramError,
 )
+from schemas.yamltext import read_text
 
 EXIT_USAGE, EXIT_ALREADY_RUNNING, EXIT_NO_GPU, EXIT_NO_DISK, EXIT_DEFECT = 2, 3, 4, 5, 70
 CONFIG_NAME = "arbiter.yaml"
@@ -92,12 +93,7 @@ def effective_config(flags: argparse.Namespace) -> ArbiterConfig:
     """The file's configuration with the flags over it. Raises ConfigError."""
     config = ArbiterConfig()
     if flags.config is not None:
-        try:
-            text = flags.config.read_text()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(
-                f"{flags.config}: {error}", hint="--config needs a readable YAML file"
-            ) from error
+        text = read_text(flags.config, hint="--config needs a readable YAML file")
         config = load_config(text, str(flags.config))
     values = config.model_dump()
     for section, key, value, flag in (

@@ -22,9 +22,9 @@ from runner.skills.sidecar_policy import wire_up
 from runner.world_state import JOINT_STATE
 from schemas.errors import ConfigError, ManifestInvalid, UnknownSkill
 from schemas.manifest import Kind, RSkillManifest
-from schemas.robot import RobotEnvironment, VlaSpec, load_robot
+from schemas.robot import RobotEnvironment, VlaSpec, robot_of
 from schemas.yamltext import Path as FieldPath
-from schemas.yamltext import Problem, YamlText, config_error, parse_yaml
+from schemas.yamltext import Problem, YamlText, config_error, parse_yaml, read_text
 
 LICENCE_FLAG = "--allow-noncommercial"
 
@@ -59,13 +59,8 @@ class DeploymentFile:
 
 def read_deployment(path: Path) -> DeploymentFile:
     """Raises ConfigError: the file cannot be read, or every mistake in it by line and field."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"{path} cannot be read: {error}", hint="--config takes a deployment file"
-        ) from error
-    return DeploymentFile(load_robot(text, path.name), parse_yaml(text, path.name))
+    source = parse_yaml(read_text(path, hint="--config takes a deployment file"), path.name)
+    return DeploymentFile(robot_of(source), source)
 
 
 @dataclass(frozen=True, slots=True)

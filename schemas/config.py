@@ -5,15 +5,16 @@ keys with the same defaults, and a test holds both together. No key is required:
 """
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from schemas import defaults as d
 from schemas.errors import ConfigError
 from schemas.otel import checked_url
 from schemas.units import ByteSize, parse_bytes
-from schemas.yamltext import Path, config_error, parse_yaml, problems_of
+from schemas.yamltext import Path, parse_yaml, validated
 
 Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
 
@@ -289,7 +290,4 @@ def load_config(text: str, name: str) -> ArbiterConfig:
     if isinstance(data, dict):
         # `verify:` with all its keys commented out is an empty section, not a mistake
         data = {key: {} if value is None and (key,) in known_keys() else value for key, value in data.items()}
-    try:
-        return ArbiterConfig.model_validate(data)
-    except ValidationError as error:
-        raise config_error(name, problems_of(error, source, known_keys())) from error
+    return validated(ArbiterConfig, replace(source, data=data), known_keys())

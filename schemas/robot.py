@@ -9,12 +9,12 @@ from collections.abc import Collection, Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from schemas.body import Body, Capability
 from schemas.manifest.contracts import SafetyEnvelope
 from schemas.manifest.vocabulary import EmbodimentTag
-from schemas.yamltext import Path, config_error, parse_yaml, problems_of
+from schemas.yamltext import Path, YamlText, parse_yaml, validated
 
 RATE_HZ_MAX = 1000.0
 MAX_AGE_MS = 100.0
@@ -151,8 +151,9 @@ def load_robot(text: str, name: str) -> RobotEnvironment:
 
     Raises ConfigError with every mistake and its line: `robot.yaml:7: sensors[0].bakend: unknown key; did you mean backend?`
     """
-    source = parse_yaml(text, name)
-    try:
-        return RobotEnvironment.model_validate(source.data)
-    except ValidationError as error:
-        raise config_error(name, problems_of(error, source, known_keys())) from error
+    return robot_of(parse_yaml(text, name))
+
+
+def robot_of(source: YamlText) -> RobotEnvironment:
+    """Return a parsed deployment file as its model. Raises ConfigError with every mistake and its line."""
+    return validated(RobotEnvironment, source, known_keys())

@@ -6,11 +6,11 @@ Pure: `load_scenario(text, name)` takes the text of a file. configs/scenarios ho
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from schemas import defaults as d
 from schemas.units import ByteSize
-from schemas.yamltext import Path, config_error, parse_yaml, problems_of
+from schemas.yamltext import Path, parse_yaml, validated
 
 Seconds = Annotated[float, Field(ge=0, le=86_400, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
@@ -187,7 +187,4 @@ def load_scenario(text: str, name: str) -> Scenario:
     Raises ConfigError with every mistake, each with its line: `robot.yaml:12: consumers.grab.lod_s: unknown key; did you mean load_s?`
     """
     source = parse_yaml(text, name)
-    try:
-        return Scenario.model_validate(source.data)
-    except ValidationError as error:
-        raise config_error(name, problems_of(error, source, _Keys(source.data))) from error
+    return validated(Scenario, source, _Keys(source.data))

@@ -12,7 +12,7 @@ from schemas.errors import ConfigError
 from schemas.manifest import RSkillManifest, load_manifest
 from schemas.units import ByteSize, parse_bytes
 from schemas.wire import Footprint, LeaseSpec
-from schemas.yamltext import parse_yaml
+from schemas.yamltext import read_yaml
 from sidecars.weights import Weights, resolve
 
 NICE = 5  # a third of the cores' time beside one ordinary program, all of it when nobody else wants them
@@ -94,10 +94,7 @@ def read_model(rskill: Path, configs: Path) -> tuple[RSkillManifest, Weights]:
 
 def read_footprints(path: Path) -> dict[str, FootprintEntry]:
     """All entries of a footprint file. Raises ConfigError naming file, line and problem."""
-    try:
-        document = parse_yaml(path.read_text(), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} cannot be read: {error}") from error
+    document = read_yaml(path)
     if not isinstance(document.data, Mapping):
         raise ConfigError(f"{path}: must be a map from manifest names to footprints")
     entries = {}

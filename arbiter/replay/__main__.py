@@ -15,7 +15,7 @@ from arbiter.replay import compare, runner, text
 from arbiter.replay.codec import to_json
 from arbiter.replay.outcome import Outcome, as_plain
 from schemas import terminal
-from schemas.errors import ConfigError, VramError
+from schemas.errors import VramError
 
 DONE, NO = 0, 1
 TIMELINE_LINES = 40
@@ -134,13 +134,9 @@ def what_if(log: Path, policies: Sequence[str], *, as_json: bool) -> int:
 def simulate(path: Path, policies: Sequence[str], timeline: int | None, *, as_json: bool) -> int:
     from arbiter.replay.scenarios import settings_of, workload_of
     from schemas.scenario import load_scenario
+    from schemas.yamltext import read_text
 
-    try:
-        scenario = load_scenario(path.read_text(), path.name)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}", hint=_WHAT_TO_SIMULATE) from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not text", hint=_WHAT_TO_SIMULATE) from error
+    scenario = load_scenario(read_text(path, hint=_WHAT_TO_SIMULATE), path.name)
     settings = settings_of(scenario)
     outcomes = [compare.under(workload_of(scenario), settings, name) for name in policies]
     shown = (TIMELINE_LINES if len(outcomes) == 1 else 0) if timeline is None else timeline

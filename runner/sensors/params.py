@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from schemas.errors import ConfigError
 from schemas.robot import SensorReaderConfig
-from schemas.yamltext import Problem, config_error, parse_yaml, problems_of
+from schemas.yamltext import Problem, YamlText, config_error, problems_of
 
 
 class BackendParams(BaseModel):
@@ -27,7 +27,7 @@ def read_params[P: BackendParams](config: SensorReaderConfig, model: type[P]) ->
     try:
         return model.model_validate(dict(config.backend_params))
     except ValidationError as error:
-        empty = parse_yaml("", "")  # no text here, so no lines: who read the file knows them
+        empty = YamlText("", {}, {})  # the lines are known where the file was read
         known: Mapping[tuple[str | int, ...], list[str]] = {(): list(model.model_fields)}
         found = [(p.field, p.problem) for p in problems_of(error, empty, known)]
         raise _error(config, found) from error

@@ -11,10 +11,9 @@ import math
 from pathlib import Path
 from typing import Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from schemas.errors import ConfigError
-from schemas.yamltext import config_error, parse_yaml, problems_of
+from schemas.yamltext import read_yaml, validated
 
 ARM_JOINTS: Final = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 BASE_JOINTS: Final = ("base_x", "base_y", "base_yaw")
@@ -118,16 +117,7 @@ class SceneConfig(BaseModel):
     @classmethod
     def load(cls, path: Path | None = None) -> SceneConfig:
         """The scene of a YAML file (keys as the fields), or the built-in one. Raises ConfigError with the file's name, line and field."""
-        if path is None:
-            return cls()
-        try:
-            source = parse_yaml(path.read_text(encoding="utf-8"), str(path))
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"the scene {path} cannot be read: {error}") from error
-        try:
-            return cls.model_validate(source.data)
-        except ValidationError as error:
-            raise config_error(str(path), problems_of(error, source, {(): set(cls.model_fields)})) from error
+        return cls() if path is None else validated(cls, read_yaml(path))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

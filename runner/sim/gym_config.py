@@ -14,8 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from schemas.control import JOINT_MODES, ControlMode
 from schemas.errors import ConfigError
 from schemas.manifest.vocabulary import EmbodimentTag
-from schemas.yamltext import config_error as said
-from schemas.yamltext import parse_yaml, problems_of
+from schemas.yamltext import read_yaml, validated
 
 RENDER: Final = "render"  # the camera that is the environment's own `render()`
 SUCCESS_KEYS: Final = ("is_success", "success")  # of `info`, where nothing else is said
@@ -89,14 +88,7 @@ class GymConfig(BaseModel):
     @classmethod
     def load(cls, path: Path) -> GymConfig:
         """Raises ConfigError with the file's name, line and field."""
-        try:
-            source = parse_yaml(path.read_text(encoding="utf-8"), str(path))
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"the environment's file {path} cannot be read: {error}") from error
-        try:
-            return cls.model_validate(source.data)
-        except ValidationError as error:
-            raise said(str(path), problems_of(error, source, {(): set(cls.model_fields)})) from error
+        return validated(cls, read_yaml(path))
 
     def with_success(self, rule: str) -> GymConfig:
         """Raises ConfigError for a rule that is none."""

@@ -24,6 +24,7 @@ class Problem:
     path: Path
     message: str
     line: int | None = None
+    column: int | None = None
 
     @property
     def field(self) -> str:
@@ -38,7 +39,8 @@ class Problem:
 
     def at(self, source: str) -> str:
         """The finding with its place in the file: `rskill.yaml:12: quantization.dtype: …`."""
-        return f"{source}:{self.line}: {self}" if self.line else f"{source}: {self}"
+        place = "".join(f":{number}" for number in (self.line, self.column) if number)
+        return f"{source}{place}: {self}"
 
     def below(self, prefix: Path) -> "Problem":
         """The same finding seen from the enclosing value."""

@@ -177,7 +177,7 @@ def test_simulate_prints_decisions_and_tables(capsys: pytest.CaptureFixture[str]
     )
     broken.write_bytes(b"\xff\xfe")
     assert main(["simulate", str(broken)]) == 1
-    assert "not text" in capsys.readouterr().err
+    assert "not UTF-8 text" in capsys.readouterr().err
     with pytest.raises(SystemExit) as end:
         main(["simulate", path, "--timeline", "-3"])
     assert end.value.code == 2

@@ -42,7 +42,7 @@ CAMERA = "{parent: %s, width_px: 64, height_px: 48, fovy_deg: 43.0, pos_m: [0, 0
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("cameras: [unclosed\n", r"scene.yaml:\d+: not valid YAML"),
+        ("cameras: [unclosed\n", r"scene.yaml:2:1: not valid YAML"),
         ("- a list\n", r"scene.yaml"),
         ("object_count: 3\ntimestep_s: 0\n", r"scene.yaml:2: timestep_s"),
         ("timestep_s: 0.1\n", r"scene.yaml:1: timestep_s"),  # not one step in a control period

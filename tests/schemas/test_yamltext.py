@@ -1,0 +1,137 @@
+"""One loader reads all YAML of the product; a hostile text ended in RecursionError, AttributeError or gigabytes of memory."""
+
+import re
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas.config import load_config
+from schemas.errors import ConfigError
+from schemas.manifest import ManifestError, parse_manifest
+from schemas.robot import load_robot
+from schemas.scenario import load_scenario
+from schemas.yamltext import DEPTH_MAX, NODES_MAX, TEXT_MAX_BYTES, parse_yaml, read_yaml
+
+ROOT = Path(__file__).parents[2]
+DEEP_BY_ALIASES = "a: &a " + "[" * 40 + "]" * 40 + "\nb: " + "[" * 40 + "*a" + "]" * 40
+LAUGHS = "a: &a {x: 1, y: 2}\n" + "".join(
+    f"{new}: &{new} {{<<: [{', '.join([f'*{old}'] * 20)}]}}\n"
+    for old, new in zip("abcdef", "bcdefg", strict=True)
+)
+
+
+def said(content: str | bytes) -> str:
+    with pytest.raises(ConfigError) as raised:
+        parse_yaml(content, "x.yaml")
+    assert raised.value.details["fields"]
+    return raised.value.message
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("gpu: &a\n  source: *a", "x.yaml:1:6: gpu.source: contains itself"),
+        ("gpu: &a [*a]", "x.yaml:1:6: gpu[0]: contains itself"),
+        ("gpu: &a {<<: *a}", "x.yaml:1:6: gpu.<<: contains itself"),
+        ("&a ? *a\n: 1", "not valid YAML"),
+        ("[" * 100_000, "x.yaml:1:65: not valid YAML: nested deeper than 64 levels"),
+        ("{a: " * 100_000, "nested deeper than 64 levels"),
+        ("- " * 100_000, "x.yaml:1:129: not valid YAML: nested deeper than 64 levels"),
+        ("? " * 100_000, "nested deeper than 64 levels"),
+        (DEEP_BY_ALIASES, "nested deeper than 64 levels, aliases expanded"),
+        (LAUGHS, "more than 100000 values, aliases expanded"),
+        ("[" + "1," * (NODES_MAX + 1) + "]", "more than 100000 values"),
+        ("a: !!timestamp x", "x.yaml:1:4: not valid YAML: 'x' cannot be read as timestamp"),
+        ("a: !!bool x", "x.yaml:1:4: not valid YAML: 'x' cannot be read as bool"),
+        ("a: !!int ''", "x.yaml:1:4: not valid YAML: '' cannot be read as int"),
+        ("a: !!float x", "x.yaml:1:4: not valid YAML: 'x' cannot be read as float"),
+        ("a: !!map x", "x.yaml:1:4: not valid YAML: expected a mapping node"),
+        ("a:\n - !!binary aGk=", "x.yaml:2:4: a[0]: the tag !!binary is not read here"),
+        ("a: !!set {x}", "the tag !!set is not read here"),
+        ("a: !mine x", "the tag !mine is not read here"),
+        ("!!python/name:os.system x: 1", "the tag !!python/name:os.system is not read here"),
+        ("a: " + "9" * 5000, "x.yaml:1:4: a: 5000 characters are too many for the type int"),
+        ("a: 1" + ":59" * 5000, "too many for the type int"),
+        ("a: 0x" + "f" * 5000, "too many for the type int"),
+        ("? {a: 1}\n: x", "x.yaml:1:3: a key must be a single value"),
+        ('a: "\\0"', "x.yaml:1:4: a: holds a character that no text may hold"),
+        ('a: "\\ud800"', "x.yaml:1:4: a: holds a character that no text may hold"),
+        ('\na: "\\Uffffffff"', "x.yaml:2: not valid YAML"),
+        ("%YAML " + "9" * 5000 + ".1\n--- a", "x.yaml:1: not valid YAML"),
+        ("a: 1\nb: \x07", "x.yaml:2:4: not valid YAML: special characters are not allowed"),
+        ("a: 1\na: 2\nb: 1\nb: 2", "x.yaml:4:1: b: key given twice; first in line 3"),
+        (b"a: 1\nb: \xff", "x.yaml:2: not UTF-8 text"),
+        (b"#" * (TEXT_MAX_BYTES + 1), "x.yaml: larger than 1048576 bytes"),
+    ],
+)  # fmt: skip
+def test_a_text_that_cannot_be_read_names_its_place(content: str | bytes, expected: str) -> None:
+    assert expected in said(content)
+
+
+def test_the_limits_leave_room_for_what_people_write() -> None:
+    deep = "[" * (DEPTH_MAX - 1) + "]" * (DEPTH_MAX - 1)
+    assert parse_yaml(f"a: {deep[1:-1]}", "x").data
+    text = "base: &base {rate: 2, when: 2026-01-02}\nhere: {<<: *base, rate: 3}\n~: .inf\n7: 0x1f\n"
+    found = parse_yaml("\ufeff".encode() + text.encode(), "x")
+    assert found.data["here"]["rate"] == 3
+    assert found.data[7] == 31
+    assert found.line(("here", "rate")) == 2
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").rglob("*.yaml")), ids=lambda path: path.name)
+def test_every_shipped_file_is_read(path: Path) -> None:
+    assert read_yaml(path).data
+
+
+def test_a_file_that_cannot_be_read_is_a_typed_error(tmp_path: Path) -> None:
+    for path, reason in (
+        (tmp_path / "none.yaml", "No such file or directory"),
+        (tmp_path, "Is a directory"),
+        (Path("/dev/zero"), "larger than 1048576 bytes"),
+        (Path("a\0b"), "null"),
+    ):
+        with pytest.raises(ConfigError, match=reason):
+            read_yaml(path)
+
+
+def test_no_other_module_reads_yaml() -> None:
+    """Each loader of its own would need these limits again."""
+    users = {
+        str(path.relative_to(ROOT))
+        for package in ("arbiter", "clients", "reasoner", "runner", "schemas", "sidecars")
+        for path in (ROOT / package).rglob("*.py")
+        if re.search(r"^\s*(import|from) (yaml|ruamel)\b", path.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert users == {"schemas/yamltext.py"}
+
+
+WORDS = st.sampled_from(
+    ["a: ", "gpu: ", "sensors: ", "hal: ", "- ", "? ", ": ", "[", "]", "{", "}", ",", "\n", "\n  ", "&a ", "*a ", "<<: ", "!!timestamp ",
+     "!!binary ", "!!int ", "!!set ", "!!omap ", "!!merge ", "! ", "!x ", "!!null ", "~", "1", "x", "'", '"', "|\n", ">-\n", "=", "%", "--- ",
+     "... ", "0x", "1:1", ".nan", "2026-01-02", "1e999", "# "]
+)  # fmt: skip
+
+
+@given(st.lists(WORDS | st.text(max_size=4), max_size=30).map("".join))
+def test_no_text_raises_anything_but_a_typed_error(text: str) -> None:
+    for load in (parse_yaml, load_config, load_robot, load_scenario, parse_manifest):
+        try:
+            load(text, "x.yaml")
+        except (ConfigError, ManifestError) as error:
+            str(error).encode()
+
+
+def test_a_hostile_text_of_full_size_ends_soon() -> None:
+    """Quadratic work would need hours; the limit is generous towards busy machines."""
+    began = time.process_time()
+    for text in (
+        "[" * TEXT_MAX_BYTES,
+        "a: 1" + ":5" * 500_000,
+        "a: '" + "x" * 1_000_000,
+        "1" * TEXT_MAX_BYTES,
+    ):
+        said(text)
+    assert time.process_time() - began < 60
