@@ -282,7 +282,10 @@ class Daemon:
         else:
             inbox.post(Tick())  # lets the core ask for its first readings
         if traced is not None:
-            traced.watch(loop, lambda: None if inbox.closed else inbox.figures())
+            traced.watch(
+                loop,
+                lambda: None if inbox.closed else {**inbox.figures(), "journal_healthy": not journal.problem},
+            )
         server.bind()  # 6
         server.start(loop, sessions.receive)
         undo.callback(server.stop_receiving)
@@ -316,7 +319,8 @@ class Daemon:
             log.info("telemetry: Prometheus endpoint on loopback, port %d", installed.prometheus_port)
         from arbiter.host.traced import Traced
 
-        traced = Traced(self._environ.get(TRACEPARENT_VARIABLE))
+        version = self._server_name.partition(" ")[2]
+        traced = Traced(self._environ.get(TRACEPARENT_VARIABLE), version)
         undo.push(lambda _, error, __: traced.close(self._exit_code, error))
         return traced
 

@@ -5,6 +5,7 @@ microseconds). Must not decide anything; sockets, files and threads are behind t
 """
 
 import logging
+import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -49,6 +50,8 @@ class Traces(Protocol):
     def outgoing(self, effects: Sequence[fx.Effect]) -> None: ...
 
     def revoke(self, body: Mapping[str, Any]) -> Mapping[str, Any]: ...
+
+    def wrote(self, seconds: float, *, failed: bool) -> None: ...
 
 
 class Executor:
@@ -135,11 +138,14 @@ class Executor:
         if self.owed:
             named = {key for key, _ in changes}
             owed = [(key, None) for key in self.owed if key not in named]
+        began = time.monotonic()
         try:
             self._journal.apply([*owed, *changes])
+            self._count_write(began, failed=False)
             self.owed.clear()
             return _NOTHING
         except JournalUnavailable as error:
+            self._count_write(began, failed=True)
             log.error("journal: %s", error)
             failed: dict[str, JournalUnavailable] = {}
             gates = {e.key for e in records if isinstance(e, fx.JournalPut) and e.gates}
@@ -152,6 +158,10 @@ class Executor:
                     failed[key] = error
                 self._post(ev.JournalFailed(key, error.message, key in gates))
             return failed
+
+    def _count_write(self, began: float, *, failed: bool) -> None:
+        if self._traces is not None:
+            self._traces.wrote(time.monotonic() - began, failed=failed)
 
 
 def _lease_of(effect: fx.Effect) -> str | None:

@@ -53,6 +53,8 @@ class Counts(Protocol):
 
     def evicted(self, verdict: str) -> None: ...
 
+    def wrote(self, seconds: float, *, failed: bool) -> None: ...
+
 
 @dataclass(slots=True)
 class _Acquire:
@@ -118,6 +120,10 @@ class LeaseTelemetry:
         own: dict[str, str] = {}
         _W3C.inject(own, trace.set_span_in_context(leaving.evict, Context()))
         return {**body, **own}  # nothing is added where only metrics are on
+
+    def wrote(self, seconds: float, *, failed: bool) -> None:
+        """One transaction of the journal."""
+        self._counts.wrote(seconds, failed=failed)
 
     # -- what has happened -------------------------------------------------------------------------------------------------
     def observe(self, event: Event) -> Mapping[str, str]:

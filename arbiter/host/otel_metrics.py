@@ -5,6 +5,7 @@ finished picture every PICTURE_S, and a picture that is old is not shown at all.
 """
 
 import asyncio
+import platform
 import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -28,7 +29,9 @@ Figures = Mapping[str, Any]
 class LeaseMetrics:
     """`watch` on the loop's thread begins the pictures, `close` ends them."""
 
-    def __init__(self, meter: metrics.Meter, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, meter: metrics.Meter, clock: Callable[[], float] = time.monotonic, version: str = ""
+    ) -> None:
         self._clock = clock
         self._consumers: set[str] = set()
         self._picture: tuple[float, Figures] | None = None  # swapped as a whole: read by other threads
@@ -45,15 +48,29 @@ class LeaseMetrics:
         for name, read, unit, what in (
             (names.METRIC_WAITERS, _waiters, "{lease}", "Leases that wait"),
             (names.METRIC_CHARGED, self._charged, "By", "Bytes that are leased"),
+            (names.METRIC_MEASURED, self._measured, "By", "Bytes that are held, by consumer"),
+            (names.METRIC_USED, _by_gpu("used_bytes"), "By", "Bytes that are held on the GPU"),
+            (names.METRIC_CAPACITY, _by_gpu("capacity_bytes"), "By", "Bytes of the GPU"),
+            (names.METRIC_PRESSURE, _by_gpu("pressure_bytes"), "By", "Bytes held beyond what was granted"),
+            (names.METRIC_READING_AGE, self._reading_age, "s", "Since the newest successful reading"),
+            (names.METRIC_DRAINED, _flag("drained"), "", "1 while an operator's drain stops grants"),
             (
-                names.METRIC_MEASURED,
-                self._measured,
-                "By",
-                "Bytes that are held; consumer '' is the whole card",
+                names.METRIC_JOURNAL_HEALTHY,
+                _flag("journal_healthy"),
+                "",
+                "1 while the journal can be written",
             ),
-            (names.METRIC_CAPACITY, _capacity, "By", "Bytes of the card"),
         ):
             meter.create_observable_gauge(name, [self._shown(read)], unit, what)
+        self._journal_write = meter.create_histogram(
+            names.METRIC_JOURNAL_WRITE, "s", "One transaction of the journal"
+        )
+        self._journal_failures = meter.create_counter(
+            names.METRIC_JOURNAL_FAILURES, "{failure}", "Transactions of the journal that failed"
+        )
+        self._journal_failures.add(0)  # the series exists before the first failure
+        build = Observation(1, {names.ATTR_VERSION: version, names.ATTR_PYTHON: platform.python_version()})
+        meter.create_observable_gauge(names.METRIC_BUILD, [lambda _: [build]], "", "Version of the daemon")
 
     def granted(self, consumer: str, waited_s: float, handover_s: float | None, context: Context) -> None:
         labels = {names.ATTR_CONSUMER: self._name(consumer)}
@@ -67,6 +84,12 @@ class LeaseMetrics:
 
     def evicted(self, verdict: str) -> None:
         self._evictions.add(1, {names.ATTR_VERDICT: verdict})
+
+    def wrote(self, seconds: float, *, failed: bool) -> None:
+        """One transaction of the journal."""
+        self._journal_write.record(seconds)
+        if failed:
+            self._journal_failures.add(1)
 
     def watch(self, loop: asyncio.AbstractEventLoop, read: Callable[[], Figures | None]) -> None:
         """`read` gives the figures of the core, or None when they can no longer be trusted."""
@@ -100,6 +123,12 @@ class LeaseMetrics:
             if card["measured"] is not None:
                 yield from self._by_consumer(card["gpu"], card["measured"])
 
+    def _reading_age(self, figures: Figures) -> Iterable[Observation]:
+        now = self._clock()
+        for card in figures["gpus"]:
+            if card["read_at"] is not None:
+                yield Observation(max(0.0, now - card["read_at"]), {names.ATTR_GPU: card["gpu"]})
+
     def _by_consumer(self, gpu: str, amounts: Mapping[str, int]) -> Iterable[Observation]:
         sums: dict[str, int] = {}
         for consumer, count in amounts.items():
@@ -110,7 +139,7 @@ class LeaseMetrics:
 
     def _name(self, consumer: str) -> str:
         """Called from several threads: at worst a few more names than the limit are told apart."""
-        if not consumer or consumer in self._consumers:
+        if consumer in self._consumers:
             return consumer
         if len(self._consumers) >= CONSUMERS_MAX:
             return OTHERS
@@ -122,6 +151,19 @@ def _waiters(figures: Figures) -> Iterable[Observation]:
     yield Observation(figures["waiters"])
 
 
-def _capacity(figures: Figures) -> Iterable[Observation]:
-    for card in figures["gpus"]:
-        yield Observation(card["capacity_bytes"], {names.ATTR_GPU: card["gpu"]})
+def _by_gpu(key: str) -> Callable[[Figures], Iterable[Observation]]:
+    """The gauge of one figure of each GPU; an unknown one (None) has no series."""
+
+    def read(figures: Figures) -> Iterable[Observation]:
+        for card in figures["gpus"]:
+            if card[key] is not None:
+                yield Observation(card[key], {names.ATTR_GPU: card["gpu"]})
+
+    return read
+
+
+def _flag(key: str) -> Callable[[Figures], Iterable[Observation]]:
+    def read(figures: Figures) -> Iterable[Observation]:
+        yield Observation(int(figures[key]))
+
+    return read

@@ -34,6 +34,9 @@ class Harmless:
     def observe(self, event: Mapping[str, Any]) -> Mapping[str, str]:
         return self._ask(lambda leases: leases.observe(event), _NONE)
 
+    def wrote(self, seconds: float, *, failed: bool) -> None:
+        self._ask(lambda leases: leases.wrote(seconds, failed=failed), None)
+
     def close(self) -> None:
         self._ask(lambda leases: leases.close(), None)
 
@@ -54,10 +57,10 @@ class Traced:
     The daemon's own run is a span beside what it serves, `cli.command`.
     """
 
-    def __init__(self, traceparent: str | None = None) -> None:
-        """`traceparent`: of who started the daemon."""
+    def __init__(self, traceparent: str | None = None, version: str = "") -> None:
+        """`traceparent`: of the program that started the daemon. `version`: of the daemon."""
         self._command = tracing.begin(names.SPAN_COMMAND, traceparent, {names.ATTR_COMMAND: "serve"})
-        self._metrics = LeaseMetrics(metrics.get_meter(names.TRACER))
+        self._metrics = LeaseMetrics(metrics.get_meter(names.TRACER), version=version)
         self.leases = Harmless(LeaseTelemetry(trace.get_tracer(names.TRACER), self._metrics))
 
     def log_event(self, event: Mapping[str, Any]) -> None:

@@ -202,6 +202,9 @@ def test_telemetry_hears_a_batch_before_it_is_performed_and_names_its_spans() ->
         def revoke(self, body: Mapping[str, Any]) -> Mapping[str, Any]:
             return {**body, "traceparent": "mine"}
 
+        def wrote(self, seconds: float, *, failed: bool) -> None:
+            recorder.done.append(("wrote", seconds >= 0, failed))
+
     executor = Executor(
         recorder,
         recorder,
@@ -214,5 +217,9 @@ def test_telemetry_hears_a_batch_before_it_is_performed_and_names_its_spans() ->
     )
     push = fx.Push(A, {"push": "revoke", "lease_id": "L1-1"})
     executor.perform([fx.JournalPut("lease:L1-1", {}), push])
-    assert [done[0] for done in recorder.done] == ["outgoing", "journal", "push"]
+    assert [done[0] for done in recorder.done] == ["outgoing", "journal", "wrote", "push"]
+    assert recorder.done[2] == ("wrote", True, False)
     assert recorder.done[-1][2] == {"push": "revoke", "lease_id": "L1-1", "traceparent": "mine"}
+    recorder.disk_full = True
+    executor.perform([fx.JournalPut("lease:L1-2", {})])
+    assert ("wrote", True, True) in recorder.done

@@ -501,6 +501,11 @@ class Ticks:
         self.later.clear()
 
 
+def figures_of(driver: CoreDriver) -> dict[str, Any]:
+    """What the daemon hands on: the engine's figures and the journal's state."""
+    return {**driver.arbiter.figures(), "journal_healthy": True}
+
+
 @pytest.fixture
 def ticks() -> Iterator[Ticks]:
     made = Ticks()
@@ -513,9 +518,10 @@ def test_gauges_show_the_present_and_nothing_that_is_old(
 ) -> None:
     trusted = True
     held(driver, "det", 2)
-    heard.metrics.watch(ticks, lambda: driver.arbiter.figures() if trusted else None)  # type: ignore[arg-type]
+    heard.metrics.watch(ticks, lambda: figures_of(driver) if trusted else None)  # type: ignore[arg-type]
     assert heard.numbers("vram.gpu.charged") == {("GPU-0", "det"): 2 * GIB}
-    assert heard.numbers("vram.gpu.measured") == {("GPU-0", ""): 2 * GIB, ("GPU-0", "det"): 2 * GIB}
+    assert heard.numbers("vram.gpu.measured") == {("GPU-0", "det"): 2 * GIB}
+    assert heard.numbers("vram.gpu.used") == {("GPU-0",): 2 * GIB}
     assert heard.numbers("vram.gpu.capacity") == {("GPU-0",): 8 * GIB}
     assert heard.numbers("vram.lease.waiters") == {(): 0}
     driver.consumer("policy").acquire(7 * GIB)
@@ -536,6 +542,33 @@ def test_gauges_show_the_present_and_nothing_that_is_old(
     assert ticks.later == []
 
 
+def test_the_sum_over_consumers_is_what_the_gpu_holds(
+    driver: CoreDriver, heard: Listener, ticks: Ticks
+) -> None:
+    """A series with consumer "" for the whole card doubled every `sum()`."""
+    held(driver, "det", 2)
+    driver.card.overhead_bytes = 300 * MIB
+    driver.advance(1.1)
+    heard.metrics.watch(ticks, lambda: figures_of(driver))  # type: ignore[arg-type]
+    by_consumer = heard.numbers("vram.gpu.measured")
+    assert ("GPU-0", "") not in by_consumer
+    assert sum(by_consumer.values()) == heard.numbers("vram.gpu.used")[("GPU-0",)] == 2 * GIB + 300 * MIB
+
+
+def test_the_health_of_the_daemon_in_numbers(driver: CoreDriver, heard: Listener, ticks: Ticks) -> None:
+    heard.metrics.watch(ticks, lambda: figures_of(driver))  # type: ignore[arg-type]
+    heard.telemetry.wrote(0.002, failed=False)
+    heard.telemetry.wrote(0.1, failed=True)
+    assert heard.numbers("vram.journal.healthy") == {(): 1}
+    assert heard.numbers("vram.journal.write")[()] == pytest.approx(0.102)
+    assert heard.numbers("vram.journal.failures") == {(): 1}
+    assert heard.numbers("vram.drained") == {(): 0}
+    assert heard.numbers("vram.gpu.pressure") == {("GPU-0",): 0}
+    assert set(heard.numbers("vram.build.info").values()) == {1}
+    heard.now = driver.now + 3.0
+    assert heard.numbers("vram.gpu.reading_age")[("GPU-0",)] == pytest.approx(3.0, abs=0.1)
+
+
 def test_names_that_clients_invent_do_not_grow_the_metrics(heard: Listener, driver: CoreDriver) -> None:
     for number in range(otel_metrics.CONSUMERS_MAX + 5):
         person = driver.consumer(f"c{number}")
@@ -553,7 +586,7 @@ def test_a_defect_in_telemetry_is_said_once_and_stops_nothing(caplog: pytest.Log
         def _fail(self, *_: Any) -> Any:
             raise KeyError("a fact that nobody thought of")
 
-        outgoing = revoke = observe = close = _fail  # type: ignore[assignment]
+        outgoing = revoke = observe = wrote = close = _fail  # type: ignore[assignment]
 
     provider = TracerProvider(shutdown_on_exit=False)
     meters = MeterProvider([], shutdown_on_exit=False)

@@ -22,7 +22,9 @@ from arbiter.host.otel_metrics import LeaseMetrics
 from arbiter.testing.core_driver import CoreDriver
 from arbiter.testing.scenes import sent_away
 from schemas import defaults as d
+from schemas import telemetry as names
 
+GUIDE = Path(__file__).parents[3] / "docs" / "operating.md"
 DASHBOARD = Path(__file__).parents[3] / "configs" / "grafana" / "arbiter.json"
 
 
@@ -48,7 +50,9 @@ def exported() -> dict[str, set[str]]:
     for note in (effect for effect in driver.effects if isinstance(effect, Note)):
         event = {"seq": 1, "at_wall_s": 1.8e9, "kind": note.kind, **note.data}
         assert telemetry.observe(event) == {}
-    numbers.watch(NeverCalled(), driver.arbiter.figures)  # type: ignore[arg-type]
+    numbers.wrote(0.001, failed=False)
+    figures = {**driver.arbiter.figures(), "journal_healthy": True}
+    numbers.watch(NeverCalled(), lambda: figures)  # type: ignore[arg-type]
     series: dict[str, set[str]] = {}
     for family in text_string_to_metric_families(generate_latest(registry).decode()):
         for sample in family.samples:
@@ -74,3 +78,11 @@ def test_every_metric_has_a_panel(exported: dict[str, set[str]]) -> None:
     shown = " ".join(expressions())
     own = {re.sub(r"_(bucket|count|sum|total)$", "", name) for name in exported if name.startswith("vram_")}
     assert {name for name in own if name not in shown} == set()
+
+
+def test_the_operators_guide_names_the_metrics_that_there_are() -> None:
+    """A metric that is only written down makes an alert that never fires."""
+    documented = re.search(r"^Metrics of the programs.*?(?=^\*\*Logs)", GUIDE.read_text(), re.M | re.S)
+    assert documented
+    named = set(re.findall(r"`(vram\.[a-z_.]+)`", documented[0]))
+    assert named == {value for key, value in vars(names).items() if key.startswith("METRIC_")}
