@@ -5,9 +5,11 @@ import itertools
 import os
 import uuid
 from collections.abc import AsyncIterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal, Self, cast
 
 from clients import traces
+from clients.estop import Stopped, stop
 from clients.patience import answered
 from clients.transport import Transport
 from schemas.endpoints import program_endpoint
@@ -166,9 +168,17 @@ class RunnerClient:
     async def ping(self, *, timeout_s: float = 1.0) -> Message:
         return await self._exchange("ping", {}, timeout_s)
 
-    async def estop(self, reason: str = "") -> Message:
-        """Emergency stop. Returns once the motors have been told; raises InternalError when nobody knows whether they have."""
-        return await self._exchange("estop", {"reason": reason}, self._timeout_s)
+    async def estop(self, reason: str = "") -> Stopped:
+        """Emergency stop, on its own socket and a thread of its own. Returns once the motors have been told; raises what
+        `clients.estop.stop` raises."""
+        executor = ThreadPoolExecutor(1, "estop")
+        try:
+            loop = asyncio.get_running_loop()
+            return await loop.run_in_executor(
+                executor, lambda: stop(self.endpoint, reason, timeout_s=self._timeout_s)
+            )
+        finally:
+            executor.shutdown(wait=False)
 
     async def shutdown(self) -> None:
         await self._exchange("shutdown", {}, self._timeout_s)

@@ -1,7 +1,7 @@
 """The goal server: what the runner is asked on its socket, and who answers it.
 
-Speaks `schemas.goals` on a `RouterServer`. Goals are `runner.one_goal`'s, pictures `runner.frames`'; an emergency stop is read however much else is
-asked. It knows no model and no simulator.
+Speaks `schemas.goals` on a `RouterServer`. Goals are `runner.one_goal`'s, pictures `runner.frames`'; the emergency stop has a socket and a thread of
+its own beside it (`runner.estop`). It knows no model and no simulator.
 """
 
 from __future__ import annotations
@@ -15,25 +15,24 @@ from typing import Any, Protocol
 
 from pydantic import ValidationError
 
-from clients.serve import Message, Peer, RouterServer, reason_of
+from clients.serve import Message, Peer, RouterServer
 from runner import frames
 from runner.catalogue import Catalogue
 from runner.clock import Clock
 from runner.control import ControlThread
+from runner.estop import OBEY_S, EstopServer
 from runner.one_goal import OneGoal, Performer
 from schemas.errors import (
     BadRequest,
     EstopRequested,
     InternalError,
     LimitExceeded,
-    RobotFault,
     UnknownOp,
     VramError,
 )
 from schemas.goals import (
     RUNNER_REQUEST,
     CancelGoal,
-    EstopRunner,
     GetFrame,
     GetGroundTruth,
     GetResult,
@@ -48,10 +47,9 @@ from schemas.world import WorldState
 
 log = logging.getLogger(__name__)
 
-ESTOP_S = 1.0  # a control loop that has not obeyed by then hangs
-READS_MAX = 16  # requests that wait for the control thread; more are refused, so that an emergency stop is always read
+READS_MAX = 16  # requests that wait for the control thread; more are refused, so that its mailbox keeps room for others
 LOOP_SILENT_S = 1.0  # a control loop that has not looked at the world for so long hangs
-OPS = ("goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "ping", "estop", "shutdown")
+OPS = ("goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "ping", "shutdown")
 
 
 class Robot(frames.FrameSource, Performer, Protocol):
@@ -61,6 +59,7 @@ class Robot(frames.FrameSource, Performer, Protocol):
     rate_hz: float
     tick_idx: int
     deadline_misses: int
+    estop_ns: int
 
     def request_estop(self, reason: str) -> None: ...
 
@@ -70,7 +69,8 @@ class Robot(frames.FrameSource, Performer, Protocol):
 class GoalServer:
     """`await GoalServer(...).serve()` until `shutdown` or cancellation; then the running goal is canceled and answered.
 
-    `estop_s`: a control loop that has not obeyed an emergency stop by then is said to hang.
+    `estop_s`: a control loop that has not obeyed an emergency stop by then is said to hang. `realtime`: the emergency stop's thread goes
+    before other programs.
     """
 
     def __init__(
@@ -85,7 +85,8 @@ class GoalServer:
         identity: dict[str, Any] | None = None,
         on_bound: Callable[[], None] | None = None,
         stopping: asyncio.Event | None = None,
-        estop_s: float = ESTOP_S,
+        estop_s: float = OBEY_S,
+        realtime: bool = False,
     ) -> None:
         self._endpoint = endpoint
         self._control = control
@@ -96,6 +97,7 @@ class GoalServer:
         self._identity = identity or {}
         self._on_bound = on_bound
         self._estop_s = estop_s
+        self._realtime = realtime
         self._server: RouterServer | None = None
         self._reads = 0
         self.stopping = stopping or asyncio.Event()
@@ -104,7 +106,27 @@ class GoalServer:
 
     async def serve(self) -> None:
         """Raises AlreadyRunning when another runner serves the endpoint."""
-        async with RouterServer(self._endpoint, lambda error: _refusal(None, error)) as server:
+        loop = asyncio.get_running_loop()
+
+        def on_stop(reason: str, pid: int, uid: int) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended: the stop is latched all the same
+                loop.call_soon_threadsafe(self._stopped, reason, pid, uid)
+
+        async with contextlib.AsyncExitStack() as stack:
+            server = await stack.enter_async_context(
+                RouterServer(self._endpoint, lambda error: _refusal(None, error))
+            )
+            stack.enter_context(
+                EstopServer(
+                    self._endpoint,
+                    self._robot,
+                    self._control.runner.mailbox,
+                    on_stop=on_stop,
+                    robot_id=str(self._identity.get("robot", "")),
+                    obey_s=self._estop_s,
+                    realtime=self._realtime,
+                )
+            )
             self._server = server
             serving = asyncio.create_task(server.serve(self._handle))
             stopping = asyncio.create_task(self.stopping.wait())
@@ -180,8 +202,6 @@ class GoalServer:
             case PingRunner():
                 goal = self._goals.goal
                 return {"pid": os.getpid(), "goal_id": goal.goal_id if goal else None} | self._identity
-            case EstopRunner():
-                return await self._estop(request.reason or "on request")
             case ShutdownRunner():
                 return {}
         raise UnknownOp("unknown request", details={"known": [*OPS]})
@@ -201,28 +221,11 @@ class GoalServer:
         finally:
             self._reads -= 1
 
-    async def _estop(self, reason: str) -> Message:
-        """Latched before anything else. Raises InternalError when the control loop does not say that it has obeyed, RobotFault when
-        the motors could not be told."""
-        log.critical("emergency stop: %s", reason)
-        self._robot.request_estop(reason)
-        error = self._robot.estop
-        if error is not None:
+    def _stopped(self, reason: str, pid: int, uid: int) -> None:
+        """An emergency stop was latched on its own thread; words for the log, and the end of the goal, are left to this one."""
+        log.critical("emergency stop by process %d of uid %d: %s", pid, uid, reason)
+        if (error := self._robot.estop) is not None:
             self._goals.stop(error)
-        try:
-            async with asyncio.timeout(self._estop_s):
-                error = await self._control.call(self._robot.obey_estop)
-        except TimeoutError:
-            raise InternalError(
-                f"the control loop has not obeyed the emergency stop within {self._estop_s:.0f} s",
-                hint="cut the robot's power; the loop hangs, and moves nothing if it comes back",
-            ) from None
-        if error is not None and not error.details.get("told", True):
-            raise RobotFault(
-                error.message, hint="cut the robot's power; the runner goes on trying", details=error.details
-            )
-        message = error.message if error is not None else ""
-        return {"reason": reason, "message": message, "robot": self._identity.get("robot")}
 
     def _state(self) -> Message:
         robot, goal = self._robot, self._goals.goal
@@ -260,10 +263,6 @@ def _parse(message: Message) -> Any:
         raise UnknownOp(
             f"unknown op {message.get('op')!r}", hint=f"one of {', '.join(OPS)}", details={"known": [*OPS]}
         )
-    if (
-        message["op"] == "estop"
-    ):  # whatever else is in it: nobody is refused an emergency stop for a long reason
-        return EstopRunner(op="estop", id=0, reason=reason_of(message))
     try:
         return RUNNER_REQUEST.validate_python(message)
     except ValidationError as error:

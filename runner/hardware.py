@@ -223,7 +223,7 @@ class HardwareRunner(SkillRunner):
     def _latched_by_hardware(self, error: EstopRequested) -> None:
         if self.estop is None and self._on_estop is not None:
             self._on_estop(error.message)
-        self.estop = self.estop or error
+        self._latch(error)
         self._halted = bool(error.details.get("told", True))
         self.obey_estop()
 

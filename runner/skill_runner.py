@@ -8,6 +8,8 @@ control thread, but for what the event loop may read at any time (`progress`, `w
 from __future__ import annotations
 
 import logging
+import threading
+import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -109,6 +111,8 @@ class SkillRunner(RunnerBase):
         self.progress = Progress(0.0, "idle")  # replaced whole: the event loop may read it any time
         self.caption: tuple[str, ...] = ()
         self.estop: EstopRequested | None = None  # latched for the life of the process
+        self.estop_ns = 0  # when it was, on the monotonic clock; 0: it is not
+        self._latching = threading.Lock()  # two threads may stop at once: the first reason stays
 
     @abstractmethod
     def _gate_of(self, skill: Stepped) -> SafetyGate:
@@ -124,12 +128,19 @@ class SkillRunner(RunnerBase):
 
     def request_estop(self, reason: str) -> None:
         """Any thread: latch the emergency stop. The first reason stays. The control thread obeys before it moves anything again."""
-        if self.estop is None:
-            self.estop = EstopRequested(
+        self._latch(
+            EstopRequested(
                 f"emergency stop: {reason}",
                 hint="look at the robot, then start the runner again",
                 details={"reason": reason},
             )
+        )
+
+    def _latch(self, error: EstopRequested) -> None:
+        with self._latching:
+            if self.estop is None:
+                self.estop_ns = time.monotonic_ns()
+                self.estop = error
 
     def obey_estop(self) -> EstopRequested | None:
         """Control thread: end the skill and stop what moves, if the stop is latched; repeatable. Says what was done."""

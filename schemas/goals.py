@@ -2,6 +2,7 @@
 
 Request {"op": …, "id": n, …} → reply {"re": n, "ok": true, …} | {"re": n, "ok": false, "error": {…}}.
 A goal's progress comes as pushes to whoever sent it: {"push": "feedback", …} and exactly one {"push": "result", …} per accepted goal.
+The emergency stop has a socket of its own: `schemas.estop`.
 """
 
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
@@ -72,13 +73,6 @@ class PingRunner(_Call):
     op: Literal["ping"]
 
 
-class EstopRunner(_Call):
-    """Emergency stop: the motors stop, the goal fails with `estop_requested`, and no goal is accepted until the runner is started again."""
-
-    op: Literal["estop"]
-    reason: Annotated[str, Field(max_length=500)] = ""
-
-
 class ShutdownRunner(_Call):
     op: Literal["shutdown"]
 
@@ -92,7 +86,6 @@ RunnerRequest = Annotated[
     | GetSkills
     | GetGroundTruth
     | PingRunner
-    | EstopRunner
     | ShutdownRunner,
     Field(discriminator="op"),
 ]

@@ -168,6 +168,7 @@ class Deploy:
                 self._clock,
                 identity=self._identity(parts, arbiter),
                 stopping=self._stopping,
+                realtime=self._args.realtime,
             )
             ended = await self._serve(server, runner)
         failed = control.ended.exception() is not None

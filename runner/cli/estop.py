@@ -1,6 +1,6 @@
 """`vram-runner estop`: the emergency stop of the runners of this machine. Exits 0 only when their motors have been told.
 
-Whoever is in a hurry names no endpoint: the runner of this login and the system service's are both stopped, whichever there are.
+Without an endpoint it stops the runner of this login and the system service's, as far as they are there.
 """
 
 from __future__ import annotations
@@ -10,11 +10,10 @@ import asyncio
 import os
 import sys
 
-from clients.runner import RunnerClient
+from clients.estop import ANSWER_S, stop
 from schemas.endpoints import SYSTEM_RUNTIME, program_endpoint
 from schemas.errors import RunnerUnreachable
-
-ANSWER_S = 3.0  # the server itself waits a second for its control loop
+from schemas.estop import path_of
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
@@ -52,16 +51,19 @@ def _there() -> list[str]:
     """The endpoints of runners that may be there: this login's, and the system service's."""
     own = program_endpoint("runner", os.environ, os.getuid())
     system = f"ipc://{SYSTEM_RUNTIME}/runner.sock"
-    # os.path: a folder that may not be looked into is no reason to stop nobody
-    there = [name for name in dict.fromkeys((own, system)) if os.path.exists(name.removeprefix("ipc://"))]
+    # os.path: a folder that may not be looked into does not keep the other runner from being stopped
+    there = [name for name in dict.fromkeys((own, system)) if _exists(name)]
     return there or [own]
 
 
+def _exists(endpoint: str) -> bool:
+    return os.path.exists(path_of(endpoint)) or os.path.exists(endpoint.removeprefix("ipc://"))
+
+
 async def _stop(endpoint: str, reason: str) -> str:
-    async with RunnerClient(endpoint, timeout_s=ANSWER_S) as runner:
-        try:
-            reply = await runner.estop(reason)
-        except RunnerUnreachable as error:
-            hint = "if a robot moves, cut its power"
-            raise RunnerUnreachable(error.message, hint=hint, details=error.details) from error
-    return f"{reply.get('robot') or endpoint}: {reply['message']}"  # which one: there may be several
+    try:
+        stopped = await asyncio.to_thread(stop, endpoint, reason, timeout_s=ANSWER_S)
+    except RunnerUnreachable as error:
+        hint = "if a robot moves, cut its power"
+        raise RunnerUnreachable(error.message, hint=hint, details=error.details) from error
+    return f"{stopped.robot or endpoint}: {stopped.message}"  # which one: there may be several

@@ -169,6 +169,7 @@ async def run(args: argparse.Namespace) -> int:
                 "seed": args.seed,
                 "arbiter": arbiter is not None,
             },
+            realtime=args.realtime,
         )
         install_signals(server.stopping)
         try:

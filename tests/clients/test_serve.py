@@ -58,13 +58,13 @@ def test_words_that_utf8_has_no_bytes_for_reach_the_other_side(tmp_path: Path) -
             serving = asyncio.create_task(server.serve(handle))
             async with RunnerClient(endpoint) as client:
                 with pytest.raises(RobotFault) as raised:
-                    await client.estop("smoke \udcff")
+                    await client.call("cancel", {"goal_id": "smoke \udcff"})
             serving.cancel()
             await asyncio.gather(serving, return_exceptions=True)
         return heard[-1], raised.value.message
 
     stopped, said = asyncio.run(there_and_back())
-    assert (stopped["op"], stopped["reason"]) == ("estop", "smoke \\udcff")
+    assert (stopped["op"], stopped["goal_id"]) == ("cancel", "smoke \\udcff")
     assert said == "no file \\udcff"
 
 

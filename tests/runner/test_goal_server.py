@@ -484,7 +484,7 @@ def test_the_emergency_stop_of_a_simulator_ends_its_goal_too(
         while not b.made:
             await client.ping(timeout_s=60)
         await b.made[0].begun.wait()
-        assert "emergency stop: smoke" in (await client.estop("smoke"))["message"]
+        assert "emergency stop: smoke" in (await client.estop("smoke")).message
         result = await goal.result(60)
         assert (result["status"], result["code"]) == ("failed", "estop_requested")
         assert b.made[0].story == [f"start {prompt}", "finish"]

@@ -118,7 +118,7 @@ def test_the_stop_fails_the_goal_and_refuses_new_ones(bench: Any, run_async: Run
         goal = await client.send_goal(RSKILL, prompt=prompt)
         await b.skill.begun.wait()
         reply = await client.estop("a hand is in the way")
-        assert "a hand is in the way; all joints stand still" in reply["message"]
+        assert "a hand is in the way; all joints stand still" in reply.message
         assert b.twin.story == ["connect", "halt"]
         sent = len(b.twin.sent)
         result = await goal.result(60)
@@ -129,7 +129,7 @@ def test_the_stop_fails_the_goal_and_refuses_new_ones(bench: Any, run_async: Run
         assert "a hand is in the way" in state["estop"]
         await diagnosed(client, "ok")  # it can still be looked at
         again = await client.estop("once more")
-        assert "a hand is in the way" in again["message"]
+        assert "a hand is in the way" in again.message
         assert len(b.twin.sent) == sent
 
     play(run_async, bench, body)
@@ -220,12 +220,10 @@ def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_being_read
     play(run_async, bench, body, estop_s=0.5)
 
 
-@pytest.mark.parametrize(
-    "fields", [{"reason": "x" * 10_000}, {"reason": 7, "by": "a newer client"}, {"reason": None}]
-)
-def test_a_stop_is_not_refused_for_its_words(bench: Any, run_async: Run, fields: dict[str, Any]) -> None:
+@pytest.mark.parametrize("reason", ["x" * 10_000, "smoke \udcff", "\x1b[2J\n\u202e", ""])
+def test_a_stop_is_not_refused_for_its_words(bench: Any, run_async: Run, reason: str) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
-        assert "stand still" in (await client.call("estop", fields))["message"]
+        assert "stand still" in (await client.estop(reason)).message
         assert b.runner.estop is not None
         assert b.twin.story == ["connect", "halt"]
 

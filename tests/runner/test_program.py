@@ -150,7 +150,7 @@ def test_a_second_runner_records_nothing(tmp_path: Path, capsys: pytest.CaptureF
 def test_an_address_that_is_none_is_said_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     """Of all programs the one that stops motors ended with a traceback."""
     assert main(["estop", "--endpoint", "runner.sock"]) == 2
-    assert "runner.sock is no endpoint" in capsys.readouterr().err
+    assert "got 'runner.sock'" in capsys.readouterr().err
 
 
 def test_where_a_sidecar_is() -> None:

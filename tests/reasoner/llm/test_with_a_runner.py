@@ -121,7 +121,7 @@ def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(tmp_path:
             stand_in.hangs()
             async with programs.reasoner("anthropic") as reasoner:
                 await until(lambda: len(stand_in.asked) > asked)
-                await client.call("estop", {"reason": "a hand in the way"})
+                await client.estop("a hand in the way")
                 assert await reasoner.wait() == 1
             assert programs.result()["reason"].startswith("stopped: emergency stop")
 

@@ -1,0 +1,259 @@
+"""The emergency stop's socket: answered while the event loop stands still, under a flood of connections, and without descriptors."""
+
+import asyncio
+import contextlib
+import os
+import resource
+import socket
+import stat
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from clients.estop import stop
+from runner.control import Mailbox
+from runner.estop import CONNECTIONS_PER_UID, EstopServer
+from schemas.errors import AlreadyRunning, ConfigError, EstopRequested, InternalError, RunnerUnreachable
+from schemas.estop import Answer, path_of, reason_in, reply_in, request
+
+WAIT_S = 60.0
+
+
+class Robot:
+    """A control thread that does nothing but obey."""
+
+    def __init__(self) -> None:
+        self.estop: EstopRequested | None = None
+        self.estop_ns = 0
+        self.asked: list[str] = []
+        self.mailbox = Mailbox()
+        self.hangs = threading.Event()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._main)
+        self._thread.start()
+
+    def request_estop(self, reason: str) -> None:
+        self.asked.append(reason)
+        if self.estop is None:
+            self.estop_ns = time.monotonic_ns()
+            self.estop = EstopRequested(f"emergency stop: {reason}", details={"reason": reason})
+
+    def obey_estop(self) -> EstopRequested | None:
+        return self.estop
+
+    def _main(self) -> None:
+        while not self._ended.wait(0.001):
+            if not self.hangs.is_set():
+                self.mailbox.run_pending()
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join()
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    made = Robot()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def serve(robot: Robot, endpoint: str) -> Callable[..., EstopServer]:
+    def make(obey_s: float = WAIT_S) -> EstopServer:
+        return EstopServer(
+            endpoint, robot, robot.mailbox, on_stop=lambda *_: None, robot_id="bench", obey_s=obey_s
+        )
+
+    return make
+
+
+def connect(endpoint: str) -> socket.socket:
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    limit = struct.pack(
+        "ll", int(WAIT_S), 0
+    )  # of the kernel: with Python's a full backlog is an error at once
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
+    connection.connect(path_of(endpoint))
+    return connection
+
+
+def test_a_stop_is_answered_while_the_event_loop_stands_still(
+    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+) -> None:
+    """Regression: the stop came in on the goal socket; three million empty frames there delayed it by 20.9 s."""
+
+    async def scenario() -> str:
+        with serve():
+            return stop(
+                endpoint, "smoke", timeout_s=WAIT_S
+            ).message  # nothing else runs on this loop until it returns
+
+    assert asyncio.run(scenario()) == "emergency stop: smoke"
+
+
+def test_the_first_reason_and_its_time_stay(
+    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+) -> None:
+    with serve():
+        before_ns = time.monotonic_ns()
+        first = stop(endpoint, "a hand in the way", timeout_s=WAIT_S)
+        again = stop(endpoint, "once more", timeout_s=WAIT_S)
+    assert (first.first, first.reason, first.robot) == (True, "a hand in the way", "bench")
+    assert (again.first, again.reason) == (False, "a hand in the way")
+    assert before_ns < first.stopped_ns == again.stopped_ns < time.monotonic_ns()
+    assert robot.asked == ["a hand in the way", "once more"]
+
+
+def test_a_loop_that_hangs_is_said_after_the_stop_is_latched(
+    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+) -> None:
+    robot.hangs.set()
+    with serve(obey_s=0.05):
+        with pytest.raises(InternalError, match="has not obeyed"):
+            stop(endpoint, "smoke", timeout_s=WAIT_S)
+        assert robot.estop is not None
+        robot.hangs.clear()
+        assert not stop(endpoint, "again", timeout_s=WAIT_S).first
+
+
+def test_an_ended_control_thread_is_said(
+    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+) -> None:
+    robot.mailbox.close()
+    with serve(), pytest.raises(InternalError, match="control thread"):
+        stop(endpoint, "smoke", timeout_s=WAIT_S)
+    assert robot.estop is not None
+
+
+def test_silent_connections_of_the_same_user_keep_no_stop_out(
+    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+) -> None:
+    """A peer that may connect could hold all places; the oldest silent connection is closed for a new one."""
+    with serve():
+        silent = [connect(endpoint) for _ in range(10 * CONNECTIONS_PER_UID)]
+        assert stop(endpoint, "smoke", timeout_s=WAIT_S).first
+        assert silent[0].recv(1) == b""  # hung up on
+        for one in silent:
+            one.close()
+
+
+def test_a_flood_of_connections_from_other_threads_keeps_no_stop_out(
+    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+) -> None:
+    ended, under_way = threading.Event(), threading.Barrier(5)
+
+    def flood() -> None:
+        opened: list[socket.socket] = []
+        try:
+            for count in range(20_000):
+                if ended.is_set():
+                    return
+                opened.append(connect(endpoint))
+                if count == 10:
+                    under_way.wait(WAIT_S)
+                if len(opened) > 50:
+                    opened.pop(0).close()
+        finally:
+            for one in opened:
+                one.close()
+
+    with serve():
+        floods = [threading.Thread(target=flood) for _ in range(4)]
+        for one in floods:
+            one.start()
+        under_way.wait(WAIT_S)
+        assert stop(endpoint, "smoke", timeout_s=WAIT_S).first
+        ended.set()
+        for one in floods:
+            one.join()
+
+
+def test_a_stop_is_read_by_a_process_that_has_no_descriptor_left(
+    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+) -> None:
+    """Bare connects to the goal socket could use all descriptors up; the server keeps one for a stop."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with serve(), socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
+        client.settimeout(WAIT_S)
+        taken: list[int] = []
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(map(int, os.listdir("/proc/self/fd"))) + 8, hard))
+        try:
+            with contextlib.suppress(OSError):
+                while True:
+                    taken.append(os.dup(0))
+            client.connect(path_of(endpoint))
+            client.send(request("smoke"))
+            replies = [reply_in(client.recv(4096)).answer for _ in range(2)]
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+            for one in taken:
+                os.close(one)
+    assert replies == [Answer.LATCHED, Answer.OBEYED]
+
+
+@pytest.mark.parametrize("packet", [b"stop", b"\x00" * 4096, b"VRAM-ESTO"])
+def test_what_is_no_request_stops_nothing_and_is_hung_up_on(
+    serve: Callable[..., EstopServer], robot: Robot, endpoint: str, packet: bytes
+) -> None:
+    with serve():
+        with connect(endpoint) as client:
+            client.send(packet)
+            assert client.recv(4096) == b""
+        assert robot.estop is None
+        with connect(endpoint) as client:  # any version stops, and a reason that is too long is cut
+            client.send(b"VRAM-ESTOP/7 " + b"x" * 100_000)
+            assert reply_in(client.recv(4096)).answer is Answer.LATCHED
+
+
+def test_a_deleted_socket_file_is_made_again(
+    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+) -> None:
+    path = Path(path_of(endpoint))
+    with serve():
+        assert stat.S_IMODE(path.stat().st_mode) == 0o660
+        path.unlink()
+        deadline = time.monotonic() + WAIT_S
+        while True:
+            try:
+                assert stop(endpoint, "smoke", timeout_s=WAIT_S).first
+                break
+            except RunnerUnreachable:
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o660
+    assert not path.exists()
+
+
+def test_the_socket_of_a_killed_runner_is_taken_over_and_nothing_else(
+    serve: Callable[..., EstopServer], robot: Robot, endpoint: str, tmp_path: Path
+) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left_over:
+        left_over.bind(path_of(endpoint))
+    with pytest.raises(RunnerUnreachable, match="was killed"):
+        stop(endpoint, "smoke", timeout_s=WAIT_S)
+    with serve():
+        assert stop(endpoint, "smoke", timeout_s=WAIT_S).first
+    Path(path_of(endpoint)).write_text("a file")
+    with pytest.raises(AlreadyRunning, match="not a socket"), serve():
+        pass
+    long = f"ipc://{tmp_path}/{'x' * 120}"
+    with (
+        pytest.raises(ConfigError, match="cannot serve the emergency stop"),
+        EstopServer(long, robot, robot.mailbox, on_stop=lambda *_: None),
+    ):
+        pass
+    with pytest.raises(ConfigError, match="expected an endpoint"):
+        path_of("tcp://127.0.0.1:7")
+
+
+def test_the_words_of_a_request() -> None:
+    assert reason_in(request("a hand\nin the\x1b[2J way\udcff")) == "a hand in the [2J way\\udcff"
+    assert reason_in(request("")) == ""
+    assert reason_in(request("ä" * 9000)) == "ä" * 500
+    assert reason_in(b"VRAM-ESTOP/1 \xff\xfe") == "\ufffd\ufffd"
