@@ -17,6 +17,8 @@ import os
 import resource
 import socket
 import stat
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -36,9 +38,9 @@ LISTEN_BACKLOG = 512
 ACCEPT_MAX = 16
 """Connections accepted in one turn of the loop."""
 ACCEPT_PAUSE_S = 0.1
-"""After a failed accept (EMFILE, ENFILE, ENOMEM); the backlog keeps who connects meanwhile."""
+"""After a failed accept (EMFILE, ENFILE, ENOMEM); the backlog keeps new connections meanwhile."""
 SWEEP_S = 0.5
-"""Period of the look at silent connections and at the socket's file."""
+"""Period in which silent connections and the socket's file are checked."""
 TURN_S = 0.002
 """Longest work on waiting messages before the loop's other callbacks run."""
 DIRECT_SHARE = 0.5
@@ -241,7 +243,7 @@ class Connection(asyncio.Protocol):
                 self._handle(event)
         except ZmtpError as error:
             self._flush_wire()
-            log.info("cut %r: %s", self, error)
+            self._router._complain(f"{error}", self.peer)
             self.cut(f"protocol error: {error}")
         if self.ended:
             return False
@@ -342,6 +344,7 @@ class Router:
         self._processes: dict[ProcessKey, _Process] = {}
         self._turns: Turns[Connection] = Turns()
         self._turn_scheduled = False
+        self._complaints = 0
         self._credit_s = TURN_S
         self._credit_at = 0.0
         self._sweep: asyncio.TimerHandle | None = None
@@ -467,7 +470,7 @@ class Router:
                 self._pause_accept(error)
                 return
             if not self._make_room(peer):  # 3
-                log.warning("refused a connection of process %s, uid %d: too many", peer.process, peer.uid)
+                self._complain("too many connections", peer)
                 _close(peer.pidfd)
                 sock.close()
                 continue
@@ -499,26 +502,23 @@ class Router:
         limits, total = self.limits, self._connections_max
         process = self._processes.get(peer.process)
         if process is not None and len(process.connections) >= max(1, int(total * limits.process_share)):
-            return False
+            return self._evict_stranger(lambda other: other.process == peer.process)
         user = self._users.get(peer.uid)
-        over_share = user is not None and user.connections >= max(1, int(total * limits.user_share))
-        if not over_share and len(self._connections) < total:
-            return True
-        return self._evict_stranger(peer.uid if over_share else None)
+        if user is not None and user.connections >= max(1, int(total * limits.user_share)):
+            return self._evict_stranger(lambda other: other.uid == peer.uid)
+        return len(self._connections) < total or self._evict_stranger(lambda _: True)
 
-    def _evict_stranger(self, uid: int | None) -> bool:
-        """Cut the oldest connection without a hello of the process that has the most, of `uid` or
-        of any user.
-        """
-        waiting: dict[ProcessKey, Connection] = {}
-        counts: dict[ProcessKey, int] = {}
+    def _evict_stranger(self, among: Callable[[Peer], bool]) -> bool:
+        """Cut the oldest connection without a hello of the process that has the most of them."""
+        oldest: dict[ProcessKey, Connection] = {}
+        counts: Counter[ProcessKey] = Counter()
         for connection in self._strangers:
-            if uid is None or connection.peer.uid == uid:
-                waiting.setdefault(connection.peer.process, connection)
-                counts[connection.peer.process] = counts.get(connection.peer.process, 0) + 1
+            if among(connection.peer):
+                oldest.setdefault(connection.peer.process, connection)
+                counts[connection.peer.process] += 1
         if not counts:
             return False
-        waiting[max(counts, key=counts.__getitem__)].cut("no hello, and the place was needed")
+        oldest[counts.most_common(1)[0][0]].cut("no hello, and the place was needed")
         return True
 
     def _enter(self, peer: Peer) -> Connection:
@@ -622,10 +622,19 @@ class Router:
             log.exception("a message of %r could not be handled", connection)
             return True
 
+    def _complain(self, what: str, peer: Peer) -> None:
+        """Log what a peer did wrong, once per sweep: a flood must not fill the log."""
+        self._complaints += 1
+        if self._complaints == 1:
+            log.warning("refused process %s of uid %d: %s", peer.process, peer.uid, what)
+
     # -- watching ----------------------------------------------------------------------------------
     def _sweep_once(self) -> None:
         loop = self._loop_or_fail
         now = loop.time()
+        if self._complaints > 1:
+            log.warning("refused %d more connections within %g s", self._complaints - 1, SWEEP_S)
+        self._complaints = 0
         for connection in list(self._strangers):
             age = now - connection.accepted_at
             if age < self.limits.handshake_s:
