@@ -145,6 +145,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         config = effective_config(flags)
         from arbiter.daemon import Daemon, find_places  # late: --help and --version need none of it
         from arbiter.host.loop import new_loop
+        from arbiter.host.memory import give_back_freed_memory
         from arbiter.telemetry import set_up_logging
 
         places = find_places(config, os.environ, os.getuid())
@@ -161,6 +162,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             )
             return 0
         set_up_logging(config.log.format, config.log.level)
+        give_back_freed_memory()
 
         async def serve() -> int:
             return await Daemon(config, os.environ, version()).run()

@@ -79,7 +79,7 @@ class Limits:
     out_max_bytes: int = 4 * MIB
     """Queued for one connection that does not read."""
     user_out_max_bytes: int = 64 * MIB
-    user_in_max_bytes: int = 64 * MIB
+    user_in_max_bytes: int = 16 * MIB
     """Incomplete messages of all connections of one user."""
 
 

@@ -1,5 +1,5 @@
-"""Fault injection on real processes: a daemon, consumers, a user of other people's leases and stowaways on one simulated card, hit
-at every named step of a switch, for as long as is asked. An independent checker judges afterwards.
+"""Fault injection on real processes: a daemon, consumers, a user of other processes' leases, stowaways and attackers of the
+daemon's socket on one simulated card, hit at every named step of a switch, for as long as is asked. An independent checker judges afterwards.
 
 `make chaos SECONDS=300 SEED=0`, or `python tests/chaos/storm.py --seconds 300 --seed 0 --out out/chaos`. Ends with 1 if anything that
 must not happen happened. What to hit and when is drawn from the seed; when exactly it lands is the machine's doing, so a seed chooses
@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from arbiter.host.gpu.fake import locked
+from arbiter.testing.attacks import ATTACKS
 from arbiter.testing.fakegpu_check import check_log
 from arbiter.testing.forkserver import Child, ForkServer
 from arbiter.testing.lease_check import Finding, Hindrance, Story, check_leases, read_lines
@@ -48,6 +49,7 @@ STEPS = {
 ROLES = ("holder", "waiter", "bystander", "user", "daemon")
 CARD_FAULTS = ("probe fails", "probe hangs", "leak", "lag", "hidden processes", "stowaway")
 DISK_FAULTS = ("disk full", "file limit", "daemon restart")
+ATTACK_FAULTS = tuple(f"attack: {attack}" for attack in ATTACKS)
 CONSUMERS = 6
 STRIKERS = 3
 STEP_WAIT_S = 3.0
@@ -185,7 +187,7 @@ class Storm:
     # -- following the arbiter -----------------------------------------------------------------------------------------
     async def _watch(self) -> None:
         async with ArbiterClient(
-            self._arbiter.endpoint, name="watch", role="observer", connect_timeout_s=60.0
+            self._arbiter.endpoint, name="watch", role="operator", connect_timeout_s=60.0
         ) as client:
             async for event in client.subscribe():
                 self._heard(event)
@@ -221,7 +223,10 @@ class Storm:
         while time.monotonic() < end or not self._enough():
             if not self._plan:
                 self._plan = [(s, r, h) for s in STEPS.values() for r in ROLES for h in ("kill", "stop")]
-                self._plan += [("any time", "machine", fault) for fault in (*CARD_FAULTS, *DISK_FAULTS) * 2]
+                self._plan += [
+                    ("any time", "machine", fault)
+                    for fault in (*CARD_FAULTS, *DISK_FAULTS, *ATTACK_FAULTS) * 2
+                ]
                 self._random.shuffle(self._plan)
             step, role, how = self._plan.pop()
             if role == "machine":
@@ -344,6 +349,11 @@ class Storm:
                 child = self._spawn("stowaway", f"s-{self._born}", str(size))
                 self._strangers.append(child)
                 self._later(pause_s, child.hang_up)
+            case _ if fault in ATTACK_FAULTS:
+                self._tally.count(fault)
+                self._born += 1
+                attack = fault.removeprefix("attack: ")
+                self._strangers.append(self._spawn("attacker", f"x-{self._born}", f"{attack}:{pause_s:.2f}"))
             case _:
                 self._tally.count(fault)
                 faulty: dict[str, Any] = {

@@ -17,8 +17,10 @@ from collections.abc import Coroutine, Sequence
 from pathlib import Path
 from typing import Any
 
+from arbiter.testing.attacks import ATTACKS
 from clients.aio import ArbiterClient
 from clients.lease import Lease
+from schemas.endpoints import arbiter_endpoint
 from schemas.errors import VramError
 from schemas.fakegpu import SimulatedOutOfMemory
 from schemas.wire import Footprint, LeaseSpec
@@ -229,7 +231,8 @@ async def lines() -> asyncio.StreamReader:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """`consumer NAME SEED CARD TRACES`, `stowaway NAME BYTES CARD TRACES` or `user NAME - CARD TRACES`."""
+    """`consumer NAME SEED CARD TRACES`, `stowaway NAME BYTES CARD TRACES`, `user NAME - CARD TRACES` or
+    `attacker NAME ATTACK:SECONDS CARD TRACES`."""
     kind, name, what, card, traces = arguments
     trace = Trace(Path(traces) / f"{name}.jsonl", name)
     trace.say("born", kind=kind)
@@ -239,6 +242,10 @@ def main(arguments: Sequence[str]) -> None:
                 asyncio.run(Consumer(name, what, Path(card), trace).run())
             case "stowaway":
                 asyncio.run(take_bytes(Path(card), trace, int(what)))
+            case "attacker":
+                attack, seconds = what.split(":")
+                endpoint = arbiter_endpoint(os.environ, os.getuid())
+                ATTACKS[attack](endpoint.removeprefix("ipc://"), time.monotonic() + float(seconds))
             case _:
                 asyncio.run(mark_uses(trace))
     except BaseException as error:
