@@ -4,6 +4,7 @@ import asyncio
 import contextvars
 import os
 import threading
+import traceback
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -49,11 +50,13 @@ class Worker:
     def _guarded[T](work: Callable[[], T]) -> T:
         try:
             return work()
-        except VramError:
+        except VramError as error:
+            _forget_locals(error)
             raise
         except (
             Exception
         ) as error:  # any failure inside a model is an answer to the caller, not the end of the sidecar
+            _forget_locals(error)
             if (
                 type(error).__name__ == "OutOfMemoryError"
             ):  # torch's; importing torch to say so would cost seconds
@@ -61,6 +64,14 @@ class Worker:
             if isinstance(error, ImportError):
                 raise ModelError(str(error), hint="pip install 'vram-arbiter[sidecars]'") from error
             raise ModelError(f"{type(error).__name__}: {error}", hint="see the sidecar's log") from error
+
+
+def _forget_locals(error: BaseException | None) -> None:
+    """Of the frames that a failure came through: the error is kept for `ping`, and half a loaded
+    model would stay on the GPU with it."""
+    while error is not None:
+        traceback.clear_frames(error.__traceback__)
+        error = error.__cause__ or error.__context__
 
 
 def _stand_back(nice: int) -> None:
