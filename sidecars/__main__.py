@@ -5,6 +5,8 @@ Exit codes: 0 ended in order; 1 could not start or failed, another try may succe
 
 import argparse
 import asyncio
+import contextlib
+import importlib.util
 import logging
 import os
 import sys
@@ -17,7 +19,7 @@ from schemas import defaults as d
 from schemas import telemetry, terminal
 from schemas.commands import command
 from schemas.endpoints import arbiter_endpoint, program_endpoint
-from schemas.errors import ConfigError, NoGpu, VramError
+from schemas.errors import ConfigError, ModelError, NoGpu, VramError
 from schemas.fakegpu import CARD_FILE, FOLDER_VARIABLE, parse_config
 from schemas.manifest import ManifestError, RSkillManifest
 from sidecars.adapters.base import ModelAdapter
@@ -33,7 +35,7 @@ from sidecars.settings import (
     read_footprints,
     read_model,
 )
-from sidecars.weights import Weights
+from sidecars.weights import Weights, cached
 
 FOOTPRINTS = "models/footprints.yaml"
 _ENVIRONMENT = {  # of the model libraries, before they are imported: what they write and whom they tell
@@ -56,13 +58,14 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
     try:
         settings = settings_from(flags)
         adapter = adapter_for(settings.manifest, settings.weights)
+        for name, value in _ENVIRONMENT.items():
+            os.environ.setdefault(name, value)
         if flags.check:
-            print(f"ok: {settings.manifest.name} from {settings.weights.source} as {adapter.kind}")
+            found = compare_weights(settings.manifest, settings.weights, adapter_for)
+            print(f"ok: {settings.manifest.name} from {settings.weights.source} as {adapter.kind}; {found}")
             return 0
         from sidecars.host import SidecarHost
 
-        for name, value in _ENVIRONMENT.items():
-            os.environ.setdefault(name, value)
         with command(service, "serve", serves=True, attributes={telemetry.ATTR_CONSUMER: flags.name}):
             finished = asyncio.run(SidecarHost(settings, adapter, open_memory(settings)).serve())
         if not finished:
@@ -70,7 +73,8 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
             os._exit(0)  # the interpreter would wait for an import of many seconds that nobody needs any more
     except (VramError, ManifestError) as error:
         print(f"vram-sidecar: {error}", file=sys.stderr)
-        return 2 if isinstance(error, ConfigError | ManifestError) else 1
+        wrong = (ConfigError, ManifestError, ModelError) if flags.check else (ConfigError, ManifestError)
+        return 2 if isinstance(error, wrong) else 1
     return 0
 
 
@@ -109,6 +113,24 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         standby=flags.standby,
         nice=flags.nice,
     )
+
+
+def compare_weights(manifest: RSkillManifest, weights: Weights, adapter_for: AdapterFor) -> str:
+    """Compare the checkpoint with the model that its config describes, on no device. Returns what
+    was done, in words. Raises ModelError."""
+    if importlib.util.find_spec("torch") is None:
+        return "weights not compared with the model: torch is not installed"
+    place = weights if weights.local else cached(weights)
+    if place is None:
+        return "weights not compared with the model: they are not in the hub's cache"
+    adapter = adapter_for(manifest, place)
+    with contextlib.redirect_stdout(sys.stderr):  # what the loaders print is not our answer
+        try:
+            adapter.prepare()
+            adapter.load("meta")
+        except ImportError as error:
+            raise ModelError(str(error), hint="pip install 'vram-arbiter[sidecars]'") from error
+    return "the weights hold the whole model"
 
 
 def open_memory(settings: Settings) -> DeviceMemory:
@@ -212,7 +234,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--log-level", choices=("debug", "info", "warning", "error"), default="info")
     add("--log-format", choices=logs.FORMS, default="human", help="json: one object a line")
-    add("--check", action="store_true", help="check manifest, footprint and flags, then end")
+    add(
+        "--check",
+        action="store_true",
+        help="check manifest, footprint, flags and whether the weights hold the whole model, then end",
+    )
     return parser
 
 

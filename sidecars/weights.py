@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from clients.configs import CONFIGS_VARIABLE
-from schemas.errors import ConfigError, ModelError
+from schemas.errors import ConfigError, ModelError, VramError
 from schemas.manifest import RSkillManifest
 from schemas.manifest.vocabulary import Dtype
 
@@ -42,6 +42,19 @@ def resolve(uri: str, configs: Path) -> Weights:
     return Weights(str(folder), local=True)
 
 
+def cached(weights: Weights) -> Weights | None:
+    """A hub repository as the local folder that the hub's cache keeps it in; None if its weights
+    were never fetched."""
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import LocalEntryNotFoundError
+
+    try:
+        folder = Path(snapshot_download(weights.source, revision=weights.revision, local_files_only=True))
+    except LocalEntryNotFoundError:
+        return None
+    return Weights(str(folder), local=True) if any(folder.glob("*.safetensors")) else None
+
+
 def from_pretrained(cls: Any, weights: Weights, **options: Any) -> Any:
     """`cls.from_pretrained` for any class of transformers or lerobot. Raises ModelError if the checkpoint does not fit the class."""
     if weights.local:
@@ -50,7 +63,13 @@ def from_pretrained(cls: Any, weights: Weights, **options: Any) -> Any:
         options["revision"] = weights.revision
     try:
         return cls.from_pretrained(weights.source, **options)
-    except (OSError, ValueError, KeyError, TypeError, ImportError) as error:
+    except VramError:
+        raise
+    except Exception as error:
+        if (
+            type(error).__name__ == "OutOfMemoryError"
+        ):  # torch's, which says more than that the weights are bad
+            raise
         raise ModelError(
             f"{cls.__name__} cannot load {weights.source}: {type(error).__name__}: {error}",
             hint="is it complete, and of the kind that the manifest says?",
@@ -66,6 +85,8 @@ def model_options(manifest: RSkillManifest, weights: Weights, device: str) -> di
     os.environ.setdefault(
         "HF_DEACTIVATE_ASYNC_LOAD", "1"
     )  # transformers then loads shard by shard: a lower peak
+    if device == "meta":
+        return {"device_map": {"": device}}
     if not device.startswith("cuda"):
         return {}
     import torch

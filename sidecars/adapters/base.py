@@ -11,8 +11,10 @@ class ModelAdapter(Protocol):
     """One model. All methods block and are called from one worker thread, never two at a time.
 
     `ops` are the ops or endpoints that `run` answers. `prepare` does what needs no device (imports, processors). `load` puts
-    the weights onto `device` (`cpu`, `cuda:0`) and `unload` drops every reference to them; both may be repeated.
-    `run` raises a `schemas.errors` type for what the caller did wrong; anything else that it raises is the model's own failure.
+    the weights onto `device` (`cpu`, `cuda:0`) and `unload` drops every reference to them; both may
+    be repeated. A load onto `meta` puts nothing anywhere: it finds out whether the checkpoint holds
+    the whole model, as every load does. `run` raises a `schemas.errors` type for what the caller
+    did wrong; anything else that it raises is the model's own failure.
     """
 
     @property

@@ -9,6 +9,7 @@ from schemas.errors import BadRequest, ModelError
 from schemas.manifest import RSkillManifest
 from schemas.sidecar import DetectionResult, DetectOp
 from sidecars.adapters.base import ModelCall
+from sidecars.checkpoints import load_transformers
 from sidecars.images import decode, within
 from sidecars.weights import Weights, from_pretrained, model_options
 
@@ -44,7 +45,7 @@ class DetectorAdapter:
         from transformers import AutoModelForZeroShotObjectDetection
 
         options = model_options(self._manifest, self._weights, device)
-        self._model = from_pretrained(AutoModelForZeroShotObjectDetection, self._weights, **options).eval()
+        self._model = load_transformers(AutoModelForZeroShotObjectDetection, self._weights, **options)
 
     def unload(self) -> None:
         self._model = None

@@ -8,6 +8,7 @@ from schemas.errors import BadRequest, ModelError
 from schemas.manifest import RSkillManifest
 from schemas.sidecar import EndpointCall
 from sidecars.adapters.base import ModelCall
+from sidecars.checkpoints import META, load_lerobot, need_statistics
 from sidecars.images import decode
 from sidecars.weights import Weights, from_pretrained
 
@@ -48,13 +49,21 @@ class PolicyAdapter:
 
         self._config.device = device
         self._config.pretrained_path = self._weights.source
-        self._policy = from_pretrained(self._policy_class, self._weights, config=self._config).eval()
-        self._before, self._after = make_pre_post_processors(
-            self._config,
-            pretrained_path=self._weights.source,
-            pretrained_revision=self._weights.revision,
-            preprocessor_overrides={"device_processor": {"device": device}},
-        )
+        self._policy = load_lerobot(self._policy_class, self._weights, self._config)
+        try:
+            self._before, self._after = make_pre_post_processors(
+                self._config,
+                pretrained_path=self._weights.source,
+                pretrained_revision=self._weights.revision,
+                preprocessor_overrides={"device_processor": {"device": "cpu" if device == META else device}},
+            )
+        except (OSError, ValueError, KeyError, ImportError) as error:
+            raise ModelError(
+                f"{self._weights.source}: its processors cannot be read: {type(error).__name__}: {error}",
+                hint="is the checkpoint complete?",
+            ) from error
+        need_statistics(self._before, self._config.input_features, self._weights.source)
+        need_statistics(self._after, self._config.output_features, self._weights.source)
 
     def unload(self) -> None:
         self._policy = self._before = self._after = None

@@ -8,6 +8,7 @@ from schemas.errors import BadRequest, ModelError
 from schemas.manifest import RSkillManifest
 from schemas.sidecar import ScoreOp
 from sidecars.adapters.base import ModelCall
+from sidecars.checkpoints import load_lerobot
 from sidecars.images import decode_all
 from sidecars.weights import Weights, from_pretrained
 
@@ -49,7 +50,7 @@ class RewardAdapter:
 
         self._config.device = device
         self._config.pretrained_path = self._weights.source
-        self._model = from_pretrained(self._model_class, self._weights, config=self._config).eval()
+        self._model = load_lerobot(self._model_class, self._weights, self._config)
         try:
             self._before, _ = make_reward_pre_post_processors(self._config)
         except (ValueError, ImportError, OSError) as error:

@@ -5,6 +5,7 @@ from typing import Any, Literal
 from schemas.manifest import RSkillManifest
 from schemas.sidecar import QueryOp
 from sidecars.adapters.base import ModelCall
+from sidecars.checkpoints import load_transformers
 from sidecars.images import decode, within
 from sidecars.weights import Weights, from_pretrained, model_options
 
@@ -34,7 +35,7 @@ class SceneVlmAdapter:
         from transformers import AutoModelForImageTextToText
 
         options = model_options(self._manifest, self._weights, device)
-        self._model = from_pretrained(AutoModelForImageTextToText, self._weights, **options).eval()
+        self._model = load_transformers(AutoModelForImageTextToText, self._weights, **options)
 
     def unload(self) -> None:
         self._model = None

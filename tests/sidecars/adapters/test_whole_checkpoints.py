@@ -1,0 +1,282 @@
+"""A checkpoint that does not hold all of its model is refused before the first answer.
+
+Regression: an ACT without its decoder and action head answered actions, an OWLv2 without its heads
+answered detections, and lerobot's pi0.5 loader returned a model of random numbers for a folder
+without weights. A robot moves on these answers.
+"""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from schemas.errors import ModelError
+from sidecars.checkpoints import load_lerobot, load_transformers
+from sidecars.weights import Weights
+
+pytestmark = pytest.mark.heavy
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+DEVICES = ("cpu", "meta")  # a load, and `vram-sidecar --check`
+WHOLE = "model.safetensors"
+
+
+def save_owlv2(folder: Path) -> None:
+    from transformers import Owlv2Config, Owlv2ForObjectDetection
+
+    small = {"hidden_size": 32, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
+    config = Owlv2Config(
+        text_config=small | {"vocab_size": 64, "max_position_embeddings": 16},
+        vision_config=small | {"image_size": 64, "patch_size": 16},
+        projection_dim=32,
+    )
+    Owlv2ForObjectDetection(config).save_pretrained(folder)
+
+
+def save_grounding_dino(folder: Path) -> None:
+    from transformers import BertConfig, GroundingDinoConfig, GroundingDinoForObjectDetection, SwinConfig
+
+    config = GroundingDinoConfig(
+        backbone_config=SwinConfig(
+            image_size=64, embed_dim=8, depths=[1, 1, 1, 1], num_heads=[1, 1, 1, 1], window_size=2,
+            out_features=["stage2", "stage3", "stage4"],
+        ),
+        text_config=BertConfig(vocab_size=64, hidden_size=16, num_hidden_layers=1, num_attention_heads=2, intermediate_size=16),
+        encoder_layers=1, decoder_layers=2, d_model=32, encoder_ffn_dim=16, decoder_ffn_dim=16,
+        encoder_attention_heads=2, decoder_attention_heads=2, num_queries=4, encoder_n_points=1, decoder_n_points=1,
+    )  # fmt: skip
+    GroundingDinoForObjectDetection(config).save_pretrained(folder)
+
+
+def features() -> dict[str, Any]:
+    from lerobot.configs.types import FeatureType, PolicyFeature
+
+    return {
+        "input_features": {
+            "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, 64, 64)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (6,)),
+        },
+        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (6,))},
+        "device": "cpu",
+    }
+
+
+def save_vqbet(folder: Path) -> None:
+    from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
+    from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
+
+    config = VQBeTConfig(
+        **features(), pretrained_backbone_weights=None, crop_shape=None, gpt_n_layer=1, gpt_n_head=2, gpt_hidden_dim=16, gpt_input_dim=16,
+        gpt_output_dim=16, vqvae_embedding_dim=8, vqvae_enc_hidden_dim=8, vqvae_n_embed=4, spatial_softmax_num_keypoints=4,
+        use_group_norm=True, gpt_block_size=50,
+    )  # fmt: skip
+    VQBeTPolicy(config).save_pretrained(folder)
+
+
+def shipped(name: str) -> Callable[[Path], None]:
+    return lambda folder: shutil.copytree(CONFIGS / "models" / name, folder, dirs_exist_ok=True)  # type: ignore[arg-type,func-returns-value]
+
+
+def load_detector(weights: Weights, device: str) -> Any:
+    from transformers import AutoModelForZeroShotObjectDetection
+
+    return load_transformers(AutoModelForZeroShotObjectDetection, weights, device_map={"": device})
+
+
+def load_vlm(weights: Weights, device: str) -> Any:
+    from transformers import AutoModelForImageTextToText
+
+    return load_transformers(AutoModelForImageTextToText, weights, device_map={"": device})
+
+
+def load_policy(weights: Weights, device: str) -> Any:
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.policies.factory import get_policy_class
+
+    import sidecars.compact_act  # noqa: F401  registers itself
+
+    config = PreTrainedConfig.from_pretrained(weights.source)
+    config.device = device
+    return load_lerobot(get_policy_class(config.type), weights, config)
+
+
+def load_reward(weights: Weights, device: str) -> Any:
+    from lerobot.configs.rewards import RewardModelConfig
+    from lerobot.rewards.factory import get_reward_model_class
+
+    import sidecars.compact_progress  # noqa: F401  registers itself
+
+    config = RewardModelConfig.from_pretrained(weights.source)
+    config.device = device
+    return load_lerobot(get_reward_model_class(config.type), weights, config)
+
+
+OTHERS: dict[str, Callable[[Path], None]] = {
+    "owlv2": save_owlv2,
+    "grounding_dino": save_grounding_dino,
+    "vqbet": save_vqbet,
+    "compact_act": shipped("so101-grab"),
+    "compact_progress": shipped("so101-progress"),
+    "shipped detector": shipped("so101-detector"),
+    "shipped vlm": shipped("so101-scene-vlm"),
+}
+MODELS: dict[str, tuple[Callable[[Weights, str], Any], str]] = {  # how it is loaded, and a part that it does not work without
+    "act": (load_policy, "model.action_head"),
+    "vqbet": (load_policy, "vqbet.action_head"),
+    "compact_act": (load_policy, "act."),
+    "compact_progress": (load_reward, "judge"),
+    "owlvit": (load_detector, "box_head"),
+    "owlv2": (load_detector, "class_head"),
+    "grounding_dino": (load_detector, "bbox_embed"),
+    "qwen": (load_vlm, "lm_head"),
+    "shipped detector": (load_detector, "box_head"),
+    "shipped vlm": (load_vlm, "layers.0"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def saved(weights: Any, tmp_path_factory: Any) -> Callable[[str], Path]:
+    """A whole checkpoint's folder."""
+    folder = tmp_path_factory.mktemp("whole")
+
+    def saved(name: str) -> Path:
+        if name not in OTHERS:
+            return Path(weights(name).source)
+        place: Path = folder / name
+        if not place.exists():
+            place.mkdir()
+            OTHERS[name](place)
+        return place
+
+    return saved
+
+
+def refused(load: Callable[[Weights, str], Any], folder: Path, device: str) -> ModelError:
+    with pytest.raises(ModelError) as caught:
+        load(Weights(str(folder), local=True), device)
+    return caught.value
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", MODELS)
+def test_only_a_whole_checkpoint_is_loaded(
+    saved: Callable[[str], Path], tmp_path: Path, name: str, device: str
+) -> None:
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    load, part = MODELS[name]
+    whole = saved(name)
+    model = load(Weights(str(whole), local=True), device)
+    assert {tensor.device.type for tensor in model.parameters()} == {device}
+
+    tensors = load_file(whole / WHOLE)
+    folder = tmp_path / "damaged"
+    shutil.copytree(whole, folder)
+
+    def damaged(content: dict[str, Any]) -> ModelError:
+        save_file(content, folder / WHOLE, metadata={"format": "pt"})
+        return refused(load, folder, device)
+
+    without = {key: tensor for key, tensor in tensors.items() if part not in key}
+    assert without.keys() < tensors.keys(), f"no {part} in {sorted(tensors)}"
+    error = damaged(without)
+    assert error.details["missing"] >= len(tensors) - len(without)
+    assert "missing from it" in error.message
+    assert part in error.message
+    assert damaged({}).details["missing"] >= len(tensors)
+    error = damaged(tensors | {"another.models.weight": torch.zeros(3)})
+    assert (error.details["missing"], error.details["foreign"]) == (0, 1)
+    assert "1 unknown to the model (another.models.weight)" in error.message
+    key = next(key for key in tensors if part in key and tensors[key].ndim)
+    error = damaged(tensors | {key: torch.zeros([side + 1 for side in tensors[key].shape])})
+    assert error.details["misshapen"] == 1
+    assert str(tuple(tensors[key].shape)) in error.message
+
+    content = (whole / WHOLE).read_bytes()
+    (folder / WHOLE).write_bytes(content[: len(content) // 2])
+    refused(load, folder, device)
+    (folder / WHOLE).unlink()
+    refused(load, folder, device)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_checkpoint_in_parts_needs_all_of_them(tmp_path: Path, device: str) -> None:
+    from transformers import Owlv2ForObjectDetection
+
+    save_owlv2(tmp_path / "one")
+    model = Owlv2ForObjectDetection.from_pretrained(tmp_path / "one")
+    model.save_pretrained(tmp_path / "parts", max_shard_size="40KB")
+    parts = sorted((tmp_path / "parts").glob("model-*.safetensors"))
+    assert len(parts) > 2
+    load_detector(Weights(str(tmp_path / "parts"), local=True), device)
+    parts[1].unlink()
+    refused(load_detector, tmp_path / "parts", device)
+
+
+def test_a_loader_that_swallows_what_it_could_not_read_is_found_out(tmp_path: Path) -> None:
+    """lerobot's pi0.5: without weights, or with those of another model, it prints a line and
+    returns random numbers. Three billion, so without bytes."""
+    import torch
+    from lerobot.policies.pi05.configuration_pi05 import PI05Config
+    from safetensors.torch import save_file
+
+    PI05Config(**features())._save_pretrained(tmp_path)
+    assert "read no weights" in refused(load_policy, tmp_path, "meta").message
+    save_file({"another.models.weight": torch.zeros(3)}, tmp_path / WHOLE)
+    error = refused(load_policy, tmp_path, "meta")
+    assert error.details["foreign"] == 1
+    assert error.details["missing"] > 100
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("part", ["preprocessor_step_3_normalizer", "postprocessor_step_0_unnormalizer"])
+def test_a_policy_without_its_statistics_is_refused(tmp_path: Path, part: str, device: str) -> None:
+    """lerobot's processors leave what they have no statistics of as it is: actions would be in the
+    network's units, not in the robot's."""
+    from safetensors.torch import load_file, save_file
+
+    from schemas.manifest import load_manifest
+    from sidecars.adapters.choose import make_adapter
+
+    shipped("so101-grab")(tmp_path)
+    file = tmp_path / f"policy_{part}_processor.safetensors"
+    kept = "observation.state." if "post" in part else "action."
+    numbers = {key: tensor for key, tensor in load_file(file).items() if key.startswith(kept)}
+    save_file(numbers, file)
+    adapter = make_adapter(
+        load_manifest(CONFIGS / "rskills/so101-grab/rskill.yaml"), Weights(str(tmp_path), local=True)
+    )
+    adapter.prepare()
+    with pytest.raises(ModelError, match=r"no statistics of (action|observation\.state)"):
+        adapter.load(device)
+    file.unlink()
+    with pytest.raises(ModelError, match="its processors cannot be read"):
+        adapter.load(device)
+
+
+def test_check_compares_the_weights_and_ends_with_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from safetensors.torch import load_file, save_file
+
+    from sidecars.__main__ import main
+
+    for name in ("so101-grab", "so101-detector"):
+        shutil.copytree(CONFIGS / "models" / name, tmp_path / "models" / name)
+        flags = [
+            "--name", "x", "--rskill", str(CONFIGS / f"rskills/{name}/rskill.yaml"), "--device", "none",
+            "--configs", str(tmp_path), "--footprint", "1GB", "--check",
+        ]  # fmt: skip
+        assert main(flags) == 0
+        out = capsys.readouterr().out
+        assert out.count("\n") == 1, "what the loaders print is not the answer"
+        assert "the weights hold the whole model" in out
+        file = tmp_path / "models" / name / WHOLE
+        tensors = load_file(file)
+        dropped = sorted(tensors)[:5]
+        save_file({key: tensors[key] for key in tensors if key not in dropped}, file, {"format": "pt"})
+        assert main(flags) == 2
+        assert f"of the parameters 5 missing from it ({dropped[0]}" in capsys.readouterr().err
