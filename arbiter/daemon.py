@@ -11,6 +11,7 @@ import gc
 import logging
 import os
 import resource
+import secrets
 import signal
 import sys
 import time
@@ -64,6 +65,7 @@ OPEN_FILES = 65_536
 SWITCH_S = 0.0005
 """How long the loop may keep the interpreter from a thread that reads a card, which asks for it some twenty times per reading: with
 Python's own 5 ms a client that floods the loop makes every reading take a tenth of a second."""
+TOKEN_SECRET_BYTES = 16
 STATUS_EVERY_S = 5.0
 KEEP_LEARNT_EVERY_S = 10.0
 
@@ -154,6 +156,7 @@ def core_settings(config: ArbiterConfig, gpus: tuple[GpuInfo, ...], opened: Open
         waiters_max=config.limits.waiters_max,
         leases_per_client_max=config.limits.leases_per_client_max,
         uses_per_lease_max=config.limits.uses_per_lease_max,
+        token_secret=secrets.token_hex(TOKEN_SECRET_BYTES),
         host_ram_budget_bytes=park_budget_bytes(config.host.park_budget_bytes),
     )
 

@@ -8,6 +8,7 @@ loop's timers and of the probes' time stamps.
 import asyncio
 import json
 import logging
+import re
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -15,7 +16,8 @@ from typing import Any, Protocol
 
 from arbiter.core.effects import Effect
 from arbiter.core.events import Event, Resumed, Tick
-from schemas.ids import GpuId
+from schemas.defaults import STATUS_PAGE
+from schemas.ids import GpuId, ProcessKey
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +31,9 @@ FRESH_S = 1.0
 """Time limit for the reading that an answer waits for. After it the answer shows the old reading with its age."""
 QUESTIONS_MAX = 1024
 """Answers that wait for a reading at a time. One more is given at once, with the reading that there is."""
+NOBODY = ProcessKey(0, 0)
+"""Reader of a status that goes to the log: it may see no token."""
+_TOKEN = re.compile(r"Token\(epoch=(\d+), serial=\d+\)")
 
 
 class Core(Protocol):
@@ -38,7 +43,13 @@ class Core(Protocol):
 
     def next_deadline(self) -> float | None: ...
 
-    def status(self, now: float) -> dict[str, Any]: ...
+    def status(
+        self,
+        now: float,
+        reader: ProcessKey | None = None,
+        after: tuple[int, float, int] | None = None,
+        limit: int | None = None,
+    ) -> dict[str, Any]: ...
 
     def why(self, consumer: str, now: float) -> dict[str, Any]: ...
 
@@ -49,6 +60,11 @@ class Core(Protocol):
     def learnt(self) -> dict[str, dict[str, float]]: ...
 
     def footprints(self) -> dict[str, dict[str, list[int]]]: ...
+
+
+def without_tokens(event: Event) -> str:
+    """An event as the log may show it: a token authorizes uses, and the log has more readers than the lease."""
+    return _TOKEN.sub(r"Token(epoch=\1, …)", repr(event))
 
 
 class Inbox:
@@ -123,8 +139,11 @@ class Inbox:
             for gpu in stale:
                 self._sample(gpu)
 
-    def status(self) -> dict[str, Any]:
-        return self._core.status(self._clock())
+    def status(
+        self, reader: ProcessKey | None, after: tuple[int, float, int] | None = None
+    ) -> dict[str, Any]:
+        """A page of the status as `reader` may see it; None: an operator."""
+        return self._core.status(self._clock(), reader, after, STATUS_PAGE)
 
     def why(self, consumer: str) -> dict[str, Any]:
         return self._core.why(consumer, self._clock())
@@ -167,7 +186,7 @@ class Inbox:
             self._perform(effects)
             self._handled += 1
         except Exception as error:  # outermost: a core that raised has an unknown state
-            log.critical("the core failed on %s: %s", event, error, exc_info=error)
+            log.critical("the core failed on %s: %s", without_tokens(event), error, exc_info=error)
             log.critical("state of the core: %s", self._state())
             self.close()
             if effects is None and self._record is not None:
@@ -187,7 +206,7 @@ class Inbox:
 
     def _state(self) -> str:
         try:
-            return json.dumps(self.status(), default=str)
+            return json.dumps(self.status(NOBODY), default=str)
         except Exception as error:  # noqa: BLE001 - the state may be what is broken; this is its last word
             return f"unreadable: {error!r}"
 

@@ -289,8 +289,15 @@ class ArbiterClient:
         )
 
     async def status(self) -> r.Message:
-        """`schemas.wire.StatusReply`."""
-        return await self.ask("status")
+        """`schemas.wire.StatusReply`, with the leases of all its pages. Leases that move meanwhile are listed once, or not at all."""
+        shown = await self.ask("status")
+        leases = {lease["lease_id"]: lease for lease in shown["leases"]}
+        after = shown.pop("next", None)
+        while after is not None:
+            page = await self.ask("status", {"after": after})
+            leases |= {lease["lease_id"]: lease for lease in page["leases"]}
+            after = page.get("next")
+        return {**shown, "leases": list(leases.values())}
 
     async def why(self, consumer: str) -> r.Message:
         """`schemas.wire.WhyReply`: who blocks this consumer, how many bytes, on which condition, what happens next."""

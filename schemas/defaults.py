@@ -49,6 +49,7 @@ WAITERS_MAX = 16_384
 LEASES_PER_CLIENT_MAX = 64
 SUBLEASE_DEPTH_MAX = 4  # a lease, its sub-leases, theirs, and once more
 USES_PER_LEASE_MAX = 256
+STATUS_PAGE = 200  # leases in one reply to `status`: about 2 ms
 RATE_PER_CLIENT_PER_S = 2000
 SUBSCRIBERS_MAX = 64
 HISTORY_MAX_EVENTS = 200_000

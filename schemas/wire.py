@@ -23,6 +23,7 @@ from schemas.traceparent import Traceparent
 Name = Annotated[str, Field(min_length=1, max_length=d.NAME_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]+$")]
 LeaseIdText = Annotated[str, Field(min_length=1, max_length=64)]
 TokenPair = Annotated[tuple[int, int], Field(description="[epoch, serial]")]
+Serial = Annotated[int, Field(ge=0, lt=1 << 63)]
 Seconds = Annotated[float, Field(ge=0, le=86_400 * 365, allow_inf_nan=False)]
 Reason = Annotated[str, Field(max_length=d.REASON_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]*$")]
 Bytes = Annotated[int, Field(ge=0, le=1 << 50)]
@@ -214,7 +215,10 @@ class Oom(_Request):
 
 
 class Status(_Request):
+    """The state of everything. Leases come in pages: `after` is the `next` of the page before."""
+
     op: Literal["status"]
+    after: tuple[Literal[0, 1], Annotated[float, Field(allow_inf_nan=False)], Serial] | None = None
 
 
 class Why(_Request):
@@ -305,7 +309,9 @@ class LeaseView(TypedDict):
     """A lease as replies, pushes and `status` show it."""
 
     lease_id: str
-    token: list[int] | None  # None while queued
+    token: NotRequired[
+        list[int] | None
+    ]  # None while queued; shown to the holder's process and to operators only
     state: str
     consumer: str
     model: str
@@ -427,7 +433,9 @@ class StatusReply(TypedDict):
     phase: Literal["recovering", "serving"]
     uptime_s: float
     gpus: list[GpuView]
-    leases: list[LeaseView]  # live ones: held, loading, …, then the queue in order
+    leases: list[LeaseView]  # a page of the live ones: held, loading, …, then the queue in order
+    totals: NotRequired[dict[str, int]]  # {"leases", "waiting"} of all pages
+    next: NotRequired[list[float]]  # there may be more: ask again with this as `after`
     clients: int
     host_ram: NotRequired[dict[str, int]]  # {"budget_bytes", "parked_bytes"}
     drained: str  # who drained the arbiter and why; "" while it grants

@@ -102,10 +102,16 @@ class Arbiter:
         """When a Tick is due (monotonic seconds); None: nothing is planned."""
         return self._core.timers.next_at()
 
-    def status(self, now: float) -> dict[str, Any]:
-        """Shape of `schemas.wire.StatusReply`."""
+    def status(
+        self,
+        now: float,
+        reader: ProcessKey | None = None,
+        after: explain.PageKey | None = None,
+        limit: int | None = None,
+    ) -> dict[str, Any]:
+        """Return the shape of `schemas.wire.StatusReply`. `reader`: the process that asks; None: an operator, for all tokens."""
         self._core.now = max(self._core.now, now)
-        return explain.status(self._core)
+        return explain.status(self._core, reader, after, limit)
 
     def why(self, consumer: str, now: float) -> dict[str, Any]:
         """Shape of `schemas.wire.WhyReply`."""

@@ -1,6 +1,10 @@
 """Answers for people and programs: views of leases, `status`, `why`, and the record of a switch. Reads only."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from heapq import merge, nsmallest
+from itertools import chain, islice
+from math import inf
+from operator import attrgetter
 from statistics import median
 from typing import Any
 
@@ -8,6 +12,7 @@ from arbiter.core import drift, gangs, outlook, policy, standby
 from arbiter.core.blockers import ago, gib, loading, named, unloading, uses, who_blocks
 from arbiter.core.lease import AWAY, LEAVING, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
+from schemas.ids import ProcessKey
 
 NOTE_KINDS: tuple[str, ...] = (
     "queued", "granted", "ready", "switch", "use_began", "use_ended", "use_yielded", "revoke_asked", "revoke_acked", "reminded",
@@ -27,9 +32,22 @@ DAEMON_KINDS: tuple[str, ...] = (
 """What the daemon itself adds to the history: its starts and ends, and what is wrong with its own files."""
 
 
+type PageKey = tuple[int, float, int]
+"""Where `status` goes on: waiters (1) after all others (0), rank in the queues, arrival."""
+
+
 # -- views -------------------------------------------------------------------------------------------------------------
+def view_for(core: Core, lease: Lease, reader: ProcessKey | None) -> dict[str, Any]:
+    """A lease as `reader` may see it: its token is shown to the holder's process and to an operator (None) only, since a token is all
+    that is needed to mark a use, which keeps a lease from being evicted."""
+    shown = view(core, lease)
+    if reader is not None and reader != lease.process:
+        del shown["token"]
+    return shown
+
+
 def view(core: Core, lease: Lease) -> dict[str, Any]:
-    """`schemas.wire.LeaseView`."""
+    """`schemas.wire.LeaseView`, for the lease's holder or an operator."""
     gpu = None if lease.gpu is None else core.gpus[lease.gpu]
     shown: dict[str, Any] = {
         "lease_id": lease.id,
@@ -135,20 +153,65 @@ def _processes(gpu: Gpu) -> list[dict[str, Any]]:
     return shown
 
 
-def status(core: Core) -> dict[str, Any]:
-    """`schemas.wire.StatusReply`."""
-    resident = [lease for lease in core.leases.values() if lease.state is not LeaseState.QUEUED]
-    waiting = sorted(core.waiting.values(), key=lambda lease: (_best_position(core, lease), lease.arrival))
-    return {
+def status(
+    core: Core, reader: ProcessKey | None = None, after: PageKey | None = None, limit: int | None = None
+) -> dict[str, Any]:
+    """Return `schemas.wire.StatusReply` with the leases that follow `after`, at most `limit` of them.
+
+    A page costs what it holds, however many wait: the queues are sorted already. `reader`: see `view_for`.
+    """
+    leases = list(islice(_listed(core, after, limit), limit))
+    shown: dict[str, Any] = {
         "epoch": core.settings.epoch,
         "phase": "serving" if core.recovering is None else "recovering",
         "uptime_s": core.now - core.started_at,
         "gpus": [gpu_view(core, gpu) for gpu in core.gpus.values()],
-        "leases": [view(core, lease) for lease in [*resident, *waiting]],
+        "leases": [view_for(core, lease, reader) for lease in leases],
+        "totals": {"leases": len(core.leases), "waiting": len(core.waiting)},
         "clients": len(core.clients),
         "host_ram": {"budget_bytes": core.host.budget_bytes, "parked_bytes": core.host.used_bytes()},
         "drained": "" if core.drain is None else str(core.drain),
     }
+    if leases and len(leases) == limit:
+        shown["next"] = list(_page_key(core, leases[-1]))
+    return shown
+
+
+def _page_key(core: Core, lease: Lease) -> PageKey:
+    if lease.state is not LeaseState.QUEUED:
+        return (0, 0.0, lease.arrival)
+    return (1, *core.gpus[lease.gpus[0]].queue.rank(lease))
+
+
+def _listed(core: Core, after: PageKey | None, limit: int | None) -> Iterator[Lease]:
+    """Leases with bytes or away by arrival, then the waiters in the order of the queues."""
+    section, rank, arrival = after or (0, 0.0, 0)
+    if section == 0:
+        granted = chain(*(gpu.residents.values() for gpu in core.gpus.values()), core.away.values())
+        rest = (lease for lease in granted if lease.arrival > arrival)
+        by_arrival = attrgetter("arrival")
+        yield from sorted(rest, key=by_arrival) if limit is None else nsmallest(limit, rest, key=by_arrival)
+    yield from _in_queues(core, (rank, arrival) if section else (-inf, 0))
+
+
+def _in_queues(core: Core, after: tuple[float, int]) -> Iterator[Lease]:
+    """Waiters in the order of the queues, each once. Members of a gang that gathers or loads stand in none, and are listed at their rank."""
+
+    def rank(lease: Lease) -> tuple[float, int]:
+        return core.gpus[lease.gpus[0]].queue.rank(lease)
+
+    unqueued = [
+        lease
+        for gang in core.gangs.values()
+        for lease in gang.waiting()
+        if rank(lease) > after and not any(lease in core.gpus[gpu_id].queue for gpu_id in lease.gpus)
+    ]
+    queued = [gpu.queue.after(after) for gpu in core.gpus.values()]
+    last: Lease | None = None
+    for lease in merge(sorted(unqueued, key=rank), *queued, key=rank):
+        if lease is not last:  # else it waits for several GPUs
+            yield lease
+        last = lease
 
 
 def _best_position(core: Core, lease: Lease) -> int:

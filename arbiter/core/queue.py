@@ -5,13 +5,14 @@ waiters is fixed when they arrive: `arrival time − priority × ageing` (smalle
 sorted list that time never disturbs, bounds every wait, and never reorders equals. Without ageing (0) it is the order of arrival.
 """
 
-from bisect import bisect_left, insort
+from bisect import bisect_left, bisect_right, insort
 from collections.abc import Iterator
+from itertools import islice
 
 from arbiter.core.lease import Lease
 from schemas.ids import LeaseId
 
-type _Rank = tuple[float, int]
+type Rank = tuple[float, int]
 
 
 class WaitQueue:
@@ -19,7 +20,7 @@ class WaitQueue:
 
     def __init__(self, ageing_s_per_point: float) -> None:
         self._ageing_s = ageing_s_per_point
-        self._ranks: list[_Rank] = []
+        self._ranks: list[Rank] = []
         self._leases: dict[int, Lease] = {}  # by arrival
         self._needs: list[int] = []
 
@@ -33,7 +34,7 @@ class WaitQueue:
         return lease.arrival in self._leases
 
     def add(self, lease: Lease) -> None:
-        insort(self._ranks, self._rank(lease))
+        insort(self._ranks, self.rank(lease))
         insort(self._needs, lease.load_peak_bytes)
         self._leases[lease.arrival] = lease
 
@@ -42,7 +43,7 @@ class WaitQueue:
         if lease.arrival not in self._leases:
             return
         del self._leases[lease.arrival]
-        del self._ranks[bisect_left(self._ranks, self._rank(lease))]
+        del self._ranks[bisect_left(self._ranks, self.rank(lease))]
         del self._needs[bisect_left(self._needs, lease.load_peak_bytes)]
 
     def head(self) -> Lease | None:
@@ -58,18 +59,24 @@ class WaitQueue:
 
     def precedes(self, first: Lease, second: Lease) -> bool:
         """Is, or was, the one before the other? Neither has to wait still."""
-        return self._rank(first) < self._rank(second)
+        return self.rank(first) < self.rank(second)
 
     def position(self, lease: Lease) -> int:
         """1 is the head."""
-        return bisect_left(self._ranks, self._rank(lease)) + 1
+        return bisect_left(self._ranks, self.rank(lease)) + 1
 
     def ahead_of(self, lease: Lease) -> LeaseId | None:
         """Who stands directly before this waiter."""
         index = self.position(lease) - 2
         return self._leases[self._ranks[index][1]].id if index >= 0 else None
 
-    def _rank(self, lease: Lease) -> _Rank:
+    def after(self, rank: Rank) -> Iterator[Lease]:
+        """Waiters behind a place in the order, whether or not one stands there now."""
+        first = bisect_right(self._ranks, rank)
+        return (self._leases[arrival] for _, arrival in islice(self._ranks, first, None))
+
+    def rank(self, lease: Lease) -> Rank:
+        """Its place in the order of any queue."""
         if lease.rank is not None:
             return (lease.rank, lease.arrival)
         return (lease.arrived_at - lease.spec.priority * self._ageing_s, lease.arrival)

@@ -60,7 +60,6 @@ def lease_for(core: Core, lease_id: LeaseId, token: Token) -> Lease:
             "stale_token",
             f"{token} is not the token of {lease_id}",
             "use the token that came with the grant",
-            token=[lease.token.epoch, lease.token.serial],
         )
     return lease
 

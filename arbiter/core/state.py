@@ -6,6 +6,7 @@ Data and bookkeeping only: no decision is taken here.
 from collections import Counter, OrderedDict, deque
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass, field
+from hashlib import blake2b
 from statistics import median
 from typing import Any
 
@@ -25,6 +26,8 @@ from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, 
 
 ENDED_REMEMBERED = 1024
 LEARNT_REMEMBERED = 32
+TOKEN_STEP_BYTES = 4
+"""Tokens are apart by up to 2^32: 2^31 grants of one epoch stay below 2^63."""
 _LOADING = frozenset({LeaseState.LOADING})
 _MOVING = LEAVING | _LOADING
 IDLE_PROBE_S = 10.0  # how long after the last client a card is still read in the background
@@ -149,6 +152,7 @@ class Core:
         self.ended: OrderedDict[LeaseId, Ended] = OrderedDict()
         self.timers = Timers()
         self.serial = 0
+        self.token_offset = 0  # tokens are ahead of `serial` by so much
         self.arrivals = 0
         self.last_token = Token(settings.epoch, 0)
         self.users: dict[ProcessKey, dict[tuple[LeaseId, UseId], Lease]] = {}  # whose busy uses are where
@@ -185,8 +189,6 @@ class Core:
         facts: dict[str, Any] = {}
         if lease is not None:
             facts = {"lease_id": lease.id, "consumer": lease.spec.consumer, "gpu": lease.gpu}
-            if lease.token is not None:
-                facts["token"] = [lease.token.epoch, lease.token.serial]
             if lease.traceparent is not None:
                 facts["traceparent"] = lease.traceparent
         self.out.append(Note(kind, {**facts, **data}))
@@ -224,8 +226,14 @@ class Core:
         return LeaseId(f"L{self.settings.epoch}-{self.serial}")
 
     def next_token(self) -> Token:
+        """Return a token greater than every one before it. With `Settings.token_secret` the distance to the last one cannot be guessed:
+        a token is what authorizes a use, and lease ids are public."""
         self.serial += 1
-        return Token(self.settings.epoch, self.serial)
+        if self.settings.token_secret:
+            key = bytes.fromhex(self.settings.token_secret)
+            step = blake2b(b"%d" % self.serial, digest_size=TOKEN_STEP_BYTES, key=key).digest()
+            self.token_offset += int.from_bytes(step)
+        return Token(self.settings.epoch, self.serial + self.token_offset)
 
     def next_arrival(self) -> int:
         self.arrivals += 1

@@ -52,7 +52,9 @@ class Decisions(Protocol):
         """Call `answer` once the GPUs were read, or when the time limit for that has passed."""
         ...
 
-    def status(self) -> dict[str, Any]: ...
+    def status(
+        self, reader: ProcessKey | None, after: tuple[int, float, int] | None = None
+    ) -> dict[str, Any]: ...
 
     def why(self, consumer: str) -> dict[str, Any]: ...
 
@@ -355,8 +357,14 @@ class SessionTable:
             case w.Ping():
                 self.reply(client, re, {"server": self._settings.server})
             case w.Status():
+                reader = None if session.role == "operator" else session.peer.process
+                page = request.after
                 self._decisions.when_read(
-                    lambda: self.reply(client, re, {**self._decisions.status(), "problems": self._problems()})
+                    lambda: self.reply(
+                        client,
+                        re,
+                        {**self._decisions.status(reader, page), "problems": self._problems()},
+                    )
                 )
             case w.Why():
                 consumer = request.consumer

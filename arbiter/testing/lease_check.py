@@ -19,7 +19,7 @@ Rules (their names stand in `Finding.rule`):
 import bisect
 import json
 import re
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -126,6 +126,7 @@ def check_leases(
     claims = _claims(traces, events, times)
     known = {claim.lease_id: claim for mine in claims.values() for claim in mine}
     _check_history(story, events, times, known, hindrances)
+    _check_tokens(story, events, times, traces)
     _check_card(story, read_lines([log]), claims, traces, hindrances, _kept(events, times, traces))
     _check_uses(story, read_lines([log]), traces)
     _check_waits(story, traces, hindrances, outages, stuck_s)
@@ -198,7 +199,6 @@ def _check_history(
 ) -> None:
     loading: dict[str, dict[str, str]] = defaultdict(dict)  # card → lease → consumer
     uses: dict[str, set[str]] = defaultdict(set)  # as far as they began since the daemon did
-    newest = (0, 0)
     epoch = seq = 0
     for event, t in zip(events, times, strict=True):
         if (
@@ -221,10 +221,6 @@ def _check_history(
                 uses.pop(lease, None)
             case "granted":
                 story.grants += 1
-                token = (int(event["token"][0]), int(event["token"][1]))
-                if token <= newest:
-                    story.bad("tokens", t, f"{lease} of {event['consumer']} has {token} after {newest}")
-                newest = max(newest, token)
                 if loading[gpu] and not event.get("parent"):
                     others = ", ".join(loading[gpu].values())
                     story.bad("loading", t, f"{event['consumer']} is granted while {others} loads")
@@ -251,6 +247,28 @@ def _check_history(
                 uses[lease].add(event["use_id"])
             case "use_ended":
                 uses[lease].discard(event["use_id"])
+
+
+def _check_tokens(
+    story: Story, events: Sequence[Line], times: Sequence[float], traces: Sequence[Line]
+) -> None:
+    """The history has the order of the grants, their holders have the tokens. A lease of which one side missed a grant says nothing."""
+    heard: dict[str, deque[tuple[int, int]]] = defaultdict(deque)
+    for line in traces:
+        if line["event"] == "granted":
+            heard[str(line["lease_id"])].append((int(line["token"][0]), int(line["token"][1])))
+    grants = [(event, t) for event, t in zip(events, times, strict=True) if event["kind"] == "granted"]
+    told = Counter(str(event["lease_id"]) for event, _ in grants)
+    whole = {lease for lease, count in told.items() if count == len(heard[lease])}
+    newest = (0, 0)
+    for event, t in grants:
+        lease = str(event["lease_id"])
+        if lease not in whole:
+            continue
+        token = heard[lease].popleft()
+        if token <= newest:
+            story.bad("tokens", t, f"{lease} of {event['consumer']} has {token} after {newest}")
+        newest = max(newest, token)
 
 
 def _epoch(lease: str) -> int:

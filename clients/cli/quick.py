@@ -135,7 +135,22 @@ def complain(error: Mapping[str, Any], *, as_json: bool) -> None:
 
 # -- commands ----------------------------------------------------------------------------------------------------------
 def status(*, as_json: bool = False, endpoint: str | None = None) -> int:
-    return answer("status", {}, endpoint=endpoint, as_json=as_json, lines=text.status_lines)[0]
+    return answer(
+        "status", {}, endpoint=endpoint, as_json=as_json, lines=text.status_lines, question=_all_pages
+    )[0]
+
+
+def _all_pages(op: str, fields: Mapping[str, Any], endpoint: str | None) -> Message:
+    """The whole status: its leases come in pages."""
+    reply = ask(op, fields, endpoint)
+    after = reply.pop("next", None)
+    while after is not None:
+        page = ask(op, {**fields, "after": after}, endpoint)
+        if not page.get("ok"):
+            return page
+        reply["leases"] += page["leases"]
+        after = page.get("next")
+    return reply
 
 
 def why(consumer: str, *, as_json: bool = False, endpoint: str | None = None) -> int:

@@ -41,7 +41,7 @@ class ScriptedCore:
     def next_deadline(self) -> float | None:
         return self.deadline
 
-    def status(self, now: float) -> dict[str, Any]:
+    def status(self, now: float, *page: object) -> dict[str, Any]:
         if self.broken:
             raise KeyError("state")
         return {"now": now}
@@ -91,7 +91,7 @@ def test_the_clock_is_monotonic_time() -> None:
         before = time.monotonic()
         inbox.post(left("a"))
         assert before <= core.times[0] <= time.monotonic()
-        assert inbox.status()["now"] >= core.times[0]
+        assert inbox.status(None)["now"] >= core.times[0]
         assert inbox.why("c")["consumer"] == "c"
         assert inbox.learnt() == {"detector": {"load_s": 2.0}}
         assert inbox.footprints() == {"detector m": {"steady": [5]}}

@@ -1,6 +1,8 @@
 """The asyncio client against a real daemon with a simulated card."""
 
 import asyncio
+import contextlib
+import json
 import signal
 import subprocess
 import sys
@@ -13,6 +15,7 @@ import pytest
 from arbiter.testing.process import ArbiterProcess
 from clients.aio import ArbiterClient
 from clients.connection import REQUEST_TIMEOUT_S
+from schemas.defaults import STATUS_PAGE
 from schemas.errors import (
     ArbiterUnreachable,
     LeaseLost,
@@ -52,6 +55,32 @@ async def test_acquire_ready_use_release(arbiter_daemon: ArbiterProcess, spec: S
         assert lease.error is None
         with pytest.raises(LeaseLost):
             await lease.ready()
+
+
+async def test_status_is_whole_though_it_comes_in_pages(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    """The daemon answers `status` in pages: thousands of waiters in one reply held its loop for seconds."""
+    waiters = STATUS_PAGE + 40
+    async with contextlib.AsyncExitStack() as stack:
+        clients = [
+            await stack.enter_async_context(ArbiterClient(arbiter_daemon.endpoint, name="t"))
+            for _ in range(5)
+        ]
+        await clients[0].acquire(spec("holder", 5))
+        asked = {"spec": spec("crowd", 5).model_dump()}
+        for number in range(waiters):
+            await clients[1 + number % 4].ask("acquire", {"nonce": f"n{number}", **asked})
+        page = await clients[0].ask("status")
+        assert (len(page["leases"]), page["totals"]) == (
+            STATUS_PAGE,
+            {"leases": waiters + 1, "waiting": waiters},
+        )
+        whole = await clients[0].status()
+        assert [lease.get("position") for lease in whole["leases"]] == [None, *range(1, waiters + 1)]
+        assert "next" not in whole
+        vramctl = str(Path(sys.executable).with_name("vramctl"))
+        command = [vramctl, "status", "--json", "--endpoint", arbiter_daemon.endpoint]
+        told = await asyncio.to_thread(subprocess.run, command, capture_output=True, check=True)
+        assert len(json.loads(told.stdout)["leases"]) == waiters + 1
 
 
 async def test_a_block_unloads_and_releases_also_when_it_raises(

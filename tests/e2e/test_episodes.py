@@ -173,7 +173,9 @@ class Stage:
     async def open(cls, programs: Programs, stack: AsyncExitStack) -> "Stage":
         stage, where = cls(programs), f"ipc://{programs.runtime}"
         stage.arbiter = await stack.enter_async_context(
-            ArbiterClient(programs.arbiter.endpoint, name="witness", connect_timeout_s=WAIT_S)
+            ArbiterClient(
+                programs.arbiter.endpoint, name="witness", role="operator", connect_timeout_s=WAIT_S
+            )
         )
         stage.runner = await stack.enter_async_context(
             RunnerClient(f"{where}/runner.sock", connect_timeout_s=BOOT_S)
@@ -262,7 +264,8 @@ class Stage:
         assert granted["reason"] == "back from standby: there is room and nobody waits"
         assert sum(e["kind"] == "granted" and e.get("consumer") == "detector" for e in self.events) == 1
         await self.detector.load()  # the arbiter's word is a moment ahead of the sidecar's
-        assert (await self.detector.ping(timeout_s=WAIT_S))["token"] == granted["token"]
+        (shown,) = (await self.arbiter.status())["leases"]
+        assert (await self.detector.ping(timeout_s=WAIT_S))["token"] == shown["token"]
         assert await self.leases() == {"detector": "held"}
 
     def detector_was_away(self) -> bool:

@@ -96,7 +96,7 @@ class Box:
     @contextlib.asynccontextmanager
     async def client(self) -> AsyncIterator[ArbiterClient]:
         async with ArbiterClient(
-            f"ipc://{self.runtime}/arbiter.sock", name="test", connect_timeout_s=PATIENCE_S
+            f"ipc://{self.runtime}/arbiter.sock", name="test", role="operator", connect_timeout_s=PATIENCE_S
         ) as client:
             yield client
 

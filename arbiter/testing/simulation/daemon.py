@@ -59,6 +59,7 @@ class Machine:
     boot: int = 1
     alive: dict[int, ProcessKey] = field(default_factory=dict)  # by pid
     history: list[Happening] = field(default_factory=list)
+    tokens: dict[str, tuple[int, int]] = field(default_factory=dict)  # by lease, as the journal had it last
     epochs: list[int] = field(default_factory=list)
     slept_s: float = 0.0  # of a suspend that the daemon has not noticed yet
 
@@ -280,6 +281,9 @@ class _Records:
         if self._daemon.journal_full:
             raise JournalUnavailable("the disk is full", hint="simulated")
         self._journal.apply(changes)
+        for _, record in changes:
+            if record is not None and "token" in record:
+                self._daemon.machine.tokens[record["lease_id"]] = (record["token"][0], record["token"][1])
         written = [(key, record.get("state", "kept") if record else "gone") for key, record in changes]
         self._daemon.clock.say(f"journal {written}")
         self._daemon.crash_point("after a journal write")

@@ -237,7 +237,7 @@ class World:
     def _check_note(self, note: Happening) -> None:
         if note.kind != "granted":
             return
-        token = (int(note.data["token"][0]), int(note.data["token"][1]))
+        token = self.machine.tokens[str(note.data["lease_id"])]
         if token <= self._last_token:
             self.fail(f"token {token} was granted after {self._last_token}")
         self._last_token = token

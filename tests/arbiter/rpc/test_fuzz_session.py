@@ -44,7 +44,7 @@ class Recording:
     def when_read(self, answer: Callable[[], None]) -> None:
         answer()
 
-    def status(self) -> dict[str, Any]:
+    def status(self, *page: object) -> dict[str, Any]:
         return {}
 
     def why(self, consumer: str) -> dict[str, Any]:
@@ -86,8 +86,10 @@ class RealCore:
     def when_read(self, answer: Callable[[], None]) -> None:
         answer()
 
-    def status(self) -> dict[str, Any]:
-        return self.arbiter.status(self.plant.now)
+    def status(
+        self, reader: ProcessKey | None = None, after: tuple[int, float, int] | None = None
+    ) -> dict[str, Any]:
+        return self.arbiter.status(self.plant.now, reader, after, d.STATUS_PAGE)
 
     def why(self, consumer: str) -> dict[str, Any]:
         return self.arbiter.why(consumer, self.plant.now)

@@ -48,8 +48,10 @@ class Bench:
     def when_read(self, answer: Callable[[], None]) -> None:
         answer()
 
-    def status(self) -> dict[str, Any]:
-        return {"phase": "serving"}
+    def status(
+        self, reader: ProcessKey | None, after: tuple[int, float, int] | None = None
+    ) -> dict[str, Any]:
+        return {"phase": "serving", "reader": str(reader), "after": after}
 
     def why(self, consumer: str) -> dict[str, Any]:
         return {"consumer": consumer, "leases": []}
@@ -160,7 +162,10 @@ def test_roles(bench: Bench) -> None:
     assert bench.hello(routing=b"x", address=STRANGER)["ok"]
     assert bench.hello(routing=b"o", role="operator")["role"] == "operator"
     bench.hello(routing=b"v", role="observer")
-    assert bench.ask("status", b"v")["phase"] == "serving"
+    me = str(ProcessKey(os.getpid(), start_ticks(os.getpid()) or 0))
+    assert bench.ask("status", b"v")["reader"] == me, "only its own tokens are for it"
+    assert bench.ask("status", b"o", after=[1, 2.5, 3])["reader"] == "None"
+    assert bench.ask("status", b"o", after=[1, 2.5, 3])["after"] == [1, 2.5, 3]
     lease = {"lease_id": "L1-1", "token": [1, 1]}
     for op, fields in (
         ("ready", lease),

@@ -1,0 +1,78 @@
+"""`status` in pages: one answer must not hold the loop for seconds because thousands wait."""
+
+from typing import Any
+
+from arbiter.testing.core_driver import CoreDriver
+from schemas import defaults as d
+
+GIB = d.GIB
+
+
+def pages(driver: CoreDriver, limit: int) -> list[list[dict[str, Any]]]:
+    found: list[list[dict[str, Any]]] = []
+    after = None
+    while True:
+        page = driver.arbiter.status(driver.now, None, after, limit)
+        found.append(page["leases"])
+        if "next" not in page:
+            return found
+        after = tuple(page["next"])
+
+
+def crowd() -> CoreDriver:
+    """Two GPUs on which somebody loads, a lease on standby, waiters for one GPU and for both, and a member of a gang that is not complete."""
+    driver = CoreDriver(8 * GIB, cards=2)
+    sleeper, first, second = (driver.consumer(name) for name in ("sleeper", "first", "second"))
+    away = sleeper.acquire(7 * GIB, gpu="0", standby=True)
+    sleeper.load(away)
+    first.acquire(7 * GIB, gpu="0")
+    sleeper.unload(away)
+    driver.advance(3.0)
+    second.acquire(7 * GIB, gpu="1")
+    for number in range(5):
+        driver.consumer(f"any{number}").acquire(5 * GIB, priority=40 + 5 * number)
+        driver.consumer(f"zero{number}").acquire(5 * GIB, gpu="0")
+        driver.advance(0.5)
+    driver.consumer("one of two").acquire(5 * GIB, gang=("g", 2))
+    return driver
+
+
+def test_pages_hold_every_lease_once_whatever_their_size() -> None:
+    driver = crowd()
+    (whole,) = pages(driver, 1000)
+    assert whole == driver.arbiter.status(driver.now)["leases"]
+    assert len(whole) == 14
+    assert [view["state"] for view in whole[:4]] == ["standby", "loading", "loading", "queued"]
+    for limit in (1, 2, 5, 14):
+        found = pages(driver, limit)
+        assert [view for page in found for view in page] == whole
+        assert max(len(page) for page in found) == limit
+
+
+def test_waiters_are_listed_in_the_order_in_which_they_are_served() -> None:
+    driver = crowd()
+    waiting = [view for view in driver.arbiter.status(driver.now)["leases"] if view["state"] == "queued"]
+    for index in ("0", "1"):
+        places = [
+            view["position"]
+            for view in waiting
+            if view["consumer"].startswith("any" if index == "1" else "zero")
+        ]
+        assert places == sorted(places)
+    urgent = driver.consumer("urgent").acquire(5 * GIB, priority=100)
+    (page,) = [driver.arbiter.status(driver.now, None, (1, float("-inf"), 0), 1)]
+    assert [view["lease_id"] for view in page["leases"]] == [urgent]
+    assert page["totals"] == {"leases": 15, "waiting": 12}
+
+
+def test_a_page_goes_on_where_the_last_one_ended_though_that_lease_is_gone() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.consumer("holder").acquire(7 * GIB)
+    people = [driver.consumer(f"p{number}") for number in range(4)]
+    leases = [person.acquire(5 * GIB) for person in people]
+    first = driver.arbiter.status(driver.now, None, None, 2)
+    assert first["leases"][-1]["lease_id"] == leases[0]
+    people[0].cancel(leases[0])
+    rest = driver.arbiter.status(driver.now, None, tuple(first["next"]), 10)
+    assert [view["lease_id"] for view in rest["leases"]] == leases[1:]
+    assert "next" not in rest
