@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 
-from schemas import otel
+from schemas import otel, terminal
 from schemas.config import ArbiterConfig, load_config
 from schemas.errors import (
     AlreadyRunning,
@@ -32,6 +32,7 @@ exit codes:
   3   another arbiter serves this socket or uses this state folder
   4   no GPU: no NVIDIA driver or no card (--gpu fake:8GiB simulates one)
   5   the disk of the state folder is full or failing
+  74  the output cannot be written (a full disk behind a redirection)
   70  a defect: the core's state became invalid; the log says how, a restart recovers the leases
 
 environment:
@@ -136,6 +137,7 @@ def exit_code_of(error: VramError) -> int:
             return EXIT_USAGE
 
 
+@terminal.program
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns the exit code; prints errors of the operator as one line without a traceback."""
     flags = parser().parse_args(argv)

@@ -1,6 +1,6 @@
 """`python -m clients` is `vramctl`."""
 
-from clients.cli.main import main
+from vramctl import main
 
 if __name__ == "__main__":
     main()

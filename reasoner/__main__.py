@@ -29,6 +29,7 @@ from reasoner.playbooks import Playbook, load_playbook
 from reasoner.server import OperatorServer, send
 from reasoner.tools import FRAME_MAX_AGE_MS, Judge, Tools
 from reasoner.watch import watch
+from schemas import terminal
 from schemas.body import read_body
 from schemas.commands import command
 from schemas.endpoints import program_endpoint
@@ -104,7 +105,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main() -> None:
+@terminal.program
+def main() -> int:
     arguments = _parser().parse_args()
     logs.set_up("vram-reasoner", "info", arguments.log_format, "%(asctime)s %(name)s %(message)s")
     what = "task" if arguments.task is not None else "say" if arguments.say is not None else "cancel"
@@ -112,7 +114,8 @@ def main() -> None:
         with command("vram-reasoner", what):
             _main(arguments)
     except ConfigError as error:  # of the telemetry: everything else is said within
-        sys.exit(_complain(error, EXIT_USAGE))
+        return _complain(error, EXIT_USAGE)
+    return 0
 
 
 def _main(arguments: argparse.Namespace) -> None:
@@ -264,4 +267,4 @@ def _endpoint(given: str | None, name: str) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

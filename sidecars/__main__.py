@@ -20,11 +20,12 @@ from schemas import telemetry, terminal
 from schemas.commands import command
 from schemas.endpoints import arbiter_endpoint, program_endpoint
 from schemas.errors import ConfigError, ModelError, NoGpu, VramError
+from schemas.extras import need
 from schemas.fakegpu import CARD_FILE, FOLDER_VARIABLE, parse_config
-from schemas.manifest import ManifestError, RSkillManifest
+from schemas.manifest import Kind, ManifestError, RSkillManifest
 from sidecars.adapters.base import ModelAdapter
 from sidecars.adapters.choose import make_adapter
-from sidecars.adapters.gpu_passthrough import need_card
+from sidecars.adapters.gpu_passthrough import is_passthrough, need_card
 from sidecars.device.memory import DeviceMemory, NoDevice
 from sidecars.settings import (
     NICE,
@@ -64,6 +65,8 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
             found = compare_weights(settings.manifest, settings.weights, adapter_for)
             print(f"ok: {settings.manifest.name} from {settings.weights.source} as {adapter.kind}; {found}")
             return 0
+        if adapter_for is make_adapter:
+            _need_packages(settings.manifest)
         from sidecars.host import SidecarHost
 
         with command(service, "serve", serves=True, attributes={telemetry.ATTR_CONSUMER: flags.name}):
@@ -76,6 +79,13 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
         wrong = (ConfigError, ManifestError, ModelError) if flags.check else (ConfigError, ManifestError)
         return 2 if isinstance(error, wrong) else 1
     return 0
+
+
+def _need_packages(manifest: RSkillManifest) -> None:
+    """Raises ConfigError where the model's libraries are not installed: better now than at the first request."""
+    if not is_passthrough(manifest):
+        library = "lerobot" if manifest.kind is Kind.VLA else "transformers"
+        need(f"a model of kind {manifest.kind.value}", "torch", library, extra="sidecars")
 
 
 def settings_from(flags: argparse.Namespace) -> Settings:

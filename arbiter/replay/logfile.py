@@ -9,6 +9,7 @@ may go. `digest` is null where the engine raised. Reads files and nothing else.
 """
 
 import json
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -109,10 +110,17 @@ def entry_line(now: float, event: Event, effects: Sequence[Effect] | None) -> st
 # -- reading -----------------------------------------------------------------------------------------------------------
 def find_files(place: Path) -> list[Path]:
     """The files of a log: the one file, or those of the newest start in a folder (the state folder or its `record`). Raises LogError."""
-    if place.is_file():
-        return [place]
-    folder = place / FOLDER if (place / FOLDER).is_dir() else place
-    found = sorted(folder.glob(f"*{SUFFIX}")) if folder.is_dir() else []
+    try:
+        if place.is_file():
+            return [place]
+        folder = place / FOLDER if (place / FOLDER).is_dir() else place
+        names = os.listdir(folder) if folder.is_dir() else []
+    except OSError as error:
+        raise LogError(
+            f"{error.filename or place} cannot be read: {error.strerror}",
+            hint="the daemon's state folder is its own user's: use that user, or root",
+        ) from error
+    found = sorted(folder / name for name in names if name.endswith(SUFFIX))
     if not found:
         raise LogError(f"{place}: no event log here", hint="give a .jsonl file, or the daemon's state folder")
     newest = found[-1].name.rpartition("-")[0]

@@ -11,7 +11,8 @@ from schemas.defaults import NAME_MAX_CHARS, REASON_MAX_CHARS
 from schemas.errors import ArbiterUnreachable, VramError
 
 _EPILOG = (
-    "Exit codes: 0 done · 1 the answer is no, or an error · 2 wrong usage · 3 the arbiter cannot be reached. "
+    "Exit codes: 0 done · 1 the answer is no, or an error · 2 wrong usage · 3 the arbiter cannot be reached · "
+    "74 the output cannot be written. "
     "Sizes are printed in GiB/MiB (1024-based); written ones may be 8GiB, 5.3GB, 450MiB. "
     "VRAM_ARBITER_ENDPOINT or VRAM_ARBITER_RUNTIME say where the arbiter serves."
 )
@@ -256,7 +257,11 @@ def run(
 
 @app.command()
 def doctor(as_json: AsJson = False, endpoint: Endpoint = None) -> None:
-    """Check this installation: where the six packages come from, the endpoint, the arbiter, its probe. Exits 1 on a finding."""
+    """Check this installation: where the six packages come from, the endpoint, the daemon's health, its GPUs.
+
+    Exits 0 if all is well, 1 on any finding (a foreign package, a journal that cannot be written, a drained daemon, a GPU that cannot be
+    read or is under pressure), 3 if the arbiter cannot be reached.
+    """
     from clients.cli.doctor import doctor as examine
 
     raise typer.Exit(examine(as_json=as_json, endpoint=endpoint))

@@ -30,6 +30,7 @@ from clients.sidecar.policy import PolicyClient
 from schemas import fakegpu
 from schemas.endpoints import RUNTIME_VARIABLE
 from schemas.errors import RunnerUnreachable, SidecarUnavailable, VramError
+from schemas.extras import need
 from schemas.units import parse_bytes
 
 SIDECARS = {"detector": "so101-detector", "scene-vlm": "so101-scene-vlm", "grab": "so101-grab"}
@@ -79,6 +80,7 @@ def demo(
             "without the arbiter nobody reads a real card; use --gpu fake:8GiB with --arbiter off"
         )
     try:
+        need("the demo", "torch", "lerobot", "transformers", "mujoco", "cv2", "matplotlib", extra="all")
         summary = asyncio.run(_demo(seed, arbiter == "on", gpu, out))
     except VramError as error:
         typer.echo(f"vramctl demo: {error}", err=True)

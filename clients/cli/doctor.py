@@ -1,16 +1,14 @@
-"""`vramctl doctor`: is this installation what it should be? Looks and says; changes nothing."""
+"""`vramctl doctor`: checks the installation, the daemon and its GPUs, and changes nothing."""
 
-import importlib.util
 import json
 import os
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
+import vramctl
 from clients.cli import quick
 from schemas.endpoints import arbiter_endpoint
-
-PACKAGES = ("arbiter", "clients", "sidecars", "runner", "reasoner", "schemas")
+from schemas.sizes import format_bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +21,7 @@ class Finding:
 
 
 def doctor(*, as_json: bool, endpoint: str | None) -> int:
-    """3 if the arbiter cannot be reached, 1 if anything else is wrong, else 0."""
+    """Return 0 if all is well, 1 for a finding (an unhealthy daemon too), 3 if the arbiter cannot be reached."""
     where = endpoint or arbiter_endpoint(os.environ, os.getuid())
     findings = [*_origins(), _driver(), Finding("endpoint", None, where)]
     reachable, about = _arbiter(where)
@@ -40,23 +38,15 @@ def doctor(*, as_json: bool, endpoint: str | None) -> int:
 
 
 def _origins() -> list[Finding]:
-    """All six names must come from one tree: generic names can be shadowed by other distributions."""
-    origins = {name: _origin(name) for name in PACKAGES}
-    home = origins["clients"].parent if origins["clients"] else None
+    """All six packages must come from one tree: other projects use the same common names."""
     findings = []
-    for name, folder in origins.items():
-        if folder is None:
+    for name, where in vramctl.origins().items():
+        if where is None:
             findings.append(Finding(name, False, "not importable: reinstall vram-arbiter"))
         else:
-            foreign = "" if folder.parent == home else f" (another tree than clients: {home})"
-            findings.append(Finding(name, not foreign, f"{folder}{foreign}"))
+            ours = vramctl.is_ours(where)
+            findings.append(Finding(name, ours, where if ours else f"{where} (not of this installation)"))
     return findings
-
-
-def _origin(name: str) -> Path | None:
-    spec = importlib.util.find_spec(name)
-    locations = list(spec.submodule_search_locations or ()) if spec else []
-    return Path(locations[0]).resolve() if locations else None
 
 
 def _driver() -> Finding:
@@ -98,6 +88,11 @@ def _arbiter(endpoint: str) -> tuple[bool, list[Finding]]:
     about = [
         Finding("daemon", True, f"{status['phase']}, epoch {status['epoch']}, {status['clients']} clients")
     ]
+    about += [Finding("files", False, problem) for problem in status.get("problems", ())]
+    if status.get("drained"):
+        about.append(
+            Finding("grants", False, f"drained by {status['drained']}: grant again with `vramctl resume`")
+        )
     return True, about + [_card(gpu) for gpu in status["gpus"]]
 
 
@@ -107,6 +102,9 @@ def _card(gpu: dict[str, Any]) -> Finding:
         return Finding(
             what, False, f"{gpu['name']}: the probe does not answer, nothing is granted ({gpu['blocked']})"
         )
+    if gpu["pressure_bytes"]:
+        over = format_bytes(gpu["pressure_bytes"])
+        return Finding(what, False, f"{gpu['name']}: {over} more are held than were granted")
     if gpu["blocked"]:
         return Finding(what, None, f"{gpu['name']}: no grants now: {gpu['blocked']}")
     reads = {"unified": "memory shared with the CPU, read from /proc/meminfo", "fake": "a simulated card"}

@@ -8,17 +8,27 @@ TELEMETRY_S = 1.0  # a person waits for the prompt: a collector that is away cos
 
 
 def main() -> None:
-    """Entry point. Exit codes: 0 done, 1 the answer is no or an error, 2 wrong usage, 3 the arbiter cannot be reached."""
+    """Entry point. Exit codes: 0 done, 1 the answer is no or an error, 2 wrong usage, 3 the arbiter cannot be reached, 74 no room to write."""
     try:
-        code = quick.try_run(sys.argv[1:])
-        if code is None:
-            code = _in_full(sys.argv[1:])
-        sys.stdout.flush()
+        try:
+            code = quick.try_run(sys.argv[1:])
+            if code is None:
+                code = _in_full(sys.argv[1:])
+        finally:
+            sys.stdout.flush()
     except BrokenPipeError:  # `vramctl history | head`
         sys.stderr.close()
         code = quick.OK
     except KeyboardInterrupt:
         code = 130
+    except OSError as error:
+        from schemas import terminal
+
+        code = terminal.no_room("vramctl", error)
+    except ModuleNotFoundError as error:
+        from schemas import terminal
+
+        code = terminal.not_installed("vramctl", error)
     sys.exit(code)
 
 

@@ -27,6 +27,7 @@ from runner.cli.common import (
 )
 from runner.sim.config import CONTROL_HZ
 from schemas.errors import ConfigError
+from schemas.extras import need
 
 if TYPE_CHECKING:
     from runner.sim.benchmark import Benchmark, Cell, Contestant
@@ -96,6 +97,7 @@ class Entry:
 
 async def run(args: argparse.Namespace) -> int:
     """Exit 0: every episode got a verdict or nobody judges; 1: errors, or stopped. Either way the report says what was played."""
+    need("a benchmark", "numpy", "cv2", extra="runner")
     async with contextlib.AsyncExitStack() as stack:
         arbiter = None
         if args.skill and not args.no_arbiter:

@@ -27,6 +27,7 @@ from runner.cli.common import (
 from runner.control import ControlThread
 from schemas.endpoints import program_endpoint
 from schemas.errors import ConfigError, InternalError
+from schemas.extras import need
 
 log = logging.getLogger("runner")
 
@@ -82,6 +83,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 async def run(args: argparse.Namespace) -> int:
     """Build everything, serve until a signal, `shutdown`, `--max-seconds` or the last of `--episodes`, end in order."""
+    need("the simulator", "numpy", "cv2", extra="runner")
     from clients.serve import check_free
     from runner.catalogue import Catalogue, read_manifests
     from runner.clock import SystemClock

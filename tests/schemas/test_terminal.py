@@ -1,5 +1,6 @@
-"""Programs whose reader leaves (`| head`), or who are told Ctrl-C, end without a traceback."""
+"""Programs whose reader leaves, whose output device is full (`| head`), or who are told Ctrl-C, end without a traceback."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -13,7 +14,10 @@ from schemas.units import parse_bytes
 
 ROOT = Path(__file__).parents[2]
 MANIFEST = ROOT / "tests/schemas/manifests"
+GRAB = ROOT / "configs/rskills/so101-grab/rskill.yaml"
 PATIENCE_S = 60
+BUFFERED = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+"""argparse itself swallows the error of an unbuffered device."""
 
 
 @pytest.mark.parametrize(
@@ -79,3 +83,82 @@ def test_a_pipe_of_the_programs_own_that_breaks_is_its_error() -> None:
 
 def test_the_exit_code_and_the_arguments_pass() -> None:
     assert terminal.program(parse_bytes)("8KiB") == 8192
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["schemas", "check", str(MANIFEST)],
+        ["arbiter", "--help"],
+        ["runner", "--help"],
+        ["clients", "doctor"],
+        ["clients", "status", "--json"],
+        ["clients", "--help"],
+        ["clients", "simulate", "find-navigate-grab"],
+    ],
+)
+def test_a_full_output_device_is_one_line(arguments: list[str], tmp_path: Path) -> None:
+    """`vramctl doctor > /dev/full` ended with a traceback."""
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", *arguments],
+            cwd=ROOT,
+            env={**BUFFERED, "VRAM_ARBITER_RUNTIME": str(tmp_path)},
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=PATIENCE_S,
+        )
+    (line,) = done.stderr.splitlines()
+    assert line.endswith(": the output cannot be written: No space left on device")
+    assert done.returncode == terminal.NO_ROOM
+
+
+def test_a_full_disk_behind_a_file_is_named() -> None:
+    program = "import errno, os\nfrom schemas import terminal\n"
+    program += "@terminal.program\ndef main():\n"
+    program += "    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), 'out/summary.json')\n"
+    program += "raise SystemExit(main())\n"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == terminal.NO_ROOM
+    assert "out/summary.json cannot be written: No space left on device" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_another_error_of_the_system_keeps_its_traceback() -> None:
+    @terminal.program
+    def main() -> int:
+        raise OSError(errno.ECHILD, "a defect")
+
+    with pytest.raises(OSError, match="a defect"):
+        main()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "extra"),
+    [
+        (["clients", "demo"], "all"),
+        (["sidecars", "--name", "x", "--rskill", str(GRAB), "--device", "none", "--no-arbiter"], "sidecars"),
+        (["runner", "sim", "--no-arbiter"], "runner"),
+    ],
+)
+def test_a_missing_extra_is_one_line(arguments: list[str], extra: str, tmp_path: Path) -> None:
+    """In the base install `vramctl demo` and `vram-sidecar` ended with tracebacks, the second at its first request."""
+    program = (
+        "import runpy, sys\n"
+        "for name in ('torch', 'lerobot', 'mujoco', 'cv2', 'numpy'): sys.modules[name] = None\n"  # as if not installed
+        "sys.argv = sys.argv[1:]\n"
+        "runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments],
+        cwd=ROOT,
+        env={**os.environ, "VRAM_ARBITER_RUNTIME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+    )
+    (line,) = done.stderr.splitlines()
+    assert f"pip install 'vram-arbiter[{extra}]'" in line
+    assert done.returncode in (1, 2)
+    assert list(tmp_path.iterdir()) == [], "nothing was begun"

@@ -35,12 +35,17 @@ class FakeProbe:
                 raise NoGpu(
                     f"no simulated card in {folder}", hint="start with --gpu fake:8GiB to make one"
                 ) from None
+            except (OSError, UnicodeDecodeError) as error:
+                raise _unreadable(folder, error) from error
             self._folders[GpuId(config.uuid)] = folder
 
     def cards(self) -> tuple[Card, ...]:
         found = []
         for gpu, folder in self._folders.items():
-            config = fakegpu.parse_config((folder / fakegpu.CARD_FILE).read_text())
+            try:
+                config = fakegpu.parse_config((folder / fakegpu.CARD_FILE).read_text())
+            except (OSError, UnicodeDecodeError) as error:
+                raise _unreadable(folder, error) from error
             found.append(Card(gpu, config.index, config.name, config.capacity_bytes))
         return tuple(sorted(found, key=lambda card: card.index))
 
@@ -75,6 +80,13 @@ class FakeProbe:
                 raise ProbeFailed("the probe was closed while it hung")
 
 
+def _unreadable(folder: Path, error: OSError | UnicodeDecodeError) -> ConfigError:
+    return ConfigError(
+        f"the simulated card in {folder} cannot be used: {error}",
+        hint="name a folder that this user may read and write, or let --gpu fake:8GiB make one",
+    )
+
+
 def open_cards(text: str, runtime: Path) -> FakeProbe:
     """Probe for what stands behind `fake:` in `--gpu`: a size (makes or keeps the card in RUNTIME/fakegpu) or a folder.
 
@@ -91,7 +103,10 @@ def open_cards(text: str, runtime: Path) -> FakeProbe:
     folders = []
     for index, size in enumerate(sizes):
         folder = runtime / ("fakegpu" if index == 0 else f"fakegpu-{index}")
-        make_card(folder, size, index=index)
+        try:
+            make_card(folder, size, index=index)
+        except (OSError, UnicodeDecodeError) as error:
+            raise _unreadable(folder, error) from error
         folders.append(folder)
     return FakeProbe(folders)
 

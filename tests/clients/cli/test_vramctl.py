@@ -123,6 +123,28 @@ def test_doctor_says_where_the_packages_come_from(nowhere: dict[str, str]) -> No
     assert findings["daemon"]["ok"] is False
 
 
+@pytest.mark.parametrize("package", ["schemas", "clients"])
+def test_doctor_names_a_foreign_package_instead_of_dying_of_it(package: str, tmp_path: Path) -> None:
+    """Beside a project with its own `schemas/` or `clients/` doctor ended with a traceback: on exactly what it looks for."""
+    foreign = tmp_path / package
+    foreign.mkdir()
+    (foreign / "__init__.py").write_text("")
+    root = str(Path(__file__).parents[3])
+    environ = {**os.environ, "PYTHONPATH": f"{tmp_path}:{root}"}
+    done = {
+        command: subprocess.run(
+            [sys.executable, "-P", "-m", "vramctl", command],
+            env=environ, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+        )
+        for command in ("doctor", "status")
+    }  # fmt: skip
+    assert f"BAD  {package:<18} {foreign} (not of this installation)" in done["doctor"].stdout
+    for one in done.values():
+        assert one.returncode == 1
+        assert f"the package {package} is found at {foreign}" in one.stderr
+        assert "Traceback" not in one.stderr
+
+
 @pytest.mark.e2e
 def test_a_socket_that_nobody_serves(nowhere: dict[str, str]) -> None:
     import zmq
@@ -204,6 +226,20 @@ def test_an_operators_actions(client: SyncArbiterClient, arbiter_daemon: Arbiter
     listed = json.loads(vramctl("history", "--kind", "operator", "--json", environ=environ).stdout)["events"]
     assert [event["action"] for event in listed] == ["pin", "unpin", "evict", "drain", "resume"]
     assert all("vramctl (uid" in event["by"] for event in listed)
+
+
+@pytest.mark.e2e
+def test_doctor_fails_on_a_drained_daemon_and_on_a_full_disk(
+    make_arbiter: Callable[..., ArbiterProcess],
+) -> None:
+    """Both grant nothing, and doctor exited 0."""
+    arbiter = make_arbiter().start()
+    assert vramctl("drain", "-r", "service", environ=arbiter.environ).returncode == 0
+    done = vramctl("doctor", environ=arbiter.environ)
+    assert done.returncode == 1
+    assert "BAD  grants             drained by" in done.stdout
+    assert vramctl("resume", environ=arbiter.environ).returncode == 0
+    assert vramctl("doctor", environ=arbiter.environ).returncode == 0
 
 
 @pytest.mark.e2e
