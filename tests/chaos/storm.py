@@ -21,7 +21,7 @@ import subprocess
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -191,6 +191,20 @@ class Storm:
         ) as client:
             async for event in client.subscribe():
                 self._heard(event)
+                if event["kind"] == "ready" and self._user is not None and self._random.random() < 0.3:
+                    self._start(self._tell_user(client, str(event["lease_id"])))
+
+    async def _tell_user(self, client: ArbiterClient, lease: str) -> None:
+        """Give the user a lease to mark a use on. Only an operator's status shows its token."""
+        with contextlib.suppress(VramError):
+            shown = {view["lease_id"]: view for view in (await client.status())["leases"]}
+            if self._user is not None and (token := shown.get(lease, {}).get("token")) is not None:
+                self._user.tell(f"{lease} {token[0]} {token[1]}")
+
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     def _heard(self, event: dict[str, Any]) -> None:
         self._events[event["seq"], event["at_wall_s"]] = event
@@ -199,9 +213,6 @@ class Storm:
             self._queued[str(lease)] = event["consumer"]
         elif lease is not None:
             self._queued.pop(lease, None)
-        if kind == "ready" and self._user is not None and self._random.random() < 0.3:
-            epoch, serial = event["token"]
-            self._user.tell(f"{lease} {epoch} {serial}")
         if step := STEPS.get(kind):
             waiting, self._steps[step] = self._steps[step], []
             for future in waiting:
@@ -392,9 +403,7 @@ class Storm:
             resource.prlimit(self._arbiter.pid, resource.RLIMIT_FSIZE, (hard, hard))
 
     def _mend_card(self) -> None:
-        mending = asyncio.get_running_loop().create_task(asyncio.to_thread(self._set_card))
-        self._tasks.add(mending)
-        mending.add_done_callback(self._tasks.discard)
+        self._start(asyncio.to_thread(self._set_card))
 
     def _set_card(self, release_lag_s: float = LAG_S, faults: dict[str, Any] | None = None) -> None:
         """Not on the loop: whoever holds the card's lock may have been stopped, and the loop lets it go on."""
