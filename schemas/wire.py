@@ -323,6 +323,7 @@ class LeaseView(TypedDict):
     uses: int  # busy ones
     pid: int
     since_s: float  # seconds in this state
+    granted_s: NotRequired[float]  # seconds since the grant, also across restarts of the daemon
     standby: NotRequired[bool]  # asked to leave, it comes back by itself
     grows: NotRequired[str]  # it waits for bytes for that lease
     resizing: NotRequired[str]  # growing or shrinking

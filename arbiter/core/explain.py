@@ -65,6 +65,8 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
         "since_s": core.now - lease.since,
         "waited_s": (core.now if lease.state is LeaseState.QUEUED else lease.granted_at) - lease.arrived_at,
     }
+    if lease.token is not None:
+        shown["granted_s"] = core.now - lease.held_from
     if lease.pinned is not None:
         shown["pinned"] = str(lease.pinned)
     if lease.parent is not None:

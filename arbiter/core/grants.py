@@ -158,7 +158,7 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     lease.token = token
     lease.gpu = gpu.info.id
     lease.move(LeaseState.LOADING, core.now, "came back by itself" if by_itself else "granted")
-    lease.granted_at = core.now
+    lease.granted_at = lease.held_from = core.now
     lease.reason = ""
     gpu.residents[lease.id] = lease
     families.claim(core, gpu, lease.process)

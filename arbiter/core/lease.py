@@ -234,6 +234,7 @@ class Lease:
     uses: dict[tuple[ProcessKey, UseId], Use] = field(default_factory=dict)  # busy ones
     yielded: dict[tuple[ProcessKey, UseId], Use] = field(default_factory=dict)  # pausing: nobody waits
     granted_at: float = 0.0
+    held_from: float = 0.0  # the grant as people count it: a restart of the daemon does not change it
     ready_at: float = 0.0
     last_used_at: float = 0.0
     expires_at: float = 0.0

@@ -398,6 +398,7 @@ class Core:
                 "pid": lease.process.pid,
                 "start_ticks": lease.process.start_ticks,
                 "nonce": lease.nonce,
+                "held_from": lease.held_from,
                 "charge_bytes": charge_bytes,
                 "load_peak_bytes": lease.load_peak_bytes,
                 "measured_bytes": lease.measured_bytes,

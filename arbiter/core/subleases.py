@@ -41,7 +41,8 @@ def acquire(core: Core, event: AcquireRequested, ref: tuple[LeaseId, Token]) -> 
         )
     lease = new_lease(core, event, client, spec, peak, steady, (gpu.info.id,))
     token = core.next_token()
-    lease.token, lease.gpu, lease.granted_at = token, gpu.info.id, core.now
+    lease.token, lease.gpu = token, gpu.info.id
+    lease.granted_at = lease.held_from = core.now
     lease.move(LeaseState.LOADING, core.now, f"carved out of {parent.id}")
     gpu.residents[lease.id] = lease
     gpu.ledger.charge(lease.id, lease.process, peak, peak, core.now)

@@ -81,18 +81,31 @@ def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = Non
 def collect(wanted: Wanted, endpoint: str | None) -> Message:
     """Page forward: to the end, keeping the tail, or (`after`) until there are enough. Raises quick.Unreachable."""
     reply = _page(NEVER, 1, (), endpoint)
-    after = (
-        wanted.after if wanted.after is not None else _start(wanted, int(reply.get("last_seq", 0)), endpoint)
-    )
+    if not reply.get("ok"):
+        return reply
+    last_seq = int(reply.get("last_seq", 0))
+    if wanted.after is not None:
+        return _forward(wanted, wanted.after, endpoint)
+    after = _start(wanted, last_seq, endpoint)
+    while True:
+        reply = _forward(wanted, after, endpoint)
+        short = len(reply.get("events", ())) < wanted.limit
+        if not short or after == 0 or wanted.since_wall_s is not None or not reply.get("ok"):
+            return reply
+        after = max(
+            0, last_seq - 8 * (last_seq - after)
+        )  # more numbers were left out than there are in one gap
+
+
+def _forward(wanted: Wanted, after: int, endpoint: str | None) -> Message:
     found: list[Any] = []
-    while reply.get("ok"):
-        reply = _page(after, PAGE, wanted.kinds, endpoint)
+    while (reply := _page(after, PAGE, wanted.kinds, endpoint)).get("ok"):
         events = reply.get("events", [])
         found += [event for event in events if wanted.keeps(event)]
         if wanted.after is None:
             found = found[-wanted.limit :]
         if len(events) < PAGE or (wanted.after is not None and len(found) >= wanted.limit):
-            return {**reply, "events": found[: wanted.limit]} if reply.get("ok") else reply
+            return {**reply, "events": found[: wanted.limit]}
         after = events[-1]["seq"]
     return reply
 
@@ -151,17 +164,20 @@ async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None 
             await client.ping()
             past = await asyncio.to_thread(collect, wanted, client.endpoint)
             last = int(past.get("last_seq", 0))
+            known_wall_s = time.time()  # whatever happened before has a number up to `last`
             for event in past.get("events", []):
                 tell(event)
             while True:
                 event = await live.get()
+                if event["seq"] <= last and event["at_wall_s"] > known_wall_s:
+                    last = 0  # the arbiter began a new history: its numbers start at 1 again
                 if event["seq"] > last + 1:  # the arbiter was away, or we were slow
                     missed = await client.history(last, PAGE)
                     for older in missed["events"]:
                         if last < older["seq"] < event["seq"]:
                             tell(older)
                 if event["seq"] > last:
-                    last = event["seq"]
+                    last, known_wall_s = event["seq"], max(known_wall_s, event["at_wall_s"])
                     tell(event)
         finally:
             listening.cancel()

@@ -10,7 +10,7 @@ from typing import Any
 from schemas.sizes import format_bytes
 
 Message = Mapping[str, Any]
-_COLUMNS = ("LEASE", "CONSUMER", "MODEL", "STATE", "CHARGE", "DRIFT", "USES", "PRIO", "PID", "SINCE")
+_COLUMNS = ("LEASE", "CONSUMER", "MODEL", "GPU", "STATE", "CHARGE", "DRIFT", "USES", "PRIO", "PID", "SINCE")
 _RIGHT = frozenset({"CHARGE", "DRIFT", "USES", "PRIO", "PID", "SINCE"})
 _NOT_SHOWN = frozenset(
     {"seq", "at_wall_s", "kind", "lease_id", "consumer", "reason", "gpu", "token", "traceparent"}
@@ -51,11 +51,15 @@ def status_lines(status: Message) -> list[str]:
     lines.append("")
     if not status["leases"]:
         return [*lines, "no leases"]
-    rows = [_lease_row(lease) for lease in status["leases"]]
-    at = _COLUMNS.index("DRIFT")
-    if any(row[at] for row in rows):
-        return lines + table(_COLUMNS, rows)
-    return lines + table(_without(_COLUMNS, at), [_without(row, at) for row in rows])
+    indices = {gpu["gpu"]: str(gpu["index"]) for gpu in status["gpus"]}
+    rows = [_lease_row(lease, indices) for lease in status["leases"]]
+    drift = _COLUMNS.index("DRIFT")
+    hidden = {
+        _COLUMNS.index("GPU"): len(indices) < 2,  # where there is one, it is said above
+        drift: not any(row[drift] for row in rows),
+    }
+    shown = [at for at in range(len(_COLUMNS)) if not hidden.get(at)]
+    return lines + table([_COLUMNS[at] for at in shown], [[row[at] for at in shown] for row in rows])
 
 
 def _gpu_lines(gpu: Message) -> list[str]:
@@ -87,7 +91,7 @@ def _gpu_lines(gpu: Message) -> list[str]:
     return lines
 
 
-def _lease_row(lease: Message) -> tuple[str, ...]:
+def _lease_row(lease: Message, indices: Mapping[str, str]) -> tuple[str, ...]:
     state = lease["state"]
     if "position" in lease:
         state = f"{state} #{lease['position']}"
@@ -99,18 +103,22 @@ def _lease_row(lease: Message) -> tuple[str, ...]:
         lease["lease_id"],
         lease["consumer"],
         lease["model"],
+        indices.get(lease["gpu"] or "", ""),
         state,
         format_bytes(lease["charge_bytes"]),
         _drift(lease.get("drift_bytes") or 0),
         str(lease["uses"]),
         str(lease["priority"]),
         str(lease["pid"]),
-        duration(lease["since_s"]),
+        duration(_since_s(lease)),
     )
 
 
-def _without(cells: Sequence[str], at: int) -> list[str]:
-    return [*cells[:at], *cells[at + 1 :]]
+def _since_s(lease: Message) -> float:
+    """Since the grant of a lease with bytes on a GPU; otherwise since it waits, or since it left."""
+    if lease["state"] in ("queued", "standby", "parked"):
+        return float(lease["since_s"])
+    return float(lease.get("granted_s", lease["since_s"]))
 
 
 def _drift(count: int) -> str:
@@ -206,15 +214,11 @@ def _footprint_lines(footprint: Message | None) -> list[str]:
 
 # -- events ------------------------------------------------------------------------------------------------------------
 def event_line(event: Message) -> str:
-    """One history event: local time, kind, who, why, and its other plain fields."""
+    """One history event: local date and time, kind, consumer and lease, reason, and its other plain fields."""
     at = event["at_wall_s"]
-    clock = time.strftime("%H:%M:%S", time.localtime(at)) + f".{int(at * 1000) % 1000:03d}"
+    clock = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at)) + f".{int(at * 1000) % 1000:03d}"
     who = " ".join(str(event[key]) for key in ("consumer", "lease_id") if event.get(key))
-    more = [
-        f"{key}={_value(key, value)}"
-        for key, value in event.items()
-        if key not in _NOT_SHOWN and _plain(value)
-    ]
+    more = [_field(key, value) for key, value in event.items() if key not in _NOT_SHOWN and _plain(value)]
     parts = [clock, f"{event['kind']:<14}", who, str(event.get("reason") or ""), " ".join(more)]
     return "  ".join(part for part in parts if part)
 
@@ -223,14 +227,23 @@ def _plain(value: object) -> bool:
     return value is not None and not isinstance(value, dict | list | tuple)
 
 
-def _value(key: str, value: Any) -> str:
+def _field(key: str, value: Any) -> str:
+    """`charge=1GiB`, `waited=12.3ms`, `eta=3.5s`, `uses=2`: the unit stands behind the number, not in the name."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
     if key.endswith("_bytes") and isinstance(value, int):
-        return format_bytes(value).replace(" ", "")
-    if key.endswith("_ms") and isinstance(value, int | float):
-        return f"{value:.1f}"
+        return f"{key.removesuffix('_bytes')}={format_bytes(value).replace(' ', '')}"
+    if number and (key == "ms" or key.endswith("_ms")):
+        return f"{key.removesuffix('ms').removesuffix('_') or 'took'}={_seconds(value / 1e3)}"
+    if number and key.endswith("_s"):
+        return f"{key.removesuffix('_s')}={_seconds(value)}"
     if isinstance(value, float):
-        return f"{value:.3g}"
-    return str(value)
+        return f"{key}={f'{value:.3f}'.rstrip('0').rstrip('.')}"
+    return f"{key}={value}"
+
+
+def _seconds(seconds: float) -> str:
+    """`0.4ms`, `950.0ms`, `3.5s`, `3512.0s`."""
+    return f"{seconds * 1e3:.1f}ms" if abs(seconds) < 1 else f"{seconds:.1f}s"
 
 
 def error_line(error: Message) -> str:

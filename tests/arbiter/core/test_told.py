@@ -8,7 +8,7 @@ import pytest
 from arbiter.core.events import OperatorAsked, ProbeFailed
 from arbiter.core.lease import Lease
 from arbiter.core.recovery import spec_from_record
-from arbiter.testing.core_driver import CoreDriver, answer, refusal
+from arbiter.testing.core_driver import START_S, CoreDriver, answer, refusal
 from arbiter.testing.scenes import Tree, held, order, sent_away
 from schemas import defaults as d
 from schemas.ids import LeaseId, ProcessKey, Token
@@ -329,6 +329,7 @@ def test_a_record_holds_all_that_was_asked_for() -> None:
         "pid": det.process.pid,
         "start_ticks": det.process.start_ticks,
         "nonce": "n1",
+        "held_from": START_S + 0.01,
         "charge_bytes": 2 * GIB,
         "load_peak_bytes": 3 * GIB,
         "measured_bytes": None,
@@ -479,3 +480,22 @@ def test_a_gpu_is_stale_when_its_newest_reading_may_gate_no_grant() -> None:
     assert arbiter.stale(driver.now + age_s + 0.1) == [driver.card.gpu]
     driver.post(ProbeFailed(driver.card.gpu, driver.now + age_s, "no answer"))
     assert arbiter.stale(driver.now + age_s + 0.1) == [], "a failed reading is news as well"
+
+
+def test_the_time_since_the_grant_outlives_a_restart() -> None:
+    """`vramctl status` counted from the restart: a lease that was held for hours looked new."""
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 2)
+    driver.advance(1.0)
+    det.renew((lease, det.token(lease)))
+    before = view_of(driver, lease)["granted_s"]
+    assert before == pytest.approx(1.0, abs=0.1)
+    driver.restart()
+    assert view_of(driver, lease)["granted_s"] >= before
+    assert view_of(driver, lease)["since_s"] < 0.1, "it is in its present state since the restart"
+
+
+def view_of(driver: CoreDriver, lease: LeaseId) -> dict[str, Any]:
+    found = driver.view(lease)
+    assert found is not None
+    return found

@@ -3,6 +3,7 @@
 import datetime
 import json
 import queue
+import shutil
 import signal
 import subprocess
 import sys
@@ -97,6 +98,14 @@ def test_the_newest_are_found_without_reading_everything(archive: Archive) -> No
     assert archive.asked <= 5
 
 
+def test_the_newest_are_found_behind_several_crashes(archive: Archive) -> None:
+    """Each crash leaves 2,000 numbers out: after three of them `vramctl history` showed an empty list."""
+    for event in archive.events[-5:]:
+        event["seq"] = int(str(event["seq"])) + 20_000
+    found = collect(Wanted(limit=8), None)["events"]
+    assert [event["at_wall_s"] for event in found] == [float(n) for n in range(8993, 9001)]
+
+
 def test_since_starts_at_its_time(archive: Archive) -> None:
     found = collect(Wanted(since_wall_s=8000.0, consumers=["c1"], limit=5000), None)["events"]
     assert found[0]["at_wall_s"] == 8002.0
@@ -152,3 +161,40 @@ def test_following_shows_the_past_and_then_the_present(
         finally:
             process.kill()
             process.wait()
+
+
+@pytest.mark.e2e
+def test_following_goes_on_after_a_restart_with_a_new_history(
+    make_arbiter: Callable[..., ArbiterProcess],
+) -> None:
+    """A deleted state folder begins the numbers at 1 again: nothing was shown any more."""
+    arbiter = make_arbiter().start()
+    for _ in range(3):
+        assert vramctl(arbiter, "drain", "-r", "x").returncode == 0
+    process = subprocess.Popen(
+        [sys.executable, "-m", "clients", "history", "--follow", "--kind", "operator", "--json"],
+        env=arbiter.environ,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        output = process.stdout
+        assert output is not None
+        assert [json.loads(output.readline())["action"] for _ in range(3)] == ["drain"] * 3
+        arbiter.stop()
+        for path in arbiter.state.glob("*"):
+            path.unlink() if path.is_file() else shutil.rmtree(path)
+        arbiter.start()
+        while process.poll() is None and not arbiter_has_two_clients(arbiter):
+            pass
+        assert vramctl(arbiter, "drain", "-r", "after").returncode == 0
+        assert json.loads(output.readline())["reason"] == "after"
+    finally:
+        process.kill()
+        process.wait()
+
+
+def arbiter_has_two_clients(arbiter: ArbiterProcess) -> bool:
+    """The follower has come back."""
+    clients = json.loads(vramctl(arbiter, "status", "--json").stdout)["clients"]
+    return int(clients) >= 2

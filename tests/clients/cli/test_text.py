@@ -1,5 +1,6 @@
 """What `vramctl` prints, to the letter."""
 
+import time
 from typing import Any
 
 import pytest
@@ -203,9 +204,46 @@ def test_an_event() -> None:
         "eta": None,
     }
     line = text.event_line(event)
+    day = time.strftime("%Y-%m-%d", time.localtime(0))
+    assert line.startswith(day + " "), "the history is days long: without a date two nights look like one"
     assert line.partition(":")[2].partition(":")[2] == (
-        "00.062  granted         a L1-1  fits  charge_bytes=1GiB waited_ms=12.3 share=0.123"
+        "00.062  granted         a L1-1  fits  charge=1GiB waited=12.3ms share=0.123"
     )
+
+
+@pytest.mark.parametrize(
+    ("field", "said"),
+    [
+        ({"ms": 3512.4}, "took=3.5s"),  # was ms=3.51e+03
+        ({"ms": 0.41}, "took=0.4ms"),
+        ({"load_ms": 96_000}, "load=96.0s"),
+        ({"safe_point_eta_s": 0.25}, "safe_point_eta=250.0ms"),
+        ({"pressure_bytes": 0}, "pressure=0B"),
+        ({"resolved": True}, "resolved=True"),
+        ({"share": 12_345.678}, "share=12345.678"),
+    ],
+)
+def test_fields_of_an_event_have_units(field: dict[str, Any], said: str) -> None:
+    assert text.event_line({"at_wall_s": 0.0, "kind": "verified", **field}).endswith(f"  {said}")
+
+
+def test_since_counts_from_the_grant() -> None:
+    """It counted from the last change of state: a lease that was held for a day showed 2 s once it was asked to leave."""
+    revoked = LEASE | {"state": "revoking", "since_s": 2.0, "granted_s": 90_000.0}
+    away = LEASE | {"lease_id": "L1-2", "state": "standby", "gpu": None, "since_s": 3.0, "granted_s": 900.0}
+    lines = text.status_lines(STATUS | {"leases": [revoked, away]})
+    assert [line.split("  ")[-1].strip() for line in lines[-2:]] == ["25 h", "3.0 s"]
+
+
+def test_the_gpu_of_a_lease_is_a_column_where_there_are_several() -> None:
+    second = GPU | {"gpu": "GPU-2", "index": 1}
+    waits = LEASE | {"lease_id": "L1-2", "state": "queued", "gpu": None, "position": 1}
+    status = STATUS | {"gpus": [GPU, second], "leases": [LEASE | {"gpu": "GPU-2"}, waits]}
+    head, row, waiting = text.status_lines(status)[-3:]
+    assert head.split()[:5] == ["LEASE", "CONSUMER", "MODEL", "GPU", "STATE"]
+    assert row.split()[3] == "1"
+    assert waiting.split()[3] == "queued", "a waiter has none yet"
+    assert "GPU  STATE" not in "\n".join(text.status_lines(STATUS))
 
 
 @pytest.mark.parametrize(
