@@ -156,6 +156,9 @@ def core_settings(config: ArbiterConfig, gpus: tuple[GpuInfo, ...], opened: Open
         waiters_max=config.limits.waiters_max,
         leases_per_client_max=config.limits.leases_per_client_max,
         uses_per_lease_max=config.limits.uses_per_lease_max,
+        process_share=config.limits.process_share,
+        user_share=config.limits.user_share,
+        priority_reserve=config.limits.priority_reserve,
         token_secret=secrets.token_hex(TOKEN_SECRET_BYTES),
         host_ram_budget_bytes=park_budget_bytes(config.host.park_budget_bytes),
     )

@@ -17,6 +17,7 @@ from schemas.units import ByteSize, parse_bytes
 from schemas.yamltext import Path, parse_yaml, validated
 
 Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
+Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
 
 
 class _Section(BaseModel):
@@ -144,10 +145,16 @@ class LimitsConfig(_Section):
     """Connections at a time."""
     waiters_max: Annotated[int, Field(ge=1, le=1_000_000)] = d.WAITERS_MAX
     """Queued leases at a time."""
+    process_share: Share = d.PROCESS_SHARE
+    """Part of the places of `waiters_max`, and of the uses of another process's lease, that one process may take."""
+    user_share: Share = d.USER_SHARE
+    """The same for all processes of one user together."""
+    priority_reserve: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = d.PRIORITY_RESERVE
+    """Part of the places of `waiters_max` that is kept for requests above the default priority."""
     leases_per_client_max: Annotated[int, Field(ge=1, le=4096)] = d.LEASES_PER_CLIENT_MAX
     """Live leases of one client."""
     uses_per_lease_max: Annotated[int, Field(ge=1, le=65_536)] = d.USES_PER_LEASE_MAX
-    """Uses of one lease at a time."""
+    """Uses of one lease at a time: its holder's own, and as many of others."""
     rate_per_client_per_s: Annotated[int, Field(ge=10, le=1_000_000)] = d.RATE_PER_CLIENT_PER_S
     """Requests a second of one connection; a burst of one second's worth is allowed."""
     subscribers_max: Annotated[int, Field(ge=0, le=65_536)] = d.SUBSCRIBERS_MAX

@@ -45,6 +45,7 @@ def begin(core: Core, gpu: Gpu, lease: Lease, event: ResizeAsked, more_bytes: in
         ),
         process=lease.process,
         client=event.client,
+        uid=lease.uid,
         arrived_at=core.now,
         arrival=core.next_arrival(),
         load_peak_bytes=more_bytes,

@@ -224,6 +224,7 @@ class Lease:
     gpus: tuple[GpuId, ...]  # where it may be placed
     state: LeaseState = LeaseState.QUEUED
     since: float = 0.0
+    uid: int = -1  # of its process when it asked; -1: it came from the journal, and has not asked since
     token: Token | None = None
     gpu: GpuId | None = None
     measured_bytes: int | None = None

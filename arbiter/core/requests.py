@@ -20,6 +20,7 @@ from arbiter.core.events import (
     UnloadStarted,
 )
 from arbiter.core.lease import AWAY, EXPIRING, Lease, LeaseState, Recall, Use
+from arbiter.core.limits import check_leases, check_waiters
 from arbiter.core.measure import begin_for_lease
 from arbiter.core.state import Client, Core, Ended, Refused
 from schemas.ids import ClientId, GpuId, LeaseId, RequestId, Token
@@ -111,7 +112,7 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         if spec.gang is not None:
             gangs.left_out(core, spec.gang[0], refused.message)
         raise
-    check_waiters(core)
+    check_waiters(core, client, spec.priority)
     away = None if spec.gang is not None else standby.find(core, client.process, spec.consumer, spec.key)
     if away is not None:
         _take_over(core, event, away, spec, gpus)
@@ -136,20 +137,14 @@ def new_lease(
     gpus: tuple[GpuId, ...],
 ) -> Lease:
     """A lease that is asked for, known by its nonce from now on. Refuses what is one too many for its connection."""
-    owned = core.count_of_client(client.id)
-    if owned >= core.settings.leases_per_client_max:
-        raise Refused(
-            "limit_exceeded",
-            f"this connection has {owned} leases",
-            "release some",
-            limit="leases_per_client_max",
-        )
+    check_leases(core, client)
     lease = Lease(
         id=core.next_lease_id(),
         nonce=event.nonce,
         spec=spec,
         process=client.process,
         client=client.id,
+        uid=client.uid,
         arrived_at=core.now,
         arrival=core.next_arrival(),
         load_peak_bytes=load_peak,
@@ -165,11 +160,6 @@ def new_lease(
     core.nonces[client.process, event.nonce] = lease.id
     costs.wanted(core, spec.consumer)
     return lease
-
-
-def check_waiters(core: Core) -> None:
-    if len(core.waiting) >= core.settings.waiters_max:
-        raise Refused("limit_exceeded", "too many wait already", "try again later", limit="waiters_max")
 
 
 def _take_over(
@@ -191,7 +181,7 @@ def _want_back(
 ) -> None:
     """A lease that is away becomes a waiter, as it was last asked for."""
     gpus = placement.places(core, lease.spec, drift.expected_bytes(core, lease.spec)[0])
-    check_waiters(core)
+    check_waiters(core, client_of(core, client), lease.spec.priority)
     _call_back(core, lease, client, request, wait_timeout_s, gpus)
 
 
@@ -204,6 +194,7 @@ def _call_back(
     gpus: tuple[GpuId, ...],
 ) -> None:
     lease.gpus = gpus
+    lease.uid = client_of(core, client).uid
     lease.load_peak_bytes, lease.steady_bytes = drift.expected_bytes(core, lease.spec)
     standby.queue_again(core, lease, client, request, core.now, wait_timeout_s)
     costs.wanted(core, lease.spec.consumer)

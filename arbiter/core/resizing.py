@@ -10,8 +10,9 @@ from dataclasses import replace
 from arbiter.core import explain, growth
 from arbiter.core.events import ResizeAsked
 from arbiter.core.lease import LEAVING, Lease, LeaseState
+from arbiter.core.limits import check_waiters
 from arbiter.core.policy import largest_growth_bytes
-from arbiter.core.requests import bad_state, check_waiters, own_lease
+from arbiter.core.requests import bad_state, own_lease
 from arbiter.core.state import Core, Gpu, Refused
 
 
@@ -39,7 +40,7 @@ def resize(core: Core, event: ResizeAsked) -> None:
     charge = gpu.ledger.charge_bytes(lease.id)
     if target > charge and not _waits_for(core, lease, target):
         _check_ever_fits(gpu, lease, target, charge)
-        check_waiters(core)
+        check_waiters(core, core.clients[event.client], lease.spec.priority)
         growth.abandon(core, lease, "another size is asked for")
         growth.begin(core, gpu, lease, event, target - charge)
     elif target < charge and (lease.shrink is None or lease.shrink.target_bytes != target):

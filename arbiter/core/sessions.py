@@ -26,7 +26,7 @@ def on_connected(core: Core, event: ClientConnected) -> None:
     earlier = core.instances.get(instance)
     if earlier is not None:
         _take_over(core, earlier, event.client)
-    core.join(Client(event.client, event.process, event.name, event.instance))
+    core.join(Client(event.client, event.process, event.name, event.instance, event.uid))
     core.instances[instance] = event.client
     core.last_client_at = core.now
     for gpu in core.gpus.values():

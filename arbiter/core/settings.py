@@ -46,6 +46,9 @@ class Settings:
     waiters_max: int = d.WAITERS_MAX
     leases_per_client_max: int = d.LEASES_PER_CLIENT_MAX
     uses_per_lease_max: int = d.USES_PER_LEASE_MAX
+    process_share: float = d.PROCESS_SHARE
+    user_share: float = d.USER_SHARE
+    priority_reserve: float = d.PRIORITY_RESERVE
     token_secret: str = ""
     """Hexadecimal digits that nobody else knows; tokens cannot be guessed with it. "": the next number each time."""
     host_ram_budget_bytes: int = 0

@@ -53,6 +53,7 @@ class Client:
     process: ProcessKey
     name: str
     instance: str
+    uid: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +144,7 @@ class Core:
         self._of_process: dict[ProcessKey, dict[LeaseId, Lease]] = {}
         self._of_client: dict[ClientId, dict[LeaseId, Lease]] = {}
         self.waiting: dict[LeaseId, Lease] = {}
+        self._waiting_by: dict[ProcessKey | int, int] = {}  # waiters of each process and of each uid
         self.away: dict[LeaseId, Lease] = {}  # without bytes on a card, in the order of their leaving
         self.host = HostRam(settings.host_ram_budget_bytes)
         self.nonces: dict[tuple[ProcessKey, str], LeaseId] = {}
@@ -279,6 +281,10 @@ class Core:
     def count_of_client(self, client: ClientId) -> int:
         return len(self._of_client.get(client, {}))
 
+    def waiting_by(self, process: ProcessKey, uid: int) -> tuple[int, int]:
+        """Waiters of a process, and of a user."""
+        return self._waiting_by.get(process, 0), self._waiting_by.get(uid, 0)
+
     def disagreement(self) -> str:
         """Where the tables of owners and the leases disagree; "" if nowhere. Looks at everybody: for tests."""
         by_process = {lease_id: owner for owner, some in self._of_process.items() for lease_id in some}
@@ -297,6 +303,9 @@ class Core:
         busy = {(*use, lease.id) for lease in self.leases.values() for use in lease.uses}
         if odd := busy ^ {(who, use, lease) for who, mine in self.users.items() for lease, use in mine}:
             return f"{sorted(odd)}: uses are listed otherwise than they are"
+        owners = Counter(owner for lease in self.waiting.values() for owner in (lease.process, lease.uid))
+        if owners != self._waiting_by:
+            return f"waiters are {owners}, kept as {self._waiting_by}"
         counted = Counter(client.process for client in self.clients.values())
         return "" if counted == self.connected else f"{counted} are connected, kept as {self.connected}"
 
@@ -330,12 +339,18 @@ class Core:
     def hold_back(self, lease: Lease) -> None:
         """It waits, but in no queue yet."""
         self.waiting[lease.id] = lease
+        for owner in (lease.process, lease.uid):
+            self._waiting_by[owner] = self._waiting_by.get(owner, 0) + 1
         self.suspects.add(lease.process)
         if lease.wait_timeout_s is not None:
             self.timers.set(("wait", lease.id), lease.arrived_at + lease.wait_timeout_s)
 
     def dequeue(self, lease: Lease) -> None:
-        self.waiting.pop(lease.id, None)
+        if self.waiting.pop(lease.id, None) is not None:
+            for owner in (lease.process, lease.uid):
+                self._waiting_by[owner] -= 1
+                if not self._waiting_by[owner]:
+                    del self._waiting_by[owner]
         self.timers.clear(("wait", lease.id))
         for gpu_id in lease.gpus:
             self.gpus[gpu_id].queue.discard(lease)

@@ -15,6 +15,7 @@ from typing import Any, Final
 from arbiter.core import eviction
 from arbiter.core.events import UseBegan, UseEnded, UseYielded
 from arbiter.core.lease import LEAVING, Lease, LeaseState, Use
+from arbiter.core.limits import check_uses
 from arbiter.core.requests import bad_state, client_of, lease_for, note_ended
 from arbiter.core.state import Core, Refused
 from schemas import defaults
@@ -46,10 +47,8 @@ def begin(core: Core, event: UseBegan) -> None:
     if lease.state is not LeaseState.HELD:
         raise bad_state(lease, "only a held lease can be used")
     paused = lease.yielded.get(key)
-    if paused is None and len(lease.uses) + len(lease.yielded) >= core.settings.uses_per_lease_max:
-        raise Refused(
-            "limit_exceeded", f"{lease.id} has too many uses", "end some", limit="uses_per_lease_max"
-        )
+    if paused is None:
+        check_uses(core, lease, client)
     core.mark(lease, paused or Use(event.use, client.id, client.process, event.label, core.now))
     use = lease.uses[key] = replace(lease.uses[key], client=client.id)
     lease.last_used_at = core.now

@@ -235,14 +235,16 @@ class CoreDriver:
         self.advance(0.01)
 
     # -- people ----------------------------------------------------------------------------------------------------
-    def consumer(self, name: str, *, pid: int | None = None, priority: int = d.PRIORITY) -> "Consumer":
+    def consumer(
+        self, name: str, *, pid: int | None = None, priority: int = d.PRIORITY, uid: int = 1000
+    ) -> "Consumer":
         """A process with one connection."""
         if pid is None:
             self._pids += 1
             pid = self._pids
         process = ProcessKey(pid, 7 * pid)
         client = ClientId(f"c{pid}")
-        person = Consumer(self, name, process, client, priority)
+        person = Consumer(self, name, process, client, priority, uid)
         for card in self.cards.values():
             card.names[process] = name
         person.connect()
@@ -289,6 +291,7 @@ class Consumer:
     process: ProcessKey
     client: ClientId
     priority: int = d.PRIORITY
+    uid: int = 1000
     specs: dict[LeaseId, Spec] = field(default_factory=dict)
     nonces: int = 0
     traceparent: str | None = None  # sent with what it asks for
@@ -296,7 +299,7 @@ class Consumer:
     # -- connection ------------------------------------------------------------------------------------------------
     def connect(self) -> list[Effect]:
         return self.driver.post(
-            ClientConnected(self.client, self.process, 1000, self.name, f"{self.name}-{self.client}")
+            ClientConnected(self.client, self.process, self.uid, self.name, f"{self.name}-{self.client}")
         )
 
     def leave(self, reason: str = BYE) -> list[Effect]:
