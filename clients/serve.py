@@ -1,226 +1,246 @@
-"""A small asyncio ROUTER server for the programs that are not the arbiter (sidecars, runner): one msgpack map per frame.
+"""The server of the programs that are not the arbiter (sidecars, runner, reasoner): one msgpack map per message, on `schemas.runtime.router`.
 
-It owns the socket, decoding, size limits and the error reply for frames that are no messages. It knows nothing of ops: a handler
-gets the decoded map and may answer at once, later, or several times. Speaks to DEALER (one frame) and REQ (empty delimiter) peers alike.
-Only `ipc://` and loopback `tcp://` endpoints are bound; an ipc socket gets mode 0660.
+It owns the socket, decoding, size limits and the error reply for what is not a message. A handler gets the decoded map and may answer at once,
+later, or several times. Peers are unmodified pyzmq DEALER and REQ sockets. Only `ipc://PATH` is served: on loopback tcp any user of
+the machine could drive the robot. It must not know what a message means.
 """
 
 import asyncio
 import contextlib
-import errno
-import fcntl
-import os
-import stat
+import logging
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-import msgpack
-import zmq
-import zmq.asyncio
-
 from clients.packing import pack
-from schemas.defaults import IMAGE_MESSAGE_MAX_BYTES
-from schemas.errors import AlreadyRunning, BadFrame, ConfigError, MessageTooLarge, VramError
+from schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MIB, RATE_PER_CLIENT_PER_S
+from schemas.errors import ConfigError, LimitExceeded, MessageTooLarge, VramError
+from schemas.runtime.folders import LockFile, private_folder
+from schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
+from schemas.runtime.router import Connection, Limits, Router
+from schemas.runtime.zmtp import Oversize
+
+log = logging.getLogger(__name__)
 
 Message = dict[str, Any]
 REASON_MAX_CHARS = 500
-MAX_DEPTH_BYTES = IMAGE_MESSAGE_MAX_BYTES + 64 * 1024  # an image plus its envelope
+ENVELOPE_MAX_BYTES = 64 * 1024
+IMAGES_MAX_BYTES = IMAGE_MESSAGE_MAX_BYTES + ENVELOPE_MAX_BYTES
+VALUES_MAX = 12_288
+"""msgpack values of one message: 1,100 points of a trajectory of six joints; at most 4 ms of decoding."""
+LISTED_MAX = 4096
 LINGER_S = 3.0
-"""How long a server that ends waits until its last answers are with the kernel; only peers that do not read cost so long."""
+"""How long a server that ends waits until its last answers are read; only peers that do not read cost so long."""
+SILENT_S = 300.0
+"""A connection without one good message is cut then, and earlier where its place is needed. libzmq connects again by itself."""
+CONNECTIONS_MAX = 512
+WAITING_MAX = 512
+"""Requests of one user that wait for their answers."""
 
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """Whoever sent a message: where to answer, and which process the kernel says it is (None on tcp)."""
+    """Sender of a message: where to answer, and which process and user the kernel says it is.
 
-    identity: bytes
-    delimiter: bool
-    pid: int | None
+    `identity` is the serial of its connection, never reused. `pid` is 0 for a process that cannot be seen from here.
+    """
+
+    identity: int
+    pid: int
+    uid: int
 
 
 Handler = Callable[[Peer, Message], Awaitable[None]]
 ErrorReply = Callable[[VramError], Message]
 
 
+@dataclass(slots=True)
+class _Client:
+    """What the server keeps of a connection."""
+
+    connection: Connection
+    peer: Peer
+    budget: float = RATE_PER_CLIENT_PER_S  # messages it may send at once
+    counted_at: float = 0.0
+
+    def within_rate(self, now: float) -> bool:
+        rate = float(RATE_PER_CLIENT_PER_S)
+        self.budget = min(rate, self.budget + (now - self.counted_at) * rate) - 1.0
+        self.counted_at = now
+        return self.budget >= 0
+
+
+@dataclass(slots=True)
+class _Waiting:
+    """Requests of one user that are being answered."""
+
+    count: int = 0
+    size_bytes: int = 0
+
+
 def check_free(endpoint: str) -> None:
-    """Before a server has moved or recorded anything: may it serve there? Claims nothing; who serves in the end is decided when it binds.
+    """Before a server has moved or recorded anything: may it serve there? Claims nothing; binding decides which server gets the endpoint.
 
     Raises what `RouterServer` does.
     """
-    _check_form(endpoint)
-    if not endpoint.startswith("ipc://"):
-        return
-    path = Path(endpoint.removeprefix("ipc://"))
-    try:
-        lock = os.open(_lock_of(path), os.O_RDWR | os.O_CLOEXEC)
-    except OSError:
-        return  # nobody served there yet; what else is wrong with it binding will say
-    try:
-        _lock(lock, path)
-    finally:
-        os.close(lock)
+    path = path_of(endpoint)
+    _lock_of(path).check_free()
 
 
-def _check_form(endpoint: str) -> None:
-    if not endpoint.startswith(("ipc://", "tcp://127.0.0.1:", "tcp://localhost:")):
-        raise ConfigError(f"cannot serve on {endpoint}", hint="use ipc://PATH or tcp://127.0.0.1:PORT")
+def path_of(endpoint: str) -> Path:
+    """Path of the socket of an endpoint that a server may bind. Raises ConfigError."""
+    path = endpoint.removeprefix("ipc://")
+    if endpoint.startswith("tcp://"):
+        raise ConfigError(
+            f"cannot serve on {endpoint}: over tcp any user of this machine could drive the robot and stop it, and nothing says who asks",
+            hint="use ipc://PATH: the socket's file then says who may connect",
+        )
+    if not endpoint.startswith("ipc://") or not path or path.startswith("@"):
+        raise ConfigError(f"cannot serve on {endpoint}", hint="use ipc://PATH, with the path of a socket")
+    return Path(path)
 
 
-def _lock_of(path: Path) -> str:
-    return f"{path}.lock"
-
-
-def _lock(lock: int, path: Path) -> None:
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        owner = os.pread(lock, 32, 0).decode(errors="replace").strip()
-        raise AlreadyRunning(f"{path} is served by process {owner or '?'}", hint="stop it first") from None
+def _lock_of(path: Path) -> LockFile:
+    return LockFile(Path(f"{path}.lock"), f"ipc://{path}", "a server")
 
 
 class RouterServer:
     """`async with RouterServer(endpoint, on_error) as server: await server.serve(handler)`.
 
-    Each message is handled in a task of its own, so that a slow one never delays `ping` or `revoke`; at most `concurrent_max` run, then reading
-    stops and ZeroMQ's own queue holds the rest (high-water mark `queue_max` per peer).
-    Raises ConfigError for a foreign endpoint, or one where nothing can be bound, AlreadyRunning when a living server owns it.
+    A handler runs in a task of its own, so that a slow one delays no other request; its work up to the first wait is done at once.
+    Args: `message_max_bytes` bounds one request; beside binary values, as pictures are, it holds at most 1 MiB.
+    Raises ConfigError for an endpoint that cannot be bound, AlreadyRunning when a living server has it.
     """
 
     def __init__(
-        self, endpoint: str, on_error: ErrorReply, *, concurrent_max: int = 64, queue_max: int = 256
+        self, endpoint: str, on_error: ErrorReply, *, message_max_bytes: int = IMAGES_MAX_BYTES
     ) -> None:
-        _check_form(endpoint)
         self.endpoint = endpoint
+        self._path = path_of(endpoint)
         self._on_error = on_error
-        self._slots = asyncio.Semaphore(concurrent_max)
-        self._queue_max = queue_max
+        self._unpack = UnpackLimits(
+            message_max_bytes, values_max=VALUES_MAX, keys_max=LISTED_MAX, items_max=LISTED_MAX
+        )
+        several_bytes = max(64 * MIB, 8 * message_max_bytes)
+        self._waiting_max_bytes = several_bytes
+        limits = Limits(
+            message_max_bytes=message_max_bytes,
+            stranger_message_max_bytes=message_max_bytes,  # these wires have no hello: the first request may be a picture
+            skip_max_bytes=several_bytes,
+            hello_s=SILENT_S,
+            connections_max=CONNECTIONS_MAX,
+            out_max_bytes=several_bytes,
+            user_out_max_bytes=2 * several_bytes,
+            user_in_max_bytes=several_bytes,
+        )
+        self._router = Router(self._path, self, limits)
+        self._clients: dict[int, _Client] = {}  # by serial
+        self._waiting: dict[int, _Waiting] = {}  # by uid
+        self._handler: Handler | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._stack = contextlib.AsyncExitStack()
-        self._send_lock = asyncio.Lock()
-        self._socket: zmq.asyncio.Socket | None = None
 
     async def __aenter__(self) -> Self:
+        private_folder(self._path.parent)
+        lock = _lock_of(self._path)
+        lock.acquire()
+        self._stack.callback(lock.release)
         try:
-            self._open()
-        except (OSError, zmq.ZMQError) as error:
-            await self._stack.aclose()
-            if error.errno == errno.EADDRINUSE:
-                raise AlreadyRunning(
-                    f"{self.endpoint} is served by another process", hint="stop it first"
-                ) from error
-            raise ConfigError(
-                f"cannot serve on {self.endpoint}: {os.strerror(error.errno or errno.EINVAL)}",
-                hint="use a short path in a folder of your own",
-            ) from error
+            self._router.bind()
         except BaseException:
             await self._stack.aclose()
             raise
+        self._stack.push_async_callback(self._router.aclose, LINGER_S)
         return self
 
-    def _open(self) -> None:
-        if self.endpoint.startswith("ipc://"):
-            self._claim(Path(self.endpoint.removeprefix("ipc://")))
-        # a context of its own: that it has ended is all that libzmq says of what was sent
-        context = zmq.asyncio.Context()
-        self._stack.push_async_callback(asyncio.to_thread, context.term)
-        socket: zmq.asyncio.Socket = context.socket(zmq.ROUTER)
-        self._stack.callback(socket.close, round(LINGER_S * 1000))
-        # beyond this libzmq drops the peer; below we can answer
-        socket.setsockopt(zmq.MAXMSGSIZE, 4 * MAX_DEPTH_BYTES)
-        socket.setsockopt(zmq.SNDHWM, self._queue_max)
-        socket.setsockopt(zmq.RCVHWM, self._queue_max)
-        old_umask = os.umask(0o117)
-        try:
-            socket.bind(self.endpoint)
-        finally:
-            os.umask(old_umask)
-        self._socket = socket
-
     async def __aexit__(self, *_: object) -> None:
-        """What was sent by now reaches its peer, though the process ends behind this. Then the endpoint is anybody's."""
+        """What was sent by now reaches its peer, though the process ends behind this. Then the endpoint is free."""
+        self._router.stop_receiving()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self._stack.aclose()
 
-    def _claim(self, path: Path) -> None:
-        """Binding steals an existing ipc path without a word: a locked file beside it tells a living owner from a stale socket."""
-        path.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
-        lock = os.open(_lock_of(path), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660)
-        self._stack.callback(os.close, lock)
-        _lock(lock, path)
-        os.ftruncate(lock, 0)
-        os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
-        if path.exists() and stat.S_ISSOCK(path.stat().st_mode):
-            path.unlink()
-
     async def serve(self, handler: Handler) -> None:
         """Read until cancelled."""
-        assert self._socket is not None, "serve() belongs inside `async with`"
-        while True:
-            await self._slots.acquire()
-            try:
-                frames = await self._socket.recv_multipart(copy=False)
-                identity, delimiter, payload = frames[0].bytes, len(frames) == 3, frames[-1]
-                peer = Peer(identity, delimiter, _pid(payload))
-                message = self._decode(frames)
-            except VramError as error:
-                self._slots.release()
-                await self.send(Peer(identity, delimiter, None), self._on_error(error))
-                continue
-            except BaseException:
-                self._slots.release()
-                raise
-            task = asyncio.create_task(self._run(handler, peer, message))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
-
-    async def _run(self, handler: Handler, peer: Peer, message: Message) -> None:
+        loop = asyncio.get_running_loop()
+        self._handler = handler
+        self._router.start(loop)
         try:
-            await handler(peer, message)
+            await loop.create_future()
         finally:
-            self._slots.release()
-
-    @staticmethod
-    def _decode(frames: list[zmq.Frame]) -> Message:
-        payload = frames[-1]
-        if len(payload) > MAX_DEPTH_BYTES:
-            raise MessageTooLarge(
-                f"a message of {len(payload)} bytes; the limit is {MAX_DEPTH_BYTES}",
-                hint="send a smaller image",
-            )
-        try:
-            message = msgpack.unpackb(payload.buffer, raw=False, strict_map_key=True)
-        except (ValueError, msgpack.exceptions.UnpackException, RecursionError) as error:
-            raise BadFrame(f"not msgpack: {error}", hint="send one msgpack map per message") from None
-        if not isinstance(message, dict):
-            raise BadFrame(
-                f"a msgpack {type(message).__name__}, not a map", hint="send one msgpack map per message"
-            )
-        return message
+            self._router.stop_receiving()
 
     async def send(self, peer: Peer, message: Message) -> None:
-        """Answer or push. A peer that is gone or too slow gets nothing."""
-        assert self._socket is not None
-        payload = pack(message)
-        frames = [peer.identity, b"", payload] if peer.delimiter else [peer.identity, payload]
-        async with self._send_lock:
-            await self._socket.send_multipart(frames)
+        """Answer or push. A peer that is gone gets nothing; one that does not read is hung up on."""
+        client = self._clients.get(peer.identity)
+        if client is not None and not client.connection.send(pack(message)):
+            client.connection.close("it does not read its answers")
+
+    # -- for the router --------------------------------------------------------------------------------------------------
+    def connected(self, connection: Connection) -> None:
+        peer = Peer(connection.serial, connection.peer.process.pid, connection.peer.uid)
+        self._clients[connection.serial] = _Client(connection, peer)
+
+    def disconnected(self, connection: Connection, reason: str) -> None:
+        del self._clients[connection.serial]
+
+    def received(self, connection: Connection, payload: bytes | bytearray | Oversize) -> bool:
+        client, loop = self._clients[connection.serial], asyncio.get_running_loop()
+        within_rate = client.within_rate(loop.time())
+        try:
+            message, size = self._decoded(payload)
+            waiting = self._waiting_of(client.peer.uid, size)
+        except VramError as error:
+            connection.send(pack(self._on_error(error)))
+            return within_rate
+        if not connection.admitted:
+            connection.admit()
+        waiting.count += 1
+        waiting.size_bytes += size
+        task = asyncio.Task(self._run(client.peer, message, waiting, size), loop=loop, eager_start=True)
+        if not task.done():
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+        return within_rate
+
+    def _decoded(self, payload: bytes | bytearray | Oversize) -> tuple[Message, int]:
+        """The message and its size. Raises MessageTooLarge and BadFrame."""
+        if isinstance(payload, Oversize):
+            raise MessageTooLarge(
+                f"the message has {payload.size} bytes, the limit is {payload.limit}",
+                hint="send a smaller image",
+                details={"size_bytes": payload.size, "limit_bytes": payload.limit},
+            )
+        return unpack_map(payload, self._unpack), len(payload)
+
+    def _waiting_of(self, uid: int, size: int) -> _Waiting:
+        """Raises LimitExceeded where a user has all the requests, or bytes of them, that may wait."""
+        waiting = self._waiting.setdefault(uid, _Waiting())
+        full = "requests" if waiting.count >= WAITING_MAX else "bytes of requests"
+        if waiting.count >= WAITING_MAX or waiting.size_bytes + size > self._waiting_max_bytes:
+            limit = WAITING_MAX if full == "requests" else self._waiting_max_bytes
+            raise LimitExceeded(
+                f"{limit} {full} of uid {uid} wait for their answers",
+                hint="wait for answers before asking more",
+                details={"limit": full, "value": limit},
+            )
+        return waiting
+
+    async def _run(self, peer: Peer, message: Message, waiting: _Waiting, size: int) -> None:
+        assert self._handler is not None, "nothing is received before serve()"
+        try:
+            await self._handler(peer, message)
+        finally:
+            waiting.count -= 1
+            waiting.size_bytes -= size
+            if not waiting.count:
+                self._waiting.pop(peer.uid, None)
 
 
 def reason_of(message: Message) -> str:
-    """The `reason` of a request that must never be refused for its words, as a stop: on one line, and not for ever."""
+    """The `reason` of a request that must never be refused for its words, as a cancel: on one line, of bounded length."""
     words = message.get("reason")
     text = "" if words is None else str(words)[: 4 * REASON_MAX_CHARS]
     return "".join(letter if letter.isprintable() else " " for letter in text).strip()[:REASON_MAX_CHARS]
-
-
-def _pid(frame: zmq.Frame) -> int | None:
-    try:
-        address = str(frame.get("Peer-Address"))  # localhost:UID:GID:PID on ipc, an ip address on tcp
-    except zmq.ZMQError:
-        return None
-    tail = address.rsplit(":", 3)
-    return int(tail[3]) if len(tail) == 4 and all(part.isdecimal() for part in tail[1:]) else None

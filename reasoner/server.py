@@ -15,6 +15,7 @@ from clients.patience import answered
 from clients.serve import Message, Peer, RouterServer, reason_of
 from clients.transport import Transport
 from reasoner.inbox import Cancel, Inbox, Said
+from schemas.defaults import MESSAGE_MAX_BYTES
 from schemas.errors import BadRequest, ReasonerUnreachable, UnknownOp, VramError, from_wire
 from schemas.reasoner import OPS, REASONER_REQUEST, CancelEpisode, GetEpisode, Say
 
@@ -29,7 +30,9 @@ class OperatorServer:
     def __init__(self, endpoint: str, task: str, inbox: Inbox) -> None:
         self._task_text = task
         self._inbox = inbox
-        self._server = RouterServer(endpoint, lambda error: _refusal(None, error))
+        self._server = RouterServer(
+            endpoint, lambda error: _refusal(None, error), message_max_bytes=MESSAGE_MAX_BYTES
+        )
         self._serving: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:

@@ -22,6 +22,7 @@ from runner.clock import Clock
 from runner.control import ControlThread
 from runner.estop import OBEY_S, EstopServer
 from runner.one_goal import OneGoal, Performer
+from schemas.defaults import MESSAGE_MAX_BYTES
 from schemas.errors import (
     BadRequest,
     EstopRequested,
@@ -114,7 +115,11 @@ class GoalServer:
 
         async with contextlib.AsyncExitStack() as stack:
             server = await stack.enter_async_context(
-                RouterServer(self._endpoint, lambda error: _refusal(None, error))
+                RouterServer(
+                    self._endpoint,
+                    lambda error: _refusal(None, error),
+                    message_max_bytes=MESSAGE_MAX_BYTES,
+                )
             )
             stack.enter_context(
                 EstopServer(

@@ -76,14 +76,14 @@ def test_an_endpoint_is_free_when_its_server_has_ended_and_when_it_never_began(t
             async with RouterServer(endpoint, refused):
                 with pytest.raises(AlreadyRunning):
                     await RouterServer(endpoint, refused).__aenter__()
-                with pytest.raises(AlreadyRunning, match=f"is served by process {os.getpid()}"):
+                with pytest.raises(AlreadyRunning, match=rf"\(pid {os.getpid()}\) already uses"):
                     check_free(endpoint)
             check_free(endpoint)
         nowhere = RouterServer(f"ipc://{tmp_path}/{'x' * 120}", refused)
         for _ in range(2):  # too long for a socket: what was begun is taken back
-            with pytest.raises(ConfigError, match="x: File name too long"):
+            with pytest.raises(ConfigError, match="too long"):
                 await nowhere.__aenter__()
-        with pytest.raises(ConfigError, match="none/s: No such file"):
+        with pytest.raises(ConfigError, match="No such file"):
             await RouterServer("ipc:///proc/none/s", refused).__aenter__()
 
     asyncio.run(one_after_the_other())

@@ -143,7 +143,7 @@ def test_a_second_runner_records_nothing(tmp_path: Path, capsys: pytest.CaptureF
         fcntl.flock(first, fcntl.LOCK_EX)
         there = ["--endpoint", f"ipc://{tmp_path}/runner.sock", "--record", str(tmp_path / "set")]
         assert main(["sim", *there, "--env", "gym:CartPole-v1", "--policy", "random", "--rate", "0"]) == 1
-    assert "is served by process" in capsys.readouterr().err
+    assert "already uses" in capsys.readouterr().err
     assert not (tmp_path / "set").exists()
 
 

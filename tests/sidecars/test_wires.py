@@ -15,7 +15,7 @@ from sidecars.wires import PENDING_MAX, Wire, error_reply, parse
 
 PNG = b"\x89PNG\r\n\x1a\n"
 OPS = frozenset({"detect", "get_action", "reset"})
-PEER = Peer(b"peer", False, None)
+PEER = Peer(1, 0, 0)
 
 
 class Host:
