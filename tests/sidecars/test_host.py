@@ -19,7 +19,7 @@ PATIENCE_S = 60.0
 @pytest.fixture
 def arbiter(arbiter_daemon):
     with WireClient(arbiter_daemon.endpoint) as client:
-        yield client.hello("looker")
+        yield client.hello("looker", role="operator")  # whose status shows tokens
 
 
 def leases(arbiter):
