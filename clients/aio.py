@@ -47,7 +47,7 @@ SUBSCRIBER_QUEUE_MAX = 10_000  # events; a subscriber that does not read loses t
 class ArbiterClient:
     """One connection to the arbiter. `async with`, or `connect` and `close`. Use it on one loop, in one process.
 
-    `name` is what `vramctl` shows. Raises ArbiterUnreachable from `connect` after `connect_timeout_s` without an answer;
+    `name` is what `vramctl` shows. Raises ArbiterUnreachable from `connect` after `connect_timeout_s` without an answer, UntrustedServer;
     later losses of contact are ridden out.
     """
 
@@ -73,6 +73,7 @@ class ArbiterClient:
         self._tasks: dict[asyncio.Task[None], None] = {}  # in the order of their beginning
         self._closing = False
         self._lost = False
+        self._distrusted = False  # of the present loss of contact
 
     # -- connection ------------------------------------------------------------------------------------------------
     async def __aenter__(self) -> Self:
@@ -97,7 +98,7 @@ class ArbiterClient:
         return tuple(lease for lease in self._leases.values() if lease.state != "gone")
 
     async def connect(self) -> None:
-        """Raises ArbiterUnreachable, or the arbiter's own refusal (VersionMismatch, NotPermitted, LimitExceeded)."""
+        """Raises ArbiterUnreachable, UntrustedServer, or the arbiter's own refusal (VersionMismatch, NotPermitted, LimitExceeded)."""
         if self._transport is not None:
             return
         self._greeted = asyncio.get_running_loop().create_future()
@@ -381,7 +382,7 @@ class ArbiterClient:
         self.pump()
 
     def _new_transport(self, loop: asyncio.AbstractEventLoop) -> Transport:
-        return Transport(self.endpoint, loop, self._received, self._hung_up)
+        return Transport(self.endpoint, loop, self._received, self._hung_up, self._refused, program="arbiter")
 
     def _shut(self) -> None:
         """Close the socket; whoever still waits is told."""
@@ -412,6 +413,14 @@ class ArbiterClient:
         if self._transport is not None:
             self.pump()
 
+    def _refused(self, error: VramError) -> None:
+        """Another user's process listens there. It was told nothing; the greeting's own deadline leads to the next try."""
+        if self._greeted is not None and not self._greeted.done():
+            self._greeted.set_exception(error)
+        elif not self._distrusted:
+            log.error("%s", error)
+        self._distrusted = True
+
     def _ticked(self) -> None:
         self._timer = None
         if self._transport is not None:
@@ -434,7 +443,7 @@ class ArbiterClient:
     def _tell(self, event: r.Event) -> None:
         match event:
             case r.Up():
-                self._lost = False
+                self._lost = self._distrusted = False
                 if self._greeted is not None and not self._greeted.done():
                     self._greeted.set_result(None)
                 else:

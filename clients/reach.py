@@ -11,16 +11,19 @@ import socket
 import stat
 from typing import Final
 
-IPC: Final = "ipc://"
+from schemas.endpoints import socket_path
+from schemas.errors import ConfigError
+
 START: Final = "start `vram-arbiter`, or set VRAM_ARBITER_ENDPOINT"
 PATIENCE_S: Final = 1.0
 
 
 def obstacle(endpoint: str) -> tuple[str, str] | None:
     """What is wrong with an endpoint and what to do; None if it can be connected to, or only trying can tell."""
-    path = endpoint.removeprefix(IPC)
-    if not endpoint.startswith(IPC) or path.startswith("@"):
-        return None
+    try:
+        path = socket_path(endpoint)
+    except ConfigError as error:
+        return error.message, error.hint
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(PATIENCE_S)
         try:
@@ -38,7 +41,7 @@ def obstacle(endpoint: str) -> tuple[str, str] | None:
         except OSError as error:
             if error.errno == errno.EAGAIN:
                 return None
-            return f"{endpoint} is no endpoint: {error.strerror or error}", START
+            return f"{endpoint} is not an endpoint: {error.strerror or error}", START
     return None
 
 

@@ -13,7 +13,7 @@ from clients.estop import Stopped, stop
 from clients.patience import answered
 from clients.transport import Transport
 from schemas.endpoints import program_endpoint
-from schemas.errors import BadState, GoalRejected, RunnerUnreachable, from_wire
+from schemas.errors import BadState, GoalRejected, RunnerUnreachable, VramError, from_wire
 from schemas.goals import FeedbackPush, FrameReply, ResultPush
 
 Message = dict[str, Any]
@@ -95,7 +95,7 @@ class RunnerClient:
 
     async def close(self) -> None:
         """Goals go on without us."""
-        self._drop("the client was closed")
+        self._drop(self._lost("the client was closed"))
 
     # -- goals -------------------------------------------------------------------------------------------------------
     async def send_goal(
@@ -186,7 +186,7 @@ class RunnerClient:
     async def call(
         self, op: str, fields: Mapping[str, Any] | None = None, *, timeout_s: float | None = None
     ) -> Message:
-        """Any op of `schemas.goals`. Raises its typed error, or RunnerUnreachable."""
+        """Any op of `schemas.goals`. Raises its typed error, RunnerUnreachable, or UntrustedServer before anything is said."""
         if not self._proven:
             await self._exchange("ping", {}, self._connect_timeout_s)
         return await self._exchange(op, fields or {}, self._timeout_s if timeout_s is None else timeout_s)
@@ -195,7 +195,14 @@ class RunnerClient:
     async def _exchange(self, op: str, fields: Mapping[str, Any], timeout_s: float) -> Message:
         if self._transport is None:
             loop = asyncio.get_running_loop()
-            self._transport = Transport(self.endpoint, loop, self._received, lambda: self._drop("it hung up"))
+            self._transport = Transport(
+                self.endpoint,
+                loop,
+                self._received,
+                lambda: self._drop(self._lost("it hung up")),
+                self._drop,
+                program="runner",
+            )
         request_id = next(self._ids)
         answer: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
         self._waiting[request_id] = answer
@@ -234,15 +241,14 @@ class RunnerClient:
         if goal := self._goals.pop(result["goal_id"], None):
             goal.ended(result)
 
-    def _drop(self, reason: str) -> None:
+    def _lost(self, reason: str) -> RunnerUnreachable:
+        return RunnerUnreachable(f"contact to {self.endpoint} lost: {reason}", hint="is the runner alive?")
+
+    def _drop(self, error: VramError) -> None:
         if self._transport is not None:
             self._transport.close()
         self._transport = None
         self._proven = False
         for answer in self._waiting.values():
             if not answer.done():
-                answer.set_exception(
-                    RunnerUnreachable(
-                        f"contact to {self.endpoint} lost: {reason}", hint="is the runner alive?"
-                    )
-                )
+                answer.set_exception(error)

@@ -5,31 +5,33 @@ tells of a hang-up at once, where heartbeats would take seconds. It knows nothin
 """
 
 import asyncio
-import errno
 import logging
-import os
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 import msgpack
 import zmq
-import zmq.utils.monitor
 
+from clients.link import Link
 from clients.packing import pack
-from schemas.errors import ConfigError
+from schemas.errors import VramError
+from schemas.runtime.trust import Program
 
 log = logging.getLogger(__name__)
 
 DRAIN_MAX = 256  # messages in one go, then the loop's other work gets its turn
-RECONNECT_MS = 20  # libzmq's first pause before it tries again …
-RECONNECT_MAX_MS = 500  # … and the longest
-MESSAGE_LIMIT_BYTES = 64 * 1024 * 1024  # a reply is never near it; libzmq hangs up beyond
+RETRY_S = 0.02  # the first pause before another connection is tried …
+RETRY_MAX_S = 0.5  # … and the longest
+UNSENT_MAX = 1000  # messages kept until there is a connection
 
 
 class Transport:
-    """Open from construction to `close`. `received(message)` and `hung_up()` are called on the loop.
+    """Open from construction to `close`. `received(message)`, `hung_up()` and `refused(error)` are called on the loop.
 
-    Raises ConfigError for a text that is no address; whether anybody is there shows only later.
+    It tries until a server of a trusted user listens (`clients.link`), and sends then what was to be sent. It connects once: after
+    `hung_up` or `refused` (UntrustedServer) the owner closes it.
+    Raises ConfigError for a text that is not an endpoint; whether a server is there shows only later.
     """
 
     def __init__(
@@ -38,54 +40,86 @@ class Transport:
         loop: asyncio.AbstractEventLoop,
         received: Callable[[dict[str, Any]], None],
         hung_up: Callable[[], None],
+        refused: Callable[[VramError], None],
+        *,
+        program: Program,
     ) -> None:
+        self._endpoint = endpoint
+        self._program: Program = program
         self._loop = loop
         self._received = received
         self._hung_up = hung_up
+        self._refused = refused
+        self._unsent: deque[bytes] = deque()
         self._drain_scheduled = False
-        self._closed = False
-        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MAX_MS)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, MESSAGE_LIMIT_BYTES)
-        self._monitor: zmq.Socket[bytes] = self._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
-        self._monitor.setsockopt(zmq.LINGER, 0)
-        try:
-            self._socket.connect(endpoint)
-        except zmq.ZMQError as error:
-            self._socket.disable_monitor()
-            self._monitor.close(0)
-            self._socket.close(0)
-            raise ConfigError(
-                f"{endpoint} is no endpoint: {os.strerror(error.errno or errno.EINVAL)}",
-                hint="write ipc:///absolute/path.sock",
-            ) from error
-        loop.add_reader(self._socket.fileno(), self._drain)
-        loop.add_reader(self._monitor.fileno(), self._drain_monitor)
-        self._schedule_drain()
-        loop.call_soon(self._drain_monitor)  # libzmq only signals a reader that found nothing once
+        self._pause_s = RETRY_S
+        self._retry: asyncio.TimerHandle | None = None
+        self._link: Link | None = None
+        self._connect()
 
     def send(self, message: dict[str, Any]) -> bool:
         """Queue one message. False: the queue is full, the other side does not read."""
-        try:
-            self._socket.send(pack(message), zmq.NOBLOCK)
-        except zmq.Again:
-            return False
+        payload = pack(message)
+        if self._link is None or self._link.state != "open":
+            if len(self._unsent) >= UNSENT_MAX:
+                return False
+            self._unsent.append(payload)
+            return True
+        sent = self._link.send(payload)
         self._schedule_drain()
-        return True
+        return sent
 
     def close(self) -> None:
         """Idempotent. What was not sent is dropped."""
-        if self._closed:
-            return
-        self._closed = True
-        self._loop.remove_reader(self._socket.fileno())
-        self._loop.remove_reader(self._monitor.fileno())
-        self._socket.disable_monitor()
-        self._monitor.close(0)
-        self._socket.close(0)
+        self._unsent.clear()
+        if self._retry is not None:
+            self._retry.cancel()
+        self._disconnect()
 
+    # -- the connection ----------------------------------------------------------------------------------------------
+    def _connect(self) -> None:
+        self._retry = None
+        link = self._link = Link(zmq.Context.instance(), self._endpoint, self._program)
+        self._loop.add_reader(link.socket.fileno(), self._drain)
+        self._loop.add_reader(link.monitor.fileno(), self._advance)
+        self._loop.call_soon(self._advance)  # libzmq only signals a reader that found nothing once
+
+    def _disconnect(self) -> None:
+        if self._link is not None:
+            self._loop.remove_reader(self._link.socket.fileno())
+            self._loop.remove_reader(self._link.monitor.fileno())
+            self._link.close()
+            self._link = None
+
+    def _advance(self) -> None:
+        link = self._link
+        if link is None:
+            return
+        before = link.state
+        try:
+            state = link.advance()
+        except VramError as error:
+            self._refuse(error)
+            return
+        if before == "connecting" and state == "open":
+            while self._unsent:
+                link.send(self._unsent.popleft())
+            self._schedule_drain()
+        elif state == "ended" and before == "connecting":
+            self._disconnect()
+            self._retry = self._loop.call_later(self._pause_s, self._connect)
+            self._pause_s = min(2 * self._pause_s, RETRY_MAX_S)
+        elif state == "ended":
+            self._drain()  # its last words
+            if self._link is link:
+                self._disconnect()
+                self._hung_up()
+
+    def _refuse(self, error: VramError) -> None:
+        self._disconnect()
+        self._refused(error)
+
+    # -- messages ----------------------------------------------------------------------------------------------------
     def _schedule_drain(self) -> None:
         if not self._drain_scheduled:
             self._drain_scheduled = True
@@ -94,11 +128,14 @@ class Transport:
     def _drain(self) -> None:
         self._drain_scheduled = False
         for _ in range(DRAIN_MAX):
-            if self._closed:
+            if self._link is None:
                 return
             try:
-                payload = self._socket.recv_multipart(zmq.NOBLOCK)[-1]
-            except zmq.Again:
+                payload = self._link.receive()
+            except VramError as error:
+                self._refuse(error)
+                return
+            if payload is None:
                 return
             try:
                 message = msgpack.unpackb(payload, raw=False, strict_map_key=False)
@@ -108,14 +145,3 @@ class Transport:
             if isinstance(message, dict):
                 self._received(message)
         self._schedule_drain()
-
-    def _drain_monitor(self) -> None:
-        hung_up = False
-        while not self._closed:
-            try:
-                frames = self._monitor.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
-                break
-            hung_up |= zmq.utils.monitor.parse_monitor_message(frames)["event"] == zmq.EVENT_DISCONNECTED
-        if hung_up and not self._closed:
-            self._hung_up()

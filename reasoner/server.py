@@ -89,7 +89,7 @@ def _refusal(request_id: int | None, error: VramError) -> Message:
 
 
 async def send(endpoint: str, request: Mapping[str, Any], *, timeout_s: float = SEND_S) -> Message:
-    """One request to a running reasoner. Raises ReasonerUnreachable, or the typed error of its answer."""
+    """One request to a running reasoner. Raises ReasonerUnreachable, UntrustedServer, or the typed error of its answer."""
     answer: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
 
     def received(message: Message) -> None:
@@ -100,7 +100,12 @@ async def send(endpoint: str, request: Mapping[str, Any], *, timeout_s: float = 
         if not answer.done():
             answer.set_exception(ReasonerUnreachable(f"{endpoint} hung up", hint="has the episode ended?"))
 
-    transport = Transport(endpoint, asyncio.get_running_loop(), received, hung_up)
+    def refused(error: VramError) -> None:
+        if not answer.done():
+            answer.set_exception(error)
+
+    loop = asyncio.get_running_loop()
+    transport = Transport(endpoint, loop, received, hung_up, refused, program="reasoner")
     try:
         transport.send({"id": 1, **request})
         reply = await answered(answer, timeout_s)

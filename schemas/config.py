@@ -11,6 +11,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from schemas import defaults as d
+from schemas.endpoints import check_endpoint
 from schemas.errors import ConfigError
 from schemas.otel import checked_url
 from schemas.units import ByteSize, parse_bytes
@@ -250,30 +251,6 @@ class ArbiterConfig(_Section):
     state: StateConfig = StateConfig()
     log: LogConfig = LogConfig()
     telemetry: TelemetryConfig = TelemetryConfig()
-
-
-IPC_PATH_MAX = 107
-"""sun_path of a unix socket on Linux holds 108 bytes with the closing zero."""
-
-
-def check_endpoint(endpoint: str) -> str:
-    """The endpoint itself if the daemon can serve it. Raises ValueError that says what to write instead."""
-    scheme, separator, path = endpoint.partition("://")
-    if not separator or scheme not in ("ipc", "tcp"):
-        raise ValueError(f"{endpoint!r} is no endpoint; write ipc:///run/vram-arbiter/arbiter.sock")
-    if scheme == "tcp":
-        raise ValueError(
-            "tcp:// is refused: without CURVE keys anybody on the network could take leases; write ipc://PATH"
-        )
-    if not path.startswith("/"):
-        raise ValueError(
-            f"an ipc:// endpoint needs an absolute path, not {path!r}; write ipc:///run/vram-arbiter/arbiter.sock"
-        )
-    if len(path.encode()) > IPC_PATH_MAX:
-        raise ValueError(
-            f"the socket path has {len(path.encode())} bytes, Linux allows {IPC_PATH_MAX}; choose a shorter folder"
-        )
-    return endpoint
 
 
 def known_keys() -> Mapping[Path, Collection[str]]:

@@ -17,7 +17,7 @@ from pathlib import Path
 import zmq
 
 from arbiter.rpc.peer import parse_peer_address
-from schemas.config import check_endpoint
+from schemas.endpoints import check_endpoint
 from schemas.errors import ConfigError, InternalError
 
 log = logging.getLogger(__name__)

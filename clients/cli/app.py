@@ -8,7 +8,7 @@ import typer
 
 from clients.cli import quick
 from schemas.defaults import NAME_MAX_CHARS, REASON_MAX_CHARS
-from schemas.errors import ArbiterUnreachable, VramError
+from schemas.errors import ArbiterUnreachable, UntrustedServer, VramError
 
 _EPILOG = (
     "Exit codes: 0 done · 1 the answer is no, or an error · 2 wrong usage · 3 the arbiter cannot be reached · "
@@ -56,7 +56,7 @@ def run_app(arguments: Sequence[str]) -> int:
         return 130
     except SystemExit as end:
         return int(end.code or 0)
-    except ArbiterUnreachable as error:
+    except (ArbiterUnreachable, UntrustedServer) as error:
         quick.complain(error.to_wire(), as_json=as_json)
         return quick.UNREACHABLE
     except VramError as error:

@@ -4,25 +4,33 @@ An operator types these a hundred times, scripts poll them: the path imports zmq
 typer, rich, OpenTelemetry; a test holds it to that). Output and exit codes are the same as through `clients.cli.app`.
 """
 
+import contextlib
 import json
 import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from clients.cli import text
 from clients.packing import pack
 from schemas.defaults import WIRE_VERSION
 from schemas.endpoints import arbiter_endpoint
+from schemas.errors import UntrustedServer, VramError
+
+if TYPE_CHECKING:
+    import zmq
+
+    from clients.link import Link
 
 OK, NO, USAGE, UNREACHABLE = 0, 1, 2, 3
 """Exit codes of `vramctl`: done; the answer is no, or an error; wrong usage; the arbiter cannot be reached."""
 
 TIMEOUT_S = 3.0
-DOUBT_MS = 200
-"""An arbiter answers within a few; after so long it is looked whether there is one."""
+DOUBT_S = 0.2
+"""An arbiter answers within milliseconds; after so long the kernel is asked whether there is one."""
+RETRY_S = 0.02
 HANGS = "something holds the socket and is silent: look at the arbiter's log, or set VRAM_ARBITER_ENDPOINT"
 ENVELOPE = frozenset({"re", "ok"})
 
@@ -30,11 +38,12 @@ Message = dict[str, Any]
 
 
 class Unreachable(Exception):
-    """Nobody answers; the text says where, `hint` what to do."""
+    """No arbiter answers that may be believed; the text says where, `hint` what to do, `code` is that of the typed error."""
 
-    def __init__(self, message: str, hint: str) -> None:
+    def __init__(self, message: str, hint: str, code: str = "arbiter_unreachable") -> None:
         super().__init__(message)
         self.hint = hint
+        self.code = code
 
 
 def ask(
@@ -45,44 +54,74 @@ def ask(
     role: str = "observer",
 ) -> Message:
     """Hello, then one request. Returns its reply, error replies too. Raises Unreachable."""
+    import zmq
+
+    deadline = time.monotonic() + timeout_s
+    hello = {
+        "op": "hello",
+        "id": 1,
+        "version": WIRE_VERSION,
+        "name": "vramctl",
+        "instance": f"vramctl-{os.getpid()}",
+        "role": role,
+    }
+    try:
+        where = endpoint or arbiter_endpoint(os.environ, os.getuid())
+        silent = Unreachable(f"no arbiter answers at {where} within {timeout_s:g} s", HANGS)
+        if where.startswith("ipc:///") and not os.path.exists(where.removeprefix("ipc://")):
+            _look(where)
+        with zmq.Context() as context, contextlib.closing(_link(context, where, deadline, silent)) as link:
+            for message in (hello, {"op": op, "id": 2, **fields}):
+                link.send(pack(message))
+            return _reply(link, where, deadline, silent)
+    except VramError as error:
+        code = error.code if isinstance(error, UntrustedServer) else "arbiter_unreachable"
+        raise Unreachable(error.message, error.hint, code) from error
+
+
+def _link(
+    context: "zmq.Context[zmq.Socket[bytes]]", where: str, deadline: float, silent: Unreachable
+) -> "Link":
+    """A link to an arbiter that may be believed. Raises Unreachable, UntrustedServer, ConfigError."""
+    from clients.link import Link
+
+    while True:
+        link = Link(context, where, "arbiter")
+        try:
+            if link.wait(deadline) == "open":
+                return link
+        except BaseException:
+            link.close()
+            raise
+        link.close()
+        _look(where)
+        if time.monotonic() + RETRY_S >= deadline:
+            raise silent
+        time.sleep(RETRY_S)
+
+
+def _reply(link: "Link", where: str, deadline: float, silent: Unreachable) -> Message:
+    """The reply to the request, or the refusal of the hello. Raises Unreachable, UntrustedServer."""
     import msgpack
     import zmq
 
-    where = endpoint or arbiter_endpoint(os.environ, os.getuid())
-    if where.startswith("ipc://") and not os.path.exists(where.removeprefix("ipc://")):
+    from clients.link import ms_until
+
+    poller = zmq.Poller()
+    poller.register(link.socket, zmq.POLLIN)
+    poller.register(link.monitor, zmq.POLLIN)
+    if not poller.poll(min(int(1000 * DOUBT_S), ms_until(deadline))):
         _look(where)
-    context = zmq.Context()
-    socket = context.socket(zmq.DEALER)
-    try:
-        socket.setsockopt(zmq.LINGER, 0)
-        try:
-            socket.connect(where)
-        except zmq.ZMQError as error:
-            _look(where)
-            hint = (
-                "set VRAM_ARBITER_ENDPOINT to where it serves, such as ipc:///run/vram-arbiter/arbiter.sock"
-            )
-            raise Unreachable(f"{where} is no endpoint: {error.strerror}", hint) from error
-        hello = {
-            "op": "hello",
-            "id": 1,
-            "version": WIRE_VERSION,
-            "name": "vramctl",
-            "instance": f"vramctl-{os.getpid()}",
-        }
-        for message in (hello | {"role": role}, {"op": op, "id": 2, **fields}):
-            socket.send(pack(message))
-        deadline = time.monotonic() + timeout_s
-        if not socket.poll(min(DOUBT_MS, int(1000 * timeout_s))):
-            _look(where)
-        while socket.poll(max(0, int(1000 * (deadline - time.monotonic())))):
-            reply: Message = msgpack.unpackb(socket.recv(), strict_map_key=False)
+    while poller.poll(ms_until(deadline)):
+        ended = link.advance() == "ended"
+        while (payload := link.receive()) is not None:
+            reply: Message = msgpack.unpackb(payload, strict_map_key=False)
             if reply.get("re") == 2 or (reply.get("re") == 1 and not reply.get("ok")):
                 return reply
-        raise Unreachable(f"no arbiter answers at {where} within {timeout_s:g} s", HANGS)
-    finally:
-        socket.close()
-        context.term()
+        if ended:
+            _look(where)
+            raise Unreachable(f"the arbiter at {where} hung up", "try again, or look at its log")
+    raise silent
 
 
 def _look(where: str) -> None:
@@ -108,7 +147,7 @@ def answer(
         reply = question(op, fields, endpoint)
     except Unreachable as error:
         problem = {
-            "code": "arbiter_unreachable",
+            "code": error.code,
             "message": str(error),
             "hint": error.hint,
             "details": {},

@@ -98,7 +98,7 @@ class SidecarClient:
         """One request, connecting and starting the sidecar first where needed. It carries the present span, if there is one.
 
         `fresh_s`: from now on, what was sent has to be looked at within so long; else FrameStale.
-        Raises the type of the reply's code (Evicted, NotResident, Loading, OutOfMemory, ModelError, …) or SidecarUnavailable.
+        Raises the type of the reply's code (Evicted, NotResident, Loading, OutOfMemory, ModelError, …) SidecarUnavailable or UntrustedServer.
         """
         began_s = monotonic()
         await self._ensure()
@@ -221,7 +221,9 @@ class SidecarClient:
         transport = self._transport
         if transport is None:
             loop = asyncio.get_running_loop()
-            transport = self._transport = Transport(self.endpoint, loop, self._received, self._hung_up)
+            transport = self._transport = Transport(
+                self.endpoint, loop, self._received, self._hung_up, self._fail, program="sidecar"
+            )
         request_id = next(self._ids)
         answer: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
         self._waiting[request_id] = answer
@@ -254,17 +256,18 @@ class SidecarClient:
         self._drop("it hung up")
 
     def _drop(self, reason: str) -> None:
+        self._fail(
+            SidecarUnavailable(f"contact to {self.endpoint} lost: {reason}", hint="the next call tries again")
+        )
+
+    def _fail(self, error: VramError) -> None:
         if self._transport is not None:
             self._transport.close()
         self._transport = None
         self._proven = False
         for answer in self._waiting.values():
             if not answer.done():
-                answer.set_exception(
-                    SidecarUnavailable(
-                        f"contact to {self.endpoint} lost: {reason}", hint="the next call tries again"
-                    )
-                )
+                answer.set_exception(error)
 
 
 def _result(reply: Message) -> Any:

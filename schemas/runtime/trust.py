@@ -17,11 +17,12 @@ from schemas.errors import ConfigError, UntrustedServer
 USERS_VARIABLE: Final = "VRAM_ARBITER_SERVER_USERS"
 ROOT: Final = 0
 
-Program = Literal["arbiter", "runner", "sidecar"]
+Program = Literal["arbiter", "runner", "sidecar", "reasoner"]
 SERVICE_USERS: Final[Mapping[Program, str]] = {
     "arbiter": "vram-arbiter",
     "runner": "vram-robot",
     "sidecar": "vram-sidecar",
+    "reasoner": "vram-robot",
 }
 """The users of configs/systemd. Only root can make a user of such a name."""
 

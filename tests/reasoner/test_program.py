@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-NOBODY = ["--runner", "tcp://127.0.0.1:1", "--detector", "none", "--scene-vlm", "none"]
+NOBODY = ["--runner", "ipc:///proc/none/runner.sock", "--detector", "none", "--scene-vlm", "none"]
 
 
 def reasoner(runtime: Path, *arguments: str, **environ: str) -> subprocess.CompletedProcess[str]:
@@ -49,8 +49,8 @@ def test_usage(tmp_path: Path) -> None:
         (["--task", " "], "--task says nothing"),
         (["--task", "x", "--result", "/proc/none/result.json"], "--result /proc/none/result.json cannot be written"),
         (["--task", "x", "--planner", "openai"], "VRAM_REASONER_LLM_BASE_URL and VRAM_REASONER_LLM_MODEL not set"),
-        (["--task", "x", "--runner", "runner.sock"], "runner.sock is no endpoint"),
-        (["--say", "x", "--listen", "reasoner.sock"], "reasoner.sock is no endpoint"),
+        (["--task", "x", "--runner", "runner.sock"], "'runner.sock' is not an endpoint"),
+        (["--say", "x", "--listen", "reasoner.sock"], "'reasoner.sock' is not an endpoint"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_from_the_start_is_said_at_the_start(

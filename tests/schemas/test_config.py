@@ -123,7 +123,7 @@ def test_a_wrong_list_item_is_named_by_its_place() -> None:
         ("wire:\n  endpoint: tcp://0.0.0.0:5555\n", 2, "without CURVE keys"),
         ("wire:\n  endpoint: ipc://relative.sock\n", 2, "absolute path"),
         ("wire:\n  endpoint: ipc:///" + "x" * 120 + "\n", 2, "Linux allows 107"),
-        ("wire:\n  endpoint: nonsense\n", 2, "is no endpoint"),
+        ("wire:\n  endpoint: nonsense\n", 2, "is not an endpoint"),
         ("telemetry:\n  endpoint: localhost:4318\n", 2, "write http://localhost:4318"),
         ("telemetry:\n  prometheus_port: 70000\n", 2, "65535"),
         ("telemetry:\n  sample_ratio: 1.5\n", 2, "less than or equal to 1"),

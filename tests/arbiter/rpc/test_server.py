@@ -335,7 +335,7 @@ def test_a_stale_socket_is_replaced_and_close_removes_it(folder: Path) -> None:
     [
         ("tcp://127.0.0.1:1", "CURVE"),
         ("ipc://x", "absolute"),
-        ("x", "no endpoint"),
+        ("x", "not an endpoint"),
         ("ipc:///" + "x" * 200, "107"),
     ],
 )

@@ -177,18 +177,16 @@ def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) 
     assert "there is no such socket" in one_line(vramctl(environ, "resume"))
     (arbiter_daemon.runtime / "arbiter.sock").write_text("")
     assert "is no socket" in one_line(vramctl(environ, "resume"))
-    assert "is no endpoint" in one_line(vramctl(environ, "resume", "--endpoint", f"ipc:///{'x' * 200}"))
-    assert "garbage is no endpoint" in one_line(vramctl(environ, "resume", "--endpoint", "garbage"))
+    assert "Linux allows 107" in one_line(vramctl(environ, "resume", "--endpoint", f"ipc:///{'x' * 200}"))
+    assert "'garbage' is not an endpoint" in one_line(vramctl(environ, "resume", "--endpoint", "garbage"))
 
 
 def test_a_look_at_the_socket_disturbs_nobody(
     client: SyncArbiterClient, arbiter_daemon: ArbiterProcess
 ) -> None:
-    """`obstacle` connects and says nothing. Elsewhere than on a path it does not look at all."""
+    """`obstacle` connects and says nothing."""
     for _ in range(300):
         assert obstacle(arbiter_daemon.endpoint) is None
-    assert obstacle("tcp://127.0.0.1:1") is None
-    assert obstacle("ipc://@abstract") is None
     assert client.status()["clients"] == 1
 
 

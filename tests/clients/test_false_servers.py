@@ -1,0 +1,173 @@
+"""A process of another user serves where ours should: no client says a word to it, and none believes what it says.
+
+A false arbiter was believed by every client, and a false runner answered an emergency stop with "the motors hold".
+"""
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import pwd
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from clients.aio import ArbiterClient
+from clients.cli import quick
+from clients.runner import RunnerClient
+from clients.sidecar.perception import DetectorClient
+from clients.sidecar.spawn import SpawnSpec
+from clients.sync import SyncArbiterClient
+from reasoner.server import send
+from schemas.errors import ConfigError, UntrustedServer
+
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="only root can start a server of another user")
+
+SCRIPT = Path(__file__).parents[1] / "schemas/runtime/false_server.py"
+DEADLINE_S = 60.0
+Heard = Callable[[], list[str]]
+
+
+@contextlib.contextmanager
+def false_server(folder: Path, name: str) -> Iterator[Heard]:
+    """A server of the user nobody on `folder/name`. What it yields ends it, and returns what it heard."""
+    nobody = pwd.getpwnam("nobody").pw_uid
+    owner = folder.stat().st_uid
+    os.chown(folder, nobody, -1)
+    command = [sys.executable, str(SCRIPT), str(folder), name, str(nobody)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
+        said: list[str] = []
+
+        def heard() -> list[str]:
+            if child.poll() is None:
+                out, _ = child.communicate()
+                said.extend(out.splitlines())
+            return said
+
+        try:
+            assert child.stdout is not None
+            assert child.stdout.readline() == "listening\n"
+            yield heard
+        finally:
+            heard()
+            os.chown(folder, owner, -1)
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """Short: a socket path holds 107 bytes."""
+    with tempfile.TemporaryDirectory(prefix="va") as made:
+        yield Path(made)
+
+
+async def ask_arbiter(endpoint: str) -> None:
+    async with ArbiterClient(endpoint, name="t"):
+        pass
+
+
+async def ask_runner(endpoint: str) -> None:
+    async with RunnerClient(endpoint) as runner:
+        await runner.send_goal("a/grab")
+
+
+async def stop_runner(endpoint: str) -> None:
+    async with RunnerClient(endpoint) as runner:
+        await runner.shutdown()
+
+
+async def ask_sidecar(endpoint: str) -> None:
+    async with DetectorClient(endpoint) as sidecar:
+        await sidecar.load()
+
+
+async def ask_sidecar_that_could_be_started(endpoint: str) -> None:
+    async with DetectorClient(endpoint, spawn=SpawnSpec(["/bin/false"])) as sidecar:
+        await sidecar.load()
+
+
+async def ask_reasoner(endpoint: str) -> None:
+    await send(endpoint, {"op": "say", "text": "stop"})
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        ask_arbiter,
+        ask_runner,
+        stop_runner,
+        ask_sidecar,
+        ask_sidecar_that_could_be_started,
+        ask_reasoner,
+    ],
+)
+def test_nothing_is_said_to_a_false_server(ask: Callable[[str], object], folder: Path) -> None:
+    with false_server(folder, "s") as heard:
+        with pytest.raises(UntrustedServer, match=r"served by uid \d+ \(nobody\)"):
+            asyncio.run(ask(f"ipc://{folder}/s"))  # type: ignore[arg-type]
+        assert heard() == []
+
+
+def test_vramctl_says_who_serves_there(folder: Path) -> None:
+    environ = {**os.environ, "VRAM_ARBITER_ENDPOINT": f"ipc://{folder}/s"}
+    with false_server(folder, "s") as heard:
+        for command in (["status"], ["status", "--json"], ["resume"], ["watch"]):
+            done = subprocess.run(
+                [sys.executable, "-m", "clients", *command], env=environ, capture_output=True, text=True
+            )
+            assert done.returncode == quick.UNREACHABLE, done
+            if "--json" in command:
+                assert json.loads(done.stdout)["error"]["code"] == "untrusted_server"
+            else:
+                assert "is served by uid" in done.stderr
+                assert done.stdout == ""
+        assert heard() == []
+
+
+def test_a_user_that_was_named_is_believed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VRAM_ARBITER_SERVER_USERS", "nobody")
+    with false_server(folder, "s") as heard:
+        assert quick.ask("status", {}, f"ipc://{folder}/s")["ok"]
+        assert any("'op': 'hello'" in line for line in heard())
+
+
+@pytest.mark.e2e
+def test_a_lease_is_not_told_to_a_server_that_took_the_arbiters_place(
+    arbiter_daemon: ArbiterProcess, spec: Callable[..., object], caplog: pytest.LogCaptureFixture
+) -> None:
+    """libzmq reconnects by itself, to whatever listens then; the re-attachment holds every token."""
+    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        lease = client.acquire(spec("detector", 1))  # type: ignore[arg-type]
+        lease.ready()
+        assert arbiter_daemon.stop() == 0
+        with (
+            caplog.at_level(logging.ERROR, "clients.aio"),
+            false_server(arbiter_daemon.runtime, "arbiter.sock") as heard,
+        ):
+            deadline = time.monotonic() + DEADLINE_S
+            while not any("is served by uid" in record.getMessage() for record in caplog.records):
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
+            assert heard() == []
+        (arbiter_daemon.runtime / "arbiter.sock").unlink(missing_ok=True)
+        arbiter_daemon.start()
+        assert client.status()["leases"][0]["lease_id"] == lease.lease_id
+        assert lease.state == "held"
+        lease.release()
+
+
+@pytest.mark.parametrize("endpoint", ["ipc://@vram-arbiter", "tcp://127.0.0.1:5555"])
+def test_what_has_no_user_is_not_connected_to(endpoint: str) -> None:
+    """Any user may serve on an abstract name or a port."""
+    with pytest.raises(ConfigError, match="refused"):
+        asyncio.run(ask_runner(endpoint))
+    with pytest.raises(ConfigError, match="refused"):
+        asyncio.run(ask_arbiter(endpoint))
+    with pytest.raises(quick.Unreachable, match="refused"):
+        quick.ask("status", {}, endpoint)
