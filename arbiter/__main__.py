@@ -64,8 +64,11 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--endpoint", metavar="URL", help="where to listen, ipc:///absolute/path")
     made.add_argument("--state-dir", metavar="DIR", help="folder of journal and history")
+    made.add_argument("--group", metavar="GROUP", help="Unix group that may connect and hold leases")
     made.add_argument(
-        "--operators-group", metavar="GROUP", help="Unix group that may connect and act as operator"
+        "--operators-group",
+        metavar="GROUP",
+        help="Unix group that may act by hand (evict, pin, drain); without --group it may connect as well",
     )
     made.add_argument(
         "--log-format", choices=("human", "json"), help="human (default) or one JSON object a line"
@@ -101,6 +104,7 @@ def effective_config(flags: argparse.Namespace) -> ArbiterConfig:
         ("gpu", "source", flags.gpu, "--gpu"),
         ("wire", "endpoint", flags.endpoint, "--endpoint"),
         ("state", "dir", flags.state_dir, "--state-dir"),
+        ("wire", "group", flags.group, "--group"),
         ("wire", "operators_group", flags.operators_group, "--operators-group"),
         ("log", "format", flags.log_format, "--log-format"),
         ("log", "level", flags.log_level, "--log-level"),

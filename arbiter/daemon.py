@@ -18,7 +18,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from arbiter import telemetry
 from arbiter.core.arbiter import Arbiter
@@ -213,7 +213,9 @@ class Daemon:
         """1. Folders and locks. 2. Journal and history. 3. Cards. 4. Core and the parts around it. 5. The past. 6. The socket."""
         config, loop = self._config, asyncio.get_running_loop()
         places = find_places(config, self._environ, os.getuid())
-        group = self._operators_group()
+        operators = self._group("operators_group")
+        members = self._group("group")
+        group = operators if members is None else members  # of the socket: it has one
         self._take_folders(places, group, undo)  # 1
         traced = self._open_telemetry(undo)
         boot = boot_id()
@@ -259,7 +261,7 @@ class Daemon:
 
         watch = ProcessWatch(loop, start_ticks, died)
         undo.callback(watch.close)
-        wire = self._session_settings(journal.opened.epoch, boot, group)
+        wire = self._session_settings(journal.opened.epoch, boot, operators)
         sessions = SessionTable(
             wire,
             server,
@@ -357,17 +359,18 @@ class Daemon:
             told=lambda kind, facts: telemetry.log_event(history.append(kind, facts)),
         )
 
-    def _operators_group(self) -> int | None:
-        name = self._config.wire.operators_group
+    def _group(self, key: Literal["group", "operators_group"]) -> int | None:
+        """Number of a group of the configuration. Raises ConfigError."""
+        name: str | None = getattr(self._config.wire, key)
         if name is None:
             return None
         if (number := group_id(name)) is None:
             raise ConfigError(
-                f"wire.operators_group: no group {name!r} on this machine", hint=f"groupadd {name}"
+                f"wire.{key}: no group {name!r} on this machine", hint=f"groupadd --system {name}"
             )
         return number
 
-    def _session_settings(self, epoch: int, boot_id: str, group: int | None) -> SessionSettings:
+    def _session_settings(self, epoch: int, boot_id: str, operators: int | None) -> SessionSettings:
         limits = self._config.limits
         return SessionSettings(
             epoch=epoch,
@@ -379,7 +382,7 @@ class Daemon:
             sessions_max=limits.sessions_max,
             rate_per_s=limits.rate_per_client_per_s,
             subscribers_max=limits.subscribers_max,
-            operators_gid=group,
+            operators_gid=operators,
         )
 
     def _tell_start(

@@ -189,8 +189,11 @@ class WireConfig(_Section):
     """`ipc:///run/vram-arbiter/arbiter.sock`. Null: `VRAM_ARBITER_ENDPOINT`, else `arbiter.sock` in the runtime folder."""
     heartbeat_s: Annotated[float, Field(ge=0.1, le=60, allow_inf_nan=False)] = d.HEARTBEAT_S
     """How often clients are asked to say that they are there."""
+    group: Annotated[str, Field(min_length=1, max_length=64)] | None = None
+    """Unix group that may connect and hold leases, beside the daemon's own user and root. Null: that of `operators_group`."""
     operators_group: Annotated[str, Field(min_length=1, max_length=64)] | None = None
-    """Unix group that may connect and act as operator beside the daemon's own user and root. Null: nobody else."""
+    """Unix group that may act by hand (evict, pin, drain), beside the daemon's own user and root. Where `group` is set, operators are
+    members of both. Null: no group may."""
 
     @field_validator("endpoint")
     @classmethod

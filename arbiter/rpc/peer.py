@@ -90,6 +90,17 @@ def is_operator(peer: Credentials, operators_gid: int | None) -> bool:
     return operators_gid in os.getgrouplist(account.pw_name, account.pw_gid)
 
 
+def how_to_operate(operators_gid: int | None) -> str:
+    """What a peer that may not act by hand can do, with the group's name."""
+    if operators_gid is None:
+        return "use its user or root, or let the daemon name a group (wire.operators_group); looking is open to observers"
+    try:
+        name = grp.getgrgid(operators_gid).gr_name
+    except KeyError:
+        name = str(operators_gid)
+    return f"use its user or root, or join the group {name} (wire.operators_group, then log in again); looking is open to observers"
+
+
 def group_id(name: str) -> int | None:
     """Number of a Unix group; None if there is none of that name."""
     try:

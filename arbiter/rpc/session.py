@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from arbiter.core import events as ev
 from arbiter.core.explain import DAEMON_KINDS, NOTE_KINDS
 from arbiter.rpc import codec
-from arbiter.rpc.peer import Peer, Role, identify, is_operator
+from arbiter.rpc.peer import Peer, Role, how_to_operate, identify, is_operator
 from schemas import wire as w
 from schemas.defaults import WIRE_VERSION
 from schemas.errors import (
@@ -228,7 +228,7 @@ class SessionTable:
         if hello.role == "operator" and not is_operator(peer.credentials, self._settings.operators_gid):  # 3
             raise NotPermitted(
                 "only the daemon's user, root and the operators' group may be operator",
-                hint="use its user or root, or join the group (wire.operators_group); looking is open to observers",
+                hint=how_to_operate(self._settings.operators_gid),
                 details={"uid": peer.credentials.uid},
             )
         self._make_room(now)  # 4

@@ -67,7 +67,7 @@ class Service(ArbiterProcess):
         (line,) = [line for line in UNIT.read_text().splitlines() if line.startswith("ExecStart=")]
         words = shlex.split(line.removeprefix("ExecStart=").replace("$ARBITER_OPTIONS", self.options))
         assert Path(words[0]).name == "vram-arbiter"
-        named = [self.group if word == "vram-arbiter" else word for word in words[1:]]
+        named = [self.group if word in ("vram-arbiter", "vram-operators") else word for word in words[1:]]
         return [*self.wrapper, sys.executable, "-m", "arbiter", *named, *more]
 
 

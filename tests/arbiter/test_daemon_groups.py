@@ -1,0 +1,70 @@
+"""Two roles by group: members of `wire.group` hold leases, members of `wire.operators_group` act by hand. Real daemon, real users."""
+
+import grp
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+
+pytestmark = pytest.mark.e2e
+Make = Callable[..., ArbiterProcess]
+NOBODY = 65534
+CLIENT = """
+import json, os, sys
+from arbiter.testing.wire import WireClient
+endpoint, role, primary, other = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
+os.setgroups([other]); os.setresgid(primary, primary, primary); os.setresuid(65534, 65534, 65534)
+with WireClient(endpoint) as client:
+    said = client.ask("hello", version=1, name="c", instance="c", role=role)
+    if said["ok"]:
+        client.granted("job", 1 << 30)
+        said = client.ask("drain", reason="by hand")
+    print(json.dumps(said))
+"""
+
+
+def groups() -> tuple[str, str]:
+    """Two groups of this machine that neither root nor `nobody` is in by its account."""
+    names = [g.gr_name for g in grp.getgrall() if g.gr_gid not in (0, NOBODY) and "nobody" not in g.gr_mem]
+    return names[0], names[1]
+
+
+def speak(arbiter: ArbiterProcess, role: str, primary: str, other: str) -> dict[str, Any]:
+    numbers = [str(grp.getgrnam(name).gr_gid) for name in (primary, other)]
+    done = subprocess.run(
+        [sys.executable, "-c", CLIENT, arbiter.endpoint, role, *numbers],
+        env=arbiter.environ, capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    said: dict[str, Any] = json.loads(done.stdout)
+    return said
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="needs root to act as other users")
+def test_a_member_of_the_group_may_lease_and_only_operators_act_by_hand(make_arbiter: Make) -> None:
+    """Every member of the socket's group could evict and drain: to hold a lease was to be an operator."""
+    members, operators = groups()
+    arbiter = make_arbiter(arguments=("--group", members, "--operators-group", operators))
+    arbiter.runtime.chmod(0o755)
+    arbiter.start()
+    socket = (arbiter.runtime / "arbiter.sock").stat()
+    assert socket.st_gid == grp.getgrnam(members).gr_gid
+    refused = speak(arbiter, "operator", members, members)
+    assert refused["error"]["code"] == "not_permitted"
+    assert operators in refused["error"]["hint"], "the hint names the group"
+    leased = speak(arbiter, "client", members, members)
+    assert leased["error"]["message"] == "only an operator may drain", "the lease was granted, no more"
+    assert speak(arbiter, "operator", operators, members)["ok"]
+
+
+def test_a_group_that_is_not_there_is_named(make_arbiter: Make) -> None:
+    arbiter = make_arbiter(arguments=("--group", "no-such-group"))
+    arbiter.spawn()
+    assert arbiter.process is not None
+    assert arbiter.process.wait(60) == 2
+    assert "wire.group: no group 'no-such-group'" in arbiter.log
