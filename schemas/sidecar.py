@@ -26,6 +26,7 @@ Question = Annotated[str, Field(min_length=1, max_length=2000)]
 Side = Annotated[int, Field(ge=1, le=4096)]
 
 PICTURES_MAX = 32  # of one `score`
+QUERIES_MAX = 64  # of one `detect`
 
 
 class _Call(BaseModel):
@@ -62,11 +63,12 @@ class _Look(_Call):
 
 
 class DetectOp(_Look):
-    """Find `query` (several separated by ` . ` or commas, as the field writes them) in an image."""
+    """Find `query` in an image. Several are separated by `</c>`, ` . ` or commas, as the field
+    writes them, or come as a list."""
 
     op: Literal["detect"]
     image: ImageBytes
-    query: Question
+    query: Question | Annotated[list[Question], Field(min_length=1, max_length=QUERIES_MAX)]
     max_side: Annotated[int, Field(ge=32, le=4096)] = 1024
     mode: str = "hybrid"  # of the field's wire; a zero-shot detector has one mode
     max_new_tokens: Annotated[int, Field(ge=1, le=8192)] = 1024

@@ -3,19 +3,19 @@
 import inspect
 import math
 import re
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from schemas.errors import BadRequest, ModelError
 from schemas.manifest import RSkillManifest
-from schemas.sidecar import DetectionResult, DetectOp
+from schemas.sidecar import QUERIES_MAX, DetectionResult, DetectOp
 from sidecars.adapters.base import ModelCall
 from sidecars.checkpoints import load_transformers
 from sidecars.images import decode, within
 from sidecars.weights import Weights, from_pretrained, model_options
 
 NORM = 1000  # the field's grounding answers count boxes in thousandths of the image
-QUERIES_MAX = 64
-_SEPARATOR = re.compile(r"\s*(?:,|\s\.(?:\s|$))\s*")
+_SEPARATOR = re.compile(r"\s*(?:</c>|,|\s\.(?:\s|$))\s*")  # </c> is how the field joins its labels
 
 
 class DetectorAdapter:
@@ -92,14 +92,20 @@ class DetectorAdapter:
         return sorted((one for one in found if one is not None), key=lambda one: -one["score"])
 
 
-def split_query(query: str) -> list[str]:
-    """`red cube . blue ball` or `red cube, blue ball` as texts, without doubles. Raises BadRequest for none or too many."""
-    labels = [part.strip().rstrip(".").strip() for part in _SEPARATOR.split(query)]
+def split_query(query: str | Sequence[str]) -> list[str]:
+    """Return the texts of `red cube</c>blue ball`, `red cube . blue ball` or `red cube, blue ball`,
+    or of a list of such, without doubles.
+
+    Raises: BadRequest for none or too many.
+    """
+    queries = [query] if isinstance(query, str) else query
+    parts = [part for one in queries for part in _SEPARATOR.split(one)]
+    labels = [part.strip().rstrip(".").strip() for part in parts]
     labels = list(dict.fromkeys(label for label in labels if label))
     if not labels or len(labels) > QUERIES_MAX:
         raise BadRequest(
             f"a query names 1 to {QUERIES_MAX} things, not {len(labels)}",
-            hint="separate them by ' . ' or commas",
+            hint="separate them by </c>, ' . ' or commas",
         )
     return labels
 

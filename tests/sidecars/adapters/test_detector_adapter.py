@@ -19,6 +19,8 @@ BLOCK = "actions: [detect]\ndetector: {labels: [cube], score_threshold: 0.0, max
         ("red cube. blue ball.", ["red cube. blue ball"]),
         ("red cube, blue ball,red cube", ["red cube", "blue ball"]),
         ("a no. 5 bolt .", ["a no. 5 bolt"]),
+        ("red cube</c>blue ball</c> mug </c>", ["red cube", "blue ball", "mug"]),
+        (["red cube</c>mug", "blue ball , mug"], ["red cube", "mug", "blue ball"]),
     ],
 )
 def test_a_query_names_one_or_several_things(query, labels):
@@ -78,3 +80,32 @@ def test_a_checkpoint_of_another_kind_is_named(manifest, weights):
     adapter = DetectorAdapter(manifest("detector", BLOCK), weights("act"))
     with pytest.raises(ModelError, match="cannot load"):
         adapter.prepare()
+
+
+@pytest.mark.heavy
+def test_the_fields_default_query_finds_what_is_in_view():
+    """Regression: the field joins a manifest's labels by `</c>`. They were taken as one label, and
+    the answer was "nothing found" with the object in view."""
+    import io
+    from pathlib import Path
+
+    from PIL import Image
+
+    from runner.sim.env import SimEnv
+    from schemas.manifest import load_manifest
+    from sidecars.weights import resolve
+
+    configs = Path(__file__).parents[3] / "configs"
+    manifest = load_manifest(configs / "rskills/so101-detector/rskill.yaml")
+    adapter = DetectorAdapter(manifest, resolve(str(manifest.weights_uri), configs))
+    adapter.prepare()
+    adapter.load("cpu")
+    stream = io.BytesIO()
+    with SimEnv() as env:
+        env.reset(4711, names=("red cube", "blue ball", "green cylinder"))
+        Image.fromarray(env.render("front")).save(stream, "PNG")
+    joined = "</c>".join(manifest.detector.labels)
+    for query in (joined, [joined], list(manifest.detector.labels)):
+        reply = adapter.run(DetectOp(op="detect", image=stream.getvalue(), query=query))
+        assert "red cube" in {one["label"] for one in reply["detections"]}
+        assert all("</c>" not in one["label"] for one in reply["detections"])
