@@ -26,6 +26,8 @@ ENCODER_WAIT_S = 60.0
 ENCODER_POLL_S = 0.002
 LENGTH_TOLERANCE = 0.5  # frames
 
+SUCCESS = "next.success"  # only of worlds that judge: a skill that says "done" does not know
+
 Features = dict[str, dict[str, Any]]
 
 
@@ -59,11 +61,12 @@ def features_of(row: Row) -> Features:
         features["base_velocity"] = _vector("float32", ["vx", "vy", "wz"])
     if row["reward"] is not None:
         features["next.reward"] = _one("float32")
+    if row["success"] is not None:  # a column of booleans cannot say "not known": it is left out
+        features[SUCCESS] = _one("bool")
     if row["frames"]:
         features["tick.camera_ages_ms"] = _vector("float32", [frame["camera"] for frame in row["frames"]])
     return features | {
         "next.done": _one("bool"),
-        "next.success": _one("bool"),
         "tick.index": _one("int64"),
         "tick.stamp_ns": _one("int64"),
         "tick.timings_ms": _vector("float32", list(TIMINGS)),
@@ -91,7 +94,7 @@ def frame_of(row: Row, pictures: Sequence[bytes], features: Features) -> dict[st
         "base_velocity": row["base_velocity"],
         "next.reward": row["reward"],
         "next.done": False,
-        "next.success": False,
+        SUCCESS: False,
         "tick.index": row["tick_idx"],
         "tick.stamp_ns": row["stamp_ns"],
         "tick.timings_ms": row["timings_ms"],
@@ -155,8 +158,12 @@ class LerobotFiles:
         meta = self._meta()
         return meta.total_episodes, meta.total_frames
 
-    def begin(self, features: Features) -> None:
-        """Raises ConfigError when the folder's dataset has other columns or another rate: they cannot be one dataset."""
+    def begin(self, features: Features) -> Features:
+        """Open an episode and return its columns: `features`, without the verdict where the
+        folder's dataset has no column for it.
+
+        Raises: ConfigError when the folder's dataset has other columns or another rate.
+        """
         from lerobot.datasets import LeRobotDataset
 
         commit.repair(self._root)  # of an episode that could not be abandoned either
@@ -168,6 +175,8 @@ class LerobotFiles:
                 f"{self._root} has {meta.fps} frames a second, this recording {self._fps}",
                 hint="record into a new folder",
             )
+        if SUCCESS not in meta.features:
+            features = {name: feature for name, feature in features.items() if name != SUCCESS}
         if differences := _differences(meta.features, features):
             raise ConfigError(
                 f"{self._root} was recorded with other columns: {differences}",
@@ -184,6 +193,7 @@ class LerobotFiles:
             encoder_threads=1,
         )
         self._rows = 0
+        return features
 
     def add(self, frame: dict[str, Any]) -> None:
         """Raises InternalError when the encoder hangs, ValueError for a row that does not fit the columns."""

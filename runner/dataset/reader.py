@@ -174,7 +174,7 @@ def _recorded(
             "deadline_missed": row["tick.deadline_missed"],
             "violations": row["tick.violations"],
             "done": row["next.done"],
-            "success": row["next.success"],
+            "success": row.get("next.success"),  # None: no world judged
         },
         timings_ms=named("tick.timings_ms"),
         state=named("observation.state"),

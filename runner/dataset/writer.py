@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from runner.dataset import commit, wire
-from runner.dataset.lerobot_files import Features, LerobotFiles, features_of, frame_of
+from runner.dataset.lerobot_files import SUCCESS, Features, LerobotFiles, features_of, frame_of
 from runner.dataset.rows import Row
 from schemas.errors import ConfigError, FrameStale, InternalError, ModelError, VramError
 
@@ -52,8 +52,7 @@ class EpisodeWriter:
         if self._goal is not None and self._goal["goal_id"] != goal_id:
             self._close({"status": "unfinished"})
         if self._goal is None:
-            self._features = features_of(row)
-            self._files.begin(self._features)
+            self._features = self._files.begin(features_of(row))
             self._goal, self._broken = row, 0
         try:
             frame = frame_of(row, pictures, self._features)
@@ -98,7 +97,8 @@ class EpisodeWriter:
             )
             return
         last["next.done"][0] = True
-        last["next.success"][0] = note.get("status") == "succeeded" and self._judged is not False
+        if SUCCESS in last:
+            last[SUCCESS][0] = note.get("status") == "succeeded" and self._judged is True
         self._files.add(last)
         about = {key: first[key] for key in ("goal_id", "skill", "task", "trace_id", "units")}
         about["judged"] = self._judged

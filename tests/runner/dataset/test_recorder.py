@@ -1,6 +1,7 @@
 """Recording for real: a writer's process, lerobot's files on disk, lerobot's own reader; and what is left when something is killed."""
 
 import io
+import json
 import logging
 import os
 import shutil
@@ -17,7 +18,7 @@ import pytest
 
 from runner import __main__ as program
 from runner.cli.replay import as_text
-from runner.dataset import commit
+from runner.dataset import commit, wire
 from runner.dataset.lerobot_files import LerobotFiles, features_of, frame_of
 from runner.dataset.reader import read_frame
 from runner.dataset.recorder import QUEUE_TICKS, DatasetRecorder, whole_rate
@@ -144,7 +145,7 @@ def test_lerobots_own_reader_finds_every_tick(
         assert tuple(seen.shape) == (3, HEIGHT, WIDTH)
         assert float(seen.mean()) * 255 == pytest.approx(10 * index, abs=3)  # the picture of this very tick
     assert [index for index, row in enumerate(rows) if row["next.done"]] == [5, 9, 12, 14]
-    assert [index for index, row in enumerate(rows) if row["next.success"]] == [5, 14]
+    assert "next.success" not in dataset.meta.features, "no world judged"
 
 
 def test_a_run_says_what_it_recorded_and_what_not(recorded: Recorded) -> None:
@@ -212,17 +213,46 @@ def test_a_frame_leads_back_to_its_tick_and_trace(recorded: Recorded) -> None:
     assert read_frame(recorded.root, 2, episode=1) == found
 
 
-def test_what_its_world_calls_a_failure_is_no_success(tmp_path: Path) -> None:
-    """A skill that was done all the same; where nobody judges, its own word counts."""
+def record_verdicts(root: Path, *verdicts: bool | None) -> list[wire.Header]:
+    """An episode of two ticks for each word of a world; what the writer answered."""
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        writer = EpisodeWriter(theirs, LerobotFiles(tmp_path, fps=30, robot="bench"))
-        for said in (False, True, None):
-            for index in range(2):
-                writer.row(*row_of(tick(index, of=goal(str(said)), frames={}, success=said), ()))
-            writer.ended({"goal_id": str(said), "status": "succeeded"})
-    assert [read_frame(tmp_path, 1, episode).tick["success"] for episode in range(3)] == [False, True, True]
-    assert [note["judged"] for note in commit.notes(tmp_path)] == [False, True, None]
+        writer = EpisodeWriter(theirs, LerobotFiles(root, fps=30, robot="bench"))
+        for said in verdicts:
+            try:
+                for index in range(2):
+                    writer.row(*row_of(tick(index, of=goal(str(said)), frames={}, success=said), ()))
+                writer.ended({"goal_id": str(said), "status": "succeeded"})
+            except ConfigError as error:
+                writer.failed(str(said), error)
+        theirs.shutdown(socket.SHUT_RDWR)
+        answers = []
+        while (answer := wire.receive(ours)) is not None:
+            answers.append(answer[0])
+        return answers
+
+
+def test_success_is_what_the_world_says_and_no_skill(tmp_path: Path) -> None:
+    """Regression: a live grab that lifted nothing was recorded with `next.success` true, because
+    its skill said that it was done. Policies are trained on this column."""
+    record_verdicts(tmp_path / "judged", False, True)
+    said = [read_frame(tmp_path / "judged", 1, episode).tick["success"] for episode in range(2)]
+    assert said == [False, True]
+    assert [note["judged"] for note in commit.notes(tmp_path / "judged")] == [False, True]
+
+    record_verdicts(tmp_path / "live", None, True)
+    assert [read_frame(tmp_path / "live", 1, episode).tick["success"] for episode in range(2)] == [None] * 2
+    assert "next.success" not in json.loads((tmp_path / "live/meta/info.json").read_text())["features"]
+    assert [note["judged"] for note in commit.notes(tmp_path / "live")] == [None, True]
+
+
+def test_what_no_world_judges_does_not_go_into_a_dataset_of_verdicts(tmp_path: Path) -> None:
+    """Its episodes would stand there as failures, or as successes."""
+    *_, answer = record_verdicts(tmp_path, True, None)
+    assert answer["kind"] == "failed"
+    assert "next.success" in answer["error"]["message"]
+    assert "new folder" in answer["error"]["hint"]
+    assert len(commit.notes(tmp_path)) == 1
 
 
 def test_a_state_or_an_action_of_one_number_is_replayed(tmp_path: Path) -> None:
