@@ -229,7 +229,7 @@ def test_pictures_of_any_mode_become_rgb():
     for data in (
         picture("PNG", mode="RGBA"),
         picture("PNG", mode="L"),
-        picture("PNG", mode="I;16"),
+        picture("PNG", mode="P"),
         picture("JPEG"),
     ):
         found = decode(data)

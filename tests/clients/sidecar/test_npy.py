@@ -1,9 +1,13 @@
 """Arrays on the wire."""
 
+import re
 import subprocess
 import sys
+from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from clients.sidecar import npy
 from schemas.errors import BadRequest
@@ -51,3 +55,91 @@ def test_pickles_are_neither_written_nor_read() -> None:
     numpy.save(stream, evil, allow_pickle=True)
     with pytest.raises(BadRequest):
         npy.unpack({npy.MARK: True, npy.BYTES: stream.getvalue()})
+
+
+def npy_bytes(array: Any, **options: Any) -> bytes:
+    import io
+
+    import numpy
+
+    stream = io.BytesIO()
+    numpy.save(stream, array, **options)
+    return stream.getvalue()
+
+
+def head(text: str, version: tuple[int, int] = (1, 0)) -> bytes:
+    size = len(text).to_bytes(2 if version == (1, 0) else 4, "little")
+    return b"\x93NUMPY" + bytes(version) + size + text.encode()
+
+
+@pytest.mark.heavy
+def test_only_arrays_of_numbers_whose_bytes_are_there() -> None:
+    import io
+
+    import numpy
+
+    archive = io.BytesIO()
+    numpy.savez(archive, a=numpy.zeros(3))
+    header = "{'descr': '<f8', 'fortran_order': False, 'shape': (%s), }"
+    refused = {
+        "not an array in .npy format": [
+            archive.getvalue(), head("(" * 500), head("1" * 5000), head("{'descr': '<f8'}"),
+            head(header % "3.5,"), head("os.system('x')"), head(header % "1,", (3, 0)), head("\n "),
+            head("{'descr': [], 'fortran_order': 1, 'shape': 2}"),
+        ],
+        "not of numbers": [
+            npy_bytes(numpy.array(["text"])), npy_bytes(numpy.zeros(2, "c16")), npy_bytes(numpy.zeros(2, "M8[s]")),
+            npy_bytes(numpy.zeros(2, [("a", "f4")])), npy_bytes(numpy.zeros(2, "V8")),
+        ],
+        "by its header has": [
+            head(header % "1000000000000,"), npy_bytes(numpy.zeros(3))[:-1], npy_bytes(numpy.zeros(3)) + b"x",
+            head(header % ("9" * 400 + ",")),
+        ],
+        "an array of shape": [head(header % "-1,") + bytes(8), head(header % ("1," * 9)) + bytes(8)],
+    }  # fmt: skip
+    for told, payloads in refused.items():
+        for payload in payloads:
+            with pytest.raises(BadRequest, match=re.escape(told)):
+                npy.unpack({npy.MARK: True, npy.BYTES: payload})
+
+
+@pytest.mark.heavy
+def test_a_message_has_a_bounded_number_of_arrays() -> None:
+    import numpy
+
+    one = {npy.MARK: True, npy.BYTES: npy_bytes(numpy.zeros(1))}
+    assert len(npy.unpack([one] * npy.ARRAYS_MAX)) == npy.ARRAYS_MAX
+    with pytest.raises(BadRequest, match="more than 256 arrays"):
+        npy.unpack({"nested": [one] * (npy.ARRAYS_MAX + 1)})
+
+
+@pytest.mark.heavy
+@settings(max_examples=200, deadline=None)
+@given(
+    dtype=st.sampled_from(["<f4", ">f8", "<i2", "|u1", "|b1", "<f2"]),
+    shape=st.lists(st.integers(0, 5), max_size=4),
+    fortran=st.booleans(),
+    seed=st.integers(0, 9),
+)
+def test_every_array_of_numbers_comes_back(dtype: str, shape: list[int], fortran: bool, seed: int) -> None:
+    import numpy
+
+    numbers = numpy.random.default_rng(seed).integers(0, 100, shape).astype(dtype)
+    array = numpy.asfortranarray(numbers) if fortran else numbers
+    found = npy.unpack(npy.pack(array))
+    assert (found == array).all()
+    assert (found.dtype, found.shape) == (array.dtype, array.shape)
+    assert found.flags.writeable
+
+
+@pytest.mark.heavy
+@settings(max_examples=300, deadline=None)
+@given(at=st.integers(0, 140), inserted=st.binary(min_size=1, max_size=8))
+def test_damaged_arrays_are_read_or_refused(at: int, inserted: bytes) -> None:
+    import numpy
+
+    whole = npy_bytes(numpy.arange(4.0))
+    try:
+        npy.unpack({npy.MARK: True, npy.BYTES: whole[:at] + inserted + whole[at + len(inserted) :]})
+    except BadRequest:
+        pass
