@@ -120,7 +120,18 @@ def budget(cards: Sequence[Card], config: ArbiterConfig, source: str = "") -> tu
                 f"({format_bytes(capacity)})",
                 hint="lower the reserve or raise the cap",
             )
-        found.append(GpuInfo(card.id, card.index, card.name, capacity, reserve, source, card.noise_bytes))
+        found.append(
+            GpuInfo(
+                id=card.id,
+                index=card.index,
+                name=card.name,
+                capacity_bytes=capacity,
+                reserve_bytes=reserve,
+                source=source,
+                noise_bytes=card.noise_bytes,
+                total_bytes=card.total_bytes,
+            )
+        )
     if caps:
         known = ", ".join(f"{card.index} ({card.id})" for card in cards)
         raise ConfigError(

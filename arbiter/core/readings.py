@@ -13,11 +13,15 @@ from schemas.ids import GpuId, ProcessKey
 
 
 def on_sample(core: Core, sample: MemorySampled) -> None:
-    """A reading arrived. One older than the newest or from before a suspend is dropped; one of an unknown card too."""
+    """A reading arrived. One older than the newest or from before a suspend is dropped; one of an unknown card too. One that cannot be true
+    is a failed one."""
     gpu = core.gpus.get(sample.gpu)
     if gpu is None or sample.taken_at < gpu.read_from:
         return
     if gpu.sample is not None and sample.taken_at < gpu.sample.taken_at:
+        return
+    if problem := _impossible(core, gpu, sample):
+        on_probe_failed(core, ProbeFailed(sample.gpu, sample.taken_at, problem))
         return
     if gpu.asked_at is not None and sample.taken_at >= gpu.asked_at:
         gpu.asked_at = None
@@ -42,6 +46,22 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
     measure.on_reading(core, gpu, sample, answers_again=answers_again)
     note_pressure(core, gpu)
     core.wake(gpu)
+
+
+def _impossible(core: Core, gpu: Gpu, sample: MemorySampled) -> str:
+    """Why a reading cannot be true; "" if it can. A driver that answers nonsense knows nothing: its GPU is unknown, not free."""
+    tolerance = core.settings.verify_tolerance_bytes
+    used, total, info = sample.used_bytes, sample.total_bytes, gpu.info
+    if info.total_bytes and abs(total - info.total_bytes) > tolerance:
+        return f"impossible reading: {total} bytes of memory, {info.total_bytes} at the start; if that is so now, restart the arbiter"
+    if total < info.capacity_bytes - tolerance:
+        return f"impossible reading: {total} bytes of memory, {info.capacity_bytes} are leased out"
+    if not 0 <= used <= total + tolerance:
+        return f"impossible reading: {used} of {total} bytes are used"
+    for use in sample.processes or ():
+        if use.used_bytes is not None and not 0 <= use.used_bytes <= total + tolerance:
+            return f"impossible reading: process {use.process.pid} holds {use.used_bytes} of {total} bytes"
+    return ""
 
 
 def on_probe_failed(core: Core, event: ProbeFailed) -> None:

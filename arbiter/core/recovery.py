@@ -370,7 +370,9 @@ def account_for_the_empty(core: Core, sample: MemorySampled) -> None:
     and a reading may lie. Their bytes stay charged, and nobody asks them to leave before they are heard of.
     """
     gpu = core.gpus.get(sample.gpu)
-    if gpu is None or core.recovering is None or sample.taken_at < core.started_at:
+    if gpu is None or gpu.sample is not sample:
+        return  # it does not count (`readings.on_sample`)
+    if core.recovering is None or sample.taken_at < core.started_at:
         return
     noise_bytes = gpu.info.reserve_bytes + core.settings.verify_tolerance_bytes
     if sample.used_bytes > noise_bytes:

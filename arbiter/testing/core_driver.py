@@ -66,6 +66,9 @@ class SimCard:
     lists_processes: bool = True
     knows_bytes: bool = True  # False: the driver lists processes without their bytes
     failing: str = ""  # not empty: readings fail with this reason
+    lies: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # fields of a reading that are not as they should be
     silent: bool = False  # readings hang and never answer
     reading_s: float = READING_S
     held: dict[ProcessKey, int] = field(default_factory=dict)
@@ -106,13 +109,14 @@ class SimCard:
                 for process, count in sorted(seen.items())
                 if process not in self.unlisted
             )
-        return MemorySampled(
+        sample = MemorySampled(
             self.gpu,
             now,
             min(self.total_bytes, sum(seen.values()) + self.overhead_bytes),
             self.total_bytes,
             processes,
         )
+        return replace(sample, **self.lies)
 
 
 class CoreDriver:
@@ -129,7 +133,14 @@ class CoreDriver:
     ) -> None:
         self.now = START_S
         gpus = tuple(
-            GpuInfo(GpuId(f"GPU-{index}"), index, f"simulated {index}", capacity_bytes, reserve_bytes)
+            GpuInfo(
+                GpuId(f"GPU-{index}"),
+                index,
+                f"simulated {index}",
+                capacity_bytes,
+                reserve_bytes,
+                total_bytes=capacity_bytes,
+            )
             for index in range(cards)
         )
         self.cards = {info.id: SimCard(info.id, capacity_bytes) for info in gpus}

@@ -251,9 +251,13 @@ def test_a_measured_footprint_is_charged_after_a_restart_and_a_reboot(make_arbit
 
 
 def set_fault(arbiter: ArbiterProcess, probe: str) -> None:
+    change_card(arbiter, lambda config: config["faults"].update(probe=probe))
+
+
+def change_card(arbiter: ArbiterProcess, change: Callable[[dict[str, Any]], None]) -> None:
     path = arbiter.card / fakegpu.CARD_FILE
     config = json.loads(path.read_text())
-    config["faults"]["probe"] = probe
+    change(config)
     temporary = path.with_name(".new")
     temporary.write_text(json.dumps(config))
     temporary.rename(path)
@@ -271,6 +275,26 @@ def test_a_card_that_cannot_be_read_blocks_and_comes_back(make_arbiter: Make, fa
         assert waiting["state"] == "queued", "unknown never counts as free"
         assert client.ask("status")["gpus"][0]["blocked"]
         set_fault(arbiter, "ok")
+        assert client.push("granted")["lease"]["consumer"] == "waiter"
+
+
+@pytest.mark.parametrize("capacity_bytes", [4 * GIB, 16 * GIB, 1 << 50])
+def test_a_card_whose_capacity_changes_is_unknown_until_it_is_as_it_was(
+    make_arbiter: Make, capacity_bytes: int
+) -> None:
+    """The larger card was believed: what was granted on it did not exist."""
+    arbiter = make_arbiter(config="probe: {period_s: 0.1}\n").start()
+    with WireClient(arbiter.endpoint) as watcher, WireClient(arbiter.endpoint) as client:
+        watcher.hello("watcher").ask("subscribe")
+        client.hello()
+        before = client.ask("status")["gpus"][0]["capacity_bytes"]
+        change_card(arbiter, lambda config: config.update(capacity_bytes=capacity_bytes))
+        told = watcher.push("event", where=lambda push: push["event"]["kind"] == "probe_failed")
+        assert f"{capacity_bytes} bytes of memory, {before} at the start" in told["event"]["reason"]
+        assert client.acquire("waiter", GIB)["state"] == "queued"
+        gpu = client.ask("status")["gpus"][0]
+        assert (gpu["measured_used_bytes"], "impossible reading" in gpu["blocked"]) == (None, True)
+        change_card(arbiter, lambda config: config.update(capacity_bytes=before))
         assert client.push("granted")["lease"]["consumer"] == "waiter"
 
 

@@ -96,7 +96,7 @@ def test_a_torn_last_line_is_tolerated_and_said(busy: CoreDriver, log: Path) -> 
 def test_a_crash_of_the_engine_is_repeated_too(busy: CoreDriver, log: Path) -> None:
     """The last line of a daemon that stopped on a defect has no digest."""
     broken = {"t": 5000.0, "event": "MemorySampled", "effects": "", "digest": None}
-    data = {"gpu": "GPU-0", "taken_at": 5000.0, "used_bytes": None, "total_bytes": 8, "processes": None}
+    data = {"gpu": "GPU-0", "taken_at": 5000.0, "used_bytes": None, "total_bytes": 8 << 30, "processes": None}
     with log.open("a") as file:
         file.write(json.dumps(broken | {"data": data}) + "\n")
     found = runner.replay(runner.load(log))

@@ -1,0 +1,88 @@
+"""A reading that cannot be true says nothing: its GPU is unknown. A driver that called a card of 8 GiB one of 2^60 bytes, or -1 bytes used, made
+room for grants that did not exist."""
+
+from typing import Any
+
+import pytest
+
+from arbiter.core.events import MemorySampled, ProcessUse
+from arbiter.testing.core_driver import CoreDriver
+from schemas import defaults as d
+from schemas.ids import ProcessKey
+
+GIB = d.GIB
+LIES: list[dict[str, Any]] = [
+    {"used_bytes": -1},
+    {"used_bytes": 9 * GIB},
+    {"used_bytes": 1 << 60},
+    {"total_bytes": 1 << 60},
+    {"total_bytes": 0},
+    {"total_bytes": -8 * GIB},
+    {"total_bytes": 4 * GIB},
+    {"total_bytes": 16 * GIB},
+    {"processes": (ProcessUse(ProcessKey(9, 9), "odd", 1 << 60),)},
+    {"processes": (ProcessUse(ProcessKey(9, 9), "odd", None), ProcessUse(ProcessKey(8, 8), "odd", -5))},
+]
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_nothing_is_granted_on_an_impossible_reading_until_a_plausible_one(lie: dict[str, Any]) -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lies = lie
+    driver.advance(3.0)
+    waiter = driver.consumer("waiter").acquire(GIB)
+    driver.advance(3.0)
+    assert driver.state(waiter) == "queued"
+    gpu = driver.gpu()
+    assert gpu["measured_used_bytes"] is None
+    assert "impossible reading" in gpu["blocked"]
+    assert [note["reason"] in gpu["blocked"] for note in driver.notes("probe_failed")] == [True], "once"
+    driver.card.lies = {}
+    driver.until(lambda: driver.state(waiter) == "loading")
+    assert len(driver.notes("probe_ok")) == 1
+
+
+def test_a_first_reading_that_cannot_be_true_is_no_measure_for_later_ones() -> None:
+    driver = CoreDriver(8 * GIB, start=False)
+    driver.card.lies = {"total_bytes": 1 << 60}
+    driver.advance(0.1)
+    assert "impossible reading" in driver.gpu()["blocked"]
+    driver.card.lies = {}
+    driver.advance(3.0)
+    assert driver.gpu()["blocked"] == ""
+
+
+def test_bytes_are_not_measured_gone_by_an_impossible_reading() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB)
+    det.load(lease)
+    driver.card.lies = {"used_bytes": -(1 << 40), "processes": ()}
+    det.die()
+    driver.advance(2.0)
+    assert driver.gpu()["charged_bytes"] == 5 * GIB
+    driver.card.lies = {}
+    driver.advance(3.0)
+    assert driver.gpu()["charged_bytes"] == 0
+
+
+def test_an_empty_card_that_cannot_be_true_accounts_for_no_holder_after_a_restart() -> None:
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB)
+    det.load(lease)
+    driver.card.lies = {"used_bytes": -1}
+    driver.restart()
+    driver.advance(2.0)
+    assert driver.arbiter.status(driver.now)["phase"] == "recovering"
+
+
+def test_a_little_more_than_everything_is_the_drivers_rounding() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.card.lies = {"used_bytes": 8 * GIB + d.MIB, "total_bytes": 8 * GIB - d.MIB}
+    driver.advance(2.0)
+    assert driver.gpu()["measured_used_bytes"] == 8 * GIB + d.MIB
+    sample = MemorySampled(driver.card.gpu, driver.now, 0, 8 * GIB, None)
+    driver.card.lies = {"used_bytes": 0, "total_bytes": 8 * GIB, "processes": None}
+    driver.post(sample)
+    assert driver.gpu()["measured_used_bytes"] == 0
