@@ -35,6 +35,7 @@ from arbiter.host.lockfile import LockFile
 from arbiter.host.memory import park_budget_bytes
 from arbiter.host.probing import Prober, within
 from arbiter.host.recorder import Recorder, freezer
+from arbiter.host.records import check_record
 from arbiter.host.suspend import SuspendWatch
 from arbiter.host.systemd import Notifier
 from arbiter.host.tree import Known
@@ -230,7 +231,7 @@ class Daemon:
         self._take_folders(places, group, undo)  # 1
         traced = self._open_telemetry(undo)
         boot = boot_id()
-        journal = Journal.open(places.state, boot)  # 2
+        journal = Journal.open(places.state, boot, check=check_record)  # 2
         undo.callback(journal.close)
         history = History.open(places.state, config.history.max_events, config.history.days)
         history.start(loop)
@@ -294,7 +295,7 @@ class Daemon:
         )
 
         self._tell_start(history, journal, places, gpus)  # 5
-        if journal.opened.records or journal.opened.put_aside:
+        if journal.opened.records:
             inbox.post(Recovered(journal.opened.records))
             for process in processes_of(journal.opened.records):
                 watch.add(process)
@@ -403,6 +404,8 @@ class Daemon:
         if found.put_aside is not None:
             facts = {"file": str(found.put_aside), "problem": found.problem}
             telemetry.log_event(history.append("journal_put_aside", facts))
+        if found.doubt:
+            telemetry.log_event(history.append("journal_doubted", {"why": found.doubt}))
         started = {
             "server": self._server_name,
             "epoch": found.epoch,
@@ -455,9 +458,7 @@ def status_text(gpus: Sequence[GpuInfo]) -> str:
 
 def problems(journal: Journal, history: History) -> list[str]:
     """What an operator should know of the daemon's own files, in words."""
-    aside = journal.opened.put_aside
-    corrupt = "" if aside is None else f"the journal was not readable and was put aside as {aside}"
-    return [problem for problem in (corrupt, journal.problem, history.problem) if problem]
+    return [problem for problem in (*journal.opened.problems, journal.problem, history.problem) if problem]
 
 
 def boot_id() -> str:

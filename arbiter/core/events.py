@@ -7,6 +7,9 @@ from typing import Any, Final, Literal
 
 from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
 
+DOUBT_KEY: Final = "doubt"
+"""Key of a journal record that says why leases may be missing among the others. It outlives restarts until the core deletes it, once
+each holder had its time to reattach."""
 BYE: Final = "bye"
 """`ClientLeft.reason` of a connection that took its leave: only then are its resident leases released."""
 

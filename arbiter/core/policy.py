@@ -47,7 +47,7 @@ def _missing(core: Core, missing: Collection[LeaseId]) -> str:
     """Who has not come back since a restart, by name. They live: whoever died meanwhile was lost at once."""
     holders = [core.leases[lease_id] for lease_id in sorted(missing) if lease_id in core.leases]
     if not holders:
-        return "holders"
+        return "holders that the journal may not name"
     names = ", ".join(f"{lease.spec.consumer} (pid {lease.process.pid})" for lease in holders[:MISSING_NAMED])
     return names if len(holders) <= MISSING_NAMED else f"{names} and {len(holders) - MISSING_NAMED} more"
 

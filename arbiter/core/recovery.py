@@ -2,6 +2,7 @@
 
 Until every recovered lease is accounted for (re-attached, given up, its process dead, or the card is read at baseline) nothing is
 granted. Recovered bytes are charged from the first moment, until their holder says that they are gone, dies, or its time is over.
+A journal in doubt names some leases at best: its holders are believed, and grants wait as long as any holder may keep what it has.
 """
 
 from collections.abc import Mapping
@@ -9,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from arbiter.core import drift, eviction, explain, families, gangs, operators, placement, standby, uses
-from arbiter.core.events import MemorySampled, Reattached, ReattachedLease, Recovered, Spec
+from arbiter.core.events import DOUBT_KEY, MemorySampled, Reattached, ReattachedLease, Recovered, Spec
 from arbiter.core.lease import AWAY, EXPIRING, Lease, LeaseState, Order, Use
 from arbiter.core.ledger import process_bytes
 from arbiter.core.measure import begin_for_lease
@@ -19,19 +20,23 @@ from schemas import defaults
 from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, Token
 
 EMPTY_JOURNAL = LeaseId("journal")
-"""Stands for whoever an empty (lost) journal does not name; given up after a ttl and the fence grace."""
+"""Stands for the holders that an empty, lost or doubted journal does not name; given up after a TTL and the fence grace."""
 
 
 def on_recovered(core: Core, event: Recovered) -> None:
     """Charge everything that the journal names, then wait for the holders. Records of a card that is gone are dropped."""
     core.recovering = set()
-    held = {key: record for key, record in sorted(event.records.items()) if key != operators.DRAIN_KEY}
-    if len(held) < len(event.records):
-        operators.restore_drain(core, event.records[operators.DRAIN_KEY])
+    held = dict(sorted(event.records.items()))
+    doubt = held.pop(DOUBT_KEY, None)
+    if (drain := held.pop(operators.DRAIN_KEY, None)) is not None:
+        operators.restore_drain(core, drain)
     for key, record in held.items():
         gpu = core.gpus.get(GpuId(str(record["gpu"])))
         if record.get("state") in AWAY:
-            _restore_away(core, record)
+            if doubt is None:
+                _restore_away(core, record)
+            else:  # it may have been granted again since: its holder tells
+                core.forget(key)
         elif gpu is None:
             core.forget(key)
         elif key.startswith("residue:"):
@@ -49,11 +54,12 @@ def on_recovered(core: Core, event: Recovered) -> None:
     parents = {LeaseId(str(r["lease_id"])): str(r["parent"]) for r in held.values() if r.get("parent")}
     for gpu in core.gpus.values():
         families.tie(core, gpu, parents)
-    if not held:
+    if not held or doubt is not None:
         core.recovering.add(EMPTY_JOURNAL)
         grace_s = defaults.LEASE_TTL_S + core.settings.fence_grace_s
         core.timers.set(("recover", EMPTY_JOURNAL), core.now + grace_s)
-    core.note("recovered", leases=sorted(core.recovering), records=len(held))
+    facts: dict[str, Any] = {} if doubt is None else {"doubt": str(doubt["why"])}
+    core.note("recovered", leases=sorted(core.recovering), records=len(held), **facts)
 
 
 def _restore_away(core: Core, record: Mapping[str, Any]) -> None:
@@ -209,6 +215,9 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
         if item.lease in core.ended:
             raise ended_error(core.ended[item.lease])
         lease = _adopt(core, client, item)
+    elif _journal_is_behind(core, lease, client, item):
+        lease.token = item.token
+        core.record_lease(lease)
     elif lease.token != item.token and not _missed_its_grant(lease, client, item):
         raise Refused(
             "stale_token", f"{item.token} is not the token of {item.lease}", "unload, then acquire again"
@@ -236,6 +245,18 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
     account_for(core, lease.id)
     core.note("reattached", lease, uses=len(lease.uses), state=str(lease.state))
     return lease
+
+
+def _journal_is_behind(core: Core, lease: Lease, client: Client, item: ReattachedLease) -> bool:
+    """The journal is in doubt and has lost the lease's last grant, which its holder knows."""
+    return (
+        core.recovering is not None
+        and EMPTY_JOURNAL in core.recovering
+        and lease.process == client.process
+        and lease.token is not None
+        and lease.token < item.token
+        and item.token.epoch < core.settings.epoch
+    )
 
 
 def _missed_its_grant(lease: Lease, client: Client, item: ReattachedLease) -> bool:
@@ -355,8 +376,10 @@ def _reunite(core: Core, gpu: Gpu, lease: Lease) -> None:
 # -- coming to an end --------------------------------------------------------------------------------------------------
 def account_for(core: Core, lease_id: LeaseId) -> None:
     """One lease less to wait for."""
-    if core.recovering is not None:
-        core.recovering.discard(lease_id)
+    if core.recovering is not None and lease_id in core.recovering:
+        core.recovering.remove(lease_id)
+        if lease_id == EMPTY_JOURNAL:
+            core.forget(DOUBT_KEY)
 
 
 def on_recover_due(core: Core, subject: str) -> None:

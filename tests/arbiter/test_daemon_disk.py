@@ -162,7 +162,7 @@ def test_a_start_on_a_full_disk_says_so_and_is_worth_another_try(
     tmpfs.fill()
     with pytest.raises(RuntimeError, match="ended with 5"):
         arbiter.start()
-    assert "full or failing" in arbiter.log
+    assert "is full, failing or read-only" in arbiter.log
     assert "Traceback" not in arbiter.log
     tmpfs.free()
     arbiter.start()

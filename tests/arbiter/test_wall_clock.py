@@ -9,7 +9,7 @@ from pathlib import Path
 ARBITER = Path(__file__).parents[2] / "arbiter"
 READERS = {
     "host/history.py": "dates of events, and which events of earlier runs are old",
-    "host/journal.py": "the epoch, only if both places that keep it were lost with a corrupt journal",
+    "host/seal.py": "the epoch, which grows past every known one whatever it says",
     "host/otel.py": "dates of spans",
     "host/recorder.py": "dates in the event log",
     "replay/logfile.py": "names of its files",

@@ -18,6 +18,7 @@ from arbiter.core.settings import Settings
 from arbiter.daemon import processes_of, try_records
 from arbiter.host.executor import Executor
 from arbiter.host.journal import Journal
+from arbiter.host.records import check_record
 from arbiter.inbox import Inbox
 from arbiter.rpc.peer import Peer, parse_peer_address
 from arbiter.rpc.session import SessionSettings, SessionTable
@@ -91,7 +92,7 @@ class SimDaemon:
 
     def _start(self) -> None:
         machine, clock = self.machine, self.clock
-        self.journal = Journal.open(machine.folder, f"boot-{machine.boot}", wall_s=clock.now)
+        self.journal = Journal.open(machine.folder, f"boot-{machine.boot}", check=check_record, at_least=1)
         epoch = self.journal.opened.epoch
         machine.epochs.append(epoch)
         settings = machine.settings(epoch)
@@ -137,7 +138,7 @@ class SimDaemon:
         )
         records = self.journal.opened.records
         clock.say(f"daemon starts, epoch {epoch}, {len(records)} records")
-        if records or self.journal.opened.put_aside:
+        if records:
             self._post(Recovered(records))
             for process in processes_of(records):
                 self.watch(process)

@@ -132,7 +132,7 @@ def test_whoever_has_not_come_back_is_named() -> None:
     driver = CoreDriver(8 * GIB)
     driver.card.set(driver.consumer("x").process, 1 * GIB, driver.now)
     driver.post(Recovered({}))
-    assert "holders must come back first" in str(driver.gpu()["blocked"])
+    assert "holders that the journal may not name must come back first" in str(driver.gpu()["blocked"])
 
 
 def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> None:

@@ -1,0 +1,148 @@
+"""The journal is damaged while the daemon is down: nothing may be granted beside a holder that it no longer names.
+
+Regression: SQLite drops a write-ahead log from its first bad frame on without a word. In each of these cases the next start
+granted another client's lease beside a living exclusive holder in use.
+"""
+
+import contextlib
+import os
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from arbiter.testing.wire import WireClient
+
+pytestmark = pytest.mark.e2e
+GIB = 1 << 30
+PAGE = 4096
+FRAME = 24 + PAGE
+PATIENCE_S = 60.0
+OLD = ".before"
+
+HOLDER = """
+import asyncio, sys
+from pathlib import Path
+from clients.aio import ArbiterClient
+from schemas.wire import Footprint, LeaseSpec
+from sidecars.device.fake import FakeMemory
+
+async def main():
+    memory, size = FakeMemory(Path(sys.argv[1]), "holder", 0), 2 << 30
+    footprint = Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=0)
+    spec = LeaseSpec(consumer="holder", model_id="m", mode="exclusive", footprint=footprint, min_residency_s=0.0)
+    async with ArbiterClient(name="holder") as client:
+        lease = await client.acquire(spec)
+        blocks = [memory.allocate("m", size)]
+        await lease.ready(size)
+        async with lease.use("grab"):
+            print("in use", flush=True)
+            await asyncio.to_thread(sys.stdin.readline)
+            print("ends", lease.state, flush=True)
+        memory.free(blocks.pop())
+        memory.empty_cache()
+        await lease.release()
+
+asyncio.run(main())
+"""
+
+
+@contextlib.contextmanager
+def holder_in_use(arbiter: ArbiterProcess) -> Iterator[subprocess.Popen[str]]:
+    """A process by the product's own client: an exclusive lease, bytes on the GPU, a use under way."""
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(arbiter.card)],
+        env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "in use\n"
+        yield holder
+    finally:
+        holder.kill()
+        holder.communicate()
+
+
+def wal(database: Path) -> Path:
+    found = database.with_name(database.name + "-wal")
+    assert found.stat().st_size > 3 * FRAME, "the grant lies in the write-ahead log"
+    return found
+
+
+def change(path: Path, offset: int, change: Callable[[bytes], bytes], size: int = 1) -> None:
+    with path.open("r+b") as file:
+        file.seek(offset, os.SEEK_SET if offset >= 0 else os.SEEK_END)
+        old = file.read(size)
+        file.seek(-len(old), os.SEEK_CUR)
+        file.write(change(old))
+
+
+def put_back(database: Path) -> None:
+    for suffix in ("", "-wal", "-shm"):
+        path = database.with_name(database.name + suffix)
+        path.unlink(missing_ok=True)
+        old = path.with_name(path.name + OLD)
+        if old.exists():
+            shutil.copy(old, path)
+
+
+def delete(database: Path) -> None:
+    for path in (database, wal(database), database.with_name(database.name + "-shm")):
+        path.unlink()
+
+
+def edit_record(database: Path) -> None:
+    with contextlib.closing(sqlite3.connect(database)) as connection, connection:
+        connection.execute(
+            "UPDATE records SET json = replace(json, '\"charge_bytes\":2', '\"charge_bytes\":1')"
+        )
+
+
+DAMAGES: dict[str, Callable[[Path], Any]] = {
+    "log deleted": lambda database: wal(database).unlink(),
+    "log emptied": lambda database: os.truncate(wal(database), 0),
+    "log cut in the middle": lambda database: os.truncate(wal(database), wal(database).stat().st_size // 2),
+    "last page zeroed": lambda database: change(wal(database), -PAGE, lambda old: bytes(len(old)), PAGE),
+    "one bit flipped": lambda database: change(wal(database), 32 + 24 + 100, lambda old: bytes([old[0] ^ 1])),
+    "older copy put back": put_back,
+    "database deleted": delete,
+    "record edited": edit_record,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_journal_grants_nothing_beside_a_holder_in_use(damage: str) -> None:
+    arbiter = ArbiterProcess(config="record:\n  enabled: false\n")
+    with contextlib.closing(arbiter):
+        arbiter.start()
+        database = arbiter.state / "journal.sqlite"
+        for path in sorted(arbiter.state.glob("journal.sqlite*")):
+            shutil.copy(path, path.with_name(path.name + OLD))
+        with holder_in_use(arbiter) as holder:
+            holder.send_signal(signal.SIGSTOP)  # it cannot tell the next daemon what the journal does not
+            arbiter.kill()
+            DAMAGES[damage](database)
+            arbiter.start()
+            with WireClient(arbiter.endpoint) as client:
+                waiting = client.hello().acquire("other", GIB)
+                status = client.ask("status")
+                assert (waiting["state"], status["phase"]) == ("queued", "recovering"), waiting
+                assert any("journal" in problem for problem in status["problems"])
+                assert any(e["kind"].startswith("journal_") for e in client.ask("history")["events"])
+                assert client.ask("subscribe")["ok"]
+                holder.send_signal(signal.SIGCONT)
+                client.push("event", PATIENCE_S, where=lambda push: push["event"]["kind"] == "reattached")
+                (lease,) = (one for one in client.ask("status")["leases"] if one["consumer"] == "holder")
+                assert (lease["state"], lease["uses"]) == ("held", 1)
+                assert not [push for push in client.pushes if push["push"] == "granted"]
+                told, _ = holder.communicate("end\n", timeout=PATIENCE_S)
+                assert told.startswith(("ends held", "ends revoking")), "it kept its lease"
+                granted = client.push("granted", PATIENCE_S)["lease"]
+                assert granted["lease_id"] == waiting["lease"]["lease_id"]
