@@ -5,6 +5,7 @@ holder free its bytes and tells the arbiter, through the `Driver`. It must not k
 """
 
 import asyncio
+import inspect
 import logging
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
@@ -18,7 +19,8 @@ from schemas.wire import LeaseSpec
 
 log = logging.getLogger(__name__)
 
-Unload = Callable[[], Awaitable[None]]
+Unload = Callable[[], Awaitable[None] | None]
+"""A plain function, or a coroutine function. A plain one runs on the loop, so a long one holds up renewals."""
 
 RETRY_UNLOADING_S = 0.25
 """Somebody else's use is still on the lease: the arbiter pushes when it ends; this only covers a lost push."""
@@ -246,7 +248,9 @@ class Leaving:
 
     async def _guarded(self, work: Unload, what: str) -> None:
         try:
-            await work()
+            result = work()
+            if inspect.isawaitable(result):
+                await result
         except Exception:
             log.exception("%s of %s failed; the arbiter will measure what is left", what, self._spec.consumer)
 

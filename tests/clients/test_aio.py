@@ -101,6 +101,17 @@ async def test_a_block_unloads_and_releases_also_when_it_raises(
         assert unloaded == ["a", "a"]
 
 
+async def test_a_plain_function_may_unload(
+    arbiter_daemon: ArbiterProcess, spec: Spec, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The README's example does it so: its end was a traceback, and a lease whose bytes nobody had freed."""
+    unloaded: list[str] = []
+    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        async with client.lease(spec("a", 5), unload=lambda: unloaded.append("a")) as lease:
+            await lease.ready()
+    assert (unloaded, lease.state, caplog.messages) == (["a"], "gone", [])
+
+
 async def test_closing_the_client_gives_up_its_leases(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
     unloaded = asyncio.Event()
 
