@@ -89,6 +89,11 @@ class Lease:
         return self._leaving.asked and not self._leaving.gone
 
     @property
+    def revoke(self) -> Mapping[str, Any] | None:
+        """`schemas.wire.RevokePush` as the arbiter sent it last; None unless it asks for this lease."""
+        return self._record.revoke
+
+    @property
     def given_up(self) -> bool:
         """The holder itself turned away from it (`give_up`)."""
         return self._leaving.own_will

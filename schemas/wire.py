@@ -366,6 +366,9 @@ class RevokePush(TypedDict):
     token: list[int]
     reason: str
     wanted_by: str
+    priority: NotRequired[
+        int
+    ]  # of the request that wants the room; absent where an operator or the arbiter does
     deadline_in_s: float
     uses: NotRequired[
         int

@@ -68,14 +68,18 @@ def _tell(core: Core, holder: Lease, eviction: Eviction) -> None:
 def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
     """`uses` counts what still runs on the lease, also what others marked: at 0 the holder is at its safe point."""
     assert holder.token is not None, f"{holder.id} is revoked without a token"
+    waiter = None
+    if eviction.wanted_by is not None and eviction.order is None:
+        waiter = core.waiting.get(eviction.wanted_by)
     core.push(
         holder,
         {
             "push": "revoke",
             "lease_id": holder.id,
             "token": [holder.token.epoch, holder.token.serial],
-            "reason": eviction.reason,
+            "reason": f"evicted by {eviction.order}" if eviction.order else eviction.reason,
             "wanted_by": eviction.wanted_consumer,
+            **({"priority": waiter.spec.priority} if waiter is not None else {}),
             "deadline_in_s": max(0.0, eviction.asked_at + core.settings.revoke_deadline_s - core.now),
             "uses": holder.busy_uses(),
             **({"children": len(holder.children)} if holder.children else {}),

@@ -78,6 +78,9 @@ def evict(core: Core, lease: Lease, order: Order) -> None:
         lease.comes_back = False
         lease.recalled = None
         _ordered(core, lease, order)
+        if lease.state is LeaseState.REVOKING and lease.eviction is not None:
+            # A holder may let a waiter wait that it would not keep an operator waiting for.
+            eviction.push_revoke(core, lease, lease.eviction)
         _note(core, "evict", order, lease, repeated=True)
         return
     if lease.state is not LeaseState.HELD:

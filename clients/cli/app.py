@@ -227,31 +227,47 @@ def run(
     vram: Annotated[str, typer.Option(help="Bytes that the program needs, e.g. 5GiB.")],
     name: Annotated[str | None, typer.Option(help="Consumer's name (default: the program's).")] = None,
     gpu: Annotated[str, typer.Option(help="uuid, index or any.")] = "any",
-    priority: Annotated[int, typer.Option(min=0, max=100)] = 50,
+    priority: Annotated[
+        int, typer.Option(min=0, max=100, help="Below the 50 of other leases: a robot's models go first.")
+    ] = 40,
     wait: Annotated[
         float | None, typer.Option(min=0, help="Give up after so many seconds (default: never).")
     ] = None,
-    exclusive: Annotated[bool, typer.Option("--exclusive", help="Nobody else's model on that card.")] = False,
+    exclusive: Annotated[bool, typer.Option("--exclusive", help="No other model on that GPU.")] = False,
+    pin: Annotated[bool, typer.Option("--pin", help="Never end the program to make room.")] = False,
     on_revoke: Annotated[
-        str, typer.Option(help="pin: nobody makes it leave. term: SIGTERM when its room is wanted.")
-    ] = "pin",
+        str,
+        typer.Option(
+            help="priority: end the program for a request of a higher priority, or for an operator; others wait. "
+            "term: end it for any request. pin: as --pin."
+        ),
+    ] = "priority",
+    grace: Annotated[
+        float | None,
+        typer.Option(min=0, help="Seconds from SIGTERM to SIGKILL (default: as long as the program takes)."),
+    ] = None,
     endpoint: Endpoint = None,
 ) -> None:
     """Run a program that knows nothing of the arbiter under a lease: `vramctl run --vram 5GiB -- python train.py`.
 
-    The program sees VRAM_LEASE_ID, VRAM_LEASE_TOKEN and VRAM_LEASE_GPU; signals are passed on. Exits with the program's code
-    (128+n if signal n ended it), 1 if no lease was granted, 3 without an arbiter, 126/127 if it cannot be started.
+    The program sees VRAM_LEASE_ID, VRAM_LEASE_TOKEN and VRAM_LEASE_GPU, and CUDA_VISIBLE_DEVICES unless that was set;
+    signals are passed on. Two programs that do not fit together run one after the other. At the end the measured peak is
+    said. Exits with the program's code (128+n if signal n ended it), 1 if no lease was granted, 3 without an arbiter,
+    126/127 if it cannot be started.
     """
-    from clients.cli.run import RunSpec, run_leased
+    from clients.cli.run import ON_REVOKE, RunSpec, run_leased
     from schemas.sizes import parse_bytes
 
-    if on_revoke not in ("pin", "term"):
-        raise typer.BadParameter(f"--on-revoke is pin or term, not {on_revoke!r}")
+    chosen = "pin" if pin else on_revoke
+    if chosen not in ON_REVOKE:
+        raise typer.BadParameter(f"--on-revoke is one of {', '.join(ON_REVOKE)}, not {on_revoke!r}")
+    if pin and on_revoke == "term":
+        raise typer.BadParameter("--pin and --on-revoke term exclude each other")
     try:
         size = parse_bytes(vram)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-    spec = RunSpec(command, name, size, gpu, priority, wait, exclusive, on_revoke == "term")
+    spec = RunSpec(command, name, size, gpu, priority, wait, exclusive, chosen, grace)
     raise typer.Exit(asyncio.run(run_leased(spec, endpoint)))
 
 

@@ -1,34 +1,46 @@
 """`vramctl run`: a lease for a program that knows nothing of the arbiter. Acquire, start it, pass signals on, release when it ends.
 
-The lease belongs to `vramctl`, the bytes to its child: a consumer is a process tree, and the arbiter books a child's bytes on its nearest
-ancestor with a lease, so they are measured as this lease's, shown as "vramctl (python)". A program that leaves `vramctl`'s tree (it
-daemonises) or leases for itself is not covered by this lease. By default the lease is pinned, because a
-program that cannot unload can only be killed, and whether that is safe is for a person to say (`--on-revoke term`).
+The lease belongs to `vramctl`, the bytes to its child: a consumer is a process tree, and the arbiter charges a child's bytes to its
+nearest ancestor with a lease. A program that leaves the tree (it daemonizes) or leases for itself is not covered.
+
+A program cannot unload, it can only end. So it counts as one long use, and what a revoke does is decided here (`ON_REVOKE`).
 """
 
 import asyncio
+import contextlib
 import os
 import shutil
-import signal
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Literal
 
-from clients import traces
+from clients import cuda, traces
 from clients.aio import ArbiterClient
+from clients.cli.signals import Forwarding
 from clients.lease import Lease
+from schemas.defaults import NAME_MAX_CHARS
 from schemas.errors import VramError
+from schemas.runtime.printable import printable
+from schemas.sizes import format_bytes
 from schemas.wire import Footprint, LeaseSpec
 
+PRIORITY = 40
+"""Below that of other leases: programs make room for a robot's models, and queue among themselves."""
+OnRevoke = Literal["priority", "term", "pin"]
+ON_REVOKE: tuple[OnRevoke, ...] = ("priority", "term", "pin")
+"""priority: end the program for a request of a higher priority, or for an operator; others wait until it ends. term: end it for any
+request, and when the arbiter stays away. pin: never."""
+
 PATIENCE_S = 1.0
+FIRST_LOOK_S, LOOK_S = 0.2, 1.0  # the arbiter reads the GPU once a second
 NOT_FOUND, NOT_STARTED = 127, 126  # as shells have it
-FORWARDED = (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGCONT, signal.SIGWINCH)
 
 
 @dataclass(frozen=True, slots=True)
 class RunSpec:
-    """What to run and what it needs. `term_on_revoke` False pins the lease."""
+    """What to run and what it needs. `grace_s`: from SIGTERM to SIGKILL; None waits for as long as the program takes."""
 
     command: list[str]
     name: str | None
@@ -37,20 +49,25 @@ class RunSpec:
     priority: int
     wait_timeout_s: float | None
     exclusive: bool
-    term_on_revoke: bool
+    on_revoke: OnRevoke
+    grace_s: float | None
+
+    @property
+    def consumer(self) -> str:
+        """`--name`, or the program's, which may hold any byte and be of any length."""
+        return self.name or printable(Path(self.command[0]).name)[:NAME_MAX_CHARS] or "program"
 
 
 def lease_spec(spec: RunSpec) -> LeaseSpec:
     """The program's whole need for its whole life: nothing is known of phases inside it. It leaves no residue: it exits."""
-    name = spec.name or Path(spec.command[0]).name
     return LeaseSpec(
-        consumer=name,
-        model_id=name,
+        consumer=spec.consumer,
+        model_id=spec.consumer,
         gpu=spec.gpu,
         mode="exclusive" if spec.exclusive else "shared",
         footprint=Footprint(load_peak_bytes=spec.vram_bytes, steady_bytes=spec.vram_bytes, residue_bytes=0),
         priority=spec.priority,
-        evictable=spec.term_on_revoke,
+        evictable=spec.on_revoke != "pin",
     )
 
 
@@ -58,41 +75,136 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
     """The program's exit code. Raises the typed error of a lease that was not granted, ArbiterUnreachable."""
     program = shutil.which(spec.command[0])
     if program is None:
-        print(f"vramctl run: {spec.command[0]}: not found", file=sys.stderr)
-        return NOT_FOUND
-    async with ArbiterClient(endpoint, name=f"vramctl run {spec.name or Path(program).name}"[:128]) as client:
-        child: asyncio.subprocess.Process | None = None
-
-        async def ended() -> None:
-            """Room is wanted: SIGTERM, and however long the program takes to end well, it is not cut short."""
-            if child is not None and child.returncode is None:
-                print("vramctl run: its room is wanted; sending SIGTERM", file=sys.stderr)
-                child.terminate()
-                await child.wait()
-
-        def lost(lease: Lease, error: VramError) -> None:
-            print(f"vramctl run: {lease.lease_id} was lost: {error}", file=sys.stderr)
-
+        code, problem = _why_not(spec.command[0])
+        _say(f"{spec.command[0]}: {problem}")
+        return code
+    async with ArbiterClient(endpoint, name=f"vramctl run {spec.consumer}"[:NAME_MAX_CHARS]) as client:
+        run = _Run(spec, client)
         acquiring = client.acquire(
             lease_spec(spec),
             spec.wait_timeout_s,
-            unload=ended if spec.term_on_revoke else None,
-            on_lost=lost,
+            unload={"pin": None, "term": run.end, "priority": run.ended}[spec.on_revoke],
+            on_revoke=run.revoke_asked,
+            on_lost=run.lost,
         )
-        lease = await _tell_why(client, asyncio.ensure_future(acquiring), lease_spec(spec).consumer)
-        with _Forwarding() as signals:
+        lease = await _tell_why(client, asyncio.ensure_future(acquiring), spec.consumer)
+        with Forwarding() as signals:
             try:
                 child = await asyncio.create_subprocess_exec(program, *spec.command[1:], env=_environ(lease))
             except OSError as error:
-                print(f"vramctl run: {program}: {error.strerror}", file=sys.stderr)
+                _say(f"{program}: {error.strerror}")
                 await lease.release()
                 return NOT_STARTED
             signals.to(child)
-            ready = client.spawn(lease.ready(), f"ready {lease.lease_id}")
-            code = await child.wait()
-            ready.cancel()
+            code = await run.until_ended(child, lease)
             await lease.release(exiting=True)
     return code if code >= 0 else 128 - code
+
+
+class _Run:
+    """One program under one lease, from its start to its end."""
+
+    def __init__(self, spec: RunSpec, client: ArbiterClient) -> None:
+        self._spec = spec
+        self._client = client
+        self._child: asyncio.subprocess.Process | None = None
+        self.peak_bytes = 0
+        self._wake = asyncio.Event()
+        self._ending = False
+        self._reason = "its lease is over"  # said when the program is made to end
+        self._told: set[str] = set()  # whom the program keeps waiting
+
+    async def until_ended(self, child: asyncio.subprocess.Process, lease: Lease) -> int:
+        self._child = child
+        held = self._client.spawn(self._hold(lease), f"use of {lease.lease_id}")
+        watched = self._client.spawn(self._watch(lease), f"watch of {lease.lease_id}")
+        code = await child.wait()
+        for task in (held, watched):
+            task.cancel()
+        await asyncio.wait({held, watched})
+        if self.peak_bytes:
+            asked = self._spec.vram_bytes
+            more = ", more than was asked for" if self.peak_bytes > asked else ""
+            _say(f"peak {format_bytes(self.peak_bytes)} measured of {format_bytes(asked)} asked{more}")
+        else:
+            _say("peak not measured: no reading showed bytes of the program")
+        return code
+
+    async def _hold(self, lease: Lease) -> None:
+        """The program is one long use, unless any request may end it."""
+        await lease.ready()
+        if self._spec.on_revoke != "term":
+            async with lease.use(self._spec.consumer):
+                await asyncio.Event().wait()  # until canceled
+
+    async def _watch(self, lease: Lease) -> None:
+        """Measure the peak, and see which requests the program keeps waiting."""
+        pause_s = FIRST_LOOK_S
+        while True:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), pause_s)
+            self._wake.clear()
+            self._decide(lease, {})
+            with contextlib.suppress(VramError):
+                status = await self._client.status()
+                self._measure(lease, status)
+                self._decide(lease, status)
+            pause_s = LOOK_S
+
+    def _measure(self, lease: Lease, status: Mapping[str, Any]) -> None:
+        used = sum(
+            process["used_bytes"] or 0
+            for gpu in status["gpus"]
+            for process in gpu["processes"]
+            if lease.lease_id in process["lease_ids"]
+        )
+        self.peak_bytes = max(self.peak_bytes, used)
+
+    # -- revoke ------------------------------------------------------------------------------------------------------
+    def revoke_asked(self, lease: Lease, push: Mapping[str, Any]) -> None:
+        self._reason = push["reason"]
+        self._wake.set()
+
+    def lost(self, lease: Lease, error: VramError) -> None:
+        _say(f"{lease.lease_id} was lost: {error}")
+
+    def _decide(self, lease: Lease, status: Mapping[str, Any]) -> None:
+        """End the program where a revoke is for a higher priority. A request that came after the revoke is seen in `status`."""
+        push = lease.revoke
+        if push is None or self._ending or self._spec.on_revoke != "priority":
+            return
+        waiting = [
+            (view["consumer"], view["priority"])
+            for view in status.get("leases", ())
+            if view["state"] == "queued" and view["gpu"] in (None, lease.gpu)
+        ]
+        waiting.append((push["wanted_by"], push.get("priority", self._spec.priority + 1)))
+        consumer, priority = max(waiting, key=lambda one: one[1])
+        if priority > self._spec.priority:
+            self._reason = push["reason"] if consumer == push["wanted_by"] else f"{consumer} needs the room"
+            self._client.spawn(self.end(), f"end of {lease.lease_id}")
+        elif consumer not in self._told:
+            self._told.add(consumer)
+            _say(f"{consumer} waits for its room (priority {priority}): it gets it when the program ends")
+
+    async def ended(self) -> None:
+        if self._child is not None:
+            await self._child.wait()
+
+    async def end(self) -> None:
+        """SIGTERM, and SIGKILL after the grace. Returns when the program has ended."""
+        child = self._child
+        if child is None or child.returncode is not None or self._ending:
+            return
+        self._ending = True
+        _say(f"{self._reason}; sending SIGTERM")
+        child.terminate()
+        try:
+            await asyncio.wait_for(child.wait(), self._spec.grace_s)
+        except TimeoutError:
+            _say(f"still running after {self._spec.grace_s:g} s; sending SIGKILL")
+            child.kill()
+            await child.wait()
 
 
 async def _tell_why(client: ArbiterClient, acquiring: asyncio.Future[Lease], consumer: str) -> Lease:
@@ -102,49 +214,31 @@ async def _tell_why(client: ArbiterClient, acquiring: asyncio.Future[Lease], con
         if not done:
             for entry in (await client.why(consumer))["leases"]:
                 if entry["state"] == "queued":
-                    print(f"vramctl run: waiting: {entry['text']}", file=sys.stderr)
+                    _say(f"waiting: {entry['text']}")
         return await acquiring
     finally:
         acquiring.cancel()
 
 
-class _Forwarding:
-    """Signals go to the program, whose end is ours: from before it starts, so that none ends us while it runs. Ctrl-C reaches it from the
-    terminal; we only have to outlive it."""
-
-    def __init__(self) -> None:
-        self._child: asyncio.subprocess.Process | None = None
-        self._early: list[signal.Signals] = []
-
-    def __enter__(self) -> Self:
-        loop = asyncio.get_running_loop()
-        for number in FORWARDED:
-            loop.add_signal_handler(number, self._forward, number)
-        loop.add_signal_handler(signal.SIGINT, lambda: None)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number in (*FORWARDED, signal.SIGINT):
-            asyncio.get_running_loop().remove_signal_handler(number)
-
-    def to(self, child: asyncio.subprocess.Process) -> None:
-        """It has started."""
-        self._child = child
-        for number in self._early:
-            self._forward(number)
-
-    def _forward(self, number: signal.Signals) -> None:
-        if self._child is None:
-            self._early.append(number)
-        elif self._child.returncode is None:
-            self._child.send_signal(number)
+def _why_not(command: str) -> tuple[int, str]:
+    """The exit code and the reason for a command that is not an executable file."""
+    folders = [""] if os.sep in command else os.environ.get("PATH", os.defpath).split(os.pathsep)
+    found = [path for folder in folders if command and os.path.exists(path := os.path.join(folder, command))]
+    if not found:
+        return NOT_FOUND, "not found"
+    return NOT_STARTED, "is a directory" if os.path.isdir(found[0]) else "permission denied"
 
 
 def _environ(lease: Lease) -> dict[str, str]:
     return {
         **os.environ,
         **traces.environ(),
+        **cuda.visible(lease.gpu, os.environ),
         "VRAM_LEASE_ID": lease.lease_id,
         "VRAM_LEASE_TOKEN": f"{lease.token[0]}.{lease.token[1]}",
         "VRAM_LEASE_GPU": lease.gpu,
     }
+
+
+def _say(text: str) -> None:
+    print(f"vramctl run: {printable(text)}", file=sys.stderr)

@@ -106,9 +106,11 @@ async def test_a_plain_function_may_unload(
 ) -> None:
     """The README's example does it so: its end was a traceback, and a lease whose bytes nobody had freed."""
     unloaded: list[str] = []
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
-        async with client.lease(spec("a", 5), unload=lambda: unloaded.append("a")) as lease:
-            await lease.ready()
+    async with (
+        ArbiterClient(arbiter_daemon.endpoint, name="t") as client,
+        client.lease(spec("a", 5), unload=lambda: unloaded.append("a")) as lease,
+    ):
+        await lease.ready()
     assert (unloaded, lease.state, caplog.messages) == (["a"], "gone", [])
 
 

@@ -28,6 +28,7 @@ def test_revoke_is_sent_again_until_acknowledged() -> None:
         "token": [det.token(lease).epoch, det.token(lease).serial],
         "reason": "vlm needs the room",
         "wanted_by": "vlm",
+        "priority": 50,
         "deadline_in_s": 30.0,
         "uses": 1,
         "park": False,

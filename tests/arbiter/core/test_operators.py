@@ -69,6 +69,20 @@ def test_evicting_twice_asks_once(driver: CoreDriver, ops: Consumer) -> None:
     assert len(driver.notes("revoke_asked")) == 1
 
 
+def test_a_holder_that_leaves_for_a_waiter_hears_of_the_operator(driver: CoreDriver, ops: Consumer) -> None:
+    """`vramctl run` lets a waiter of its own priority wait, and ends its program for an operator."""
+    det, lease = held(driver, "det", 5 * GIB)
+    det.use_begin(lease)
+    driver.consumer("vlm").acquire(5 * GIB)
+    driver.until(lambda: bool(driver.pushes("revoke", lease)))
+    det.ack(lease, None)
+    ask(ops, "evict", lease, "maintenance")
+    first, *_, last = driver.pushes("revoke", lease)
+    assert (first["priority"], first["reason"]) == (d.PRIORITY, "vlm needs the room")
+    assert "priority" not in last
+    assert last["reason"] == f"evicted by {BY}: maintenance"
+
+
 @pytest.mark.parametrize("spec", [{"evictable": False}, {}])
 def test_a_pinned_holder_is_not_evicted_even_by_an_operator(
     driver: CoreDriver, ops: Consumer, spec: dict[str, Any]

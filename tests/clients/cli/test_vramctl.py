@@ -5,7 +5,6 @@ import json
 import os
 import pty
 import queue
-import re
 import select
 import signal
 import subprocess
@@ -15,7 +14,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -248,79 +246,6 @@ def test_doctor_with_a_daemon(arbiter_daemon: ArbiterProcess) -> None:
     assert done.returncode == 0, done.stdout
     assert "ok   gpu 0" in done.stdout
     assert "its probe answers (a simulated card)" in done.stdout, "what reads the card is said"
-
-
-@pytest.mark.e2e
-def test_run_leases_for_a_program(arbiter_daemon: ArbiterProcess) -> None:
-    environ = arbiter_daemon.environ
-    script = "import os, sys; print(os.environ['VRAM_LEASE_ID'], os.environ['VRAM_LEASE_TOKEN']); sys.exit(7)"
-    done = vramctl(
-        "run", "--vram", "1GiB", "--name", "job", "--", sys.executable, "-c", script, environ=environ
-    )
-    assert done.returncode == 7
-    assert re.fullmatch(r"L1-1 1\.\d+\n", done.stdout)
-    history = json.loads(vramctl("history", "--json", environ=environ).stdout)["events"]
-    story = [(event["kind"], event.get("exiting")) for event in history if event.get("consumer") == "job"]
-    assert ("granted", None) in story
-    assert ("released", True) in story
-
-
-@pytest.mark.e2e
-@pytest.mark.parametrize(
-    ("command", "code", "said"),
-    [
-        (["--vram", "9GiB", "true"], 1, "needs 9"),
-        (["--vram", "1GiB", "/nonexistent/program"], 127, "not found"),
-        (["--vram", "1GiB", sys.executable, "-c", "import os; os.kill(os.getpid(), 15)"], 128 + 15, ""),
-    ],
-)
-def test_codes_of_run(command: list[str], code: int, said: str, arbiter_daemon: ArbiterProcess) -> None:
-    done = vramctl("run", *command, environ=arbiter_daemon.environ)
-    assert done.returncode == code
-    assert said in done.stderr
-
-
-SLEEPER = (
-    "import signal, sys; signal.signal(15, lambda *_: sys.exit(5)); print('up', flush=True); signal.pause()"
-)
-
-
-@contextlib.contextmanager
-def running(environ: dict[str, str], *options: str) -> Iterator["subprocess.Popen[str]"]:
-    """A program under `vramctl run` that ends with 5 on SIGTERM, once it is up."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "clients", "run", "--vram", "5GiB", "--name", "job", *options, "--", sys.executable, "-c", SLEEPER],
-        env=environ,
-        stdout=subprocess.PIPE,
-        text=True,
-    )  # fmt: skip
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "up\n"
-        yield process
-    finally:
-        process.terminate()  # passed on to the program
-        process.wait(PATIENCE_S)
-
-
-@pytest.mark.e2e
-def test_run_passes_signals_on(arbiter_daemon: ArbiterProcess) -> None:
-    with running(arbiter_daemon.environ) as process:
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(PATIENCE_S) == 5
-
-
-@pytest.mark.e2e
-def test_run_is_pinned_unless_told_otherwise(
-    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
-) -> None:
-    with running(arbiter_daemon.environ):
-        views: dict[str, Any] = {view["consumer"]: view for view in client.status()["leases"]}
-        assert views["job"]["evictable"] is False
-    with running(arbiter_daemon.environ, "--on-revoke", "term") as process:
-        lease = client.acquire(spec("b", 5), PATIENCE_S)
-        assert process.wait(PATIENCE_S) == 5
-    lease.release()
 
 
 @pytest.mark.e2e

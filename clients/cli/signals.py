@@ -1,0 +1,60 @@
+"""Signals that `vramctl run` passes on to its program, whose end is its own: from before the program starts, so that none ends `vramctl`
+while it runs."""
+
+import asyncio
+import signal
+import threading
+from typing import Self
+
+FORWARDED = (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGCONT, signal.SIGWINCH)
+TYPED = frozenset({signal.SIGINT, signal.SIGQUIT})
+"""A terminal sends these to the program as well (Ctrl-C, Ctrl-\\): they are passed on only when a process sent them."""
+SI_KERNEL = 128
+
+
+class Forwarding:
+    """`with Forwarding() as signals`, start a program, then `signals.to(it)`."""
+
+    def __init__(self) -> None:
+        self._child: asyncio.subprocess.Process | None = None
+        self._early: list[signal.Signals] = []
+        self._over = False
+        self._loop = asyncio.get_running_loop()
+        # Only sigwaitinfo says where a signal is from, and only in a thread does it not block the loop.
+        self._listener = threading.Thread(target=self._listen, name="signals", daemon=True)
+
+    def __enter__(self) -> Self:
+        for number in (*FORWARDED, *TYPED):
+            self._loop.add_signal_handler(number, self._forward, number)
+        return self
+
+    def to(self, child: asyncio.subprocess.Process) -> None:
+        """It has started. Not before, because it inherits which signals are blocked."""
+        self._child = child
+        signal.pthread_sigmask(signal.SIG_BLOCK, TYPED)
+        self._listener.start()
+        for number in self._early:
+            self._forward(number)
+
+    def __exit__(self, *_: object) -> None:
+        if self._listener.ident is not None:
+            self._over = True
+            signal.pthread_kill(self._listener.ident, signal.SIGINT)
+            self._listener.join()
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, TYPED)
+        for number in (*FORWARDED, *TYPED):
+            self._loop.remove_signal_handler(number)
+
+    def _listen(self) -> None:
+        while True:
+            found = signal.sigwaitinfo(TYPED)
+            if self._over:
+                return
+            if found.si_code != SI_KERNEL:
+                self._loop.call_soon_threadsafe(self._forward, signal.Signals(found.si_signo))
+
+    def _forward(self, number: signal.Signals) -> None:
+        if self._child is None:
+            self._early.append(number)
+        elif self._child.returncode is None:
+            self._child.send_signal(number)

@@ -1,0 +1,301 @@
+"""`vramctl run` as a program: what it starts, passes on and measures, and what ends its program."""
+
+import asyncio
+import contextlib
+import fcntl
+import json
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import termios
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arbiter.testing.process import ArbiterProcess
+from clients import cuda
+from clients.aio import ArbiterClient
+from clients.cli.run import RunSpec, _Run, lease_spec
+from clients.lease import Lease
+from clients.sync import SyncArbiterClient
+from schemas.wire import LeaseSpec
+
+Spec = Callable[..., LeaseSpec]
+Finished = subprocess.CompletedProcess[str]
+PATIENCE_S = 60.0
+PROGRAM = """
+import signal, sys
+ints = []
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(5 + len(ints)))
+signal.signal(signal.SIGQUIT, lambda *_: sys.exit(9))
+signal.signal(signal.SIGINT, lambda *_: (ints.append(1), print("int", flush=True)))
+print("up", flush=True)
+while True:
+    signal.pause()
+"""
+"""Ends with 5 on SIGTERM and with 1 more for each SIGINT before."""
+DEAF = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"
+
+
+def command(*options: str, program: str = PROGRAM) -> list[str]:
+    run = [sys.executable, "-m", "clients", "run", "--vram", "5GiB", "--name", "job", *options]
+    return [*run, "--", sys.executable, "-c", program]
+
+
+def vramctl(*arguments: str | bytes, environ: dict[str, str]) -> Finished:
+    return subprocess.run(
+        [sys.executable, "-m", "clients", *arguments],
+        env=environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+
+
+@contextlib.contextmanager
+def running(
+    environ: dict[str, str], *options: str, program: str = PROGRAM
+) -> Iterator["subprocess.Popen[str]"]:
+    """A program under `vramctl run`, once it is up."""
+    process = subprocess.Popen(
+        command(*options, program=program),
+        env=environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        yield process
+    finally:
+        if process.poll() is None:
+            process.terminate()  # passed on to the program
+        process.communicate(timeout=PATIENCE_S)
+
+
+@pytest.fixture
+def client(arbiter_daemon: ArbiterProcess) -> Iterator[SyncArbiterClient]:
+    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        yield client
+
+
+def view(client: SyncArbiterClient, consumer: str) -> dict[str, Any]:
+    (found,) = [lease for lease in client.status()["leases"] if lease["consumer"] == consumer]
+    return dict(found)
+
+
+def said(process: "subprocess.Popen[str]") -> str:
+    assert process.stderr is not None
+    return process.stderr.readline()
+
+
+# -- the program ---------------------------------------------------------------------------------------------------------
+@pytest.mark.e2e
+def test_run_leases_for_a_program(arbiter_daemon: ArbiterProcess) -> None:
+    environ = {**arbiter_daemon.environ, "CUDA_VISIBLE_DEVICES": "3"}
+    script = "import os, sys; print(*(os.environ[name] for name in sys.argv[1:])); sys.exit(7)"
+    names = ("VRAM_LEASE_ID", "VRAM_LEASE_TOKEN", "CUDA_VISIBLE_DEVICES")
+    run = ("run", "--vram", "1GiB", "--name", "job", "--", sys.executable, "-c", script, *names)
+    done = vramctl(*run, environ=environ)
+    assert done.returncode == 7
+    assert re.fullmatch(r"L1-1 1\.\d+ 3\n", done.stdout)
+    assert "peak not measured" in done.stderr
+    history = json.loads(vramctl("history", "--json", environ=environ).stdout)["events"]
+    story = [(event["kind"], event.get("exiting")) for event in history if event.get("consumer") == "job"]
+    assert ("granted", None) in story
+    assert ("released", True) in story
+
+
+@pytest.mark.parametrize(
+    ("gpu", "environ", "variables"),
+    [
+        ("GPU-1", {}, {"CUDA_VISIBLE_DEVICES": "GPU-1", "CUDA_DEVICE_ORDER": "PCI_BUS_ID"}),
+        ("MIG-1", {"CUDA_DEVICE_ORDER": "FASTEST_FIRST"}, {"CUDA_VISIBLE_DEVICES": "MIG-1"}),
+        ("GPU-1", {"CUDA_VISIBLE_DEVICES": "0"}, {}),
+        ("GPU-fake-1", {}, {}),
+        ("UNIFIED-0", {}, {}),
+    ],
+)
+def test_cuda_sees_the_granted_gpu(gpu: str, environ: dict[str, str], variables: dict[str, str]) -> None:
+    """A program on a machine with two GPUs took the first, whichever was granted."""
+    assert cuda.visible(gpu, environ) == variables
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize(
+    ("command", "code", "said"),
+    [
+        (["--vram", "9GiB", "true"], 1, "needs 9"),
+        (["--vram", "1GiB", "/nonexistent/program"], 127, "not found"),
+        (["--vram", "1GiB", ""], 127, "not found"),
+        (["--vram", "1GiB", "/"], 126, "is a directory"),
+        (["--vram", "1GiB", __file__], 126, "permission denied"),
+        (["--vram", "1GiB", sys.executable, "-c", "import os; os.kill(os.getpid(), 15)"], 128 + 15, ""),
+        (["--vram", "1GiB", "--pin", "--on-revoke", "term", "true"], 2, "exclude each other"),
+    ],
+)
+def test_codes_of_run(command: list[str], code: int, said: str, arbiter_daemon: ArbiterProcess) -> None:
+    done = vramctl("run", *command, environ=arbiter_daemon.environ)
+    assert done.returncode == code, done.stderr
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize(
+    "name", [b"\xff\xfe", b"\x1b[31m\n", b"x" * 200], ids=["undecodable", "control", "long"]
+)
+def test_a_program_may_have_any_name(name: bytes, arbiter_daemon: ArbiterProcess, tmp_path: Path) -> None:
+    program = os.fsencode(tmp_path) + b"/" + name
+    with open(program, "wb") as file:
+        file.write(b"#!/bin/sh\nexit 3\n")
+    os.chmod(program, 0o755)
+    done = vramctl("run", "--vram", "1GiB", program, environ=arbiter_daemon.environ)
+    assert done.returncode == 3, done.stderr
+    assert "\x1b" not in done.stderr
+
+
+# -- signals ---------------------------------------------------------------------------------------------------------------
+@pytest.mark.e2e
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 5), (signal.SIGQUIT, 9)])
+def test_run_passes_signals_on(number: signal.Signals, code: int, arbiter_daemon: ArbiterProcess) -> None:
+    with running(arbiter_daemon.environ) as process:
+        process.send_signal(number)
+        assert process.wait(PATIENCE_S) == code
+
+
+@pytest.mark.e2e
+def test_an_interrupt_by_another_process_is_passed_on(arbiter_daemon: ArbiterProcess) -> None:
+    """`kill -INT` of `vramctl` reached nothing: its program was left to run."""
+    with running(arbiter_daemon.environ) as process:
+        process.send_signal(signal.SIGINT)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "int\n"
+        process.terminate()
+        assert process.wait(PATIENCE_S) == 6
+
+
+@pytest.mark.e2e
+def test_the_terminals_interrupt_reaches_the_program_once(arbiter_daemon: ArbiterProcess) -> None:
+    """The terminal sends it to both. Passed on as well, a program would take it for the second Ctrl-C, which ends many at once."""
+    master, slave = pty.openpty()
+    attributes = termios.tcgetattr(slave)
+    attributes[3] &= ~termios.ECHO
+    termios.tcsetattr(slave, termios.TCSANOW, attributes)
+    process = subprocess.Popen(
+        command(), env=arbiter_daemon.environ, stdin=slave, stdout=subprocess.PIPE, text=True,
+        start_new_session=True, preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        os.write(master, b"\x03")
+        assert process.stdout.readline() == "int\n"
+        process.terminate()
+        assert process.wait(PATIENCE_S) == 6
+    finally:
+        process.kill()
+        process.communicate()
+        os.close(master)
+        os.close(slave)
+
+
+# -- room for others ---------------------------------------------------------------------------------------------------------
+@pytest.mark.e2e
+def test_two_programs_that_do_not_fit_together_run_one_after_the_other(
+    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess
+) -> None:
+    """The second was denied at once, because the first was pinned."""
+    with running(arbiter_daemon.environ) as first:
+        second = subprocess.Popen(
+            command("--name", "next", "--wait", "60", program="raise SystemExit(4)"),
+            env=arbiter_daemon.environ, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert "next waits for its room (priority 40)" in said(first)
+        assert view(client, "job")["uses"] == 1
+        assert first.poll() is None
+        first.terminate()
+        assert first.wait(PATIENCE_S) == 5
+    assert second.wait(PATIENCE_S) == 4
+    second.communicate()
+
+
+@pytest.mark.e2e
+def test_a_higher_priority_behind_an_equal_one_ends_the_program(
+    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    """The revoke was for the first of them, and no second one comes."""
+    with running(arbiter_daemon.environ) as process:
+        equal = subprocess.Popen(command("--name", "next", program="pass"), env=arbiter_daemon.environ)
+        assert "next waits" in said(process)
+        lease = client.acquire(spec("b", 5), PATIENCE_S)
+        assert process.wait(PATIENCE_S) == 5
+        assert "b needs the room; sending SIGTERM" in said(process)
+    lease.release()
+    assert equal.wait(PATIENCE_S) == 0
+
+
+@pytest.mark.e2e
+def test_an_operator_ends_the_program_although_it_keeps_another_waiting(
+    arbiter_daemon: ArbiterProcess,
+) -> None:
+    environ = arbiter_daemon.environ
+    with running(environ) as process:
+        equal = subprocess.Popen(command("--name", "next", program="pass"), env=environ)
+        assert "next waits" in said(process)
+        assert vramctl("evict", "job", "--reason", "lunch", environ=environ).returncode == 0
+        assert process.wait(PATIENCE_S) == 5
+        assert "lunch; sending SIGTERM" in said(process)
+    assert equal.wait(PATIENCE_S) == 0
+
+
+@pytest.mark.e2e
+def test_a_program_that_does_not_end_in_its_grace_is_killed(
+    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    with running(arbiter_daemon.environ, "--grace", "0.1", program=DEAF) as process:
+        lease = client.acquire(spec("b", 5), PATIENCE_S)
+        assert process.wait(PATIENCE_S) == 128 + signal.SIGKILL
+    lease.release()
+
+
+@pytest.mark.e2e
+def test_run_is_pinned_only_on_request(
+    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    with running(arbiter_daemon.environ, "--pin"):
+        assert view(client, "job")["evictable"] is False
+    with running(arbiter_daemon.environ, "--priority", "60", "--on-revoke", "term") as process:
+        assert view(client, "job")["evictable"] is True
+        lease = client.acquire(spec("b", 5), PATIENCE_S)
+        assert process.wait(PATIENCE_S) == 5
+    lease.release()
+
+
+# -- what it measured --------------------------------------------------------------------------------------------------------
+@pytest.mark.e2e
+@pytest.mark.anyio
+async def test_the_peak_is_what_the_arbiter_measured_of_the_program(
+    arbiter_daemon: ArbiterProcess, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The bytes of the program's process, charged to the lease of its parent; they are gone when the peak is said."""
+    holder = (
+        "import sys; from pathlib import Path; from sidecars.device.fake import FakeMemory\n"
+        "memory = FakeMemory(Path(sys.argv[1]), 'job', 0); memory.allocate('x', 2 << 30); sys.stdin.read()"
+    )
+    spec = RunSpec(["job"], None, 1 << 30, "any", 40, None, False, "priority", None)
+    async with asyncio.timeout(PATIENCE_S), ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        run = _Run(spec, client)
+        lease: Lease = await client.acquire(lease_spec(spec))
+        child = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", holder, str(arbiter_daemon.card),
+            env=arbiter_daemon.environ, stdin=subprocess.PIPE,
+        )  # fmt: skip
+        ended = asyncio.create_task(run.until_ended(child, lease))
+        while not run.peak_bytes:
+            await asyncio.sleep(0.05)
+        assert child.stdin is not None
+        child.stdin.close()
+        assert await ended == 0
+        await lease.release(exiting=True)
+    assert "peak 2 GiB measured of 1 GiB asked, more than was asked for" in capfd.readouterr().err
