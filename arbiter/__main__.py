@@ -6,7 +6,6 @@ import faulthandler
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 
 from schemas import otel, terminal
@@ -20,6 +19,7 @@ from schemas.errors import (
     ProbeFailed,
     VramError,
 )
+from schemas.version import add_version, version
 from schemas.yamltext import read_text
 
 EXIT_USAGE, EXIT_ALREADY_RUNNING, EXIT_NO_GPU, EXIT_NO_DISK, EXIT_DEFECT = 2, 3, 4, 5, 70
@@ -75,15 +75,8 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--log-level", choices=("debug", "info", "warning", "error"), help="info (default)")
     made.add_argument("--check-config", action="store_true", help="check flags and configuration, then exit")
-    made.add_argument("--version", action="version", version=f"vram-arbiter {version()}")
+    add_version(made)
     return made
-
-
-def version() -> str:
-    try:
-        return metadata.version("vram-arbiter")
-    except metadata.PackageNotFoundError:  # run from a source tree that is not installed
-        return "0+source"
 
 
 def config_of_service(environ: Mapping[str, str]) -> Path | None:

@@ -42,6 +42,7 @@ from schemas.errors import (
     VramError,
 )
 from schemas.manifest import RSkillManifest
+from schemas.version import add_version
 
 LLM_PLANNERS: dict[str, type[LlmPlanner]] = {"openai": OpenAiPlanner, "anthropic": AnthropicPlanner}
 MANAGED = ("detector", "scene-vlm", "reward")
@@ -55,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="vram-reasoner", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    add_version(parser)
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--task", help='what to do, e.g. "grab the red cube"')
     what.add_argument(

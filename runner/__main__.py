@@ -17,6 +17,7 @@ from clients import logs
 from schemas import terminal
 from schemas.commands import Command, command
 from schemas.errors import ConfigError, EstopRequested, ManifestInvalid, VramError
+from schemas.version import add_version
 
 COMMANDS = ("sim", "benchmark", "deploy", "estop", "replay")
 URGENT = "estop"  # it imports nothing of the others: a second of imports is a second of motion
@@ -27,11 +28,13 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="vram-runner", description="Runs a robot's skills and serves goals and frames."
     )
+    add_version(parser)
     commands = parser.add_subparsers(dest="command", required=True)
     given = sys.argv[1:] if argv is None else argv
     for name in [URGENT] if given[:1] == [URGENT] else COMMANDS:
         module = import_module(f"runner.cli.{name}")
         flags = module.add_parser(commands)
+        add_version(flags)
         flags.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
         flags.add_argument(
             "--log-format", default="human", choices=logs.FORMS, help="json: one object a line"

@@ -14,6 +14,7 @@ from pathlib import Path
 from schemas import terminal
 from schemas.export import documents
 from schemas.manifest import ManifestError, load_manifest
+from schemas.version import add_version
 
 
 @terminal.program
@@ -27,6 +28,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     export = commands.add_parser("export", help="write JSON Schemas")
     export.add_argument("folder", metavar="DIR", type=Path, help="folder to write to; made if missing")
+    for one in (parser, check, export):
+        add_version(one)
     options = parser.parse_args(argv)
     return _check(options.files) if options.command == "check" else _export(options.folder)
 

@@ -23,6 +23,7 @@ from schemas.errors import ConfigError, ModelError, NoGpu, VramError
 from schemas.extras import need
 from schemas.fakegpu import CARD_FILE, FOLDER_VARIABLE, parse_config
 from schemas.manifest import Kind, ManifestError, RSkillManifest
+from schemas.version import add_version
 from sidecars.adapters.base import ModelAdapter
 from sidecars.adapters.choose import make_adapter
 from sidecars.adapters.gpu_passthrough import is_passthrough, need_card
@@ -191,6 +192,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Serve one model, under a lease of the VRAM arbiter.",
         epilog="exit codes: 0 ended in order \u00b7 1 could not start or failed, another try may succeed \u00b7 2 flags, files or environment are wrong",
     )
+    add_version(parser)
     add = parser.add_argument
     add("--name", required=True, type=_name, help="consumer name and socket name, e.g. detector")
     add("--rskill", required=True, type=Path, metavar="FILE", help="the skill's rskill.yaml")

@@ -16,6 +16,7 @@ from arbiter.replay.codec import to_json
 from arbiter.replay.outcome import Outcome, as_plain
 from schemas import terminal
 from schemas.errors import VramError
+from schemas.version import add_version
 
 DONE, NO = 0, 1
 TIMELINE_LINES = 40
@@ -55,7 +56,9 @@ def parser() -> argparse.ArgumentParser:
         default=None,
         help=f"so many lines of decisions (default: {TIMELINE_LINES} for one policy, else 0)",
     )
+    add_version(made)
     for command in (again, what):
+        add_version(command)
         command.add_argument(
             "--policy",
             metavar="NAME",

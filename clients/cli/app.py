@@ -1,6 +1,7 @@
 """The command line of `vramctl`: parse, call, print. What a command does is in the module that it imports when it runs."""
 
 import asyncio
+import shutil
 from collections.abc import Callable, Sequence
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import typer
 from clients.cli import quick
 from schemas.defaults import NAME_MAX_CHARS, REASON_MAX_CHARS
 from schemas.errors import ArbiterUnreachable, UntrustedServer, VramError
+from schemas.version import DISTRIBUTION, version
 
 _EPILOG = (
     "Exit codes: 0 done · 1 the answer is no, or an error · 2 wrong usage · 3 the arbiter cannot be reached · "
@@ -17,9 +19,13 @@ _EPILOG = (
     "VRAM_ARBITER_ENDPOINT or VRAM_ARBITER_RUNTIME say where the arbiter serves."
 )
 
+CONTEXT = {
+    "help_option_names": ["-h", "--help"],
+    "max_content_width": shutil.get_terminal_size().columns,  # click stops at 80 otherwise
+}
 app = typer.Typer(
     name="vramctl",
-    help="See and use the VRAM arbiter: who holds which bytes, why somebody waits, and leases for any program.",
+    context_settings=CONTEXT,
     epilog=_EPILOG,
     no_args_is_help=True,
     add_completion=False,
@@ -49,6 +55,11 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the reply as JSON (t
 
 def run_app(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code."""
+    if (
+        "--version" in arguments[:2]
+    ):  # of a command too; what follows `run` and its flags is another program's
+        print(f"{DISTRIBUTION} {version()}")
+        return quick.OK
     as_json = "--json" in arguments and arguments[0] != "run"  # what follows `run` is another program's
     try:
         result = app(args=list(arguments), prog_name="vramctl", standalone_mode=False)
@@ -70,6 +81,13 @@ def run_app(arguments: Sequence[str]) -> int:
         show()
         return int(getattr(error, "exit_code", quick.USAGE))
     return int(result or 0)
+
+
+@app.callback()
+def options(
+    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
+) -> None:
+    """See and use the VRAM arbiter: which lease holds which bytes, why a request waits, and leases for any program."""
 
 
 @app.command()
@@ -312,5 +330,5 @@ def demo(context: typer.Context) -> None:
     from clients.cli.demo import demo as show
 
     inner = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    inner.command()(show)
+    inner.command(context_settings=CONTEXT)(show)
     raise typer.Exit(int(inner(args=context.args, prog_name="vramctl demo", standalone_mode=False) or 0))

@@ -29,7 +29,11 @@ def install_into(
     packages.mkdir(parents=True)
     wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
     for name in wheel["only-include"]:
-        shutil.copytree(TREE / name, packages / wheel["sources"].get(name, name))
+        target = packages / wheel["sources"].get(name, name)
+        if (TREE / name).is_dir():
+            shutil.copytree(TREE / name, target)
+        else:
+            shutil.copy2(TREE / name, target)
     (packages / "dependencies.pth").write_text(f"{dependencies}\n")
 
     (prefix / "pyvenv.cfg").write_text(f"home = {python.parent}\ninclude-system-site-packages = false\n")

@@ -110,6 +110,49 @@ def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) ->
         assert word in done.stdout
 
 
+EVERY_COMMAND = (
+    "status", "why", "history", "watch", "evict", "pin", "unpin", "drain", "resume", "release-dead", "run", "doctor",
+    "replay", "simulate", "demo",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("flag", ["-h", "--version"])
+def test_every_program_and_command_has_it(flag: str, nowhere: dict[str, str]) -> None:
+    """`vramctl -h` was wrong usage, and only the daemon had `--version`."""
+    program = (
+        "import contextlib, io, json, runpy, sys\n"
+        "said = {}\n"
+        "for line in json.loads(sys.argv[1]):\n"
+        "    sys.argv, out = line, io.StringIO()\n"
+        "    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):\n"
+        "        runpy.run_module(line[0], run_name='__main__')\n"
+        "    said[' '.join(line)] = out.getvalue()\n"
+        "print(json.dumps(said))\n"
+    )
+    lines = [["clients", flag], *(["clients", command, flag] for command in EVERY_COMMAND)]
+    lines += [["runner", flag], *(["runner", command, flag] for command in ("sim", "deploy", "estop"))]
+    lines += [[name, flag] for name in ("arbiter", "sidecars", "reasoner", "schemas")]
+    lines += [["schemas", "check", flag], ["arbiter.replay", "replay", flag]]
+    done = subprocess.run(
+        [sys.executable, "-c", program, json.dumps(lines)],
+        env=nowhere, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    wanted = "vram-arbiter " if flag == "--version" else "sage: "
+    through_a_program = {f"clients {command} {flag}" for command in ("replay", "simulate")}
+    wrong = {
+        line: said for line, said in json.loads(done.stdout.splitlines()[-1]).items()
+        if wanted not in said and not (flag == "-h" and line in through_a_program)
+    }  # fmt: skip
+    assert wrong == {}
+
+
+def test_help_uses_the_width_of_the_terminal(nowhere: dict[str, str]) -> None:
+    """It stopped at 80 columns."""
+    wide = vramctl("status", "--help", environ={**nowhere, "COLUMNS": "150"}).stdout
+    assert "Where the arbiter serves.  [env var: VRAM_ARBITER_ENDPOINT]" in wide
+
+
 @pytest.mark.e2e
 def test_doctor_says_where_the_packages_come_from(nowhere: dict[str, str]) -> None:
     done = vramctl("doctor", "--json", environ=nowhere)
