@@ -4,6 +4,8 @@ from collections.abc import Mapping
 
 VISIBLE: str = "CUDA_VISIBLE_DEVICES"
 ORDER: str = "CUDA_DEVICE_ORDER"
+PCI: str = "PCI_BUS_ID"
+"""The order in which NVML, and so the arbiter, counts GPUs; CUDA's own order is by speed."""
 _FAKE = "GPU-fake-"
 
 
@@ -16,4 +18,4 @@ def visible(gpu: str, environ: Mapping[str, str]) -> dict[str, str]:
     known = gpu.startswith(("GPU-", "MIG-")) and not gpu.startswith(_FAKE)
     if VISIBLE in environ or not known:
         return {}
-    return {VISIBLE: gpu, **({} if ORDER in environ else {ORDER: "PCI_BUS_ID"})}
+    return {VISIBLE: gpu, **({} if ORDER in environ else {ORDER: PCI})}

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from clients import logs
+from clients import cuda, logs
 from clients.configs import configs_folder
 from schemas import defaults as d
 from schemas import telemetry, terminal
@@ -155,7 +155,8 @@ def open_memory(settings: Settings) -> DeviceMemory:
         return FakeMemory(folder, settings.name, settings.footprint.residue_bytes)
     from sidecars.device.cuda import CudaMemory
 
-    return CudaMemory(int(settings.device.partition(":")[2] or 0), settings.footprint.residue_bytes)
+    index = settings.device.partition(":")[2]
+    return CudaMemory(int(index) if index else None, settings.footprint.residue_bytes)
 
 
 def _device(text: str | None) -> str:
@@ -174,9 +175,9 @@ def _device(text: str | None) -> str:
 
 
 def _gpu_of(device: str) -> str:
-    """Which card to lease: on a simulated one its own, so that lease and bytes cannot differ. Raises NoGpu."""
+    """Which GPU to lease: the one that the device names, so that lease and bytes cannot differ. Raises NoGpu."""
     if not device.startswith("fake:"):
-        return "any"
+        return device.partition(":")[2] or "any" if cuda.VISIBLE not in os.environ else "any"
     path = Path(device.removeprefix("fake:")) / CARD_FILE
     try:
         return parse_config(path.read_text()).uuid

@@ -63,6 +63,7 @@ class Residency:
         self._client = client
         self._turn = asyncio.Lock()  # one attempt to become resident at a time
         self._prepared: asyncio.Task[None] | None = None
+        self._bound: str | None = None  # the only GPU that this process can use
         self._blocks: list[Block] = []
         self._loads = 0  # counts loads and unloads, in the worker: an op that was queued before an unload must not run after it
         self._running = 0
@@ -350,8 +351,11 @@ class Residency:
             raise WaitTimeout(
                 f"{self._settings.name}: no time left to wait for the lease", hint="wait longer"
             )
+        spec = self._settings.lease_spec()
+        if self._bound is not None:
+            spec = spec.model_copy(update={"gpu": self._bound})
         return await self._client.acquire(
-            self._settings.lease_spec(),
+            spec,
             wait_s,
             unload=self._unload,
             on_return=self._on_return,
@@ -377,6 +381,8 @@ class Residency:
             return unloads != self._unloads if lease is None else lease.given_up
 
         try:
+            if lease is not None:
+                self._bound = self._memory.bind(lease.gpu)
             loads = await self._worker.run(self._load_blocking)
             measured = await self._worker.run(self._memory.used_bytes)
             if lease is not None:

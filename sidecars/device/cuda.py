@@ -3,27 +3,37 @@
 import os
 from typing import Any
 
+from clients import cuda
 from schemas.defaults import RESIDUE_BYTES
-from schemas.errors import NoGpu, OutOfMemory
+from schemas.errors import BadState, NoGpu, OutOfMemory
 from sidecars.device.memory import Block
 
 _ALLOCATOR_VARIABLE = "PYTORCH_CUDA_ALLOC_CONF"
+_CHECK_VARIABLE = "PYTORCH_NVML_BASED_CUDA_CHECK"
 
 
 class CudaMemory:
-    """`DeviceMemory` on card `index`. Raises NoGpu if torch sees no such card.
+    """`DeviceMemory` on GPU `index`, or on the first one that is granted. Raises NoGpu if torch sees no such GPU.
 
+    CUDA reads which GPUs it may use when it is initialized, so a process stays on the GPU that it was granted first.
     `context_bytes` is the guess for what the process's context costs where the driver does not list it.
     """
 
-    def __init__(self, index: int = 0, context_bytes: int = RESIDUE_BYTES) -> None:
+    def __init__(self, index: int | None = None, context_bytes: int = RESIDUE_BYTES) -> None:
         # segments that can grow and shrink: without them a fragmented cache keeps far more than is in use
         os.environ.setdefault(_ALLOCATOR_VARIABLE, "expandable_segments:True")
+        os.environ.setdefault(
+            _CHECK_VARIABLE, "1"
+        )  # is_available() asks NVML then, and does not initialize CUDA
+        if cuda.VISIBLE not in os.environ:
+            os.environ.setdefault(cuda.ORDER, cuda.PCI)  # GPU N of CUDA is the arbiter's GPU N
         import torch
 
+        self._free_choice = index is None
+        index = index or 0
         if not torch.cuda.is_available() or index >= torch.cuda.device_count():
             raise NoGpu(
-                f"torch sees no CUDA card {index}",
+                f"torch sees no CUDA GPU {index}",
                 hint="use --device fake:FOLDER, or install a CUDA build of torch",
             )
         self._torch = torch
@@ -32,6 +42,19 @@ class CudaMemory:
         self._ballast: dict[int, Any] = {}
         self._number = 0
         self._touched = False
+        self._bound: str | None = None
+
+    def bind(self, gpu: str) -> str | None:
+        if self._bound not in (None, gpu):
+            raise BadState(
+                f"{gpu} was granted, but CUDA of this process is limited to {self._bound}",
+                hint="ask again: the next lease names that GPU",
+            )
+        found = cuda.visible(gpu, os.environ) if self._free_choice and self._bound is None else {}
+        if found and not self._torch.cuda.is_initialized():
+            os.environ.update(found)
+            self._bound = gpu
+        return self._bound
 
     @property
     def torch_device(self) -> str:

@@ -40,6 +40,9 @@ class FakeMemory:
         if not (folder / fakegpu.CARD_FILE).exists():
             raise NoGpu(f"no simulated card in {folder}", hint="start the arbiter with --gpu fake:8GiB")
 
+    def bind(self, gpu: str) -> str | None:
+        return None  # the lease names the GPU of this folder
+
     def touch(self) -> None:
         """Raises SimulatedOutOfMemory if not even the context fits."""
         self._do(lambda card, now: fakegpu.touch(card, self._key, self._name, self._context_bytes, now))

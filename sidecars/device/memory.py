@@ -30,6 +30,13 @@ class DeviceMemory(Protocol):
         """Where the model's weights go: `cpu` or `cuda:N`."""
         ...
 
+    def bind(self, gpu: str) -> str | None:
+        """Put what follows on the granted GPU. Returns the only GPU that this process can use from now on, None for any.
+
+        Raises BadState where it is another one.
+        """
+        ...
+
     def touch(self) -> None: ...
 
     def allocate(self, label: str, size_bytes: int) -> Block: ...
@@ -52,6 +59,9 @@ class NoDevice:
 
     def __init__(self) -> None:
         self._number = 0
+
+    def bind(self, gpu: str) -> str | None:
+        return None
 
     def touch(self) -> None:
         pass

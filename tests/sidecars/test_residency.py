@@ -106,6 +106,30 @@ async def test_an_unload_between_the_grant_and_the_load_is_heard(arbiter_daemon)
     worker.close()
 
 
+class OneGpu(FakeMemory):
+    """A process that stays on the GPU that it was granted first, as CUDA does."""
+
+    def bind(self, gpu):
+        return gpu
+
+
+async def test_a_process_that_cannot_change_its_gpu_asks_for_that_one(arbiter_daemon):
+    """A sidecar loaded on the first GPU whichever was granted."""
+    daemon = arbiter_daemon
+    worker = Worker()
+    async with ArbiterClient(daemon.endpoint, name="eye") as client, asyncio.timeout(WAIT_S):
+        memory = OneGpu(daemon.card, "eye", GB // 10)
+        residency = Residency(settings(daemon), Model(), memory, worker, client)
+        await residency.load()
+        first = residency.lease
+        assert first.spec.gpu == "any"
+        await residency.unload()
+        await residency.load()
+        assert residency.lease.spec.gpu == residency.lease.gpu == first.gpu
+        assert await residency.leave()
+    worker.close()
+
+
 async def test_an_unload_without_an_arbiter_is_heard_in_the_middle_of_a_load_too(arbiter_daemon):
     """Regression: there was no lease to give up and nothing resident to unload yet, so it was answered and the model stayed."""
     worker, model = Worker(), Model()

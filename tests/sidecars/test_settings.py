@@ -102,7 +102,7 @@ def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
     alone = settings(
         "--name", "d", "--rskill", rskill, "--footprint", "2GB", "--no-arbiter", "--device", "cuda:1"
     )
-    assert (alone.arbiter, alone.device, alone.gpu) == (None, "cuda:1", "any")
+    assert (alone.arbiter, alone.device, alone.gpu) == (None, "cuda:1", "1"), "not any: it loads on that one"
     with pytest.raises(ConfigError, match="--device gpu"):
         settings("--name", "d", "--rskill", rskill, "--footprint", "2GB", "--device", "gpu")
 

@@ -1,5 +1,9 @@
 """Memory of a real card. Where there is none, it says so."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 
 from schemas.errors import NoGpu, OutOfMemory
@@ -42,3 +46,39 @@ def test_ballast_fills_up_and_goes():
         memory.allocate("too much", 1 << 50)
     assert caught.value.details["requested_bytes"] == 1 << 50
     memory.close()
+
+
+BIND = """
+import os
+from schemas.errors import BadState
+from sidecars.device.cuda import CudaMemory
+uuid = os.environ["TEST_UUID"]
+memory = CudaMemory()
+assert memory.bind(uuid) == uuid
+memory.touch()
+import torch
+assert torch.cuda.device_count() == 1
+assert str(torch.cuda.get_device_properties(0).uuid) in uuid
+try:
+    memory.bind("GPU-another")
+except BadState:
+    print("bound")
+"""
+
+
+@pytest.mark.gpu
+@pytest.mark.heavy
+def test_cuda_is_limited_to_the_granted_gpu():
+    torch = pytest.importorskip("torch")
+    if not torch.cuda.is_available():
+        pytest.skip("needs an NVIDIA card")
+    import pynvml
+
+    pynvml.nvmlInit()
+    last = pynvml.nvmlDeviceGetHandleByIndex(pynvml.nvmlDeviceGetCount() - 1)
+    environ = {**os.environ, "TEST_UUID": pynvml.nvmlDeviceGetUUID(last)}
+    environ.pop("CUDA_VISIBLE_DEVICES", None)
+    done = subprocess.run(
+        [sys.executable, "-c", BIND], env=environ, capture_output=True, text=True, timeout=120
+    )
+    assert done.stdout == "bound\n", done.stderr
