@@ -30,6 +30,7 @@ from sidecars.adapters.gpu_passthrough import is_passthrough, need_card
 from sidecars.device.memory import DeviceMemory, NoDevice
 from sidecars.settings import (
     NICE,
+    REQUEST_TIMEOUT_S,
     WAIT_TIMEOUT_S,
     Settings,
     footprint_for,
@@ -120,6 +121,7 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         evictable=not flags.pinned,
         min_residency_s=flags.min_residency_s,
         wait_timeout_s=flags.wait_timeout_s,
+        request_timeout_s=flags.request_timeout_s,
         idle_release_s=flags.idle_release_s,
         standby=flags.standby,
         nice=flags.nice,
@@ -227,6 +229,12 @@ def _parser() -> argparse.ArgumentParser:
         type=_number(float, 0.1, 86_400),
         default=WAIT_TIMEOUT_S,
         help="of a request for the lease; default %(default)s",
+    )
+    add(
+        "--request-timeout-s",
+        type=_number(float, 0.1, 86_400),
+        default=REQUEST_TIMEOUT_S,
+        help="of one request's work in the model: one that lasts longer is stuck, and the sidecar ends with 1; default %(default)s",
     )
     add(
         "--idle-release-s",

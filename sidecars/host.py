@@ -10,7 +10,7 @@ import logging
 import os
 import signal
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from clients.aio import ArbiterClient
 from clients.serve import RouterServer
@@ -23,6 +23,7 @@ from sidecars.settings import Settings
 from sidecars.wires import Wire, error_reply
 from sidecars.worker import Worker
 
+LAST_WORDS_S = 0.5  # until the answers that say so are with the kernel
 _log = logging.getLogger("sidecars")
 
 
@@ -62,11 +63,17 @@ class SidecarHost:
                 )
             _log.info("%s serves %s on %s", settings.name, settings.manifest.name, settings.endpoint)
             stopped = asyncio.create_task(self._stopping.wait(), name="stopped")
+            stuck = asyncio.create_task(worker.stuck.wait(), name="stuck")
             try:
-                await asyncio.wait([stopped, background[0]], return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait([stopped, stuck, background[0]], return_when=asyncio.FIRST_COMPLETED)
             finally:
                 stopped.cancel()
-                finished = await residency.leave()
+                leaving = asyncio.create_task(residency.leave(), name="leave")
+                await asyncio.wait([leaving, stuck], return_when=asyncio.FIRST_COMPLETED)
+                if worker.stuck.is_set():
+                    await self._end_at_once()
+                stuck.cancel()
+                finished = await leaving
                 for task in background:
                     task.cancel()
                 outcomes = await asyncio.gather(*background, return_exceptions=True)
@@ -74,6 +81,16 @@ class SidecarHost:
                 raise outcomes[0]
         _log.info("%s has ended", settings.name)
         return finished
+
+    @staticmethod
+    async def _end_at_once() -> NoReturn:
+        """The model's thread hangs: it can neither be ended nor asked to unload. Only the end of
+        the process gives the lease and its bytes back; systemd, or the next request, starts
+        another."""
+        _log.critical("the model is stuck: ending, so that its lease and its memory come back")
+        await asyncio.sleep(LAST_WORDS_S)
+        logging.shutdown()
+        os._exit(1)
 
     @staticmethod
     async def _load_at_start(residency: Residency) -> None:

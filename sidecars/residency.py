@@ -129,6 +129,10 @@ class Residency:
         With a `token` the caller holds the lease by a use of its own: anything but the current one raises Evicted. Without, the model is made
         resident first, also if it was evicted a moment ago. Raises FrameStale when the work could not begin within `fresh_s`: the model is
         there by then, for a request with a newer picture.
+
+        The use does not outlive the request's time. Work that has not begun by then never does, and
+        its use ends (WaitTimeout). Work that does not end keeps the lease in use, because it is:
+        the caller hears ModelError, and the host ends the process.
         """
         came_s = time.monotonic()
         deadline = came_s + self._settings.wait_timeout_s
@@ -140,8 +144,10 @@ class Residency:
             lease, loads = self.lease, self._loads
             try:
                 async with self._use(lease, label, handed=token is not None):
-                    return await self._worker.run(
-                        lambda: self._guarded(loads, came_s, fresh_s, work)  # noqa: B023  awaited in this very pass
+                    return await self._worker.run_for(
+                        lambda: self._guarded(loads, came_s, fresh_s, work),  # noqa: B023  awaited in this very pass
+                        begin_s=max(0.0, deadline - time.monotonic()),
+                        end_s=self._settings.request_timeout_s,
                     )
             except _GONE as error:
                 if token is not None:

@@ -17,6 +17,7 @@ from sidecars.weights import Weights, resolve
 
 NICE = 5  # a third of the cores' time beside one ordinary program, all of it when nobody else wants them
 WAIT_TIMEOUT_S = 120.0  # how long a request without a time limit of its own waits for the lease
+REQUEST_TIMEOUT_S = 180.0  # of work in the model; the field's clients wait as long for an answer
 GB = 10**9  # manifests count in 1000s
 
 
@@ -59,6 +60,7 @@ class Settings:
     evictable: bool = True
     min_residency_s: float = d.MIN_RESIDENCY_S
     wait_timeout_s: float = WAIT_TIMEOUT_S
+    request_timeout_s: float = REQUEST_TIMEOUT_S  # a model that works longer is stuck, and the process ends
     nice: int = NICE
     idle_release_s: float | None = None  # None: resident until somebody else needs the room
     standby: bool = False  # once evicted, it comes back by itself when there is room

@@ -7,8 +7,9 @@ import threading
 import traceback
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
-from schemas.errors import ModelError, OutOfMemory, VramError
+from schemas.errors import ModelError, OutOfMemory, VramError, WaitTimeout
 
 
 class Worker:
@@ -23,6 +24,55 @@ class Worker:
             max_workers=1, thread_name_prefix="model", initializer=_stand_back, initargs=(nice,)
         )
         self.stopping = threading.Event()
+        self.stuck = asyncio.Event()
+        """Work did not end within its time. No thread can be ended from outside: only the process
+        can."""
+
+    async def run_for[T](self, work: Callable[[], T], *, begin_s: float, end_s: float) -> T:
+        """Do the work as `run` does, within limits.
+
+        Raises: WaitTimeout when it could not begin within `begin_s`, because other work is under
+        way: it never will. ModelError when it has not ended `end_s` after that: it still runs, and
+        `stuck` is set.
+        """
+        loop, context = asyncio.get_running_loop(), contextvars.copy_context()
+        begun: asyncio.Future[None] = loop.create_future()
+
+        def begin() -> None:
+            if not begun.done():
+                begun.set_result(None)
+
+        def noted() -> T:
+            loop.call_soon_threadsafe(begin)
+            return work()
+
+        submitted = self._pool.submit(context.run, self._guarded, noted)
+        done = asyncio.wrap_future(submitted)
+        done.add_done_callback(_seen)
+        try:
+            waited: set[asyncio.Future[Any]] = {begun, done}
+            await asyncio.wait(waited, timeout=begin_s, return_when=asyncio.FIRST_COMPLETED)
+            if submitted.cancel():
+                raise WaitTimeout(
+                    f"the model was busy for {begin_s:.0f} s with requests that came before",
+                    hint="ask less often, or wait longer",
+                )
+            await self._until(done, end_s)
+        except asyncio.CancelledError:
+            if not submitted.cancel():
+                await self._until(done, end_s)
+            raise
+        if not done.done():
+            raise ModelError(
+                f"the model has not answered within {end_s:.0f} s; the sidecar ends",
+                hint="the next request starts it again; see its log",
+            )
+        return await done
+
+    async def _until(self, done: asyncio.Future[Any], end_s: float) -> None:
+        await asyncio.wait({done}, timeout=end_s)
+        if not done.done():
+            self.stuck.set()
 
     async def run[T](self, work: Callable[[], T], *, abandon: bool = False) -> T:
         """Do the work and wait for it, also if the caller is cancelled meanwhile: a model is never left half loaded.
@@ -64,6 +114,12 @@ class Worker:
             if isinstance(error, ImportError):
                 raise ModelError(str(error), hint="pip install 'vram-arbiter[sidecars]'") from error
             raise ModelError(f"{type(error).__name__}: {error}", hint="see the sidecar's log") from error
+
+
+def _seen(done: asyncio.Future[Any]) -> None:
+    """Keep asyncio from complaining about a failure whose caller is gone."""
+    if not done.cancelled():
+        done.exception()
 
 
 def _forget_locals(error: BaseException | None) -> None:

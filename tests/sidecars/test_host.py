@@ -316,3 +316,39 @@ def from_outside(condition):
     while not condition():
         assert monotonic() < deadline, "it did not happen in time"
         Event().wait(0.01)
+
+
+def test_a_request_that_waits_behind_another_does_not_keep_the_lease_in_use(box, arbiter):
+    """Its time is over before its work could begin: it never will, and its use ends."""
+    sidecar = box.start("detector", "--wait-timeout-s", "2")
+    sidecar.detect()
+    held = sidecar.hold()
+    assert sidecar.detect()["code"] == "wait_timeout"
+    from_outside(lambda: leases(arbiter)["detector"]["uses"] == 1)  # the one that runs
+    sidecar.let_go()
+    assert sidecar.client.reply(held, PATIENCE_S)["ok"]
+    from_outside(lambda: leases(arbiter)["detector"]["uses"] == 0)
+    assert sidecar.detect()["ok"]
+
+
+def test_a_stuck_model_is_said_and_ends_the_process(box, arbiter):
+    """Regression: a request that hung in a decoder kept its lease in use for ever: no other model
+    could be loaded. The memory really is in use, so only the end of the process gives it back."""
+    sidecar = box.start("detector", "--request-timeout-s", "0.5", footprint="5GB,5GB,100MB")
+    sidecar.detect()
+    hanging = sidecar.hold()
+    sidecar.send_detect()
+    answer = sidecar.client.reply(hanging, PATIENCE_S)
+    assert (answer["code"], answer["ok"]) == ("model_error", False)
+    assert "has not answered within" in answer["error"]
+    assert sidecar.process.wait(PATIENCE_S) == 1, "what systemd starts again"
+    from_outside(lambda: leases(arbiter) == {})
+    grab = box.start("grab", footprint="5GB,5GB,100MB")
+    assert grab.detect()["ok"], "the room is there for others"
+
+
+def test_a_stuck_model_does_not_keep_the_process_from_ending(box):
+    sidecar = box.start("detector", "--request-timeout-s", "0.5")
+    sidecar.detect()
+    sidecar.hold()
+    assert sidecar.terminate() == 1
