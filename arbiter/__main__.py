@@ -38,7 +38,8 @@ exit codes:
 environment:
   VRAM_ARBITER_ENDPOINT   endpoint, if neither --endpoint nor wire.endpoint is given
   VRAM_ARBITER_RUNTIME    folder of the sockets and of the simulated card (else RUNTIME_DIRECTORY,
-                          XDG_RUNTIME_DIR/vram-arbiter or /tmp/vram-arbiter-UID)
+                          XDG_RUNTIME_DIR/vram-arbiter, /run/user/UID/vram-arbiter,
+                          for root /run/vram-arbiter)
   OTEL_EXPORTER_OTLP_ENDPOINT, OTEL_METRICS_EXPORTER=prometheus and the other standard OTEL_ variables switch
                           telemetry on (docs/operating.md)
 """

@@ -31,7 +31,6 @@ from arbiter.host.gpu.probe import Card, GpuProbe
 from arbiter.host.gpu.unified import choose
 from arbiter.host.history import CLEAN_END, History
 from arbiter.host.journal import Journal, Opened
-from arbiter.host.lockfile import LockFile
 from arbiter.host.memory import park_budget_bytes
 from arbiter.host.probing import Prober, within
 from arbiter.host.recorder import Recorder, freezer
@@ -42,14 +41,15 @@ from arbiter.host.tree import Known
 from arbiter.host.watch import ProcessWatch
 from arbiter.inbox import Inbox
 from arbiter.rpc.peer import group_id, start_ticks
-from arbiter.rpc.server import RouterServer, make_private_folder, socket_path
+from arbiter.rpc.server import RouterServer
 from arbiter.rpc.session import SessionSettings, SessionTable
 from schemas import otel
 from schemas.commands import TRACEPARENT_VARIABLE
 from schemas.config import ArbiterConfig, GpuConfig
-from schemas.endpoints import arbiter_endpoint, runtime_dir
+from schemas.endpoints import arbiter_endpoint, runtime_dir, socket_path
 from schemas.errors import ConfigError
 from schemas.ids import ProcessKey
+from schemas.runtime.folders import LockFile, private_folder, socket_folder
 from schemas.units import format_bytes
 
 if TYPE_CHECKING:
@@ -83,8 +83,12 @@ class Places:
 
 def find_places(config: ArbiterConfig, environ: Mapping[str, str], uid: int) -> Places:
     """Raises ConfigError for an endpoint that the daemon does not serve."""
-    runtime = Path(runtime_dir(environ, uid))
     endpoint = config.wire.endpoint or arbiter_endpoint(environ, uid)
+    socket = Path(socket_path(endpoint))
+    try:
+        runtime = Path(runtime_dir(environ, uid))
+    except ConfigError:  # without a login session; then the endpoint was given
+        runtime = socket.parent
     if config.state.dir is not None:
         state = Path(config.state.dir)
     elif under_systemd := environ.get("STATE_DIRECTORY"):
@@ -94,7 +98,7 @@ def find_places(config: ArbiterConfig, environ: Mapping[str, str], uid: int) -> 
     else:
         home = environ.get("XDG_STATE_HOME") or str(Path(environ.get("HOME", "/")) / ".local" / "state")
         state = Path(home) / "vram-arbiter"
-    return Places(endpoint, socket_path(endpoint), runtime.absolute(), state.absolute())
+    return Places(endpoint, socket, runtime.absolute(), state.absolute())
 
 
 def open_probe(config: GpuConfig, runtime: Path) -> tuple[GpuProbe, str]:
@@ -312,10 +316,12 @@ class Daemon:
         return Parts(gpus, inbox, sessions, history, journal, executor)
 
     def _take_folders(self, places: Places, group: int | None, undo: contextlib.ExitStack) -> None:
-        make_private_folder(places.socket.parent, group)
-        make_private_folder(places.state, None)
-        if self._config.gpu.source.startswith("fake:"):
-            make_private_folder(places.runtime, group)
+        if self._config.gpu.source.startswith("fake:") or places.state.parent == places.runtime:
+            private_folder(places.runtime, group)
+        socket_folder(places.socket.parent, self._environ, group)
+        if self._config.state.dir is None:
+            places.state.parent.mkdir(mode=0o700, parents=True, exist_ok=True)  # such as ~/.local/state
+        private_folder(places.state)
         socket_lock = places.socket.with_name(places.socket.name + ".lock")
         for path, protects in ((socket_lock, places.socket), (places.state / "lock", places.state)):
             lock = LockFile(path, str(protects))

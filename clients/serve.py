@@ -8,6 +8,7 @@ the machine could drive the robot. It must not know what a message means.
 import asyncio
 import contextlib
 import logging
+import os
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +16,9 @@ from typing import Any, Self
 
 from clients.packing import pack
 from schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MIB, RATE_PER_CLIENT_PER_S
-from schemas.errors import ConfigError, LimitExceeded, MessageTooLarge, VramError
-from schemas.runtime.folders import LockFile, private_folder
+from schemas.endpoints import socket_path
+from schemas.errors import LimitExceeded, MessageTooLarge, VramError
+from schemas.runtime.folders import LockFile, socket_folder
 from schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
 from schemas.runtime.router import Connection, Limits, Router
 from schemas.runtime.zmtp import Oversize
@@ -90,15 +92,7 @@ def check_free(endpoint: str) -> None:
 
 def path_of(endpoint: str) -> Path:
     """Path of the socket of an endpoint that a server may bind. Raises ConfigError."""
-    path = endpoint.removeprefix("ipc://")
-    if endpoint.startswith("tcp://"):
-        raise ConfigError(
-            f"cannot serve on {endpoint}: over tcp any user of this machine could drive the robot and stop it, and nothing says who asks",
-            hint="use ipc://PATH: the socket's file then says who may connect",
-        )
-    if not endpoint.startswith("ipc://") or not path or path.startswith("@"):
-        raise ConfigError(f"cannot serve on {endpoint}", hint="use ipc://PATH, with the path of a socket")
-    return Path(path)
+    return Path(socket_path(endpoint))
 
 
 def _lock_of(path: Path) -> LockFile:
@@ -142,7 +136,7 @@ class RouterServer:
         self._stack = contextlib.AsyncExitStack()
 
     async def __aenter__(self) -> Self:
-        private_folder(self._path.parent)
+        socket_folder(self._path.parent, os.environ, shared=True)
         lock = _lock_of(self._path)
         lock.acquire()
         self._stack.callback(lock.release)

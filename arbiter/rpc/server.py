@@ -9,7 +9,6 @@ import contextlib
 import errno
 import logging
 import os
-import stat
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,6 @@ from pathlib import Path
 import zmq
 
 from arbiter.rpc.peer import parse_peer_address
-from schemas.endpoints import check_endpoint
 from schemas.errors import ConfigError, InternalError
 
 log = logging.getLogger(__name__)
@@ -39,36 +37,6 @@ FLOOD_REST_S = 0.0003
 
 OnFrame = Callable[[bytes, bool, str | None, bytes], bool]
 """`on_frame(routing_id, delimiter, peer_address, payload)`; False: its sender is over its rate."""
-
-
-def socket_path(endpoint: str) -> Path:
-    """The path of an `ipc://` endpoint. Raises ConfigError for everything that the daemon does not serve."""
-    try:
-        return Path(check_endpoint(endpoint).removeprefix("ipc://"))
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
-
-
-def make_private_folder(folder: Path, group: int | None) -> None:
-    """Make the runtime folder 0700, or 0750 with the operators' group. A folder of another user is refused, not trusted."""
-    mode = 0o700 if group is None else 0o750
-    try:
-        made = not folder.exists()
-        folder.mkdir(mode=mode, parents=True, exist_ok=True)
-        found = folder.stat()
-        if found.st_uid not in (os.getuid(), 0):
-            raise ConfigError(
-                f"{folder} belongs to uid {found.st_uid}", hint="choose another folder for the socket"
-            )
-        if not stat.S_ISDIR(found.st_mode):
-            raise ConfigError(f"{folder} is no folder")
-        if made and group is not None:
-            os.chown(folder, -1, group)
-            folder.chmod(mode)
-    except OSError as error:
-        raise ConfigError(
-            f"{folder}: {error.strerror}", hint="choose a folder that the daemon may write"
-        ) from error
 
 
 class RouterServer:

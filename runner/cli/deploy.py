@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import fcntl
 import logging
 import os
 import re
@@ -47,10 +46,11 @@ from runner.skills.ros_standins import TRAJECTORY, StandIn, StandIns
 from runner.skills.sidecar_policy import Arbiter
 from schemas.control import ControlMode
 from schemas.endpoints import program_endpoint, runtime_dir
-from schemas.errors import AlreadyRunning, RunnerUnreachable, VramError
+from schemas.errors import RunnerUnreachable, VramError
 from schemas.goals import ResultPush
 from schemas.manifest import Kind, RSkillManifest
 from schemas.robot import RobotEnvironment
+from schemas.runtime.folders import LockFile, private_folder
 from schemas.world import RunResult
 
 log = logging.getLogger("runner")
@@ -297,22 +297,14 @@ def claim(robot: RobotEnvironment, stack: contextlib.AsyncExitStack) -> None:
 def _robot_file(kind: str, key: str, suffix: str) -> Path:
     """A file of this robot, or port, in the runtime folder, which is made."""
     folder = Path(runtime_dir(os.environ, os.getuid()))
-    folder.mkdir(mode=0o750, parents=True, exist_ok=True)
+    private_folder(folder, shared=True)
     return folder / f"{kind}-{re.sub(r'[^A-Za-z0-9._-]', '_', key)}.{suffix}"
 
 
 def _claim(what: str, key: str, stack: contextlib.AsyncExitStack) -> None:
-    lock = os.open(
-        _robot_file(what.partition(" ")[0], key, "lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660
-    )
-    stack.callback(os.close, lock)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        owner = os.pread(lock, 32, 0).decode(errors="replace").strip()
-        raise AlreadyRunning(f"{what} belongs to process {owner or '?'}", hint="stop it first") from None
-    os.ftruncate(lock, 0)
-    os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
+    lock = LockFile(_robot_file(what.partition(" ")[0], key, "lock"), what, "a runner")
+    lock.acquire()
+    stack.callback(lock.release)
 
 
 def summary(result: RunResult, runner: HardwareRunner, success: bool | None, robot_id: str) -> str:

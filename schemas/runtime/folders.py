@@ -9,21 +9,36 @@ import errno
 import fcntl
 import os
 import stat
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from schemas.endpoints import runtime_dir
 from schemas.errors import AlreadyRunning, ConfigError
-from schemas.runtime.trust import trusts
+from schemas.runtime.trust import ROOT, trusts
 
 CHOOSE: Final = "choose a folder that this program may write"
 _FOLDER: Final = os.O_DIRECTORY | os.O_CLOEXEC
 
 
-def private_folder(folder: Path, group: int | None = None, *, make: bool = True) -> None:
+def socket_folder(
+    folder: Path, environ: Mapping[str, str], group: int | None = None, *, shared: bool = False
+) -> None:
+    """Make or check the folder of a socket, as `private_folder` does. Only the runtime folder is made: a mistyped endpoint leaves no trace."""
+    try:
+        default = Path(runtime_dir(environ, os.getuid()))
+    except ConfigError:
+        default = None
+    private_folder(folder, group, make=default is not None and folder == default.absolute(), shared=shared)
+
+
+def private_folder(
+    folder: Path, group: int | None = None, *, make: bool = True, shared: bool = False
+) -> None:
     """Make the last component of `folder`, 0700, or 0750 with `group`; check a folder that exists.
 
-    A folder that exists must belong to this user, root or the arbiter's service user, and must not be writable by others (by a
-    group only with the sticky bit, as the shared folder of the units). Raises ConfigError.
+    A folder that exists must belong to this user or root, if it is `shared` also to the arbiter's service user, and must not be writable
+    by others (by a group only with the sticky bit, as the shared folder of the units). Raises ConfigError.
     """
     try:
         parent = os.open(folder.parent, _FOLDER | os.O_PATH)
@@ -31,7 +46,7 @@ def private_folder(folder: Path, group: int | None = None, *, make: bool = True)
         raise ConfigError(f"{folder.parent}: {error.strerror}", hint=CHOOSE) from error
     try:
         made = make and _made(folder, parent)
-        opened = _open_folder(folder, parent)
+        opened = _open_folder(folder, parent, shared=shared)
         try:
             if made and group is not None:
                 os.fchown(opened, -1, group)
@@ -52,7 +67,7 @@ def _made(folder: Path, parent: int) -> bool:
     return True
 
 
-def _open_folder(folder: Path, parent: int | None = None) -> int:
+def _open_folder(folder: Path, parent: int | None = None, *, shared: bool = True) -> int:
     """A descriptor of a folder that passed the checks of `private_folder`. Raises ConfigError, OSError."""
     path = folder if parent is None else Path(folder.name or ".")
     try:
@@ -63,7 +78,7 @@ def _open_folder(folder: Path, parent: int | None = None) -> int:
             raise ConfigError(f"{folder} {what}", hint="name the folder itself") from error
         raise
     try:
-        if problem := _problem(os.fstat(opened)):
+        if problem := _problem(os.fstat(opened), shared):
             raise ConfigError(f"{folder} {problem}", hint="use a folder of your own with mode 0700")
     except BaseException:
         os.close(opened)
@@ -71,9 +86,10 @@ def _open_folder(folder: Path, parent: int | None = None) -> int:
     return opened
 
 
-def _problem(found: os.stat_result) -> str:
+def _problem(found: os.stat_result, shared: bool) -> str:
     """Why other users could exchange the files of a folder; empty: they cannot."""
-    if not trusts(found.st_uid, "arbiter"):
+    own = found.st_uid in (os.geteuid(), ROOT)
+    if not (own or (shared and trusts(found.st_uid, "arbiter"))):
         return f"belongs to uid {found.st_uid}"
     if found.st_mode & stat.S_IWOTH:
         return "may be written by every user"
@@ -136,7 +152,7 @@ class LockFile:
             if folder is not None:
                 os.close(folder)
         found = os.fstat(fd)
-        if stat.S_ISREG(found.st_mode) and found.st_nlink == 1 and found.st_uid in (os.geteuid(), 0):
+        if stat.S_ISREG(found.st_mode) and found.st_nlink == 1 and found.st_uid in (os.geteuid(), ROOT):
             return fd
         os.close(fd)
         raise ConfigError(

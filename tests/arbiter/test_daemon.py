@@ -71,7 +71,7 @@ def test_a_typo_in_the_configuration_is_named_with_its_line(make_arbiter: Make) 
         (["--gpu", "fake:8GX", "--check-config"], "not a size"),
         (["--endpoint", "tcp://127.0.0.1:5555"], "without CURVE keys"),
         (["--config", "/nonexistent/arbiter.yaml"], "readable YAML file"),
-        (["--state-dir", "/proc/nonexistent", "--gpu", "fake:8GiB"], "the daemon may write"),
+        (["--state-dir", "/proc/nonexistent", "--gpu", "fake:8GiB"], "this program may write"),
         (["--nonsense"], "unrecognized arguments"),
     ],
 )

@@ -293,7 +293,7 @@ def test_a_port_has_one_runner_whatever_its_robots_are_called(
     async def scenario() -> None:
         async with contextlib.AsyncExitStack() as stack:
             claim(robot("left", bus), stack)
-            with pytest.raises(AlreadyRunning, match=f"by-id belongs to process {os.getpid()}"):
+            with pytest.raises(AlreadyRunning, match=rf"pid {os.getpid()}\) already uses port .*by-id"):
                 claim(robot("right", link), stack)
             claim(robot("other", tmp_path / "ttyACM1"), stack)
 
@@ -308,7 +308,7 @@ def test_a_robot_has_one_runner(start: Start, tmp_path: Path) -> None:
         second = start("--endpoint", f"ipc://{tmp_path}/second.sock")
         _, err = await asyncio.to_thread(second.communicate, timeout=60)
         assert second.returncode == 1
-        assert f"robot bench belongs to process {first.pid}" in err
+        assert f"(pid {first.pid}) already uses robot bench" in err
 
     play(tmp_path, body)
 

@@ -16,7 +16,7 @@ import msgpack
 import pytest
 import zmq
 
-from arbiter.rpc.server import FLOOD, RouterServer, make_private_folder, socket_path
+from arbiter.rpc.server import FLOOD, RouterServer
 from arbiter.testing.wire import WireClient
 from schemas.errors import ConfigError
 
@@ -330,40 +330,8 @@ def test_a_stale_socket_is_replaced_and_close_removes_it(folder: Path) -> None:
     assert not path.exists()
 
 
-@pytest.mark.parametrize(
-    ("endpoint", "words"),
-    [
-        ("tcp://127.0.0.1:1", "CURVE"),
-        ("ipc://x", "absolute"),
-        ("x", "not an endpoint"),
-        ("ipc:///" + "x" * 200, "107"),
-    ],
-)
-def test_endpoints_that_are_not_served(endpoint: str, words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
-        socket_path(endpoint)
-
-
-def test_a_folder_is_made_private(folder: Path) -> None:
-    make_private_folder(folder / "a" / "b", None)
-    assert stat.S_IMODE((folder / "a" / "b").stat().st_mode) == 0o700
-    make_private_folder(folder / "c", os.getgid())
-    assert stat.S_IMODE((folder / "c").stat().st_mode) == 0o750
-    (folder / "file").touch()
-    with pytest.raises(ConfigError):
-        make_private_folder(folder / "file", None)
-
-
 def test_an_unbindable_path_is_a_config_error(folder: Path) -> None:
     server = RouterServer(folder / "no-such-folder" / "a.sock", LIMIT, None)
     with pytest.raises(ConfigError, match="cannot bind"):
         server.bind()
     server.close()
-
-
-@pytest.mark.skipif(os.getuid() != 0, reason="only root can make a folder of somebody else")
-def test_a_folder_of_somebody_else_is_refused(folder: Path) -> None:
-    (folder / "x").mkdir()
-    os.chown(folder / "x", 54_321, -1)
-    with pytest.raises(ConfigError, match="belongs to uid 54321"):
-        make_private_folder(folder / "x", None)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from schemas.errors import AlreadyRunning, ConfigError
-from schemas.runtime.folders import LockFile, private_folder
+from schemas.runtime.folders import LockFile, private_folder, socket_folder
 
 FOREIGN = 54_321
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can make files of another user")
@@ -77,8 +77,18 @@ def test_a_folder_of_another_user_is_refused(tmp_path: Path, monkeypatch: pytest
     os.chown(folder, FOREIGN, -1)
     with pytest.raises(ConfigError, match=f"belongs to uid {FOREIGN}"):
         private_folder(folder)
+    with pytest.raises(ConfigError, match=f"belongs to uid {FOREIGN}"):
+        private_folder(folder, shared=True)
     monkeypatch.setenv("VRAM_ARBITER_SERVER_USERS", str(FOREIGN))
-    private_folder(folder)
+    private_folder(folder, shared=True)  # as sidecars do in the folder of the arbiter's unit
+
+
+def test_only_the_runtime_folder_is_made_for_a_socket(tmp_path: Path) -> None:
+    environ = {"VRAM_ARBITER_RUNTIME": str(tmp_path / "run")}
+    with pytest.raises(ConfigError, match="No such file"):
+        socket_folder(tmp_path / "mistyped", environ)
+    socket_folder(tmp_path / "run", environ)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 # -- lock files --------------------------------------------------------------------------------------------------------
