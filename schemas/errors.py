@@ -78,7 +78,7 @@ class LimitExceeded(CallerError):
 
 # -- leases -----------------------------------------------------------------------------------------------------
 class VramInsufficient(CallerError):
-    code = "vram_insufficient"  # can never fit: details.needed_bytes, capacity_bytes, pinned
+    code = "vram_insufficient"  # can never fit: details.needed_bytes, capacity_bytes, reserve_bytes
 
 
 class HostRamInsufficient(TransientError):

@@ -342,12 +342,11 @@ def _clash(some: list[Lease]) -> bool:
 
 
 def _ever(core: Core, gpu: Gpu, some: list[Lease]) -> bool:
-    """Would they fit if everything left that may? What an unfinished gang holds already stays, as pins do."""
-    staying = {lease.root.id: lease.root for lease in gpu.residents.pinned.values()}
+    """Would they fit if every lease ended but what their own unfinished gang holds already?"""
     mine = some[0].gang
-    staying.update((lease.id, lease) for lease in gpu.residents.values() if lease.gang is mine)
-    fixed = sum(gpu.ledger.charge_bytes(one.id) for root in staying.values() for one in root.tree())
-    alone = any(one.spec.exclusive for one in [*some, *staying.values()])
+    staying = [lease for lease in gpu.residents.values() if lease.gang is mine]
+    fixed = sum(gpu.ledger.charge_bytes(one.id) for root in staying for one in root.tree())
+    alone = any(one.spec.exclusive for one in [*some, *staying])
     if alone and len(some) + len(staying) > 1:
         return False
     return fixed + sum(_needs(some).values()) <= gpu.ledger.budget_bytes

@@ -14,7 +14,7 @@ Per card, in this order (the numbers stand in `_serve`):
 
 from collections.abc import Mapping
 
-from arbiter.core import costs, eviction, explain, families, gangs, growth, placement, policy, standby
+from arbiter.core import costs, eviction, explain, families, gangs, growth, policy, standby
 from arbiter.core.lease import Lease, LeaseState
 from arbiter.core.readings import note_pressure
 from arbiter.core.state import Core, Gpu
@@ -30,8 +30,6 @@ def schedule(core: Core) -> None:
             if gpu.dirty:
                 gpu.dirty = False
                 pending = True
-                if gpu.residents.unpinned:
-                    placement.reconsider(core, gpu)
                 _serve(core, gpu)
 
 

@@ -109,9 +109,8 @@ def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool
 
 
 def largest_growth_bytes(gpu: Gpu, lease: Lease) -> int:
-    """The most that a resident lease could ever get on top, once everybody has left who may be asked to."""
-    stay = {lease.id, *gpu.residents.pinned}
-    going = {other.id: 0 for other in gpu.residents.values() if other.id not in stay}
+    """The most that a resident lease could ever get on top, once every other lease has ended."""
+    going = {other.id: 0 for other in gpu.residents.values() if other is not lease}
     return gpu.ledger.budget_bytes - gpu.ledger.total_if(going)
 
 

@@ -22,8 +22,6 @@ class Residents(dict[LeaseId, Lease]):
         self.exclusive: dict[LeaseId, Lease] = {}
         self.pinned: dict[LeaseId, Lease] = {}
         """Never asked to leave, by their own wish or an operator's."""
-        self.unpinned = False
-        """A pin has ended, and nobody has looked whose place that makes this card (`placement`)."""
         self.recent: dict[LeaseId, Lease] = {}
         """All that were granted or became ready since the newest reading began, and perhaps some more."""
         self.touched: set[LeaseId] = set()
@@ -53,7 +51,6 @@ class Residents(dict[LeaseId, Lease]):
             return None
         super().__delitem__(lease_id)
         lease.roster = None
-        self.unpinned = self.unpinned or lease_id in self.pinned
         for table in (self._by_state[lease.state], self.exclusive, self.pinned, self.recent):
             table.pop(lease_id, None)
         self.touched.add(lease_id)
@@ -69,7 +66,7 @@ class Residents(dict[LeaseId, Lease]):
     def refresh(self, lease: Lease) -> None:
         """Whether it may be asked to leave has changed."""
         if lease.evictable:
-            self.unpinned = self.pinned.pop(lease.id, None) is not None or self.unpinned
+            self.pinned.pop(lease.id, None)
         else:
             self.pinned[lease.id] = lease
 

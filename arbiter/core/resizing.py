@@ -74,10 +74,9 @@ def _check_ever_fits(gpu: Gpu, lease: Lease, target: int, charge: int) -> None:
         return
     raise Refused(
         "vram_insufficient",
-        f"{lease.spec.consumer} would need {target} bytes; beside what never leaves it can have {charge + room}",
-        "stay smaller, or unpin what is resident",
+        f"{lease.spec.consumer} would need {target} bytes; alone on its GPU it can have {charge + room}",
+        "stay smaller",
         needed_bytes=target,
         capacity_bytes=gpu.info.capacity_bytes,
         reserve_bytes=gpu.info.reserve_bytes,
-        pinned=[other for other in gpu.residents.pinned if other != lease.id],
     )

@@ -236,6 +236,17 @@ class CoreDriver:
             self.advance(step_s)
         return self.now - began
 
+    def shrink(self, gpu: GpuId, capacity_bytes: int) -> None:
+        """Another, smaller card is in the place of this one from the next `restart` on."""
+        gpus = tuple(
+            replace(info, capacity_bytes=capacity_bytes, total_bytes=capacity_bytes)
+            if info.id == gpu
+            else info
+            for info in self.settings.gpus
+        )
+        self.settings = replace(self.settings, gpus=gpus)
+        self.cards[gpu].total_bytes = capacity_bytes
+
     def restart(self, *, epoch: int = 2, keep_journal: bool = True) -> None:
         """kill -9 of the daemon: a new core, the journal's records, no memory of anything else."""
         self.settings = replace(self.settings, epoch=epoch)

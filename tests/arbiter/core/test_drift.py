@@ -5,7 +5,7 @@ import pytest
 from arbiter.core.effects import Sample
 from arbiter.testing.core_driver import CoreDriver, refusal
 from schemas import defaults as d
-from schemas.ids import LeaseId
+from schemas.ids import GpuId, LeaseId
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -179,10 +179,11 @@ def test_what_was_learnt_never_asks_for_more_than_a_whole_card() -> None:
 
 
 def test_a_refusal_says_that_the_figure_was_learnt() -> None:
-    driver = CoreDriver(8 * GIB, settings={"footprints": {"det det-model": {"steady": [6 * GIB]}}})
-    pin = driver.consumer("pin")
-    pin.acquire(4 * GIB, evictable=False)
-    refused = refusal(driver.consumer("det").try_acquire(2 * GIB))
+    settings = {"footprints": {"det det-model": {"steady": [6 * GIB]}}}
+    driver = CoreDriver(8 * GIB, cards=2, settings=settings)
+    driver.shrink(GpuId("GPU-1"), 4 * GIB)
+    driver.restart(keep_journal=False)
+    refused = refusal(driver.consumer("det").try_acquire(2 * GIB, gpu="1"))
     assert "declared, more was measured" in refused.message
     assert (refused.details["needed_bytes"], refused.details["declared_bytes"]) == (6 * GIB, 2 * GIB)
 

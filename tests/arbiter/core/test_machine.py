@@ -139,7 +139,7 @@ class Leases(RuleBasedStateMachine):
         effects = person.try_acquire(size, steady, wait_timeout_s=bound, **spec)
         self.taking_over = {}
         reply = next((effect for effect in effects if isinstance(effect, Reply)), None)
-        if reply is None:  # beside a pinned lease it can never fit
+        if reply is None:  # it can never fit
             return None
         lease = LeaseId(reply.body["lease"]["lease_id"])
         person.specs[lease] = person.spec(size, steady, **spec)

@@ -58,14 +58,12 @@ def test_a_model_over_two_cards_is_two_leases_of_one_process() -> None:
     driver.until(lambda: driver.gpu(0)["charged_bytes"] + driver.gpu(1)["charged_bytes"] == 0, limit_s=2.0)
 
 
-def test_pins_count_for_their_own_card_only() -> None:
+def test_pins_are_in_the_way_on_their_own_card_only() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
-    _, pinned = held(driver, "pinned", 5, gpu="0", evictable=False)
-    assert (
-        refusal(driver.consumer("a").try_acquire(5 * GIB, gpu="0")).details["pinned"][0]["lease_id"] == pinned
-    )
+    held(driver, "pinned", 5, gpu="0", evictable=False)
+    waiter = driver.consumer("a").acquire(5 * GIB, gpu="0")
     _, lease = held(driver, "b", 5)
-    assert place(driver, lease) == ONE
+    assert (place(driver, lease), driver.state(waiter)) == (ONE, "queued")
 
 
 def test_exclusive_means_alone_on_its_card() -> None:

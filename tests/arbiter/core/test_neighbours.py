@@ -95,7 +95,9 @@ def test_13_two_claims_of_six_on_a_card_of_eight() -> None:
     driver = CoreDriver(8 * GIB)
     first = driver.consumer("a").acquire(6 * GIB, evictable=False)
     assert driver.state(first) == "loading"
-    assert refusal(driver.consumer("b").try_acquire(6 * GIB)).code == "vram_insufficient"
+    second = driver.consumer("b").acquire(6 * GIB, wait_timeout_s=5.0)
+    driver.advance(6.0)
+    assert driver.pushes("denied", second)[0]["error"]["code"] == "wait_timeout"
     second = driver.consumer("c").acquire(1 * GIB)
     driver.advance(30.0)
     assert driver.state(second) == "queued", "the first still loads"

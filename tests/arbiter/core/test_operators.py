@@ -167,12 +167,14 @@ def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consum
     assert other.notes("operator")[-1]["action"] == "unpin"
 
 
-def test_a_request_that_a_pin_makes_impossible_is_refused_at_once(driver: CoreDriver, ops: Consumer) -> None:
+def test_a_request_that_a_pin_is_in_the_way_of_waits_for_the_unpin(driver: CoreDriver, ops: Consumer) -> None:
     _, lease = held(driver, "det", 5 * GIB)
     ask(ops, "pin", lease)
-    refused = refusal(driver.consumer("policy").try_acquire(4 * GIB))
-    assert refused.code == "vram_insufficient"
-    assert refused.details["pinned"][0]["consumer"] == "det"
+    waiter = driver.consumer("policy").acquire(4 * GIB)
+    driver.advance(10.0)
+    assert (driver.state(waiter), driver.state(lease)) == ("queued", "held")
+    ask(ops, "unpin", lease, "")
+    assert driver.state(lease) == "revoking"
 
 
 def test_a_waiter_can_be_pinned_for_when_it_holds(driver: CoreDriver, ops: Consumer) -> None:

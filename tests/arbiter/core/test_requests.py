@@ -82,23 +82,29 @@ def test_what_can_never_fit_fails_at_once(driver: CoreDriver) -> None:
         "declared_bytes": 8 * GIB,
         "capacity_bytes": 8 * GIB,
         "reserve_bytes": d.RESERVE_BYTES,
-        "pinned": [],
     }
 
 
-def test_pinned_leases_count_as_gone_room(driver: CoreDriver) -> None:
-    pin = driver.consumer("pin")
-    lease = pin.acquire(4 * GIB, evictable=False)
+@pytest.mark.parametrize("spec", [{}, {"exclusive": True}])
+def test_beside_a_pinned_holder_a_request_waits(driver: CoreDriver, spec: dict[str, Any]) -> None:
+    """A pinned program ends one day. Two `vramctl run --vram 6GiB` are no reason to say that the second can never fit: its own timeout
+    counts."""
+    pin, big = driver.consumer("pin"), driver.consumer("big")
+    lease = pin.acquire(6 * GIB, evictable=False, **spec)
     pin.load(lease)
-    refused = refusal(driver.consumer("big").try_acquire(4 * GIB))
-    assert refused.details["pinned"] == [{"lease_id": lease, "consumer": "pin", "bytes": 4 * GIB}]
-    assert refusal(driver.consumer("alone").try_acquire(1 * GIB, exclusive=True)).code == "vram_insufficient"
-    assert driver.consumer("small").acquire(1 * GIB)
-
-
-def test_nothing_goes_beside_a_pinned_exclusive_lease(driver: CoreDriver) -> None:
-    driver.consumer("pin").acquire(1 * GIB, evictable=False, exclusive=True)
-    assert refusal(driver.consumer("small").try_acquire(1 * GIB)).code == "vram_insufficient"
+    bounded = big.acquire(6 * GIB, wait_timeout_s=5.0, **spec)
+    second = driver.consumer("second").acquire(6 * GIB, **spec)
+    driver.advance(4.0)
+    assert (driver.state(bounded), driver.state(second)) == ("queued", "queued")
+    (blocker,) = driver.arbiter.why("big", driver.now)["leases"][0]["blockers"]
+    assert (blocker["consumer"], blocker["condition"]) == ("pin", "is pinned")
+    driver.advance(2.0)
+    (denied,) = driver.pushes("denied", bounded)
+    assert denied["error"]["code"] == "wait_timeout"
+    assert "pin (is pinned)" in denied["error"]["message"]
+    assert driver.pushes("revoke", lease) == []
+    pin.unload(lease)
+    driver.until(lambda: driver.state(second) == "loading")
 
 
 def test_an_unknown_card_is_named(driver: CoreDriver) -> None:

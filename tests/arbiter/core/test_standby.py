@@ -356,14 +356,20 @@ def test_reacquire_of_what_is_not_coming_back_is_refused() -> None:
 
 
 def test_reacquire_that_can_never_fit_changes_nothing() -> None:
+    """It was granted once; after a restart there is a smaller card."""
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, standby=True)
     policy = driver.consumer("policy")
-    wanted = policy.acquire(5 * GIB, evictable=False)
+    wanted = policy.acquire(5 * GIB)
     driver.until(lambda: driver.state(lease) == "revoking")
     det.unload(lease)
     driver.until(lambda: driver.state(wanted) == "loading")
-    policy.load(wanted)
+    token = det.token(lease)
+    policy.die()
+    driver.shrink(driver.card.gpu, 4 * GIB)
+    driver.restart()
+    det.connect()
+    answer(det.reattach(lease, token, away=True))
     assert refusal(det.reacquire(lease)).code == "vram_insufficient"
     assert driver.state(lease) == "standby"
 
