@@ -46,15 +46,21 @@ def obstacle(endpoint: str) -> tuple[str, str] | None:
 
 
 def _who_may(path: str) -> str:
-    """The group that may use it, where it can be seen from outside."""
-    try:
-        found = os.stat(path)
-    except OSError:
-        return "its folder is closed to you: use its user, or root"
+    """Name the group that may use a socket: its own, or that of the folder which hides it."""
+    place, opens, hidden = path, stat.S_IWGRP, ""
+    while True:
+        try:
+            found = os.stat(place)
+            break
+        except OSError:
+            if place in ("/", ""):
+                return "its folder is closed to you: use its user, or root"
+            place, opens, hidden = os.path.dirname(place), stat.S_IXGRP, "its folder is closed to you: "
+    if not stat.S_IMODE(found.st_mode) & opens:
+        only = "use its user, or root" if hidden else "only its own user may: use it, or root"
+        return f"{hidden}{only}; wire.group opens it to a group"
     try:
         group = grp.getgrgid(found.st_gid).gr_name
     except KeyError:
         group = str(found.st_gid)
-    if stat.S_IMODE(found.st_mode) & stat.S_IWGRP:
-        return f"join the group {group} (log in again), or use root"
-    return "only its own user may: use it, or root; wire.operators_group opens it to a group"
+    return f"{hidden}join the group {group} (log in again), or use root"

@@ -9,6 +9,7 @@ import resource
 import shutil
 import sqlite3
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -130,6 +131,12 @@ def test_a_full_disk_blocks_grants_and_nothing_else(arbiter: ArbiterProcess, dis
         assert refused["error"]["code"] == "journal_unavailable"
         assert any("journal cannot be written" in problem for problem in client.ask("status")["problems"])
         arbiter.wait_for("journal cannot be written", PATIENCE_S)
+        doctor = subprocess.run(
+            [sys.executable, "-m", "clients", "doctor"],
+            env=arbiter.environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+        )  # fmt: skip
+        assert doctor.returncode == 1, "a daemon that can grant nothing is not healthy"
+        assert "BAD  files" in doctor.stdout
         assert sorted(consumers(client)) == ["goes", "stays"]
         assert client.ask("renew", leases=[on])["ok"]
 

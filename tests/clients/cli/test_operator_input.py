@@ -3,6 +3,7 @@
 Real daemon, real programs. The table of exit codes is in docs/operating.md.
 """
 
+import grp
 import json
 import os
 import signal
@@ -154,6 +155,9 @@ def test_who_is_no_operator_may_look_and_is_told_who_may_act(
     assert "join the group root" in shut_out.stderr
     arbiter_daemon.runtime.chmod(0o700)
     assert "its folder is closed to you" in one_line(vramctl(environ, "status", program=stranger))
+    os.chown(arbiter_daemon.runtime, -1, grp.getgrnam("daemon").gr_gid)
+    arbiter_daemon.runtime.chmod(0o750)  # as the daemon makes it for a group
+    assert "join the group daemon" in one_line(vramctl(environ, "status", program=stranger))
 
 
 def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) -> None:
