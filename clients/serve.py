@@ -103,12 +103,18 @@ class RouterServer:
     """`async with RouterServer(endpoint, on_error) as server: await server.serve(handler)`.
 
     A handler runs in a task of its own, so that a slow one delays no other request; its work up to the first wait is done at once.
-    Args: `message_max_bytes` bounds one request; beside binary values, as pictures are, it holds at most 1 MiB.
+    Args: `message_max_bytes` bounds one request; beside binary values, as pictures are, it holds at most 1 MiB. `work_share` as in
+    `schemas.runtime.router.Limits`.
     Raises ConfigError for an endpoint that cannot be bound, AlreadyRunning when a living server has it.
     """
 
     def __init__(
-        self, endpoint: str, on_error: ErrorReply, *, message_max_bytes: int = IMAGES_MAX_BYTES
+        self,
+        endpoint: str,
+        on_error: ErrorReply,
+        *,
+        message_max_bytes: int = IMAGES_MAX_BYTES,
+        work_share: float = 1.0,
     ) -> None:
         self.endpoint = endpoint
         self._path = path_of(endpoint)
@@ -127,6 +133,7 @@ class RouterServer:
             out_max_bytes=several_bytes,
             user_out_max_bytes=2 * several_bytes,
             user_in_max_bytes=several_bytes,
+            work_share=work_share,
         )
         self._router = Router(self._path, self, limits)
         self._clients: dict[int, _Client] = {}  # by serial

@@ -49,6 +49,7 @@ from schemas.world import WorldState
 log = logging.getLogger(__name__)
 
 READS_MAX = 16  # requests that wait for the control thread; more are refused, so that its mailbox keeps room for others
+WORK_SHARE = 0.25  # of the time, for the goal socket: the control thread waits for this thread's turn with the interpreter
 LOOP_SILENT_S = 1.0  # a control loop that has not looked at the world for so long hangs
 OPS = ("goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "ping", "shutdown")
 
@@ -119,6 +120,7 @@ class GoalServer:
                     self._endpoint,
                     lambda error: _refusal(None, error),
                     message_max_bytes=MESSAGE_MAX_BYTES,
+                    work_share=WORK_SHARE,
                 )
             )
             stack.enter_context(

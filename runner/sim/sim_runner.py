@@ -88,6 +88,9 @@ class SimRunner(SkillRunner):
         self._next_seed: int | None = None
         self._had_skill = False  # in this episode
         self._snapshots: dict[str, Snapshot] = {}
+        self._rendered_in: dict[
+            str, int
+        ] = {}  # the tick of the last picture that a request has cost, by camera
         self._shown: Mapping[str, float] | None = None  # by a world that is no robot, before this tick's step
         self._view = EpisodeView()
 
@@ -160,11 +163,15 @@ class SimRunner(SkillRunner):
         return self._cameras
 
     def snapshot(self, camera: str, max_age_s: float) -> Snapshot:
-        """Control thread: a picture no older than `max_age_s`, rendered now unless a recent one is at hand."""
+        """Control thread: a picture no older than `max_age_s`, rendered now unless a recent one is at hand. Once a tick and camera: no crowd
+        of requests for pictures makes a tick long, and the world stands still within one."""
         known = self._snapshots.get(camera)
         newest_ns = self.clock.now_ns() - int(min(max_age_s, FRAME_REUSE_S) * 1e9)
-        if known is not None and known.stamp_ns >= newest_ns:
+        if known is not None and (
+            known.stamp_ns >= newest_ns or self._rendered_in.get(camera) == self.tick_idx
+        ):
             return known
+        self._rendered_in[camera] = self.tick_idx
         return self._render(camera)
 
     def _render(self, camera: str) -> Snapshot:

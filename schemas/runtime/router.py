@@ -81,6 +81,11 @@ class Limits:
     user_out_max_bytes: int = 64 * MIB
     user_in_max_bytes: int = 16 * MIB
     """Incomplete messages of all connections of one user."""
+    work_share: float = 1.0
+    """Largest share of the time for accepting and handling. Below 1 the loop rests between its
+    turns, so that another thread of the process, as a control loop, gets the interpreter at once
+    while a flood lasts.
+    """
 
 
 class Handler(Protocol):
@@ -332,6 +337,7 @@ class Router:
         self.handler = handler
         self.limits = limits or Limits()
         self._group = group
+        self._direct_share = min(DIRECT_SHARE, self.limits.work_share)
         self._listener: socket.socket | None = None
         self._inode: tuple[int, int] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -446,10 +452,11 @@ class Router:
     # -- accepting ---------------------------------------------------------------------------------
     def _accept(self) -> None:
         """1. Take a few from the backlog. 2. Ask the kernel for the peer. 3. Room within the
-        shares. 4. Open the transport.
+        shares. 4. Open the transport. Where more may wait: 5. Rest.
         """
         assert self._listener is not None
         loop = self._loop_or_fail
+        began = loop.time()
         for _ in range(ACCEPT_MAX):
             try:
                 sock, _address = self._listener.accept()  # 1
@@ -478,6 +485,11 @@ class Router:
             opening = loop.create_task(loop.connect_accepted_socket(partial(_the, connection), sock))  # 4
             self._opening.add(opening)
             opening.add_done_callback(self._opened)
+        if self.limits.work_share < 1:  # 5
+            # opening and closing cost as much again, in callbacks of their own
+            rest_s = self._rest_s(2 * (loop.time() - began))
+            loop.remove_reader(self._listener.fileno())
+            loop.call_later(rest_s, self._resume_accept)
 
     def _opened(self, opening: "asyncio.Task[object]") -> None:
         self._opening.discard(opening)
@@ -585,7 +597,7 @@ class Router:
         more = True
         if not self._turns:
             now = self._loop_or_fail.time()
-            self._credit_s = min(TURN_S, self._credit_s + (now - self._credit_at) * DIRECT_SHARE)
+            self._credit_s = min(TURN_S, self._credit_s + (now - self._credit_at) * self._direct_share)
             self._credit_at = now
             if self._credit_s > 0:
                 more = connection.handle()
@@ -595,15 +607,19 @@ class Router:
             self._turns.add(connection, (connection.peer.uid, connection.peer.process))
             self._schedule_turn()
 
-    def _schedule_turn(self) -> None:
+    def _schedule_turn(self, after_s: float = 0.0) -> None:
         if not self._turn_scheduled:
             self._turn_scheduled = True
-            self._loop_or_fail.call_soon(self._take_turns)
+            if after_s > 0:
+                self._loop_or_fail.call_later(after_s, self._take_turns)
+            else:
+                self._loop_or_fail.call_soon(self._take_turns)
 
     def _take_turns(self) -> None:
         self._turn_scheduled = False
         loop = self._loop_or_fail
-        end = loop.time() + TURN_S
+        began = loop.time()
+        end = began + TURN_S
         while self._turns:
             connection = self._turns.pop()
             if connection.handle():
@@ -611,7 +627,10 @@ class Router:
             if loop.time() >= end:
                 break
         if self._turns:
-            self._schedule_turn()
+            self._schedule_turn(self._rest_s(loop.time() - began))
+
+    def _rest_s(self, worked_s: float) -> float:
+        return worked_s * (1.0 / self.limits.work_share - 1.0)
 
     def _deliver(self, connection: Connection, payload: bytes | bytearray | Oversize) -> bool:
         if not self._receiving:

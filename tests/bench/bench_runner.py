@@ -14,6 +14,7 @@ has such gaps, as a whole period each.
 import asyncio
 import itertools
 import json
+import socket
 import subprocess
 import sys
 import time
@@ -30,14 +31,20 @@ from clients.runner import RunnerClient
 from clients.sidecar.perception import DetectorClient
 from clients.sidecar.policy import PolicyClient
 from schemas.errors import RunnerUnreachable, SidecarUnavailable
+from schemas.estop import REPLY_MAX_BYTES, Answer, path_of, reply_in, request
 
 ROOT = Path(__file__).parents[2]
 SKILLS = {"detector": "so101-detector", "grab": "so101-grab"}
 GRAB = "vram-arbiter/so101-grab"
 NAVIGATE = "vram-arbiter/so101-navigate"
 TURN_RAD = 6.0  # some eight seconds of driving
+ATTACKER = ROOT / "tests/clients/attacker.py"
+ATTACKS = ("empties", "maps", "more", "connects")
 RATE_HZ = 30.0
 JITTER_MAX_US = 2000.0
+STOP_MAX_US = 10_000.0
+STOPS = 200
+STOP_PAUSE_S = 0.01
 NO_HOLD = "scheduling:\n  thrash_hold_max_s: 0\n"  # it would slow down on purpose what is measured here
 FOOTPRINT = "5GB,5GB,450MiB"  # of each, on 8 GiB; without the simulated bandwidth of a real load there are more switches in a second
 BOOT_S = 240.0
@@ -96,6 +103,10 @@ class Measured:
     switches_us: list[float]
     goals_us: list[float]
     cold_goals_us: list[float]
+    attacked: list[Stretch]
+    attacked_state_us: list[float]
+    stops_us: list[float]
+    attacked_stops_us: list[float]
 
     def rows(self) -> list[RunnerRow]:
         alone, beside = self._within(self.idle), self._within(self.switching)
@@ -103,9 +114,24 @@ class Measured:
         jitter = _compare("tick_jitter", _us(busy, "late_ms"), _us(idle, "late_ms"))
         assert jitter.p99_us is not None
         jitter.target, jitter.ok = "p99 < 2 ms", jitter.p99_us < JITTER_MAX_US
+        attacked = _compare(
+            "tick_jitter under attack",
+            _us(_all(self._within(self.attacked)), "late_ms"),
+            _us(idle, "late_ms"),
+        )
+        assert attacked.p99_us is not None
+        attacked.target, attacked.ok = "p99 < 2 ms", attacked.p99_us < JITTER_MAX_US
+        stops = _compare(
+            "emergency stop under attack: asked to latched", self.attacked_stops_us, self.stops_us
+        )
+        assert stops.p99_us is not None
+        stops.target, stops.ok = "p99 < 10 ms", stops.p99_us < STOP_MAX_US
         driven, driven_beside = self._within(self.driving), self._within(self.driving_beside)
         return [
             jitter,
+            attacked,
+            stops,
+            RunnerRow("state, asked by another client under attack", p50(self.attacked_state_us), p99(self.attacked_state_us)),
             _compare(
                 "tick_jitter while it drives and is filmed",
                 _us(_all(driven_beside), "late_ms"),
@@ -159,7 +185,7 @@ def _compare(name: str, busy: Sequence[float], idle: Sequence[float]) -> RunnerR
 
 # -- the run ------------------------------------------------------------------------------------------------------------
 async def _measure(daemon: ArbiterProcess, rounds: int, stretch_s: float) -> Measured:
-    found = Measured([], [], [], [], [], [], [], [], [])
+    found = Measured([], [], [], [], [], [], [], [], [], [], [], [], [])
     timings = daemon.runtime / "ticks.jsonl"
     video = daemon.runtime / "episode.mp4"
     words = ["runner", "sim", "--seed", "1", "--video", str(video), "--timings", str(timings)]
@@ -185,6 +211,9 @@ async def _measure(daemon: ArbiterProcess, rounds: int, stretch_s: float) -> Mea
                 await _drive(found, runner, detector, grab, stretch_s)
             found.starting.append(await _start_another(daemon, [process]))
             await _goals(found, runner, detector, grab, 3 * rounds)
+            for attack in ATTACKS:
+                await _attacked(found, runner, attack, stretch_s / 2)
+            await _stops(found, runner)
     found.ticks = [json.loads(line) for line in timings.read_text().splitlines()]
     return found
 
@@ -244,6 +273,58 @@ async def _goals(
         frame = await runner.frame("front", encoding="png")
         await detector.detect(frame["data"], "red cube", timeout_s=BOOT_S)
         found.cold_goals_us.append(await _goal(runner))
+
+
+async def _attacked(found: Measured, runner: RunnerClient, attack: str, stretch_s: float) -> None:
+    """Another process of the same user attacks the goal socket; a client that was there before asks for the state."""
+    with _attackers(runner, [attack]):
+        began = time.monotonic()
+        while time.monotonic() - began < stretch_s:
+            asked = time.perf_counter()
+            await runner.state()
+            found.attacked_state_us.append((time.perf_counter() - asked) * 1e6)
+            await asyncio.sleep(STOP_PAUSE_S)
+        found.attacked.append((began, time.monotonic()))
+
+
+async def _stops(found: Measured, runner: RunnerClient) -> None:
+    """The last that is measured: the robot stays stopped. First nothing beside, then all attacks at once."""
+    for stops_us, attacks in ((found.stops_us, ()), (found.attacked_stops_us, ATTACKS)):
+        with _attackers(runner, attacks):
+            for _ in range(STOPS):
+                stops_us.append(await asyncio.to_thread(_stop, path_of(runner.endpoint)))
+                await asyncio.sleep(STOP_PAUSE_S)
+
+
+def _stop(path: str) -> float:
+    """Microseconds until the stop is latched, the connection included."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as button:
+        began = time.perf_counter()
+        button.connect(path)
+        button.send(request("bench"))
+        reply = reply_in(button.recv(REPLY_MAX_BYTES))
+        took_us = (time.perf_counter() - began) * 1e6
+    if reply.answer not in (Answer.LATCHED, Answer.ALREADY):
+        raise RuntimeError(f"the runner did not stop: {reply}")
+    return took_us
+
+
+@contextmanager
+def _attackers(runner: RunnerClient, attacks: Sequence[str]) -> Iterator[None]:
+    path = runner.endpoint.removeprefix("ipc://")
+    started: list[subprocess.Popen[bytes]] = []
+    try:
+        for attack in attacks:
+            words = [sys.executable, str(ATTACKER), attack, path]
+            started.append(subprocess.Popen(words, stdout=subprocess.PIPE))
+            assert started[-1].stdout is not None
+            if started[-1].stdout.readline() != b"under way\n":
+                raise RuntimeError(f"the attack {attack} did not begin")
+        yield
+    finally:
+        for process in started:
+            process.kill()
+            process.communicate()
 
 
 async def _goal(runner: RunnerClient) -> float:

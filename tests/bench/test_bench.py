@@ -89,7 +89,8 @@ def test_a_loop_that_stood_still_is_in_the_figures_however_long() -> None:
 
     ticks = [tick(at) for at in (0.0, 1 / 30, 5 + 1 / 30, 10.0, 10 + 1 / 30, 20.0, 20 + 1 / 30)]
     alone, beside, starting = [(10.0, 11.0)], [(0.0, 6.0)], [(20.0, 21.0)]
-    found = Measured(ticks, alone, beside, starting, alone, beside, [1.0], [1.0], [1.0])
+    one = [1.0]
+    found = Measured(ticks, alone, beside, starting, alone, beside, one, one, one, alone, one, one, one)
     (uneven,) = [row for row in found.rows() if "from one start to the next" in row.name]
     assert uneven.p99_us == pytest.approx(5e6, rel=0.05)
     assert uneven.idle_p99_us == pytest.approx(0.0, abs=1.0)

@@ -453,10 +453,30 @@ def test_frames_are_rendered_on_demand_and_reused_while_young(
     assert runner.snapshot("front", 0.5) is first
     assert runner.snapshot("front", 0.02) is not first
     clock.advance(0.2)
+    runner.tick()
     assert runner.snapshot("front", 0.5).stamp_ns == clock.now_ns()
 
 
 @pytest.mark.heavy
+@pytest.mark.heavy
+def test_a_crowd_of_requests_for_pictures_costs_a_tick_one_picture_a_camera(
+    make_runner: Make, env: Any, clock: Any
+) -> None:
+    """Each request that wanted a picture of this instant rendered one in the tick: sixteen of them made it half a second long."""
+    runner = make_runner(rate_hz=0, clock=clock, cameras=("front", "wrist"))
+    runner.activate()
+    runner.tick()
+    pictures = []
+    for _ in range(16):
+        clock.advance(0.001)
+        pictures.append(runner.snapshot("front", 1e-9))
+    assert all(picture is pictures[0] for picture in pictures)
+    assert runner.snapshot("wrist", 1e-9) is not pictures[0]
+    runner.tick()
+    clock.advance(0.001)
+    assert runner.snapshot("front", 1e-9) is not pictures[0]
+
+
 def test_a_skill_sees_the_cameras_it_wants(make_runner: Make) -> None:
     runner, skill = make_runner(rate_hz=0, cameras=("front", "wrist")), Scripted(Hold("x"))
     skill.cameras = ("wrist",)
