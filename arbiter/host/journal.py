@@ -94,7 +94,13 @@ class Journal:
 
     @classmethod
     def open(
-        cls, folder: Path, boot_id: str, *, check: Check | None = None, at_least: int | None = None
+        cls,
+        folder: Path,
+        boot_id: str,
+        *,
+        check: Check | None = None,
+        at_least: int | None = None,
+        seals: type[Seal] = Seal,
     ) -> Self:
         """Open or make the journal in `folder`, and count a new epoch, `at_least` that (else `fresh_epoch`). Raises ConfigError if the
         folder cannot be used, JournalUnavailable if its disk is full, failing or read-only: without a durable epoch tokens could be
@@ -120,7 +126,7 @@ class Journal:
                 records[DOUBT_KEY] = {"why": doubt}
                 digests = _digests_of(records)
             epoch = max(found.epoch + 1, fresh_epoch() if at_least is None else at_least)  # 4
-            seal = Seal.open(folder, epoch, boot_id)  # 5
+            seal = seals.open(folder, epoch, boot_id)  # 5
             total = total_of(digests)
             if not doubt:
                 seal.write(total, total)

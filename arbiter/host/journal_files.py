@@ -230,6 +230,6 @@ def put_rows_aside(folder: Path, found: Found) -> None:
     first = next(iter(found.damaged.items()))
     count = len(found.damaged)
     what = f"{count} records of the journal" if count > 1 else "a record of the journal"
-    found.problems.append(f"{what} could not be used and lies in {aside} ({_decoded(first[0])}: {first[1]})")
+    found.problems.append(f"{what} could not be used: see {aside} ({_decoded(first[0])}: {first[1]})")
     found.put_aside = found.put_aside or aside
     log.error("%s", found.problems[-1])

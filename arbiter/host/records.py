@@ -16,7 +16,7 @@ Count = Annotated[int, Field(ge=0, lt=1 << 62)]
 Bytes = Annotated[int, Field(ge=0, le=1 << 53)]
 Text = Annotated[str, Field(max_length=4 * d.REASON_MAX_CHARS)]
 Id = Annotated[str, Field(min_length=1, max_length=d.NAME_MAX_CHARS)]
-Seconds = Annotated[float, Field(ge=0, le=86_400 * 366, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=0, le=1e10, allow_inf_nan=False)]
 Order = tuple[Text, Text]
 
 
@@ -75,6 +75,7 @@ class LeaseRecord(_Record):
     parked_bytes: Bytes = 0
     left_for: Text = ""
     dismissed: bool = False
+    held_from: Seconds | None = None  # monotonic
     users: Annotated[list[tuple[Pid, Ticks, Id, Text]], Field(max_length=1 << 17)] = []
     spec: _Spec
 

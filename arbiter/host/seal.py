@@ -12,6 +12,7 @@ import struct
 import time
 from dataclasses import dataclass
 from hashlib import sha256
+from io import FileIO
 from pathlib import Path
 from typing import Self
 
@@ -57,15 +58,18 @@ class Sealed:
 class Seal:
     """The open file. `write` raises OSError; its caller says what that stops."""
 
-    def __init__(self, fd: int, head: bytes) -> None:
-        self._fd = fd
+    def __init__(self, file: FileIO, head: bytes) -> None:
+        self._file = file
+        self._fd = file.fileno()
         self._head = head
 
     @classmethod
     def open(cls, folder: Path, epoch: int, boot_id: str) -> Self:
         flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-        fd = os.open(folder / "journal.seal", flags, 0o600)
-        return cls(fd, struct.pack("<8sQ16s", _MAGIC, epoch, _of_boot(boot_id)))
+        file = FileIO(os.open(folder / "journal.seal", flags, 0o600), "r+")
+        if os.fstat(file.fileno()).st_size > _BODY.size:
+            file.truncate(_BODY.size)
+        return cls(file, struct.pack("<8sQ16s", _MAGIC, epoch, _of_boot(boot_id)))
 
     @staticmethod
     def read(folder: Path) -> Sealed | None:
@@ -88,7 +92,7 @@ class Seal:
             raise OSError("the seal was written in part")
 
     def close(self) -> None:
-        os.close(self._fd)
+        self._file.close()
 
 
 @dataclass(frozen=True, slots=True)

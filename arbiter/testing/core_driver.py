@@ -9,6 +9,7 @@ For tests of the core and of whatever stands on it. Knows nothing of sockets or 
     driver.until(lambda: driver.state(lease) == "held")
 """
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -46,6 +47,7 @@ from arbiter.core.events import (
 )
 from arbiter.core.explain import NOTE_KINDS
 from arbiter.core.settings import GpuInfo, Settings
+from arbiter.host.records import check_record
 from schemas import defaults as d
 from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
 
@@ -253,6 +255,8 @@ class CoreDriver:
         self.arbiter = Arbiter(self.settings, self.now)
         self._readings.clear()
         records = dict(self.journal) if keep_journal else {}
+        for key, record in records.items():
+            check_record(key, json.dumps(record))  # what the core writes, the next start takes
         self.post(Recovered(records))
         self.advance(0.01)
 

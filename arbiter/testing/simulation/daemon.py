@@ -94,6 +94,7 @@ class SimDaemon:
         machine, clock = self.machine, self.clock
         self.journal = Journal.open(machine.folder, f"boot-{machine.boot}", check=check_record, at_least=1)
         epoch = self.journal.opened.epoch
+        assert not self.journal.opened.problems, f"the journal is whole: {self.journal.opened.problems}"
         machine.epochs.append(epoch)
         settings = machine.settings(epoch)
         try_records(self.journal, settings)
@@ -174,8 +175,9 @@ class SimDaemon:
 
     def records(self) -> list[str]:
         """Keys in the journal, but for those that are to be deleted with the next write."""
-        found = self.journal._connection.execute("SELECT key FROM records ORDER BY key").fetchall()
-        return [key for (key,) in found if key not in self._executor.owed]
+        rows = self.journal._connection.execute("SELECT key FROM records ORDER BY key").fetchall()
+        found = [key.decode() for (key,) in rows]
+        return [key for key in found if key not in self._executor.owed]
 
     # -- in --------------------------------------------------------------------------------------------------------
     def deliver(self, routing_id: bytes, address: str, payload: bytes) -> None:
