@@ -75,7 +75,7 @@ class LeaseRecord(_Record):
     parked_bytes: Bytes = 0
     left_for: Text = ""
     dismissed: bool = False
-    held_from: Seconds | None = None  # monotonic
+    held_from: Seconds = 0.0  # on the monotonic clock
     users: Annotated[list[tuple[Pid, Ticks, Id, Text]], Field(max_length=1 << 17)] = []
     spec: _Spec
 
