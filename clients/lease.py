@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from clients import inside, traces
 from clients.leaving import Driver, Leaving, Unload
-from clients.records import LeaseRecord, TokenPair
+from clients.records import Eviction, LeaseRecord, TokenPair
 from schemas.errors import (
     BadState,
     LeaseLost,
@@ -92,6 +92,11 @@ class Lease:
     def revoke(self) -> Mapping[str, Any] | None:
         """`schemas.wire.RevokePush` as the arbiter sent it last; None unless it asks for this lease."""
         return self._record.revoke
+
+    @property
+    def evicted(self) -> Eviction | None:
+        """Who made it leave, and why: from the first `revoke` on, and still when the lease is gone. None: nobody did."""
+        return None if self._record.revoke is None else Eviction.of(self._record.revoke)
 
     @property
     def given_up(self) -> bool:
@@ -271,13 +276,15 @@ class Lease:
     # -- steps -------------------------------------------------------------------------------------------------------
     def _raise_if_gone(self) -> None:
         if self._leaving.gone:
-            raise self.error or LeaseLost(f"{self.lease_id} was released", hint="acquire again")
+            told = f"evicted: {gone.reason}" if (gone := self.evicted) else "released"
+            raise self.error or LeaseLost(f"{self.lease_id} was {told}", hint="acquire again")
 
     def _raise_if_leaving(self) -> None:
         self._raise_if_gone()
         if self._leaving.asked or self._record.asleep:
+            told = f": {gone.reason}" if (gone := self.evicted) else ""
             raise LeaseRevoking(
-                f"{self.lease_id} was asked to leave",
+                f"{self.lease_id} was asked to leave{told}",
                 hint="wait until it is granted again, or acquire again",
                 details={"state": self.state},
             )

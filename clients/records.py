@@ -19,6 +19,22 @@ def token_of(message: Message) -> TokenPair:
     return int(epoch), int(serial)
 
 
+@dataclass(frozen=True, slots=True)
+class Eviction:
+    """Who made a lease leave, and why, by the arbiter's word."""
+
+    cause: str  # waiter, pressure, operator, parent; "": an arbiter that does not say
+    by: str  # the consumer that the room is for, or an operator with uid and pid; "" where there is neither
+    reason: str  # in words
+
+    @classmethod
+    def of(cls, push: Message) -> "Eviction":
+        order = push.get("order") or {}
+        return cls(
+            push.get("cause", ""), order.get("by") or push.get("wanted_by", ""), push.get("reason", "")
+        )
+
+
 # -- what the owner is told -----------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Up:

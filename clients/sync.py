@@ -22,6 +22,7 @@ from typing import Any, Self, TypeVar
 from clients import inside
 from clients.aio import CONNECT_TIMEOUT_S, ArbiterClient
 from clients.lease import ForeignUse, Lease, LeaseState, SafePointEta, Use
+from clients.records import Eviction
 from schemas.errors import BadState, VramError
 from schemas.wire import Footprint, LeaseSpec
 
@@ -69,6 +70,11 @@ class SyncLease:
     @property
     def revoking(self) -> bool:
         return self._lease.revoking
+
+    @property
+    def evicted(self) -> Eviction | None:
+        """Who made it leave, and why; see `clients.lease.Lease.evicted`."""
+        return self._lease.evicted
 
     @property
     def error(self) -> VramError | None:

@@ -364,8 +364,10 @@ class RevokePush(TypedDict):
     push: Literal["revoke"]
     lease_id: str
     token: list[int]
-    reason: str
-    wanted_by: str
+    reason: str  # in words
+    wanted_by: str  # the consumer that the room is for; "" where there is none
+    cause: NotRequired[Literal["waiter", "pressure", "operator", "parent"]]
+    order: NotRequired[dict[str, str]]  # an operator wants it: {"by": name, uid and pid, "reason"}
     priority: NotRequired[
         int
     ]  # of the request that wants the room; absent where an operator or the arbiter does

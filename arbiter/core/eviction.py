@@ -9,18 +9,28 @@ from typing import Any, Literal
 
 from arbiter.core import families
 from arbiter.core.effects import Signal
-from arbiter.core.lease import LEAVING, Eviction, Lease, LeaseState
+from arbiter.core.lease import LEAVING, Cause, Eviction, Lease, LeaseState, Order
 from arbiter.core.state import Core, Gpu, Refused
 from schemas.ids import LeaseId
 
 
-def ask(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: str) -> None:
+def ask(
+    core: Core,
+    gpu: Gpu,
+    holder: Lease,
+    waiter: Lease | None,
+    reason: str,
+    *,
+    cause: Cause | None = None,
+    order: Order | None = None,
+) -> None:
     """Ask a holder to leave, and everything that was carved out of it: leaves first. A fresh reading is taken, so that there is
-    something to compare with."""
+    something to compare with. Without a waiter, an `order` of an operator or another `cause` it is for pressure."""
+    cause = cause or ("operator" if order else "waiter" if waiter else "pressure")
     for member in reversed(list(holder.tree())):
         if member.state is LeaseState.HELD:
             member.move(LeaseState.REVOKING, core.now, reason)
-            _begin(core, gpu, member, waiter, reason)
+            _begin(core, gpu, member, waiter, reason, cause, order)
     if holder.children:  # a restart must find the whole tree asked, or none of it
         for member in holder.tree():
             core.record_lease(member)
@@ -30,7 +40,9 @@ def ask(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: str) 
             _tell(core, member, member.eviction)
 
 
-def _begin(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: str) -> None:
+def _begin(
+    core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: str, cause: Cause, order: Order | None
+) -> None:
     holder.left_for = "" if waiter is None else waiter.spec.consumer
     holder.eviction = Eviction(
         lease=holder.id,
@@ -39,6 +51,8 @@ def _begin(core: Core, gpu: Gpu, holder: Lease, waiter: Lease | None, reason: st
         wanted_by=None if waiter is None else waiter.id,
         wanted_consumer=holder.left_for,
         reason=reason,
+        cause=cause,
+        order=order,
         asked_at=core.now,
         next_push_at=core.now + core.settings.revoke_resend_s,
         traceparent=None if waiter is None else waiter.traceparent,
@@ -61,6 +75,7 @@ def _tell(core: Core, holder: Lease, eviction: Eviction) -> None:
         wanted_by=eviction.wanted_consumer,
         wanted_by_lease=eviction.wanted_by,
         uses=holder.busy_uses(),
+        cause=eviction.cause,
         reason=eviction.reason,
     )
 
@@ -68,8 +83,8 @@ def _tell(core: Core, holder: Lease, eviction: Eviction) -> None:
 def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
     """`uses` counts what still runs on the lease, also what others marked: at 0 the holder is at its safe point."""
     assert holder.token is not None, f"{holder.id} is revoked without a token"
-    waiter = None
-    if eviction.wanted_by is not None and eviction.order is None:
+    waiter, order = None, eviction.order
+    if eviction.wanted_by is not None and order is None:
         waiter = core.waiting.get(eviction.wanted_by)
     core.push(
         holder,
@@ -77,7 +92,9 @@ def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
             "push": "revoke",
             "lease_id": holder.id,
             "token": [holder.token.epoch, holder.token.serial],
-            "reason": f"evicted by {eviction.order}" if eviction.order else eviction.reason,
+            "reason": f"evicted by {order}" if order else eviction.reason,
+            "cause": "operator" if order else eviction.cause,
+            **({"order": {"by": order.by, "reason": order.reason}} if order else {}),
             "wanted_by": eviction.wanted_consumer,
             **({"priority": waiter.spec.priority} if waiter is not None else {}),
             "deadline_in_s": max(0.0, eviction.asked_at + core.settings.revoke_deadline_s - core.now),
@@ -253,7 +270,7 @@ def depart(core: Core, lease: Lease, *, exiting: bool) -> None:
         lease.move(LeaseState.REVOKING, core.now, "leaves after its sub-leases")
     gpu = core.gpu_of(lease)
     for child in list(lease.children):
-        ask(core, gpu, child, None, f"{lease.spec.consumer} ({lease.id}) leaves")
+        ask(core, gpu, child, None, f"{lease.spec.consumer} ({lease.id}) leaves", cause="parent")
 
 
 def follow(core: Core, lease: Lease) -> None:
@@ -264,7 +281,7 @@ def follow(core: Core, lease: Lease) -> None:
     gpu = core.gpu_of(lease)
     wanted = parent.eviction.wanted_by if parent.eviction is not None else None
     waiter = None if wanted is None else core.waiting.get(wanted)
-    ask(core, gpu, lease, waiter, f"{parent.spec.consumer} ({parent.id}) leaves")
+    ask(core, gpu, lease, waiter, f"{parent.spec.consumer} ({parent.id}) leaves", cause="parent")
 
 
 def part(core: Core, gpu: Gpu, lease: Lease) -> None:

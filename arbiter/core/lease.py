@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Protocol
+from typing import Literal, Protocol
 
 from arbiter.core.events import MemorySampled, Spec
 from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
@@ -100,6 +100,10 @@ class Order:
         return f"{self.by}: {self.reason}" if self.reason else self.by
 
 
+Cause = Literal["waiter", "pressure", "operator", "parent"]
+"""Why a holder has to leave: for a request, for more bytes than the GPU has, by hand, or since what it was carved out of leaves."""
+
+
 @dataclass(slots=True)
 class Eviction:
     """One holder's way out, from the first `revoke` to the verdict. Times are monotonic seconds."""
@@ -110,6 +114,7 @@ class Eviction:
     wanted_by: LeaseId | None  # None: nobody waits, the card is under pressure
     wanted_consumer: str
     reason: str
+    cause: Cause
     asked_at: float
     next_push_at: float
     acked_at: float | None = None

@@ -95,7 +95,7 @@ def evict(core: Core, lease: Lease, order: Order) -> None:
             state=str(lease.state),
         )
     gpu = core.gpu_of(lease)
-    eviction.ask(core, gpu, lease, None, f"evicted by {order}")
+    eviction.ask(core, gpu, lease, None, f"evicted by {order}", order=order)
     _ordered(core, lease, order)
     _note(core, "evict", order, lease, uses=len(lease.uses))
 

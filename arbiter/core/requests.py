@@ -41,7 +41,10 @@ def ended_error(ended: Ended) -> Refused:
     if ended.error is not None:
         error = ended.error
         return Refused(str(error["code"]), str(error["message"]), str(error["hint"]), **error["details"])
-    return Refused("bad_state", f"{ended.lease} is {ended.state}", _HINT_ACQUIRE, state=str(ended.state))
+    told = f": {ended.evicted}" if ended.evicted else ""
+    return Refused(
+        "bad_state", f"{ended.lease} is {ended.state}{told}", _HINT_ACQUIRE, state=str(ended.state)
+    )
 
 
 def lease_for(core: Core, lease_id: LeaseId, token: Token) -> Lease:

@@ -67,6 +67,7 @@ class Ended:
     state: LeaseState
     error: Mapping[str, Any] | None
     earlier_nonces: tuple[str, ...] = ()
+    evicted: str = ""  # who made it leave, and why, in words
 
 
 @dataclass(slots=True)
@@ -376,7 +377,9 @@ class Core:
         elif lease.token is not None:  # it was resident once: the journal knows it as away
             self.forget(f"lease:{lease.id}")
         earlier = tuple(lease.earlier_nonces)
-        self.remember(Ended(lease.id, lease.process, lease.nonce, lease.token, lease.state, error, earlier))
+        evicted = "" if lease.eviction is None else lease.eviction.reason
+        ended = Ended(lease.id, lease.process, lease.nonce, lease.token, lease.state, error, earlier, evicted)
+        self.remember(ended)
 
     def remember(self, ended: Ended) -> None:
         self.ended[ended.lease] = ended

@@ -116,6 +116,8 @@ def _give_up(core: Core, lease: Lease) -> None:
     token = lease.token
     assert token is not None, f"{lease.id} is resident without a token"
     why = "it was asked to leave and its last sub-lease has left"
+    assert lease.eviction is not None, f"{lease.id} is revoked and was not asked"
+    why += f": {lease.eviction.reason}"
     if standby.stays_on(lease):
         let_go(core, lease, exiting=False, why=why, comes_back=True)
         return

@@ -38,9 +38,10 @@ def begin(core: Core, event: UseBegan) -> None:
             _note_begun(core, lease, known, resumed=True)
         return
     if lease.state in LEAVING:
+        told = "" if lease.eviction is None else f": {lease.eviction.reason}"
         raise Refused(
             "lease_revoking",
-            f"{lease.spec.consumer} was asked to leave",
+            f"{lease.spec.consumer} was asked to leave{told}",
             "wait until it is granted again",
             state=str(lease.state),
         )

@@ -15,6 +15,7 @@ import pytest
 from arbiter.testing.process import ArbiterProcess
 from clients.aio import ArbiterClient
 from clients.connection import REQUEST_TIMEOUT_S
+from clients.records import Eviction
 from schemas.defaults import STATUS_PAGE
 from schemas.errors import (
     ArbiterUnreachable,
@@ -55,6 +56,28 @@ async def test_acquire_ready_use_release(arbiter_daemon: ArbiterProcess, spec: S
         assert lease.error is None
         with pytest.raises(LeaseLost):
             await lease.ready()
+
+
+async def test_an_evicted_holder_hears_by_whom_and_why(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    """After an eviction every call on the lease said that it "was released", as if its holder had wanted that."""
+    async with (
+        ArbiterClient(arbiter_daemon.endpoint, name="t") as client,
+        ArbiterClient(arbiter_daemon.endpoint, name="ops", role="operator") as ops,
+    ):
+        first = await client.acquire(spec("a", 5))
+        await first.ready()
+        assert first.evicted is None
+        second = await ops.acquire(spec("b", 5), WAIT_S)
+        assert first.evicted == Eviction("waiter", "b", "b needs the room")
+        with pytest.raises(LeaseLost, match="was evicted: b needs the room"):
+            await first.ready()
+        await second.ready()
+        await ops.ask("evict", {"target": "b", "reason": "lunch"})
+        while second.state != "gone":
+            await asyncio.sleep(0.01)
+        assert second.evicted is not None
+        assert (second.evicted.cause, second.evicted.by.split()[0]) == ("operator", "ops")
+        assert second.evicted.reason.endswith(": lunch")
 
 
 async def test_status_is_whole_though_it_comes_in_pages(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:

@@ -27,6 +27,7 @@ def test_revoke_is_sent_again_until_acknowledged() -> None:
         "lease_id": lease,
         "token": [det.token(lease).epoch, det.token(lease).serial],
         "reason": "vlm needs the room",
+        "cause": "waiter",
         "wanted_by": "vlm",
         "priority": 50,
         "deadline_in_s": 30.0,

@@ -203,7 +203,8 @@ def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder() -> None:
         "held",
         "held",
     ]
-    assert driver.pushes("revoke", calm_lease)[0]["wanted_by"] == ""
+    (push,) = driver.pushes("revoke", calm_lease)[:1]
+    assert (push["wanted_by"], push["cause"]) == ("", "pressure")
     queued = waiter.acquire(100 * MIB)
     assert driver.state(queued) == "queued"
     calm.unload(calm_lease)

@@ -54,10 +54,19 @@ def test_an_evicted_holder_in_use_finishes_first(driver: CoreDriver, ops: Consum
     (revoke,) = driver.pushes("revoke", lease)
     assert "maintenance" in revoke["reason"]
     assert BY in revoke["reason"]
+    assert (revoke["cause"], revoke["order"]) == ("operator", {"by": BY, "reason": "maintenance"})
     assert refusal(det.unloading(lease)).code == "bad_state"
+    token = det.token(lease)
+    other = driver.consumer("other")
+    assert (
+        f"asked to leave: evicted by {BY}: maintenance"
+        in refusal(other.use_begin(lease, token=token)).message
+    )
     det.use_end(lease)
     det.unload(lease)
     driver.until(lambda: driver.state(lease) == "over")
+    late = refusal(other.use_begin(lease, token=token))
+    assert late.message == f"{lease} is released: evicted by {BY}: maintenance", "not a bare `is released`"
     assert driver.notes("verified")[-1]["verdict"] == "verified"
 
 

@@ -179,7 +179,8 @@ def test_a_sub_lease_that_becomes_ready_in_a_tree_that_an_operator_evicts_is_ask
     tree.driver.post(OperatorAsked(ops.client, tree.driver.next_request(), "evict", tree.root, "ops", "test"))
     assert (tree.state(second), tree.state(tree.leaf)) == ("loading", "revoking")
     assert revokes(other.ready(second)) == [(second, 0, 0)]
-    assert tree.driver.pushes("revoke", second)[-1]["wanted_by"] == ""
+    push = tree.driver.pushes("revoke", second)[-1]
+    assert (push["wanted_by"], push["cause"]) == ("", "parent")
 
 
 def test_a_tree_with_a_pinned_lease_is_pinned(tree: Tree) -> None:

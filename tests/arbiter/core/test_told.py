@@ -265,7 +265,10 @@ def test_a_reservation_that_ends_by_itself_says_why() -> None:
     tree.policy.unload(tree.leaf)
     tree.driver.until(lambda: bool(tree.driver.pushes("lost", tree.root)))
     (push,) = tree.driver.pushes("lost", tree.root)
-    assert push["error"]["message"] == f"{tree.root}: it was asked to leave and its last sub-lease has left"
+    assert (
+        push["error"]["message"]
+        == f"{tree.root}: it was asked to leave and its last sub-lease has left: other needs the room"
+    )
 
 
 # -- who grows -------------------------------------------------------------------------------------------------------
