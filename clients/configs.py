@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
 import schemas
 
@@ -15,3 +16,9 @@ def configs_folder(environ: Mapping[str, str]) -> Path:
     package = Path(schemas.__file__).parent
     installed = package / "_configs"
     return installed if installed.is_dir() else package.parent / "configs"
+
+
+def shipped(path: Path, kind: Literal["rskills", "robots"], configs: Path) -> Path:
+    """The shipped file that a bare name such as `so101-detector` stands for; any other path as it is."""
+    named = configs / kind / path / "rskill.yaml" if kind == "rskills" else configs / kind / f"{path}.yaml"
+    return named if len(path.parts) == 1 and not path.exists() and named.exists() else path

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from clients import cuda, logs
-from clients.configs import configs_folder
+from clients.configs import configs_folder, shipped
 from schemas import defaults as d
 from schemas import telemetry, terminal
 from schemas.commands import command
@@ -98,7 +98,7 @@ def settings_from(flags: argparse.Namespace) -> Settings:
             hint="choose one: --standby for what shall be there between goals, --idle-release-s for what makes room for it",
         )
     configs = flags.configs or configs_folder(os.environ)
-    manifest, weights = read_model(flags.rskill, configs)
+    manifest, weights = read_model(shipped(flags.rskill, "rskills", configs), configs)
     if flags.footprint:
         entry = parse_footprint(flags.footprint)
     else:
@@ -198,7 +198,13 @@ def _parser() -> argparse.ArgumentParser:
     add_version(parser)
     add = parser.add_argument
     add("--name", required=True, type=_name, help="consumer name and socket name, e.g. detector")
-    add("--rskill", required=True, type=Path, metavar="FILE", help="the skill's rskill.yaml")
+    add(
+        "--rskill",
+        required=True,
+        type=Path,
+        metavar="FILE",
+        help="the skill's rskill.yaml, or the name of a shipped skill",
+    )
     add(
         "--device",
         metavar="fake:FOLDER|cuda[:N]|none",

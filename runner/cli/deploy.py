@@ -14,6 +14,7 @@ import re
 from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 
+from clients.configs import configs_folder, shipped
 from clients.runner import RunnerClient
 from runner.catalogue import Catalogue, Maker, read_manifests, sidecar_endpoint
 from runner.cli.common import (
@@ -65,7 +66,12 @@ MakeMakers = Callable[[Parts, Arbiter | None], Mapping[Kind, Maker]]
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
     """The flags of `vram-runner deploy`."""
     deploy = commands.add_parser("deploy", help="a robot, as a deployment file describes it")
-    deploy.add_argument("--config", type=Path, required=True, help="deployment file (docs/runner.md)")
+    deploy.add_argument(
+        "--config",
+        type=Path,
+        required=True,
+        help="deployment file (docs/runner.md), or the name of a shipped one",
+    )
     deploy.add_argument(
         "--dry-run", action="store_true", help="check everything, print what would run, open nothing"
     )
@@ -81,7 +87,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 async def run(args: argparse.Namespace) -> int:
     """`vram-runner deploy`. 0: ended on request, or the task succeeded; 1: it failed; 2: a person has to act (a wrong file
     or flag, or a task that the emergency stop ended)."""
-    file = read_deployment(args.config)
+    file = read_deployment(shipped(args.config, "robots", configs_folder(os.environ)))
     return await Deploy(args, file, policy_makers(args, file)).run()
 
 

@@ -1,0 +1,120 @@
+"""README.md does what it says: its commands are typed in a fresh clone with an installed product, its example runs as printed.
+
+`readme.sh` alone types all of them; what installs, trains or takes minutes is left out here.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from installed import TREE, install_into
+
+from arbiter.testing.process import ArbiterProcess
+from clients.sync import SyncArbiterClient
+
+pytestmark = pytest.mark.e2e
+PAGE = (TREE / "README.md").read_text(encoding="utf-8")
+LIMIT_S = 240.0
+INSTALLS = "^(make|pip) "
+LONG = "^vram-(reasoner|runner (benchmark|sim --policy|replay)) ?"
+
+
+class Reader:
+    """A folder with a clone, an environment with the product, and a home that is removed afterwards."""
+
+    def __init__(self, folder: Path) -> None:
+        for name in ("clone", "home", "run"):
+            (folder / name).mkdir(mode=0o700)
+        install_into(folder / "prefix")
+        self._folder = folder
+        git = ["git", "-C", str(TREE)]
+        listed = subprocess.run(
+            [*git, "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+            capture_output=True, text=True, check=True, timeout=60,
+        )  # fmt: skip
+        for name in filter(None, listed.stdout.split("\0")):
+            if (TREE / name).exists():  # else it is about to be removed
+                place = folder / "clone" / name
+                place.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(TREE / name, place, follow_symlinks=False)
+
+    def types(self, *sections: str, skip: str) -> str:
+        """Everything that is printed. Fails the test at the first command that fails."""
+        kept = {name: os.environ[name] for name in ("MUJOCO_GL", "LANG") if name in os.environ}
+        done = subprocess.run(
+            ["tests/packaging/readme.sh", *sections],
+            cwd=self._folder / "clone", timeout=LIMIT_S, text=True,
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            env={
+                **kept, "SKIP": skip, "HOME": str(self._folder / "home"),
+                "XDG_RUNTIME_DIR": str(self._folder / "run"),
+                "PATH": f"{self._folder}/prefix/bin:/usr/local/bin:/usr/bin:/bin",
+            },
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout
+        return done.stdout
+
+
+@pytest.fixture(scope="module")
+def reader() -> Iterator[Reader]:
+    if shutil.which("git") is None or not (TREE / ".git").exists():
+        pytest.skip("needs git and a checkout")
+    folder = Path(tempfile.mkdtemp(prefix="vr"))  # short: sockets lie below it
+    try:
+        yield Reader(folder)
+    finally:
+        shutil.rmtree(folder)
+
+
+def test_what_is_needed_is_said_before_the_first_command() -> None:
+    before = PAGE.split("```sh\n")[0]
+    assert "Python ≥ 3.12" in before
+    assert "6 GB" in before
+
+
+def test_the_commands_of_the_base_install_work(reader: Reader) -> None:
+    printed = reader.types("On your machine", skip=INSTALLS)
+    assert re.search(r"^8 commands of README\.md work$", printed, re.MULTILINE)
+    assert "Traceback" not in printed
+
+
+@pytest.mark.heavy
+def test_the_commands_with_a_robot_work(reader: Reader) -> None:
+    printed = reader.types("On your machine", "With a robot", skip=f"{INSTALLS}|{LONG}|^vramctl ")
+    assert "vram-sidecar --name grab" in printed
+    assert "dry run: nothing was opened" in printed
+    assert "Traceback" not in printed
+
+
+def test_a_command_that_fails_fails_the_script(reader: Reader, tmp_path: Path) -> None:
+    """The check can fail."""
+    (tmp_path / "README.md").write_text("## A\n```sh\ntrue  # fine\nfalse\n```\n")
+    done = subprocess.run(
+        [str(TREE / "tests/packaging/readme.sh")],
+        cwd=tmp_path, env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (1, "readme.sh: exit code 1 of: false\n")
+
+
+def test_the_example_runs_as_printed(arbiter_daemon: ArbiterProcess, tmp_path: Path) -> None:
+    """It ended in a traceback: its `unload` is a plain function, and only coroutine functions were taken."""
+    (example,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    path = tmp_path / "example.py"
+    path.write_text(example)
+    done = subprocess.run(
+        [sys.executable, str(path)],
+        env=arbiter_daemon.environ,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "detecting\n", "")
+    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        kinds = [event["kind"] for event in client.history()["events"] if event.get("consumer") == "detector"]
+    assert {"granted", "ready", "use_began", "use_ended", "released"} <= set(kinds)
