@@ -31,7 +31,7 @@ exit codes:
   2   wrong flags or configuration
   3   another arbiter serves this socket or uses this state folder
   4   no GPU: no NVIDIA driver or no card (--gpu fake:8GiB simulates one)
-  5   the disk of the state folder is full or failing
+  5   the disk of the state folder is full, failing or read-only: worth another try
   74  the output cannot be written (a full disk behind a redirection)
   70  a defect: the core's state became invalid; the log says how, a restart recovers the leases
 

@@ -30,7 +30,7 @@ from arbiter.host.gpu.pids import PidMap
 from arbiter.host.gpu.probe import Card, GpuProbe
 from arbiter.host.gpu.unified import choose
 from arbiter.host.history import CLEAN_END, History
-from arbiter.host.journal import Journal, Opened
+from arbiter.host.journal import Journal, Opened, may_pass, unavailable
 from arbiter.host.memory import park_budget_bytes
 from arbiter.host.probing import Prober, within
 from arbiter.host.recorder import Recorder, freezer
@@ -319,14 +319,23 @@ class Daemon:
         if self._config.gpu.source.startswith("fake:") or places.state.parent == places.runtime:
             private_folder(places.runtime, group)
         socket_folder(places.socket.parent, self._environ, group)
-        if self._config.state.dir is None:
-            places.state.parent.mkdir(mode=0o700, parents=True, exist_ok=True)  # such as ~/.local/state
-        private_folder(places.state)
-        socket_lock = places.socket.with_name(places.socket.name + ".lock")
-        for path, protects in ((socket_lock, places.socket), (places.state / "lock", places.state)):
-            lock = LockFile(path, str(protects))
+        lock = LockFile(places.socket.with_name(places.socket.name + ".lock"), str(places.socket))
+        lock.acquire()
+        undo.callback(lock.release)
+        try:
+            if self._config.state.dir is None:
+                places.state.parent.mkdir(mode=0o700, parents=True, exist_ok=True)  # such as ~/.local/state
+            private_folder(places.state)
+            lock = LockFile(places.state / "lock", str(places.state))
             lock.acquire()
             undo.callback(lock.release)
+        except (ConfigError, OSError) as error:
+            cause = error.__cause__ if isinstance(error, ConfigError) else error
+            if cause is not None and may_pass(cause):  # a person need not start the daemon again
+                raise unavailable(places.state, cause) from error
+            if isinstance(error, ConfigError):
+                raise
+            raise ConfigError(f"the state folder {places.state} cannot be made: {error}") from error
 
     def _open_telemetry(self, undo: contextlib.ExitStack) -> "Traced | None":
         """None: it was not asked for, and nothing of it is imported. Raises ConfigError."""

@@ -46,6 +46,17 @@ _DELETE = [
     "",
     *(f"DELETE FROM records WHERE key IN ({', '.join('?' * n)})" for n in range(1, AT_ONCE_MAX + 1)),
 ]
+_PASSING = frozenset(
+    {
+        errno.ENOSPC,
+        errno.EDQUOT,
+        errno.EFBIG,
+        errno.EIO,
+        errno.EROFS,
+        errno.EACCES,
+        errno.EPERM,
+    }
+)
 _text = json.JSONEncoder(separators=(",", ":")).encode
 
 
@@ -321,18 +332,24 @@ def _footprints(meta: Mapping[str, str]) -> dict[str, dict[str, list[int]]]:
         return {}
 
 
-def _raise(folder: Path, error: OSError | sqlite3.OperationalError) -> NoReturn:
-    """As a typed error: trouble that may be over soon, unlike a wrong folder."""
+def may_pass(error: BaseException) -> bool:
+    """Is it the disk's trouble, or its permissions', which may be over at the next try, unlike a wrong folder?"""
     if isinstance(error, OSError):
-        passing = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
-    else:
-        codes = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY)
-        passing = getattr(error, "sqlite_errorcode", 0) & 0xFF in codes
-    if passing:
-        raise JournalUnavailable(
-            f"the disk of the state folder {folder} is full, failing or read-only: {error}",
-            hint="make room on it, mount it writable, or choose another --state-dir",
-        ) from error
+        return error.errno in _PASSING
+    codes = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY)
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF in codes
+
+
+def unavailable(folder: Path, error: BaseException) -> JournalUnavailable:
+    return JournalUnavailable(
+        f"the state folder {folder} is on a disk that is full, failing or read-only: {error}",
+        hint="make room on it, mount it writable, or choose another --state-dir",
+    )
+
+
+def _raise(folder: Path, error: OSError | sqlite3.OperationalError) -> NoReturn:
+    if may_pass(error):
+        raise unavailable(folder, error) from error
     raise ConfigError(
         f"the state folder {folder} cannot be used: {error}",
         hint="make it writable, or choose another --state-dir",

@@ -47,6 +47,9 @@ class Tmpfs:
     def free(self) -> None:
         self._ballast.unlink()
 
+    def remount(self, how: str) -> None:
+        subprocess.run(["mount", "-o", f"remount,{how}", str(self._folder)], check=True, timeout=60)
+
     def close(self) -> None:
         subprocess.run(["umount", str(self._folder)], check=True, timeout=60)
 
@@ -169,12 +172,34 @@ def test_a_start_on_a_full_disk_says_so_and_is_worth_another_try(
     tmpfs.fill()
     with pytest.raises(RuntimeError, match="ended with 5"):
         arbiter.start()
-    assert "is full, failing or read-only" in arbiter.log
+    assert "on a disk that is full, failing or read-only" in arbiter.log
     assert "Traceback" not in arbiter.log
     tmpfs.free()
     arbiter.start()
     with WireClient(arbiter.endpoint) as client:
         assert client.hello().acquire("later", GIB)["ok"]
+
+
+def test_a_start_on_a_read_only_disk_is_worth_another_try_and_loses_no_lease(
+    arbiter: ArbiterProcess, tmpfs: Tmpfs
+) -> None:
+    """Regression: it ended with 2, the code that systemd takes for a person's mistake, and stayed down for ever."""
+    arbiter.start()
+    with WireClient(arbiter.endpoint) as client:
+        client.hello().granted("holder", GIB, ttl_s=600.0)
+        client.ask("ping")
+    arbiter.kill()
+    tmpfs.remount("ro")
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="ended with 5"):
+            arbiter.start()
+    assert "full, failing or read-only" in arbiter.log
+    assert "Traceback" not in arbiter.log
+    tmpfs.remount("rw")
+    arbiter.start()
+    with WireClient(arbiter.endpoint) as client:
+        assert consumers(client.hello()) == ["holder"]
+        assert not client.ask("status")["problems"], "and nothing was taken for damage"
 
 
 def test_a_restart_on_a_full_disk_loses_no_lease(arbiter: ArbiterProcess, tmpfs: Tmpfs) -> None:
