@@ -40,8 +40,7 @@ from arbiter.host.systemd import Notifier
 from arbiter.host.tree import Known
 from arbiter.host.watch import ProcessWatch
 from arbiter.inbox import Inbox
-from arbiter.rpc.peer import group_id, start_ticks
-from arbiter.rpc.server import RouterServer
+from arbiter.rpc.peer import group_id
 from arbiter.rpc.session import SessionSettings, SessionTable
 from schemas import otel
 from schemas.commands import TRACEPARENT_VARIABLE
@@ -50,6 +49,8 @@ from schemas.endpoints import arbiter_endpoint, runtime_dir, socket_path
 from schemas.errors import ConfigError
 from schemas.ids import ProcessKey
 from schemas.runtime.folders import LockFile, private_folder, socket_folder
+from schemas.runtime.peercred import start_ticks
+from schemas.runtime.router import Limits, Router
 from schemas.units import format_bytes
 
 if TYPE_CHECKING:
@@ -63,6 +64,8 @@ EXIT_DEFECT = 70
 PROBE_START_S = 30.0
 """Without persistence mode the NVIDIA driver needs seconds to initialise its cards."""
 OPEN_FILES = 65_536
+DESCRIPTOR_RESERVE = 128
+"""For the daemon's own files: journal, history, event log, readings, telemetry."""
 SWITCH_S = 0.0005
 """How long the loop may keep the interpreter from a thread that reads a card, which asks for it some twenty times per reading: with
 Python's own 5 ms a client that floods the loop makes every reading take a tenth of a second."""
@@ -209,7 +212,7 @@ class Daemon:
         notifier = Notifier(self._environ)
         raise_open_files()
         sys.setswitchinterval(SWITCH_S)
-        with contextlib.ExitStack() as undo:
+        async with contextlib.AsyncExitStack() as undo:
             parts = await self._start(undo)
             for number in (signal.SIGTERM, signal.SIGINT):
                 asyncio.get_running_loop().add_signal_handler(number, self._stop.set)
@@ -225,7 +228,7 @@ class Daemon:
             telemetry.log_event(parts.history.append(CLEAN_END, facts))
         return self._exit_code
 
-    async def _start(self, undo: contextlib.ExitStack) -> Parts:
+    async def _start(self, undo: contextlib.AsyncExitStack) -> Parts:
         """1. Folders and locks. 2. Journal and history. 3. Cards. 4. Core and the parts around it. 5. The past. 6. The socket."""
         config, loop = self._config, asyncio.get_running_loop()
         places = find_places(config, self._environ, os.getuid())
@@ -268,8 +271,6 @@ class Daemon:
         )
         undo.callback(prober.close)
         undo.callback(inbox.close)
-        server = RouterServer(places.socket, config.limits.message_max_bytes, group)
-        undo.callback(server.close)
 
         def died(process: ProcessKey) -> None:
             sessions.process_died(process)
@@ -280,10 +281,9 @@ class Daemon:
         wire = self._session_settings(journal.opened.epoch, boot, operators)
         sessions = SessionTable(
             wire,
-            server,
             inbox,
             history.read,
-            watch.add,
+            watch,
             time.monotonic,
             problems=lambda: problems(journal, history),
         )
@@ -310,12 +310,15 @@ class Daemon:
                 loop,
                 lambda: None if inbox.closed else {**inbox.figures(), "journal_healthy": not journal.problem},
             )
-        server.bind()  # 6
-        server.start(loop, sessions.receive)
-        undo.callback(server.stop_receiving)
+        router = Router(places.socket, sessions, self._router_limits(), group)  # 6
+        undo.push_async_callback(router.aclose)
+        router.bind()
+        router.start(loop)
+        undo.callback(inbox.close)  # while answers leave nothing more is decided
+        undo.callback(router.stop_receiving)
         return Parts(gpus, inbox, sessions, history, journal, executor)
 
-    def _take_folders(self, places: Places, group: int | None, undo: contextlib.ExitStack) -> None:
+    def _take_folders(self, places: Places, group: int | None, undo: contextlib.AsyncExitStack) -> None:
         if self._config.gpu.source.startswith("fake:") or places.state.parent == places.runtime:
             private_folder(places.runtime, group)
         socket_folder(places.socket.parent, self._environ, group)
@@ -337,7 +340,7 @@ class Daemon:
                 raise
             raise ConfigError(f"the state folder {places.state} cannot be made: {error}") from error
 
-    def _open_telemetry(self, undo: contextlib.ExitStack) -> "Traced | None":
+    def _open_telemetry(self, undo: contextlib.AsyncExitStack) -> "Traced | None":
         """None: it was not asked for, and nothing of it is imported. Raises ConfigError."""
         chosen = self._config.telemetry
         installed = otel.set_up(
@@ -397,6 +400,18 @@ class Daemon:
             )
         return number
 
+    def _router_limits(self) -> Limits:
+        """A connection may take three descriptors: its socket, and two pidfds if it is the only one of its process."""
+        limits = self._config.limits
+        soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        return Limits(
+            message_max_bytes=limits.message_max_bytes,
+            connections_max=min(limits.connections_max, max(4, (soft - DESCRIPTOR_RESERVE) // 3)),
+            descriptor_reserve=DESCRIPTOR_RESERVE,
+            user_share=limits.user_share,
+            process_share=limits.process_share,
+        )
+
     def _session_settings(self, epoch: int, boot_id: str, operators: int | None) -> SessionSettings:
         limits = self._config.limits
         return SessionSettings(
@@ -407,7 +422,11 @@ class Daemon:
             grace_s=self._config.lease.fence_grace_s,
             message_max_bytes=limits.message_max_bytes,
             sessions_max=limits.sessions_max,
+            operator_reserve=limits.operator_reserve,
+            user_share=limits.user_share,
+            process_share=limits.process_share,
             rate_per_s=limits.rate_per_client_per_s,
+            process_rate_per_s=limits.rate_per_process_per_s,
             subscribers_max=limits.subscribers_max,
             operators_gid=operators,
         )
@@ -450,6 +469,7 @@ class Daemon:
             await asyncio.sleep(period_s)
             if notifier.watchdog_s is not None and parts.inbox.pulse():
                 notifier.watchdog()
+            parts.sessions.sweep()
             parts.journal.settle()
             parts.executor.settle()
             wrong = problems(parts.journal, parts.history)

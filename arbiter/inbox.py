@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from arbiter.core.effects import Effect
 from arbiter.core.events import Event, Resumed, Tick
 from schemas.defaults import STATUS_PAGE
-from schemas.ids import GpuId, ProcessKey
+from schemas.ids import ClientId, GpuId, ProcessKey
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +52,8 @@ class Core(Protocol):
     ) -> dict[str, Any]: ...
 
     def why(self, consumer: str, now: float) -> dict[str, Any]: ...
+
+    def concerns(self, client: ClientId) -> bool: ...
 
     def stale(self, now: float) -> list[GpuId]: ...
 
@@ -147,6 +149,9 @@ class Inbox:
 
     def why(self, consumer: str) -> dict[str, Any]:
         return self._core.why(consumer, self._clock())
+
+    def concerns(self, client: ClientId) -> bool:
+        return self._core.concerns(client)
 
     def figures(self) -> dict[str, Any]:
         return self._core.figures()

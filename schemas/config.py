@@ -142,14 +142,19 @@ class LimitsConfig(_Section):
 
     message_max_bytes: Annotated[ByteSize, Field(ge=4096, le=64 * d.MIB)] = d.MESSAGE_MAX_BYTES
     """Largest request."""
+    connections_max: Annotated[int, Field(ge=4, le=65_536)] = d.CONNECTIONS_MAX
+    """Connections at a time, with those that have not said hello. Less where the daemon may open fewer files (three per connection)."""
     sessions_max: Annotated[int, Field(ge=1, le=65_536)] = d.SESSIONS_MAX
-    """Connections at a time."""
+    """Clients at a time: connections that have said hello."""
+    operator_reserve: Annotated[int, Field(ge=0, le=1024)] = d.OPERATOR_RESERVE
+    """Of these, how many only operators get."""
     waiters_max: Annotated[int, Field(ge=1, le=1_000_000)] = d.WAITERS_MAX
     """Queued leases at a time."""
     process_share: Share = d.PROCESS_SHARE
-    """Part of the places of `waiters_max`, and of the uses of another process's lease, that one process may take."""
+    """Part of the connections, clients, subscribers and places of `waiters_max`, and of the uses of another process's lease, that one
+    process may take."""
     user_share: Share = d.USER_SHARE
-    """The same for all processes of one user together."""
+    """The same for all processes of one user together, but that operators always find room as clients."""
     priority_reserve: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = d.PRIORITY_RESERVE
     """Part of the places of `waiters_max` that is kept for requests above the default priority."""
     leases_per_client_max: Annotated[int, Field(ge=1, le=4096)] = d.LEASES_PER_CLIENT_MAX
@@ -157,7 +162,9 @@ class LimitsConfig(_Section):
     uses_per_lease_max: Annotated[int, Field(ge=1, le=65_536)] = d.USES_PER_LEASE_MAX
     """Uses of one lease at a time: its holder's own, and as many of others."""
     rate_per_client_per_s: Annotated[int, Field(ge=10, le=1_000_000)] = d.RATE_PER_CLIENT_PER_S
-    """Requests a second of one connection; a burst of one second's worth is allowed."""
+    """Requests a second of one connection; a burst of one second's worth is allowed. Each KiB of a request counts as one more."""
+    rate_per_process_per_s: Annotated[int, Field(ge=10, le=1_000_000)] = d.RATE_PER_PROCESS_PER_S
+    """The same for all connections of one process together."""
     subscribers_max: Annotated[int, Field(ge=0, le=65_536)] = d.SUBSCRIBERS_MAX
     """Connections that receive every event."""
 

@@ -64,10 +64,10 @@ from arbiter.core.events import (
     UseEnded,
     UseYielded,
 )
-from arbiter.core.sessions import on_connected, on_died, on_journal_failed, on_left
+from arbiter.core.sessions import concerns, on_connected, on_died, on_journal_failed, on_left
 from arbiter.core.settings import Settings
 from arbiter.core.state import Core, Refused
-from schemas.ids import GpuId, ProcessKey
+from schemas.ids import ClientId, GpuId, ProcessKey
 
 
 class Arbiter:
@@ -146,6 +146,10 @@ class Arbiter:
     def clients(self) -> Set[ProcessKey]:
         """Processes with a connection, observers too. As it is at that moment."""
         return self._core.connected.keys()
+
+    def concerns(self, client: ClientId) -> bool:
+        """Whether a lease, a request or a use is this client's (`sessions.concerns`)."""
+        return concerns(self._core, client)
 
     def _happened(self, event: Event) -> None:
         core = self._core

@@ -76,6 +76,13 @@ def on_left(core: Core, event: ClientLeft) -> None:
             let_go(core, lease, exiting=False, why="its client said bye")
 
 
+def concerns(core: Core, client: ClientId) -> bool:
+    """Whether a live lease, a request or a use is this client's: then losing its connection ends nothing."""
+    if core.count_of_client(client):
+        return True
+    return any(use.client == client for lease in _concerned(core, []) for use in lease.all_uses())
+
+
 def _concerned(core: Core, own: list[Lease]) -> list[Lease]:
     """Somebody's own leases, and all that are in use, perhaps by him, in the order of their arrival."""
     used = (

@@ -1,7 +1,7 @@
 """Deaths of processes, told by the kernel: one pidfd per process, readable the moment it ends (0.2 ms here).
 
-A pid alone can be reused between learning it and opening its pidfd, so the start time is compared after the opening: what the pidfd
-names then is the process that was meant, or that one is dead already. Must not know clients or leases.
+The process of a connection comes with the pidfd of its accept (`take`). One that is known by its pid alone, from the journal, may have
+died and its pid been reused, so the start time is compared after the pidfd is opened (`add`). Must not know clients or leases.
 """
 
 import asyncio
@@ -47,8 +47,24 @@ class ProcessWatch:
             os.close(fd)  # another process has this pid now
             self._gone(process)
             return
-        self._fds[process] = fd
-        self._loop.add_reader(fd, self._readable, process, fd)
+        self._watch(process, fd)
+
+    def take(self, process: ProcessKey, pidfd: int) -> bool:
+        """Watch the process of a connection by a copy of the pidfd that was opened when it was accepted: its pid may have been reused.
+
+        Return False if it was watched before. Raises OSError where no descriptor is left.
+        """
+        if process in self._fds:
+            return False
+        self._watch(process, os.dup(pidfd))
+        return True
+
+    def drop(self, process: ProcessKey) -> None:
+        """Watch a process no longer: its death concerns nothing."""
+        fd = self._fds.pop(process, None)
+        if fd is not None:
+            self._loop.remove_reader(fd)
+            os.close(fd)
 
     def signal(self, process: ProcessKey, kind: str) -> None:
         """Send SIGTERM ("term") or SIGKILL ("kill") through the pidfd, which names the process whose start time was compared. One that is
@@ -71,6 +87,10 @@ class ProcessWatch:
                 self._loop.remove_reader(fd)
                 os.close(fd)
         self._fds.clear()
+
+    def _watch(self, process: ProcessKey, fd: int) -> None:
+        self._fds[process] = fd
+        self._loop.add_reader(fd, self._readable, process, fd)
 
     def _gone(self, process: ProcessKey) -> None:
         self._fds[process] = None

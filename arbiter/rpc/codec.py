@@ -32,7 +32,7 @@ class Undecodable(Exception):
         self.request_id = request_id
 
 
-def decode(payload: bytes | memoryview, size_max: int) -> Request:
+def decode(payload: bytes | bytearray | memoryview, size_max: int) -> Request:
     """One frame to one request. Raises Undecodable with BadFrame, MessageTooLarge, UnknownOp or BadRequest."""
     try:
         message = unpack_map(payload, _limits(size_max))
@@ -54,7 +54,7 @@ def decode(payload: bytes | memoryview, size_max: int) -> Request:
         raise Undecodable(_bad_request(op, error), request_id) from error
 
 
-def id_of(payload: bytes | memoryview, size_max: int) -> int | None:
+def id_of(payload: bytes | bytearray | memoryview, size_max: int) -> int | None:
     """The id that a request is answered to, without looking at the rest of it; None where none can be read."""
     try:
         return _id(unpack_map(payload, _limits(size_max)))

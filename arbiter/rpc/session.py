@@ -1,8 +1,8 @@
-"""Connections: who they are, what they may do, and requests turned into events of the core.
+"""Connections: whose they are, what they may do, and requests turned into events of the engine.
 
-One `SessionTable` holds all of them. It runs on the thread of the event loop, never blocks, and knows neither sockets (it is given
-`Wire`) nor how the core decides (it is given `Decisions`). Rules: nothing but `hello` before a hello; a session belongs to the process
-that the kernel named at its hello; every limit's breach is a typed reply; no input raises.
+One `SessionTable` is the router's handler. It runs on the thread of the event loop, never blocks, and knows neither sockets (it is given
+`Connection`) nor how the engine decides (it is given `Decisions`). Rules: nothing but `hello` before a hello; a connection belongs to the
+process that the kernel named when it was accepted; every limit's breach is a typed reply; no input raises.
 """
 
 import difflib
@@ -13,38 +13,55 @@ from typing import Any, Protocol
 from arbiter.core import events as ev
 from arbiter.core.explain import DAEMON_KINDS, NOTE_KINDS
 from arbiter.rpc import codec
-from arbiter.rpc.peer import Peer, Role, how_to_operate, identify, is_operator
+from arbiter.rpc.peer import Role, check_visible, how_to_operate, is_operator
+from arbiter.rpc.requests import BY_HAND, HOLDING, event_of
+from arbiter.rpc.shares import Budget, ProcessBudgets, cost_of, share_of, spend
 from schemas import wire as w
-from schemas.defaults import WIRE_VERSION
+from schemas.defaults import KIB, WIRE_VERSION
 from schemas.errors import (
     BadRequest,
     BadState,
     LimitExceeded,
+    MessageTooLarge,
     NotPermitted,
     UnknownSession,
     VersionMismatch,
     VramError,
 )
-from schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
+from schemas.ids import ClientId, ProcessKey, RequestId
+from schemas.runtime.peercred import Peer
+from schemas.runtime.zmtp import Oversize
 
 SILENT_S = 10.0
-"""At the limit of sessions a connection that never held anything and has been silent for so long makes room."""
+"""At a limit of sessions a connection that never held anything and has been silent for so long makes room."""
+REFUSED_MAX_BYTES = 64 * KIB
+"""Of a message over the rate the id is read, if it is no larger than this."""
 
 _READS = ("status", "why", "history", "subscribe", "ping", "bye")  # all that an observer may do
 _KINDS = frozenset((*NOTE_KINDS, *DAEMON_KINDS))
-_BY_HAND = ("evict", "pin", "unpin", "release_dead", "drain", "resume")  # operators only
 
 
-class Wire(Protocol):
-    """The socket, as sessions need it."""
+class Connection(Protocol):
+    """A peer's connection (`schemas.runtime.router.Connection`), as sessions need it."""
 
-    def send(self, routing_id: bytes, delimiter: bool, payload: bytes) -> bool:
+    serial: int
+    peer: Peer
+
+    def admit(self) -> None:
+        """The peer has said hello."""
+        ...
+
+    def send(self, payload: bytes) -> bool:
         """Queue one message without blocking. False: the peer is gone or does not read."""
+        ...
+
+    def close(self, reason: str) -> None:
+        """Hang up when what was sent has left."""
         ...
 
 
 class Decisions(Protocol):
-    """The owner of the core, as sessions need it."""
+    """The owner of the engine, as sessions need it."""
 
     def post(self, event: ev.Event) -> None: ...
 
@@ -57,6 +74,22 @@ class Decisions(Protocol):
     ) -> dict[str, Any]: ...
 
     def why(self, consumer: str) -> dict[str, Any]: ...
+
+    def concerns(self, client: ClientId) -> bool:
+        """Whether a lease, a request or a use is this client's."""
+        ...
+
+
+class Watch(Protocol):
+    """Deaths of processes (`arbiter.host.watch.ProcessWatch`), as sessions need them."""
+
+    def take(self, process: ProcessKey, pidfd: int) -> bool:
+        """Watch a process by a copy of `pidfd`. False: it was watched before. Raises OSError where no descriptor is left."""
+        ...
+
+    def drop(self, process: ProcessKey) -> None:
+        """Watch it no longer."""
+        ...
 
 
 HistoryReader = Callable[[int, int, tuple[str, ...], Callable[[Mapping[str, Any]], None]], None]
@@ -74,27 +107,40 @@ class SessionSettings:
     grace_s: float
     message_max_bytes: int
     sessions_max: int
+    operator_reserve: int
+    user_share: float
+    process_share: float
     rate_per_s: int
+    process_rate_per_s: int
     subscribers_max: int
     operators_gid: int | None
 
 
 @dataclass(slots=True)
 class Session:
-    """One connection after its hello."""
+    """One connection after its hello, and after its loss if the engine still knows its client."""
 
     client: ClientId
-    routing_id: bytes
-    delimiter: bool  # a REQ socket: an empty frame stands before the payload
-    address: str  # the kernel's words, compared on every frame
+    connection: Connection
     peer: Peer
     role: Role
     name: str
     instance: str
-    budget: float  # requests that may still come at once
     heard_at: float
     seq: int = 0
-    leased: bool = False  # it asked for a lease at least once: never dropped for being silent
+    leased: bool = False
+    """It asked for a lease or a use at least once: the engine is asked before the session ends without a `bye`."""
+    lost: bool = False
+    """Its connection is gone; the client may come back on another one."""
+
+
+@dataclass(slots=True)
+class _Entry:
+    """An open connection; strangers have no session."""
+
+    budget: Budget
+    process_budget: Budget
+    session: Session | None = None
 
 
 class SessionTable:
@@ -103,55 +149,65 @@ class SessionTable:
     def __init__(
         self,
         settings: SessionSettings,
-        wire: Wire,
         decisions: Decisions,
         history: HistoryReader,
-        watch: Callable[[ProcessKey], None],
+        watch: Watch,
         clock: Callable[[], float],
-        identify: Callable[[str], Peer] = identify,
         problems: Callable[[], list[str]] = list,
     ) -> None:
         self._settings = settings
-        self._wire = wire
         self._decisions = decisions
         self._history = history
         self._watch = watch
         self._clock = clock
-        self._identify = identify
         self._problems = problems
+        self._entries: dict[int, _Entry] = {}
         self._sessions: dict[ClientId, Session] = {}
         self._of_process: dict[ProcessKey, dict[ClientId, Session]] = {}
+        self._sessions_of_user: dict[int, int] = {}
         self._subscribers: dict[ClientId, Session] = {}
         self._instances: dict[tuple[ProcessKey, str], ClientId] = {}
         # the connection that each instance had before → the one that it has
         self._moved: dict[ClientId, ClientId] = {}
-        self._strangers_budget = float(settings.rate_per_s)
-        self._strangers_at = clock()
+        self._casual: set[ProcessKey] = set()  # watched since a hello, and never had a lease or a use
+        self._budgets = ProcessBudgets(settings.process_rate_per_s)
         self._too_fast = LimitExceeded(
-            f"more than {settings.rate_per_s} requests a second",
+            f"more than {settings.rate_per_s} requests a second of one connection, or {settings.process_rate_per_s} of one process; "
+            "each KiB of a message counts as one more",
             hint="send less often",
-            details={"limit": "rate_per_client_per_s", "value": settings.rate_per_s},
+            details={
+                "limit": "rate_per_client_per_s",
+                "value": settings.rate_per_s,
+                "process_value": settings.process_rate_per_s,
+            },
         ).to_wire()
 
     # -- in ----------------------------------------------------------------------------------------------------
-    def receive(self, routing_id: bytes, delimiter: bool, address: str | None, payload: bytes) -> bool:
-        """One frame from the socket. Never raises for anything that a peer can send. False: its sender is over its rate.
+    def connected(self, connection: Connection) -> None:
+        """A peer has finished the handshake; it is a stranger until its hello."""
+        now, rate = self._clock(), float(self._settings.rate_per_s)
+        peer = connection.peer
+        shared = self._budgets.of(peer.uid, peer.process, now)
+        self._entries[connection.serial] = _Entry(Budget(rate, rate, now), shared)
 
-        1. Charge the rate; over it: LimitExceeded, and nothing more is looked at. 2. Decode and validate. 3. No session: hello or UnknownSession.
-        4. The frame's process is not the session's: NotPermitted. 5. Role. 6. Dispatch.
+    def received(self, connection: Connection, payload: bytes | bytearray | Oversize) -> bool:
+        """One message. Never raises for anything that a peer can send. False: its sender is over its rate.
+
+        1. Charge the rate; over it: LimitExceeded, and nothing more is looked at. 2. Decode and validate. 3. No session: hello or
+        UnknownSession. 4. Role. 5. Dispatch.
         """
-        session = self._sessions.get(ClientId(routing_id.hex()))
-        now = self._clock()
-        if not self._charge_rate(session, now):  # 1
-            request_id = codec.id_of(payload, self._settings.message_max_bytes)
-            self._wire.send(
-                routing_id, delimiter, codec.refusal(request_id, self._settings.epoch, self._too_fast)
-            )
+        entry, now = self._entries[connection.serial], self._clock()
+        session, size_max = entry.session, self._settings.message_max_bytes
+        if not spend(cost_of(payload), entry.budget, entry.process_budget, now):  # 1
+            request_id = None if isinstance(payload, Oversize) else codec.id_of(payload, REFUSED_MAX_BYTES)
+            connection.send(codec.refusal(request_id, self._settings.epoch, self._too_fast))
             return False
         try:
-            request = codec.decode(payload, self._settings.message_max_bytes)  # 2
+            if isinstance(payload, Oversize):  # 2
+                raise codec.Undecodable(_too_large(payload, stranger=session is None), None)
+            request = codec.decode(payload, size_max)
         except codec.Undecodable as bad:
-            self._refuse_raw(routing_id, delimiter, bad.request_id, bad.error)
+            self._refuse(connection, bad.request_id, bad.error)
             return True
         try:
             if session is None:  # 3
@@ -159,24 +215,36 @@ class SessionTable:
                     raise UnknownSession(
                         f"{request.op} before hello", hint="say hello first, then re-attach your leases"
                     )
-                self._hello(routing_id, delimiter, address, request, now)
+                self._hello(connection, entry, request, now)
                 return True
-            if address != session.address:  # 4
-                raise NotPermitted(
-                    "this connection belongs to another process", hint="open a connection of your own"
-                )
-            session.delimiter = delimiter
-            if session.role == "observer" and request.op not in _READS and request.op != "hello":  # 5
+            session.heard_at = now
+            if session.role == "observer" and request.op not in _READS and request.op != "hello":  # 4
                 raise NotPermitted(f"an observer may not {request.op}", hint="say hello as a client")
-            if request.op in _BY_HAND and session.role != "operator":
+            if request.op in BY_HAND and session.role != "operator":
                 raise NotPermitted(f"only an operator may {request.op}", hint="say hello as operator")
-            self._dispatch(session, request)  # 6
+            self._dispatch(session, request)  # 5
         except VramError as error:
-            self._refuse_raw(routing_id, delimiter, request.id, error)
+            self._refuse(connection, request.id, error)
         return True
 
+    def disconnected(self, connection: Connection, reason: str) -> None:
+        """A connection has ended. Its session ends with it, unless the engine knows the client: a holder keeps its lease and its uses
+        until it reattaches, its ttl is over or its process dies."""
+        session = self._entries.pop(connection.serial).session
+        if session is None or self._sessions.get(session.client) is not session:
+            return
+        session.lost = True
+        self._subscribers.pop(session.client, None)
+        self._end_if_forgotten(session)
+
+    def sweep(self) -> None:
+        """End the sessions of lost connections whose clients have nothing left. Called now and then."""
+        for session in [session for session in self._sessions.values() if session.lost]:
+            self._end_if_forgotten(session)
+
     def process_died(self, process: ProcessKey) -> None:
-        """The kernel said so: forget its connections. The core hears it from whoever watches."""
+        """The kernel said so: forget its sessions. The engine hears it from the watch."""
+        self._casual.discard(process)  # nothing is to be watched any more
         for session in list(self._of_process.get(process, {}).values()):
             self._drop(session)
 
@@ -186,16 +254,16 @@ class SessionTable:
     # -- out ---------------------------------------------------------------------------------------------------
     def reply(self, client: ClientId, request: RequestId, body: Mapping[str, Any]) -> None:
         if session := self._sessions.get(self._moved.get(client, client)):
-            self._send(session, codec.reply(request, self._settings.epoch, body))
+            session.connection.send(codec.reply(request, self._settings.epoch, body))
 
     def refuse(self, client: ClientId, request: RequestId, error: Mapping[str, Any]) -> None:
         if session := self._sessions.get(self._moved.get(client, client)):
-            self._send(session, codec.refusal(request, self._settings.epoch, error))
+            session.connection.send(codec.refusal(request, self._settings.epoch, error))
 
     def push(self, client: ClientId, body: Mapping[str, Any]) -> None:
         if session := self._sessions.get(self._moved.get(client, client)):
             session.seq += 1
-            self._send(session, codec.push(session.seq, self._settings.epoch, body))
+            session.connection.send(codec.push(session.seq, self._settings.epoch, body))
 
     def broadcast(self, event: Mapping[str, Any]) -> None:
         """One history event to every subscriber. One that does not read loses events and can fetch them by `history`."""
@@ -203,75 +271,64 @@ class SessionTable:
             self.push(client, {"push": "event", "event": event})
 
     # -- steps -------------------------------------------------------------------------------------------------
-    def _charge_rate(self, session: Session | None, now: float) -> bool:
-        rate = float(self._settings.rate_per_s)
-        if session is None:  # connections without a session share one budget: they cost nothing but an answer
-            self._strangers_budget = min(rate, self._strangers_budget + (now - self._strangers_at) * rate)
-            self._strangers_at = now
-            if self._strangers_budget < 1:
-                return False
-            self._strangers_budget -= 1
-            return True
-        session.budget = min(rate, session.budget + (now - session.heard_at) * rate)
-        session.heard_at = now
-        if session.budget < 1:
-            return False
-        session.budget -= 1
-        return True
-
-    def _hello(
-        self, routing_id: bytes, delimiter: bool, address: str | None, hello: w.Hello, now: float
-    ) -> None:
-        """1. Version. 2. The kernel's word on the process. 3. Role. 4. Room. 5. Watch it, tell the core, welcome it."""
+    def _hello(self, connection: Connection, entry: _Entry, hello: w.Hello, now: float) -> None:
+        """1. Version. 2. A process that can be seen. 3. Role. 4. Room. 5. Watch it, tell the engine, welcome it."""
         self._check_version(hello)  # 1
-        peer = self._identify(address or "")  # 2
-        if hello.role == "operator" and not is_operator(peer.credentials, self._settings.operators_gid):  # 3
+        peer = connection.peer
+        check_visible(peer)  # 2
+        if hello.role == "operator" and not is_operator(peer, self._settings.operators_gid):  # 3
             raise NotPermitted(
                 "only the daemon's user, root and the operators' group may be operator",
                 hint=how_to_operate(self._settings.operators_gid),
-                details={"uid": peer.credentials.uid},
+                details={"uid": peer.uid},
             )
-        self._make_room(now)  # 4
+        session = Session(
+            client=ClientId(f"c{connection.serial}"),
+            connection=connection,
+            peer=peer,
+            role=hello.role,
+            name=hello.name,
+            instance=hello.instance,
+            heard_at=now,
+        )
+        if (peer.process, hello.instance) not in self._instances:
+            self._make_room(session, now)  # 4
+        self._begin_watch(peer)  # 5
+        self._replace_earlier(session)
+        entry.session = self._sessions[session.client] = session
+        self._of_process.setdefault(peer.process, {})[session.client] = session
+        self._sessions_of_user[peer.uid] = self._sessions_of_user.get(peer.uid, 0) + 1
+        connection.admit()
+        self._connect(session)
+        self._welcome(session, hello)
+
+    def _begin_watch(self, peer: Peer) -> None:
         try:
-            self._watch(peer.process)  # 5
+            if self._watch.take(peer.process, peer.pidfd):
+                self._casual.add(peer.process)
         except OSError as error:
             raise LimitExceeded(
                 f"no more processes can be watched: {error}",
                 hint="raise LimitNOFILE of the daemon",
                 details={"limit": "open_files"},
             ) from error
-        session = Session(
-            client=ClientId(routing_id.hex()),
-            routing_id=routing_id,
-            delimiter=delimiter,
-            address=address or "",
-            peer=peer,
-            role=hello.role,
-            name=hello.name,
-            instance=hello.instance,
-            budget=float(self._settings.rate_per_s - 1),
-            heard_at=now,
-        )
-        self._replace_earlier(session)
-        self._sessions[session.client] = session
-        self._of_process.setdefault(peer.process, {})[session.client] = session
-        self._connect(session)
-        self._welcome(session, hello)
 
     def _replace_earlier(self, session: Session) -> None:
-        """A client object that comes back on a new connection: the old one is gone, though ROUTER never says so. The core moves what was
-        its own to the new one; answers under way to the old one, and to no older one, go there too."""
+        """A client object that comes back on a new connection: the old one ends. The engine moves what was its own to the new one;
+        answers under way to the old one, and to no older one, go there too."""
         key = (session.peer.process, session.instance)
         earlier = self._instances.get(key)
         if earlier is not None and earlier in self._sessions:
-            self._forget(self._sessions[earlier])
+            replaced = self._sessions[earlier]
+            self._forget(replaced)
+            session.leased = replaced.leased
+            replaced.connection.close("its client came back on another connection")
             self._stop_standing_for(earlier)
             self._moved[earlier] = session.client
-        self._moved.pop(session.client, None)  # it was replaced once; from here on it speaks for itself
         self._instances[key] = session.client
 
     def _connect(self, session: Session) -> None:
-        uid = session.peer.credentials.uid
+        uid = session.peer.uid
         self._decisions.post(
             ev.ClientConnected(session.client, session.peer.process, uid, session.name, session.instance)
         )
@@ -296,7 +353,7 @@ class SessionTable:
         self.reply(session.client, RequestId(hello.id), {**welcome})
 
     def _hello_again(self, session: Session, hello: w.Hello) -> None:
-        """A reconnect under the same routing id repeats its hello; under another name it is somebody else."""
+        """A repeated hello is answered again; under another name it is another client's, which needs its own connection."""
         self._check_version(hello)
         if (hello.name, hello.instance, hello.role) != (session.name, session.instance, session.role):
             raise BadState(
@@ -304,17 +361,49 @@ class SessionTable:
             )
         self._welcome(session, hello)
 
-    def _make_room(self, now: float) -> None:
-        if len(self._sessions) < self._settings.sessions_max:
+    def _make_room(self, session: Session, now: float) -> None:
+        """A place within the shares of the process and the user, and beside the operators' reserve. A session whose connection is
+        lost, or that is silent and never held anything, leaves for it."""
+        settings, peer = self._settings, session.peer
+        operator = session.role == "operator"
+        every = settings.sessions_max
+        allowed = every if operator else every - min(settings.operator_reserve, every - 1)
+        self._need(
+            len(self._of_process.get(peer.process, ())), share_of(every, settings.process_share), "process_share",
+            f"process {peer.process.pid}", lambda other: other.peer.process == peer.process, now,
+        )  # fmt: skip
+        if not operator:
+            self._need(
+                self._sessions_of_user.get(peer.uid, 0), share_of(every, settings.user_share), "user_share",
+                f"uid {peer.uid}", lambda other: other.peer.uid == peer.uid, now,
+            )  # fmt: skip
+        self._need(len(self._sessions), allowed, "sessions_max", "all clients", lambda other: True, now)
+
+    def _need(
+        self, count: int, most: int, limit: str, whose: str, among: Callable[[Session], bool], now: float
+    ) -> None:
+        """Raises LimitExceeded where `count` sessions are as many as may be, and none of those `among` can leave."""
+        if count < most:
             return
-        silent = [s for s in self._sessions.values() if not s.leased and now - s.heard_at > SILENT_S]
-        if not silent:
+        leaving = [
+            other
+            for other in self._sessions.values()
+            if among(other)
+            and (other.lost or now - other.heard_at > SILENT_S)
+            and not (other.leased and self._decisions.concerns(other.client))
+        ]
+        if not leaving:
             raise LimitExceeded(
-                f"{self._settings.sessions_max} connections are open",
-                hint="close connections that are not used, or raise limits.sessions_max",
-                details={"limit": "sessions_max", "value": self._settings.sessions_max},
+                f"{whose}: {count} connections are open, the limit is {most}",
+                hint=f"close connections that are not used, or raise limits.sessions_max or limits.{limit}",
+                details={"limit": limit, "value": most},
             )
-        self._leave(min(silent, key=lambda s: s.heard_at), "silent while connections were needed")
+        oldest = min(leaving, key=lambda other: (not other.lost, other.heard_at))
+        self._leave(oldest, "silent while connections were needed")
+
+    def _end_if_forgotten(self, session: Session) -> None:
+        if not (session.leased and self._decisions.concerns(session.client)):
+            self._leave(session, "its connection was lost")
 
     def _leave(self, session: Session, reason: str) -> None:
         self._drop(session)
@@ -322,35 +411,38 @@ class SessionTable:
 
     def _forget(self, session: Session) -> None:
         del self._sessions[session.client]
+        if (entry := self._entries.get(session.connection.serial)) is not None:
+            entry.session = None
         self._subscribers.pop(session.client, None)
-        siblings = self._of_process[session.peer.process]
+        process, uid = session.peer.process, session.peer.uid
+        siblings = self._of_process[process]
         del siblings[session.client]
         if not siblings:
-            del self._of_process[session.peer.process]
+            del self._of_process[process]
+        self._sessions_of_user[uid] -= 1
+        if not self._sessions_of_user[uid]:
+            del self._sessions_of_user[uid]
 
     def _drop(self, session: Session) -> None:
         self._forget(session)
-        self._instances.pop((session.peer.process, session.instance), None)
+        process = session.peer.process
+        self._instances.pop((process, session.instance), None)
         self._stop_standing_for(session.client)
+        if process in self._casual and process not in self._of_process:
+            self._casual.discard(process)
+            self._watch.drop(process)
 
     def _stop_standing_for(self, client: ClientId) -> None:
         """Forget whom a connection has replaced."""
         for old in [old for old, new in self._moved.items() if new == client]:
             del self._moved[old]
 
-    def _send(self, session: Session, payload: bytes) -> None:
-        self._wire.send(session.routing_id, session.delimiter, payload)
-
-    def _refuse_raw(
-        self, routing_id: bytes, delimiter: bool, request_id: int | None, error: VramError
-    ) -> None:
-        self._wire.send(
-            routing_id, delimiter, codec.refusal(request_id, self._settings.epoch, error.to_wire())
-        )
+    def _refuse(self, connection: Connection, request_id: int | None, error: VramError) -> None:
+        connection.send(codec.refusal(request_id, self._settings.epoch, error.to_wire()))
 
     def _dispatch(self, session: Session, request: w.Request) -> None:
-        """Reads are answered here; everything that can change the core becomes an event, whose effects answer."""
-        post, client, re = self._decisions.post, session.client, RequestId(request.id)
+        """Reads are answered here; everything that can change the engine becomes an event, whose effects answer."""
+        client, re = session.client, RequestId(request.id)
         match request:
             case w.Hello():
                 self._hello_again(session, request)
@@ -378,101 +470,39 @@ class SessionTable:
             case w.Bye():
                 self.reply(client, re, {})
                 self._leave(session, ev.BYE)
-            case w.Acquire():
-                session.leased = True
-                post(
-                    ev.AcquireRequested(
-                        client,
-                        re,
-                        request.nonce,
-                        to_spec(request.spec),
-                        request.wait_timeout_s,
-                        request.traceparent,
-                    )
-                )
-            case w.Ready():
-                post(ev.ReadyReported(client, re, *_on_lease(request), request.measured_bytes))
-            case w.UseBegin():
-                session.leased = True  # a use ends with its client: never drop it for being silent
-                post(ev.UseBegan(client, re, *_on_lease(request), UseId(request.use_id), request.label))
-            case w.UseEnd():
-                post(ev.UseEnded(client, re, *_on_lease(request), UseId(request.use_id)))
-            case w.Yield():
-                post(ev.UseYielded(client, re, *_on_lease(request), UseId(request.use_id)))
-            case w.Renew():
-                post(
-                    ev.Renewed(
-                        client, re, tuple((LeaseId(r.lease_id), Token(*r.token)) for r in request.leases)
-                    )
-                )
-            case w.RevokeAck():
-                post(ev.RevokeAcknowledged(client, re, *_on_lease(request), request.safe_point_eta_s))
-            case w.Unloading():
-                post(ev.UnloadStarted(client, re, *_on_lease(request)))
-            case w.Release():
-                post(ev.ReleaseReported(client, re, *_on_lease(request), request.exiting, request.parked))
-            case w.Cancel():
-                post(ev.CancelRequested(client, re, LeaseId(request.lease_id)))
-            case w.Reacquire():
-                post(
-                    ev.Reacquired(
-                        client, re, *_on_lease(request), request.wait_timeout_s, request.traceparent
-                    )
-                )
-            case w.Resize():
-                size = request.footprint
-                sizes = (size.load_peak_bytes, size.steady_bytes, size.residue_bytes)
-                post(ev.ResizeAsked(client, re, *_on_lease(request), *sizes, request.wait_timeout_s))
-            case w.Reattach():
-                session.leased = True
-                post(ev.Reattached(client, re, tuple(_reattached(lease) for lease in request.leases)))
-            case w.Evict() | w.Pin() | w.Unpin() | w.ReleaseDead():
-                post(
-                    ev.OperatorAsked(
-                        client, re, request.op, request.target, _operator(session), request.reason
-                    )
-                )
-            case w.Drain() | w.Resume():
-                post(ev.OperatorAsked(client, re, request.op, "", _operator(session), request.reason))
-            case w.Oom():
-                lease, token = LeaseId(request.lease_id), Token(*request.token)
-                post(
-                    ev.OomReported(client, re, lease, token, request.requested_bytes, request.allocated_bytes)
-                )
+            case _:
+                if request.op in HOLDING and not session.leased:
+                    session.leased = True
+                    self._casual.discard(session.peer.process)
+                event = event_of(request, client, _operator(session) if request.op in BY_HAND else "")
+                assert event is not None, f"{request.op} is answered by nothing"
+                self._decisions.post(event)
 
     def _subscribe(self, session: Session, request: RequestId) -> None:
-        subscribers = len(self._subscribers)
-        if session.client not in self._subscribers and subscribers >= self._settings.subscribers_max:
-            raise LimitExceeded(
-                f"{subscribers} connections are subscribed",
-                hint="poll history instead, or raise limits.subscribers_max",
-                details={"limit": "subscribers_max", "value": self._settings.subscribers_max},
-            )
+        most, peer = self._settings.subscribers_max, session.peer
+        if session.client not in self._subscribers:
+            others = [other.peer for other in self._subscribers.values()]
+            for count, allowed, limit in (
+                (len(others), most, "subscribers_max"),
+                (sum(other.uid == peer.uid for other in others), share_of(most, self._settings.user_share), "user_share"),
+                (sum(other.process == peer.process for other in others),
+                 share_of(most, self._settings.process_share), "process_share"),
+            ):  # fmt: skip
+                if count >= allowed:
+                    raise LimitExceeded(
+                        f"{count} connections are subscribed, the limit is {allowed} ({limit})",
+                        hint="poll history instead, or raise limits.subscribers_max",
+                        details={"limit": limit, "value": allowed},
+                    )
         self._subscribers[session.client] = session
         self.reply(session.client, request, {})
 
 
-def to_spec(spec: w.LeaseSpec) -> ev.Spec:
-    """The wire's lease spec as the core knows it."""
-    return ev.Spec(
-        consumer=spec.consumer,
-        key=ModelKey(spec.model_id, spec.revision),
-        gpu=spec.gpu,
-        exclusive=spec.mode == "exclusive",
-        load_peak_bytes=spec.footprint.load_peak_bytes,
-        steady_bytes=spec.footprint.steady_bytes,
-        residue_bytes=spec.footprint.residue_bytes,
-        priority=spec.priority,
-        evictable=spec.evictable,
-        ttl_s=spec.ttl_s,
-        min_residency_s=spec.min_residency_s,
-        deny_on_deadline=spec.on_deadline == "deny",
-        standby=spec.standby,
-        on_overstay=spec.on_overstay,
-        park_bytes=spec.park_bytes,
-        parent=None if spec.parent is None else (LeaseId(spec.parent.lease_id), Token(*spec.parent.token)),
-        independent=spec.independent,
-        gang=None if spec.gang is None else (spec.gang.id, spec.gang.size),
+def _too_large(message: Oversize, *, stranger: bool) -> MessageTooLarge:
+    return MessageTooLarge(
+        f"the message has {message.size} bytes, the limit is {message.limit}",
+        hint="say hello first, with a small message" if stranger else "send less in one message",
+        details={"size_bytes": message.size, "limit_bytes": message.limit},
     )
 
 
@@ -488,32 +518,5 @@ def _check_kinds(kinds: Sequence[str]) -> None:
 
 
 def _operator(session: Session) -> str:
-    """Who it is by the kernel's word; the name is what the connection calls itself."""
-    return f"{session.name} (uid {session.peer.credentials.uid}, pid {session.peer.process.pid})"
-
-
-def _on_lease(
-    request: w.Ready
-    | w.UseBegin
-    | w.UseEnd
-    | w.Yield
-    | w.RevokeAck
-    | w.Unloading
-    | w.Release
-    | w.Reacquire
-    | w.Resize,
-) -> tuple[LeaseId, Token]:
-    return LeaseId(request.lease_id), Token(*request.token)
-
-
-def _reattached(lease: w.ReattachLease) -> ev.ReattachedLease:
-    return ev.ReattachedLease(
-        lease=LeaseId(lease.lease_id),
-        token=Token(*lease.token),
-        spec=to_spec(lease.spec),
-        held=lease.state == "held",
-        measured_bytes=lease.measured_bytes,
-        uses=tuple(UseId(use) for use in lease.use_ids),
-        away=lease.state in ("standby", "parked"),
-        parked=lease.state == "parked",
-    )
+    """The peer by the kernel's word; the name is what the connection calls itself."""
+    return f"{session.name} (uid {session.peer.uid}, pid {session.peer.process.pid})"

@@ -260,7 +260,7 @@ class Connection(asyncio.Protocol):
 
     @property
     def _stopped(self) -> bool:
-        return self._resting or self._clogged
+        return self._resting or self._clogged or self._finishing
 
     def _handle(self, event: Ready | Heartbeat | Message | Oversize) -> None:
         match event:

@@ -15,11 +15,11 @@ import pytest
 
 from arbiter.daemon import boot_id
 from arbiter.host.journal import Journal
-from arbiter.rpc.peer import start_ticks
 from arbiter.testing.process import ArbiterProcess
 from arbiter.testing.wire import TTL_S, WireClient
 from schemas import fakegpu
 from schemas.ids import ProcessKey
+from schemas.runtime.peercred import start_ticks
 
 pytestmark = pytest.mark.e2e
 GIB = 1 << 30

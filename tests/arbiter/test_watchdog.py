@@ -44,10 +44,10 @@ JOURNAL = """
 """
 LOOP = """
     class Stuck(daemon.SessionTable):
-        def receive(self, routing_id, delimiter, address, payload):
+        def received(self, connection, payload):
             if b"trigger" in payload:
                 wait_for_ever()
-            super().receive(routing_id, delimiter, address, payload)
+            return super().received(connection, payload)
 
     daemon.SessionTable = Stuck
 """

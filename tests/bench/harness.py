@@ -34,9 +34,13 @@ FLOOR = "floor: ZeroMQ round trip (F)"
 
 WIDE = """
 limits:
+  connections_max: 65536
   sessions_max: 65536
+  user_share: 1
+  process_share: 1
   leases_per_client_max: 4096
   rate_per_client_per_s: 1000000
+  rate_per_process_per_s: 1000000
 log:
   level: error
 """

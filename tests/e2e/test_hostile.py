@@ -279,22 +279,21 @@ done(**codes)
     honest.is_alone()
 
 
-def test_a_frame_under_another_ones_routing_id_is_nobodys(honest: Honest, connect: Connect) -> None:
+def test_another_ones_routing_id_gives_nothing_of_it(honest: Honest, connect: Connect) -> None:
+    """A connection is the kernel's word for it; the identity that a peer gives itself is ignored."""
     mine = connect(routing_id=b"mine").hello("mine")
     forger = attack(
         honest.arbiter,
         """
-client = WireClient(endpoint, routing_id=b"mine")
-client.send("hello", version=1, name="mine", instance="mine-1")
-client.send("bye")
-done(answer=client.receive(1.0))
+client = WireClient(endpoint, routing_id=b"mine").hello("mine", instance="mine-1")
+clients = client.ask("status")["clients"]
+done(clients=clients, left=client.ask("bye")["ok"])
 """,
     )
-    assert findings(forger)["answer"] is None, (
-        "a second connection under a living routing id is not even heard"
-    )
+    assert findings(forger) == {"clients": 3, "left": True}, "it is a client of its own"
     assert mine.ask("ping")["ok"]
-    honest.is_served()
+    assert mine.ask("bye")["ok"]
+    honest.is_alone()
 
 
 def test_a_pid_cannot_be_claimed_in_a_message(honest: Honest) -> None:

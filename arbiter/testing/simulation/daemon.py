@@ -20,13 +20,12 @@ from arbiter.host.executor import Executor
 from arbiter.host.journal import Journal
 from arbiter.host.records import check_record
 from arbiter.inbox import Inbox
-from arbiter.rpc.peer import Peer, parse_peer_address
 from arbiter.rpc.session import SessionSettings, SessionTable
 from arbiter.testing.simulation.card import Device, ProbeFaults, SimProber
 from arbiter.testing.simulation.clock import Clock, ProcessLoop
-from arbiter.testing.simulation.wire import SimWire
+from arbiter.testing.simulation.wire import Line, SimWire
 from schemas import defaults as d
-from schemas.errors import JournalUnavailable, NotPermitted
+from schemas.errors import JournalUnavailable
 from schemas.ids import ClientId, GpuId, ProcessKey, RequestId
 
 CHECK_ALL_EVERY = 4
@@ -85,6 +84,7 @@ class SimDaemon:
         self._failed = failed
         self._crash_in: int | None = None  # effects still to be performed; None: no crash is planned
         self._watched: set[ProcessKey] = set()
+        self._connected: set[int] = set()
 
     # -- life ------------------------------------------------------------------------------------------------------
     def start(self) -> None:
@@ -117,16 +117,18 @@ class SimDaemon:
                 grace_s=settings.fence_grace_s,
                 message_max_bytes=d.MESSAGE_MAX_BYTES,
                 sessions_max=d.SESSIONS_MAX,
+                operator_reserve=d.OPERATOR_RESERVE,
+                user_share=d.USER_SHARE,
+                process_share=d.PROCESS_SHARE,
                 rate_per_s=d.RATE_PER_CLIENT_PER_S,
+                process_rate_per_s=d.RATE_PER_PROCESS_PER_S,
                 subscribers_max=d.SUBSCRIBERS_MAX,
                 operators_gid=None,
             ),
-            self,
             self._inbox,
             lambda after, limit, kinds, done: done({"events": [], "last": 0}),
-            self.watch,
+            self,
             lambda: clock.now,
-            self._identify,
         )
         self._executor = Executor(
             _Outbox(self, self.sessions),
@@ -180,14 +182,28 @@ class SimDaemon:
         return [key for key in found if key not in self._executor.owed]
 
     # -- in --------------------------------------------------------------------------------------------------------
-    def deliver(self, routing_id: bytes, address: str, payload: bytes) -> None:
-        """A frame from the wire; waits if the daemon is stopped."""
+    def deliver(self, line: Line, payload: bytes) -> None:
+        """A message from the wire; waits if the daemon is stopped."""
 
         def receive() -> None:
-            self.clock.say(f"in {ClientId(routing_id.hex())} {_asked(payload)}")
-            self.sessions.receive(routing_id, False, address, payload)
+            self.clock.say(f"in c{line.serial} {_asked(payload)}")
+            if line.serial not in self._connected:
+                self._connected.add(line.serial)
+                self.sessions.connected(line)
+            self.sessions.received(line, payload)
 
         self.loop.enter(lambda: self._guarded(receive))
+
+    def lost(self, line: Line) -> None:
+        """A connection has ended."""
+
+        def disconnect() -> None:
+            if line.serial in self._connected:
+                self._connected.discard(line.serial)
+                self.clock.say(f"end of c{line.serial}")
+                self.sessions.disconnected(line, "the peer hung up")
+
+        self.loop.enter(lambda: self._guarded(disconnect))
 
     def process_died(self, process: ProcessKey) -> None:
         """A pidfd became readable."""
@@ -199,6 +215,16 @@ class SimDaemon:
         self._watched.add(process)
         if self.machine.alive.get(process.pid) != process:
             self.loop.call_soon(self.process_died, process)
+
+    def take(self, process: ProcessKey, pidfd: int) -> bool:
+        """`arbiter.rpc.session.Watch`."""
+        new = process not in self._watched
+        self.watch(process)
+        return new
+
+    def drop(self, process: ProcessKey) -> None:
+        """`arbiter.rpc.session.Watch`."""
+        self._watched.discard(process)
 
     def _died(self, process: ProcessKey) -> None:
         if process in self._watched:
@@ -219,22 +245,11 @@ class SimDaemon:
         if not isinstance(error, Crashed):
             self._failed(error)
 
-    def _identify(self, address: str) -> Peer:
-        credentials = parse_peer_address(address)
-        process = self.machine.alive.get(credentials.pid)
-        if process is None:
-            raise NotPermitted(f"process {credentials.pid} has ended")
-        return Peer(credentials, process)
-
     def _slept(self) -> float:
         slept_s, self.machine.slept_s = self.machine.slept_s, 0.0
         return slept_s
 
     # -- out -------------------------------------------------------------------------------------------------------
-    def send(self, routing_id: bytes, delimiter: bool, payload: bytes) -> bool:
-        """`arbiter.rpc.session.Wire`."""
-        return self.machine.wire.send(routing_id, payload)
-
     def _perform(self, effects: Sequence[Effect]) -> None:
         self.handled += 1
         if self.handled % CHECK_ALL_EVERY == 0:

@@ -1,7 +1,8 @@
 """The simulated wire between processes and the daemon: what ZeroMQ over `ipc://` does, with everything that can go wrong.
 
-Order is kept within one connection; across connections it is not. A connection that breaks loses what is under way, comes back under
-a new routing id, and perhaps nobody is told. Frames are bytes and go through the real codec on both sides.
+Order is kept within one connection; across connections it is not. A connection that breaks loses what is under way; the daemon sees its
+end behind all that arrived on it, perhaps after the same client's next connection, and the client perhaps is not told. Messages are bytes
+and go through the real codec on both sides.
 """
 
 from collections.abc import Callable
@@ -11,17 +12,20 @@ from typing import Any, Protocol
 import msgpack
 
 from arbiter.testing.simulation.clock import Clock, ProcessLoop
+from schemas.runtime.peercred import Peer
 
 LATENCY_S = (0.00005, 0.0004)
 RECONNECT_S = (0.02, 0.5)
 QUEUE_MAX = 4096
-"""As `arbiter.rpc.server.SEND_QUEUE_MAX`: a peer that does not read loses what comes beyond."""
+"""As `schemas.runtime.router.OUT_MESSAGES_MAX`: a peer that does not read loses what comes beyond."""
 
 
 class Server(Protocol):
     """The daemon, as the wire needs it."""
 
-    def deliver(self, routing_id: bytes, address: str, payload: bytes) -> None: ...
+    def deliver(self, line: "Line", payload: bytes) -> None: ...
+
+    def lost(self, line: "Line") -> None: ...
 
 
 @dataclass(slots=True)
@@ -33,6 +37,29 @@ class WireFaults:
     duplicated: float = 0.0
 
 
+class Line:
+    """One connection as the daemon sees it; the shape of `arbiter.rpc.session.Connection`."""
+
+    def __init__(self, serial: int, link: "Link") -> None:
+        self.serial = serial
+        self.peer = link.peer
+        self._link = link
+
+    def admit(self) -> None:
+        """There is no time limit for hellos here."""
+
+    def send(self, payload: bytes) -> bool:
+        link = self._link
+        return link.line is self and not link.loop.dead and link.send_down(payload)
+
+    def close(self, reason: str) -> None:
+        self._link.wire.clock.after(self._link.wire.delay_s(), self._hang_up)
+
+    def _hang_up(self) -> None:
+        if self._link.line is self:
+            self._link.cut(told=True)
+
+
 class Link:
     """One DEALER socket of a process, from its opening to its closing; the shape of `clients.transport.Transport`."""
 
@@ -40,14 +67,14 @@ class Link:
         self,
         wire: "SimWire",
         loop: ProcessLoop,
-        address: str,
+        peer: Peer,
         received: Callable[[dict[str, Any]], None],
         hung_up: Callable[[], None],
     ) -> None:
         self.wire = wire
         self.loop = loop
-        self.address = address
-        self.routing_id: bytes | None = None  # None: not connected
+        self.peer = peer
+        self.line: Line | None = None  # None: not connected
         self.queue_max = QUEUE_MAX
         self.closed = False
         self._received = received
@@ -63,7 +90,7 @@ class Link:
         if self.closed or self.loop.dead:
             return True
         payload: bytes = msgpack.packb(message, use_bin_type=True)
-        if self.routing_id is None:
+        if self.line is None:
             self._unsent.append(payload)
         else:
             self._go_up(payload)
@@ -76,16 +103,16 @@ class Link:
         self.closed = True
         if self.wire.clock.chance(0.5):
             self._generation += 1
-        self.routing_id = None
+        self._end()
         self.wire.forget(self)
 
     # -- the world's side ------------------------------------------------------------------------------------------
     def connect(self) -> None:
         """The socket found the daemon."""
-        if self.closed or self.loop.dead or self.routing_id is not None or self.wire.server is None:
+        if self.closed or self.loop.dead or self.line is not None or self.wire.server is None:
             return
         self._generation += 1
-        self.routing_id = self.wire.register(self)
+        self.line = self.wire.register(self)
         self._up_at = self._down_at = 0.0
         self._in_flight_down = 0
         unsent, self._unsent = self._unsent, []
@@ -94,14 +121,22 @@ class Link:
 
     def cut(self, *, told: bool) -> None:
         """The connection breaks; the socket comes back by itself. `told`: the socket's monitor says so to its owner."""
-        if self.closed or self.routing_id is None:
+        if self.closed or self.line is None:
             return
         self._generation += 1
-        self.wire.unregister(self)
-        self.routing_id = None
+        self._end()
         if told:
             self.wire.clock.after(0.001, lambda: self.loop.enter(self._tell_hung_up))
         self.wire.seek(self)
+
+    def _end(self) -> None:
+        """The daemon reads the end of the connection behind everything else."""
+        if self.line is None:
+            return
+        line, self.line = self.line, None
+        wire, server = self.wire, self.wire.server
+        self._up_at = max(self._up_at, wire.clock.now + wire.delay_s())
+        wire.clock.at(self._up_at, lambda: wire.arrive_end(server, line))
 
     def send_down(self, payload: bytes) -> bool:
         """The daemon sends. False: the queue is full."""
@@ -119,17 +154,15 @@ class Link:
         return True
 
     def _go_up(self, payload: bytes) -> None:
-        generation, routing_id = self._generation, self.routing_id
-        assert routing_id is not None, "sending on a socket without a connection"
+        generation, line = self._generation, self.line
+        assert line is not None, "sending on a socket without a connection"
         clock, server = self.wire.clock, self.wire.server
         copies = 2 if clock.chance(self.wire.faults.duplicated) else 1
         for _ in range(copies):
             self._up_at = max(self._up_at, clock.now + self.wire.delay_s())
             clock.at(
                 self._up_at,
-                lambda: self.wire.arrive_up(
-                    self, generation == self._generation, server, routing_id, payload
-                ),
+                lambda: self.wire.arrive_up(line, generation == self._generation, server, payload),
             )
         self.wire.duplicates += copies - 1
 
@@ -151,9 +184,8 @@ class SimWire:
         self.clock = clock
         self.server: Server | None = None
         self.faults = WireFaults()
-        self.links: dict[bytes, Link] = {}
         self._open: dict[Link, None] = {}
-        self._ids = 0
+        self._serial = 0
         self.delays = self.dropped = self.duplicates = self.lost = 0
 
     def delay_s(self) -> float:
@@ -168,20 +200,12 @@ class SimWire:
         self.clock.after(self.delay_s(), link.connect)
 
     def forget(self, link: Link) -> None:
-        """The process closed its socket. The daemon's ROUTER notices nothing but that sends fail."""
+        """The process closed its socket."""
         self._open.pop(link, None)
-        for routing_id in [r for r, known in self.links.items() if known is link]:
-            del self.links[routing_id]
 
-    def register(self, link: Link) -> bytes:
-        self._ids += 1
-        routing_id = self._ids.to_bytes(5, "big")
-        self.links[routing_id] = link
-        return routing_id
-
-    def unregister(self, link: Link) -> None:
-        if link.routing_id is not None:
-            self.links.pop(link.routing_id, None)
+    def register(self, link: Link) -> Line:
+        self._serial += 1
+        return Line(self._serial, link)
 
     def seek(self, link: Link) -> None:
         self.clock.after(self.clock.random.uniform(*RECONNECT_S), link.connect)
@@ -197,21 +221,16 @@ class SimWire:
         for link in list(self._open):
             link.cut(told=self.clock.chance(0.8))
 
-    def send(self, routing_id: bytes, payload: bytes) -> bool:
-        """To a client. False: it is gone, or does not read."""
-        link = self.links.get(routing_id)
-        if link is None or link.loop.dead:
-            return False
-        return link.send_down(payload)
-
-    def arrive_up(
-        self, link: Link, same_connection: bool, server: Server | None, routing_id: bytes, payload: bytes
-    ) -> None:
-        """Also from a socket closed meanwhile: then the frames are older than what its owner says now."""
+    def arrive_up(self, line: Line, same_connection: bool, server: Server | None, payload: bytes) -> None:
+        """Also from a socket closed meanwhile: then the messages are older than what its owner says now."""
         if self.server is None or self.server is not server or not same_connection:
             self.lost += 1
             return
-        self.server.deliver(routing_id, link.address, payload)
+        self.server.deliver(line, payload)
+
+    def arrive_end(self, server: Server | None, line: Line) -> None:
+        if self.server is not None and self.server is server:
+            self.server.lost(line)
 
     def open_links(self) -> list[Link]:
-        return [link for link in self._open if link.routing_id is not None and not link.loop.dead]
+        return [link for link in self._open if link.line is not None and not link.loop.dead]

@@ -25,6 +25,7 @@ from arbiter.testing.simulation.daemon import Happening, Machine, SimDaemon
 from arbiter.testing.simulation.wire import Link, SimWire
 from schemas import defaults as d
 from schemas.ids import GpuId, ProcessKey
+from schemas.runtime.peercred import Peer
 
 DEATH_SEEN_S = (0.0002, 0.02)  # pidfd
 CAPACITY_BYTES = 8 * d.GIB
@@ -63,7 +64,7 @@ class SimProcess:
     key: ProcessKey
     name: str
     loop: ProcessLoop
-    address: str
+    peer: Peer
     links: list[Link] = field(default_factory=list)
     on_kill: list[Callable[[], None]] = field(default_factory=list)
 
@@ -146,7 +147,7 @@ class World:
             pid = self._pids
         key = ProcessKey(pid, int(self.clock.now * 100))
         loop = ProcessLoop(self.clock, f"{name}:{pid}")  # type: ignore[abstract]  # reason: its docstring
-        process = SimProcess(key, name, loop, f"localhost:{uid}:{uid}:{pid}")
+        process = SimProcess(key, name, loop, Peer(key, uid, uid, -1))
         loop.on_failure = lambda error: self.fail(f"{name} ({key}): {type(error).__name__}: {error}")
         self.processes[key] = process
         self.machine.alive[pid] = key
@@ -161,7 +162,7 @@ class World:
         received: Callable[[dict[str, Any]], None],
         hung_up: Callable[[], None],
     ) -> Link:
-        link = Link(self.wire, process.loop, process.address, received, hung_up)
+        link = Link(self.wire, process.loop, process.peer, received, hung_up)
         process.links = [known for known in process.links if not known.closed]
         process.links.append(link)
         return link

@@ -11,8 +11,8 @@ from collections.abc import Awaitable, Callable, Iterator
 import pytest
 
 from arbiter.host.watch import ProcessWatch
-from arbiter.rpc.peer import start_ticks
 from schemas.ids import ProcessKey
+from schemas.runtime.peercred import start_ticks
 
 PATIENCE_S = 60.0
 
@@ -61,6 +61,46 @@ def watched() -> int:
         with contextlib.suppress(FileNotFoundError):  # the listing's own
             found.append(os.readlink(f"/proc/self/fd/{number}"))
     return sum("pidfd" in link for link in found)
+
+
+def test_a_process_is_watched_by_the_descriptor_of_its_connection(
+    children: Callable[[], "subprocess.Popen[bytes]"],
+) -> None:
+    """Between a connection's accept and its hello the process may die and its pid be reused: the pidfd still names the first one."""
+
+    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+        child = children()
+        key, pidfd = key_of(child), os.pidfd_open(child.pid)
+        child.kill()
+        child.communicate()  # reaped: nothing has this pid now, or something else has
+        try:
+            assert watch.take(key, pidfd)
+            assert not watch.take(key, pidfd), "it is watched once"
+        finally:
+            os.close(pidfd)  # the connection's own
+        assert await died.get() == key
+        assert len(watch) == 0
+
+    watching(test)
+
+
+def test_a_process_that_is_dropped_is_not_reported(children: Callable[[], "subprocess.Popen[bytes]"]) -> None:
+    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+        dropped, other = children(), children()
+        before = watched()
+        watch.add(key_of(dropped))
+        watch.add(key_of(other))
+        watch.drop(key_of(dropped))
+        watch.drop(key_of(dropped))
+        assert watched() == before + 1
+        key = key_of(other)
+        dropped.kill()
+        dropped.wait()
+        other.kill()
+        assert await died.get() == key
+        assert died.empty()
+
+    watching(test)
 
 
 def test_a_killed_process_is_reported_once_before_it_is_reaped(

@@ -19,15 +19,17 @@ from arbiter.core.arbiter import Arbiter
 from arbiter.core.settings import GpuInfo, Settings
 from arbiter.host.executor import Executor
 from arbiter.rpc.session import SessionSettings, SessionTable
+from arbiter.testing.connections import KeptConnection, peer_of
 from arbiter.testing.core_driver import SimCard
 from arbiter.testing.hostile import Forger, pack
 from schemas import defaults as d
 from schemas.ids import ClientId, GpuId, ProcessKey
+from schemas.runtime.peercred import Peer
 
 GPU = GpuId("GPU-0")
 STRANGER_UID = 54_321
-VICTIM = f"localhost:{os.getuid()}:{os.getgid()}:{os.getpid()}"
-ATTACKERS = [f"localhost:{STRANGER_UID}:{STRANGER_UID}:{pid}" for pid in (os.getppid(), 1)]
+VICTIM = peer_of(os.getpid())
+ATTACKERS = [peer_of(pid, STRANGER_UID, STRANGER_UID) for pid in (os.getppid(), 1)]
 SEED = st.integers(0, 1 << 32)  # draws through Hypothesis would cost more than what they test
 SETTINGS = settings(deadline=None, max_examples=40, suppress_health_check=list(HealthCheck))
 
@@ -49,6 +51,9 @@ class Recording:
 
     def why(self, consumer: str) -> dict[str, Any]:
         return {"consumer": consumer, "leases": []}
+
+    def concerns(self, client: ClientId) -> bool:
+        return True
 
 
 @dataclass
@@ -94,6 +99,9 @@ class RealCore:
     def why(self, consumer: str) -> dict[str, Any]:
         return self.arbiter.why(consumer, self.plant.now)
 
+    def concerns(self, client: ClientId) -> bool:
+        return self.arbiter.concerns(client)
+
     # the machine
     def apply(self, changes: Sequence[tuple[str, Mapping[str, Any] | None]]) -> None:
         for key, record in changes:
@@ -123,22 +131,30 @@ class Plant:
 
     def __init__(self, *, real: bool, **limits: int) -> None:
         self.now = 100.0
-        self.answers: list[tuple[bytes, dict[str, Any]]] = []
+        self.connections: dict[bytes, KeptConnection] = {}
+        self.serial = 0
         self.watched: set[ProcessKey] = set()
         self.outbox: Any = self  # the executor's way out, until the table is there
-        values: dict[str, int] = {"sessions_max": 50, "rate_per_s": 1_000_000, "subscribers_max": 3, **limits}
+        values: dict[str, Any] = {
+            "sessions_max": 50, "rate_per_s": 1_000_000, "process_rate_per_s": 1_000_000, "subscribers_max": 3,
+            "operator_reserve": 0, "user_share": 1.0, "process_share": 1.0, **limits,
+        }  # fmt: skip
         settings_ = SessionSettings(
             epoch=1, boot_id="b", server="test", heartbeat_s=2.0, grace_s=5.0, message_max_bytes=d.MESSAGE_MAX_BYTES,
             operators_gid=None, **values,
         )  # fmt: skip
         self.core: Any = Recording() if not real else RealCore(self)
-        self.table = SessionTable(settings_, self, self.core, self._read, self.watched.add, lambda: self.now)
+        self.table = SessionTable(settings_, self.core, self._read, self, lambda: self.now)
         self.outbox = self.table
 
-    # Wire
-    def send(self, routing_id: bytes, delimiter: bool, payload: bytes) -> bool:
-        self.answers.append((routing_id, msgpack.unpackb(payload)))
-        return True
+    # Watch
+    def take(self, process: ProcessKey, pidfd: int) -> bool:
+        new = process not in self.watched
+        self.watched.add(process)
+        return new
+
+    def drop(self, process: ProcessKey) -> None:
+        self.watched.remove(process)
 
     # the executor's way out
     def reply(self, *arguments: Any) -> None:
@@ -158,32 +174,57 @@ class Plant:
     ) -> None:
         done({"events": [], "last_seq": 0})
 
-    def say(self, routing_id: bytes, address: str | None, frame: bytes) -> list[dict[str, Any]]:
-        """Deliver a frame; the answers (not pushes) to it."""
-        before = len(self.answers)
-        self.table.receive(routing_id, False, address, frame)
-        return [answer for to, answer in self.answers[before:] if to == routing_id and "re" in answer]
+    def connection(self, via: bytes, peer: Peer) -> KeptConnection:
+        if via not in self.connections:
+            self.serial += 1
+            self.connections[via] = KeptConnection(self.serial, peer)
+            self.table.connected(self.connections[via])
+        return self.connections[via]
 
-    def ask(self, routing_id: bytes, address: str, op: str, **fields: Any) -> dict[str, Any]:
-        (answer,) = self.say(routing_id, address, msgpack.packb({"op": op, "id": 1, **fields}))
+    def hang_up(self, via: bytes) -> None:
+        if via in self.connections:
+            self.table.disconnected(self.connections.pop(via), "the peer hung up")
+
+    def say(self, via: bytes, peer: Peer, frame: bytes) -> list[dict[str, Any]]:
+        """Deliver a message; the answers (not pushes) to it. A connection that the table closed is opened again."""
+        if via in self.connections and self.connections[via].closed:
+            self.hang_up(via)
+        connection = self.connection(via, peer)
+        before = len(connection.sent)
+        self.table.received(connection, frame)
+        return [answer for answer in connection.sent[before:] if "re" in answer]
+
+    def ask(self, via: bytes, peer: Peer, op: str, **fields: Any) -> dict[str, Any]:
+        (answer,) = self.say(via, peer, msgpack.packb({"op": op, "id": 1, **fields}))
         return answer
 
-    def hello(self, routing_id: bytes, address: str, **fields: Any) -> dict[str, Any]:
-        facts = {"version": 1, "name": "n", "instance": routing_id.hex(), **fields}
-        return self.ask(routing_id, address, "hello", **facts)
+    def hello(self, via: bytes, peer: Peer, **fields: Any) -> dict[str, Any]:
+        facts = {"version": 1, "name": "n", "instance": via.hex(), **fields}
+        return self.ask(via, peer, "hello", **facts)
 
     def everybody_dies(self) -> None:
         """The kernel tells of every process that was watched."""
         for process in sorted(self.watched):
             self.table.process_died(process)
             self.core.post(ev.ProcessDied(process))
+        for name in list(self.connections):
+            self.hang_up(name)
 
     def leftovers(self) -> dict[str, int]:
         """Everything that the table remembers of somebody."""
         table = self.table
         return {
             name: len(getattr(table, name))
-            for name in ("_sessions", "_of_process", "_subscribers", "_instances", "_moved")
+            for name in (
+                "_entries",
+                "_sessions",
+                "_of_process",
+                "_sessions_of_user",
+                "_subscribers",
+                "_instances",
+                "_moved",
+                "_casual",
+            )
             if getattr(table, name)
         }
 
@@ -191,9 +232,9 @@ class Plant:
 def attack(plant: Plant, draw: random.Random, forger: Forger, frames: int) -> Counter[int]:
     """Hellos, valid requests, mutants, bombs and noise over a few connections of two processes. Counts answers per frame."""
     counts: Counter[int] = Counter()
-    connections = [b"c%d" % number for number in range(6)]
+    connections = [(b"c%d" % number, ATTACKERS[number % 2]) for number in range(6)]
     for number in range(frames):
-        routing_id, address = draw.choice(connections), draw.choice(ATTACKERS)
+        name, peer = draw.choice(connections)
         match draw.randint(0, 5):
             case 0:
                 role = draw.choice(["client", "client", "observer", "operator"])
@@ -202,12 +243,14 @@ def attack(plant: Plant, draw: random.Random, forger: Forger, frames: int) -> Co
                 frame = pack(forger.request(id=number))
             case _:
                 frame = forger.frame()
-        answers = plant.say(routing_id, address, frame)
+        answers = plant.say(name, peer, frame)
         counts[len(answers)] += 1
         for answer in answers:
             learn(forger, answer)
         if draw.random() < 0.1:
             plant.now += draw.random()
+        if draw.random() < 0.05:
+            plant.hang_up(draw.choice(connections)[0])
     return counts
 
 
@@ -303,5 +346,5 @@ def test_acquire_and_cancel_for_ever_keeps_nothing() -> None:
     assert len(inside.ended) <= 1024
     assert len(inside.nonces) <= 1025
     assert isinstance(core.executor, Executor)
-    assert ClientId(b"c".hex()) in inside.clients
+    assert ClientId("c1") in inside.clients
     assert not any(isinstance(effect, fx.Push) for effect in inside.out)

@@ -9,14 +9,16 @@ import msgpack
 import pytest
 
 from arbiter.core import events as ev
-from arbiter.rpc.peer import start_ticks
 from arbiter.rpc.session import SessionSettings, SessionTable
+from arbiter.testing.connections import KeptConnection, peer_of
 from schemas import wire
 from schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
+from schemas.runtime.peercred import Peer
+from schemas.runtime.zmtp import Oversize
 
-ME = f"localhost:{os.getuid()}:{os.getgid()}:{os.getpid()}"
-PARENT = f"localhost:{os.getuid()}:{os.getgid()}:{os.getppid()}"
-STRANGER = f"localhost:54321:54321:{os.getpid()}"
+ME = peer_of(os.getpid())
+PARENT = peer_of(os.getppid())
+STRANGER = peer_of(1, 54_321, 54_321)
 LEASE, USE = LeaseId("L3-1"), UseId("u")
 FOOTPRINT = {"load_peak_bytes": 10, "steady_bytes": 8, "residue_bytes": 2}
 
@@ -25,21 +27,16 @@ FOOTPRINT = {"load_peak_bytes": 10, "steady_bytes": 8, "residue_bytes": 2}
 class Bench:
     """A session table with a list for a socket and a list for a core."""
 
-    sent: list[tuple[bytes, bool, dict[str, Any]]] = field(default_factory=list)
     events: list[ev.Event] = field(default_factory=list)
     watched: list[ProcessKey] = field(default_factory=list)
     questions: list[tuple[int, int, tuple[str, ...]]] = field(default_factory=list)
+    concerned: set[ClientId] = field(default_factory=set)
+    connections: dict[bytes, KeptConnection] = field(default_factory=dict)
     now: float = 100.0
-    reachable: bool = True
     watchable: bool = True
     next_id: int = 0
-    table: SessionTable = None  # type: ignore[assignment]  # made by `bench`
-
-    # Wire
-    def send(self, routing_id: bytes, delimiter: bool, payload: bytes) -> bool:
-        if self.reachable:
-            self.sent.append((routing_id, delimiter, msgpack.unpackb(payload)))
-        return self.reachable
+    serial: int = 0
+    table: SessionTable = None  # type: ignore[assignment]  # made by `make`
 
     # Decisions
     def post(self, event: ev.Event) -> None:
@@ -62,42 +59,68 @@ class Bench:
         self.questions.append((after, limit, kinds))
         done({"events": [], "last_seq": 0})
 
-    def watch(self, process: ProcessKey) -> None:
+    def concerns(self, client: ClientId) -> bool:
+        return client in self.concerned
+
+    # Watch
+    def take(self, process: ProcessKey, pidfd: int) -> bool:
         if not self.watchable:
             raise OSError(24, "Too many open files")
+        if process in self.watched:
+            return False
         self.watched.append(process)
+        return True
+
+    def drop(self, process: ProcessKey) -> None:
+        self.watched.remove(process)
 
     # the peer's side
-    def ask(
-        self, op: str, routing: bytes = b"a", address: str | None = ME, delimiter: bool = False, **fields: Any
-    ) -> dict[str, Any]:
+    def connection(self, via: bytes = b"a", peer: Peer = ME) -> KeptConnection:
+        """The open connection of that name; a new one if there is none."""
+        if via not in self.connections:
+            self.serial += 1
+            self.connections[via] = KeptConnection(self.serial, peer)
+            self.table.connected(self.connections[via])
+        return self.connections[via]
+
+    def client(self, via: bytes = b"a") -> ClientId:
+        return ClientId(f"c{self.connections[via].serial}")
+
+    def hang_up(self, via: bytes = b"a") -> None:
+        connection = self.connections.pop(via)
+        connection.reachable = False
+        self.table.disconnected(connection, "the peer hung up")
+
+    def ask(self, op: str, via: bytes = b"a", peer: Peer = ME, **fields: Any) -> dict[str, Any]:
         """Send a request; its reply, or {} if there is none yet."""
         self.next_id += 1
-        payload = msgpack.packb({"op": op, "id": self.next_id, **fields})
-        return self.raw(payload, routing, address, delimiter)
+        return self.raw(msgpack.packb({"op": op, "id": self.next_id, **fields}), via, peer)
 
-    def raw(
-        self, payload: bytes, routing: bytes = b"a", address: str | None = ME, delimiter: bool = False
-    ) -> dict[str, Any]:
-        before = len(self.sent)
-        self.table.receive(routing, delimiter, address, payload)
-        return self.sent[-1][2] if len(self.sent) > before else {}
+    def raw(self, payload: bytes | Oversize, via: bytes = b"a", peer: Peer = ME) -> dict[str, Any]:
+        connection = self.connection(via, peer)
+        before = len(connection.sent)
+        self.table.received(connection, payload)
+        return connection.sent[-1] if len(connection.sent) > before else {}
 
     def hello(
-        self, routing: bytes = b"a", address: str | None = ME, role: str = "client", **fields: Any
+        self, via: bytes = b"a", peer: Peer = ME, role: str = "client", **fields: Any
     ) -> dict[str, Any]:
-        fields = {"version": 1, "name": "n", "instance": f"i-{routing.hex()}", **fields}
-        return self.ask("hello", routing, address, role=role, **fields)
+        facts = {"version": 1, "name": "n", "instance": f"i-{via.hex()}", **fields}
+        return self.ask("hello", via, peer, role=role, **facts)
+
+    def left(self) -> list[ClientId]:
+        return [event.client for event in self.events if isinstance(event, ev.ClientLeft)]
 
 
 def make(**changes: Any) -> Bench:
     values: dict[str, Any] = {
         "epoch": 3, "boot_id": "boot", "server": "test", "heartbeat_s": 2.0, "grace_s": 5.0, "message_max_bytes": 4096,
-        "sessions_max": 3, "rate_per_s": 100, "subscribers_max": 1, "operators_gid": None,
+        "sessions_max": 3, "operator_reserve": 0, "user_share": 1.0, "process_share": 1.0, "rate_per_s": 100,
+        "process_rate_per_s": 1000, "subscribers_max": 1, "operators_gid": None,
     }  # fmt: skip
     bench = Bench()
     settings = SessionSettings(**{**values, **changes})
-    bench.table = SessionTable(settings, bench, bench, bench.history, bench.watch, lambda: bench.now)
+    bench.table = SessionTable(settings, bench, bench.history, bench, lambda: bench.now)
     return bench
 
 
@@ -111,17 +134,19 @@ def code(reply: Mapping[str, Any]) -> str:
     return str(reply["error"]["code"])
 
 
+def acquire(bench: Bench) -> None:
+    bench.ask("acquire", nonce="n", spec={"consumer": "c", "model_id": "m", "footprint": FOOTPRINT})
+
+
 def test_hello_is_welcomed_and_the_core_hears_the_kernels_word(bench: Bench) -> None:
     reply = bench.hello()
     assert reply == {
         "re": 1, "epoch": 3, "ok": True, "version": 1, "boot_id": "boot", "server": "test", "role": "client",
         "heartbeat_s": 2.0, "grace_s": 5.0,
     }  # fmt: skip
-    ticks = start_ticks(os.getpid())
-    assert ticks is not None
-    me = ProcessKey(os.getpid(), ticks)
-    assert bench.events == [ev.ClientConnected(ClientId(b"a".hex()), me, os.getuid(), "n", "i-61")]
-    assert bench.watched == [me]
+    assert bench.events == [ev.ClientConnected(bench.client(), ME.process, os.getuid(), "n", "i-61")]
+    assert bench.watched == [ME.process]
+    assert bench.connections[b"a"].admitted, "the time limit for hellos ends"
 
 
 def test_nothing_goes_before_hello(bench: Bench) -> None:
@@ -137,17 +162,13 @@ def test_another_version_is_refused(bench: Bench) -> None:
     assert len(bench.table) == 0
 
 
-@pytest.mark.parametrize("address", [None, "", "127.0.0.1", "localhost:0:0:0"])
-def test_a_peer_whom_the_kernel_does_not_name_is_refused(bench: Bench, address: str | None) -> None:
-    assert code(bench.hello(address=address)) == "not_permitted"
+def test_a_peer_that_cannot_be_seen_is_refused(bench: Bench) -> None:
+    """The kernel says pid 0 of a process of another pid namespace: its death would be heard by nothing."""
+    reply = bench.hello(peer=Peer(ProcessKey(0, 0), 1000, 1000, -1))
+    assert code(reply) == "not_permitted"
+    assert "--pid=host" in reply["error"]["hint"]
     assert bench.events == []
-
-
-def test_a_frame_of_another_process_is_refused_and_the_session_lives_on(bench: Bench) -> None:
-    bench.hello()
-    assert code(bench.ask("ping", address=PARENT)) == "not_permitted"
-    assert code(bench.ask("bye", address=PARENT)) == "not_permitted"
-    assert bench.ask("ping")["ok"]
+    assert not bench.connections[b"a"].admitted
 
 
 def test_hello_again_is_idempotent_but_not_under_another_name(bench: Bench) -> None:
@@ -158,12 +179,11 @@ def test_hello_again_is_idempotent_but_not_under_another_name(bench: Bench) -> N
 
 
 def test_roles(bench: Bench) -> None:
-    assert code(bench.hello(routing=b"x", address=STRANGER, role="operator")) == "not_permitted"
-    assert bench.hello(routing=b"x", address=STRANGER)["ok"]
-    assert bench.hello(routing=b"o", role="operator")["role"] == "operator"
-    bench.hello(routing=b"v", role="observer")
-    me = str(ProcessKey(os.getpid(), start_ticks(os.getpid()) or 0))
-    assert bench.ask("status", b"v")["reader"] == me, "only its own tokens are for it"
+    assert code(bench.hello(via=b"x", peer=STRANGER, role="operator")) == "not_permitted"
+    assert bench.hello(via=b"x", peer=STRANGER)["ok"]
+    assert bench.hello(via=b"o", role="operator")["role"] == "operator"
+    bench.hello(via=b"v", role="observer")
+    assert bench.ask("status", b"v")["reader"] == str(ME.process), "only its own tokens are for it"
     assert bench.ask("status", b"o", after=[1, 2.5, 3])["reader"] == "None"
     assert bench.ask("status", b"o", after=[1, 2.5, 3])["after"] == [1, 2.5, 3]
     lease = {"lease_id": "L1-1", "token": [1, 1]}
@@ -179,7 +199,7 @@ def test_roles(bench: Bench) -> None:
 def test_requests_of_leases_that_come_back(bench: Bench) -> None:
     bench.hello()
     bench.events.clear()
-    me, token, on = ClientId(b"a".hex()), Token(3, 7), {"lease_id": "L3-1", "token": [3, 7]}
+    me, token, on = bench.client(), Token(3, 7), {"lease_id": "L3-1", "token": [3, 7]}
     wanted = {"consumer": "detector", "model_id": "m", "footprint": FOOTPRINT, "standby": True}
     bench.ask("reacquire", **on, wait_timeout_s=4.0)
     bench.ask("reattach", leases=[{**on, "spec": wanted, "state": "standby"}])
@@ -195,7 +215,7 @@ def test_requests_of_leases_that_come_back(bench: Bench) -> None:
 def test_every_request_on_leases_becomes_its_event(bench: Bench) -> None:
     bench.hello()
     bench.events.clear()
-    me, token, on = ClientId(b"a".hex()), Token(3, 7), {"lease_id": "L3-1", "token": [3, 7]}
+    me, token, on = bench.client(), Token(3, 7), {"lease_id": "L3-1", "token": [3, 7]}
     wanted = {"consumer": "detector", "model_id": "m", "revision": "r", "footprint": FOOTPRINT, "mode": "exclusive",
               "priority": 60, "evictable": False, "on_deadline": "deny"}  # fmt: skip
     spec = ev.Spec("detector", ModelKey("m", "r"), "any", True, 10, 8, 2, 60, False, 10.0, 2.0, True)
@@ -231,20 +251,20 @@ def test_every_request_on_leases_becomes_its_event(bench: Bench) -> None:
 
 
 def test_only_an_operator_acts_by_hand_and_is_named_by_the_kernel(bench: Bench) -> None:
-    bench.hello(routing=b"c")
-    bench.hello(routing=b"v", role="observer")
-    bench.hello(routing=b"o", role="operator", name="ops")
+    bench.hello(via=b"c")
+    bench.hello(via=b"v", role="observer")
+    bench.hello(via=b"o", role="operator", name="ops")
     bench.events.clear()
-    for routing in (b"c", b"v"):
+    for via in (b"c", b"v"):
         for op in ("evict", "pin", "unpin", "release_dead"):
-            assert code(bench.ask(op, routing, target="det", reason="r")) == "not_permitted"
+            assert code(bench.ask(op, via, target="det", reason="r")) == "not_permitted"
         for op in ("drain", "resume"):
-            assert code(bench.ask(op, routing, reason="r")) == "not_permitted"
+            assert code(bench.ask(op, via, reason="r")) == "not_permitted"
     assert bench.events == []
     bench.ask("evict", b"o", target="det", reason="r")
     bench.ask("drain", b"o", reason="new driver")
     by = f"ops (uid {os.getuid()}, pid {os.getpid()})"
-    me, last = ClientId(b"o".hex()), bench.next_id
+    me, last = bench.client(b"o"), bench.next_id
     assert bench.events == [
         ev.OperatorAsked(me, RequestId(last - 1), "evict", "det", by, "r"),
         ev.OperatorAsked(me, RequestId(last), "drain", "", by, "new driver"),
@@ -254,7 +274,7 @@ def test_only_an_operator_acts_by_hand_and_is_named_by_the_kernel(bench: Bench) 
 
 
 def test_every_op_of_the_wire_is_dispatched(bench: Bench) -> None:
-    """A new op without a case in `_dispatch` would be answered by nobody."""
+    """A new op without a case in `_dispatch` or `event_of` would be answered by nothing."""
     on = {"lease_id": "L3-1", "token": [3, 7]}
     fields: dict[str, dict[str, Any]] = {
         "hello": {"version": 1, "name": "n", "instance": "i-61"},
@@ -265,9 +285,10 @@ def test_every_op_of_the_wire_is_dispatched(bench: Bench) -> None:
     }  # fmt: skip
     bench.hello()
     for op in wire.OPS:
-        before = (len(bench.sent), len(bench.events))
-        bench.ask(op, **fields.get(op, {}))
-        assert (len(bench.sent), len(bench.events)) != before, f"{op} is answered by nobody"
+        before = len(bench.events)
+        assert bench.ask(op, **fields.get(op, {})) or len(bench.events) > before, (
+            f"{op} is answered by nothing"
+        )
 
 
 def test_reads_are_answered_at_once(bench: Bench) -> None:
@@ -286,50 +307,110 @@ def test_reads_are_answered_at_once(bench: Bench) -> None:
 def test_bye_ends_the_session_and_tells_the_core(bench: Bench) -> None:
     bench.hello()
     assert bench.ask("bye")["ok"]
-    assert bench.events[-1] == ev.ClientLeft(ClientId(b"a".hex()), "bye")
+    assert bench.events[-1] == ev.ClientLeft(bench.client(), "bye")
     assert code(bench.ask("ping")) == "unknown_session"
+    assert bench.hello()["ok"], "the connection may say hello again"
 
 
 def test_a_dead_process_takes_its_sessions_along(bench: Bench) -> None:
     bench.hello(b"a")
     bench.hello(b"b")
-    bench.table.process_died(bench.watched[0])
+    bench.table.process_died(ME.process)
     assert len(bench.table) == 0
-    bench.table.push(ClientId(b"a".hex()), {"push": "revoke"})  # nobody there: nothing happens
-    assert all("push" not in message for _, _, message in bench.sent)
+    bench.table.push(bench.client(), {"push": "revoke"})  # no session: nothing happens
+    assert not any("push" in message for message in bench.connections[b"a"].sent)
+    bench.hang_up(b"a")  # the router hears of the death too
+    assert bench.left() == []
+
+
+# -- connections that are lost -----------------------------------------------------------------------------------------
+def test_a_lost_connection_without_a_lease_ends_its_session_at_once(bench: Bench) -> None:
+    """libzmq's ROUTER never said that a peer had gone: such sessions stayed until their process died."""
+    bench.hello()
+    client = bench.client()
+    bench.hang_up()
+    assert len(bench.table) == 0
+    assert bench.events[-1] == ev.ClientLeft(client, "its connection was lost")
+    assert bench.watched == [], "the death of a process that never held anything concerns nothing"
+
+
+def test_a_holder_that_loses_its_connection_keeps_its_session(bench: Bench) -> None:
+    """The end of a use makes a safe point: a connection that breaks while a robot moves must not make one."""
+    bench.hello()
+    acquire(bench)
+    bench.concerned.add(bench.client())
+    bench.hang_up()
+    assert len(bench.table) == 1
+    assert bench.left() == []
+    bench.table.sweep()
+    assert len(bench.table) == 1
+    assert bench.hello(b"b", instance="i-61")["ok"], "it comes back on another connection"
+    assert len(bench.table) == 1
+    assert bench.left() == []
+    assert bench.watched == [ME.process]
+
+
+def test_a_lost_session_ends_when_the_engine_has_forgotten_its_client(bench: Bench) -> None:
+    bench.hello()
+    acquire(bench)
+    client = bench.client()
+    bench.concerned.add(client)
+    bench.hang_up()
+    bench.concerned.clear()  # its lease expired
+    bench.table.sweep()
+    assert len(bench.table) == 0
+    assert bench.left() == [client]
+    assert bench.watched == [ME.process], "it may keep bytes on a GPU until it dies"
+
+
+def test_a_process_that_was_watched_before_its_hello_stays_watched(bench: Bench) -> None:
+    """From the journal: its lease is recovered, whatever becomes of this connection."""
+    bench.watched.append(ME.process)
+    bench.hello()
+    bench.hang_up()
+    assert bench.watched == [ME.process]
+
+
+def test_a_lost_subscriber_is_sent_nothing_more(bench: Bench) -> None:
+    bench.hello()
+    assert bench.ask("subscribe")["ok"]
+    bench.hang_up()
+    bench.table.broadcast({"seq": 1, "kind": "granted"})
+    assert bench.hello(b"b")["ok"]
+    assert bench.ask("subscribe", b"b")["ok"], "its place is free"
+
+
+def test_a_stranger_that_hangs_up_is_no_event(bench: Bench) -> None:
+    bench.raw(b"junk")
+    bench.hang_up()
+    assert bench.events == []
 
 
 def test_an_instance_on_a_new_connection_replaces_its_old_one(bench: Bench) -> None:
-    """ROUTER never says that a peer is gone: the client object that says hello again does."""
-    for routing in (b"a", b"b", b"c"):
-        assert bench.hello(routing, instance="same")["ok"]
+    """The new connection may be read before the end of the old one."""
+    for via in (b"a", b"b", b"c"):
+        assert bench.hello(via, instance="same")["ok"]
     assert len(bench.table) == 1
-    assert not any(isinstance(event, ev.ClientLeft) for event in bench.events), (
-        "nothing is lost by reconnecting"
-    )
-    for routing in (b"b", b"c"):
-        bench.table.push(ClientId(routing.hex()), {"push": "granted"})
-        assert bench.sent[-1][0] == b"c", "what is sent to an old connection reaches the new one"
+    assert bench.left() == [], "nothing is lost by reconnecting"
+    for via in (b"b", b"c"):
+        bench.table.push(bench.client(via), {"push": "granted"})
+        assert bench.connections[b"c"].sent[-1]["push"] == "granted", "it reaches the new connection"
+    assert len(bench.connections[b"c"].sent) == 3
+    assert bench.connections[b"a"].closed, "the old connection has no use any more"
+    for via in (b"a", b"b"):
+        bench.table.disconnected(bench.connections[via], "closed")
+    assert len(bench.table) == 1
     bench.ask("bye", b"c")
-    left = [event.client for event in bench.events if isinstance(event, ev.ClientLeft)]
-    assert left == [ClientId(b"c".hex())], "the core has moved what was the earlier ones'"
-
-
-def test_a_connection_that_was_replaced_and_comes_back_hears_its_own_answers(bench: Bench) -> None:
-    bench.hello(b"a", instance="one")
-    bench.hello(b"b", instance="one")
-    assert bench.hello(b"a", instance="two")["ok"]
-    assert bench.sent[-1][0] == b"a", "they used to go to the connection that had replaced it"
-    assert bench.ask("ping", b"a")["ok"]
-    assert bench.sent[-1][0] == b"a"
+    assert bench.left() == [bench.client(b"c")], "the core has moved what was the earlier ones'"
 
 
 def test_the_same_instance_of_another_process_is_another_client(bench: Bench) -> None:
     assert bench.hello(b"a", instance="same")["ok"]
-    assert bench.hello(b"b", address=PARENT, instance="same")["ok"]
+    assert bench.hello(b"b", peer=PARENT, instance="same")["ok"]
     assert len(bench.table) == 2
 
 
+# -- shares ------------------------------------------------------------------------------------------------------------
 def test_the_rate_is_limited_per_session_and_refills(bench: Bench) -> None:
     bench.hello(b"a")
     bench.hello(b"b")
@@ -337,52 +418,117 @@ def test_the_rate_is_limited_per_session_and_refills(bench: Bench) -> None:
     refused = [reply for reply in replies if not reply["ok"]]
     assert len(refused) == 51  # a hundred a second, the hello was one of them
     assert code(refused[0]) == "limit_exceeded"
-    assert refused[0]["error"]["details"] == {"limit": "rate_per_client_per_s", "value": 100}
+    assert refused[0]["error"]["details"] == {
+        "limit": "rate_per_client_per_s", "value": 100, "process_value": 1000,
+    }  # fmt: skip
     assert bench.ask("ping", b"b")["ok"], "another client is not affected"
     bench.now += 0.5
     assert sum(bench.ask("ping")["ok"] for _ in range(60)) == 50
 
 
-def test_who_is_over_the_rate_is_told_so_whatever_it_sent(bench: Bench) -> None:
+def test_the_rate_of_a_process_is_limited_over_all_its_connections() -> None:
+    bench = make(process_rate_per_s=150, sessions_max=10)
+    assert sum(bench.hello(b"%d" % number)["ok"] for number in range(5)) == 5
+    replies = [bench.ask("ping", b"%d" % (number % 5)) for number in range(200)]
+    assert sum(reply["ok"] for reply in replies) == 145
+    assert bench.hello(b"p", peer=PARENT)["ok"], "another process is not affected"
+
+
+def test_connecting_again_does_not_refill_the_rate_of_a_process() -> None:
+    bench = make(process_rate_per_s=150)
+    accepted = 0
+    for _ in range(10):
+        accepted += sum(code(bench.raw(b"junk")) == "bad_frame" for _ in range(50))
+        bench.hang_up()
+    assert accepted == 150
+
+
+def test_a_large_message_is_charged_for_its_size(bench: Bench) -> None:
+    """The cost of a message grows with its bytes: 2,000 of 1 MiB a second would take all the time there is."""
+    bench.hello()
+    assert code(bench.ask("ping", pad="x" * 3000)) == "bad_request"  # 1 + 2
+    assert sum(bench.ask("ping")["ok"] for _ in range(150)) == 96
+    bench.now += 1
+    assert code(bench.raw(Oversize(1 << 30, 4096, delimiter=False))) == "message_too_large"
+    bench.now += 100
+    assert code(bench.ask("ping")) == "limit_exceeded", "a gigabyte is paid for"
+
+
+def test_a_message_that_was_skipped_is_answered(bench: Bench) -> None:
+    refused = bench.raw(Oversize(70_000, 65_536, delimiter=False))
+    assert code(refused) == "message_too_large"
+    assert refused["error"]["details"] == {"size_bytes": 70_000, "limit_bytes": 65_536}
+    assert "hello" in refused["error"]["hint"], "a stranger may send less than a client"
+
+
+def test_one_over_the_rate_is_told_so_whatever_it_sent(bench: Bench) -> None:
     """Each is answered to its id, and nothing of it is looked at but that."""
     bench.hello(b"a")
-    receive = bench.table.receive
-    assert [receive(b"a", False, ME, msgpack.packb({"op": "ping", "id": n})) for n in range(100)] == [
-        *[True] * 99, False
-    ]  # fmt: skip
+    connection, received = bench.connections[b"a"], bench.table.received
+    pings = [received(connection, msgpack.packb({"op": "ping", "id": n})) for n in range(100)]
+    assert pings == [*[True] * 99, False]
     for payload, request in (
         (msgpack.packb({"op": "acquire", "id": 7, "spec": 3}), 7),
         (msgpack.packb({"op": "no such", "id": -1}), None),
         (msgpack.packb({"id": True}), None),
         (msgpack.packb([7]), None),
         (b"\xc1", None),
-        (msgpack.packb({"op": "ping", "id": 8, "pad": "x" * 5000}), None),
+        (msgpack.packb({"op": "ping", "id": 8, "pad": "x" * 70_000}), None),
+        (Oversize(1 << 20, 4096, delimiter=False), None),
     ):
         reply = bench.raw(payload)
         assert (code(reply), reply["re"]) == ("limit_exceeded", request)
 
 
-def test_strangers_share_one_budget(bench: Bench) -> None:
-    for _ in range(100):
+def test_strangers_do_not_use_up_each_others_rate(bench: Bench) -> None:
+    """All connections without a hello shared one budget: one of them kept every other client from its hello."""
+    for _ in range(150):
         bench.raw(b"junk", b"z")
-    assert code(bench.raw(b"junk", b"y")) == "limit_exceeded"
-    bench.now += 1
-    assert code(bench.raw(b"junk", b"y")) == "bad_frame"
+    assert code(bench.raw(b"junk", b"z")) == "limit_exceeded"
+    assert bench.hello(b"y", peer=STRANGER)["ok"]
+
+
+def test_one_process_and_one_user_leave_room_for_others() -> None:
+    """One process took all sessions, and neither another user nor an operator could connect."""
+    bench = make(sessions_max=10, process_share=0.4, user_share=0.6, operator_reserve=2)
+    other_user, third = peer_of(os.getppid(), 54_321, 54_321), peer_of(os.getpid(), 7, 7)
+    codes = [bench.hello(b"m%d" % number, peer=STRANGER) for number in range(6)]
+    assert [reply["ok"] for reply in codes] == [True] * 4 + [False] * 2
+    assert codes[4]["error"]["details"] == {"limit": "process_share", "value": 4}
+    codes = [bench.hello(b"n%d" % number, peer=other_user) for number in range(3)]
+    assert [reply["ok"] for reply in codes] == [True, True, False]
+    assert codes[2]["error"]["details"] == {"limit": "user_share", "value": 6}
+    codes = [bench.hello(b"o%d" % number, peer=third) for number in range(3)]
+    assert [reply["ok"] for reply in codes] == [True, True, False]
+    assert codes[2]["error"]["details"] == {"limit": "sessions_max", "value": 8}
+    assert bench.hello(b"p", role="operator")["ok"], "places are kept for operators"
+
+
+def test_lost_and_silent_sessions_of_a_process_make_room_for_it() -> None:
+    bench = make(sessions_max=8, process_share=0.25)
+    bench.hello(b"a", peer=PARENT)
+    assert bench.hello(b"b")["ok"]
+    assert bench.hello(b"c")["ok"]
+    assert code(bench.hello(b"d")) == "limit_exceeded"
+    bench.now += 11
+    bench.ask("ping", b"c")
+    assert bench.hello(b"d")["ok"]
+    assert bench.left() == [bench.client(b"b")], "the other process keeps its own"
 
 
 def test_at_the_limit_of_sessions_the_silent_ones_make_room(bench: Bench) -> None:
-    for routing in (b"a", b"b", b"c"):
-        bench.hello(routing)
+    for via in (b"a", b"b", b"c"):
+        bench.hello(via)
     reply = bench.hello(b"d")
     assert code(reply) == "limit_exceeded"
-    assert reply["error"]["details"] == {"limit": "sessions_max", "value": 3}
-    bench.ask("acquire", b"a", nonce="n", spec={"consumer": "c", "model_id": "m", "footprint": FOOTPRINT})
+    assert reply["error"]["details"]["value"] == 3
+    acquire(bench)
+    bench.concerned.add(bench.client())
     bench.now += 8
     bench.ask("ping", b"c")
     bench.now += 8
     assert bench.hello(b"d")["ok"]
-    left = [event for event in bench.events if isinstance(event, ev.ClientLeft)]
-    assert [event.client for event in left] == [ClientId(b"b".hex())], "a holds a lease, c spoke a moment ago"
+    assert bench.left() == [bench.client(b"b")], "a holds a lease, c spoke a moment ago"
 
 
 def test_no_descriptor_left_is_a_typed_error(bench: Bench) -> None:
@@ -400,35 +546,37 @@ def test_subscribers_receive_events_and_are_limited(bench: Bench) -> None:
     assert bench.ask("subscribe", b"a")["ok"], "twice is once"
     assert code(bench.ask("subscribe", b"b")) == "limit_exceeded"
     bench.table.broadcast({"seq": 1, "kind": "granted"})
-    routing, _, message = bench.sent[-1]
-    assert (routing, message) == (
-        b"a",
-        {"push": "event", "seq": 1, "epoch": 3, "event": {"seq": 1, "kind": "granted"}},
-    )
+    assert bench.connections[b"a"].sent[-1] == {
+        "push": "event", "seq": 1, "epoch": 3, "event": {"seq": 1, "kind": "granted"},
+    }  # fmt: skip
+
+
+def test_one_process_does_not_take_all_subscriptions() -> None:
+    bench = make(subscribers_max=4, process_share=0.5, sessions_max=20)
+    for via in (b"a", b"b", b"c"):
+        bench.hello(via)
+    answers = [bench.ask("subscribe", via) for via in (b"a", b"b", b"c")]
+    assert [answer["ok"] for answer in answers] == [True, True, False]
+    assert answers[2]["error"]["details"] == {"limit": "process_share", "value": 2}
+    bench.hello(b"p", peer=PARENT)
+    assert bench.ask("subscribe", b"p")["ok"]
 
 
 def test_pushes_are_numbered_per_session(bench: Bench) -> None:
     bench.hello(b"a")
     for _ in range(3):
-        bench.table.push(ClientId(b"a".hex()), {"push": "revoke"})
-    assert [message["seq"] for _, _, message in bench.sent if "push" in message] == [1, 2, 3]
-
-
-def test_a_req_socket_is_answered_with_its_delimiter(bench: Bench) -> None:
-    bench.raw(
-        msgpack.packb({"op": "hello", "id": 1, "version": 1, "name": "n", "instance": "i"}), delimiter=True
-    )
-    assert bench.sent[-1][1] is True
-    bench.table.reply(ClientId(b"a".hex()), RequestId(9), {})
-    assert bench.sent[-1][1] is True
+        bench.table.push(bench.client(), {"push": "revoke"})
+    sent = bench.connections[b"a"].sent
+    assert [message["seq"] for message in sent if "push" in message] == [1, 2, 3]
 
 
 def test_an_unreachable_peer_is_no_error(bench: Bench) -> None:
     bench.hello()
-    bench.reachable = False
-    bench.table.push(ClientId(b"a".hex()), {"push": "revoke"})
+    connection = bench.connections[b"a"]
+    connection.reachable = False
+    bench.table.push(bench.client(), {"push": "revoke"})
     assert bench.ask("ping") == {}
-    bench.reachable = True
+    connection.reachable = True
     assert bench.ask("ping")["ok"]
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from arbiter.host.gpu.pids import INITIAL_NAMESPACE, PidMap
-from arbiter.rpc.peer import start_ticks
 from schemas.ids import ProcessKey
+from schemas.runtime.peercred import start_ticks
 
 
 def process(proc: Path, pid: int, ticks: int, name: str, nspid: Sequence[int]) -> None:
