@@ -97,7 +97,6 @@ class Entry:
 
 async def run(args: argparse.Namespace) -> int:
     """Exit 0: every episode got a verdict or nobody judges; 1: errors, or stopped. Either way the report says what was played."""
-    need("a benchmark", "numpy", "cv2", extra="runner")
     async with contextlib.AsyncExitStack() as stack:
         arbiter = None
         if args.skill and not args.no_arbiter:
@@ -106,6 +105,7 @@ async def run(args: argparse.Namespace) -> int:
         check_output("--out", args.out / REPORT)
         if args.videos:
             check_output("--out", args.out / "videos" / "any")
+        need("a benchmark", "numpy", "cv2", extra="runner")  # behind what is wrong with the flags
         await asyncio.to_thread(warm_up)
         stopping = asyncio.Event()
         install_signals(stopping)

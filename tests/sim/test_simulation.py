@@ -89,8 +89,9 @@ def test_company_of_an_exclusive_lease_is_a_breach(tmp_path: Path) -> None:
 
 def test_a_token_that_does_not_grow_is_a_breach(tmp_path: Path) -> None:
     made = world(tmp_path)
-    for token in ([1, 5], [1, 4]):
-        made.machine.history.append(Happening(made.clock.now, 1, "granted", {"token": token}))
+    for lease, serial in (("L1-1", 5), ("L1-2", 4)):
+        made.machine.tokens[lease] = (1, serial)
+        made.machine.history.append(Happening(made.clock.now, 1, "granted", {"lease_id": lease}))
     made.clock.after(0.0, lambda: None)
     with pytest.raises(SimFailure, match="was granted after"):
         made.run(1.0)
