@@ -61,7 +61,8 @@ def check_endpoint(endpoint: str) -> str:
         raise ValueError(f"{endpoint!r} is not an endpoint; write {EXAMPLE}")
     if scheme == "tcp":
         raise ValueError(
-            "tcp:// is refused: without CURVE keys neither side knows which user it talks to; write ipc://PATH"
+            "tcp:// is refused: without CURVE keys any user of the machine could connect, take leases, drive a robot and stop it; "
+            "write ipc://PATH"
         )
     if path.startswith("@"):
         raise ValueError(

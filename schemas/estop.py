@@ -12,7 +12,8 @@ No library reads them: nothing that a peer sends costs more than a copy of `REQU
 from dataclasses import dataclass
 from enum import StrEnum
 
-from schemas.errors import BadFrame, ConfigError
+from schemas.endpoints import socket_path
+from schemas.errors import BadFrame
 
 SUFFIX = ".estop"
 PREFIX = b"VRAM-ESTOP/"
@@ -56,13 +57,8 @@ class Reply:
 
 def path_of(endpoint: str) -> str:
     """Path of the emergency-stop socket of the runner that serves goals at `endpoint`. Raises ConfigError for what is no `ipc://` endpoint."""
-    path = endpoint.removeprefix("ipc://")
-    if not endpoint.startswith("ipc://") or not path:
-        raise ConfigError(
-            f"expected an endpoint such as ipc:///run/vram-arbiter/runner.sock, got {endpoint!r}",
-            hint="a runner serves on ipc://PATH only",
-        )
-    return path + SUFFIX
+    socket_path(endpoint)  # its own mistakes are said in its own words
+    return socket_path(endpoint + SUFFIX)
 
 
 def request(reason: str) -> bytes:

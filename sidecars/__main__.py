@@ -15,6 +15,7 @@ from pathlib import Path
 
 from clients import cuda, logs
 from clients.configs import configs_folder, shipped
+from clients.serve import path_of
 from schemas import defaults as d
 from schemas import telemetry, terminal
 from schemas.commands import command
@@ -104,6 +105,8 @@ def settings_from(flags: argparse.Namespace) -> Settings:
     else:
         path = flags.footprints or configs / FOOTPRINTS
         entry = footprint_for(manifest, read_footprints(path) if path.exists() or flags.footprints else {})
+    endpoint = flags.endpoint or program_endpoint(flags.name, os.environ, os.getuid())
+    path_of(endpoint)  # refused before a model is read
     device = _device(flags.device)
     need_card(manifest, device)
     return Settings(
@@ -111,7 +114,7 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         manifest=manifest,
         weights=weights,
         footprint=entry.on_wire(),
-        endpoint=flags.endpoint or program_endpoint(flags.name, os.environ, os.getuid()),
+        endpoint=endpoint,
         device=device,
         arbiter=None if flags.no_arbiter else flags.arbiter or arbiter_endpoint(os.environ, os.getuid()),
         stands_for=entry.stands_for,

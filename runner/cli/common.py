@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clients.configs import configs_folder
+from clients.serve import check_free
 from runner import frames
 from runner.skill_runner import SkillRunner
+from schemas import estop
 from schemas.errors import ArbiterUnreachable, ConfigError
 from schemas.manifest import Kind, RSkillManifest
 
@@ -102,6 +104,13 @@ def check_sidecars(given: Mapping[str, str], manifests: Iterable[RSkillManifest]
                 f"--sidecar {name}: no such policy is installed",
                 hint=f"there is {', '.join(installed) or 'none'}",
             )
+
+
+def check_endpoint(endpoint: str) -> None:
+    """Before a world begins or a robot has power: where no goal and no emergency stop can be served nothing may move. Raises ConfigError,
+    AlreadyRunning."""
+    check_free(endpoint)
+    estop.path_of(endpoint)
 
 
 def warm_up() -> None:

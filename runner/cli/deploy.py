@@ -19,6 +19,7 @@ from clients.runner import RunnerClient
 from runner.catalogue import Catalogue, Maker, read_manifests, sidecar_endpoint
 from runner.cli.common import (
     add_serving_flags,
+    check_endpoint,
     check_sidecars,
     connect_arbiter,
     default_skills,
@@ -141,6 +142,7 @@ class Deploy:
 
     async def run(self) -> int:
         """Check, then print the plan or carry it out."""
+        check_endpoint(self._endpoint)
         parts = make_parts(self._file, self._clock)
         manifests = read_manifests(self._args.skills or [default_skills()])
         check = self._offered(parts, manifests, None)

@@ -14,6 +14,7 @@ from clients.outputs import check_output
 from runner.cli.common import (
     AS_FAST_AS_POSSIBLE_HZ,
     add_serving_flags,
+    check_endpoint,
     check_sidecars,
     connect_arbiter,
     default_skills,
@@ -84,7 +85,6 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 async def run(args: argparse.Namespace) -> int:
     """Build everything, serve until a signal, `shutdown`, `--max-seconds` or the last of `--episodes`, end in order."""
     need("the simulator", "numpy", "cv2", extra="runner")
-    from clients.serve import check_free
     from runner.catalogue import Catalogue, read_manifests
     from runner.clock import SystemClock
     from runner.goals import GoalServer
@@ -114,7 +114,7 @@ async def run(args: argparse.Namespace) -> int:
     if policy is None:
         check_sidecars(given, manifests)
     endpoint = args.endpoint or program_endpoint("runner", os.environ, os.getuid())
-    check_free(endpoint)  # before a world begins, and a recording of it
+    check_endpoint(endpoint)
     period_s = 1.0 / (args.rate or AS_FAST_AS_POSSIBLE_HZ)
     wait_s = LOCKSTEP_WAIT_S if args.lockstep or args.rate == 0 else 0.0
     clock = SystemClock()

@@ -210,12 +210,12 @@ def test_a_deleted_socket_file_is_made_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("endpoint", "says"),
     [
-        ("tcp://127.0.0.1:7777", "any user of this machine could drive the robot"),
-        ("tcp://0.0.0.0:7777", "any user of this machine could drive the robot"),
-        ("ipc://@runner", "use ipc://PATH"),
-        ("ipc://", "use ipc://PATH"),
-        ("runner.sock", "use ipc://PATH"),
-        ("inproc://runner", "use ipc://PATH"),
+        ("tcp://127.0.0.1:7777", "any user of the machine could connect"),
+        ("tcp://0.0.0.0:7777", "any user of the machine could connect"),
+        ("ipc://@runner", "write ipc://"),
+        ("ipc://", "write ipc://"),
+        ("runner.sock", "write ipc://"),
+        ("inproc://runner", "write ipc://"),
     ],
 )
 def test_only_the_path_of_a_socket_is_served(endpoint: str, says: str) -> None:

@@ -50,6 +50,7 @@ def test_usage(tmp_path: Path) -> None:
         (["--task", "x", "--result", "/proc/none/result.json"], "--result /proc/none/result.json cannot be written"),
         (["--task", "x", "--planner", "openai"], "VRAM_REASONER_LLM_BASE_URL and VRAM_REASONER_LLM_MODEL not set"),
         (["--task", "x", "--runner", "runner.sock"], "'runner.sock' is not an endpoint"),
+        (["--task", "x", "--listen", "tcp://127.0.0.1:7"], "any user of the machine"),
         (["--say", "x", "--listen", "reasoner.sock"], "'reasoner.sock' is not an endpoint"),
     ],
 )  # fmt: skip

@@ -242,13 +242,13 @@ def test_the_socket_of_a_killed_runner_is_taken_over_and_nothing_else(
     Path(path_of(endpoint)).write_text("a file")
     with pytest.raises(AlreadyRunning, match="not a socket"), serve():
         pass
-    long = f"ipc://{tmp_path}/{'x' * 120}"
-    with (
-        pytest.raises(ConfigError, match="cannot serve the emergency stop"),
-        EstopServer(long, robot, robot.mailbox, on_stop=lambda *_: None),
-    ):
-        pass
-    with pytest.raises(ConfigError, match="expected an endpoint"):
+    with pytest.raises(ConfigError, match="the socket path has"):
+        path_of(f"ipc:///{'x' * 103}")  # fits the goal socket, and leaves no room for its emergency stop's
+    with pytest.raises(ConfigError, match=r"no-such-folder/s\.estop: No such file"):
+        EstopServer(
+            f"ipc://{tmp_path}/no-such-folder/s", robot, robot.mailbox, on_stop=lambda *_: None
+        ).__enter__()
+    with pytest.raises(ConfigError, match="tcp:// is refused"):
         path_of("tcp://127.0.0.1:7")
 
 

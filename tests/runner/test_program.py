@@ -147,10 +147,25 @@ def test_a_second_runner_records_nothing(tmp_path: Path, capsys: pytest.CaptureF
     assert not (tmp_path / "set").exists()
 
 
+@pytest.mark.parametrize(
+    "command",
+    [["sim"], ["deploy", "--config", "robot.yaml"], ["deploy", "--dry-run", "--config", "robot.yaml"]],
+)
+def test_a_runner_serves_no_tcp_and_says_so_before_a_robot_has_power(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: list[str]
+) -> None:
+    (tmp_path / "robot.yaml").write_text("robot_id: bench\nhal: {adapter: so101_mujoco}\nsensors: []\n")
+    monkeypatch.chdir(tmp_path)
+    assert main([*command, "--no-arbiter", "--endpoint", "tcp://127.0.0.1:7777"]) == 2
+    said = capsys.readouterr().err
+    assert "any user of the machine could connect" in said
+    assert "write ipc://PATH" in said
+
+
 def test_an_address_that_is_none_is_said_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     """Of all programs the one that stops motors ended with a traceback."""
     assert main(["estop", "--endpoint", "runner.sock"]) == 2
-    assert "got 'runner.sock'" in capsys.readouterr().err
+    assert "'runner.sock' is not an endpoint" in capsys.readouterr().err
 
 
 def test_where_a_sidecar_is() -> None:

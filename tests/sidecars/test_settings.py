@@ -105,6 +105,10 @@ def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
     assert (alone.arbiter, alone.device, alone.gpu) == (None, "cuda:1", "1"), "not any: it loads on that one"
     with pytest.raises(ConfigError, match="--device gpu"):
         settings("--name", "d", "--rskill", rskill, "--footprint", "2GB", "--device", "gpu")
+    with pytest.raises(ConfigError, match="any user of the machine"):
+        settings(
+            "--name", "d", "--rskill", rskill, "--footprint", "2GB", "--endpoint", "tcp://127.0.0.1:5757"
+        )
 
 
 def test_check_says_ok_or_what_is_wrong(rskill, tmp_path, capsys):
