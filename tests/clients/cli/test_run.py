@@ -98,7 +98,7 @@ def test_run_leases_for_a_program(arbiter_daemon: ArbiterProcess) -> None:
     run = ("run", "--vram", "1GiB", "--name", "job", "--", sys.executable, "-c", script, *names)
     done = vramctl(*run, environ=environ)
     assert done.returncode == 7
-    assert re.fullmatch(r"L1-1 1\.\d+ 3\n", done.stdout)
+    assert re.fullmatch(r"L(\d+)-1 \1\.\d+ 3\n", done.stdout)
     assert "peak not measured" in done.stderr
     history = json.loads(vramctl("history", "--json", environ=environ).stdout)["events"]
     story = [(event["kind"], event.get("exiting")) for event in history if event.get("consumer") == "job"]
@@ -202,22 +202,33 @@ def test_the_terminals_interrupt_reaches_the_program_once(arbiter_daemon: Arbite
 
 # -- room for others ---------------------------------------------------------------------------------------------------------
 @pytest.mark.e2e
+@pytest.mark.parametrize("options", [(), ("--pin",)], ids=["default", "pinned"])
 def test_two_programs_that_do_not_fit_together_run_one_after_the_other(
-    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess
+    options: tuple[str, ...], client: SyncArbiterClient, arbiter_daemon: ArbiterProcess
 ) -> None:
     """The second was denied at once, because the first was pinned."""
-    with running(arbiter_daemon.environ) as first:
+    with running(arbiter_daemon.environ, *options) as first:
         second = subprocess.Popen(
             command("--name", "next", "--wait", "60", program="raise SystemExit(4)"),
             env=arbiter_daemon.environ, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
-        assert "next waits for its room (priority 40)" in said(first)
-        assert view(client, "job")["uses"] == 1
-        assert first.poll() is None
+        assert "waiting: " in said(second)
+        if not options:
+            assert "next waits for its room (priority 40)" in said(first)
+        assert (view(client, "job")["uses"], first.poll()) == (1, None)
         first.terminate()
         assert first.wait(PATIENCE_S) == 5
     assert second.wait(PATIENCE_S) == 4
     second.communicate()
+
+
+@pytest.mark.e2e
+def test_a_program_waits_for_as_long_as_it_was_told(arbiter_daemon: ArbiterProcess) -> None:
+    """`--wait` did not count beside a pinned program: the answer was no at once."""
+    with running(arbiter_daemon.environ, "--pin"):
+        done = vramctl("run", "--vram", "5GiB", "--wait", "0.2", "true", environ=arbiter_daemon.environ)
+    assert done.returncode == 1
+    assert "0.2 s" in done.stderr, done.stderr
 
 
 @pytest.mark.e2e
