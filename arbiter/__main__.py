@@ -170,7 +170,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with asyncio.Runner(loop_factory=new_loop) as runner:
             return runner.run(serve())
     except VramError as error:
-        print(f"vram-arbiter: {error}", file=sys.stderr)
+        terminal.complain("vram-arbiter", error)
         return exit_code_of(error)
 
 

@@ -7,6 +7,8 @@ import time
 from collections.abc import Mapping
 from typing import Any, Literal
 
+from schemas.runtime.logtext import PrintableFormatter
+from schemas.runtime.printable import printable
 from schemas.units import format_bytes
 
 events_log = logging.getLogger("arbiter.events")
@@ -74,11 +76,11 @@ def _value(key: str, value: object) -> str:
     return json.dumps(value, default=str, ensure_ascii=False)
 
 
-class _Human(logging.Formatter):
+class _Human(PrintableFormatter):
     def format(self, record: logging.LogRecord) -> str:
         clock = time.strftime("%H:%M:%S", time.localtime(record.created))
         line = f"{clock}.{int(record.msecs):03d} {record.levelname.lower():<8} {record.getMessage()}"
-        return line + ("\n" + self.formatException(record.exc_info) if record.exc_info else "")
+        return printable(line) + ("\n" + self.formatException(record.exc_info) if record.exc_info else "")
 
 
 class _Json(logging.Formatter):
@@ -94,4 +96,4 @@ class _Json(logging.Formatter):
         line.update(getattr(record, "trace", None) or {})
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
-        return json.dumps(line, default=str, ensure_ascii=False)
+        return json.dumps(line, default=str)  # everything beyond ASCII is escaped

@@ -8,6 +8,8 @@ import logging
 import sys
 from typing import Any, Literal
 
+from schemas.runtime.logtext import PrintableFormatter
+
 Form = Literal["human", "json"]
 FORMS: tuple[Form, ...] = ("human", "json")
 
@@ -15,7 +17,7 @@ FORMS: tuple[Form, ...] = ("human", "json")
 def set_up(program: str, level: str, form: Form, human: str) -> None:
     """Configure the root logger once, at the start of the program. `human`: the format of a line for people."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_Json(program) if form == "json" else logging.Formatter(human))
+    handler.setFormatter(_Json(program) if form == "json" else PrintableFormatter(human))
     root = logging.getLogger()
     for old in list(root.handlers):
         root.removeHandler(old)
@@ -39,7 +41,7 @@ class _Json(logging.Formatter):
         }
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
-        return json.dumps(line, default=str, ensure_ascii=False)
+        return json.dumps(line, default=str)  # everything beyond ASCII is escaped
 
 
 def _ids() -> dict[str, str]:

@@ -151,7 +151,7 @@ def _check_task(task: str) -> None:
 
 
 def _complain(error: VramError, code: int) -> int:
-    print(f"vram-reasoner: {error}", file=sys.stderr)
+    terminal.complain("vram-reasoner", error)
     return code
 
 

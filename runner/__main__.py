@@ -61,7 +61,7 @@ def main(argv: list[str] | None = None) -> int:
         ):
             running.code = asyncio.run(args.run(args))
     except VramError as error:
-        print(f"vram-runner: {error}", file=sys.stderr)
+        terminal.complain("vram-runner", error)
         a_person_has_to_act = isinstance(error, ConfigError | ManifestInvalid | EstopRequested)
         return 2 if a_person_has_to_act else 1
     return running.code

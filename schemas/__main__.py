@@ -14,6 +14,7 @@ from pathlib import Path
 from schemas import terminal
 from schemas.export import documents
 from schemas.manifest import ManifestError, load_manifest
+from schemas.runtime.printable import printable_lines
 from schemas.version import add_version
 
 
@@ -42,11 +43,11 @@ def _check(files: Sequence[Path]) -> int:
             manifest = load_manifest(path)
         except ManifestError as error:
             failed += 1
-            print(error)
+            print(printable_lines(error))
             continue
         print(f"{path}: ok")
         for warning in manifest.warnings():
-            print(f"warning: {warning.at(str(path))}", file=sys.stderr)
+            print(f"warning: {printable_lines(warning.at(str(path)))}", file=sys.stderr)
     if failed and len(files) > 1:
         print(f"{failed} of {len(files)} files are invalid", file=sys.stderr)
     return 1 if failed else 0

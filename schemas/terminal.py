@@ -12,6 +12,8 @@ import sys
 from collections.abc import Callable
 from functools import wraps
 
+from schemas.runtime.printable import printable_lines
+
 INTERRUPTED = 128 + signal.SIGINT
 READER_LEFT = 128 + signal.SIGPIPE
 NO_ROOM = 74
@@ -45,6 +47,11 @@ def program[**P](main: Callable[P, int]) -> Callable[P, int]:
         return code
 
     return ended
+
+
+def complain(name: str, error: BaseException) -> None:
+    """Say on stderr why a program ends; what the error quotes is escaped."""
+    print(f"{name}: {printable_lines(error)}", file=sys.stderr)
 
 
 def no_room(name: str, error: OSError) -> int:

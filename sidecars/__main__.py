@@ -78,7 +78,7 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
             logging.shutdown()
             os._exit(0)  # the interpreter would wait for an import of many seconds that nobody needs any more
     except (VramError, ManifestError) as error:
-        print(f"vram-sidecar: {error}", file=sys.stderr)
+        terminal.complain("vram-sidecar", error)
         wrong = (ConfigError, ManifestError, ModelError) if flags.check else (ConfigError, ManifestError)
         return 2 if isinstance(error, wrong) else 1
     return 0

@@ -91,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if flags.as_json:
             print(json.dumps({"error": error.to_wire()}, indent=2))
         else:
-            print(f"vramctl: {error}", file=sys.stderr)
+            terminal.complain("vramctl", error)
         return NO
 
 

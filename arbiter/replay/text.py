@@ -7,11 +7,13 @@ from typing import Any
 from arbiter.replay.codec import digest, summary, to_json
 from arbiter.replay.logfile import Entry, engine_id
 from arbiter.replay.runner import Divergence, Replayed
+from schemas.runtime.printable import makes_printable, printable
 
 WIDTH = 200
 """Longer lines of data are cut."""
 
 
+@makes_printable
 def replay_lines(found: Replayed) -> list[str]:
     """One line if all is the same, else the first divergence with what stood around it."""
     seconds = found.ended_at - found.began_at
@@ -88,6 +90,7 @@ DECISIONS = frozenset(
 """Kinds of notes that a timeline shows."""
 
 
+@makes_printable
 def timeline_lines(
     policy: str, timeline: Sequence[tuple[float, str, Mapping[str, Any]]], limit: int
 ) -> list[str]:
@@ -102,7 +105,7 @@ def timeline_lines(
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[Any]], left: int = 1) -> list[str]:
     """Columns as wide as their longest cell; all but the first `left` to the right."""
-    cells = [[str(cell) for cell in row] for row in [columns, *rows]]
+    cells = [[printable(cell) for cell in row] for row in [columns, *rows]]
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
     return [
         "  ".join(

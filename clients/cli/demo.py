@@ -27,7 +27,7 @@ from clients.configs import configs_folder
 from clients.runner import RunnerClient
 from clients.sidecar.perception import DetectorClient, SceneVlmClient
 from clients.sidecar.policy import PolicyClient
-from schemas import fakegpu
+from schemas import fakegpu, terminal
 from schemas.endpoints import RUNTIME_VARIABLE
 from schemas.errors import RunnerUnreachable, SidecarUnavailable, VramError
 from schemas.extras import need
@@ -83,7 +83,7 @@ def demo(
         need("the demo", "torch", "lerobot", "transformers", "mujoco", "cv2", "matplotlib", extra="all")
         summary = asyncio.run(_demo(seed, arbiter == "on", gpu, out))
     except VramError as error:
-        typer.echo(f"vramctl demo: {error}", err=True)
+        terminal.complain("vramctl demo", error)
         raise typer.Exit(1) from None
     typer.echo(json.dumps({key: value for key, value in summary.items() if key != "loads"}, indent=2))
     typer.echo(f"written: {out}/summary.json, {out}/timeline.png, {out}/episode.mp4")

@@ -15,6 +15,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from schemas.runtime.printable import printable
 from schemas.units import format_bytes
 
 BAR_CELLS = 60
@@ -67,6 +68,7 @@ class Display:
 
     def say(self, text: str) -> None:
         """A line of the demo itself."""
+        text = printable(text)
         self._events.append(text)
         if self._live is None:
             self._console.print(text, markup=False, highlight=False)
@@ -78,6 +80,7 @@ class Display:
 
     def robot(self, line: str, at_s: float) -> None:
         """What the reasoner does now."""
+        line = printable(line)
         if line and line != self._robot:
             self._robot = line
             if self._live is None:
@@ -88,7 +91,7 @@ class Display:
         if self._live is None:
             return
         parts: list[RenderableType] = [
-            Text(f"task: {self._task}", style="bold"),
+            Text(f"task: {printable(self._task)}", style="bold"),
             Text(f"robot: {self._robot}"),
         ]
         if status is not None:
@@ -118,7 +121,7 @@ def _table(leases: list[Mapping[str, Any]]) -> Table:
     table = Table("consumer", "state", "charged", "uses", "since", expand=False)
     for lease in leases:
         table.add_row(
-            Text(lease["consumer"], style=COLOURS.get(lease["consumer"], "white")), lease["state"],
+            Text(printable(lease["consumer"]), style=COLOURS.get(lease["consumer"], "white")), Text(printable(lease["state"])),
             format_bytes(lease["charge_bytes"]), str(lease["uses"]), f"{lease['since_s']:.0f} s",
         )  # fmt: skip
     return table

@@ -8,6 +8,7 @@ from typing import Any
 import vramctl
 from clients.cli import quick
 from schemas.endpoints import arbiter_endpoint
+from schemas.runtime.printable import printable
 from schemas.sizes import format_bytes
 
 
@@ -31,7 +32,7 @@ def doctor(*, as_json: bool, endpoint: str | None) -> int:
     else:
         marks = {True: "ok  ", False: "BAD ", None: "    "}
         for finding in findings:
-            print(f"{marks[finding.ok]} {finding.what:<18} {finding.says}")
+            print(printable(f"{marks[finding.ok]} {finding.what:<18} {finding.says}"))
     if not reachable:
         return quick.UNREACHABLE
     return quick.NO if any(finding.ok is False for finding in findings) else quick.OK

@@ -35,6 +35,7 @@ def main() -> None:
 def _in_full(arguments: list[str]) -> int:
     """A command with everything that it may import, as a span where telemetry is asked for."""
     from clients.cli.app import run_app
+    from schemas import terminal
     from schemas.commands import command
     from schemas.errors import ConfigError
 
@@ -42,6 +43,6 @@ def _in_full(arguments: list[str]) -> int:
         with command("vramctl", arguments[0] if arguments else "", flush_s=TELEMETRY_S) as running:
             running.code = run_app(arguments)
     except ConfigError as error:
-        print(f"vramctl: {error}", file=sys.stderr)
+        terminal.complain("vramctl", error)
         return quick.USAGE
     return running.code

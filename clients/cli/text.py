@@ -1,12 +1,13 @@
 """How `vramctl` says things: replies of the arbiter as lines of text. Pure; sizes in GiB/MiB, times in seconds.
 
-It stands on the fast path: no pydantic, no rich, no typer here.
+It stands on the fast path: no pydantic, no rich, no typer here. Whatever a reply quotes is escaped (`schemas.runtime.printable`).
 """
 
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from schemas.runtime.printable import makes_printable, printable
 from schemas.sizes import format_bytes
 
 Message = Mapping[str, Any]
@@ -35,6 +36,7 @@ def plural(count: int, word: str) -> str:
 
 
 # -- status ------------------------------------------------------------------------------------------------------------
+@makes_printable
 def status_lines(status: Message) -> list[str]:
     """The arbiter, each card, who else is on it, and all leases (residents first, then the queue in order)."""
     lines = [
@@ -128,7 +130,8 @@ def _drift(count: int) -> str:
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Columns as wide as their longest cell, numbers to the right."""
-    widths = [max(len(row[i]) for row in [columns, *rows]) for i in range(len(columns))]
+    shown = [[printable(cell) for cell in row] for row in rows]
+    widths = [max(len(row[i]) for row in [columns, *shown]) for i in range(len(columns))]
 
     def line(cells: Sequence[str]) -> str:
         padded = (
@@ -137,10 +140,11 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
         )
         return "  ".join(padded).rstrip()
 
-    return [line(columns), *(line(row) for row in rows)]
+    return [line(columns), *(line(row) for row in shown)]
 
 
 # -- why ---------------------------------------------------------------------------------------------------------------
+@makes_printable
 def why_lines(why: Message) -> list[str]:
     """Who blocks a consumer, how many bytes, on which condition, what happens next, and when."""
     if not why["leases"]:
@@ -178,6 +182,7 @@ def _why_details(lease: Message) -> list[str]:
 
 
 # -- by hand -----------------------------------------------------------------------------------------------------------
+@makes_printable
 def by_hand_lines(action: str, reply: Message) -> list[str]:
     """What an operator's action did, and what happens next."""
     if "drained" in reply:
@@ -220,7 +225,7 @@ def event_line(event: Message) -> str:
     who = " ".join(str(event[key]) for key in ("consumer", "lease_id") if event.get(key))
     more = [_field(key, value) for key, value in event.items() if key not in _NOT_SHOWN and _plain(value)]
     parts = [clock, f"{event['kind']:<14}", who, str(event.get("reason") or ""), " ".join(more)]
-    return "  ".join(part for part in parts if part)
+    return printable("  ".join(part for part in parts if part))
 
 
 def _plain(value: object) -> bool:
@@ -249,4 +254,4 @@ def _seconds(seconds: float) -> str:
 def error_line(error: Message) -> str:
     """`message (hint)` of a typed error."""
     hint = f" ({error['hint']})" if error.get("hint") else ""
-    return f"vramctl: {error['message']}{hint}"
+    return printable(f"vramctl: {error['message']}{hint}")

@@ -28,6 +28,7 @@ from runner.cli.common import (
 from runner.sim.config import CONTROL_HZ
 from schemas.errors import ConfigError
 from schemas.extras import need
+from schemas.runtime.printable import printable_lines
 
 if TYPE_CHECKING:
     from runner.sim.benchmark import Benchmark, Cell, Contestant
@@ -117,7 +118,7 @@ async def run(args: argparse.Namespace) -> int:
             _write(args, cells, complete=False)
     complete = len(cells) == len(entries) and all(cell.complete for cell in cells)
     _write(args, cells, complete=complete)
-    print(table([cell.summary() for cell in cells]))
+    print(printable_lines(table([cell.summary() for cell in cells])))
     print(f"{args.out / REPORT}")
     return 0 if complete and not any(cell.errors for cell in cells) else 1
 

@@ -53,6 +53,7 @@ from schemas.goals import ResultPush
 from schemas.manifest import Kind, RSkillManifest
 from schemas.robot import RobotEnvironment
 from schemas.runtime.folders import LockFile, private_folder
+from schemas.runtime.printable import printable_lines
 from schemas.world import RunResult
 
 log = logging.getLogger("runner")
@@ -147,7 +148,7 @@ class Deploy:
         manifests = read_manifests(self._args.skills or [default_skills()])
         check = self._offered(parts, manifests, None)
         if self._args.dry_run:
-            print(plan(self._file, parts, check, self._facts(check)))
+            print(printable_lines(plan(self._file, parts, check, self._facts(check))))
             print("dry run: nothing was opened")
             return 0
         for text in (*unkept(parts, check), *unused(self._file.robot)):

@@ -8,12 +8,13 @@ from __future__ import annotations
 import argparse
 import asyncio
 import os
-import sys
 
 from clients.estop import ANSWER_S, stop
+from schemas import terminal
 from schemas.endpoints import SYSTEM_RUNTIME, program_endpoint
-from schemas.errors import RunnerUnreachable
+from schemas.errors import ConfigError, RunnerUnreachable, UntrustedServer
 from schemas.estop import path_of
+from schemas.runtime.printable import printable
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
@@ -39,9 +40,9 @@ async def run(args: argparse.Namespace) -> int:
     errors = [outcome for outcome in outcomes if isinstance(outcome, BaseException)]
     for text in outcomes:
         if isinstance(text, str):
-            print(text)
+            print(printable(text))
     for error in errors[1:]:
-        print(f"vram-runner: {error}", file=sys.stderr)
+        terminal.complain("vram-runner", error)
     if errors:
         raise errors[0]
     return 0
@@ -49,8 +50,11 @@ async def run(args: argparse.Namespace) -> int:
 
 def _there() -> list[str]:
     """The endpoints of runners that may be there: this login's, and the system service's."""
-    own = program_endpoint("runner", os.environ, os.getuid())
     system = f"ipc://{SYSTEM_RUNTIME}/runner.sock"
+    try:
+        own = program_endpoint("runner", os.environ, os.getuid())
+    except ConfigError:  # a user without a login session may still stop the system's
+        own = system
     # os.path: a folder that may not be looked into does not keep the other runner from being stopped
     there = [name for name in dict.fromkeys((own, system)) if _exists(name)]
     return there or [own]
@@ -63,7 +67,7 @@ def _exists(endpoint: str) -> bool:
 async def _stop(endpoint: str, reason: str) -> str:
     try:
         stopped = await asyncio.to_thread(stop, endpoint, reason, timeout_s=ANSWER_S)
-    except RunnerUnreachable as error:
+    except (RunnerUnreachable, UntrustedServer) as error:
         hint = "if a robot moves, cut its power"
-        raise RunnerUnreachable(error.message, hint=hint, details=error.details) from error
+        raise type(error)(error.message, hint=hint, details=error.details) from error
     return f"{stopped.robot or endpoint}: {stopped.message}"  # which one: there may be several

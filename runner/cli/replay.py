@@ -13,6 +13,7 @@ from pathlib import Path
 from runner.dataset.reader import Recorded, read_frame
 from runner.dataset.rows import ROBOT
 from schemas.errors import ConfigError
+from schemas.runtime.printable import printable_lines
 
 TRACE_URL_VARIABLE = "VRAM_TRACE_URL"
 TRACE_FIELDS = ("{trace_id}", "{span_id}")
@@ -38,9 +39,9 @@ async def run(args: argparse.Namespace) -> int:
     recorded = await asyncio.to_thread(read_frame, args.dataset, args.frame, args.episode)
     link = trace_link(recorded, template)
     if args.json:
-        print(json.dumps({**dataclasses.asdict(recorded), "trace_url": link}, ensure_ascii=False))
+        print(json.dumps({**dataclasses.asdict(recorded), "trace_url": link}))
     else:
-        print(as_text(recorded, link))
+        print(printable_lines(as_text(recorded, link)))
     return 0
 
 

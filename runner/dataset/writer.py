@@ -18,6 +18,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from clients import logs
 from runner.dataset import commit, wire
 from runner.dataset.lerobot_files import SUCCESS, Features, LerobotFiles, features_of, frame_of
 from runner.dataset.rows import Row
@@ -184,9 +185,7 @@ def main(argv: list[str]) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
     warnings.filterwarnings("ignore", module="datasets.utils.tqdm")  # progress bars are off, as they shall be
-    logging.basicConfig(
-        level="WARNING", stream=sys.stderr, format="%(asctime)s dataset %(levelname)s %(message)s"
-    )
+    logs.set_up("vram-runner", "WARNING", "human", "%(asctime)s dataset %(levelname)s %(message)s")
     with socket.socket(fileno=int(argv[0])) as peer:
         return serve(peer)
 

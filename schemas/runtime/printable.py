@@ -4,6 +4,9 @@ Names, labels and reasons come from any process that may connect. A terminal obe
 marks reorder what is read, and a line break forges another line.
 """
 
+from collections.abc import Callable
+from functools import wraps
+
 
 def printable(text: object) -> str:
     """`str(text)` with every control, format and unassigned character escaped as Python writes it (`\\x1b`, `\\u202e`, `\\n`)."""
@@ -18,3 +21,13 @@ def printable(text: object) -> str:
 def printable_lines(text: object) -> str:
     """The same for text of several lines, such as a traceback: its line breaks stay."""
     return "\n".join(printable(line) for line in str(text).split("\n"))
+
+
+def makes_printable[**P](make: Callable[P, list[str]]) -> Callable[P, list[str]]:
+    """Let a function that returns lines for people return them `printable`."""
+
+    @wraps(make)
+    def made(*arguments: P.args, **named: P.kwargs) -> list[str]:
+        return [printable(line) for line in make(*arguments, **named)]
+
+    return made
