@@ -248,7 +248,7 @@ class Connection(asyncio.Protocol):
                 self._handle(event)
         except ZmtpError as error:
             self._flush_wire()
-            self._router._complain(f"{error}", self.peer)
+            self._router._complain(f"process {self.peer.process} of uid {self.peer.uid}: {error}")
             self.cut(f"protocol error: {error}")
         if self.ended:
             return False
@@ -469,7 +469,7 @@ class Router:
             try:
                 peer = identify(sock)  # 2
             except PeerGone as gone:
-                log.info("refused a connection: %s", gone)
+                self._complain(f"a connection: {gone}")
                 sock.close()
                 continue
             except OSError as error:
@@ -477,7 +477,7 @@ class Router:
                 self._pause_accept(error)
                 return
             if not self._make_room(peer):  # 3
-                self._complain("too many connections", peer)
+                self._complain(f"process {peer.process} of uid {peer.uid}: too many connections")
                 _close(peer.pidfd)
                 sock.close()
                 continue
@@ -641,11 +641,11 @@ class Router:
             log.exception("a message of %r could not be handled", connection)
             return True
 
-    def _complain(self, what: str, peer: Peer) -> None:
-        """Log what a peer did wrong, once per sweep: a flood must not fill the log."""
+    def _complain(self, what: str) -> None:
+        """Log what was refused, once per sweep: a flood must not fill the log."""
         self._complaints += 1
         if self._complaints == 1:
-            log.warning("refused process %s of uid %d: %s", peer.process, peer.uid, what)
+            log.warning("refused %s", what)
 
     # -- watching ----------------------------------------------------------------------------------
     def _sweep_once(self) -> None:
