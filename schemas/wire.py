@@ -229,7 +229,7 @@ class Why(_Request):
 class History(_Request):
     op: Literal["history"]
     after: int = 0  # sequence number of the last event already seen
-    limit: Annotated[int, Field(ge=1, le=5000)] = 500
+    limit: Annotated[int, Field(ge=1, le=5000)] = 500  # a reply has at most 2000 events
     kinds: Annotated[tuple[str, ...], Field(max_length=d.LISTED_MAX, fail_fast=True)] = ()
 
 
@@ -452,6 +452,7 @@ class WhyReply(TypedDict):
     """Answer to *why is CONSUMER not running*: one entry per live lease of that consumer."""
 
     consumer: str
+    more: NotRequired[int]  # leases of that consumer beside those that are explained
     leases: list[dict[str, Any]]
     # {"lease_id", "state", "needed_bytes", "free_bytes", "deficit_bytes", "condition", "blockers": [{"lease_id", "consumer",
     #  "bytes", "state", "uses", "condition"}], "next": str, "plan": [{"action", "consumer", "lease_id", "in_s": float | None,

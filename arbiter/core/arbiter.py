@@ -30,6 +30,7 @@ from arbiter.core import (
     operators,
     readings,
     recovery,
+    refusals,
     requests,
     resizing,
     resume,
@@ -68,6 +69,10 @@ from arbiter.core.sessions import concerns, on_connected, on_died, on_journal_fa
 from arbiter.core.settings import Settings
 from arbiter.core.state import Core, Refused
 from schemas.ids import ClientId, GpuId, ProcessKey
+
+DUE_MAX = 64
+"""Timers that one Tick serves. What is due beyond them is served by the next one, at once, so that thousands of waits that end together do
+not hold the loop."""
 
 
 class Arbiter:
@@ -183,6 +188,8 @@ class Arbiter:
                     self._requested(event)
                 except Refused as refused:
                     core.refuse(event.client, event.request, refused)
+                    if isinstance(event, AcquireRequested | Reacquired | ResizeAsked):
+                        refusals.note(core, event, refused)
 
     def _requested(
         self,
@@ -240,7 +247,10 @@ class Arbiter:
 
     def _run_due(self) -> None:
         core = self._core
-        while (due := core.timers.pop_due(core.now)) is not None:
+        for _ in range(DUE_MAX):
+            due = core.timers.pop_due(core.now)
+            if due is None:
+                return
             kind, subject = due
             match kind:
                 case "ttl":

@@ -4,6 +4,7 @@ Whoever is charged on the card is named: holders, members of a gang that wait fo
 """
 
 from collections.abc import Sequence
+from heapq import nlargest
 from typing import Any
 
 from arbiter.core import gangs, policy
@@ -13,6 +14,9 @@ from schemas.ids import ProcessKey
 
 NAMED_MAX = 3
 """Leases that are listed by name in a sentence; the others are counted."""
+
+BLOCKERS_MAX = 32
+"""Blockers of one waiter that are told; of more, the largest holders."""
 
 LONG_LOAD_S = 10.0
 """From then on it is said how far a load is, and for how long its bytes have not grown."""
@@ -27,8 +31,11 @@ def who_blocks(core: Core, gpu: Gpu, waiter: Lease, deficit: int) -> list[Blocke
     alone = waiter.spec.exclusive or any(lease.spec.exclusive for lease in gpu.residents.values())
     if not deficit and not alone and not gpu.in_state(LeaseState.LOADING):
         return []
-    holders = [_holder(core, gpu, waiter, lease) for lease in gpu.residents.values()]
-    return [*holders, *_members(gpu), *_keepers(core, gpu, waiter)]
+    residents = list(gpu.residents.values())
+    if len(residents) > BLOCKERS_MAX:
+        residents = nlargest(BLOCKERS_MAX, residents, lambda lease: gpu.ledger.charge_bytes(lease.id))
+    holders = [_holder(core, gpu, waiter, lease) for lease in residents]
+    return [*holders, *_members(gpu), *_keepers(core, gpu, waiter)][:BLOCKERS_MAX]
 
 
 def _holder(core: Core, gpu: Gpu, waiter: Lease, lease: Lease) -> Blocker:

@@ -12,11 +12,11 @@ from arbiter.core import drift, gangs, outlook, policy, standby
 from arbiter.core.blockers import ago, gib, loading, named, unloading, uses, who_blocks
 from arbiter.core.lease import AWAY, LEAVING, Lease, LeaseState
 from arbiter.core.state import Core, Gpu
-from schemas.ids import ProcessKey
+from schemas.ids import LeaseId, ProcessKey
 
 NOTE_KINDS: tuple[str, ...] = (
     "queued", "granted", "ready", "switch", "use_began", "use_ended", "use_yielded", "revoke_asked", "revoke_acked", "reminded",
-    "deadline_passed", "unloading", "released", "verified", "denied", "cancelled", "expired", "lost", "reattached", "oom",
+    "deadline_passed", "unloading", "released", "verified", "denied", "refused", "cancelled", "expired", "lost", "reattached", "oom",
     "pressure", "stowaway", "probe_failed", "probe_ok", "drift", "journal_failed", "recovered", "serving", "operator", "resumed",
     "standby", "parked", "orphaned", "gang", "signalled", "resized",
 )  # fmt: skip
@@ -34,6 +34,10 @@ DAEMON_KINDS: tuple[str, ...] = (
 
 type PageKey = tuple[int, float, int]
 """Where `status` goes on: waiters (1) after all others (0), rank in the queues, arrival."""
+
+
+EXPLAINED_MAX = 8
+"""Leases of one answer to `why`."""
 
 
 # -- views -------------------------------------------------------------------------------------------------------------
@@ -224,9 +228,19 @@ def _best_position(core: Core, lease: Lease) -> int:
 
 # -- why ---------------------------------------------------------------------------------------------------------------
 def why(core: Core, consumer: str) -> dict[str, Any]:
-    """`schemas.wire.WhyReply`: why a consumer is not running, or that it is. A lease's id stands for that lease."""
-    mine = [lease for lease in core.leases.values() if consumer in (lease.spec.consumer, lease.id)]
-    return {"consumer": consumer, "leases": [_with_plan(core, lease) for lease in mine]}
+    """`schemas.wire.WhyReply`: why a consumer is not running, or that it is. A lease's id stands for that lease.
+
+    Of a consumer with many leases the oldest are explained: each costs a search for what may make room.
+    """
+    named = core.leases.get(LeaseId(consumer))
+    mine = [named] if named else [one for one in core.leases.values() if one.spec.consumer == consumer]
+    told: dict[str, Any] = {
+        "consumer": consumer,
+        "leases": [_with_plan(core, lease) for lease in mine[:EXPLAINED_MAX]],
+    }
+    if more := len(mine[EXPLAINED_MAX:]):
+        told["more"] = more
+    return told
 
 
 def _with_plan(core: Core, lease: Lease) -> dict[str, Any]:

@@ -12,6 +12,8 @@ from arbiter.core.state import Core, Gpu
 
 LOOKED_AT_MAX = 16
 """Instants at which somebody could be asked that are looked at, the nearest first."""
+LOOKS_AT_HOLDERS_MAX = 400
+"""Beside many holders fewer instants are looked at: each look weighs all of them."""
 
 type Step = dict[str, Any]
 
@@ -79,7 +81,8 @@ def _of_head(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
 def _asking(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
     """Whom it will ask, and when: at the first instant at which somebody may be asked whose leaving is enough."""
     going = policy.leaving(gpu)
-    for at in sorted({core.now, *policy.ask_times(core, gpu, waiter)})[:LOOKED_AT_MAX]:
+    looks = max(1, min(LOOKED_AT_MAX, LOOKS_AT_HOLDERS_MAX // (1 + len(gpu.residents))))
+    for at in sorted({core.now, *policy.ask_times(core, gpu, waiter)})[:looks]:
         victims = policy.choose_victims(core, gpu, waiter, going, at)
         if victims is None:
             continue

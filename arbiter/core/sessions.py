@@ -96,6 +96,7 @@ def _concerned(core: Core, own: list[Lease]) -> list[Lease]:
 
 def on_died(core: Core, process: ProcessKey) -> None:
     """Everything of a process ends. Its bytes become debts, measured gone before they count as free."""
+    core.refusals.pop(process, None)
     gone = [client for client in core.clients.values() if client.process == process]
     for client in gone:
         _forget(core, client)

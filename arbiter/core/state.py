@@ -82,6 +82,15 @@ class Reuse:
         return (1 + sum(self.soon)) / (2 + len(self.soon))
 
 
+@dataclass(slots=True)
+class Refusals:
+    """Notes of one process's refused requests (`refusals`): how many lately, and how many were left out."""
+
+    at: float
+    noted: float = 0.0
+    left_out: int = 0
+
+
 LEFT_KEPT = 64  # more verdicts than can fall between a baseline and its own
 
 
@@ -170,6 +179,7 @@ class Core:
         self.recovering: set[LeaseId] | None = None
         self.footprints = Footprints()
         self.footprints.restore(settings.footprints)
+        self.refusals: dict[ProcessKey, Refusals] = {}  # the latest last
         self.reuse: dict[str, Reuse] = {}  # by consumer
         self.crashes: dict[str, Failures] = {}  # by model, the latest last
         self.switches: dict[tuple[str, str], float] = {}  # (who left, for whom) → when last

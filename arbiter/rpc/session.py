@@ -32,6 +32,8 @@ from schemas.ids import ClientId, ProcessKey, RequestId
 from schemas.runtime.peercred import Peer
 from schemas.runtime.zmtp import Oversize
 
+HISTORY_PAGE = 2000
+"""Events in one reply, whatever was asked for: packing more would hold the loop for too long."""
 SILENT_S = 10.0
 """At a limit of sessions a connection that never held anything and has been silent for so long makes room."""
 REFUSED_MAX_BYTES = 64 * KIB
@@ -464,7 +466,8 @@ class SessionTable:
             case w.History():
                 _check_kinds(request.kinds)
                 after = max(0, min(request.after, (1 << 63) - 1))
-                self._history(after, request.limit, request.kinds, lambda body: self.reply(client, re, body))
+                limit = min(request.limit, HISTORY_PAGE)
+                self._history(after, limit, request.kinds, lambda body: self.reply(client, re, body))
             case w.Subscribe():
                 self._subscribe(session, re)
             case w.Bye():

@@ -2,6 +2,10 @@
 
 from typing import Any
 
+from arbiter.core.arbiter import DUE_MAX
+from arbiter.core.blockers import BLOCKERS_MAX
+from arbiter.core.events import Tick
+from arbiter.core.explain import EXPLAINED_MAX
 from arbiter.testing.core_driver import CoreDriver
 from schemas import defaults as d
 
@@ -76,3 +80,49 @@ def test_a_page_goes_on_where_the_last_one_ended_though_that_lease_is_gone() -> 
     rest = driver.arbiter.status(driver.now, None, tuple(first["next"]), 10)
     assert [view["lease_id"] for view in rest["leases"]] == leases[1:]
     assert "next" not in rest
+
+
+def test_why_explains_the_oldest_leases_of_a_consumer_with_many() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.consumer("holder").acquire(7 * GIB)
+    crowd = driver.consumer("crowd")
+    leases = [crowd.acquire(5 * GIB) for _ in range(EXPLAINED_MAX + 3)]
+    told = driver.arbiter.why("crowd", driver.now)
+    assert [lease["lease_id"] for lease in told["leases"]] == leases[:EXPLAINED_MAX]
+    assert told["more"] == 3
+    alone = driver.arbiter.why(leases[-1], driver.now)
+    assert [lease["lease_id"] for lease in alone["leases"]] == leases[-1:]
+    assert "more" not in alone
+
+
+def test_of_many_blockers_the_largest_are_told() -> None:
+    driver = CoreDriver(8 * GIB)
+    for number in range(BLOCKERS_MAX + 5):
+        person = driver.consumer(f"small{number}")
+        person.load(person.acquire((1 + number) * d.MIB))
+        driver.advance(0.01)
+    driver.consumer("alone").acquire(GIB, exclusive=True)
+    (lease,) = driver.arbiter.why("alone", driver.now)["leases"]
+    assert len(lease["blockers"]) == BLOCKERS_MAX
+    assert {blocker["consumer"] for blocker in lease["blockers"]}.isdisjoint(
+        f"small{number}" for number in range(5)
+    )
+
+
+def test_waits_that_end_together_are_denied_in_slices() -> None:
+    """Thousands of timeouts in one Tick held the loop for seconds."""
+    driver = CoreDriver(8 * GIB, settings={"leases_per_client_max": 1000})
+    driver.consumer("holder").acquire(7 * GIB)
+    crowd = driver.consumer("crowd")
+    leases = [crowd.acquire(5 * GIB, wait_timeout_s=1.0) for _ in range(2 * DUE_MAX + 5)]
+    driver.advance(0.5)
+    driver.now += 1.0
+    driver.post(Tick())
+    first = len(driver.notes("denied"))
+    assert 0 < first <= DUE_MAX
+    due = driver.arbiter.next_deadline()
+    assert due is not None
+    assert due <= driver.now, "the next Tick comes at once"
+    driver.post(Tick())
+    driver.post(Tick())
+    assert len(driver.notes("denied")) == len(leases)

@@ -76,7 +76,7 @@ def test_another_input_is_another_decision(log: Path) -> None:
     found = runner.replay(runner.load(log))
     assert found.divergence is not None
     assert found.divergence.number == number
-    assert "Refuse" in text.replay_lines(found)[-1]
+    assert "Refuse" in text.replay_lines(found)[-2]
 
 
 def test_a_log_of_another_engine_says_so_beside_its_divergence(log: Path) -> None:

@@ -1,0 +1,106 @@
+"""Every request for bytes that comes to nothing is in the history with its reason. One that was refused at once left no trace: an operator saw
+a program fail and found nothing in history and log."""
+
+from typing import Any
+
+import pytest
+
+from arbiter.core.refusals import AT_ONCE, PROCESSES_REMEMBERED
+from arbiter.testing.core_driver import Consumer, CoreDriver, refusal
+from arbiter.testing.scenes import held
+from schemas import defaults as d
+
+GIB = d.GIB
+
+
+@pytest.fixture
+def driver() -> CoreDriver:
+    return CoreDriver(8 * GIB, settings={"waiters_max": 1})
+
+
+def too_large(person: Consumer) -> None:
+    person.try_acquire(9 * GIB)
+
+
+def on_no_gpu(person: Consumer) -> None:
+    person.try_acquire(GIB, gpu="7")
+
+
+def beyond_the_queue(person: Consumer) -> None:
+    person.driver.consumer("first").acquire(7 * GIB)
+    person.driver.consumer("second").acquire(7 * GIB)
+    person.try_acquire(7 * GIB)
+
+
+def grown_too_large(person: Consumer) -> None:
+    lease = person.acquire(GIB)
+    person.load(lease)
+    person.resize(lease, 9 * GIB)
+
+
+def called_back_though_it_is_here(person: Consumer) -> None:
+    lease = person.acquire(GIB)
+    person.load(lease)
+    person.reacquire(lease)
+
+
+@pytest.mark.parametrize(
+    ("ask", "code", "leased"),
+    [
+        (too_large, "vram_insufficient", False),
+        (on_no_gpu, "unknown_gpu", False),
+        (beyond_the_queue, "limit_exceeded", False),
+        (grown_too_large, "vram_insufficient", True),
+        (called_back_though_it_is_here, "bad_state", True),
+    ],
+)
+def test_what_is_refused_at_once_is_noted_with_its_reason(
+    driver: CoreDriver, ask: Any, code: str, leased: bool
+) -> None:
+    person = driver.consumer("big")
+    ask(person)
+    (note,) = driver.notes("refused")
+    refused = refusal([effect for effect in driver.effects if hasattr(effect, "code")])
+    assert (note["code"], note["reason"]) == (code, refused.message)
+    assert (note["consumer"], note["pid"], "lease_id" in note) == ("big", person.process.pid, leased)
+
+
+def test_timeouts_and_cancels_are_noted_too(driver: CoreDriver) -> None:
+    driver = CoreDriver(8 * GIB)
+    held(driver, "holder", 5, priority=99)[0].use_begin(
+        driver.arbiter.status(driver.now)["leases"][0]["lease_id"]
+    )
+    bounded, fickle = driver.consumer("bounded"), driver.consumer("fickle")
+    bounded.acquire(5 * GIB, wait_timeout_s=1.0)
+    lease = fickle.acquire(5 * GIB)
+    driver.advance(1.5)
+    fickle.cancel(lease)
+    (denied,) = driver.notes("denied")
+    (cancelled,) = driver.notes("cancelled")
+    assert (denied["consumer"], denied["code"]) == ("bounded", "wait_timeout")
+    assert (cancelled["consumer"], cancelled["reason"]) == ("fickle", "its holder gave up")
+
+
+def test_a_flood_of_refusals_is_counted_instead(driver: CoreDriver) -> None:
+    flooder, other = driver.consumer("flooder"), driver.consumer("other")
+    for _ in range(10 * AT_ONCE):
+        too_large(flooder)
+    too_large(other)
+    assert [note["consumer"] for note in driver.notes("refused")] == ["flooder"] * AT_ONCE + ["other"]
+    driver.advance(1.5)
+    too_large(flooder)
+    too_large(flooder)
+    (last,) = [note for note in driver.notes("refused") if "left_out" in note]
+    assert (last["consumer"], last["left_out"]) == ("flooder", 9 * AT_ONCE)
+
+
+def test_little_is_remembered_of_those_who_were_refused(driver: CoreDriver) -> None:
+    refusals = driver.arbiter._core.refusals
+    people = [driver.consumer(f"p{number}") for number in range(PROCESSES_REMEMBERED + 1)]
+    for person in people:
+        too_large(person)
+    assert len(refusals) == PROCESSES_REMEMBERED
+    people[-1].die()
+    assert len(refusals) == PROCESSES_REMEMBERED - 1
+    too_large(people[-1])
+    assert people[-1].process not in refusals, "it is nobody any more"
