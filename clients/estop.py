@@ -1,4 +1,6 @@
-"""The emergency stop, asked on its own socket: blocking, with nothing imported that is not needed to stop a robot. Packets: `schemas.estop`."""
+"""The emergency stop, asked on its own socket: blocking, with nothing imported that is not needed
+to stop a robot. Packets: `schemas.estop`.
+"""
 
 import contextlib
 import os
@@ -18,7 +20,9 @@ CUT = "cut the robot's power"
 
 @dataclass(frozen=True, slots=True)
 class Stopped:
-    """The motors have been told. `message` says what they do now; `first` is False where an earlier stop was in force."""
+    """The motors have been told. `message` says what they do now; `first` is False where an earlier
+    stop was in force.
+    """
 
     robot: str
     message: str
@@ -28,10 +32,12 @@ class Stopped:
 
 
 def stop(endpoint: str, reason: str = "", *, timeout_s: float = ANSWER_S) -> Stopped:
-    """Stop the robot whose runner serves goals at `endpoint`. Returns once the motors have been told.
+    """Stop the robot whose runner serves goals at `endpoint`. Returns once the motors have been
+    told.
 
-    Raises RunnerUnreachable when no runner latched the stop, InternalError when it is latched and its control loop does not obey,
-    RobotFault when the motors could not be told, UntrustedServer when another user listens there, ConfigError for what is no endpoint.
+    Raises RunnerUnreachable when no runner latched the stop, InternalError when it is latched and
+    its control loop does not obey, RobotFault when the motors could not be told, UntrustedServer
+    when another user listens there, ConfigError for what is no endpoint.
     """
     path = path_of(endpoint)
     deadline = time.monotonic() + timeout_s

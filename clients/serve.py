@@ -1,8 +1,10 @@
-"""The server of the programs that are not the arbiter (sidecars, runner, reasoner): one msgpack map per message, on `schemas.runtime.router`.
+"""The server of the programs that are not the arbiter (sidecars, runner, reasoner): one msgpack map
+per message, on `schemas.runtime.router`.
 
-It owns the socket, decoding, size limits and the error reply for what is not a message. A handler gets the decoded map and may answer at once,
-later, or several times. Peers are unmodified pyzmq DEALER and REQ sockets. Only `ipc://PATH` is served: on loopback tcp any user of
-the machine could drive the robot. It must not know what a message means.
+It owns the socket, decoding, size limits and the error reply for what is not a message. A handler
+gets the decoded map and may answer at once, later, or several times. Peers are unmodified pyzmq
+DEALER and REQ sockets. Only `ipc://PATH` is served: on loopback tcp any user of the machine could
+drive the robot. It must not know what a message means.
 """
 
 import asyncio
@@ -30,12 +32,18 @@ REASON_MAX_CHARS = 500
 ENVELOPE_MAX_BYTES = 64 * 1024
 IMAGES_MAX_BYTES = IMAGE_MESSAGE_MAX_BYTES + ENVELOPE_MAX_BYTES
 VALUES_MAX = 12_288
-"""msgpack values of one message: 1,100 points of a trajectory of six joints; at most 4 ms of decoding."""
+"""msgpack values of one message: 1,100 points of a trajectory of six joints; at most 4 ms of
+decoding.
+"""
 LISTED_MAX = 4096
 LINGER_S = 3.0
-"""How long a server that ends waits until its last answers are read; only peers that do not read cost so long."""
+"""How long a server that ends waits until its last answers are read; only peers that do not read
+cost so long.
+"""
 SILENT_S = 300.0
-"""A connection without one good message is cut then, and earlier where its place is needed. libzmq connects again by itself."""
+"""A connection without one good message is cut then, and earlier where its place is needed. libzmq
+connects again by itself.
+"""
 CONNECTIONS_MAX = 512
 WAITING_MAX = 512
 """Requests of one user that wait for their answers."""
@@ -45,7 +53,8 @@ WAITING_MAX = 512
 class Peer:
     """Sender of a message: where to answer, and which process and user the kernel says it is.
 
-    `identity` is the serial of its connection, never reused. `pid` is 0 for a process that cannot be seen from here.
+    `identity` is the serial of its connection, never reused. `pid` is 0 for a process that cannot
+    be seen from here.
     """
 
     identity: int
@@ -82,7 +91,8 @@ class _Waiting:
 
 
 def check_free(endpoint: str) -> None:
-    """Before a server has moved or recorded anything: may it serve there? Claims nothing; binding decides which server gets the endpoint.
+    """Before a server has moved or recorded anything: may it serve there? Claims nothing; binding
+    decides which server gets the endpoint.
 
     Raises what `RouterServer` does.
     """
@@ -102,10 +112,12 @@ def _lock_of(path: Path) -> LockFile:
 class RouterServer:
     """`async with RouterServer(endpoint, on_error) as server: await server.serve(handler)`.
 
-    A handler runs in a task of its own, so that a slow one delays no other request; its work up to the first wait is done at once.
-    Args: `message_max_bytes` bounds one request; beside binary values, as pictures are, it holds at most 1 MiB. `work_share` as in
-    `schemas.runtime.router.Limits`.
-    Raises ConfigError for an endpoint that cannot be bound, AlreadyRunning when a living server has it.
+    A handler runs in a task of its own, so that a slow one delays no other request; its work up to
+    the first wait is done at once.
+    Args: `message_max_bytes` bounds one request; beside binary values, as pictures are, it holds at
+    most 1 MiB. `work_share` as in `schemas.runtime.router.Limits`.
+    Raises ConfigError for an endpoint that cannot be bound, AlreadyRunning when a living server has
+    it.
     """
 
     def __init__(
@@ -156,7 +168,9 @@ class RouterServer:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """What was sent by now reaches its peer, though the process ends behind this. Then the endpoint is free."""
+        """What was sent by now reaches its peer, though the process ends behind this. Then the
+        endpoint is free.
+        """
         self._router.stop_receiving()
         for task in self._tasks:
             task.cancel()
@@ -241,7 +255,9 @@ class RouterServer:
 
 
 def reason_of(message: Message) -> str:
-    """The `reason` of a request that must never be refused for its words, as a cancel: on one line, of bounded length."""
+    """The `reason` of a request that must never be refused for its words, as a cancel: on one line,
+    of bounded length.
+    """
     words = message.get("reason")
     text = "" if words is None else str(words)[: 4 * REASON_MAX_CHARS]
     return "".join(letter if letter.isprintable() else " " for letter in text).strip()[:REASON_MAX_CHARS]

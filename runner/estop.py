@@ -1,7 +1,9 @@
-"""The emergency stop's server: a socket and a thread of its own, so that no goal, picture or flood of requests delays a stop.
+"""The emergency stop's server: a socket and a thread of its own, so that no goal, picture or flood
+of requests delays a stop.
 
-The thread latches the stop in the robot (`request_estop`), answers, and posts `obey_estop` to the control thread to learn what became of the
-motors. It uses no event loop and no decoder, and waits for neither. Packets: `schemas.estop`.
+The thread latches the stop in the robot (`request_estop`), answers, and posts `obey_estop` to the
+control thread to learn what became of the motors. It uses no event loop and no decoder, and waits
+for neither. Packets: `schemas.estop`.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ import socket
 import stat
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol, Self
@@ -33,16 +35,18 @@ OBEY_S = 1.0  # a control loop that has not obeyed by then hangs
 CONNECTIONS_MAX = 32
 CONNECTIONS_PER_UID = 16
 SILENT_S = 1.0  # a connection that has asked nothing by then is closed
-BACKLOG = 32  # connections that the kernel holds for us: a stop waits behind so many at most
-ROUND_MAX = 32  # connections accepted before those that have asked are served
-PAUSE_S = 0.0005  # after a round with work: a flood takes neither the interpreter nor a core in real time
+BACKLOG = 16  # connections that the kernel holds for us: a stop waits behind so many at most
+ROUND_MAX = 8  # connections accepted before those that have asked are served
+PAUSE_S = 0.0005  # after a round, and as long as the round was: a flood takes neither the interpreter nor a core in real time
 CHECK_S = 1.0  # how often the socket's file is looked at
 MODE = 0o660
 _NO_DESCRIPTOR = (errno.EMFILE, errno.ENFILE)
 
 
 class Stoppable(Protocol):
-    """What the server needs of a runner. `request_estop` is called on the server's thread, `obey_estop` on the control thread."""
+    """What the server needs of a runner. `request_estop` is called on the server's thread,
+    `obey_estop` on the control thread.
+    """
 
     estop: EstopRequested | None
     estop_ns: int
@@ -70,12 +74,15 @@ class _Inbox:
 
 
 class EstopServer:
-    """`with EstopServer(endpoint, robot, mailbox): ...` serves `path_of(endpoint)`; the caller holds the goal endpoint's lock.
+    """`with EstopServer(endpoint, robot, mailbox): ...` serves `path_of(endpoint)`; the caller
+    holds the goal endpoint's lock.
 
-    Args: `on_stop(reason, pid, uid)` is called once, on the server's thread, after the first request is answered, and must not wait;
-    `robot_id` stands in every reply; `obey_s` seconds without an answer of the control thread are called a hang; `realtime` asks
-    the kernel to run the thread before ordinary programs.
-    Raises ConfigError where the socket cannot be made, AlreadyRunning where something else listens there.
+    Args: `on_stop(reason, pid, uid)` is called once, on the server's thread, after the first
+    request is answered, and must not wait; `robot_id` stands in every reply; `obey_s` seconds
+    without an answer of the control thread are called a hang; after `silent_s` a connection without
+    a request is closed; `realtime` asks the kernel to run the thread before ordinary programs.
+    Raises ConfigError where the socket cannot be made, AlreadyRunning where something else listens
+    there.
     """
 
     def __init__(
@@ -87,6 +94,7 @@ class EstopServer:
         on_stop: Callable[[str, int, int], None],
         robot_id: str = "",
         obey_s: float = OBEY_S,
+        silent_s: float = SILENT_S,
         realtime: bool = False,
     ) -> None:
         self.path = path_of(endpoint)
@@ -95,6 +103,7 @@ class EstopServer:
         self._on_stop = on_stop
         self._robot_id = robot_id
         self._obey_s = obey_s
+        self._silent_s = silent_s
         self._realtime = realtime
         self._inbox = _Inbox()
         self._connections: dict[int, _Connection] = {}  # by descriptor, oldest first
@@ -137,7 +146,9 @@ class EstopServer:
             os.close(self._spare)
 
     def _wake_up(self) -> None:
-        """Any thread. The control thread may obey after the server has ended: the descriptor's number may be another file's by then."""
+        """Any thread. The control thread may obey after the server has ended: the descriptor's
+        number may be another file's by then.
+        """
         with self._waking:
             if self._wake >= 0:
                 os.eventfd_write(self._wake, 1)
@@ -190,8 +201,9 @@ class EstopServer:
 
     def _round(self, check_s: float) -> None:
         """Wait for work, and do at most one round of it."""
-        due = [check_s, *(c.obey_by_s or c.since_s + SILENT_S for c in self._connections.values())]
+        due = [check_s, *(c.obey_by_s or c.since_s + self._silent_s for c in self._connections.values())]
         ready = self._selector.select(max(0.0, min(due) - time.monotonic()))
+        began_s = time.monotonic()
         for key, _ in ready:
             if key.fileobj is self._listener:
                 self._accept()
@@ -203,7 +215,7 @@ class EstopServer:
             self._tell_outcome(*self._inbox.obeyed.popleft())
         now_s = time.monotonic()
         for connection in list(self._connections.values()):
-            if connection.obey_by_s is None and now_s >= connection.since_s + SILENT_S:
+            if connection.obey_by_s is None and now_s >= connection.since_s + self._silent_s:
                 self._close(connection)
             elif connection.obey_by_s is not None and now_s >= connection.obey_by_s:
                 self._reply(
@@ -214,10 +226,12 @@ class EstopServer:
                 self._close(connection)
         self._keep_spare()
         if ready:
-            time.sleep(PAUSE_S)
+            time.sleep(max(PAUSE_S, time.monotonic() - began_s))
 
     def _accept(self) -> None:
-        """Each is read at once: a client that has sent its request is served before anything can evict it."""
+        """Each is read at once: a client that has sent its request is served before anything can
+        evict it.
+        """
         for _ in range(ROUND_MAX):
             try:
                 accepted, _ = self._listener.accept()
@@ -234,7 +248,9 @@ class EstopServer:
         return bool(select.select([self._listener], [], [], 0)[0])
 
     def _free_descriptor(self) -> bool:
-        """The process has used its descriptors up: a silent connection has to go, or the one kept for this. False: there is none left."""
+        """The process has used its descriptors up: a silent connection has to go, or the one kept
+        for this. False: there is none left.
+        """
         silent = next((c for c in self._connections.values() if c.obey_by_s is None), None)
         if silent is not None:
             self._close(silent)
@@ -260,17 +276,24 @@ class EstopServer:
         self._read(connection)
 
     def _make_room(self, uid: int) -> None:
-        """Close the oldest connection of a user that has its share, or of all; before that it may still say what it has sent."""
-        if len(of_uid := [c for c in self._connections.values() if c.uid == uid]) >= CONNECTIONS_PER_UID:
+        """Where a user, or all, have their share of connections: close the oldest silent one of the
+        process with the most of them, so that a process with one connection keeps it. Before that
+        it may still say what it has sent.
+        """
+        candidates = list(self._connections.values())
+        of_uid = [c for c in candidates if c.uid == uid]
+        if len(of_uid) >= CONNECTIONS_PER_UID:
             candidates = of_uid
-        elif len(self._connections) >= CONNECTIONS_MAX:
-            candidates = list(self._connections.values())
-        else:
+        elif len(candidates) < CONNECTIONS_MAX:
             return
-        oldest = next((c for c in candidates if c.obey_by_s is None), candidates[0])
-        if oldest.obey_by_s is None:
-            self._read(oldest)
-        self._close(oldest)
+        silent = [c for c in candidates if c.obey_by_s is None]
+        if not silent:
+            self._close(candidates[0])  # it has its first answer
+            return
+        by_process = Counter(c.pid for c in silent)
+        victim = max(silent, key=lambda c: by_process[c.pid])  # the oldest of those with the most
+        self._read(victim)
+        self._close(victim)
 
     def _read(self, connection: _Connection) -> None:
         try:
@@ -336,7 +359,9 @@ class EstopServer:
         connection.socket.close()
 
     def _check_file(self) -> None:
-        """A socket file that was deleted or replaced is made again: nothing else tells that no stop can be heard."""
+        """A socket file that was deleted or replaced is made again: nothing else tells that no stop
+        can be heard.
+        """
         if self._is_ours():
             return
         log.error("%s is gone; it is made again", self.path)

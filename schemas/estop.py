@@ -1,12 +1,13 @@
-"""The emergency stop's own wire: one packet asks, two packets answer, on a SOCK_SEQPACKET Unix socket beside the goal socket.
+"""The emergency stop's own wire: one packet asks, two packets answer, on a SOCK_SEQPACKET Unix
+socket beside the goal socket.
 
-    client                             runner
-    VRAM-ESTOP/1 [reason]   ────────▶
-                            ◀────────  latched | already: from now on nothing is sent to the motors
-                            ◀────────  obeyed | not_told | hung: what became of the motors; then the runner hangs up
+    client                    runner
+    VRAM-ESTOP/1 [reason]  →
+                           ←  latched | already: from now on nothing is sent to the motors
+                           ←  obeyed | not_told | hung: what became of the motors; then it hangs up
 
-The packets are text, so that a button's program or a shell can stop a robot.
-No library reads them: nothing that a peer sends costs more than a copy of `REQUEST_MAX_BYTES`.
+The packets are text, so that a button's program or a shell can stop a robot. No library reads them:
+nothing that a peer sends costs more than a copy of `REQUEST_MAX_BYTES`.
 """
 
 from dataclasses import dataclass
@@ -26,7 +27,9 @@ _SEPARATOR = "\t"
 
 
 class Answer(StrEnum):
-    """First word of a reply. `LATCHED` and `ALREADY` come at once, one of the others after the control loop's next tick."""
+    """First word of a reply. `LATCHED` and `ALREADY` come at once, one of the others after the
+    control loop's next tick.
+    """
 
     LATCHED = "latched"
     ALREADY = "already"  # an earlier stop is in force; its reason and its time stand in the reply
@@ -37,7 +40,9 @@ class Answer(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """One packet of the runner's. `stopped_ns` is the monotonic time of the first stop, `text` its reason or what became of it."""
+    """One packet of the runner's. `stopped_ns` is the monotonic time of the first stop, `text` its
+    reason or what became of it.
+    """
 
     answer: Answer
     stopped_ns: int
@@ -56,13 +61,17 @@ class Reply:
 
 
 def path_of(endpoint: str) -> str:
-    """Path of the emergency-stop socket of the runner that serves goals at `endpoint`. Raises ConfigError for what is no `ipc://` endpoint."""
+    """Path of the emergency-stop socket of the runner that serves goals at `endpoint`. Raises
+    ConfigError for what is no `ipc://` endpoint.
+    """
     socket_path(endpoint)  # its own mistakes are said in its own words
     return socket_path(endpoint + SUFFIX)
 
 
 def request(reason: str) -> bytes:
-    """The packet that stops. Words that UTF-8 has no bytes for are escaped, long ones cut: a stop is not refused for its words."""
+    """The packet that stops. Words that UTF-8 has no bytes for are escaped, long ones cut: a stop
+    is not refused for its words.
+    """
     words = one_line(reason.encode(errors="backslashreplace").decode())
     return b" ".join((PREFIX + VERSION, words.encode())).strip()
 

@@ -1,6 +1,8 @@
-"""A process that attacks a ZeroMQ server's unix socket by hand, until it is killed or has sent enough. Not a test module.
+"""A process that attacks a ZeroMQ server's unix socket by hand, until it is killed or has sent
+enough. Not a test module.
 
-Usage: attacker.py MODE SOCKET. Prints a line when the attack is under way; bounded in count and bytes whatever the server does.
+Usage: attacker.py MODE SOCKET. Prints a line when the attack is under way; bounded in count and
+bytes whatever the server does.
 """
 
 import contextlib
@@ -25,7 +27,9 @@ def connect(path: str) -> socket.socket:
 
 
 def push(peer: socket.socket, data: bytes) -> None:
-    """Send without ever reading an answer, until all is sent, the server hangs up, or the time is over."""
+    """Send without ever reading an answer, until all is sent, the server hangs up, or the time is
+    over.
+    """
     left, ends = memoryview(data), time.monotonic() + SECONDS_MAX
     with contextlib.suppress(OSError):
         while left and time.monotonic() < ends:
@@ -43,7 +47,9 @@ def empties(path: str) -> None:
 
 
 def maps(path: str) -> None:
-    """Messages of 1 MiB and of 16 MiB that hold nothing but empty maps, and as many values as the server builds."""
+    """Messages of 1 MiB and of 16 MiB that hold nothing but empty maps, and as many values as the
+    server builds.
+    """
     under_way()
     ends = time.monotonic() + SECONDS_MAX
     allowed = frame(b"\x81\xa1x\xdc\x0f\xa0" + b"\x80" * 4000)
@@ -62,7 +68,9 @@ def more(path: str) -> None:
 
 
 def connects(path: str) -> None:
-    """Connections that say nothing, as many as this process may have; those that are cut are made again."""
+    """Connections that say nothing, as many as this process may have; those that are cut are made
+    again.
+    """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, CONNECTIONS_MAX + 64), hard))
     peers: list[socket.socket] = []

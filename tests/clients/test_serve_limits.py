@@ -1,4 +1,6 @@
-"""What one peer of a sidecar, runner or reasoner may send, hold and leave unread. Peers are unmodified libzmq sockets, or sockets by hand."""
+"""What one peer of a sidecar, runner or reasoner may send, hold and leave unread. Peers are
+unmodified libzmq sockets, or sockets by hand.
+"""
 
 import asyncio
 import os
@@ -90,7 +92,9 @@ def run(scenario: Callable[[], Awaitable[None]]) -> None:
 
 @pytest.mark.parametrize("kind", [zmq.REQ, zmq.DEALER])
 def test_the_first_message_may_be_the_largest_picture(tmp_path: Path, kind: int) -> None:
-    """The field's clients begin a fresh socket with a picture; only the wire of the arbiter has a hello."""
+    """The field's clients begin a fresh socket with a picture; only the wire of the arbiter has a
+    hello.
+    """
 
     async def scenario() -> None:
         async with serving(tmp_path / "s.sock") as server:
@@ -122,7 +126,9 @@ def test_the_first_message_may_be_the_largest_picture(tmp_path: Path, kind: int)
 def test_a_message_that_costs_too_much_is_refused_and_its_sender_served_on(
     tmp_path: Path, message: bytes, code: str
 ) -> None:
-    """Regression: 16 MiB of empty maps held the interpreter for 2.6 s, and the control loop with it."""
+    """Regression: 16 MiB of empty maps held the interpreter for 2.6 s, and the control loop with
+    it.
+    """
 
     async def scenario() -> None:
         async with serving(tmp_path / "s.sock"):

@@ -1,4 +1,6 @@
-"""A runner whose goal socket is attacked by another process of its own user: goals are served, the loop ticks, and a stop is answered."""
+"""A runner whose goal socket is attacked by another process of its own user: goals are served, the
+loop ticks, and a stop is answered.
+"""
 
 import asyncio
 import subprocess
@@ -70,8 +72,9 @@ async def attacked(endpoint: str, mode: str) -> AsyncIterator[None]:
 def test_goals_ticks_and_the_stop_of_an_attacked_runner(
     endpoint: str, navigate_manifest: Path, run_async: Run, mode: str
 ) -> None:
-    """Regression: empty frames delayed a stop by 20.9 s, maps stopped the control loop for 2.6 s, connects ended the process at 1,024, and
-    MORE took memory without end."""
+    """Regression: empty frames delayed a stop by 20.9 s, maps stopped the control loop for 2.6 s,
+    connects ended the process at 1,024, and MORE took memory without end.
+    """
 
     async def scenario() -> None:
         async with serving(endpoint, navigate_manifest) as runner, RunnerClient(endpoint) as client:

@@ -1,4 +1,6 @@
-"""The emergency stop's socket: answered while the event loop stands still, under a flood of connections, and without descriptors."""
+"""The emergency stop's socket: answered while the event loop stands still, under a flood of
+connections, and without descriptors.
+"""
 
 import asyncio
 import contextlib
@@ -7,6 +9,8 @@ import resource
 import socket
 import stat
 import struct
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,7 +20,7 @@ import pytest
 
 from clients.estop import stop
 from runner.control import Mailbox
-from runner.estop import CONNECTIONS_PER_UID, EstopServer
+from runner.estop import CONNECTIONS_PER_UID, SILENT_S, EstopServer
 from schemas.errors import AlreadyRunning, ConfigError, EstopRequested, InternalError, RunnerUnreachable
 from schemas.estop import Answer, path_of, reason_in, reply_in, request
 
@@ -64,9 +68,15 @@ def robot() -> Iterator[Robot]:
 
 @pytest.fixture
 def serve(robot: Robot, endpoint: str) -> Callable[..., EstopServer]:
-    def make(obey_s: float = WAIT_S) -> EstopServer:
+    def make(obey_s: float = WAIT_S, silent_s: float = SILENT_S) -> EstopServer:
         return EstopServer(
-            endpoint, robot, robot.mailbox, on_stop=lambda *_: None, robot_id="bench", obey_s=obey_s
+            endpoint,
+            robot,
+            robot.mailbox,
+            on_stop=lambda *_: None,
+            robot_id="bench",
+            obey_s=obey_s,
+            silent_s=silent_s,
         )
 
     return make
@@ -86,7 +96,9 @@ def connect(endpoint: str) -> socket.socket:
 def test_a_stop_is_answered_while_the_event_loop_stands_still(
     serve: Callable[..., EstopServer], robot: Robot, endpoint: str
 ) -> None:
-    """Regression: the stop came in on the goal socket; three million empty frames there delayed it by 20.9 s."""
+    """Regression: the stop came in on the goal socket; three million empty frames there delayed it
+    by 20.9 s.
+    """
 
     async def scenario() -> str:
         with serve():
@@ -134,13 +146,41 @@ def test_an_ended_control_thread_is_said(
 def test_silent_connections_of_the_same_user_keep_no_stop_out(
     serve: Callable[..., EstopServer], robot: Robot, endpoint: str
 ) -> None:
-    """A peer that may connect could hold all places; the oldest silent connection is closed for a new one."""
+    """A peer that may connect could hold all places; the oldest silent connection is closed for a
+    new one.
+    """
     with serve():
         silent = [connect(endpoint) for _ in range(10 * CONNECTIONS_PER_UID)]
         assert stop(endpoint, "smoke", timeout_s=WAIT_S).first
         assert silent[0].recv(1) == b""  # hung up on
         for one in silent:
             one.close()
+
+
+def test_a_process_with_one_connection_keeps_it_beside_one_with_many(
+    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+) -> None:
+    """A client that was held up between its connect and its request lost its place to a flood of
+    the same user.
+    """
+    crowd = (
+        "import socket, sys; peers = []\n"
+        "for _ in range(int(sys.argv[2])):\n"
+        "    peers.append(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)); peers[-1].connect(sys.argv[1])\n"
+        "print(len(peers), flush=True); sys.stdin.read()"
+    )
+    argv = [sys.executable, "-c", crowd, path_of(endpoint), str(4 * CONNECTIONS_PER_UID)]
+    with (
+        serve(silent_s=WAIT_S),
+        connect(endpoint) as honest,
+        subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as flood,
+    ):
+        assert flood.stdout is not None
+        assert flood.stdout.readline()
+        connect(endpoint).close()  # accepted behind all of them
+        honest.send(request("smoke"))
+        assert reply_in(honest.recv(4096)).answer is Answer.LATCHED
+        flood.communicate()
 
 
 def test_a_flood_of_connections_from_other_threads_keeps_no_stop_out(
@@ -177,7 +217,9 @@ def test_a_flood_of_connections_from_other_threads_keeps_no_stop_out(
 def test_a_stop_is_read_by_a_process_that_has_no_descriptor_left(
     serve: Callable[..., EstopServer], robot: Robot, endpoint: str
 ) -> None:
-    """Bare connects to the goal socket could use all descriptors up; the server keeps one for a stop."""
+    """Bare connects to the goal socket could use all descriptors up; the server keeps one for a
+    stop.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     with serve(), socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
         client.settimeout(WAIT_S)
