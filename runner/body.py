@@ -32,7 +32,7 @@ def body_of(robot: RobotEnvironment, description: RobotDescription) -> Body:
     }
     return Body.model_validate(
         {
-            "embodiment_tags": robot.embodiment_tags or _by_adapter(robot.hal.adapter),
+            "embodiment_tags": robot.known_tags or _by_adapter(robot.hal.adapter),
             "capabilities": {**seen, **robot.capabilities},
         }
     )

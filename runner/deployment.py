@@ -140,6 +140,8 @@ def offered(
     Skills that nobody executes here (detectors, scene VLMs) are listed for whoever plans; their licences are their sidecars' matter.
     """
     spec = file.robot.vla
+    manifests = list(manifests)
+    wanted = None if spec is None else skill_named(spec, manifests)
     kept, refused = [], {}
     for manifest in manifests:
         found = misfits(file.robot, parts, manifest)
@@ -149,21 +151,39 @@ def offered(
             refused[manifest.name] = (
                 f"its licence, {manifest.license}, does not allow commercial use; {LICENCE_FLAG} lets it run all the same"
             )
-        elif found and not (spec is not None and spec.id == manifest.name):
+        elif found and wanted != manifest.name:
             refused[manifest.name] = "; ".join(problem for _, problem in found)
         else:
             kept.append(manifest)
     body = body_of(file.robot, parts.hal.description)
     catalogue = Catalogue(kept, makers, refused=refused, body=body)
-    if spec is None:
+    if spec is None or wanted is None:
         return catalogue
     try:
-        _, _, manifest = catalogue.find(spec.id)
+        _, _, manifest = catalogue.find(wanted)
     except UnknownSkill as error:
         raise file.error(("vla.id", str(error))) from error
     if problems := [*_contradictions(spec, manifest), *misfits(file.robot, parts, manifest)]:
         raise file.error(*problems)
     return catalogue
+
+
+def skill_named(spec: VlaSpec, manifests: Iterable[RSkillManifest]) -> str:
+    """Return the name of the skill that the file means: `vla.id`, else as the field writes it the
+    one that `vla.weights_uri` names by name or folder (`rskills/so101-grab`)."""
+    names = [manifest.name for manifest in manifests]
+    folder = spec.weights_uri.rstrip("/").rpartition("/")[2]
+    found = [
+        name
+        for name in names
+        if spec.weights_uri == name
+        or (folder and "://" not in spec.weights_uri and folder == _folder_of(name))
+    ]
+    return found[0] if spec.id not in names and len(found) == 1 else spec.id
+
+
+def _folder_of(name: str) -> str:
+    return name.rpartition("/")[2].removeprefix("rskill-")
 
 
 def misfits(robot: RobotEnvironment, parts: Parts, manifest: RSkillManifest) -> list[tuple[str, str]]:
@@ -200,21 +220,28 @@ def misfits(robot: RobotEnvironment, parts: Parts, manifest: RSkillManifest) -> 
 
 def _contradictions(spec: VlaSpec, manifest: RSkillManifest) -> list[tuple[str, str]]:
     """The file may say again what the manifest says, never something else: the weights are the sidecar's to load."""
-    said = (
-        ("weights_uri", spec.weights_uri or None, manifest.weights_uri),
-        ("runtime", spec.runtime, manifest.runtime),
-        ("quantization", spec.quantization, manifest.quantization.dtype),
-    )
+    said: list[tuple[str, object, object]] = [("runtime", spec.runtime, manifest.runtime)]
+    if spec.id == manifest.name:
+        said.append(("weights_uri", spec.weights_uri or None, manifest.weights_uri))
+    elif manifest.model_family is not None:
+        said.append(("id", spec.id, manifest.model_family))
+    for field in sorted(spec.quantization.model_fields_set if spec.quantization else ()):
+        wanted, there = (getattr(block, field) for block in (spec.quantization, manifest.quantization))
+        said.append(("quantization", f"{field} {wanted}", f"{field} {there}"))
     return [
         (f"vla.{field}", f"{wanted} is not what {manifest.name} is installed with: {installed}")
         for field, wanted, installed in said
-        if wanted is not None and wanted != str(installed)
+        if wanted is not None and str(wanted) != str(installed)
     ]
 
 
 def unused(robot: RobotEnvironment) -> list[str]:
     """Fields that are given but mean nothing here, with the reason: nobody shall believe that they had an effect."""
-    notes = []
+    notes = [
+        f"embodiment_tags: {tag!r}, which no manifest can name"
+        for tag in robot.embodiment_tags
+        if tag not in robot.known_tags
+    ]
     if "thumbnail_hz" in robot.model_fields_set:
         notes.append("thumbnail_hz: pictures are made when somebody asks for them")
     if robot.vla is not None:
@@ -258,7 +285,8 @@ def plan(file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Iterab
     lines += [("skill", text) for text in catalogue.summary()]
     if robot.task is not None and robot.vla is not None:
         limit = f", at most {robot.task.max_steps} ticks" if robot.task.max_steps else ""
-        lines.append(("task", f"{robot.task.id}: {robot.vla.id} {robot.task.instruction!r}{limit}"))
+        skill = skill_named(robot.vla, catalogue.executable())
+        lines.append(("task", f"{robot.task.id}: {skill} {robot.task.instruction!r}{limit}"))
     if robot.save_dir is not None:
         lines.append(("record", f"every goal, as an episode of the dataset in {robot.save_dir}"))
     if robot.max_ticks is not None:

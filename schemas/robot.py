@@ -7,12 +7,12 @@ and is checked by that adapter, before anything moves.
 
 from collections.abc import Collection, Mapping
 from enum import StrEnum
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from schemas.body import Body, Capability
-from schemas.manifest.contracts import SafetyEnvelope
+from schemas.manifest.contracts import Quantization, SafetyEnvelope
 from schemas.manifest.vocabulary import EmbodimentTag
 from schemas.yamltext import Path, YamlText, parse_yaml, validated
 
@@ -87,12 +87,20 @@ class VlaSpec(_Section):
     """The skill that runs the task: an installed rSkill by name, without a scheme."""
 
     id: Text
+    """The skill's name; or, as the field writes it, the policy's family (`act`), and then
+    `weights_uri` names the skill: `rskills/so101-grab`."""
     weights_uri: str = ""
     device: str = "auto"
     runtime: str | None = None
-    quantization: str | None = None
+    quantization: Quantization | None = None
+    """A block as in the skill's manifest, or its `dtype` alone."""
     deterministic: bool = False
     extra: dict[str, Any] = {}
+
+    @field_validator("quantization", mode="before")
+    @classmethod
+    def _a_word_is_a_dtype(cls, value: object) -> object:
+        return {"dtype": value} if isinstance(value, str) else value
 
     @model_validator(mode="after")
     def _bare_reference(self) -> Self:
@@ -105,8 +113,9 @@ class RobotEnvironment(_Section):
     """One robot as it is deployed."""
 
     robot_id: Text
-    embodiment_tags: tuple[EmbodimentTag, ...] = ()
-    """What the robot is, e.g. `so101_follower`; empty: what its adapter is known to be. Skills made for other robots are refused."""
+    embodiment_tags: tuple[Text, ...] = ()
+    """What the robot is, e.g. `so101_follower`; empty: what its adapter is known to be. Skills made
+    for other robots are refused. A tag that no manifest can name is a warning."""
     capabilities: dict[str, Capability] = {}
     """Facts that manifests ask for by name: `has_vision: true`, `can_lift_kg: 0.5`. Cameras and grippers are seen without being named here."""
     hal: HalConfig
@@ -116,7 +125,7 @@ class RobotEnvironment(_Section):
     safety: SafetyEnvelope | None = None
     """Tightens the robot's own limits; it can never widen them."""
     rate_hz: Annotated[float, Field(gt=0, le=RATE_HZ_MAX, allow_inf_nan=False)] = 30.0
-    thumbnail_hz: Positive = 25.0
+    thumbnail_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 25.0
     deadline_overrun_policy: Literal["warn", "drop", "raise"] = "warn"
     max_ticks: Annotated[int, Field(gt=0)] | None = None
     save_dir: str | None = None
@@ -130,8 +139,13 @@ class RobotEnvironment(_Section):
             raise ValueError(f"sensor_id must be unique; given twice: {', '.join(twice)}")
         if (self.vla is None) != (self.task is None):
             raise ValueError("task and vla go together: give both, or neither to serve goals only")
-        Body(embodiment_tags=self.embodiment_tags, capabilities=self.capabilities)
+        Body.model_validate({"embodiment_tags": self.known_tags, "capabilities": self.capabilities})
         return self
+
+    @property
+    def known_tags(self) -> tuple[str, ...]:
+        """The tags that manifests have words for."""
+        return tuple(tag for tag in self.embodiment_tags if tag in get_args(EmbodimentTag))
 
 
 def known_keys() -> Mapping[Path, Collection[str]]:
@@ -141,6 +155,7 @@ def known_keys() -> Mapping[Path, Collection[str]]:
         ("hal",): list(HalConfig.model_fields),
         ("task",): list(TaskSpec.model_fields),
         ("vla",): list(VlaSpec.model_fields),
+        ("vla", "quantization"): list(Quantization.model_fields),
         ("safety",): list(SafetyEnvelope.model_fields),
         **{("sensors", index): list(SensorReaderConfig.model_fields) for index in range(64)},
     }

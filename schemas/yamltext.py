@@ -278,7 +278,9 @@ def problems_of(
 ) -> list[Problem]:
     """Pydantic's findings with the lines of the text. `known` lists the keys of each section, for suggestions."""
     problems = []
-    for finding in error.errors(include_url=False, include_context=False):
+    for finding in error.errors(include_url=False):
+        if only_counts_wrong_entries(finding):
+            continue
         path: Path = tuple(finding["loc"])
         if finding["type"] == "extra_forbidden":
             text = "unknown key" + did_you_mean(str(path[-1]), known.get(path[:-1], ()))
@@ -286,3 +288,14 @@ def problems_of(
             text = finding["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
         problems.append(Problem(source.line(path), dotted(path), text))
     return sorted(problems, key=lambda problem: problem.line)
+
+
+def only_counts_wrong_entries(finding: Mapping[str, Any]) -> bool:
+    """Whether a finding says "too short" of a list that is long enough: pydantic does not count
+    wrong entries, which have findings of their own."""
+    given = finding["input"]
+    return (
+        finding["type"] == "too_short"
+        and isinstance(given, list | tuple)
+        and len(given) >= finding["ctx"]["min_length"]
+    )

@@ -36,6 +36,7 @@ from runner.deployment import (
     offered,
     plan,
     read_deployment,
+    skill_named,
     unkept,
     unused,
 )
@@ -140,6 +141,7 @@ class Deploy:
         self._clock = SystemClock()
         self._endpoint: str = args.endpoint or program_endpoint("runner", os.environ, os.getuid())
         self._stopping = asyncio.Event()
+        self._task_skill = ""
 
     async def run(self) -> int:
         """Check, then print the plan or carry it out."""
@@ -147,6 +149,8 @@ class Deploy:
         parts = make_parts(self._file, self._clock)
         manifests = read_manifests(self._args.skills or [default_skills()])
         check = self._offered(parts, manifests, None)
+        if self._file.robot.vla is not None:
+            self._task_skill = skill_named(self._file.robot.vla, check.executable())
         if self._args.dry_run:
             print(printable_lines(plan(self._file, parts, check, self._facts(check))))
             print("dry run: nothing was opened")
@@ -268,7 +272,7 @@ class Deploy:
         try:
             async with RunnerClient(self._endpoint) as client:
                 goal = await client.send_goal(
-                    robot.vla.id,
+                    self._task_skill,
                     prompt=robot.task.instruction,
                     max_ticks=robot.task.max_steps,
                     goal_id=OWN_GOAL,

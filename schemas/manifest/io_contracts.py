@@ -161,7 +161,7 @@ class ActionSlot(Block):
                 if (rule == "R" and not given) or (rule == "F" and given):
                     verb = "is required for" if rule == "R" else "is not allowed for"
                     problems.append(Problem((field,), f"{verb} {mode.value!r}"))
-        if self.joint_names and len(self.joint_names) != self.width and not problems:
+        if self.joint_names and len(self.joint_names) != self.width > 0 and not problems:
             problems.append(
                 Problem(
                     ("joint_names",),

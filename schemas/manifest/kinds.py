@@ -74,6 +74,7 @@ def check_kind(kind: Kind, values: Mapping[str, object]) -> list[Problem]:
         if message:
             problems.append(Problem((field,), message))
     family = values.get("model_family")
-    if RULES["processors"][kind] != "F" and family in PROCESSOR_FAMILIES and values.get("processors") is None:
+    wanted = isinstance(family, str) and family in PROCESSOR_FAMILIES
+    if RULES["processors"][kind] != "F" and wanted and values.get("processors") is None:
         problems.append(Problem(("processors",), f"is required for model_family {str(family)!r}"))
     return problems

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from schemas.errors import ManifestInvalid
+from schemas.yamltext import only_counts_wrong_entries
 
 Path = tuple[str | int, ...]
 
@@ -95,6 +96,8 @@ def from_validation_error(error: ValidationError, model: type[BaseModel], data: 
     """All findings of a ValidationError of `model` over `data`, in the order of the fields, one per place and message."""
     problems: dict[Problem, None] = {}
     for item in error.errors(include_url=False):
+        if only_counts_wrong_entries(item):
+            continue
         path = _path_in(data, item["loc"], missing=item["type"] == "missing")
         cause = item.get("ctx", {}).get("error")
         if isinstance(cause, RuleError):

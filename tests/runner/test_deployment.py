@@ -148,7 +148,7 @@ def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_ro
             r"robot\.yaml:1: .*'any' is what a skill may be made for, not what a robot is",
         ),
         (
-            TWIN + "embodiment_tags: [so101]\n",
+            TWIN + "embodiment_tags: [5]\n",
             r"robot\.yaml:3: embodiment_tags\[0\]: ",
         ),
     ],
@@ -204,6 +204,33 @@ def test_a_task_that_fits_passes(dry_run: DryRun) -> None:
     assert "task      grab: vram-arbiter/so101-grab 'grab it'" in out
     assert re.search(r"sidecar +of vram-arbiter/so101-grab at ipc://.*/grab\.sock", out), out
     assert "camera    front by opencv_thread, at most 100 ms old" in out
+
+
+CAMERAS = "sensors:\n" + "".join(
+    f"  - {{sensor_id: {name}, backend_params: {{device: 0}}}}\n" for name in ("front", "wrist")
+)
+
+
+def test_the_fields_own_files_are_read_as_the_field_means_them(dry_run: DryRun) -> None:
+    """`vla.id` is the policy's family there and `vla.weights_uri` the skill, `quantization` a
+    block, 0 turns pictures off, and tags are the fleet's own."""
+    text = TWIN + CAMERAS + "thumbnail_hz: 0\nembodiment_tags: [so101_follower, our_lab_3]\n"
+    task = "task: {id: grab}\nvla:\n  id: act\n  weights_uri: {uri}\n  quantization: {dtype: {dtype}, extra: {}}\n"
+    vla = task.replace("{dtype}", "fp32")
+    for uri in ("rskills/so101-grab", "rskills/so101-grab/", "vram-arbiter/so101-grab"):
+        code, out, err = dry_run(text + vla.replace("{uri}", uri), skills=GRAB)
+        assert (code, err) == (0, "")
+        assert "task      grab: vram-arbiter/so101-grab ''" in out
+        assert "unused    embodiment_tags: 'our_lab_3', which no manifest can name" in out
+    wrong = {
+        vla.replace("id: act", "id: smolvla").replace("{uri}", "rskills/so101-grab"): "vla.id: smolvla is not what",
+        task.replace("{dtype}", "int4").replace("{uri}", "rskills/so101-grab"): "vla.quantization: dtype int4 is not",
+        vla.replace("{uri}", "rskills/none"): "vla.id: no skill 'act' is installed",
+        vla.replace("{uri}", "rskills/so101-grab").replace("dtype:", "dtyp:"): "vla.quantization.dtyp: unknown key; did you mean dtype?",
+    }  # fmt: skip
+    for block, told in wrong.items():
+        code, _, err = dry_run(text + block, skills=GRAB)
+        assert (code, told in err) == (2, True), err
 
 
 @pytest.mark.parametrize(
