@@ -66,10 +66,12 @@ def until[T](found: Callable[[], T | None], what: Callable[[], str]) -> T:
     return answer
 
 
-def leases(machine: Machine, endpoint: str = ENDPOINT) -> dict[str, dict[str, Any]] | None:
+def leases(
+    machine: Machine, endpoint: str = ENDPOINT, user: str | None = None
+) -> dict[str, dict[str, Any]] | None:
     """The granted leases by their consumer; None while nothing is granted again after a restart."""
     asked = subprocess.run(
-        machine.inside("vramctl", "status", "--json", "--endpoint", endpoint),
+        machine.inside("vramctl", "status", "--json", "--endpoint", endpoint, user=user),
         capture_output=True, text=True, timeout=PATIENCE_S,
     )  # fmt: skip
     if asked.returncode:
@@ -119,7 +121,7 @@ def test_a_killed_arbiter_comes_back_with_its_leases(machine: Machine) -> None:
     with held(machine, "survivor") as before:
         hit(machine, "KILL")
         after = until(lambda: (leases(machine) or {}).get("survivor"), lambda: machine.log(ARBITER))
-        assert (after["lease_id"], after["token"]) == (before["lease_id"], before["token"])
+        assert (after["lease_id"], after["pid"]) == (before["lease_id"], before["pid"])
 
 
 def test_the_watchdog_ends_an_arbiter_that_hangs(machine: Machine) -> None:
@@ -127,7 +129,7 @@ def test_the_watchdog_ends_an_arbiter_that_hangs(machine: Machine) -> None:
         hit(machine, "STOP")
         assert "Fatal Python error: Aborted" in machine.log(ARBITER), "where it hung, is said"
         after = until(lambda: (leases(machine) or {}).get("patient"), lambda: machine.log(ARBITER))
-        assert (after["lease_id"], after["token"]) == (before["lease_id"], before["token"])
+        assert (after["lease_id"], after["pid"]) == (before["lease_id"], before["pid"])
 
 
 def test_a_mistake_in_the_configuration_is_not_tried_again(machine: Machine) -> None:
@@ -155,7 +157,7 @@ def test_the_unit_of_a_user_starts_in_the_manager_of_a_user(machine: Machine) ->
     machine.start("manager.service")
     as_user = ["env", f"XDG_RUNTIME_DIR={runtime}", "systemctl", "--user"]
     machine.run(*as_user, "start", "vram-arbiter", user="vram-robot")
-    assert leases(machine, f"ipc://{runtime}/vram-arbiter/arbiter.sock") == {}
+    assert leases(machine, f"ipc://{runtime}/vram-arbiter/arbiter.sock", user="vram-robot") == {}
     machine.run("systemctl", "stop", "manager.service")
 
 
