@@ -203,6 +203,8 @@ class Connection(asyncio.Protocol):
         transport.write(self._wire.outgoing())
 
     def data_received(self, data: bytes) -> None:
+        if self._finishing:  # read on all the same: the peer's end of file ends the connection
+            return
         self._wire.feed(data)
         self._router._readable(self)
 
@@ -237,6 +239,7 @@ class Connection(asyncio.Protocol):
             self._reason = "the server ends"
             self._finishing = True
             self._transport.write_eof()
+            self.update_reading()
 
     def handle(self) -> bool:
         """Handle one event of what was read. True: more may be left, and the connection wants
@@ -260,6 +263,7 @@ class Connection(asyncio.Protocol):
 
     @property
     def _stopped(self) -> bool:
+        """Nothing is handled for now, or any more."""
         return self._resting or self._clogged or self._finishing
 
     def _handle(self, event: Ready | Heartbeat | Message | Oversize) -> None:
@@ -294,7 +298,8 @@ class Connection(asyncio.Protocol):
         transport = self._transport
         if transport is None or transport.is_closing():
             return
-        if self._stopped or self._wire.unread_bytes > READ_AHEAD_BYTES:
+        full = self._stopped or self._wire.unread_bytes > READ_AHEAD_BYTES
+        if full and not self._finishing:
             transport.pause_reading()
         else:
             transport.resume_reading()
