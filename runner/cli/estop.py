@@ -11,7 +11,7 @@ import os
 
 from clients.estop import ANSWER_S, stop
 from schemas import terminal
-from schemas.endpoints import SYSTEM_RUNTIME, program_endpoint
+from schemas.endpoints import SYSTEM_RUNTIME, program_endpoint, socket_path
 from schemas.errors import ConfigError, RunnerUnreachable, UntrustedServer
 from schemas.estop import path_of
 from schemas.runtime.printable import printable
@@ -61,7 +61,10 @@ def _there() -> list[str]:
 
 
 def _exists(endpoint: str) -> bool:
-    return os.path.exists(path_of(endpoint)) or os.path.exists(endpoint.removeprefix("ipc://"))
+    try:
+        return os.path.exists(path_of(endpoint)) or os.path.exists(socket_path(endpoint))
+    except ConfigError:  # a runtime folder that cannot be one: the other runner is stopped all the same
+        return False
 
 
 async def _stop(endpoint: str, reason: str) -> str:

@@ -17,12 +17,30 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from clients.estop import stop
 from runner.control import Mailbox
 from runner.estop import CONNECTIONS_PER_UID, SILENT_S, EstopServer
-from schemas.errors import AlreadyRunning, ConfigError, EstopRequested, InternalError, RunnerUnreachable
-from schemas.estop import Answer, path_of, reason_in, reply_in, request
+from schemas.errors import (
+    AlreadyRunning,
+    BadFrame,
+    ConfigError,
+    EstopRequested,
+    InternalError,
+    RunnerUnreachable,
+)
+from schemas.estop import (
+    PREFIX,
+    Answer,
+    Reply,
+    one_line,
+    path_of,
+    reason_in,
+    reply_in,
+    request,
+)
 
 WAIT_S = 60.0
 
@@ -299,3 +317,19 @@ def test_the_words_of_a_request() -> None:
     assert reason_in(request("")) == ""
     assert reason_in(request("ä" * 9000)) == "ä" * 500
     assert reason_in(b"VRAM-ESTOP/1 \xff\xfe") == "\ufffd\ufffd"
+
+
+@given(st.binary(max_size=600), st.sampled_from([b"", PREFIX, PREFIX + b"1\tlatched\t"]))
+def test_no_packet_is_anything_but_a_request_a_reply_or_refused(packet: bytes, prefix: bytes) -> None:
+    reason = reason_in(prefix + packet)
+    assert (reason is not None) == (prefix + packet).startswith(PREFIX)
+    assert reason is None or (reason.isprintable() and len(reason) <= 500)
+    with contextlib.suppress(BadFrame):
+        reply_in(prefix + packet)
+
+
+@given(st.sampled_from(Answer), st.integers(0, 1 << 63), st.text(), st.text())
+def test_a_reply_is_read_as_it_was_written(answer: Answer, stopped_ns: int, robot: str, text: str) -> None:
+    read = reply_in(Reply(answer, stopped_ns, robot, text).encode())
+    assert (read.answer, read.stopped_ns) == (answer, stopped_ns)
+    assert (read.robot, read.text) == (one_line(robot), one_line(text))

@@ -251,6 +251,19 @@ def test_whoever_names_no_endpoint_stops_the_system_service_too(
     play(run_async, bench, body)
 
 
+def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_from_being_stopped(
+    bench: Any, run_async: Run, endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VRAM_ARBITER_RUNTIME", "not/absolute")
+    monkeypatch.setattr("runner.cli.estop.SYSTEM_RUNTIME", endpoint.removeprefix("ipc://").rpartition("/")[0])
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
+        assert b.twin.story == ["connect", "halt"]
+
+    play(run_async, bench, body)
+
+
 def test_a_stop_does_not_wait_for_the_imports_of_other_commands(endpoint: str) -> None:
     code = (
         "import sys; from runner.__main__ import main; "

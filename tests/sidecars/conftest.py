@@ -46,6 +46,7 @@ class Sidecar:
     def __init__(self, process, endpoint, folder):
         self.process = process
         self.folder = folder
+        self.endpoint = endpoint
         self.client = WireClient(endpoint)
 
     def ask(self, op, **fields):

@@ -2,6 +2,9 @@
 
 import json
 import os
+import subprocess
+import sys
+from pathlib import Path
 from threading import Event
 from time import monotonic
 
@@ -14,6 +17,7 @@ pytestmark = pytest.mark.e2e
 GB = 10**9
 MB = 10**6
 PATIENCE_S = 60.0
+ATTACKER = str(Path(__file__).parents[1] / "clients/attacker.py")
 
 
 @pytest.fixture
@@ -288,6 +292,25 @@ def test_without_an_arbiter_models_stay_and_the_last_one_does_not_fit(lone_box):
 def test_a_process_without_a_device_needs_no_card(lone_box):
     sidecar = lone_box.start("detector", "--no-arbiter", device="none")
     assert sidecar.detect()["ok"]
+
+
+@pytest.mark.parametrize("mode", ["empties", "maps", "more", "connects"])
+def test_an_attacked_sidecar_serves_others_and_lives(lone_box, mode):
+    """Regression: bare connects, an odd identity or frames without end aborted the process, or took its memory."""
+    sidecar = lone_box.start("detector", "--no-arbiter", device="none")
+    assert sidecar.detect()["ok"]
+    path = sidecar.endpoint.removeprefix("ipc://")
+    with subprocess.Popen([sys.executable, ATTACKER, mode, path], stdout=subprocess.PIPE) as attacker:
+        try:
+            assert attacker.stdout.readline() == b"under way\n"
+            for _ in range(20):
+                assert sidecar.detect()["ok"]
+            with WireClient(sidecar.endpoint) as another:
+                assert another.ask("ping")["state"] == "resident"
+            assert attacker.poll() is None
+        finally:
+            attacker.kill()
+    assert sidecar.terminate() == 0
 
 
 def test_two_sidecars_cannot_serve_one_socket(lone_box):
