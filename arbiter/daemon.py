@@ -235,11 +235,12 @@ class Daemon:
         operators = self._group("operators_group")
         members = self._group("group")
         group = operators if members is None else members  # of the socket: it has one
-        self._take_folders(places, group, undo)  # 1
+        lock = self._take_folders(places, group, undo)  # 1
         traced = self._open_telemetry(undo)
         boot = boot_id()
-        journal = Journal.open(places.state, boot, check=check_record)  # 2
+        journal = Journal.open(places.state, boot, check=check_record, witness=lock.left)  # 2
         undo.callback(journal.close)
+        lock.leave(journal.opened.witness)
         history = History.open(places.state, config.history.max_events, config.history.days)
         history.start(loop)
         undo.callback(history.close)
@@ -318,13 +319,14 @@ class Daemon:
         undo.callback(router.stop_receiving)
         return Parts(gpus, inbox, sessions, history, journal, executor)
 
-    def _take_folders(self, places: Places, group: int | None, undo: contextlib.AsyncExitStack) -> None:
+    def _take_folders(self, places: Places, group: int | None, undo: contextlib.AsyncExitStack) -> LockFile:
+        """Returns the socket's lock."""
         if self._config.gpu.source.startswith("fake:") or places.state.parent == places.runtime:
             private_folder(places.runtime, group)
         socket_folder(places.socket.parent, self._environ, group)
-        lock = LockFile(places.socket.with_name(places.socket.name + ".lock"), str(places.socket))
-        lock.acquire()
-        undo.callback(lock.release)
+        socket_lock = LockFile(places.socket.with_name(places.socket.name + ".lock"), str(places.socket))
+        socket_lock.acquire()
+        undo.callback(socket_lock.release)
         try:
             if self._config.state.dir is None:
                 places.state.parent.mkdir(mode=0o700, parents=True, exist_ok=True)  # such as ~/.local/state
@@ -339,6 +341,7 @@ class Daemon:
             if isinstance(error, ConfigError):
                 raise
             raise ConfigError(f"the state folder {places.state} cannot be made: {error}") from error
+        return socket_lock
 
     def _open_telemetry(self, undo: contextlib.AsyncExitStack) -> "Traced | None":
         """None: it was not asked for, and nothing of it is imported. Raises ConfigError."""

@@ -56,10 +56,15 @@ def on_recovered(core: Core, event: Recovered) -> None:
         families.tie(core, gpu, parents)
     if not held or doubt is not None:
         core.recovering.add(EMPTY_JOURNAL)
-        grace_s = defaults.LEASE_TTL_S + core.settings.fence_grace_s
-        core.timers.set(("recover", EMPTY_JOURNAL), core.now + grace_s)
+        await_unnamed(core)
     facts: dict[str, Any] = {} if doubt is None else {"doubt": str(doubt["why"])}
     core.note("recovered", leases=sorted(core.recovering), records=len(held), **facts)
+
+
+def await_unnamed(core: Core) -> None:
+    """Holders that the journal does not name have their time from now on. A lost lease may have had the TTL of one that is known."""
+    ttl_s = max([defaults.LEASE_TTL_S, *(lease.spec.ttl_s for lease in core.leases.values())])
+    core.timers.set(("recover", EMPTY_JOURNAL), core.now + ttl_s + core.settings.fence_grace_s)
 
 
 def _restore_away(core: Core, record: Mapping[str, Any]) -> None:

@@ -7,10 +7,9 @@ So: every holder gets its full ttl anew, every card is unknown until it is read,
 from arbiter.core import measure
 from arbiter.core.events import Resumed
 from arbiter.core.lease import EXPIRING
-from arbiter.core.recovery import EMPTY_JOURNAL
+from arbiter.core.recovery import EMPTY_JOURNAL, await_unnamed
 from arbiter.core.state import Core, Gpu
 from arbiter.core.uses import await_users
-from schemas import defaults
 
 
 def on_resumed(core: Core, event: Resumed) -> None:
@@ -24,7 +23,7 @@ def on_resumed(core: Core, event: Resumed) -> None:
         if ("users", lease.id) in core.timers:
             await_users(core, lease)
     if ("recover", EMPTY_JOURNAL) in core.timers:
-        core.timers.set(("recover", EMPTY_JOURNAL), core.now + defaults.LEASE_TTL_S + grace_s)
+        await_unnamed(core)
     for gpu in core.gpus.values():
         _measure_anew(core, gpu)
 

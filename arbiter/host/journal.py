@@ -66,10 +66,11 @@ Change = tuple[str, Mapping[str, Any] | None]
 @dataclass(frozen=True, slots=True)
 class Opened:
     """What a start found. `put_aside` names the file that damage was moved to; `voided` counts records of an earlier boot.
-    `doubt` says why the records may not be all; its own record is among them then. `problems` is for people, a line each.
+    `witness` is for the next start. `doubt` says why the records may not be all; its own record is among them then. `problems` is for people, a line each.
     `learnt` is what `keep` wrote last under that name, whatever the boot, and so are `footprints`."""
 
     epoch: int
+    witness: str
     records: Mapping[str, Mapping[str, Any]]
     put_aside: Path | None = None
     problem: str = ""
@@ -111,6 +112,7 @@ class Journal:
         *,
         check: Check | None = None,
         at_least: int | None = None,
+        witness: str = "",
         seals: type[Seal] = Seal,
     ) -> Self:
         """Open or make the journal in `folder`, and count a new epoch, `at_least` that (else `fresh_epoch`). Raises ConfigError if the
@@ -120,12 +122,14 @@ class Journal:
         1. Read everything; damage is put aside. 2. Records of another boot are dropped. 3. What no seal confirms is doubted.
         4. Epoch: more than every known one. 5. Seal before the database, so that a kill between them is no doubt; in doubt the
         other way round, so that it stays one. 6. The epoch file.
+
+        `witness` is what `Opened.witness` said at the last start, kept outside of the folder.
         """
         connection: sqlite3.Connection | None = None
         seal: Seal | None = None
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            found = look(folder, check)  # 1
+            found = look(folder, check, witness)  # 1
             connection = found.connection
             voided = found.void(boot_id)  # 2
             doubt = doubt_of(found, boot_id)  # 3
@@ -144,7 +148,8 @@ class Journal:
             _begin(connection, boot_id, epoch, records if doubt or voided is not None else None)
             if doubt:
                 seal.write(total, total)
-            write_last_start(folder, LastStart(epoch, boot_id))  # 6
+            last = LastStart(epoch, boot_id)  # 6
+            write_last_start(folder, last)
         except (OSError, sqlite3.OperationalError) as error:
             if connection is not None:
                 connection.close()
@@ -153,6 +158,7 @@ class Journal:
             _raise(folder, error)
         opened = Opened(
             epoch,
+            last.text(),
             records,
             found.put_aside,
             "; ".join(found.problems),

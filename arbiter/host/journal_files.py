@@ -4,6 +4,7 @@ Damage is put aside under a name of its own and reported; `doubt` says why lease
 Decides nothing that outlives the start, and must not know what records mean.
 """
 
+import contextlib
 import json
 import logging
 import sqlite3
@@ -12,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from arbiter.host.seal import EPOCH_MAX, LastStart, Seal, Sealed, digest, read_last_start
+from arbiter.host.seal import EPOCH_MAX, LastStart, Seal, Sealed, digest, last_start, read_last_start
 from schemas import strictjson
 
 log = logging.getLogger(__name__)
@@ -43,6 +44,7 @@ class Found:
     seal: Sealed | None = None
     seal_problem: str = ""
     last: LastStart | None = None
+    forgotten: LastStart | None = None  # a later start than the folder knows of
     unread: str = ""  # why the database as a whole was put aside
     put_aside: Path | None = None
     problems: list[str] = field(default_factory=list)
@@ -57,8 +59,8 @@ class Found:
         return count
 
 
-def look(folder: Path, check: Check | None) -> Found:
-    """Read all files. A database, an epoch file or rows that cannot be read are put aside."""
+def look(folder: Path, check: Check | None, witness: str) -> Found:
+    """Read all files, and `witness`: a text of `LastStart` from outside of the folder, or anything else. A database, an epoch file or rows that cannot be read are put aside."""
     path = folder / "journal.sqlite"
     try:
         found = _read(Found(connect(path)), check)
@@ -85,11 +87,17 @@ def look(folder: Path, check: Check | None) -> Found:
     known += [] if found.seal is None else [found.seal.epoch]
     known += [] if found.last is None else [found.last.epoch]
     found.epoch = max((epoch for epoch in known if epoch <= EPOCH_MAX), default=0)
+    with contextlib.suppress(ValueError):
+        if (told := last_start(witness)).epoch > found.epoch:
+            found.forgotten = told
+            found.epoch = told.epoch
     return found
 
 
 def doubt_of(found: Found, boot_id: str) -> str:
     """Why leases of this boot may be missing among the records; "" if what is there is what was written last."""
+    if found.forgotten is not None and found.forgotten.boot == boot_id:
+        return "the state folder is older than the last start at this socket"
     seal, last, meta_boot = found.seal, found.last, found.meta.get("boot_id")
     sealed_here = seal is not None and seal.is_of(boot_id)
     if not sealed_here and meta_boot != boot_id and (last is None or last.boot != boot_id):

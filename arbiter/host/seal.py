@@ -3,7 +3,8 @@
 `journal.seal` is rewritten around each commit, without fsync: it names the digest of all records. Like the commit itself it
 survives the death of the daemon, and after a power cut nothing of it matters. Before a commit it names the old and the new digest,
 after it the new one alone: a kill at any instant leaves a journal that its seal accepts, a lost commit leaves one that it does not.
-`epoch` is replaced once per start, with fsync: it names the epoch and the boot of the last start. Must not know what records are.
+`epoch` is replaced once per start, with fsync: it names the epoch and the boot of the last start. A copy of it in the
+socket's lock file (the witness) knows of a start that the state folder as a whole has forgotten. Must not know what records are.
 """
 
 import os
@@ -102,6 +103,19 @@ class LastStart:
     epoch: int
     boot: str
 
+    def text(self) -> str:
+        return f"{self.epoch}\n{self.boot}\n"
+
+
+def last_start(text: str) -> LastStart:
+    """The inverse of `LastStart.text`. Raises ValueError for what cannot be true."""
+    number, _, rest = text.partition("\n")
+    if len(text) > _EPOCH_FILE_MAX or not number.isdecimal() or len(number) > 19:
+        raise ValueError(f"the epoch file does not hold an epoch but {number[:40]!r}")
+    if int(number) > EPOCH_MAX:
+        raise ValueError(f"the epoch file says {number}, more than {EPOCH_MAX}")
+    return LastStart(int(number), rest.strip())
+
 
 def read_last_start(folder: Path) -> LastStart | None:
     """What the last start wrote; None where there is no file. Raises ValueError for one that cannot be true."""
@@ -110,19 +124,14 @@ def read_last_start(folder: Path) -> LastStart | None:
             content = file.read(_EPOCH_FILE_MAX + 1)
     except FileNotFoundError:
         return None
-    number, _, rest = content.decode("ascii", "replace").partition("\n")
-    if len(content) > _EPOCH_FILE_MAX or not number.isdecimal() or len(number) > 19:
-        raise ValueError(f"the epoch file does not hold an epoch but {number[:40]!r}")
-    if int(number) > EPOCH_MAX:
-        raise ValueError(f"the epoch file says {number}, more than {EPOCH_MAX}")
-    return LastStart(int(number), rest.strip())
+    return last_start(content.decode("ascii", "replace"))
 
 
 def write_last_start(folder: Path, start: LastStart) -> None:
     """Replace the epoch file, durably."""
     temporary = folder / "epoch.tmp"
     with temporary.open("w") as file:
-        file.write(f"{start.epoch}\n{start.boot}\n")
+        file.write(start.text())
         file.flush()
         os.fsync(file.fileno())
     temporary.rename(folder / "epoch")

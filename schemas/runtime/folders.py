@@ -18,6 +18,7 @@ from schemas.errors import AlreadyRunning, ConfigError
 from schemas.runtime.trust import ROOT, trusts
 
 CHOOSE: Final = "choose a folder that this program may write"
+LEFT_MAX_BYTES: Final = 256
 _FOLDER: Final = os.O_DIRECTORY | os.O_CLOEXEC
 
 
@@ -110,6 +111,8 @@ class LockFile:
         self._protects = protects
         self._holder = holder
         self._fd: int | None = None
+        self.left = ""
+        """What the last holder left for the next one (`leave`)."""
 
     def acquire(self) -> None:
         """Raises AlreadyRunning with the pid of the holder, ConfigError where the file cannot be made or must not be used."""
@@ -117,10 +120,18 @@ class LockFile:
         assert fd is not None
         self._lock(fd)
         self._fd = fd
+        content = os.pread(fd, LEFT_MAX_BYTES, 0).decode("ascii", "replace")
+        self.leave(content.partition("\n")[2])
+
+    def leave(self, text: str) -> None:
+        """Keep a short text for the next holder, behind this one's pid."""
+        assert self._fd is not None, "leave before acquire"
+        self.left = text
+        content = f"{os.getpid()}\n{text}".encode("ascii", "replace")[:LEFT_MAX_BYTES]
         # a full disk: the lock holds, only the pid for the other's message is missing
         with contextlib.suppress(OSError):
-            os.ftruncate(fd, 0)
-            os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
+            os.pwrite(self._fd, content, 0)
+            os.ftruncate(self._fd, len(content))
 
     def check_free(self) -> None:
         """Raise what `acquire` would raise because of another holder, without making the file or keeping the lock."""
@@ -164,7 +175,7 @@ class LockFile:
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            text = os.pread(fd, 32, 0).decode("ascii", "replace").strip()
+            text = os.pread(fd, 32, 0).decode("ascii", "replace").partition("\n")[0].strip()
             os.close(fd)
             raise AlreadyRunning(
                 f"{self._holder} (pid {text or 'unknown'}) already uses {self._protects}",

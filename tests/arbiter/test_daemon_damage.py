@@ -8,7 +8,6 @@ import contextlib
 import os
 import shutil
 import signal
-import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -25,7 +24,6 @@ GIB = 1 << 30
 PAGE = 4096
 FRAME = 24 + PAGE
 PATIENCE_S = 60.0
-OLD = ".before"
 
 HOLDER = """
 import asyncio, sys
@@ -85,24 +83,12 @@ def change(path: Path, offset: int, change: Callable[[bytes], bytes], size: int 
 
 
 def put_back(database: Path) -> None:
-    for suffix in ("", "-wal", "-shm"):
-        path = database.with_name(database.name + suffix)
-        path.unlink(missing_ok=True)
-        old = path.with_name(path.name + OLD)
-        if old.exists():
-            shutil.copy(old, path)
-
-
-def delete(database: Path) -> None:
-    for path in (database, wal(database), database.with_name(database.name + "-shm")):
+    """An earlier copy of the database and its log; the seal and the epoch file stay."""
+    wal(database)
+    for path in database.parent.glob("journal.sqlite*"):
         path.unlink()
-
-
-def edit_record(database: Path) -> None:
-    with contextlib.closing(sqlite3.connect(database)) as connection, connection:
-        connection.execute(
-            "UPDATE records SET json = replace(json, '\"charge_bytes\":2', '\"charge_bytes\":1')"
-        )
+    for path in database.parent.with_name("before").glob("journal.sqlite*"):
+        shutil.copy(path, database.parent)
 
 
 DAMAGES: dict[str, Callable[[Path], Any]] = {
@@ -112,8 +98,7 @@ DAMAGES: dict[str, Callable[[Path], Any]] = {
     "last page zeroed": lambda database: change(wal(database), -PAGE, lambda old: bytes(len(old)), PAGE),
     "one bit flipped": lambda database: change(wal(database), 32 + 24 + 100, lambda old: bytes([old[0] ^ 1])),
     "older copy put back": put_back,
-    "database deleted": delete,
-    "record edited": edit_record,
+    "state folder deleted": lambda database: shutil.rmtree(database.parent),
 }  # fmt: skip
 
 
@@ -123,8 +108,7 @@ def test_a_damaged_journal_grants_nothing_beside_a_holder_in_use(damage: str) ->
     with contextlib.closing(arbiter):
         arbiter.start()
         database = arbiter.state / "journal.sqlite"
-        for path in sorted(arbiter.state.glob("journal.sqlite*")):
-            shutil.copy(path, path.with_name(path.name + OLD))
+        shutil.copytree(arbiter.state, arbiter.state.with_name("before"))
         with holder_in_use(arbiter) as holder:
             holder.send_signal(signal.SIGSTOP)  # it cannot tell the next daemon what the journal does not
             arbiter.kill()

@@ -1,6 +1,7 @@
 """What is lost or changed while the daemon is down is noticed at the next start; a kill at any instant is not taken for damage."""
 
 import contextlib
+import errno
 import os
 import shutil
 import sqlite3
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from arbiter.core.events import DOUBT_KEY
 from arbiter.host.journal import Journal, Opened
 from arbiter.host.seal import EPOCH_MAX, Seal, fresh_epoch
+from schemas.errors import JournalUnavailable
 
 DATABASE = "journal.sqlite"
 FRAME = 24 + 4096
@@ -225,6 +227,54 @@ def test_a_log_that_lost_its_end_is_doubted_or_says_the_same(
         assert found.doubt or found.records == truth
 
 
+class Failing(Seal):
+    """A seal on a disk that refuses some of its writes."""
+
+    refused: ClassVar[set[int]] = set()
+    writes: ClassVar[int] = 0
+
+    def write(self, now: int, soon: int) -> None:
+        Failing.writes += 1
+        if Failing.writes in self.refused:
+            raise OSError(errno.EIO, "Input/output error")
+        super().write(now, soon)
+
+
+@settings(max_examples=15)
+@given(st.lists(BATCHES, min_size=1, max_size=6), st.sets(st.integers(2, 14), min_size=1, max_size=4))
+def test_a_seal_that_cannot_be_written_stops_grants_and_nothing_else(
+    batches: list[list[tuple[str, int | None]]], refused: set[int]
+) -> None:
+    """A change is refused as a whole, or made and confirmed later; what was made is never taken for damage."""
+    with tempfile.TemporaryDirectory(prefix="va") as root:
+        folder = Path(root) / "state"
+        Failing.writes, Failing.refused = 0, refused
+        journal = Journal.open(folder, "boot-1", seals=Failing)
+        made: Records = {}
+        for batch in batches:
+            before = Failing.writes
+            changes = [(key, None if n is None else {"n": n}) for key, n in batch]
+            try:
+                journal.apply(changes)
+            except JournalUnavailable:
+                assert before + 1 in refused
+                assert journal.problem
+                continue
+            assert bool(journal.problem) == (before + 2 in refused) or all(n is None for _, n in batch)
+            for key, record in changes:
+                made.pop(key, None)
+                if record is not None:
+                    made[key] = record
+        Failing.refused = set()
+        journal.settle()
+        assert journal.problem == ""
+        copy = Path(root) / "killed"
+        shutil.copytree(folder, copy)
+        journal.close()
+        found = opened(copy)
+        assert (found.records, found.doubt) == (made, "")
+
+
 @pytest.mark.parametrize("doubted", [False, True])
 @pytest.mark.parametrize("boot_id", ["boot-1", "boot-2"])
 def test_a_kill_in_the_middle_of_a_start_changes_nothing(tmp_path: Path, boot_id: str, doubted: bool) -> None:
@@ -281,3 +331,23 @@ def test_an_epoch_that_cannot_be_is_put_aside(tmp_path: Path, text: str) -> None
     assert "epoch" in found.problems[0]
     assert (tmp_path / "epoch.corrupt-1").read_text() == text
     assert not opened(tmp_path).problems
+
+
+def test_a_folder_that_forgot_the_last_start_is_doubted(tmp_path: Path) -> None:
+    """The copy in the socket's lock file knows of it, whether the folder was deleted or an earlier one was put back."""
+    folder = tmp_path / "state"
+    first = opened(folder)
+    shutil.copytree(folder, tmp_path / "before")
+    second = opened(folder, witness=first.witness)
+    assert second.doubt == ""
+    for lost in ("deleted", "put back"):
+        shutil.rmtree(folder)
+        if lost == "put back":
+            shutil.copytree(tmp_path / "before", folder)
+        copy = tmp_path / lost
+        assert opened(folder, "boot-2", witness=second.witness, at_least=0).doubt == ""
+        shutil.copytree(tmp_path / "before", copy)
+        third = opened(copy, witness=second.witness, at_least=0)
+        assert "older than the last start" in third.doubt
+        assert third.epoch == second.epoch + 1
+    assert opened(tmp_path / "new", witness="x" * 300).doubt == "", "what says nothing is no witness"
