@@ -92,7 +92,9 @@ def test_1_for_what_cannot_be_done(
     client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     environ = arbiter_daemon.environ
-    for name in ("det", "twin", "twin"):
+    det = client.acquire(spec("det", 1))
+    det.ready()
+    for name in ("twin", "twin"):
         client.acquire(spec(name, 1)).ready()
     ended = client.acquire(spec("gone", 1))
     ended.release()
@@ -118,7 +120,9 @@ def test_1_for_what_cannot_be_done(
     nobody = vramctl(environ, "why", "nobody")
     assert (nobody.returncode, nobody.stdout.count("\n")) == (1, 1)
     assert "`vramctl history -c nobody`" in nobody.stdout
-    assert vramctl(environ, "why", "L1-1").stdout.startswith("det: "), "a lease is named by its id as well"
+    assert vramctl(environ, "why", det.lease_id).stdout.startswith("det: "), (
+        "a lease is named by its id as well"
+    )
     empty = vramctl(environ, "history", "-c", "nobody")
     assert (empty.returncode, empty.stdout) == (0, ""), "nothing is an answer, and no line"
 
