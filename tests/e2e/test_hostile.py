@@ -6,7 +6,6 @@ import os
 import random
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import msgpack
 import pytest
 
+from arbiter.testing.honest import Honest
 from arbiter.testing.hostile import BOMBS, Forger
 from arbiter.testing.process import ArbiterProcess
 from arbiter.testing.wire import WireClient
@@ -21,8 +21,6 @@ from arbiter.testing.wire import WireClient
 pytestmark = pytest.mark.e2e
 GIB, MIB = 1 << 30, 1 << 20
 PATIENCE_S = 60.0
-MEMORY_SLACK_KIB = 64 * 1024
-DESCRIPTOR_SLACK = 8
 ATTACKER = """
 import sys
 sys.path.insert(0, sys.argv[1])
@@ -37,64 +35,9 @@ ROOT = Path(__file__).parents[2]
 Connect = Callable[..., WireClient]
 
 
-class Honest:
-    """A client with a pinned lease in use, which looks at itself and at the daemon before and after."""
-
-    def __init__(self, arbiter: ArbiterProcess, connect: Connect) -> None:
-        self.arbiter = arbiter
-        self.client = connect().hello("honest")
-        reply = self.client.acquire("honest", GIB, evictable=False, ttl_s=300.0)
-        lease = reply["lease"] if reply["state"] == "loading" else self.client.push("granted")["lease"]
-        self.on = {"lease_id": lease["lease_id"], "token": lease["token"]}
-        assert self.client.ask("ready", **self.on)["ok"]
-        assert self.client.ask("use_begin", **self.on, use_id="work")["ok"]
-        self.descriptors = self._descriptors()
-        self.memory_kib = self._memory_kib()
-
-    def _descriptors(self) -> int:
-        return len(os.listdir(f"/proc/{self.arbiter.pid}/fd"))
-
-    def _memory_kib(self) -> int:
-        status = Path(f"/proc/{self.arbiter.pid}/status").read_text()
-        return int(next(line for line in status.splitlines() if line.startswith("VmRSS")).split()[1])
-
-    def is_served(self) -> None:
-        """Answered, and its lease as it was."""
-        status = self.client.ask("status")
-        (mine,) = (lease for lease in status["leases"] if lease["consumer"] == "honest")
-        assert (mine["state"], mine["token"], mine["uses"]) == ("held", self.on["token"], 1)
-        assert self.client.ask("renew", leases=[self.on])["alive"] == [self.on["lease_id"]]
-
-    def is_alone(self) -> None:
-        """Everybody else is gone without a trace. The death of a process is heard, and what it leaves is closed, a little later."""
-        with WireClient(
-            self.arbiter.endpoint
-        ) as late:  # accepted after all who came before: none of them is still to come
-            assert late.hello("late", role="observer").ask("bye")["ok"]
-        deadline = time.monotonic() + PATIENCE_S
-        while trace := self._trace_of_others():
-            assert time.monotonic() < deadline, trace
-            self.client.receive(0.05)
-        self.is_served()
-
-    def _trace_of_others(self) -> dict[str, Any]:
-        """What is more than before they came; empty: nothing. All of it at one time."""
-        status = self.client.ask("status")
-        (mine,) = (lease for lease in status["leases"] if lease["consumer"] == "honest")
-        descriptors, memory_kib = self._descriptors(), self._memory_kib()
-        found = {
-            "clients": status["clients"] - 1,
-            "leases": len(status["leases"]) - 1,
-            "uses": mine["uses"] - 1,
-            "descriptors": max(0, descriptors - self.descriptors - DESCRIPTOR_SLACK),
-            "memory_kib": max(0, memory_kib - self.memory_kib - MEMORY_SLACK_KIB),
-        }
-        return {what: more for what, more in found.items() if more}
-
-
 @pytest.fixture
 def honest(arbiter_daemon: ArbiterProcess, connect: Connect) -> Honest:
-    return Honest(arbiter_daemon, connect)
+    return Honest(arbiter_daemon, connect())
 
 
 def attack(arbiter: ArbiterProcess, script: str, **words: Any) -> "subprocess.Popen[str]":
