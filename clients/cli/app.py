@@ -273,7 +273,9 @@ def run(
     said. Exits with the program's code (128+n if signal n ended it), 1 if no lease was granted, 3 without an arbiter,
     126/127 if it cannot be started.
     """
-    from clients.cli.run import ON_REVOKE, RunSpec, run_leased
+    from pydantic import ValidationError
+
+    from clients.cli.run import ON_REVOKE, RunSpec, lease_spec, run_leased
     from schemas.sizes import parse_bytes
 
     chosen = "pin" if pin else on_revoke
@@ -286,6 +288,12 @@ def run(
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
     spec = RunSpec(command, name, size, gpu, priority, wait, exclusive, chosen, grace)
+    try:
+        lease_spec(spec)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        option = "--gpu" if problem["loc"] == ("gpu",) else "--name"
+        raise typer.BadParameter(f"{option}: {problem['msg']}, got {problem['input']!r}") from error
     raise typer.Exit(asyncio.run(run_leased(spec, endpoint)))
 
 

@@ -132,6 +132,8 @@ def test_cuda_sees_the_granted_gpu(gpu: str, environ: dict[str, str], variables:
         (["--vram", "1GiB", __file__], 126, "permission denied"),
         (["--vram", "1GiB", sys.executable, "-c", "import os; os.kill(os.getpid(), 15)"], 128 + 15, ""),
         (["--vram", "1GiB", "--pin", "--on-revoke", "term", "true"], 2, "exclude each other"),
+        (["--vram", "1GiB", "--gpu", "", "true"], 2, "--gpu: "),
+        (["--vram", "1GiB", "--name", "x\n", "true"], 2, "--name: "),
     ],
 )
 def test_codes_of_run(command: list[str], code: int, said: str, arbiter_daemon: ArbiterProcess) -> None:
