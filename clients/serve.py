@@ -32,7 +32,7 @@ REASON_MAX_CHARS = 500
 ENVELOPE_MAX_BYTES = 64 * 1024
 IMAGES_MAX_BYTES = IMAGE_MESSAGE_MAX_BYTES + ENVELOPE_MAX_BYTES
 VALUES_MAX = 12_288
-"""msgpack values of one message: 1,100 points of a trajectory of six joints; at most 4 ms of
+"""msgpack values of one message: 800 points of a trajectory of six joints; at most 4 ms of
 decoding.
 """
 LISTED_MAX = 4096

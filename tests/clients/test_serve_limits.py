@@ -151,6 +151,18 @@ def test_a_server_without_pictures_takes_a_mebibyte(tmp_path: Path) -> None:
     run(scenario)
 
 
+def test_a_goal_may_be_a_trajectory_of_eight_hundred_points(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with serving(tmp_path / "s.sock", message_max_bytes=MESSAGE_MAX_BYTES):
+            client = Client(tmp_path / "s.sock")
+            point = {"positions": [0.1] * 6, "time_from_start": {"sec": 1, "nanosec": 5}}
+            goal = {"op": "goal", "goal_params": {"trajectory": {"points": [point] * 800}}}
+            assert (await client.ask(goal))["ok"]
+            client.close()
+
+    run(scenario)
+
+
 def test_a_user_has_a_share_of_waiting_requests_in_number_and_in_bytes(tmp_path: Path) -> None:
     async def scenario() -> None:
         async with serving(tmp_path / "s.sock") as server:
