@@ -14,7 +14,7 @@ from typing import Any
 from reasoner.params import misfits
 from schemas.body import NOBODY, Body
 from schemas.errors import BadRequest, CallerError, NotPermitted, UnknownSkill
-from schemas.manifest import RSkillManifest
+from schemas.manifest import Role, RSkillManifest
 from schemas.tools import (
     EmitPrompt,
     ExecuteRskill,
@@ -243,7 +243,7 @@ def palette_of(
 ) -> Palette:
     """Palette of installed manifests. Templates, models that do not fit the robot's `body` and, unless allowed, those whose licence forbids
     commercial use are listed but barred. A robot that does not say what it is gets what is made for any."""
-    skills = tuple(
+    skills = tuple(  # by name: the same skills read from folders in another order are the same prompt
         Skill(
             manifest.name,
             str(manifest.kind),
@@ -253,7 +253,7 @@ def palette_of(
             _barred(manifest, allow_noncommercial) or body.misfit(manifest),
             manifest.latency_budget.max_execution_s or 0.0,
         )
-        for manifest in manifests
+        for manifest in sorted(manifests, key=lambda manifest: manifest.name)
     )
     return Palette(
         skills,
@@ -268,6 +268,8 @@ def palette_of(
 def _barred(manifest: RSkillManifest, allow_noncommercial: bool) -> str:
     if manifest.is_scaffold_placeholder:
         return "its manifest is still the template"
+    if manifest.kind in EXECUTABLE_KINDS and manifest.role is not Role.S1:
+        return f"its role is {manifest.role}, and only {Role.S1} acts"
     weightless = manifest.weights_uri is None  # nothing that a licence of weights could be about
     if not weightless and not allow_noncommercial and not manifest.is_commercial_use_allowed:
         return (

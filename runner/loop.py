@@ -71,6 +71,7 @@ class RunnerBase(ABC):
         self.deadline_policy = deadline_policy
         self.clock: Clock = clock or SystemClock()
         self.tick_idx = 0
+        self._first_tick = 0  # of the present run
         self.deadline_misses = 0
         self.late_actions_withheld = 0
         self.save_dir: str | None = None  # folder of the dataset that this run is recorded into
@@ -204,7 +205,14 @@ class RunnerBase(ABC):
         return result
 
     def run(self, max_ticks: int | None = None) -> RunResult:
-        """Tick until `_finished` or `max_ticks` more ticks. A long tick costs its own slots, never those after it."""
+        """Tick until `_finished` or `max_ticks` more ticks. A long tick costs its own slots, never
+        those after it.
+
+        The result is of this run's ticks alone; their indices go on from the run before.
+        """
+        if self.tick_idx != self._first_tick:
+            self._first_tick, self.timings = self.tick_idx, Timings()
+            self.deadline_misses = self.late_actions_withheld = 0
         first = self.tick_idx
         self._due_s = self.clock.now_s()
         try:
@@ -226,10 +234,10 @@ class RunnerBase(ABC):
         self.clock.sleep_s(self._due_s - self.clock.now_s())
 
     def result(self) -> RunResult:
-        """The run so far."""
+        """The present run so far, or the last one."""
         tick_ms, inference_ms = self.timings.tick_ms, self.timings.inference_ms
         return RunResult(
-            n_ticks=self.tick_idx,
+            n_ticks=self.tick_idx - self._first_tick,
             success=self._success(),
             budget_violations=self.deadline_misses,
             avg_inference_ms=mean(inference_ms),

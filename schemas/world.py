@@ -24,6 +24,7 @@ Vector3 = tuple[Finite, Finite, Finite]
 Quaternion = tuple[Finite, Finite, Finite, Finite]
 Twist = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 """vx, vy, vz in m/s, then wx, wy, wz in rad/s."""
+Index = Annotated[int, Field(ge=0, strict=True)]
 Box2d = tuple[Finite, Finite, Finite, Finite]
 """x_min, y_min, x_max, y_max in pixels."""
 Matrix3 = tuple[Vector3, Vector3, Vector3]
@@ -192,15 +193,21 @@ class Pose(_Frozen):
 
 
 class DetectedObject(_Frozen):
-    """An object of the world as last seen. `box_3d` is x_min, y_min, z_min, x_max, y_max, z_max in the frame of `pose`."""
+    """An object of the world as last seen. `box_3d`, the field's `bbox_3d`, is x_min, y_min, z_min,
+    x_max, y_max, z_max in the frame of `pose`. `track_id` is the tracker's own, a number or a
+    word."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_by_name=True, validate_by_alias=True)
 
     label: Annotated[str, Field(min_length=1)]
     confidence: UnitInterval
     pose: Pose | None = None
     box: Box2d | None = None
-    box_3d: tuple[Finite, Finite, Finite, Finite, Finite, Finite] | None = None
+    box_3d: Annotated[
+        tuple[Finite, Finite, Finite, Finite, Finite, Finite] | None, Field(validation_alias="bbox_3d")
+    ] = None
     sensor_id: str = ""
-    track_id: str | None = None
+    track_id: Index | str | None = None
     stamp_ns: Nanoseconds = 0
 
 
@@ -330,11 +337,12 @@ class Action(_Frozen):
 class TickResult(_Frozen):
     """One turn of a runner's loop: where the time went and what became of the action.
 
-    A tick without `step_idx` stepped no world: it reset it, or there was nothing to do. `success` is the world's own word, of that moment.
+    A tick without `step_idx` stepped no world: it reset it, or there was nothing to do. All indices
+    count from 0, steps in their episode. `success` is the world's own word, of that moment.
     """
 
     stamp_ns: Nanoseconds
-    tick_idx: Annotated[int, Field(ge=0)]
+    tick_idx: Index
     tick_ms: Milliseconds
     late_ms: Milliseconds = 0.0  # behind its slot when it began
     sensors_ms: Milliseconds = 0.0
@@ -342,12 +350,12 @@ class TickResult(_Frozen):
     inference_ms: Milliseconds = 0.0
     safety_ms: Milliseconds = 0.0
     hal_ms: Milliseconds = 0.0
-    chunk_index: int | None = None
+    chunk_index: Index | None = None
     safety_violations: tuple[str, ...] = ()
     action_applied: bool = True
     deadline_missed: bool = False
-    step_idx: int | None = None
-    episode_idx: int | None = None
+    step_idx: Index | None = None
+    episode_idx: Index | None = None
     reward: Finite | None = None
     terminated: bool | None = None
     truncated: bool | None = None

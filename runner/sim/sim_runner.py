@@ -274,7 +274,7 @@ class SimRunner(SkillRunner):
         truncated |= self._ends_with_skill and self._had_skill and self._active is None
         applied = Applied(
             action_applied=decision.action is not None,
-            step_idx=steps if step.moved else None,
+            step_idx=before if step.moved else None,
             episode_idx=self.episode_idx,
             reward=step.reward,
             terminated=step.terminated,

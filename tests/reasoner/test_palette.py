@@ -256,3 +256,20 @@ def test_a_skill_that_describes_no_parameters_takes_none() -> None:
     with pytest.raises(BadRequest, match="takes no goal_params"):
         found.parse("execute_rskill__lab__b", {"goal_params": {"speed": 9}})
     assert found.check(found.parse("execute_rskill__lab__b", {"goal_params": {}})) is None
+
+
+def test_only_role_s1_is_offered_as_an_action() -> None:
+    slow = manifest("vla", name="lab/slow", role="s2")
+    found = palette(slow, manifest("vla"))
+    assert list(found.executable) == ["lab/vla"]
+    error = found.check(ExecuteRskill(rskill_id="lab/slow"))
+    assert isinstance(error, NotPermitted)
+    assert "its role is s2, and only s1 acts" in error.message
+
+
+def test_the_order_of_the_palette_is_that_of_the_names() -> None:
+    """The same prompt for the same skills, in whatever order their folders were read."""
+    skills = [manifest("vla", name=f"lab/{letter}") for letter in "cab"]
+    offered = [function["function"]["name"] for function in palette(*skills).functions()]
+    assert offered[:3] == [f"execute_rskill__lab__{letter}" for letter in "abc"]
+    assert palette(*skills) == palette(*reversed(skills))

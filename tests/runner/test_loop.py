@@ -110,10 +110,15 @@ def test_figures_of_a_run(clock: Any) -> None:
     assert result.p99_tick_ms == pytest.approx(39.7)
 
 
-def test_a_second_run_goes_on_counting(clock: Any) -> None:
-    runner = Scripted(clock, [], rate_hz=10)
-    runner.run(max_ticks=2)
-    assert runner.run(max_ticks=2).n_ticks == 4
+def test_a_second_run_counts_its_own_ticks(clock: Any) -> None:
+    """Its result was of both runs; the ticks' indices still go on."""
+    runner = Scripted(clock, [0.0, 0.25, 0.01, 0.01], rate_hz=10)
+    first = runner.run(max_ticks=2)
+    assert (first.n_ticks, first.budget_violations) == (2, 1)
+    second = runner.run(max_ticks=2)
+    assert (second.n_ticks, second.budget_violations, runner.tick_idx) == (2, 0, 4)
+    assert second.avg_tick_ms == pytest.approx(10.0)
+    assert runner.result() == second
 
 
 @pytest.mark.parametrize(

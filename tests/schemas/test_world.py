@@ -185,3 +185,24 @@ def test_detection_box_is_ordered() -> None:
 def test_results_have_plain_defaults() -> None:
     assert TickResult(stamp_ns=1, tick_idx=0, tick_ms=1.5).action_applied
     assert RunResult(n_ticks=3).success is None
+
+
+def test_objects_are_read_as_the_field_writes_them() -> None:
+    box = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
+    ours = DetectedObject(label="cube", confidence=0.9, box_3d=box, track_id="a")
+    assert ours.box_3d == box
+    field = DetectedObject.model_validate({"label": "cube", "confidence": 0.9, "bbox_3d": box, "track_id": 7})
+    assert (field.box_3d, field.track_id) == (box, 7)
+    assert DetectedObject.model_validate(field.model_dump()) == field
+    assert DetectedObject.model_validate_json(field.model_dump_json()) == field
+    for track_id in (-1, 1.5, True):
+        with pytest.raises(ValidationError):
+            DetectedObject.model_validate({"label": "cube", "confidence": 0.9, "track_id": track_id})
+
+
+@pytest.mark.parametrize("name", ["tick_idx", "chunk_index", "step_idx", "episode_idx"])
+def test_indices_count_from_0(name: str) -> None:
+    tick = {"stamp_ns": 1, "tick_idx": 0, "tick_ms": 1.0}
+    assert getattr(TickResult.model_validate(tick | {name: 0}), name) == 0
+    with pytest.raises(ValidationError, match=name):
+        TickResult.model_validate(tick | {name: -1})

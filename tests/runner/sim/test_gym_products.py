@@ -298,7 +298,7 @@ def test_a_goal_plays_an_episode_of_parts_to_its_success() -> None:
     runner.tick()
     runner.begin_skill(Skill(), Goal("g", "r"), ended.append)
     tick = runner.tick()
-    assert (tick.terminated, tick.success, tick.step_idx) == (True, True, 1)
+    assert (tick.terminated, tick.success, tick.step_idx) == (True, True, 0)
     assert ended[0].error is None
 
 
