@@ -96,7 +96,7 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
                     sidecar.pid,
                     3.33 * GB,
                 )
-                token = lease["token"]
+                token = identity["token"]  # of the sidecar: `status` shows tokens to holders only
                 assert (await reward.score([picture], "grab the red cube", token=token)).progress[0] < 0.5
 
                 # somebody needs the card: it leaves, and says *evicted* to whoever still speaks of the old lease
