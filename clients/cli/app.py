@@ -16,7 +16,8 @@ _EPILOG = (
     "Exit codes: 0 done · 1 the answer is no, or an error · 2 wrong usage · 3 the arbiter cannot be reached · "
     "74 the output cannot be written. "
     "Sizes are printed in GiB/MiB (1024-based); written ones may be 8GiB, 5.3GB, 450MiB. "
-    "VRAM_ARBITER_ENDPOINT or VRAM_ARBITER_RUNTIME say where the arbiter serves."
+    "VRAM_ARBITER_ENDPOINT or VRAM_ARBITER_RUNTIME say where the arbiter serves; VRAM_ARBITER_SERVER_USERS names users who may serve it "
+    "beside root, yourself and vram-arbiter."
 )
 
 CONTEXT = {

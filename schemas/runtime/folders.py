@@ -99,6 +99,17 @@ def _problem(found: os.stat_result, shared: bool) -> str:
     return ""
 
 
+def _remove_foreign(name: str, folder: int) -> None:
+    """Remove another user's file of this name from a folder of this user's own, where members of its group may add files: one of them
+    must not keep the server from starting."""
+    try:
+        found = os.stat(name, dir_fd=folder, follow_symlinks=False)
+    except FileNotFoundError:
+        return
+    if found.st_uid not in (os.geteuid(), ROOT) and os.fstat(folder).st_uid == os.geteuid():
+        os.unlink(name, dir_fd=folder)
+
+
 class LockFile:
     """One server per socket and per state folder: a lock file, held as long as the process lives.
 
@@ -151,6 +162,8 @@ class LockFile:
         folder: int | None = None
         try:
             folder = _open_folder(self._path.parent)
+            if create:
+                _remove_foreign(self._path.name, folder)
             fd = os.open(self._path.name, flags, 0o640, dir_fd=folder)
         except FileNotFoundError as error:
             if not create:

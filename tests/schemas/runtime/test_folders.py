@@ -148,8 +148,32 @@ def test_a_lock_file_that_is_another_file_is_left_alone(tmp_path: Path, tie: obj
 
 
 @as_root
-def test_a_lock_file_of_another_user_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "lock").touch()
-    os.chown(tmp_path / "lock", FOREIGN, -1)
+def test_another_user_keeps_no_server_from_its_own_folder(tmp_path: Path) -> None:
+    """In the units' folder members of the group may add files: the arbiter would not have started again."""
+    tmp_path.chmod(0o1770)
+    (tmp_path / "precious").write_text("kept")
+    planted = tmp_path / "lock"
+    for plant in (planted.touch, lambda: planted.symlink_to(tmp_path / "precious")):
+        planted.unlink(missing_ok=True)
+        plant()
+        os.chown(planted, FOREIGN, -1, follow_symlinks=False)
+        lock = LockFile(planted, "x")
+        lock.acquire()
+        assert planted.lstat().st_uid == os.geteuid()
+        lock.release()
+    assert (tmp_path / "precious").read_text() == "kept"
+
+
+@as_root
+def test_a_lock_file_of_another_user_in_a_shared_folder_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As for a sidecar in the folder of the arbiter's unit: it may not remove what others put there."""
+    monkeypatch.setenv("VRAM_ARBITER_SERVER_USERS", str(FOREIGN))
+    folder = tmp_path / "shared"
+    folder.mkdir(mode=0o700)
+    (folder / "lock").touch()
+    os.chown(folder / "lock", FOREIGN, -1)
+    os.chown(folder, FOREIGN, -1)
     with pytest.raises(ConfigError, match=f"uid {FOREIGN}"):
-        LockFile(tmp_path / "lock", "x").acquire()
+        LockFile(folder / "lock", "x").acquire()
