@@ -5,12 +5,14 @@ connections, and without descriptors.
 import asyncio
 import contextlib
 import os
+import pwd
 import resource
 import socket
 import stat
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +23,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clients.estop import stop
+from runner.__main__ import main
 from runner.control import Mailbox
 from runner.estop import CONNECTIONS_PER_UID, SILENT_S, EstopServer
 from schemas.errors import (
@@ -317,6 +320,44 @@ def test_the_words_of_a_request() -> None:
     assert reason_in(request("")) == ""
     assert reason_in(request("ä" * 9000)) == "ä" * 500
     assert reason_in(b"VRAM-ESTOP/1 \xff\xfe") == "\ufffd\ufffd"
+
+
+FALSE_RUNNER = """
+import os, socket, sys
+folder, uid = sys.argv[1], int(sys.argv[2])
+os.chdir(folder)
+os.setgid(uid)
+os.setuid(uid)
+listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+listener.bind("runner.sock.estop")
+listener.listen()
+print("listening", flush=True)
+peer, _ = listener.accept()
+heard = peer.recv(4096)
+print(heard, flush=True)
+if heard:
+    peer.send(b"VRAM-ESTOP/1\\tlatched\\t1\\tbench\\tsmoke")
+    peer.send(b"VRAM-ESTOP/1\\tobeyed\\t1\\tbench\\tthe motors hold")
+"""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can start a server of another user")
+def test_a_false_runner_is_not_believed_that_the_motors_hold(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    nobody = pwd.getpwnam("nobody").pw_uid
+    with tempfile.TemporaryDirectory(prefix="va") as folder:
+        os.chown(folder, nobody, -1)
+        argv = [sys.executable, "-c", FALSE_RUNNER, folder, str(nobody)]
+        with subprocess.Popen(argv, stdout=subprocess.PIPE) as false:
+            assert false.stdout is not None
+            assert false.stdout.readline() == b"listening\n"
+            code = main(["estop", "--endpoint", f"ipc://{folder}/runner.sock"])
+            assert false.stdout.readline() == b"b''\n"  # nothing was said to it
+    said = capsys.readouterr()
+    assert (code, said.out) == (1, "")
+    assert f"is served by uid {nobody} (nobody)" in said.err
+    assert "cut its power" in said.err
 
 
 @given(st.binary(max_size=600), st.sampled_from([b"", PREFIX, PREFIX + b"1\tlatched\t"]))
