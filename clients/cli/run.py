@@ -146,7 +146,7 @@ class _Run:
             self._wake.clear()
             self._decide(lease, {})
             with contextlib.suppress(VramError):
-                status = await self._client.status()
+                status = await self._client.ask("status")  # its first page has the heads of the queues
                 self._measure(lease, status)
                 self._decide(lease, status)
             pause_s = LOOK_S

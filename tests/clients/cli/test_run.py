@@ -125,36 +125,49 @@ def test_cuda_sees_the_granted_gpu(gpu: str, environ: dict[str, str], variables:
 @pytest.mark.parametrize(
     ("command", "code", "said"),
     [
-        (["--vram", "9GiB", "true"], 1, "needs 9"),
-        (["--vram", "1GiB", "/nonexistent/program"], 127, "not found"),
-        (["--vram", "1GiB", ""], 127, "not found"),
-        (["--vram", "1GiB", "/"], 126, "is a directory"),
-        (["--vram", "1GiB", __file__], 126, "permission denied"),
-        (["--vram", "1GiB", sys.executable, "-c", "import os; os.kill(os.getpid(), 15)"], 128 + 15, ""),
-        (["--vram", "1GiB", "--pin", "--on-revoke", "term", "true"], 2, "exclude each other"),
-        (["--vram", "1GiB", "--gpu", "", "true"], 2, "--gpu: "),
-        (["--vram", "1GiB", "--name", "x\n", "true"], 2, "--name: "),
+        (["/nonexistent/program"], 127, "not found"),
+        ([""], 127, "not found"),
+        (["/"], 126, "is a directory"),
+        ([__file__], 126, "permission denied"),
+        (["--pin", "--on-revoke", "term", "true"], 2, "exclude each other"),
+        (["--gpu", "", "true"], 2, "--gpu: "),
+        (["--name", "x\n", "true"], 2, "--name: "),
     ],
 )
-def test_codes_of_run(command: list[str], code: int, said: str, arbiter_daemon: ArbiterProcess) -> None:
-    done = vramctl("run", *command, environ=arbiter_daemon.environ)
+def test_codes_of_what_is_never_started(command: list[str], code: int, said: str, tmp_path: Path) -> None:
+    """Known before any arbiter is asked; 126 and 127 are as shells have them."""
+    environ = {**os.environ, "VRAM_ARBITER_RUNTIME": str(tmp_path)}
+    done = vramctl("run", "--vram", "1GiB", *command, environ=environ)
     assert done.returncode == code, done.stderr
     assert said in done.stderr
     assert "Traceback" not in done.stderr
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize(
-    "name", [b"\xff\xfe", b"\x1b[31m\n", b"x" * 200], ids=["undecodable", "control", "long"]
-)
-def test_a_program_may_have_any_name(name: bytes, arbiter_daemon: ArbiterProcess, tmp_path: Path) -> None:
-    program = os.fsencode(tmp_path) + b"/" + name
-    with open(program, "wb") as file:
-        file.write(b"#!/bin/sh\nexit 3\n")
-    os.chmod(program, 0o755)
-    done = vramctl("run", "--vram", "1GiB", program, environ=arbiter_daemon.environ)
-    assert done.returncode == 3, done.stderr
-    assert "\x1b" not in done.stderr
+def test_codes_of_run(arbiter_daemon: ArbiterProcess, tmp_path: Path) -> None:
+    environ = arbiter_daemon.environ
+    done = vramctl("run", "--vram", "9GiB", "true", environ=environ)
+    assert (done.returncode, "needs 9" in done.stderr) == (1, True)
+    done = vramctl("run", "--vram", "1GiB", "sh", "-c", "kill -TERM $$", environ=environ)
+    assert done.returncode == 128 + signal.SIGTERM
+    unknown = tmp_path / "format"
+    unknown.write_text("no program")
+    unknown.chmod(0o755)
+    done = vramctl("run", "--vram", "1GiB", str(unknown), environ=environ)
+    assert (done.returncode, "Exec format error" in done.stderr) == (126, True)
+
+
+@pytest.mark.e2e
+def test_a_program_may_have_any_name(arbiter_daemon: ArbiterProcess, tmp_path: Path) -> None:
+    """Undecodable bytes, control characters and long names ended in a traceback."""
+    for name in (b"\xff\xfe", b"\x1b[31m\n", b"x" * 200):
+        program = os.fsencode(tmp_path) + b"/" + name
+        with open(program, "wb") as file:
+            file.write(b"#!/bin/sh\nexit 3\n")
+        os.chmod(program, 0o755)
+        done = vramctl("run", "--vram", "1GiB", program, environ=arbiter_daemon.environ)
+        assert done.returncode == 3, done.stderr
+        assert "\x1b" not in done.stderr
 
 
 # -- signals ---------------------------------------------------------------------------------------------------------------
