@@ -4,7 +4,7 @@ import json
 import logging
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 from schemas.runtime.logtext import PrintableFormatter
@@ -12,6 +12,7 @@ from schemas.runtime.printable import printable
 from schemas.units import format_bytes
 
 events_log = logging.getLogger("arbiter.events")
+refusals_log = logging.getLogger("arbiter.refusals")
 
 _WARNINGS = frozenset(
     {
@@ -27,6 +28,35 @@ _WARNINGS = frozenset(
     }
 )
 _DETAILS = frozenset({"use_began", "use_ended", "use_yielded", "reminded", "revoke_acked", "probe_ok"})
+
+
+REFUSALS_BURST = 50
+REFUSALS_PER_S = 5.0
+"""Refusals of one user in the log, in the long run. Those left out are counted, and the next line says how many."""
+REFUSED_USERS_MAX = 256
+
+
+class RefusalLog:
+    """Refused requests in the log, with their reasons and without letting a user fill the disk with them."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._users: dict[int, tuple[float, float, int]] = {}  # uid → (budget, at, lines left out)
+
+    def say(self, uid: int, pid: int, name: str, code: str, message: str) -> None:
+        """`name`: what the client calls itself, "" before its hello."""
+        now = self._clock()
+        budget, at, left_out = self._users.pop(uid, (float(REFUSALS_BURST), now, 0))
+        budget = min(float(REFUSALS_BURST), budget + (now - at) * REFUSALS_PER_S)
+        if len(self._users) >= REFUSED_USERS_MAX:  # the user that was refused longest ago
+            del self._users[next(iter(self._users))]
+        if budget < 1:
+            self._users[uid] = budget, now, left_out + 1
+            return
+        self._users[uid] = budget - 1, now, 0
+        more = f" ({left_out} more before it are not shown)" if left_out else ""
+        who = f"{name} (pid {pid}, uid {uid})" if name else f"pid {pid}, uid {uid}"
+        refusals_log.info("refused %s: %s: %s%s", who, code, message, more)
 
 
 def set_up_logging(form: Literal["human", "json"], level: str) -> None:

@@ -11,7 +11,6 @@ from typing import Any, Protocol
 
 from arbiter.core import effects as fx
 from arbiter.core import events as ev
-from arbiter.host.refusals import RefusalLog
 from schemas.errors import JournalUnavailable
 from schemas.ids import ClientId, GpuId, ProcessKey, RequestId
 
@@ -77,7 +76,6 @@ class Executor:
         self._log_event = log_event
         self._signal = signal
         self._traces = traces
-        self._refusals = RefusalLog()
         self.owed: dict[str, None] = {}
         """Records still to be deleted: the disk was full when they ended. The next write does it."""
 
@@ -102,7 +100,6 @@ class Executor:
                 if (why := refused.get(_lease_of(effect) or "")) is not None:
                     if isinstance(effect, fx.Reply):
                         self._outbox.refuse(effect.client, effect.request, why.to_wire())
-                        self._refusals.say(effect.client, effect.request, why.code, why.message)
                     continue
             if isinstance(effect, fx.Note):
                 notes.append(effect)
@@ -128,7 +125,6 @@ class Executor:
             case fx.Refuse(client, request, code, message, hint, details):
                 error = {"code": code, "message": message, "hint": hint, "details": dict(details)}
                 self._outbox.refuse(client, request, error)
-                self._refusals.say(client, request, code, message)
 
     def settle(self) -> None:
         """Try again to delete what could not be deleted, if anything is left of that."""

@@ -16,6 +16,7 @@ from arbiter.rpc import codec
 from arbiter.rpc.peer import Role, check_visible, how_to_operate, is_operator
 from arbiter.rpc.requests import BY_HAND, HOLDING, event_of
 from arbiter.rpc.shares import Budget, ProcessBudgets, cost_of, share_of, spend
+from arbiter.telemetry import RefusalLog
 from schemas import wire as w
 from schemas.defaults import KIB, WIRE_VERSION
 from schemas.errors import (
@@ -163,6 +164,7 @@ class SessionTable:
         self._watch = watch
         self._clock = clock
         self._problems = problems
+        self._refusals = RefusalLog(clock)
         self._entries: dict[int, _Entry] = {}
         self._sessions: dict[ClientId, Session] = {}
         self._of_process: dict[ProcessKey, dict[ClientId, Session]] = {}
@@ -203,6 +205,7 @@ class SessionTable:
         if not spend(cost_of(payload), entry.budget, entry.process_budget, now):  # 1
             request_id = None if isinstance(payload, Oversize) else codec.id_of(payload, REFUSED_MAX_BYTES)
             connection.send(codec.refusal(request_id, self._settings.epoch, self._too_fast))
+            self._log_refusal(connection, session, self._too_fast["code"], self._too_fast["message"])
             return False
         try:
             if isinstance(payload, Oversize):  # 2
@@ -261,6 +264,7 @@ class SessionTable:
     def refuse(self, client: ClientId, request: RequestId, error: Mapping[str, Any]) -> None:
         if session := self._sessions.get(self._moved.get(client, client)):
             session.connection.send(codec.refusal(request, self._settings.epoch, error))
+            self._log_refusal(session.connection, session, error["code"], error["message"])
 
     def push(self, client: ClientId, body: Mapping[str, Any]) -> None:
         if session := self._sessions.get(self._moved.get(client, client)):
@@ -441,6 +445,12 @@ class SessionTable:
 
     def _refuse(self, connection: Connection, request_id: int | None, error: VramError) -> None:
         connection.send(codec.refusal(request_id, self._settings.epoch, error.to_wire()))
+        entry = self._entries.get(connection.serial)
+        self._log_refusal(connection, None if entry is None else entry.session, error.code, error.message)
+
+    def _log_refusal(self, connection: Connection, session: Session | None, code: str, message: str) -> None:
+        peer = connection.peer
+        self._refusals.say(peer.uid, peer.process.pid, "" if session is None else session.name, code, message)
 
     def _dispatch(self, session: Session, request: w.Request) -> None:
         """Reads are answered here; everything that can change the engine becomes an event, whose effects answer."""

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from arbiter import telemetry
+from arbiter.telemetry import REFUSALS_BURST, REFUSED_USERS_MAX, RefusalLog
 
 EVENT = {"seq": 4, "at_wall_s": 1.0, "kind": "granted", "lease_id": "L1-4", "consumer": "detector",
          "charge_bytes": 5 << 30, "waited_s": 1.25, "reason": "fits"}  # fmt: skip
@@ -62,3 +63,22 @@ def test_an_exception_is_part_of_the_line(capsys: pytest.CaptureFixture[str]) ->
         except ValueError:
             logging.getLogger("x").exception("it failed")
         assert "ValueError: why" in capsys.readouterr().err
+
+
+def test_a_flood_of_refusals_does_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    now = 100.0
+    refusals = RefusalLog(lambda: now)
+    for _ in range(1000):
+        refusals.say(7, 1, "chat", "bad_state", "again")
+    assert len(caplog.records) == REFUSALS_BURST
+    refusals.say(8, 2, "", "bad_frame", "of another user")
+    assert caplog.records[-1].getMessage() == "refused pid 2, uid 8: bad_frame: of another user"
+    now += 1.0
+    refusals.say(7, 1, "chat", "bad_state", "later")
+    assert caplog.records[-1].getMessage() == (
+        f"refused chat (pid 1, uid 7): bad_state: later ({1000 - REFUSALS_BURST} more before it are not shown)"
+    )
+    for uid in range(REFUSED_USERS_MAX + 10):
+        refusals.say(uid, 1, "", "bad_state", "x")
+    assert len(refusals._users) == REFUSED_USERS_MAX

@@ -3,12 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import pytest
-
 from arbiter.core import effects as fx
 from arbiter.core import events as ev
 from arbiter.host.executor import Executor
-from arbiter.host.refusals import BURST, RefusalLog
 from schemas.errors import JournalUnavailable
 from schemas.ids import ClientId, GpuId, ProcessKey, RequestId
 
@@ -226,35 +223,3 @@ def test_telemetry_hears_a_batch_before_it_is_performed_and_names_its_spans() ->
     recorder.disk_full = True
     executor.perform([fx.JournalPut("lease:L1-2", {})])
     assert ("wrote", True, True) in recorder.done
-
-
-def test_every_refusal_is_in_the_log_with_its_reason(caplog: pytest.LogCaptureFixture) -> None:
-    """A request that was refused at once was nowhere but in its program's own error message."""
-    caplog.set_level("INFO")
-    recorder = Recorder()
-    refuse = fx.Refuse(A, ONE, "vram_insufficient", "vlm needs 9 GiB of 8 GiB", "a smaller model", {})
-    recorder.executor.perform([refuse])
-    recorder.disk_full = True
-    gated = [fx.JournalPut("lease:L1-1", {}, gates=True), fx.Reply(A, ONE, {"lease": LEASE})]
-    recorder.executor.perform(gated)
-    said = [record.getMessage() for record in caplog.records if record.name == "arbiter.host.refusals"]
-    assert said == [
-        "refused request 1 of client aa: vram_insufficient: vlm needs 9 GiB of 8 GiB",
-        "refused request 1 of client aa: journal_unavailable: disk full",
-    ]
-
-
-def test_a_flood_of_refusals_does_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO")
-    now = 100.0
-    refusals = RefusalLog(lambda: now)
-    for number in range(1000):
-        refusals.say("aa", number, "bad_state", "again")
-    assert len(caplog.records) == BURST
-    now += 1.0
-    refusals.say("aa", 1000, "bad_state", "later")
-    assert (
-        caplog.records[-1]
-        .getMessage()
-        .endswith(f"later ({1000 - BURST} more refusals before it are not shown)")
-    )

@@ -587,3 +587,19 @@ def test_bad_frames_change_nothing(bench: Bench) -> None:
         assert bench.raw(payload)["ok"] is False
     assert bench.events == []
     assert bench.ask("ping")["ok"]
+
+
+def test_every_refusal_is_in_the_log_with_its_reason(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    """A request that was refused at once was nowhere but in its own program's error message."""
+    caplog.set_level("INFO")
+    bench.ask("status")
+    bench.hello()
+    bench.ask("evict", target="L3-1", reason="by hand")
+    bench.table.refuse(bench.client(), RequestId(9), {"code": "vram_insufficient", "message": "9 GiB of 8"})
+    said = [record.getMessage() for record in caplog.records if record.name == "arbiter.refusals"]
+    whose = f"pid {ME.process.pid}, uid {ME.uid}"
+    assert said == [
+        f"refused {whose}: unknown_session: status before hello",
+        f"refused n ({whose}): not_permitted: only an operator may evict",
+        f"refused n ({whose}): vram_insufficient: 9 GiB of 8",
+    ]

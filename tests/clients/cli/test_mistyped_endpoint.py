@@ -1,0 +1,40 @@
+"""An endpoint in a folder that is not there: every program says so, and none makes the folder."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[3]
+GRAB = ROOT / "configs/rskills/so101-grab/rskill.yaml"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["clients", "status", "--endpoint", "EP"],
+        ["clients", "evict", "x", "-r", "y", "--endpoint", "EP"],
+        ["clients", "run", "--vram", "1GiB", "--endpoint", "EP", "true"],
+        ["clients", "watch", "--endpoint", "EP"],
+        ["arbiter", "--gpu", "fake:8GiB", "--endpoint", "EP"],
+        ["runner", "estop", "--endpoint", "EP"],
+    ],
+)
+def test_a_mistyped_endpoint_makes_no_folders(command: list[str], tmp_path: Path) -> None:
+    """A daemon on a mistyped endpoint served there, alone, in folders that it had made on the way."""
+    endpoint = f"ipc://{tmp_path}/runn/vram-arbiter/arbiter.sock"
+    done = subprocess.run(
+        [sys.executable, "-m", *(endpoint if word == "EP" else word for word in command)],
+        cwd=ROOT,
+        env={**os.environ, "VRAM_ARBITER_RUNTIME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode in (1, 2, 3)
+    (line,) = done.stderr.splitlines()
+    assert "/runn" in line
+    assert list(tmp_path.iterdir()) == []
