@@ -70,7 +70,9 @@ class OperatorServer:
 def _parse(message: Message) -> Any:
     if message.get("op") not in OPS:
         raise UnknownOp(
-            f"unknown op {message.get('op')!r}", hint=f"one of {', '.join(OPS)}", details={"known": [*OPS]}
+            f"unknown op {str(message.get('op'))[:64]!r}",
+            hint=f"one of {', '.join(OPS)}",
+            details={"known": [*OPS]},
         )
     if message["op"] == "cancel":  # nobody is refused a cancel for a long reason
         return CancelEpisode(op="cancel", id=0, reason=reason_of(message))
@@ -78,7 +80,7 @@ def _parse(message: Message) -> Any:
         return REASONER_REQUEST.validate_python(message)
     except ValidationError as error:
         problems = [
-            f"{'.'.join(map(str, item['loc'][1:]))}: {item['msg']}"
+            f"{'.'.join(str(part)[:64] for part in item['loc'][1:])}: {item['msg']}"
             for item in error.errors(include_url=False, include_input=False)
         ]
         raise BadRequest(f"{message['op']}: {'; '.join(problems)}") from error

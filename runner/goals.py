@@ -268,13 +268,15 @@ class GoalServer:
 def _parse(message: Message) -> Any:
     if message.get("op") not in OPS:
         raise UnknownOp(
-            f"unknown op {message.get('op')!r}", hint=f"one of {', '.join(OPS)}", details={"known": [*OPS]}
+            f"unknown op {str(message.get('op'))[:64]!r}",
+            hint=f"one of {', '.join(OPS)}",
+            details={"known": [*OPS]},
         )
     try:
         return RUNNER_REQUEST.validate_python(message)
     except ValidationError as error:
         fields = [
-            {"path": ".".join(map(str, item["loc"][1:])), "problem": item["msg"]}
+            {"path": ".".join(str(part)[:64] for part in item["loc"][1:]), "problem": item["msg"]}
             for item in error.errors(include_url=False, include_input=False)
         ]
         text = "; ".join(f"{item['path']}: {item['problem']}" for item in fields)

@@ -179,4 +179,4 @@ def _timeout_s(call: Call) -> float | None:
 
 def _field(problem: Mapping[str, Any], family: str) -> str:
     where = problem["loc"][1:] if family == "op" else problem["loc"]  # a union puts its tag, the op, in front
-    return f"{'.'.join(str(part) for part in where) or 'the message'}: {problem['msg']}"
+    return f"{'.'.join(str(part)[:64] for part in where) or 'the message'}: {problem['msg']}"

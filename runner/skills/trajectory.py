@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, FailFast, Field
 
 from runner.protocols import Act, Done, Goal, StepOutcome
 from runner.safety.limits import Limits
@@ -29,6 +29,7 @@ LONGEST_S = 600.0
 ARRIVE_S = 1.5  # after the last point, when the goal does not say (`goal_time_tolerance`)
 SLACK = 1.001  # of a speed limit: times are rounded to nanoseconds
 
+FIRST = FailFast()  # a message of a thousand wrong items costs the event loop one error, not a thousand
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -56,17 +57,17 @@ class Header(BaseModel):
 class Point(_Ros):
     """Positions in rad, in the order of `joint_names`. The way between points is straight: velocities and the like are not kept."""
 
-    positions: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=JOINTS_MAX)]
-    velocities: Annotated[tuple[Finite, ...], Field(max_length=0)] = ()
-    accelerations: Annotated[tuple[Finite, ...], Field(max_length=0)] = ()
-    effort: Annotated[tuple[Finite, ...], Field(max_length=0)] = ()
+    positions: Annotated[tuple[Finite, ...], FIRST, Field(min_length=1, max_length=JOINTS_MAX)]
+    velocities: Annotated[tuple[Finite, ...], FIRST, Field(max_length=0)] = ()
+    accelerations: Annotated[tuple[Finite, ...], FIRST, Field(max_length=0)] = ()
+    effort: Annotated[tuple[Finite, ...], FIRST, Field(max_length=0)] = ()
     time_from_start: Duration
 
 
 class JointTrajectory(_Ros):
     header: Header = Header()
-    joint_names: Annotated[tuple[str, ...], Field(max_length=JOINTS_MAX)] = ()
-    points: Annotated[tuple[Point, ...], Field(max_length=POINTS_MAX)] = ()
+    joint_names: Annotated[tuple[str, ...], FIRST, Field(max_length=JOINTS_MAX)] = ()
+    points: Annotated[tuple[Point, ...], FIRST, Field(max_length=POINTS_MAX)] = ()
 
 
 class Tolerance(_Ros):
@@ -82,8 +83,8 @@ class TrajectoryParams(_Ros):
     """`FollowJointTrajectory.Goal`."""
 
     trajectory: JointTrajectory = JointTrajectory()
-    path_tolerance: Annotated[tuple[Tolerance, ...], Field(max_length=0)] = ()
-    goal_tolerance: Annotated[tuple[Tolerance, ...], Field(max_length=JOINTS_MAX)] = ()
+    path_tolerance: Annotated[tuple[Tolerance, ...], FIRST, Field(max_length=0)] = ()
+    goal_tolerance: Annotated[tuple[Tolerance, ...], FIRST, Field(max_length=JOINTS_MAX)] = ()
     goal_time_tolerance: Duration = Duration()
 
 

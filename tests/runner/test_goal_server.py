@@ -31,6 +31,7 @@ from schemas.errors import (
     GoalRejected,
     ManifestInvalid,
     SidecarUnavailable,
+    UnknownOp,
     UnknownSkill,
 )
 from schemas.manifest import Kind, RSkillManifest, load_manifest
@@ -522,5 +523,17 @@ def test_a_goal_runs_when_it_has_the_arm_and_not_before(bench: Any, endpoint: st
         assert told["state"] == "running"
         await second.cancel()
         assert (await second.result(60))["status"] == "canceled"
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_an_answer_does_not_repeat_a_mebibyte_of_mistakes(bench: Any, endpoint: str, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        with pytest.raises(UnknownOp) as unknown:
+            await client.call("x" * 1_000_000)
+        with pytest.raises(BadRequest) as wrong:
+            await client.call("state", {"k" * 1_000_000: 0})
+        assert len(str(unknown.value)) < 1000
+        assert len(str(wrong.value)) < 1000
 
     play(run_async, bench, endpoint, body)
