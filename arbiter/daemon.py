@@ -496,7 +496,7 @@ def status_text(gpus: Sequence[GpuInfo]) -> str:
 
 def problems(journal: Journal, history: History) -> list[str]:
     """What an operator should know of the daemon's own files, in words."""
-    return [problem for problem in (*journal.opened.problems, journal.problem, history.problem) if problem]
+    return [problem for problem in (*journal.problems, history.problem) if problem]
 
 
 def boot_id() -> str:

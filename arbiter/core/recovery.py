@@ -62,9 +62,9 @@ def on_recovered(core: Core, event: Recovered) -> None:
 
 
 def await_unnamed(core: Core) -> None:
-    """Holders that the journal does not name have their time from now on. A lost lease may have had the TTL of one that is known."""
-    ttl_s = max([defaults.LEASE_TTL_S, *(lease.spec.ttl_s for lease in core.leases.values())])
-    core.timers.set(("recover", EMPTY_JOURNAL), core.now + ttl_s + core.settings.fence_grace_s)
+    """Holders that the journal does not name have their time from now on. A process with bytes that stays silent is a stowaway then."""
+    grace_s = defaults.LEASE_TTL_S + core.settings.fence_grace_s
+    core.timers.set(("recover", EMPTY_JOURNAL), core.now + grace_s)
 
 
 def _restore_away(core: Core, record: Mapping[str, Any]) -> None:

@@ -46,17 +46,8 @@ _DELETE = [
     "",
     *(f"DELETE FROM records WHERE key IN ({', '.join('?' * n)})" for n in range(1, AT_ONCE_MAX + 1)),
 ]
-_PASSING = frozenset(
-    {
-        errno.ENOSPC,
-        errno.EDQUOT,
-        errno.EFBIG,
-        errno.EIO,
-        errno.EROFS,
-        errno.EACCES,
-        errno.EPERM,
-    }
-)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_PASSING = frozenset((*_FULL, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM))
 _text = json.JSONEncoder(separators=(",", ":")).encode
 
 
@@ -66,8 +57,9 @@ Change = tuple[str, Mapping[str, Any] | None]
 @dataclass(frozen=True, slots=True)
 class Opened:
     """What a start found. `put_aside` names the file that damage was moved to; `voided` counts records of an earlier boot.
-    `witness` is for the next start. `doubt` says why the records may not be all; its own record is among them then. `problems` is for people, a line each.
-    `learnt` is what `keep` wrote last under that name, whatever the boot, and so are `footprints`."""
+    `witness` is for the next start. `doubt` says why the records may not be all; its own record is among them then.
+    `problems` is for people, a line for each file and for the records put aside. `learnt` is what `keep` wrote last under that name,
+    whatever the boot, and so are `footprints`."""
 
     epoch: int
     witness: str
@@ -163,12 +155,21 @@ class Journal:
             found.put_aside,
             "; ".join(found.problems),
             doubt,
-            (*found.problems, *_doubts(records)),
+            tuple(found.problems),
             voided or 0,
             _learnt(found.meta),
             _footprints(found.meta),
         )
         return cls(folder / "journal.sqlite", boot_id, connection, seal, digests, opened)
+
+    @property
+    def problems(self) -> list[str]:
+        """What an operator should know, a line each. A doubt, of this start or of one before it, counts until the core deletes it."""
+        doubt = ""
+        if DOUBT_KEY in self._digests and DOUBT_KEY in self.opened.records:
+            why = self.opened.records[DOUBT_KEY].get("why")
+            doubt = f"the journal may not name every lease ({why}): grants wait until each holder had time to reattach"
+        return [problem for problem in (*self.opened.problems, doubt, self.problem) if problem]
 
     def put_aside(self, problem: str) -> None:
         """The database is sound but its records cannot be used: start with an empty one, in the same epoch and in doubt."""
@@ -189,7 +190,7 @@ class Journal:
             put_aside=aside,
             problem=problem,
             doubt=doubt,
-            problems=(said, *_doubts(records)),
+            problems=(said,),
         )
 
     def apply(self, changes: Sequence[Change]) -> None:
@@ -279,16 +280,6 @@ class Journal:
 
 def _digests_of(records: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
     return {key: int.from_bytes(digest(key, _text(record))) for key, record in records.items()}
-
-
-def _doubts(records: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """A doubt of this start or of one before it, for people."""
-    if DOUBT_KEY not in records:
-        return []
-    why = records[DOUBT_KEY].get("why")
-    return [
-        f"the journal may not name every lease ({why}): grants wait until each holder had time to come back"
-    ]
 
 
 def _begin(

@@ -94,7 +94,7 @@ class SimDaemon:
         machine, clock = self.machine, self.clock
         self.journal = Journal.open(machine.folder, f"boot-{machine.boot}", check=check_record, at_least=1)
         epoch = self.journal.opened.epoch
-        assert not self.journal.opened.problems, f"the journal is whole: {self.journal.opened.problems}"
+        assert not self.journal.problems, f"the journal is whole: {self.journal.problems}"
         machine.epochs.append(epoch)
         settings = machine.settings(epoch)
         try_records(self.journal, settings)

@@ -121,7 +121,9 @@ def test_records_that_nobody_understands_are_put_aside_in_the_same_epoch(tmp_pat
     journal.close()
     again = opened(tmp_path, at_least=0)
     assert (set(again.records), again.doubt, again.epoch) == ({DOUBT_KEY, "lease:L2-1"}, "", epoch + 1)
-    assert "KeyError" in again.problems[0], "the doubt outlives a restart until the core deletes it"
+    assert "KeyError" in again.records[DOUBT_KEY]["why"], (
+        "the doubt outlives a restart until the core deletes it"
+    )
 
 
 def test_what_was_learnt_survives_a_boot_and_nonsense_is_nothing(tmp_path: Path) -> None:
