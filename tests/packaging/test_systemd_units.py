@@ -234,6 +234,15 @@ def test_the_installer_refuses_what_cannot_work(tmp_path: Path) -> None:
     assert install().returncode != 0
     assert "absolute path" in install("relative", str(tmp_path)).stderr
     assert "install the product there first" in install(str(tmp_path / "nothing")).stderr
+    # A Python of pyenv or uv is below the home folder of its user; systemd said only 203/EXEC.
+    programs = tmp_path / "prefix" / "bin"
+    programs.mkdir(parents=True)
+    (programs / "vram-arbiter").symlink_to(sys.executable)
+    (programs / "python").symlink_to("/home/python3.12")
+    warned = install(
+        str(tmp_path / "prefix"), str(tmp_path / "root")
+    )  # without a root of its own it is refused
+    assert "the system's units cannot read /home/python3.12" in warned.stderr
 
 
 @pytest.mark.skipif(
