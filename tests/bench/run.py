@@ -11,6 +11,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import bench_attacks
 import bench_core
 import bench_crowd
 import bench_death
@@ -31,6 +32,7 @@ SUBJECTS = {
     "death": bench_death.run,
     "rest": bench_rest.run,
     "core": bench_core.run,
+    "attacks": bench_attacks.run,
 }
 RUNNER = "runner"  # a file and a table of its own
 

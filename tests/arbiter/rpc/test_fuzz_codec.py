@@ -6,10 +6,14 @@ import tracemalloc
 import hypothesis.strategies as st
 import pytest
 from hypothesis import HealthCheck, given, settings
+from pydantic import ValidationError
 
 from arbiter.rpc import codec
+from arbiter.testing.costly import COSTLY
 from arbiter.testing.hostile import BOMBS, Forger, pack
-from schemas.defaults import MESSAGE_MAX_BYTES, MIB
+from schemas.defaults import MESSAGE_MAX_BYTES, MIB, VALUES_MAX
+from schemas.errors import MessageTooLarge
+from schemas.runtime.msgpack_codec import count_values
 from schemas.wire import OPS
 
 ANSWER_MAX_BYTES = 16_384
@@ -75,6 +79,25 @@ def test_a_bomb_is_defused_in_little_memory(name: str) -> None:
         "duplicate keys", "id that is true"
     )  # fmt: skip
     assert peak_bytes < MIB + 2 * len(frame)
+
+
+@pytest.mark.parametrize("name", COSTLY)
+def test_the_costliest_messages_are_little_work(name: str) -> None:
+    """What is built is counted, not timed (`make bench` does that): values, errors of validation, and the answer's bytes."""
+    message = COSTLY[name]
+    assert len(message) <= MESSAGE_MAX_BYTES + 200_000, "it is of the size that a client may send"
+    refused: codec.Undecodable | None = None
+    try:
+        codec.decode(message, MESSAGE_MAX_BYTES)
+    except codec.Undecodable as bad:
+        refused = bad
+    if refused is not None:
+        assert len(codec.refusal(refused.request_id, 1, refused.error.to_wire())) <= ANSWER_MAX_BYTES
+        if isinstance(refused.__cause__, ValidationError):
+            assert refused.__cause__.error_count() <= 5 * codec.KEYS_MAX
+        if isinstance(refused.error, MessageTooLarge):
+            return  # nothing was built
+    assert count_values(message, 1 << 30) <= VALUES_MAX
 
 
 def test_of_a_duplicate_key_the_last_counts_and_only_once() -> None:

@@ -1,0 +1,10 @@
+"""One attack of `arbiter.testing.attacks` for some seconds: ATTACK SOCKET SECONDS."""
+
+import sys
+import time
+
+from arbiter.testing.attacks import ATTACKS
+
+if __name__ == "__main__":
+    print("up", flush=True)
+    ATTACKS[sys.argv[1]](sys.argv[2], time.monotonic() + float(sys.argv[3]))
