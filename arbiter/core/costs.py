@@ -12,7 +12,7 @@ REUSE_WITHIN_S = 60.0
 
 def left(core: Core, consumer: str) -> None:
     """Its bytes are measured gone."""
-    core.reuse.setdefault(consumer, Reuse()).left_at = core.now
+    core.seen_leaving(consumer)
 
 
 def wanted(core: Core, consumer: str) -> None:

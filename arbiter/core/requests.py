@@ -19,7 +19,7 @@ from arbiter.core.events import (
     Spec,
     UnloadStarted,
 )
-from arbiter.core.lease import AWAY, EXPIRING, Lease, LeaseState, Recall, Use
+from arbiter.core.lease import AWAY, EXPIRING, NONCES_MAX, Lease, LeaseState, Recall, Use
 from arbiter.core.limits import check_leases, check_waiters
 from arbiter.core.measure import begin_for_lease
 from arbiter.core.state import Client, Core, Ended, Refused
@@ -169,6 +169,8 @@ def _take_over(
     core: Core, event: AcquireRequested, lease: Lease, spec: Spec, gpus: tuple[GpuId, ...]
 ) -> None:
     """The process has a lease for this model, away: the acquire means that one, as it is asked for now."""
+    if len(lease.earlier_nonces) == NONCES_MAX:
+        core.nonces.pop((lease.process, lease.earlier_nonces[0]), None)
     lease.earlier_nonces.append(lease.nonce)
     lease.nonce = event.nonce
     core.nonces[lease.process, event.nonce] = lease.id

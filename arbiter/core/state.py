@@ -26,6 +26,7 @@ from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, 
 
 ENDED_REMEMBERED = 1024
 LEARNT_REMEMBERED = 32
+CONSUMERS_REMEMBERED = 1024
 TOKEN_STEP_BYTES = 4
 """Tokens are apart by up to 2^32: 2^31 grants of one epoch stay below 2^63."""
 _LOADING = frozenset({LeaseState.LOADING})
@@ -400,8 +401,17 @@ class Core:
 
     def learn(self, consumer: str, phase: str, seconds: float) -> None:
         """Remember how long a phase (`drain_s`, `unload_s`, `verify_s`, `load_s`) took for a consumer."""
-        phases = self.durations.setdefault(consumer, {})
+        phases = self.durations.pop(consumer, {})
+        self.durations[consumer] = phases  # the newest last
+        _forget_oldest(self.durations)
         phases.setdefault(phase, deque(maxlen=LEARNT_REMEMBERED)).append(max(0.0, seconds))
+
+    def seen_leaving(self, consumer: str) -> None:
+        """A consumer's bytes are gone: whether it is wanted again soon is learnt from now on."""
+        seen = self.reuse.pop(consumer, None) or Reuse()
+        self.reuse[consumer] = seen
+        seen.left_at = self.now
+        _forget_oldest(self.reuse)
 
     def learnt_s(self, consumer: str, phase: str) -> float | None:
         """Median of what was learnt; None: never seen."""
@@ -509,6 +519,12 @@ def _estate(estate: Estate) -> dict[str, Any]:
         "shares": {lease: [*astuple(share)] for lease, share in estate.shares.items()},
         "borne": [[process.pid, process.start_ticks, count] for process, count in estate.borne.items()],
     }
+
+
+def _forget_oldest[T](by_consumer: dict[str, T]) -> None:
+    """Names are free: what is remembered by them has a bound."""
+    while len(by_consumer) > CONSUMERS_REMEMBERED:
+        del by_consumer[next(iter(by_consumer))]
 
 
 def _take_out[K](table: dict[K, dict[LeaseId, Lease]], owner: K, lease_id: LeaseId) -> None:

@@ -1,9 +1,12 @@
 """Deadlines by name. Setting a later time for a name is cheap (renewals do it all the time); nothing here reads a clock."""
 
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 
 type TimerKey = tuple[str, str]
 """(kind, subject), e.g. ("ttl", "L3-17")."""
+
+SLACK = 256
+"""Entries of cleared timers that stay in the heap however few are set."""
 
 
 class Timers:
@@ -28,6 +31,10 @@ class Timers:
 
     def clear(self, key: TimerKey) -> None:
         self._due.pop(key, None)
+        if len(self._heap) > SLACK + 2 * len(self._due):
+            # waits of a day that are given up after a second must not stay here for the day
+            self._heap = [(at, timer) for timer, at in self._due.items()]
+            heapify(self._heap)
 
     def next_at(self) -> float | None:
         """When the earliest timer is due."""

@@ -97,16 +97,19 @@ def disconnects(suite: Suite) -> None:
     with arbiter() as daemon:
         witness = Peer(daemon.endpoint, "witness").hello()
         lease = witness.acquire()
+        fill_history(witness)
+        before = rss_bytes(daemon.pid)
         crowd = []
         try:
             for _ in range(CROWD_PROCESSES):
                 crowd.append(spawn("crowd.py", daemon.endpoint, str(many // CROWD_PROCESSES)))
-            waiting = len(witness.ask("status")["leases"]) - 1
+            waiting = witness.ask("status")["totals"]["waiting"]
             began = time.perf_counter()
             for process in crowd:
                 process.send_signal(signal.SIGKILL)
             forgotten = all_forgotten(witness)
             took_ms = (time.perf_counter() - began) * 1e3
+            stays = rss_bytes(daemon.pid) - before
         finally:
             for process in crowd:
                 process.kill()
@@ -120,11 +123,13 @@ def disconnects(suite: Suite) -> None:
     suite.figure(survived, whole, "", at_least=1.0, note="1: every wait has ended, no invariant was violated")
     suite.figure(f"{many} simultaneous disconnects: all forgotten after", took_ms, "ms")
     suite.time("acquire + release right after that", after)
+    name = f"memory that stays when {many} waiters are gone"
+    suite.figure(name, stays / 2**20, "MiB", at_most=16.0, note="of the daemon's resident set")
 
 
 def all_forgotten(witness: Peer) -> bool:
     deadline = time.monotonic() + ANSWER_TIMEOUT_S
-    while len(witness.ask("status")["leases"]) > 1:
+    while witness.ask("status")["totals"]["leases"] > 1:
         if time.monotonic() > deadline:
             return False
         pause(0.01)

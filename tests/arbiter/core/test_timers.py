@@ -1,6 +1,6 @@
 """Deadlines by name."""
 
-from arbiter.core.timers import Timers
+from arbiter.core.timers import SLACK, Timers
 
 
 def test_timers_come_in_their_order_and_once() -> None:
@@ -31,3 +31,15 @@ def test_a_cleared_timer_never_fires() -> None:
     timers.clear(("ttl", "a"))
     assert ("ttl", "a") not in timers
     assert timers.pop_due(9.0) is None
+
+
+def test_cleared_timers_do_not_pile_up_until_they_would_be_due() -> None:
+    """Waits of a year that were given up at once stayed in the heap for the year: the daemon grew with every one."""
+    timers = Timers()
+    timers.set(("ttl", "a"), 5.0)
+    for number in range(10 * SLACK):
+        timers.set(("wait", f"L{number}"), 1e7 + number)
+        timers.clear(("wait", f"L{number}"))
+    assert len(timers._heap) <= SLACK + 2
+    timers.set(("ttl", "b"), 3.0)
+    assert [timers.pop_due(1e9) for _ in range(3)] == [("ttl", "b"), ("ttl", "a"), None]

@@ -1,0 +1,78 @@
+"""What a crowd leaves behind in the engine has a bound, whatever names it used and however often it came."""
+
+from collections.abc import Sized
+from typing import Any
+
+from arbiter.core import state
+from arbiter.core.lease import NONCES_MAX
+from arbiter.core.state import CONSUMERS_REMEMBERED, ENDED_REMEMBERED
+from arbiter.testing.core_driver import CoreDriver
+from arbiter.testing.scenes import held
+from schemas import defaults as d
+
+GIB, MIB = d.GIB, d.MIB
+
+
+def sizes(owner: object) -> dict[str, int]:
+    """Every table of the engine's state by name, with the number of its entries."""
+    tables: dict[str, Any] = {name: table for name, table in vars(owner).items() if isinstance(table, Sized)}
+    return {name: len(table) for name, table in tables.items() if not isinstance(table, str)}
+
+
+def test_a_crowd_that_waited_and_went_leaves_nothing_but_the_memory_of_the_last_ones() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.consumer("holder").acquire(7 * GIB)
+    core = driver.arbiter._core
+    before = sizes(core)
+    for number in range(30):
+        person = driver.consumer(f"crowd{number}")
+        for _ in range(10):
+            person.acquire(5 * GIB, wait_timeout_s=1e6)
+        if number % 2:
+            person.die()
+        else:
+            person.leave()
+    after = sizes(core)
+    assert after.pop("ended") <= before.pop("ended") + 300 <= ENDED_REMEMBERED
+    assert after.pop("nonces") <= before.pop("nonces") + 300
+    for name in ("suspects", "out"):  # of the last event
+        after.pop(name), before.pop(name)
+    assert after == before
+    assert len(core.gpus[driver.card.gpu].queue) == 0
+
+
+def test_consumers_of_ever_new_names_are_remembered_up_to_a_number() -> None:
+    driver = CoreDriver(8 * GIB)
+    core = driver.arbiter._core
+    for number in range(CONSUMERS_REMEMBERED + 10):
+        core.learn(f"c{number}", "load_s", 1.0)
+        core.seen_leaving(f"c{number}")
+    assert len(core.durations) == len(core.reuse) == CONSUMERS_REMEMBERED
+    assert core.learnt_s("c0", "load_s") is None
+    core.learn("c10", "load_s", 3.0)
+    core.learn("new", "load_s", 1.0)
+    assert core.learnt_s("c10", "load_s") == 2.0, "the newest stay"
+    assert len(core.durations) == state.CONSUMERS_REMEMBERED
+
+
+def test_a_lease_that_is_taken_over_again_and_again_is_known_by_its_last_nonces() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, standby=True)
+    policy = driver.consumer("policy")
+    for number in range(NONCES_MAX + 3):
+        wanted = policy.acquire(5 * GIB, min_residency_s=0.0)
+        driver.until(lambda: driver.state(lease) == "revoking")
+        det.unload(lease)
+        driver.until(lambda wanted=wanted: driver.state(wanted) == "loading")  # type: ignore[misc]
+        policy.load(wanted)
+        assert det.acquire(5 * GIB, nonce=f"again{number}", standby=True) == lease
+        driver.until(lambda wanted=wanted: driver.state(wanted) == "revoking")  # type: ignore[misc]
+        policy.unload(wanted)
+        driver.until(lambda: driver.state(lease) == "loading")
+        det.load(lease)
+        driver.advance(1.0)
+    core = driver.arbiter._core
+    mine = [
+        nonce for (process, nonce), known in core.nonces.items() if known == lease and process == det.process
+    ]
+    assert len(mine) == NONCES_MAX + 1
