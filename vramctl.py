@@ -4,7 +4,6 @@ The six packages have common names. Beside a project with its own `schemas/` or 
 program would not even reach `vramctl doctor`, which is there to say so. This module imports nothing but the standard library.
 """
 
-import importlib.util
 import os
 import sys
 
@@ -26,6 +25,8 @@ def main() -> None:
 
 def origins() -> dict[str, str | None]:
     """Folder (or file) that each package would be imported from; None: it is not found."""
+    import importlib.util  # `vramctl status` starts without it
+
     found: dict[str, str | None] = {}
     for name in PACKAGES:
         try:

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 CONNECTIONS_MAX = 64
 CONNECTIONS_PER_USER = 16
-BACKLOG = 32
+BACKLOG = 128
 SCRAPE_S = 5.0
 REQUEST_MAX_BYTES = 8 * 1024
 PAGE_S = 0.25
@@ -32,24 +32,39 @@ Page = Callable[[str], tuple[bytes, str]]
 """`page(accept)`: the metrics and their content type. `accept` is "" or OPENMETRICS."""
 
 
-def owner_of(peer: tuple[str, int]) -> int | None:
-    """Return the uid of the process at the other end of a loopback connection; None where the kernel does not say.
+Peer = tuple[str, int]
+Owners = Callable[[Peer], int | None]
+"""Which user a connection comes from, by its other end; None where the kernel does not say."""
 
-    A TCP socket has no SO_PEERCRED: the kernel lists the other end as a socket of this machine, with its owner.
+
+class KernelTable:
+    """The kernel's list of this machine's TCP sockets as it was at one moment, read when it is first asked.
+
+    A TCP socket has no SO_PEERCRED. But the other end of a loopback connection is a socket of this machine, and listed with its owner. A
+    flood of connections makes the list long, so one reading serves all connections that were accepted before it.
     """
-    address = ipaddress.ip_address(peer[0].partition("%")[0])
-    words = struct.unpack(f"={len(address.packed) // 4}I", address.packed)
-    needle = "".join(f"{word:08X}" for word in words) + f":{peer[1]:04X}"
-    try:
-        with open("/proc/self/net/tcp" if address.version == 4 else "/proc/self/net/tcp6", "rb") as table:
-            text = table.read()
-    except OSError:
-        return None
-    at = text.find(f": {needle} ".encode())
-    if at < 0:
-        return None
-    fields = text[at : text.find(b"\n", at)].split()
-    return int(fields[7])
+
+    def __init__(self) -> None:
+        self._texts: dict[int, bytes] = {}
+
+    def __call__(self, peer: Peer) -> int | None:
+        address = ipaddress.ip_address(peer[0].partition("%")[0])
+        words = struct.unpack(f"={len(address.packed) // 4}I", address.packed)
+        needle = "".join(f"{word:08X}" for word in words) + f":{peer[1]:04X}"
+        text = self._text(address.version)
+        at = text.find(f": {needle} ".encode())
+        if at < 0:
+            return None
+        return int(text[at : text.find(b"\n", at)].split()[7])
+
+    def _text(self, version: int) -> bytes:
+        if version not in self._texts:
+            try:
+                with open("/proc/self/net/tcp" if version == 4 else "/proc/self/net/tcp6", "rb") as table:
+                    self._texts[version] = table.read()
+            except OSError:
+                self._texts[version] = b""
+        return self._texts[version]
 
 
 class ScrapeServer:
@@ -60,11 +75,12 @@ class ScrapeServer:
         host: str,
         port: int,
         page: Page,
-        owner: Callable[[tuple[str, int]], int | None] = owner_of,
+        owners: Callable[[], Owners] = KernelTable,
         scrape_s: float = SCRAPE_S,
     ) -> None:
         self._page = page
-        self._owner = owner
+        self._make_owners = owners
+        self._owners: Owners | None = None  # good for the connections of this turn of the loop
         self._scrape_s = scrape_s
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         self._socket = socket.create_server(address[:2], family=family, backlog=BACKLOG)
@@ -122,7 +138,10 @@ class ScrapeServer:
             writer.transport.abort()
 
     def _make_room(self, writer: asyncio.StreamWriter) -> None:
-        user = self._owner(writer.get_extra_info("peername")[:2])
+        if self._owners is None:
+            self._owners = self._make_owners()
+            self._loop.call_soon(self._forget_owners)
+        user = self._owners(writer.get_extra_info("peername")[:2])
         held = Counter(self._open.values())
         crowded: int | None = user
         full = held[user] >= CONNECTIONS_PER_USER
@@ -133,6 +152,9 @@ class ScrapeServer:
             del self._open[oldest]
             oldest.transport.abort()
         self._open[writer] = user
+
+    def _forget_owners(self) -> None:
+        self._owners = None
 
     def _answer(self, head: bytes) -> bytes:
         line, _, rest = head.partition(b"\r\n")

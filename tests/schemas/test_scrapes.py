@@ -10,19 +10,27 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from schemas import scrapes
-from schemas.scrapes import CONNECTIONS_MAX, CONNECTIONS_PER_USER, REQUEST_MAX_BYTES, ScrapeServer, owner_of
+from schemas.scrapes import (
+    CONNECTIONS_MAX,
+    CONNECTIONS_PER_USER,
+    REQUEST_MAX_BYTES,
+    KernelTable,
+    Owners,
+    ScrapeServer,
+)
 
 PATIENCE_S = 60.0
 SCRAPER, ATTACKER = 1, 2
-Owner = Callable[[tuple[str, int]], int | None]
 
 
 @pytest.fixture
 def serve() -> Iterator[Callable[..., ScrapeServer]]:
     made: list[ScrapeServer] = []
 
-    def make(owner: Owner = owner_of, scrape_s: float = PATIENCE_S, host: str = "127.0.0.1") -> ScrapeServer:
-        made.append(ScrapeServer(host, 0, lambda accept: (b"up 1\n", "text/plain"), owner, scrape_s))
+    def make(
+        owners: Callable[[], Owners] = KernelTable, scrape_s: float = PATIENCE_S, host: str = "127.0.0.1"
+    ) -> ScrapeServer:
+        made.append(ScrapeServer(host, 0, lambda accept: (b"up 1\n", "text/plain"), owners, scrape_s))
         made[-1].start()
         return made[-1]
 
@@ -32,7 +40,7 @@ def serve() -> Iterator[Callable[..., ScrapeServer]]:
 
 
 class Users:
-    """Which user a port of this test stands for; a real table where `owner_of` asks the kernel."""
+    """Which user a port of this test stands for; a table of its own where `KernelTable` asks the kernel."""
 
     def __init__(self) -> None:
         self.of: dict[int, int] = {}
@@ -72,7 +80,7 @@ def test_one_user_with_many_silent_connections_does_not_keep_the_scraper_out(
 ) -> None:
     """Eight silent connections of any user shut the scraper out for 5 s, and for ever if they came again."""
     users = Users()
-    port = serve(users).port
+    port = serve(lambda: users).port
     silent = [users.connect(ATTACKER, port) for _ in range(CONNECTIONS_PER_USER)]
     assert users.scrape(port).endswith(b"up 1\n")
     silent.append(users.connect(ATTACKER, port))
@@ -130,18 +138,18 @@ def test_the_kernel_names_the_user_of_a_connection(host: str, serve: Callable[..
     seen = threading.Event()
 
     def owner(peer: tuple[str, int]) -> int | None:
-        named.append(owner_of(peer))
+        named.append(KernelTable()(peer))
         seen.set()
         return named[-1]
 
     try:
-        server = serve(owner, host=host)
+        server = serve(lambda: owner, host=host)
     except OSError as error:
         pytest.skip(f"no {host} here: {error}")
     with socket.create_connection((host, server.port), PATIENCE_S):
         assert seen.wait(PATIENCE_S)
     assert named == [os.getuid()]
-    assert owner_of((host, 1)) is None
+    assert KernelTable()((host, 1)) is None
 
 
 def test_pages_are_made_at_most_every_so_often() -> None:
