@@ -27,7 +27,10 @@ _WARNINGS = frozenset(
         "record_stopped",
     }
 )
-_DETAILS = frozenset({"use_began", "use_ended", "use_yielded", "reminded", "revoke_acked", "probe_ok"})
+_DETAILS = frozenset(
+    {"use_began", "use_ended", "use_yielded", "reminded", "revoke_acked", "probe_ok", "refused"}
+)
+"""`refused`: `RefusalLog` says it, with the client's name and user."""
 
 
 REFUSALS_BURST = 50
