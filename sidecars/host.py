@@ -26,6 +26,8 @@ from sidecars.worker import Worker
 LAST_WORDS_S = 0.5  # until the answers that say so are with the kernel
 _log = logging.getLogger("sidecars")
 
+WORK_SHARE = 0.5  # of the time, for the socket: a flood leaves the model's thread the interpreter
+
 
 class SidecarHost:
     """Serves until `stop`, SIGTERM or SIGINT; then finishes the op that runs, unloads, releases and returns."""
@@ -51,7 +53,9 @@ class SidecarHost:
             client = None
             if settings.arbiter is not None:
                 client = await stack.enter_async_context(ArbiterClient(settings.arbiter, name=settings.name))
-            server = await stack.enter_async_context(RouterServer(settings.endpoint, error_reply))
+            server = await stack.enter_async_context(
+                RouterServer(settings.endpoint, error_reply, work_share=WORK_SHARE)
+            )
             residency = self._residency = Residency(settings, self._adapter, self._memory, worker, client)
             background = [asyncio.create_task(server.serve(Wire(self, server.send).handle), name="serve")]
             residency.prepare()
