@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from schemas.errors import ModelError
-from sidecars.weights import Weights, from_pretrained
+from sidecars.weights import Weights, from_pretrained, is_quantized
 
 META = "meta"
 NAMES_SHOWN = 4
@@ -54,6 +54,8 @@ def load_transformers(cls: Any, weights: Weights, **options: Any) -> Any:
     transformers knows best which names are renamed, tied, quantized or known leftovers: its own
     account of the load is what counts.
     """
+    if options.get("device_map") == {"": META} and is_quantized(weights):
+        options["device_map"] = {"": "cpu"}  # what belongs to a quantized weight is in its bytes
     model, account = from_pretrained(
         cls, weights, output_loading_info=True, ignore_mismatched_sizes=True, **options
     )

@@ -216,6 +216,28 @@ def test_a_checkpoint_in_parts_needs_all_of_them(tmp_path: Path, device: str) ->
     refused(load_detector, tmp_path / "parts", device)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_quantized_checkpoint_is_compared_with_its_statistics(
+    saved: Callable[[str], Path], tmp_path: Path, device: str
+) -> None:
+    pytest.importorskip("bitsandbytes")
+    from safetensors.torch import load_file, save_file
+    from transformers import AutoModelForZeroShotObjectDetection, BitsAndBytesConfig
+
+    nf4 = BitsAndBytesConfig(load_in_4bit=True, bnb_4bit_quant_type="nf4")
+    quantized = AutoModelForZeroShotObjectDetection.from_pretrained(
+        saved("owlvit"), quantization_config=nf4, device_map={"": "cpu"}
+    )
+    quantized.save_pretrained(tmp_path)
+    load_detector(Weights(str(tmp_path), local=True), device)
+    tensors = load_file(tmp_path / WHOLE)
+    weight = next(key for key in tensors if key.endswith(".absmax")).removesuffix(".absmax")
+    for dropped in ([weight], [f"{weight}.absmax"], [key for key in tensors if key.startswith(weight)]):
+        kept = {key: tensor for key, tensor in tensors.items() if key not in dropped}
+        save_file(kept, tmp_path / WHOLE, metadata={"format": "pt"})
+        refused(load_detector, tmp_path, device)
+
+
 def test_a_loader_that_swallows_what_it_could_not_read_is_found_out(tmp_path: Path) -> None:
     """lerobot's pi0.5: without weights, or with those of another model, it prints a line and
     returns random numbers. Three billion, so without bytes."""
