@@ -5,8 +5,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from runner.__main__ import main, parse
+from runner.clock import SystemClock
+from runner.deployment import make_parts, read_deployment
+from schemas.errors import ConfigError
 
 pytestmark = pytest.mark.heavy  # the SO-101's kinematics
 
@@ -302,3 +307,35 @@ def test_a_skill_for_another_robot_or_beyond_this_one_is_refused(dry_run: DryRun
     code, _, err = dry_run(text + strong + "embodiment_tags: [ur5e]\n", skills=folder)
     assert code == 2
     assert "it is made for so101_follower; this robot is ur5e" in err
+
+
+VALUES = [
+    "[]", "{}", "{a: 1}", "null", "true", "-1", "0", ".nan", ".inf", "1e400", "''", "x", "[null]", "2020-01-01", "'\\0'", "[x, x]",
+]  # fmt: skip
+PLACES = [
+    "hal: {adapter: %s}", "hal: {adapter: so101_mujoco, transport: %s}", "hal: {adapter: so101_kinematic, params: {x: %s}}",
+    "hal: {adapter: 'lerobot:so101_follower', transport: {port: %s, id: x}}", "sensors: [{sensor_id: a, backend_params: %s}]",
+    "sensors: [{sensor_id: a, backend_params: {device: %s, width: 640}}]", "sensors: [{sensor_id: a, backend_params: {device: 0, fps: %s}}]",
+    "sensors: [{sensor_id: a, backend: gstreamer, backend_params: {pipeline: %s}}]", "sensors: [{sensor_id: a, backend: %s}]",
+    "sensors: [{sensor_id: a, backend: ros2_image, backend_params: {topic: %s}}]", "safety: {max_joint_speed_factor: %s}",
+    "safety: {workspace_box_min_xyz: %s, workspace_box_max_xyz: [1, 1, 1]}", "save_dir: %s", "rate_hz: %s", "capabilities: {a: %s}",
+    "vla: {id: act, weights_uri: %s, quantization: {dtype: %s}}\ntask: {id: t}", "task: {id: %s, max_steps: %s}\nvla: {id: x}",
+]  # fmt: skip
+
+
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(place=st.sampled_from(PLACES), value=st.sampled_from(VALUES))
+def test_any_value_in_a_deployment_is_taken_or_found_fault_with(
+    tmp_path: Path, place: str, value: str
+) -> None:
+    """Adapters, cameras and the gate check what the file's own model leaves to them."""
+    text = place.replace("%s", value)
+    head = "robot_id: bench\n" if text.startswith("hal") else TWIN
+    file = tmp_path / "robot.yaml"
+    file.write_text(f"{head}{text}\n", encoding="utf-8")
+    said = "robot.yaml: "
+    try:
+        make_parts(read_deployment(file), SystemClock())
+    except ConfigError as error:
+        said = error.message
+    assert re.match(r"robot\.yaml(:\d+)*: ", said), said
