@@ -6,6 +6,7 @@ writable one the history lives in memory only. Must not know what the events mea
 """
 
 import asyncio
+import contextlib
 import json
 import logging
 import queue
@@ -19,6 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from arbiter.host.journal_files import is_corruption, put_aside
+from schemas import strictjson
+
 log = logging.getLogger(__name__)
 
 RING_EVENTS = 2000
@@ -31,6 +35,8 @@ their numbers shows it."""
 QUESTIONS_MAX = 256
 """Questions about older events that wait for the thread; who asks beyond this hears at once that the disk does not answer."""
 PRUNE_EVERY_EVENTS = 2000
+SEQ_MAX = 1 << 52
+EVENT_MAX_CHARS = 1 << 25
 CLOSE_S = 5.0
 AT_ONCE = frozenset({"operator"})
 """Kinds that do not wait for the next batch: who did what by hand is to survive a crash that follows at once."""
@@ -45,7 +51,7 @@ CREATE TABLE IF NOT EXISTS events (seq INTEGER PRIMARY KEY, at_wall_s REAL NOT N
 CREATE INDEX IF NOT EXISTS events_by_time ON events (at_wall_s);
 """
 _QUESTION = """
-SELECT json FROM events WHERE seq > ? AND (? = '[]' OR kind IN (SELECT value FROM json_each(?))) ORDER BY seq LIMIT ?
+SELECT seq, at_wall_s, json FROM events WHERE seq > ? AND (? = '[]' OR kind IN (SELECT value FROM json_each(?))) ORDER BY seq LIMIT ?
 """
 
 
@@ -83,14 +89,12 @@ class History:
             try:
                 store = _Store(path, max_events, days, wall)
                 return cls(store, store.last_seq(), wall)
-            except sqlite3.DatabaseError as error:
+            except (sqlite3.DatabaseError, OSError) as error:
                 log.error("history %s: %s", path, error)
-                if attempt == 1 and not isinstance(error, sqlite3.OperationalError) and path.exists():
-                    aside = path.with_name(f"{path.name}.corrupt-{int(time.time())}")
-                    path.rename(aside)
-                    log.error("history put aside as %s", aside)
-                    continue
-                break
+                if attempt == 2 or not path.is_file() or not _is_damage(error):
+                    break
+                with contextlib.suppress(OSError):
+                    log.error("history put aside as %s", put_aside(path))
         log.error("history is kept in memory only")
         return cls(None, 0, wall)
 
@@ -201,6 +205,22 @@ class History:
                 pass  # the loop closed meanwhile: nobody waits for the answer
 
 
+def _event(seq: int, at_wall_s: object, text: str) -> Event:
+    """One row. A damaged one keeps its number, so that a reader goes on behind it."""
+    with contextlib.suppress(ValueError, TypeError):
+        event = strictjson.loads(text, max_chars=EVENT_MAX_CHARS)
+        if isinstance(event, dict) and event.get("seq") == seq and {"kind", "at_wall_s"} <= event.keys():
+            return event
+    return {"seq": seq, "at_wall_s": at_wall_s if isinstance(at_wall_s, float) else 0.0, "kind": "unreadable"}
+
+
+def _is_damage(error: sqlite3.DatabaseError | OSError) -> bool:
+    """The file's fault, not the machine's."""
+    if isinstance(error, sqlite3.OperationalError):
+        return is_corruption(error)
+    return isinstance(error, sqlite3.DatabaseError)
+
+
 class _Store:
     """The table. Made by the main thread, used by the history thread alone."""
 
@@ -214,6 +234,7 @@ class _Store:
         self._db = sqlite3.connect(path, isolation_level=None, timeout=1.0, check_same_thread=False)
         try:
             path.chmod(0o600)
+            self._db.text_factory = lambda text: text.decode(errors="replace")  # damage need not be UTF-8
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=NORMAL")
             self._db.executescript(_SCHEMA)
@@ -222,8 +243,14 @@ class _Store:
             raise
 
     def last_seq(self) -> int:
-        """The number after which numbering goes on: never one that was given out before."""
-        row = self._db.execute("SELECT seq, kind FROM events ORDER BY seq DESC LIMIT 1").fetchone()
+        """The number after which numbering goes on: never one that was given out before. Raises sqlite3.DatabaseError."""
+        try:
+            row = self._db.execute("SELECT seq, kind FROM events ORDER BY seq DESC LIMIT 1").fetchone()
+            if row is not None and row[0] > SEQ_MAX:
+                raise sqlite3.DatabaseError(f"an event has the number {row[0]}, more than {SEQ_MAX}")
+        except BaseException:
+            self._db.close()
+            raise
         if row is not None:
             self._earlier = int(row[0]) + (0 if row[1] == CLEAN_END else SKIPPED_AFTER_CRASH)
         return self._earlier
@@ -253,7 +280,7 @@ class _Store:
 
     def find(self, after: int, limit: int, kinds: tuple[str, ...]) -> list[Event]:
         wanted = json.dumps(list(kinds))
-        return [json.loads(text) for (text,) in self._db.execute(_QUESTION, (after, wanted, wanted, limit))]
+        return [_event(*row) for row in self._db.execute(_QUESTION, (after, wanted, wanted, limit))]
 
     def close(self) -> None:
         self._db.close()

@@ -65,7 +65,7 @@ def look(folder: Path, check: Check | None, witness: str) -> Found:
     try:
         found = _read(Found(connect(path)), check)
     except (sqlite3.DatabaseError, ValueError) as error:
-        if isinstance(error, sqlite3.OperationalError) and not _is_corruption(error):
+        if isinstance(error, sqlite3.OperationalError) and not is_corruption(error):
             raise
         aside = put_aside(path)
         log.error("journal corrupt (%s): put aside as %s", error, aside)
@@ -197,7 +197,7 @@ def connect(path: Path) -> sqlite3.Connection:
     return connection
 
 
-def _is_corruption(error: sqlite3.OperationalError) -> bool:
+def is_corruption(error: sqlite3.OperationalError) -> bool:
     """Read-only, locked or full is the machine's trouble; a wrong or half schema is the file's."""
     return getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF in (
         sqlite3.SQLITE_ERROR,

@@ -1,11 +1,15 @@
 """Events are numbered for ever, found in memory or on disk, and bounded by number and age."""
 
 import asyncio
+import contextlib
+import sqlite3
 import threading
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
+
+import pytest
 
 from arbiter.host import history as module
 from arbiter.host.history import (
@@ -251,3 +255,53 @@ def test_who_asks_a_disk_that_hangs_hears_so_beyond_the_bound() -> None:
         history.close()
 
     asyncio.run(run())
+
+
+def spoiled(folder: Path, statement: str, *values: object) -> None:
+    with_history(folder, nothing)
+    with contextlib.closing(sqlite3.connect(folder / "history.sqlite")) as database, database:
+        database.execute(statement, values)
+
+
+async def nothing(history: History) -> None:
+    history.append("first", {})
+
+
+EVENT = "INSERT INTO events VALUES (?, 9e9, 'x', ?)"  # young enough to be kept
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["{", "[" * 100_000, "7", '{"seq": 1e999}', '{"n": ' + "9" * 5000 + "}", '{"n": ' + "9" * 30 + "}", b"\xff{}", '"\\ud800"'],
+)  # fmt: skip
+def test_an_event_that_cannot_be_read_does_not_hide_the_others(tmp_path: Path, text: str | bytes) -> None:
+    """Regression: one of them ended the thread that reads and writes the history, and no question was answered again."""
+    spoiled(tmp_path, EVENT, 3, text)
+
+    async def test(history: History) -> None:
+        for _ in range(RING_EVENTS + 5):
+            history.append("x", {})
+        found = (await read(history, limit=3))["events"]
+        assert [event["seq"] for event in found] == [1, 3, SKIPPED_AFTER_CRASH + 4]
+        assert (found[1]["kind"], found[1]["at_wall_s"]) == ("unreadable", 9e9)
+
+    with_history(tmp_path, test)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "INSERT INTO events VALUES (9223372036854775807, 1.0, 'x', '{}')",
+        "ALTER TABLE events RENAME COLUMN seq TO other",
+    ],
+)
+def test_a_history_that_cannot_be_continued_is_put_aside(tmp_path: Path, statement: str) -> None:
+    """Regression: the next number did not fit in SQLite, which ended the thread that writes."""
+    spoiled(tmp_path, statement)
+
+    async def test(history: History) -> None:
+        assert history.problem == ""
+        assert history.append("x", {})["seq"] == 1
+
+    with_history(tmp_path, test)
+    assert list(tmp_path.glob("history.sqlite.corrupt-*"))
