@@ -138,7 +138,7 @@ class Holder:
 def status_when(service: Service, good: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     deadline = time.monotonic() + PATIENCE_S
     with WireClient(service.endpoint) as client:
-        client.hello("observer", role="observer").ask("subscribe")
+        client.hello("operator", role="operator").ask("subscribe")  # an observer sees no tokens
         while time.monotonic() < deadline:
             status = client.ask("status")
             if good(status):

@@ -65,26 +65,29 @@ class Machine:
     """Booted when made; `close` ends it. Its /opt/vram-arbiter holds the installed product, its /opt/tree the checkout."""
 
     def __init__(self) -> None:
+        self._init: int | None = None  # pidfd
+        self._init_pid = 0
+        self._process: subprocess.Popen[bytes] | None = None
+        self._cgroup = _own_cgroup() / f"vram-machine-{os.getpid()}"
         self._scratch = Path(tempfile.mkdtemp(prefix="vm"))
+        try:
+            self._prepare()
+            self._boot()
+        except BaseException:
+            self.close()
+            raise
+
+    def _prepare(self) -> None:
+        self._scratch.chmod(0o755)
         for name in ("notify", "layers"):
             (self._scratch / name).mkdir()
-        self._scratch.chmod(0o755)
         install_into(
             self._scratch / "prefix",
             seen_at=Path("/opt/vram-arbiter"),
             python=Path("/opt/python") / PYTHON.relative_to(sys.base_prefix),
             dependencies=Path("/opt/site-packages"),
         )
-        self._cgroup = _own_cgroup() / f"vram-machine-{os.getpid()}"
         self._cgroup.mkdir()
-        self._init: int | None = None  # pidfd
-        self._init_pid = 0
-        self._process: subprocess.Popen[bytes] | None = None
-        try:
-            self._boot()
-        except BaseException:
-            self.close()
-            raise
 
     def _boot(self) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
