@@ -9,6 +9,8 @@ from sidecars.checkpoints import load_transformers
 from sidecars.images import decode, within
 from sidecars.weights import Weights, from_pretrained, model_options
 
+ANSWER_MAX_S = 120.0  # then it is cut off, as by max_new_tokens: below the time that counts as stuck
+
 
 class SceneVlmAdapter:
     """`query`: a picture and a question in, the answer out. Greedy, so the same question gets the same answer."""
@@ -57,7 +59,9 @@ class SceneVlmAdapter:
         )
         inputs = self._processor(text=[prompt], images=[picture], return_tensors="pt").to(self._model.device)
         with torch.inference_mode():
-            output = self._model.generate(**inputs, max_new_tokens=max_new_tokens, do_sample=False)
+            output = self._model.generate(
+                **inputs, max_new_tokens=max_new_tokens, do_sample=False, max_time=ANSWER_MAX_S
+            )
         answer = output[0, inputs["input_ids"].shape[1] :]
         return after_thinking(self._processor.decode(answer, skip_special_tokens=True))
 

@@ -75,6 +75,35 @@ def save_vqbet(folder: Path) -> None:
     VQBeTPolicy(config).save_pretrained(folder)
 
 
+def save_smolvla(folder: Path) -> None:
+    """Its VLM's config and processor lie beside it; SmolVLM's own processor needs num2words."""
+    from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
+    from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+    from tokenizers import Tokenizer, models
+    from transformers import Idefics3ImageProcessor, Idefics3Processor, PreTrainedTokenizerFast, SmolVLMConfig
+
+    words = Tokenizer(models.WordLevel({"<pad>": 0, "<unknown>": 1}, unk_token="<unknown>"))
+    names = ("fake_image_token", "image_token", "global_image_token", "end_of_utterance_token")
+    special = {name: f"<{name}>" for name in names}
+    tokenizer = PreTrainedTokenizerFast(
+        tokenizer_object=words, pad_token="<pad>", extra_special_tokens=special
+    )
+    small = {"hidden_size": 32, "intermediate_size": 32, "num_attention_heads": 2}
+    text = small | {
+        "model_type": "llama",
+        "vocab_size": 16,
+        "num_hidden_layers": 2,
+        "num_key_value_heads": 2,
+        "head_dim": 16,
+    }
+    vision = small | {"num_hidden_layers": 1, "image_size": 32, "patch_size": 8}
+    vlm = folder / "vlm"
+    SmolVLMConfig(text_config=text, vision_config=vision, scale_factor=2).save_pretrained(vlm)
+    Idefics3Processor(Idefics3ImageProcessor(), tokenizer).save_pretrained(vlm)
+    config = SmolVLAConfig(**features(), vlm_model_name=str(vlm), load_vlm_weights=False, num_vlm_layers=2)
+    SmolVLAPolicy(config).save_pretrained(folder)
+
+
 def shipped(name: str) -> Callable[[Path], None]:
     return lambda folder: shutil.copytree(CONFIGS / "models" / name, folder, dirs_exist_ok=True)  # type: ignore[arg-type,func-returns-value]
 
@@ -117,6 +146,7 @@ OTHERS: dict[str, Callable[[Path], None]] = {
     "owlv2": save_owlv2,
     "grounding_dino": save_grounding_dino,
     "vqbet": save_vqbet,
+    "smolvla": save_smolvla,
     "compact_act": shipped("so101-grab"),
     "compact_progress": shipped("so101-progress"),
     "shipped detector": shipped("so101-detector"),
@@ -125,6 +155,7 @@ OTHERS: dict[str, Callable[[Path], None]] = {
 MODELS: dict[str, tuple[Callable[[Weights, str], Any], str]] = {  # how it is loaded, and a part that it does not work without
     "act": (load_policy, "model.action_head"),
     "vqbet": (load_policy, "vqbet.action_head"),
+    "smolvla": (load_policy, "model.action_out_proj"),
     "compact_act": (load_policy, "act."),
     "compact_progress": (load_reward, "judge"),
     "owlvit": (load_detector, "box_head"),
