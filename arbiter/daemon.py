@@ -425,6 +425,7 @@ class Daemon:
             grace_s=self._config.lease.fence_grace_s,
             message_max_bytes=limits.message_max_bytes,
             sessions_max=limits.sessions_max,
+            processes_max=self._router_limits().connections_max,
             operator_reserve=limits.operator_reserve,
             user_share=limits.user_share,
             process_share=limits.process_share,

@@ -15,7 +15,7 @@ from arbiter.core.explain import DAEMON_KINDS, NOTE_KINDS
 from arbiter.rpc import codec
 from arbiter.rpc.peer import Role, check_visible, how_to_operate, is_operator
 from arbiter.rpc.requests import BY_HAND, HOLDING, event_of
-from arbiter.rpc.shares import Budget, ProcessBudgets, cost_of, share_of, spend
+from arbiter.rpc.shares import Budget, ProcessBudgets, WatchedProcesses, cost_of, share_of, spend
 from arbiter.telemetry import RefusalLog
 from schemas import wire as w
 from schemas.defaults import KIB, WIRE_VERSION
@@ -110,6 +110,7 @@ class SessionSettings:
     grace_s: float
     message_max_bytes: int
     sessions_max: int
+    processes_max: int
     operator_reserve: int
     user_share: float
     process_share: float
@@ -173,6 +174,7 @@ class SessionTable:
         self._instances: dict[tuple[ProcessKey, str], ClientId] = {}
         # the connection that each instance had before → the one that it has
         self._moved: dict[ClientId, ClientId] = {}
+        self._watched = WatchedProcesses(settings.processes_max, settings.user_share)
         self._casual: set[ProcessKey] = set()  # watched since a hello, and never had a lease or a use
         self._budgets = ProcessBudgets(settings.process_rate_per_s)
         self._too_fast = LimitExceeded(
@@ -249,7 +251,8 @@ class SessionTable:
 
     def process_died(self, process: ProcessKey) -> None:
         """The kernel said so: forget its sessions. The engine hears it from the watch."""
-        self._casual.discard(process)  # nothing is to be watched any more
+        self._casual.discard(process)  # the watch has ended
+        self._watched.discard(process)
         for session in list(self._of_process.get(process, {}).values()):
             self._drop(session)
 
@@ -299,7 +302,7 @@ class SessionTable:
         )
         if (peer.process, hello.instance) not in self._instances:
             self._make_room(session, now)  # 4
-        self._begin_watch(peer)  # 5
+        self._begin_watch(session)  # 5
         self._replace_earlier(session)
         entry.session = self._sessions[session.client] = session
         self._of_process.setdefault(peer.process, {})[session.client] = session
@@ -308,16 +311,30 @@ class SessionTable:
         self._connect(session)
         self._welcome(session, hello)
 
-    def _begin_watch(self, peer: Peer) -> None:
+    def _begin_watch(self, session: Session) -> None:
+        """A process that has held something is watched until it dies, also after its last connection: such processes have shares too."""
+        peer = session.peer
+        if peer.process not in self._watched:
+            count, of_user = len(self._watched), self._watched.of_user(peer.uid)
+            if count >= self._watched.most or (
+                of_user >= self._watched.most_of_user and session.role != "operator"
+            ):
+                raise LimitExceeded(
+                    f"{count} processes are watched, {of_user} of them of uid {peer.uid}",
+                    hint="end processes that use the arbiter no longer, or raise limits.connections_max and LimitNOFILE of the daemon",
+                    details={"limit": "connections_max", "value": self._watched.most},
+                )
         try:
-            if self._watch.take(peer.process, peer.pidfd):
-                self._casual.add(peer.process)
+            new = self._watch.take(peer.process, peer.pidfd)
         except OSError as error:
             raise LimitExceeded(
                 f"no more processes can be watched: {error}",
                 hint="raise LimitNOFILE of the daemon",
                 details={"limit": "open_files"},
             ) from error
+        if new:
+            self._watched.add(peer.process, peer.uid)
+            self._casual.add(peer.process)
 
     def _replace_earlier(self, session: Session) -> None:
         """A client object that comes back on a new connection: the old one ends. The engine moves what was its own to the new one;
@@ -436,6 +453,7 @@ class SessionTable:
         self._stop_standing_for(session.client)
         if process in self._casual and process not in self._of_process:
             self._casual.discard(process)
+            self._watched.discard(process)
             self._watch.drop(process)
 
     def _stop_standing_for(self, client: ClientId) -> None:

@@ -53,6 +53,36 @@ class ProcessBudgets:
                 del self._budgets[key]
 
 
+class WatchedProcesses:
+    """Processes that are watched since a hello: each costs a descriptor until it dies, with or without a connection."""
+
+    def __init__(self, most: int, user_share: float) -> None:
+        self.most = most
+        self.most_of_user = share_of(most, user_share)
+        self._users: dict[ProcessKey, int] = {}
+        self._counts: dict[int, int] = {}
+
+    def __len__(self) -> int:
+        return len(self._users)
+
+    def of_user(self, uid: int) -> int:
+        return self._counts.get(uid, 0)
+
+    def add(self, process: ProcessKey, uid: int) -> None:
+        self._users[process] = uid
+        self._counts[uid] = self.of_user(uid) + 1
+
+    def discard(self, process: ProcessKey) -> None:
+        uid = self._users.pop(process, None)
+        if uid is not None:
+            self._counts[uid] -= 1
+            if not self._counts[uid]:
+                del self._counts[uid]
+
+    def __contains__(self, process: ProcessKey) -> bool:
+        return process in self._users
+
+
 def spend(cost: int, own: Budget, process: Budget, now: float) -> bool:
     """Charge a request to a connection and its process. False: one of them has nothing left, and nothing is charged.
 

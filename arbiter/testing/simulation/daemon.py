@@ -117,6 +117,7 @@ class SimDaemon:
                 grace_s=settings.fence_grace_s,
                 message_max_bytes=d.MESSAGE_MAX_BYTES,
                 sessions_max=d.SESSIONS_MAX,
+                processes_max=d.CONNECTIONS_MAX,
                 operator_reserve=d.OPERATOR_RESERVE,
                 user_share=d.USER_SHARE,
                 process_share=d.PROCESS_SHARE,

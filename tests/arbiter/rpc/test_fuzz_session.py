@@ -136,7 +136,8 @@ class Plant:
         self.watched: set[ProcessKey] = set()
         self.outbox: Any = self  # the executor's way out, until the table is there
         values: dict[str, Any] = {
-            "sessions_max": 50, "rate_per_s": 1_000_000, "process_rate_per_s": 1_000_000, "subscribers_max": 3,
+            "sessions_max": 50,
+            "processes_max": 1000, "rate_per_s": 1_000_000, "process_rate_per_s": 1_000_000, "subscribers_max": 3,
             "operator_reserve": 0, "user_share": 1.0, "process_share": 1.0, **limits,
         }  # fmt: skip
         settings_ = SessionSettings(
@@ -224,6 +225,7 @@ class Plant:
                 "_instances",
                 "_moved",
                 "_casual",
+                "_watched",
             )
             if getattr(table, name)
         }

@@ -115,7 +115,7 @@ class Bench:
 def make(**changes: Any) -> Bench:
     values: dict[str, Any] = {
         "epoch": 3, "boot_id": "boot", "server": "test", "heartbeat_s": 2.0, "grace_s": 5.0, "message_max_bytes": 4096,
-        "sessions_max": 3, "operator_reserve": 0, "user_share": 1.0, "process_share": 1.0, "rate_per_s": 100,
+        "sessions_max": 3, "processes_max": 1000, "operator_reserve": 0, "user_share": 1.0, "process_share": 1.0, "rate_per_s": 100,
         "process_rate_per_s": 1000, "subscribers_max": 1, "operators_gid": None,
     }  # fmt: skip
     bench = Bench()
@@ -502,6 +502,28 @@ def test_one_process_and_one_user_leave_room_for_others() -> None:
     assert [reply["ok"] for reply in codes] == [True, True, False]
     assert codes[2]["error"]["details"] == {"limit": "sessions_max", "value": 8}
     assert bench.hello(b"p", role="operator")["ok"], "places are kept for operators"
+
+
+def test_processes_that_held_something_and_left_have_a_share() -> None:
+    """Each costs a descriptor until it dies: processes of one user that lease, leave and live on took all there are."""
+    bench = make(processes_max=4, user_share=0.5)
+
+    def holder(number: int, uid: int, role: str = "client") -> dict[str, Any]:
+        via, peer = b"%d" % number, Peer(ProcessKey(1000 + number, 7), uid, uid, -1)
+        reply = bench.hello(via, peer=peer, role=role)
+        bench.ask(
+            "acquire", via, peer, nonce="n", spec={"consumer": "c", "model_id": "m", "footprint": FOOTPRINT}
+        )
+        bench.hang_up(via)
+        return reply
+
+    assert [holder(number, 1000)["ok"] for number in range(3)] == [True, True, False]
+    assert holder(4, 2000)["ok"], "another user"
+    assert holder(5, 0, "operator")["ok"], "an operator"
+    assert code(holder(6, 2000)) == "limit_exceeded", "all descriptors are taken"
+    bench.table.process_died(ProcessKey(1000, 7))
+    assert holder(7, 2000)["ok"]
+    assert len(bench.watched) == 5
 
 
 def test_lost_and_silent_sessions_of_a_process_make_room_for_it() -> None:
