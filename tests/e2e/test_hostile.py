@@ -21,6 +21,7 @@ from arbiter.testing.wire import WireClient
 pytestmark = pytest.mark.e2e
 GIB, MIB = 1 << 30, 1 << 20
 PATIENCE_S = 60.0
+LARGE_BYTES = 8192
 ATTACKER = """
 import sys
 sys.path.insert(0, sys.argv[1])
@@ -178,6 +179,8 @@ def test_thousands_of_forged_frames_are_answered_one_by_one(honest: Honest, conn
     liar = connect().hello("liar", role="observer")  # an observer can change nothing, whatever it knows
     for number in range(1500):
         frame = forger.frame() if number % 2 else msgpack.packb(forger.request(id=number))
+        if len(frame) > LARGE_BYTES:
+            continue  # charged by its size: the others would be refused for the rate
         liar.send_raw(frame)
         answer = liar.receive()
         while answer is not None and "push" in answer:
