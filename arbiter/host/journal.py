@@ -62,8 +62,8 @@ class Opened:
     whatever the boot, and so are `footprints`."""
 
     epoch: int
-    witness: str
     records: Mapping[str, Mapping[str, Any]]
+    witness: str = ""
     put_aside: Path | None = None
     problem: str = ""
     doubt: str = ""
@@ -150,8 +150,8 @@ class Journal:
             _raise(folder, error)
         opened = Opened(
             epoch,
-            last.text(),
             records,
+            last.text(),
             found.put_aside,
             "; ".join(found.problems),
             doubt,
