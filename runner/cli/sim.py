@@ -84,6 +84,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 async def run(args: argparse.Namespace) -> int:
     """Build everything, serve until a signal, `shutdown`, `--max-seconds` or the last of `--episodes`, end in order."""
+    endpoint = args.endpoint or program_endpoint("runner", os.environ, os.getuid())
+    check_endpoint(endpoint)
     need("the simulator", "numpy", "cv2", extra="runner")
     from runner.catalogue import Catalogue, read_manifests
     from runner.clock import SystemClock
@@ -113,8 +115,6 @@ async def run(args: argparse.Namespace) -> int:
     given = sidecars_given(args.sidecar)
     if policy is None:
         check_sidecars(given, manifests)
-    endpoint = args.endpoint or program_endpoint("runner", os.environ, os.getuid())
-    check_endpoint(endpoint)
     period_s = 1.0 / (args.rate or AS_FAST_AS_POSSIBLE_HZ)
     wait_s = LOCKSTEP_WAIT_S if args.lockstep or args.rate == 0 else 0.0
     clock = SystemClock()
