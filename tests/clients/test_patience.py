@@ -111,16 +111,39 @@ async def ask_reasoner(endpoint: str) -> None:
 @pytest.mark.parametrize("ask", [connect, ping_runner, ping_sidecar, ask_reasoner])
 def test_an_answer_that_came_while_the_loop_stood_still_counts(serve: Callable[..., str], ask: Any) -> None:
     """Regression: a program that imported something for longer than its time limit said that nobody had answered."""
-    said = threading.Event()
-    endpoint = serve(after=lambda _: said.set())
+    asked, standing, said = threading.Event(), threading.Event(), threading.Event()
+
+    def before(_: Peer) -> None:
+        asked.set()
+        standing.wait(PATIENCE_S)
+
+    endpoint = serve(before, lambda _: said.set())
 
     def stand_still() -> None:
-        assert said.wait(PATIENCE_S)
+        if not asked.is_set():  # the client connects first, which takes a few turns of its loop
+            asyncio.get_running_loop().call_soon(stand_still)
+            return
+        standing.set()
+        said.wait(PATIENCE_S)
         time.sleep(3 * LIMIT_S)
 
     async def run() -> None:
         asking = asyncio.create_task(ask(endpoint))
-        asyncio.get_running_loop().call_soon(stand_still)  # behind the question
+        asyncio.get_running_loop().call_soon(stand_still)
+        await asking
+
+    asyncio.run(run())
+    assert said.is_set()
+
+
+@pytest.mark.parametrize("ask", [connect, ping_runner, ping_sidecar, ask_reasoner])
+def test_a_loop_that_stood_still_before_it_could_ask_still_asks(serve: Callable[..., str], ask: Any) -> None:
+    """A client says nothing before it knows whose server it is: its connection is noticed on its loop."""
+    endpoint = serve()
+
+    async def run() -> None:
+        asking = asyncio.create_task(ask(endpoint))
+        asyncio.get_running_loop().call_soon(time.sleep, 3 * LIMIT_S)
         await asking
 
     asyncio.run(run())
