@@ -1,6 +1,7 @@
 """A reading that cannot be true says nothing: its GPU is unknown. A driver that called a card of 8 GiB one of 2^60 bytes, or -1 bytes used, made
 room for grants that did not exist."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -85,4 +86,18 @@ def test_a_little_more_than_everything_is_the_drivers_rounding() -> None:
     sample = MemorySampled(driver.card.gpu, driver.now, 0, 8 * GIB, None)
     driver.card.lies = {"used_bytes": 0, "total_bytes": 8 * GIB, "processes": None}
     driver.post(sample)
+    assert driver.gpu()["measured_used_bytes"] == 0
+
+
+def test_a_reading_is_compared_with_what_is_leased_out_where_the_whole_is_not_known() -> None:
+    """The scenarios of `simulate`, and logs, name a capacity only; a larger whole is plausible there."""
+    driver = CoreDriver(8 * GIB)
+    (info,) = driver.settings.gpus
+    driver.settings = replace(driver.settings, gpus=(replace(info, total_bytes=0),))
+    driver.card.lies = {"total_bytes": 4 * GIB}
+    driver.restart(keep_journal=False)
+    driver.advance(1.0)
+    assert f"{8 * GIB} are leased out" in driver.notes("probe_failed")[-1]["reason"]
+    driver.card.lies = {"total_bytes": 16 * GIB}
+    driver.advance(2.0)
     assert driver.gpu()["measured_used_bytes"] == 0

@@ -226,9 +226,14 @@ def user_off(b: Broken) -> None:
     b.core.users[X] = b.core.users.pop(b.held.process)
 
 
+def waiters_off(b: Broken) -> None:
+    b.core._waiting_by[b.held.process] = 1
+
+
 @pytest.mark.parametrize(
     ("breaks", "says"),
     [
+        (waiters_off, "waiters are"),
         (user_off, "uses are listed otherwise than they are"),
         (client_off, "not listed under its process and its client"),
         (gone_and_listed, "listed and gone"),
