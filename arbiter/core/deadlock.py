@@ -17,6 +17,8 @@ from arbiter.core.lease import Lease, LeaseState
 from arbiter.core.state import Core, Gpu, Refused
 from schemas.ids import LeaseId, ProcessKey
 
+WAITS_MAX = 64
+"""A process that waits for more than so many leases at a time is not looked at: each look weighs all of them."""
 HINT = (
     "carve it out of what you hold (`parent`), `yield` the use, release first, or mark the wait `independent`"
 )
@@ -27,7 +29,7 @@ def resolve(core: Core) -> None:
     if not core.suspects:
         return
     suspects, core.suspects = core.suspects, set()
-    while any(core.users.get(process) and _waits_of(core, process) for process in suspects):
+    while any(core.users.get(process) and _is_looked_at(_waits_of(core, process)) for process in suspects):
         cycle = find(core)
         if not cycle:
             return
@@ -39,7 +41,7 @@ def find(core: Core) -> list[Lease]:
     """The circle that the newest possible waiter is in, in its order; [] if everybody can be served some day."""
     state = _Reduction(core)
     left = state.run()
-    candidates = [w for w in left if w.process in core.users and not w.spec.independent]
+    candidates = [w for w in left if w.process in state.waits and not w.spec.independent]
     for waiter in sorted(candidates, key=lambda waiter: -waiter.arrival):
         cycle = _way_back(waiter, state.waits_for)
         if cycle:
@@ -55,11 +57,17 @@ def _waits_of(core: Core, process: ProcessKey) -> list[Lease]:
     ]
 
 
+def _is_looked_at(waits: list[Lease]) -> bool:
+    return 0 < len(waits) <= WAITS_MAX
+
+
 class _Reduction:
     """Who could be served if everything left that can."""
 
     def __init__(self, core: Core) -> None:
         self.core = core
+        waits = {process: _waits_of(core, process) for process in core.users}
+        self.waits = {process: mine for process, mine in waits.items() if _is_looked_at(mine)}
         # a gang's member that stands in no queue waits for its fellows, not for bytes
         aside = (one for gang in core.gangs.values() if gang.phase != "waiting" for one in gang.members)
         self.served: set[LeaseId] = {lease.id for lease in aside}
@@ -91,13 +99,18 @@ class _Reduction:
         going = self._going(gpu, self._blocked())
         everything = self._going(gpu, frozenset())
         head: Lease | None = None
+        known: dict[tuple[int, bool], bool] = {}  # crowds ask for the same, again and again
         for waiter in gpu.queue:
-            if waiter.id in self.served:
-                continue
-            possible = policy.fits(gpu, waiter, going)
-            # one that could not be served even if every use ended waits for something else, and that may come
-            if not possible and not policy.fits(gpu, waiter, everything):
-                possible = True
+            if waiter.id in self.served or (head is not None and waiter.process not in self.waits):
+                continue  # nobody waits for what is behind a head and uses nothing
+            wish = (waiter.load_peak_bytes, waiter.spec.exclusive)
+            alike = waiter.process not in gpu.ledger.accounts and not gpu.ledger.strangers
+            possible = known.get(wish) if alike else None
+            if possible is None:
+                # one that could not be served even if every use ended waits for something else, and that may come
+                possible = policy.fits(gpu, waiter, going) or not policy.fits(gpu, waiter, everything)
+                if alike:
+                    known[wish] = possible
             if head is not None:
                 possible = possible and self._passes(gpu, head, waiter, everything)
             if possible:
@@ -114,10 +127,10 @@ class _Reduction:
 
     def _blocked(self) -> frozenset[ProcessKey]:
         """Processes in the middle of a use that wait for somebody who is not served."""
-        return frozenset(process for process in self.core.users if self._left_of(process))
+        return frozenset(process for process in self.waits if self._left_of(process))
 
     def _left_of(self, process: ProcessKey) -> list[Lease]:
-        return [lease for lease in _waits_of(self.core, process) if lease.id not in self.served]
+        return [lease for lease in self.waits.get(process, ()) if lease.id not in self.served]
 
     def _blockers(self, gpu: Gpu, waiter: Lease) -> list[ProcessKey]:
         """Processes whose uses are in the way of a waiter: those that alone suffice for that, else all others."""

@@ -116,8 +116,12 @@ def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, in
 def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int], *, planned: bool) -> None:
     if len(gpu.queue) < 2 or head.spec.exclusive or not core.settings.scheduling.backfill:
         return
-    smallest = gpu.queue.smallest_need_bytes() - policy.largest_fold_bytes(gpu)
-    if smallest > gpu.ledger.budget_bytes - gpu.ledger.total_bytes():
+    fold = policy.largest_fold_bytes(gpu)
+    smallest, free = (
+        gpu.queue.smallest_need_bytes() - fold,
+        gpu.ledger.budget_bytes - gpu.ledger.total_bytes(),
+    )
+    if smallest > free:
         return
     if policy.room_is_coming(gpu):
         return  # the head's room is about to come; a load now would only be in its way
@@ -131,7 +135,11 @@ def _backfill(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int],
             return
     if smallest > spare:
         return
+    most = min(free, spare) + fold
+    alone = not gpu.ledger.leases()
     for lease in gpu.queue.behind_head():
+        if lease.load_peak_bytes > most or (lease.spec.exclusive and not alone):
+            continue  # seen at a glance: thousands may wait
         if lease is head or lease.gang is not None or (stuck and not _may_be_asked(core, lease)):
             continue
         if policy.added_bytes(gpu, lease) <= spare and policy.fits(gpu, lease):

@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from arbiter.core import deadlock
 from arbiter.core.effects import Effect, Refuse
 from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
 from schemas import defaults as d
@@ -261,3 +262,18 @@ def test_who_only_waits_for_a_circle_is_not_the_one_to_be_refused() -> None:
     assert [driver.state(lease) for lease in (first, second, newest)] == ["queued", "over", "queued"]
     (denied,) = driver.pushes("denied", second)
     assert sorted(link["consumer"] for link in denied["error"]["details"]["cycle"]) == ["a", "b"]
+
+
+def test_a_process_that_waits_for_very_many_is_not_looked_at() -> None:
+    """One look weighs every wait: with thousands each acquire of a process in a use held the loop for a tenth of a second."""
+    driver = CoreDriver(8 * GIB, settings={"leases_per_client_max": 1000})
+    job, lease = using(driver, "job", 5)
+    first, _ = using(driver, "other", 1)
+    for _ in range(deadlock.WAITS_MAX):
+        job.acquire(5 * GIB, independent=True)
+    assert refusal(job.try_acquire(5 * GIB)).code == "would_deadlock", "independent waits do not count"
+    job.use_yield(lease)
+    crowd = [job.acquire(int(5.5 * GIB)) for _ in range(deadlock.WAITS_MAX + 1)]
+    job.use_begin(lease)
+    assert {driver.state(one) for one in crowd} == {"queued"}
+    assert driver.state(first.acquire(GIB // 2)) == "loading", "and nobody else is denied because of it"
