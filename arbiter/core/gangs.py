@@ -75,7 +75,8 @@ def on_due(core: Core, name: str) -> None:
 
 
 def _gang(core: Core, name: str, size: int) -> Gang:
-    return core.gangs.setdefault(name, Gang(name, size, core.now))
+    core.unsettled.add(name)
+    return core.gangs.setdefault(name, Gang(name, size, core.now, unsettled=core.unsettled))
 
 
 def _complete(core: Core, gang: Gang) -> None:
@@ -241,7 +242,9 @@ def _is_free(core: Core, gpu: Gpu, gang: Gang, lease: Lease, *, crowded: bool) -
 
 def settle(core: Core) -> None:
     """After an event: gangs of which a member is over are broken, those of which all are held are complete."""
-    for gang in list(core.gangs.values()):
+    core.settled = set(core.unsettled)
+    core.unsettled.clear()
+    for gang in _concerned(core):
         fallen = next((one for one in gang.members if one.state not in _STANDING), None)
         if fallen is not None:
             ended = core.ended.get(fallen.id)
@@ -252,6 +255,13 @@ def settle(core: Core) -> None:
         elif gang.phase == "loading":
             for gpu_id in gang.cards:
                 _trim(core, core.gpus[gpu_id], gang)
+
+
+def _concerned(core: Core) -> list[Gang]:
+    """Gangs of which a member has moved since the last event, and those that load: thousands may gather that nothing happens to."""
+    names = {*core.settled, *core.unsettled, *(gpu.gang.name for gpu in core.gpus.values() if gpu.gang)}
+    found = [core.gangs[name] for name in names if name in core.gangs]
+    return sorted(found, key=lambda gang: (gang.first_at, gang.name))
 
 
 _STANDING = frozenset({LeaseState.QUEUED, LeaseState.LOADING, LeaseState.HELD})
@@ -451,8 +461,8 @@ def unfinished(gang: Gang, lease: Lease) -> str:
 
 
 def unsound(core: Core) -> str:
-    """Where a gang is neither wholly charged nor wholly not; "" if nowhere. For the invariants."""
-    for gang in core.gangs.values():
+    """Where a gang that the event can have changed is neither wholly charged nor wholly not; "" if nowhere. For the invariants."""
+    for gang in _concerned(core):
         for lease in gang.waiting():
             charged = lease.gpu is not None and core.gpus[lease.gpu].ledger.charges(lease.id)
             if charged != (gang.phase == "loading"):

@@ -17,7 +17,7 @@ Numbers are those of ARCHITECTURE.md:
 
 from arbiter.core import families, gangs
 from arbiter.core.lease import AWAY, Lease, LeaseState
-from arbiter.core.state import Core, Gpu
+from arbiter.core.state import NOT_COUNTED, Core, Gpu
 
 _UNUSED = tuple(state for state in LeaseState if state not in (LeaseState.HELD, LeaseState.REVOKING))
 """States in which nobody may use a lease."""
@@ -59,6 +59,8 @@ def check_all(core: Core) -> None:
         gpu.ledger.touched.update(gpu.ledger.leases(), gpu.residents, gpu.debts)
         for lease in gpu.residents.values():
             _unused(lease)
+    core.settled.update(core.gangs)
+    core.counted = NOT_COUNTED
     check(core)
 
 
@@ -148,16 +150,23 @@ def _tokens(core: Core) -> None:
     core.granted.clear()
 
 
-def _waiters(core: Core) -> None:
-    queued = 0
-    for gpu in core.gpus.values():
-        queued += len(gpu.queue)
+def _counts(core: Core, queued: int) -> None:
+    """Counted only when a number has changed: there may be thousands of gangs."""
     waiting = len(core.waiting)
     for gang in core.gangs.values():
         if gang.phase != "waiting":
             waiting -= len(gang.waiting())
     if queued < waiting or (len(core.gpus) == 1 and queued != waiting):
         raise InvariantViolation(6, f"{waiting} leases wait, {queued} are in queues")
+    core.counted = (queued, len(core.waiting))
+
+
+def _waiters(core: Core) -> None:
+    queued = 0
+    for gpu in core.gpus.values():
+        queued += len(gpu.queue)
+    if (queued, len(core.waiting)) != core.counted:
+        _counts(core, queued)
     for gpu in core.gpus.values():
         head = gpu.queue.head()
         if head is None:

@@ -198,6 +198,9 @@ class Gang:
     cards: list[GpuId] = field(default_factory=list)  # loading: where its bytes are charged
     reserved_bytes: dict[GpuId, int] = field(default_factory=dict)  # what was admitted there
     short_since: dict[GpuId, float] = field(default_factory=dict)  # cards that show less free than is kept
+    unsettled: set[str] = field(
+        default_factory=set, repr=False
+    )  # of the engine: gangs of which a member moved
 
     def waiting(self) -> list["Lease"]:
         return [lease for lease in self.members if lease.state is LeaseState.QUEUED]
@@ -292,6 +295,8 @@ class Lease:
         del self.story[:-STORY_MAX]
         if self.roster is not None:
             self.roster.moved(self, before)
+        if self.gang is not None:
+            self.gang.unsettled.add(self.gang.name)
 
     def told(self) -> str:
         """The story in one line."""

@@ -29,6 +29,7 @@ LEARNT_REMEMBERED = 32
 CONSUMERS_REMEMBERED = 1024
 TOKEN_STEP_BYTES = 4
 """Tokens are apart by up to 2^32: 2^31 grants of one epoch stay below 2^63."""
+NOT_COUNTED = (-1, -1)
 _LOADING = frozenset({LeaseState.LOADING})
 _MOVING = LEAVING | _LOADING
 IDLE_PROBE_S = 10.0  # how long after the last client a card is still read in the background
@@ -169,7 +170,12 @@ class Core:
         self.arrivals = 0
         self.last_token = Token(settings.epoch, 0)
         self.users: dict[ProcessKey, dict[tuple[LeaseId, UseId], Lease]] = {}  # whose busy uses are where
+        self.counted = NOT_COUNTED  # waiters in queues, and all, when the invariants counted them last
         self.gangs: dict[str, Gang] = {}
+        self.unsettled: set[str] = (
+            set()
+        )  # gangs of which a member moved since they were looked at (`gangs.settle`)
+        self.settled: set[str] = set()  # those that were looked at in this event
         # of the event being handled: who began to use or to wait (`deadlock`), acquires, grants (`invariants`)
         self.suspects: set[ProcessKey] = set()
         self.unanswered: list[Lease] = []

@@ -1,6 +1,7 @@
 """What an event costs does not grow with those whom it does not concern: counted in instructions, which no neighbour disturbs."""
 
 import sys
+from dataclasses import replace
 from types import FrameType
 from typing import Any
 
@@ -108,3 +109,19 @@ def test_no_event_costs_more_beside_a_hundred_times_as_many_leases_and_connectio
     before, after = few.cycle(), many.cycle()
     grown = {name: (before[name], after[name]) for name in before if after[name] > 1.1 * before[name]}
     assert not grown, f"instructions with {FEW} and with {MANY}"
+
+
+def test_no_event_costs_more_beside_gangs_that_gather() -> None:
+    """Each event looked at every gang: two thousand that wait for their second member made a renewal cost 160 times as much."""
+
+    def renewal(gangs: int) -> int:
+        counted = Counted(1, listed=True)
+        lease = counted.acquire(ClientId("busy"))
+        counted.tell(ev.ReadyReported(ClientId("busy"), counted.request(), *lease, None))
+        for number in range(gangs):
+            asking = counted.asking(ClientId("idle0"))
+            counted.tell(replace(asking, spec=replace(asking.spec, gang=(f"g{number}", 2))))
+        counted.tell(ev.Tick())
+        return counted.counted(ev.Renewed(ClientId("busy"), counted.request(), (lease,)))
+
+    assert renewal(200) == renewal(2)
