@@ -1,0 +1,94 @@
+"""A restart with a journal in doubt: it may have lost records, so holders know more than it does."""
+
+from arbiter.core.events import DOUBT_KEY
+from arbiter.testing.core_driver import CoreDriver, answer
+from arbiter.testing.scenes import held, sent_away
+from schemas import defaults as d
+
+GIB = d.GIB
+WAIT_S = d.LEASE_TTL_S + d.FENCE_GRACE_S
+
+
+def doubting() -> CoreDriver:
+    driver = CoreDriver(16 * GIB)
+    driver.journal[DOUBT_KEY] = {"why": "its seal is missing"}
+    return driver
+
+
+def phase(driver: CoreDriver) -> str:
+    return str(driver.arbiter.status(driver.now)["phase"])
+
+
+def test_holders_that_came_back_are_not_enough() -> None:
+    driver = doubting()
+    det, lease = held(driver, "det", 5)
+    token = det.token(lease)
+    driver.restart()
+    assert driver.notes("recovered")[-1]["doubt"] == "its seal is missing"
+    det.connect()
+    assert answer(det.reattach(lease, token))["leases"][0]["kept"]
+    waiter = driver.consumer("waiter").acquire(GIB)
+    driver.advance(WAIT_S - 1.0)
+    assert (driver.state(waiter), phase(driver)) == ("queued", "recovering")
+    assert "holders that the journal may not name must come back first" in driver.gpu()["blocked"]
+    assert DOUBT_KEY in driver.journal, "the next start would doubt as well"
+    driver.advance(2.0)
+    assert (driver.state(waiter), phase(driver)) == ("loading", "serving")
+    assert DOUBT_KEY not in driver.journal
+
+
+def test_an_empty_gpu_ends_the_doubt() -> None:
+    driver = doubting()
+    driver.restart()
+    driver.until(lambda: phase(driver) == "serving", limit_s=2.0)
+    assert DOUBT_KEY not in driver.journal
+
+
+def test_a_holder_with_a_later_token_is_believed() -> None:
+    """Its lease was granted again, and the record of that grant is lost. Without a doubt the token is refused."""
+    for doubt in (True, False):
+        driver = doubting()
+        if not doubt:
+            del driver.journal[DOUBT_KEY]
+        det, lease = held(driver, "det", 5)
+        before = det.token(lease)
+        later = type(before)(before.epoch, before.serial + 40)
+        driver.restart()
+        det.connect()
+        (kept,) = answer(det.reattach(lease, later, uses=["grab"]))["leases"]
+        assert kept["kept"] is doubt
+        if doubt:
+            assert (kept["lease"]["state"], kept["lease"]["uses"]) == ("held", 1)
+            assert driver.journal[f"lease:{lease}"]["token"] == [later.epoch, later.serial]
+            det.use_end(lease, "grab", later)
+        else:
+            assert kept["error"]["code"] == "stale_token"
+
+
+def test_a_holder_with_a_token_of_this_start_is_not_believed() -> None:
+    driver = doubting()
+    det, lease = held(driver, "det", 5)
+    token = det.token(lease)
+    driver.restart(epoch=2)
+    det.connect()
+    (kept,) = answer(det.reattach(lease, type(token)(2, 1)))["leases"]
+    assert kept["error"]["code"] == "stale_token"
+    other = driver.consumer("other")
+    (kept,) = answer(other.reattach(lease, type(token)(1, 99), spec=det.specs[lease]))["leases"]
+    assert kept["error"]["code"] in ("stale_token", "not_permitted"), "nor another process"
+
+
+def test_a_lease_that_was_away_is_what_its_holder_says() -> None:
+    """Its record says that it holds nothing; the record of its return may be lost."""
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver)
+    old, spec = det.token(lease), det.specs[lease]
+    policy_token = policy.token(wanted)
+    driver.journal[DOUBT_KEY] = {"why": "its log was cut"}
+    driver.restart()
+    assert driver.state(lease) == "over", "it is not remembered as away"
+    det.connect()
+    policy.connect()
+    answer(policy.reattach(wanted, policy_token))
+    (kept,) = answer(det.reattach(lease, old, spec=spec, away=True))["leases"]
+    assert (kept["kept"], kept["lease"]["state"]) == (True, "standby"), "adopted as its holder tells"
