@@ -134,6 +134,8 @@ def settings_from(flags: argparse.Namespace) -> Settings:
 def compare_weights(manifest: RSkillManifest, weights: Weights, adapter_for: AdapterFor) -> str:
     """Compare the checkpoint with the model that its config describes, on no device. Returns what
     was done, in words. Raises ModelError."""
+    if is_passthrough(manifest):
+        return "it has no weights"
     if importlib.util.find_spec("torch") is None:
         return "weights not compared with the model: torch is not installed"
     place = weights if weights.local else cached(weights)
