@@ -357,7 +357,7 @@ def test_a_request_that_waits_behind_another_does_not_keep_the_lease_in_use(box,
 def test_a_stuck_model_is_said_and_ends_the_process(box, arbiter):
     """Regression: a request that hung in a decoder kept its lease in use for ever: no other model
     could be loaded. The memory really is in use, so only the end of the process gives it back."""
-    sidecar = box.start("detector", "--request-timeout-s", "0.5", footprint="5GB,5GB,100MB")
+    sidecar = box.start("detector", "--request-timeout-s", "2", footprint="5GB,5GB,100MB")
     sidecar.detect()
     hanging = sidecar.hold()
     sidecar.send_detect()
@@ -371,7 +371,7 @@ def test_a_stuck_model_is_said_and_ends_the_process(box, arbiter):
 
 
 def test_a_stuck_model_does_not_keep_the_process_from_ending(box):
-    sidecar = box.start("detector", "--request-timeout-s", "0.5")
+    sidecar = box.start("detector", "--request-timeout-s", "2")
     sidecar.detect()
     sidecar.hold()
     assert sidecar.terminate() == 1
