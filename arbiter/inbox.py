@@ -29,6 +29,7 @@ TIMER_FLOOR_S = 0.0002
 
 FRESH_S = 1.0
 """Time limit for the reading that an answer waits for. After it the answer shows the old reading with its age."""
+ANSWERS_AT_ONCE = 4
 QUESTIONS_MAX = 1024
 """Answers that wait for a reading at a time. One more is given at once, with the reading that there is."""
 NOBODY = ProcessKey(0, 0)
@@ -199,8 +200,14 @@ class Inbox:
             self._failed(error)
 
     def _answer(self) -> None:
-        for answer in self._forget_questions():
+        self._answer_some(self._forget_questions())
+
+    def _answer_some(self, questions: list[Callable[[], None]]) -> None:
+        """A few in one turn of the loop: a thousand that waited for the same reading must not hold it for a second."""
+        for answer in questions[:ANSWERS_AT_ONCE]:
             answer()
+        if rest := questions[ANSWERS_AT_ONCE:]:
+            asyncio.get_running_loop().call_soon(self._answer_some, rest)
 
     def _forget_questions(self) -> list[Callable[[], None]]:
         questions, self._questions = self._questions, []

@@ -3,11 +3,12 @@
 import asyncio
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from functools import partial
 from typing import Any
 
 from arbiter.core.effects import Effect, Note
 from arbiter.core.events import ClientLeft, Event, Resumed, Tick
-from arbiter.inbox import QUESTIONS_MAX, Inbox
+from arbiter.inbox import ANSWERS_AT_ONCE, QUESTIONS_MAX, Inbox
 from schemas.ids import ClientId, GpuId
 
 PATIENCE_S = 60.0
@@ -304,6 +305,27 @@ def test_questions_that_wait_are_bounded() -> None:
         for _ in range(QUESTIONS_MAX + 1):
             inbox.when_read(lambda: answered.append(1))
         assert answered == [1], "the one beyond the limit is answered at once"
+        inbox.close()
+
+    asyncio.run(run())
+
+
+def test_questions_that_waited_together_are_answered_a_few_at_a_time() -> None:
+    """Each answer costs a page of the status: a thousand in one turn of the loop held everybody else for a second."""
+
+    async def run() -> None:
+        core, answered = ScriptedCore(), list[int]()
+        inbox = Inbox(core, lambda effects: None, lambda error: None)
+        core.unread = [GpuId("gpu-0")]
+        for number in range(3 * ANSWERS_AT_ONCE):
+            inbox.when_read(partial(answered.append, number))
+        core.unread = []
+        inbox.post(left("the reading"))
+        assert len(answered) == ANSWERS_AT_ONCE
+        await asyncio.sleep(0)
+        assert len(answered) == 2 * ANSWERS_AT_ONCE
+        await asyncio.sleep(0)
+        assert answered == list(range(3 * ANSWERS_AT_ONCE))
         inbox.close()
 
     asyncio.run(run())
