@@ -29,7 +29,7 @@ class LoadedPolicy:
             importlib.import_module(plugin)
         config = PreTrainedConfig.from_pretrained(folder)
         config.device = "cpu"
-        self._policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+        self._policy = get_policy_class(config.type).from_pretrained(folder, config=config, strict=True)
         self._before, self._after = make_pre_post_processors(config, pretrained_path=str(folder))
         self._cameras = [key.rsplit(".", 1)[1] for key in config.image_features]
         self.execute = execute or config.n_action_steps
