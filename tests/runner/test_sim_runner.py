@@ -457,7 +457,6 @@ def test_frames_are_rendered_on_demand_and_reused_while_young(
 
 
 @pytest.mark.heavy
-@pytest.mark.heavy
 def test_a_crowd_of_requests_for_pictures_costs_a_tick_one_picture_a_camera(
     make_runner: Make, env: Any, clock: Any
 ) -> None:
@@ -476,6 +475,7 @@ def test_a_crowd_of_requests_for_pictures_costs_a_tick_one_picture_a_camera(
     assert runner.snapshot("front", 1e-9) is not pictures[0]
 
 
+@pytest.mark.heavy
 def test_a_skill_sees_the_cameras_it_wants(make_runner: Make) -> None:
     runner, skill = make_runner(rate_hz=0, cameras=("front", "wrist")), Scripted(Hold("x"))
     skill.cameras = ("wrist",)
