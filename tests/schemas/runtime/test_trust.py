@@ -60,7 +60,9 @@ def test_the_units_users_are_those_that_are_trusted() -> None:
     units = Path(__file__).parents[3] / "configs/systemd/system"
     for program, user in SERVICE_USERS.items():
         unit = units / ("vram-arbiter.service" if program == "arbiter" else f"vram-{program}@.service")
-        assert f"User={user}" in unit.read_text().splitlines()
+        lines = unit.read_text().splitlines()
+        assert f"User={user}" in lines
+        assert "PrivateUsers=yes" not in lines  # every other user would be 65534 there
     assert len({SERVICE_USERS[program] for program in ("arbiter", "runner", "sidecar")}) == 3
 
 
