@@ -176,15 +176,19 @@ def _doubtful_bytes(
     """Bytes in nobody's list that the ledger still allows for, and that may have left in place of the lease's.
 
     More is gone than everybody who leaves accounts for, so somebody unnamed went too, and what he left room for may be the lease's. A total
-    cannot tell, unless all of the unnamed is gone. Once the time is up this doubt alone keeps nobody waiting.
+    cannot tell, unless all of the unnamed is gone. Nor can it tell what stowaways of the last list did that no list shows any more. Once
+    the time is up this doubt alone keeps nobody waiting.
     """
-    if v.baseline is None or v.overdue:
+    if v.overdue:
         return 0
+    unseen_bytes = ledger.stowaway_bytes() - ledger.unnamed_bytes if sample.processes is None else 0
+    if v.baseline is None:
+        return unseen_bytes
     leaves_bytes = _may_hold(v, ledger, v.baseline) - expected + left_bytes
     excess_bytes = v.baseline.used_bytes - sample.used_bytes - leaves_bytes
-    return (
-        ledger.unnamed_bytes if tolerance_bytes < excess_bytes < ledger.unnamed_bytes - tolerance_bytes else 0
-    )
+    unnamed_bytes = ledger.unnamed_bytes
+    doubtful = tolerance_bytes < excess_bytes < unnamed_bytes - tolerance_bytes
+    return unseen_bytes + (unnamed_bytes if doubtful else 0)
 
 
 def _may_hold(v: Verification, ledger: GpuLedger, sample: MemorySampled) -> int:

@@ -328,3 +328,26 @@ def test_20_what_the_machine_itself_takes_is_not_leased() -> None:
     fits, waits = driver.consumer("a").acquire(5 * GIB), driver.consumer("b").acquire(1 * GIB)
     driver.advance(1.0)
     assert (driver.state(fits), driver.state(waits)) == ("loading", "queued")
+
+
+def test_a_stowaway_that_goes_while_lists_are_hidden_is_not_taken_for_the_bytes_of_a_lease() -> None:
+    """A storm of faults found it: the card fell by as much as was waited for, because a stowaway had died unseen, and an exclusive lease
+    was granted beside bytes that were still there."""
+    driver = CoreDriver(8 * GIB)
+    ghost = ProcessKey(9, 9)
+    driver.card.set(ghost, 2 * GIB, driver.now)
+    driver.advance(2.0)
+    job, lease = held(driver, "job", 2)
+    driver.advance(1.0)
+    driver.card.lists_processes = False
+    driver.card.failing = "out"
+    driver.advance(0.5)
+    driver.card.set(ghost, 0, driver.now)
+    driver.card.failing = ""
+    driver.card.lag_s = 1.0
+    alone = driver.consumer("alone").acquire(GIB, exclusive=True)
+    job.unload(lease)
+    driver.advance(0.5)
+    assert driver.state(alone) == "queued", "two GiB are gone, and not those of the job"
+    driver.until(lambda: driver.state(alone) == "loading", limit_s=20.0)
+    assert driver.card.shown(driver.now).get(job.process, 0) == 0
