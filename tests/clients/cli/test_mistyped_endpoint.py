@@ -3,12 +3,21 @@
 import os
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[3]
 GRAB = ROOT / "configs/rskills/so101-grab/rskill.yaml"
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A short one: a socket's path has at most 107 bytes."""
+    with tempfile.TemporaryDirectory(prefix="va") as name:
+        yield Path(name)
 
 
 @pytest.mark.parametrize(
@@ -22,13 +31,13 @@ GRAB = ROOT / "configs/rskills/so101-grab/rskill.yaml"
         ["runner", "estop", "--endpoint", "EP"],
     ],
 )
-def test_a_mistyped_endpoint_makes_no_folders(command: list[str], tmp_path: Path) -> None:
+def test_a_mistyped_endpoint_makes_no_folders(command: list[str], folder: Path) -> None:
     """A daemon on a mistyped endpoint served there, alone, in folders that it had made on the way."""
-    endpoint = f"ipc://{tmp_path}/runn/vram-arbiter/arbiter.sock"
+    endpoint = f"ipc://{folder}/runn/vram-arbiter/arbiter.sock"
     done = subprocess.run(
         [sys.executable, "-m", *(endpoint if word == "EP" else word for word in command)],
         cwd=ROOT,
-        env={**os.environ, "VRAM_ARBITER_RUNTIME": str(tmp_path)},
+        env={**os.environ, "VRAM_ARBITER_RUNTIME": str(folder)},
         capture_output=True,
         text=True,
         timeout=60,
@@ -37,4 +46,4 @@ def test_a_mistyped_endpoint_makes_no_folders(command: list[str], tmp_path: Path
     assert done.returncode in (1, 2, 3)
     (line,) = done.stderr.splitlines()
     assert "/runn" in line
-    assert list(tmp_path.iterdir()) == []
+    assert list(folder.iterdir()) == []
