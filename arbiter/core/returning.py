@@ -31,8 +31,19 @@ class Returning:
         leaving: Collection[ProcessKey],
         booked_bytes: Callable[[ProcessKey], int],
     ) -> None:
-        """Compare two readings in a row. Whoever is leaving is measured away anyhow, and whoever is no longer listed explains what it is booked."""
-        if before is None or before.processes is None or sample.processes is None:
+        """Compare two readings in a row. What is leaving is measured away anyhow, and what is no longer listed explains its charge.
+
+        The first reading of a daemon is compared with the charges of the journal: a holder may have freed its bytes before the restart.
+        """
+        if sample.processes is None:
+            return
+        if before is None:
+            for use in sample.processes:
+                freed_bytes = booked_bytes(use.process) - (use.used_bytes or 0)
+                if use.used_bytes is not None and freed_bytes > 0:
+                    self.give_up(use.process, freed_bytes, sample.taken_at)
+            return
+        if before.processes is None:
             return
         now = {use.process: use.used_bytes or 0 for use in sample.processes}
         for use in before.processes:

@@ -351,3 +351,26 @@ def test_a_stowaway_that_goes_while_lists_are_hidden_is_not_taken_for_the_bytes_
     assert driver.state(alone) == "queued", "two GiB are gone, and not those of the job"
     driver.until(lambda: driver.state(alone) == "loading", limit_s=20.0)
     assert driver.card.shown(driver.now).get(job.process, 0) == 0
+
+
+def test_what_a_holder_freed_before_a_restart_is_waited_for_after_it() -> None:
+    """A storm of faults found it: the daemon was killed between an unload and its release. The driver listed the process with its
+    context only, the total still had its model, and the next lease was granted beside it."""
+    driver = CoreDriver(8 * GIB)
+    job, lease = held(driver, "job", 2, exclusive=True, residue_bytes=128 * MIB)
+    token = job.token(lease)
+    context = job.specs[lease].residue_bytes
+    job.unloading(lease)
+    job.hold(context)
+    driver.card.overhead_bytes = 2 * GIB - context  # freed, not returned
+    driver.restart()
+    job.connect()
+    alone = driver.consumer("alone").acquire(GIB, exclusive=True)
+    driver.advance(0.05)
+    driver.post(driver.card.read(driver.now))  # quiet: the rest in it counts
+    job.reattach(lease, token)
+    job.release(lease, token=token)
+    driver.advance(0.5)
+    assert driver.state(alone) == "queued", "the model is still on the card"
+    driver.card.overhead_bytes = 0
+    driver.until(lambda: driver.state(alone) == "loading", limit_s=20.0)
