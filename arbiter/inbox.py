@@ -32,7 +32,7 @@ FRESH_S = 1.0
 ANSWERS_AT_ONCE = 4
 QUESTIONS_MAX = 1024
 """Answers that wait for a reading at a time. One more is given at once, with the reading that there is."""
-NOBODY = ProcessKey(0, 0)
+NO_READER = ProcessKey(0, 0)
 """Reader of a status that goes to the log: it may see no token."""
 _TOKEN = re.compile(r"Token\(epoch=(\d+), serial=\d+\)")
 
@@ -218,7 +218,7 @@ class Inbox:
 
     def _state(self) -> str:
         try:
-            return json.dumps(self.status(NOBODY), default=str)
+            return json.dumps(self.status(NO_READER), default=str)
         except Exception as error:  # noqa: BLE001 - the state may be what is broken; this is its last word
             return f"unreadable: {error!r}"
 

@@ -102,7 +102,7 @@ class _Reduction:
         known: dict[tuple[int, bool], bool] = {}  # crowds ask for the same, again and again
         for waiter in gpu.queue:
             if waiter.id in self.served or (head is not None and waiter.process not in self.waits):
-                continue  # nobody waits for what is behind a head and uses nothing
+                continue  # no wait depends on a request behind a head that uses nothing
             wish = (waiter.load_peak_bytes, waiter.spec.exclusive)
             alike = waiter.process not in gpu.ledger.accounts and not gpu.ledger.strangers
             possible = known.get(wish) if alike else None

@@ -16,7 +16,7 @@ def note(core: Core, event: AcquireRequested | Reacquired | ResizeAsked, refused
     """Say that a request was refused, by whom it was asked and why."""
     client = core.clients.get(event.client)
     if client is None:
-        return  # it has not said hello: it is nobody yet
+        return  # it has not said hello
     seen = core.refusals.pop(client.process, None) or Refusals(core.now)
     core.refusals[client.process] = seen
     while len(core.refusals) > PROCESSES_REMEMBERED:

@@ -51,7 +51,7 @@ class Settings:
     user_share: float = d.USER_SHARE
     priority_reserve: float = d.PRIORITY_RESERVE
     token_secret: str = ""
-    """Hexadecimal digits that nobody else knows; tokens cannot be guessed with it. "": the next number each time."""
+    """Secret hexadecimal digits that keep tokens from being guessed. "": the next number each time."""
     host_ram_budget_bytes: int = 0
     """Host RAM for the weights of parked leases; 0: nobody parks."""
     policy: str = DEFAULT

@@ -112,7 +112,7 @@ class Journal:
         given out twice.
 
         1. Read everything; damage is put aside. 2. Records of another boot are dropped. 3. What no seal confirms is doubted.
-        4. Epoch: more than every known one. 5. Seal before the database, so that a kill between them is no doubt; in doubt the
+        4. Epoch: more than every known one. 5. Seal before the database, so that a kill between them causes no doubt; in doubt the
         other way round, so that it stays one. 6. The epoch file.
 
         `witness` is what `Opened.witness` said at the last start, kept outside of the folder.
