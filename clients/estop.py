@@ -37,7 +37,7 @@ def stop(endpoint: str, reason: str = "", *, timeout_s: float = ANSWER_S) -> Sto
 
     Raises RunnerUnreachable when no runner latched the stop, InternalError when it is latched and
     its control loop does not obey, RobotFault when the motors could not be told, UntrustedServer
-    when another user listens there, ConfigError for what is no endpoint.
+    when another user listens there, ConfigError for an endpoint that is not one.
     """
     path = path_of(endpoint)
     deadline = time.monotonic() + timeout_s
@@ -95,7 +95,7 @@ def _words(error: Exception) -> str:
     if isinstance(error, BadFrame):
         return "it hung up, or answered something else"
     if isinstance(error, FileNotFoundError):
-        return "there is no emergency-stop socket"
+        return "its emergency-stop socket does not exist"
     if isinstance(error, ConnectionRefusedError):
         return "its runner was killed and left the socket over"
     if isinstance(error, PermissionError):

@@ -77,14 +77,14 @@ def request(reason: str) -> bytes:
 
 
 def reason_in(packet: bytes) -> str | None:
-    """Reason of a request, possibly empty; None where the packet is no request. Any version stops."""
+    """Reason of a request, possibly empty; None where the packet is not a request. Any version stops."""
     if not packet.startswith(PREFIX):
         return None
     return one_line(packet.partition(b" ")[2].decode(errors="replace"))
 
 
 def reply_in(packet: bytes) -> Reply:
-    """Raises BadFrame for what is no reply."""
+    """Raises BadFrame for a packet that is not a reply."""
     words = packet.decode(errors="replace").split(_SEPARATOR, 4)
     try:
         version, answer, stopped_ns, robot, text = words

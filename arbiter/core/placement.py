@@ -1,7 +1,7 @@
 """On which cards a lease may ever be: those that its selector names and that are large enough once every lease there has ended.
 
 A pinned holder cannot be asked to leave, but it ends one day: a request beside it waits, as long as its own timeout allows. Knows no order and
-asks nobody.
+sends no revoke.
 """
 
 from arbiter.core.events import Spec
