@@ -18,6 +18,8 @@ SAMPLE ?= 300
 
 BIN := .venv/bin
 CORE := .venv-core/bin
+# The tools of the tests find `tests.support` from here.
+TOOL := PYTHONPATH=. $(BIN)/python
 # Two workers: more only make the tests of timing fight for the cores of a small machine.
 WORKERS ?= 2
 
@@ -44,10 +46,10 @@ test-core: setup-core ## the base install alone, in seconds
 	$(CORE)/pytest -q -n $(WORKERS) --dist loadfile -m "not heavy and not e2e and not gpu" $(ARGS)
 
 nightly: setup ## the engine's rule machines, far and at random, on all cores: HISTORIES=100000 MACHINE=leases SEED=n
-	$(BIN)/python tests/nightly/nightly_run.py --histories $(HISTORIES) $(if $(MACHINE),--machine $(MACHINE)) $(if $(filter-out 0,$(SEED)),--seed $(SEED)) $(ARGS)
+	$(TOOL) tests/nightly/nightly_run.py --histories $(HISTORIES) $(if $(MACHINE),--machine $(MACHINE)) $(if $(filter-out 0,$(SEED)),--seed $(SEED)) $(ARGS)
 
 mutation: setup ## small changes in arbiter/core that no test of the core sees: SAMPLE=300 of them by chance, SEED=n
-	$(BIN)/python tests/mutation/mutation_run.py --sample $(SAMPLE) --seed $(SEED) $(ARGS)
+	$(TOOL) tests/mutation/mutation_run.py --sample $(SAMPLE) --seed $(SEED) $(ARGS)
 
 lint: setup ## style, types and who may import whom
 	$(BIN)/ruff check .
@@ -60,16 +62,16 @@ format: setup ## rewrite the code in the project's style
 	$(BIN)/ruff format .
 
 chaos: setup ## kill, stop and starve real processes at every step of a switch: SECONDS=300 SEED=0
-	$(BIN)/python tests/chaos/storm.py --seconds $(SECONDS) --seed $(SEED) --out out/chaos
+	$(TOOL) tests/chaos/storm.py --seconds $(SECONDS) --seed $(SEED) --out out/chaos
 
 sim: setup ## the daemon under simulated faults: SEED=n one run with its story, SEEDS=1000 many on all cores
-	$(BIN)/python tests/sim/sim_run.py $(if $(SEEDS),--seeds $(SEEDS) --out out/sim/sums.json,--seed $(SEED)) $(ARGS)
+	$(TOOL) tests/sim/sim_run.py $(if $(SEEDS),--seeds $(SEEDS) --out out/sim/sums.json,--seed $(SEED)) $(ARGS)
 
 bench: setup ## how fast it is, beside bare ZeroMQ and Redis locks: QUICK=1 takes less of everything
-	$(BIN)/python tests/bench/run.py $(if $(QUICK),--quick) $(ARGS)
+	$(TOOL) tests/bench/run.py $(if $(QUICK),--quick) $(ARGS)
 
 schemas: setup ## write the JSON Schemas anew after a model changed
-	$(BIN)/python -m schemas export schemas/json
+	$(BIN)/python -m vram_arbiter.schemas export schemas/json
 
 install-units: ## copy the systemd units into the system (docs/systemd.md): PREFIX=/opt/vram-arbiter DESTDIR=
 	@bash .ci/install-units "$(PREFIX)" "$(DESTDIR)"

@@ -8,9 +8,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from schemas import otel, terminal
-from schemas.config import ArbiterConfig, load_config
-from schemas.errors import (
+from vram_arbiter.schemas.config.arbiter import ArbiterConfig, load_config
+from vram_arbiter.schemas.errors import (
     AlreadyRunning,
     ConfigError,
     InternalError,
@@ -19,8 +18,10 @@ from schemas.errors import (
     ProbeFailed,
     VramError,
 )
-from schemas.version import add_version, version
-from schemas.yamltext import read_text
+from vram_arbiter.schemas.runtime import terminal
+from vram_arbiter.schemas.runtime.telemetry import setup as otel
+from vram_arbiter.schemas.runtime.version import add_version, version
+from vram_arbiter.schemas.yamltext import read_text
 
 EXIT_USAGE, EXIT_ALREADY_RUNNING, EXIT_NO_GPU, EXIT_NO_DISK, EXIT_DEFECT = 2, 3, 4, 5, 70
 CONFIG_NAME = "arbiter.yaml"
@@ -65,7 +66,9 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--endpoint", metavar="URL", help="where to listen, ipc:///absolute/path")
     made.add_argument("--state-dir", metavar="DIR", help="folder of journal and history")
-    made.add_argument("--group", metavar="GROUP", help="Unix group that may connect and hold leases")
+    made.add_argument(
+        "--group", metavar="GROUP", help="Unix group that may connect and hold leases"
+    )
     made.add_argument(
         "--operators-group",
         metavar="GROUP",
@@ -74,8 +77,12 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--log-format", choices=("human", "json"), help="human (default) or one JSON object a line"
     )
-    made.add_argument("--log-level", choices=("debug", "info", "warning", "error"), help="info (default)")
-    made.add_argument("--check-config", action="store_true", help="check flags and configuration, then exit")
+    made.add_argument(
+        "--log-level", choices=("debug", "info", "warning", "error"), help="info (default)"
+    )
+    made.add_argument(
+        "--check-config", action="store_true", help="check flags and configuration, then exit"
+    )
     add_version(made)
     return made
 
@@ -109,7 +116,9 @@ def effective_config(flags: argparse.Namespace) -> ArbiterConfig:
         try:
             ArbiterConfig.model_validate(values)
         except ValueError as error:
-            raise ConfigError(f"{flag}: {_first_problem(error)}", hint="see vram-arbiter --help") from error
+            raise ConfigError(
+                f"{flag}: {_first_problem(error)}", hint="see vram-arbiter --help"
+            ) from error
     return ArbiterConfig.model_validate(values)
 
 
@@ -143,10 +152,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         flags.config = flags.config or config_of_service(os.environ)
         config = effective_config(flags)
-        from arbiter.daemon import Daemon, find_places  # late: --help and --version need none of it
-        from arbiter.host.loop import new_loop
-        from arbiter.host.memory import give_back_freed_memory
-        from arbiter.telemetry import set_up_logging
+        from vram_arbiter.arbiter.daemon import (  # late: --help and --version need none of it
+            Daemon,
+            find_places,
+        )
+        from vram_arbiter.arbiter.host.loop import new_loop
+        from vram_arbiter.arbiter.host.memory import give_back_freed_memory
+        from vram_arbiter.arbiter.log import set_up_logging
 
         places = find_places(config, os.environ, os.getuid())
         if flags.check_config:

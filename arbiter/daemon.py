@@ -20,41 +20,41 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from arbiter import telemetry
-from arbiter.core.arbiter import Arbiter
-from arbiter.core.events import ProcessDied, Recovered, Tick
-from arbiter.core.settings import GpuInfo, Settings
-from arbiter.host.executor import Executor
-from arbiter.host.gpu.fake import open_cards
-from arbiter.host.gpu.pids import PidMap
-from arbiter.host.gpu.probe import Card, GpuProbe
-from arbiter.host.gpu.unified import choose
-from arbiter.host.history import CLEAN_END, History
-from arbiter.host.journal import Journal, Opened, may_pass, unavailable
-from arbiter.host.memory import park_budget_bytes
-from arbiter.host.probing import Prober, within
-from arbiter.host.recorder import Recorder, freezer
-from arbiter.host.records import check_record
-from arbiter.host.suspend import SuspendWatch
-from arbiter.host.systemd import Notifier
-from arbiter.host.tree import Known
-from arbiter.host.watch import ProcessWatch
-from arbiter.inbox import Inbox
-from arbiter.rpc.peer import group_id
-from arbiter.rpc.session import SessionSettings, SessionTable
-from schemas import otel
-from schemas.commands import TRACEPARENT_VARIABLE
-from schemas.config import ArbiterConfig, GpuConfig
-from schemas.endpoints import arbiter_endpoint, runtime_dir, socket_path
-from schemas.errors import ConfigError
-from schemas.ids import ProcessKey
-from schemas.runtime.folders import LockFile, private_folder, socket_folder
-from schemas.runtime.peercred import start_ticks
-from schemas.runtime.router import Limits, Router
-from schemas.units import format_bytes
+from vram_arbiter.arbiter import log as telemetry
+from vram_arbiter.arbiter.core.arbiter import Arbiter
+from vram_arbiter.arbiter.core.events import ProcessDied, Recovered, Tick
+from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
+from vram_arbiter.arbiter.eventlog.writer import Recorder, freezer
+from vram_arbiter.arbiter.host.executor import Executor
+from vram_arbiter.arbiter.host.gpu.fake import open_cards
+from vram_arbiter.arbiter.host.gpu.pids import PidMap
+from vram_arbiter.arbiter.host.gpu.probe import Card, GpuProbe
+from vram_arbiter.arbiter.host.gpu.unified import choose
+from vram_arbiter.arbiter.host.history import CLEAN_END, History
+from vram_arbiter.arbiter.host.journal import Journal, Opened, may_pass, unavailable
+from vram_arbiter.arbiter.host.memory import park_budget_bytes
+from vram_arbiter.arbiter.host.prober import Prober, within
+from vram_arbiter.arbiter.host.process_tree import Known
+from vram_arbiter.arbiter.host.process_watch import ProcessWatch
+from vram_arbiter.arbiter.host.records import check_record
+from vram_arbiter.arbiter.host.suspend import SuspendWatch
+from vram_arbiter.arbiter.host.systemd import Notifier
+from vram_arbiter.arbiter.inbox import Inbox
+from vram_arbiter.arbiter.rpc.peer import group_id
+from vram_arbiter.arbiter.rpc.session import SessionSettings, SessionTable
+from vram_arbiter.schemas.config.arbiter import ArbiterConfig, GpuConfig
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint, runtime_dir, socket_path
+from vram_arbiter.schemas.runtime.folders import LockFile, private_folder, socket_folder
+from vram_arbiter.schemas.runtime.peercred import start_ticks
+from vram_arbiter.schemas.runtime.router import Limits, Router
+from vram_arbiter.schemas.runtime.telemetry import setup as otel
+from vram_arbiter.schemas.runtime.telemetry.commands import TRACEPARENT_VARIABLE
+from vram_arbiter.schemas.units import format_bytes
 
 if TYPE_CHECKING:
-    from arbiter.host.traced import Traced
+    from vram_arbiter.arbiter.host.telemetry.traced import Traced
 
 log = logging.getLogger(__name__)
 
@@ -99,7 +99,9 @@ def find_places(config: ArbiterConfig, environ: Mapping[str, str], uid: int) -> 
     elif config.gpu.source.startswith("fake:"):
         state = runtime / "state"  # a simulated card is as short-lived as the runtime folder
     else:
-        home = environ.get("XDG_STATE_HOME") or str(Path(environ.get("HOME", "/")) / ".local" / "state")
+        home = environ.get("XDG_STATE_HOME") or str(
+            Path(environ.get("HOME", "/")) / ".local" / "state"
+        )
         state = Path(home) / "vram-arbiter"
     return Places(endpoint, socket, runtime.absolute(), state.absolute())
 
@@ -143,7 +145,8 @@ def budget(cards: Sequence[Card], config: ArbiterConfig, source: str = "") -> tu
     if caps:
         known = ", ".join(f"{card.index} ({card.id})" for card in cards)
         raise ConfigError(
-            f"gpu.capacity_bytes names no card of this machine: {', '.join(caps)}", hint=f"cards: {known}"
+            f"gpu.capacity_bytes names no card of this machine: {', '.join(caps)}",
+            hint=f"cards: {known}",
         )
     return tuple(found)
 
@@ -167,7 +170,9 @@ def core_settings(config: ArbiterConfig, gpus: tuple[GpuInfo, ...], opened: Open
         verify_poll_until_s=config.verify.poll_until_s,
         verify_confirm_s=config.verify.confirm_s,
         verify_slow_poll_s=config.verify.slow_poll_s,
-        verify_tolerance_bytes=max(config.verify.tolerance_bytes, *(gpu.noise_bytes for gpu in gpus)),
+        verify_tolerance_bytes=max(
+            config.verify.tolerance_bytes, *(gpu.noise_bytes for gpu in gpus)
+        ),
         sample_max_age_s=config.probe.sample_max_age_s,
         probe_period_s=config.probe.period_s,
         load_probe_s=config.probe.load_s,
@@ -309,7 +314,11 @@ class Daemon:
         if traced is not None:
             traced.watch(
                 loop,
-                lambda: None if inbox.closed else {**inbox.figures(), "journal_healthy": not journal.problem},
+                lambda: (
+                    None
+                    if inbox.closed
+                    else {**inbox.figures(), "journal_healthy": not journal.problem}
+                ),
             )
         router = Router(places.socket, sessions, self._router_limits(), group)  # 6
         undo.push_async_callback(router.aclose)
@@ -319,17 +328,23 @@ class Daemon:
         undo.callback(router.stop_receiving)
         return Parts(gpus, inbox, sessions, history, journal, executor)
 
-    def _take_folders(self, places: Places, group: int | None, undo: contextlib.AsyncExitStack) -> LockFile:
+    def _take_folders(
+        self, places: Places, group: int | None, undo: contextlib.AsyncExitStack
+    ) -> LockFile:
         """Returns the socket's lock."""
         if self._config.gpu.source.startswith("fake:") or places.state.parent == places.runtime:
             private_folder(places.runtime, group)
         socket_folder(places.socket.parent, self._environ, group)
-        socket_lock = LockFile(places.socket.with_name(places.socket.name + ".lock"), str(places.socket))
+        socket_lock = LockFile(
+            places.socket.with_name(places.socket.name + ".lock"), str(places.socket)
+        )
         socket_lock.acquire()
         undo.callback(socket_lock.release)
         try:
             if self._config.state.dir is None:
-                places.state.parent.mkdir(mode=0o700, parents=True, exist_ok=True)  # such as ~/.local/state
+                places.state.parent.mkdir(
+                    mode=0o700, parents=True, exist_ok=True
+                )  # such as ~/.local/state
             private_folder(places.state)
             lock = LockFile(places.state / "lock", str(places.state))
             lock.acquire()
@@ -357,8 +372,10 @@ class Daemon:
             return None
         undo.callback(installed)
         if installed.prometheus_port is not None:
-            log.info("telemetry: Prometheus endpoint on loopback, port %d", installed.prometheus_port)
-        from arbiter.host.traced import Traced
+            log.info(
+                "telemetry: Prometheus endpoint on loopback, port %d", installed.prometheus_port
+            )
+        from vram_arbiter.arbiter.host.telemetry.traced import Traced
 
         version = self._server_name.partition(" ")[2]
         traced = Traced(self._environ.get(TRACEPARENT_VARIABLE), version)
@@ -450,7 +467,12 @@ class Daemon:
             "endpoint": places.endpoint,
             "state_dir": str(places.state),
             "gpus": [
-                {"gpu": g.id, "name": g.name, "capacity_bytes": g.capacity_bytes, "source": g.source}
+                {
+                    "gpu": g.id,
+                    "name": g.name,
+                    "capacity_bytes": g.capacity_bytes,
+                    "source": g.source,
+                }
                 for g in gpus
             ],
             "records": len(found.records),
@@ -492,7 +514,9 @@ def keep_learnt(parts: Parts) -> None:
 
 
 def status_text(gpus: Sequence[GpuInfo]) -> str:
-    return f"serving {', '.join(f'{gpu.name} ({format_bytes(gpu.capacity_bytes)})' for gpu in gpus)}"
+    return (
+        f"serving {', '.join(f'{gpu.name} ({format_bytes(gpu.capacity_bytes)})' for gpu in gpus)}"
+    )
 
 
 def problems(journal: Journal, history: History) -> list[str]:

@@ -14,10 +14,10 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from arbiter.core.effects import Effect
-from arbiter.core.events import Event, Resumed, Tick
-from schemas.defaults import STATUS_PAGE
-from schemas.ids import ClientId, GpuId, ProcessKey
+from vram_arbiter.arbiter.core.effects import Effect
+from vram_arbiter.arbiter.core.events import Event, Resumed, Tick
+from vram_arbiter.schemas.defaults import STATUS_PAGE
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
 
 log = logging.getLogger(__name__)
 

@@ -1,6 +1,6 @@
-"""`python -m clients` is `vramctl`."""
+"""`python -m vram_arbiter.clients` is `vramctl`."""
 
-from vramctl import main
+from vram_arbiter.clients.cli.main import main
 
 if __name__ == "__main__":
     main()

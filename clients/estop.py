@@ -9,9 +9,9 @@ import struct
 import time
 from dataclasses import dataclass
 
-from schemas.errors import BadFrame, InternalError, RobotFault, RunnerUnreachable
-from schemas.estop import REPLY_MAX_BYTES, Answer, Reply, path_of, reply_in, request
-from schemas.runtime.trust import check_server
+from vram_arbiter.schemas.errors import BadFrame, InternalError, RobotFault, RunnerUnreachable
+from vram_arbiter.schemas.estop import REPLY_MAX_BYTES, Answer, Reply, path_of, reply_in, request
+from vram_arbiter.schemas.runtime.trust import check_server
 
 ANSWER_S = 3.0  # the runner itself waits a second for its control loop
 RETRY_S = 0.001
@@ -47,7 +47,9 @@ def stop(endpoint: str, reason: str = "", *, timeout_s: float = ANSWER_S) -> Sto
                 latched = _latched(connection, reason)
             except (OSError, BadFrame) as error:
                 if not isinstance(error, BlockingIOError) and time.monotonic() < deadline:
-                    time.sleep(RETRY_S)  # its place was taken before it had asked: others flood the socket
+                    time.sleep(
+                        RETRY_S
+                    )  # its place was taken before it had asked: others flood the socket
                     continue
                 raise _unreachable(endpoint, _words(error)) from error
             try:
@@ -111,7 +113,9 @@ def _judged(endpoint: str, latched: Reply, outcome: Reply) -> Stopped:
             outcome.text, hint=f"{CUT}; the runner goes on trying", details={"endpoint": endpoint}
         )
     if outcome.answer is not Answer.OBEYED:
-        raise InternalError(outcome.text, hint=f"{CUT}; the loop hangs, and moves nothing if it comes back")
+        raise InternalError(
+            outcome.text, hint=f"{CUT}; the loop hangs, and moves nothing if it comes back"
+        )
     return Stopped(
         robot=outcome.robot,
         message=outcome.text,

@@ -1,7 +1,7 @@
-"""The lease as its holder sees it: what he may do with it, and what he hears of it. asyncio; made by `clients.aio`, never by hand.
+"""The lease as its holder sees it: what he may do with it, and what he hears of it. asyncio; made by `clients.client`, never by hand.
 
 It owns no socket: everything that goes over the wire goes through the `Driver`. How it leaves the card, whoever wants it to, is
-`clients.leaving`.
+`clients.eviction`.
 """
 
 import inspect
@@ -11,16 +11,12 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from clients import inside, traces
-from clients.leaving import Driver, Leaving, Unload
-from clients.records import Eviction, LeaseRecord, TokenPair
-from schemas.errors import (
-    BadState,
-    LeaseLost,
-    LeaseRevoking,
-    VramError,
-)
-from schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.clients import use_context as inside
+from vram_arbiter.clients._protocol import traces
+from vram_arbiter.clients._protocol.records import Eviction, LeaseRecord, TokenPair
+from vram_arbiter.clients.eviction import Driver, Leaving, Unload
+from vram_arbiter.schemas.errors import BadState, LeaseLost, LeaseRevoking, VramError
+from vram_arbiter.schemas.wire import Footprint, LeaseSpec
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +46,9 @@ class Callbacks:
 class Lease:
     """A granted lease. Free it by `give_up` (runs `unload`) or by `release` (you freed the bytes yourself)."""
 
-    def __init__(self, driver: Driver, record: LeaseRecord, spec: LeaseSpec, callbacks: Callbacks) -> None:
+    def __init__(
+        self, driver: Driver, record: LeaseRecord, spec: LeaseSpec, callbacks: Callbacks
+    ) -> None:
         self.spec = spec
         self.error: VramError | None = None
         self._driver = driver
@@ -181,7 +179,9 @@ class Lease:
         Where the arbiter has no host RAM to give, the lease ends as by `give_up` (see `state`).
         """
         if self._callbacks.park is None or not self.spec.park_bytes:
-            raise BadState(f"{self.lease_id} cannot park", hint="give a `park` callback and park_bytes")
+            raise BadState(
+                f"{self.lease_id} cannot park", hint="give a `park` callback and park_bytes"
+            )
         self._raise_if_gone()
         await self._leaving.park()
 
@@ -241,7 +241,9 @@ class Lease:
             self._driver.protocol.holdings.revoke_ack(
                 self._record, eta() if eta else None, self._driver.now()
             )
-            with traces.joined(push.get("traceparent")):  # leaving is part of whose room it is to be
+            with traces.joined(
+                push.get("traceparent")
+            ):  # leaving is part of whose room it is to be
                 if not self._leaving.asked and self._callbacks.on_revoke is not None:
                     self._driver.spawn(
                         self._call(self._callbacks.on_revoke, push), f"on_revoke {self.lease_id}"
@@ -253,8 +255,12 @@ class Lease:
         """Granted again under a new token. The model is to be loaded now."""
         self._leaving.returned()
         if self._callbacks.on_return is not None:
-            with traces.joined(self._record.wanted_by):  # coming back by itself it begins a trace of its own
-                self._driver.spawn(self._call(self._callbacks.on_return), f"on_return {self.lease_id}")
+            with traces.joined(
+                self._record.wanted_by
+            ):  # coming back by itself it begins a trace of its own
+                self._driver.spawn(
+                    self._call(self._callbacks.on_return), f"on_return {self.lease_id}"
+                )
             self._record.wanted_by = None
         self._leaving.progress.changed()
 
@@ -295,7 +301,9 @@ class Lease:
             await self._call(self._callbacks.on_lost, error)
         self._leaving.end()
 
-    async def _call(self, callback: Callable[..., Awaitable[None] | None], *arguments: object) -> None:
+    async def _call(
+        self, callback: Callable[..., Awaitable[None] | None], *arguments: object
+    ) -> None:
         try:
             result = callback(self, *arguments)
             if inspect.isawaitable(result):
@@ -320,7 +328,9 @@ class Use:
         driver = lease._driver
         try:
             await driver.reply(
-                driver.protocol.holdings.use_begin(lease._record, self.use_id, self._label, driver.now())
+                driver.protocol.holdings.use_begin(
+                    lease._record, self.use_id, self._label, driver.now()
+                )
             )
         except BaseException:
             lease._leaving.uses.discard(self.use_id)
@@ -335,7 +345,9 @@ class Use:
         """
         lease = self._lease
         driver = lease._driver
-        await driver.reply(driver.protocol.holdings.use_yield(lease._record, self.use_id, driver.now()))
+        await driver.reply(
+            driver.protocol.holdings.use_yield(lease._record, self.use_id, driver.now())
+        )
         inside.leave(self.use_id)
         lease._leaving.uses.discard(self.use_id)
         lease._leaving.progress.changed()
@@ -363,5 +375,7 @@ class ForeignUse:
             return
         self._ended = True
         inside.leave(self.use_id)
-        self._driver.protocol.foreign_uses.end(self.lease_id, self.token, self.use_id, self._driver.now())
+        self._driver.protocol.foreign_uses.end(
+            self.lease_id, self.token, self.use_id, self._driver.now()
+        )
         self._driver.pump()

@@ -8,7 +8,7 @@ import logging
 import sys
 from typing import Any, Literal
 
-from schemas.runtime.logtext import PrintableFormatter
+from vram_arbiter.schemas.runtime.logtext import PrintableFormatter
 
 Form = Literal["human", "json"]
 FORMS: tuple[Form, ...] = ("human", "json")
@@ -47,6 +47,6 @@ class _Json(logging.Formatter):
 def _ids() -> dict[str, str]:
     if "opentelemetry.trace" not in sys.modules:
         return {}
-    from schemas import tracing
+    from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
     return tracing.log_ids()

@@ -8,13 +8,19 @@ from collections.abc import AsyncIterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal, Self, cast
 
-from clients import traces
-from clients.estop import Stopped, stop
-from clients.patience import answered
-from clients.transport import Transport
-from schemas.endpoints import program_endpoint
-from schemas.errors import BadState, GoalRejected, RunnerUnreachable, VramError, from_wire
-from schemas.goals import FeedbackPush, FrameReply, ResultPush
+from vram_arbiter.clients._protocol import traces
+from vram_arbiter.clients.estop import Stopped, stop
+from vram_arbiter.clients.net.dealer import Transport
+from vram_arbiter.clients.net.timeouts import answered
+from vram_arbiter.schemas.errors import (
+    BadState,
+    GoalRejected,
+    RunnerUnreachable,
+    VramError,
+    from_wire,
+)
+from vram_arbiter.schemas.goals import FeedbackPush, FrameReply, ResultPush
+from vram_arbiter.schemas.runtime.endpoints import program_endpoint
 
 Message = dict[str, Any]
 
@@ -118,7 +124,9 @@ class RunnerClient:
         name = goal_id or f"goal-{uuid.uuid4().hex[:12]}"
         if name in self._goals:
             raise GoalRejected(f"goal {name} runs already", hint="choose another goal_id")
-        goal = self._goals[name] = Goal(self, name)  # before the answer: pushes may come right behind it
+        goal = self._goals[name] = Goal(
+            self, name
+        )  # before the answer: pushes may come right behind it
         fields: Message = {
             "goal_id": name,
             "rskill_id": rskill_id,
@@ -149,7 +157,11 @@ class RunnerClient:
 
     # -- reads -------------------------------------------------------------------------------------------------------
     async def frame(
-        self, camera: str = "", max_age_ms: float = 500.0, *, encoding: Literal["jpeg", "png"] = "jpeg"
+        self,
+        camera: str = "",
+        max_age_ms: float = 500.0,
+        *,
+        encoding: Literal["jpeg", "png"] = "jpeg",
     ) -> FrameReply:
         """Latest frame ("" takes the first camera). Raises FrameStale when none is young enough."""
         fields = {"camera": camera, "max_age_ms": max_age_ms, "encoding": encoding}
@@ -189,7 +201,9 @@ class RunnerClient:
         """Any op of `schemas.goals`. Raises its typed error, RunnerUnreachable, or UntrustedServer before anything is said."""
         if not self._proven:
             await self._exchange("ping", {}, self._connect_timeout_s)
-        return await self._exchange(op, fields or {}, self._timeout_s if timeout_s is None else timeout_s)
+        return await self._exchange(
+            op, fields or {}, self._timeout_s if timeout_s is None else timeout_s
+        )
 
     # -- steps -------------------------------------------------------------------------------------------------------
     async def _exchange(self, op: str, fields: Mapping[str, Any], timeout_s: float) -> Message:
@@ -242,7 +256,9 @@ class RunnerClient:
             goal.ended(result)
 
     def _lost(self, reason: str) -> RunnerUnreachable:
-        return RunnerUnreachable(f"contact to {self.endpoint} lost: {reason}", hint="is the runner alive?")
+        return RunnerUnreachable(
+            f"contact to {self.endpoint} lost: {reason}", hint="is the runner alive?"
+        )
 
     def _drop(self, error: VramError) -> None:
         if self._transport is not None:

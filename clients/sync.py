@@ -1,4 +1,4 @@
-"""The arbiter's client for programs with threads: the same surface as `clients.aio`, blocking, with `with`.
+"""The arbiter's client for programs with threads: the same surface as `clients.client`, blocking, with `with`.
 
     with SyncArbiterClient(name="detector") as client:
         with client.lease(spec, unload=model.unload) as lease:
@@ -19,12 +19,12 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Self, TypeVar
 
-from clients import inside
-from clients.aio import CONNECT_TIMEOUT_S, ArbiterClient
-from clients.lease import ForeignUse, Lease, LeaseState, SafePointEta, Use
-from clients.records import Eviction
-from schemas.errors import BadState, VramError
-from schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.clients import use_context as inside
+from vram_arbiter.clients._protocol.records import Eviction
+from vram_arbiter.clients.client import CONNECT_TIMEOUT_S, ArbiterClient
+from vram_arbiter.clients.lease import ForeignUse, Lease, LeaseState, SafePointEta, Use
+from vram_arbiter.schemas.errors import BadState, VramError
+from vram_arbiter.schemas.wire import Footprint, LeaseSpec
 
 T = TypeVar("T")
 Message = dict[str, Any]
@@ -143,7 +143,7 @@ class SyncUse:
 
 
 class SyncArbiterClient:
-    """`with`, or `connect` and `close`. Raises as `clients.aio.ArbiterClient`."""
+    """`with`, or `connect` and `close`. Raises as `clients.client.ArbiterClient`."""
 
     def __init__(
         self,
@@ -153,7 +153,9 @@ class SyncArbiterClient:
         role: str = "client",
         connect_timeout_s: float = CONNECT_TIMEOUT_S,
     ) -> None:
-        self._client = ArbiterClient(endpoint, name=name, role=role, connect_timeout_s=connect_timeout_s)
+        self._client = ArbiterClient(
+            endpoint, name=name, role=role, connect_timeout_s=connect_timeout_s
+        )
         self._pid = os.getpid()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
@@ -182,7 +184,9 @@ class SyncArbiterClient:
         if self._loop is not None:
             return
         loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=_serve, args=(loop,), name="vram-arbiter-client", daemon=True)
+        self._thread = threading.Thread(
+            target=_serve, args=(loop,), name="vram-arbiter-client", daemon=True
+        )
         self._thread.start()
         self._loop = loop
         try:
@@ -205,7 +209,9 @@ class SyncArbiterClient:
         if self._loop is None or os.getpid() != self._pid:
             work.close()
             what = "closed" if self._loop is None else "made before a fork"
-            raise BadState(f"this client was {what}", hint="make one in this process, use it inside `with`")
+            raise BadState(
+                f"this client was {what}", hint="make one in this process, use it inside `with`"
+            )
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result()

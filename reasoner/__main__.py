@@ -12,28 +12,25 @@ import signal
 import sys
 from pathlib import Path
 
-from clients import logs
-from clients.outputs import check_output
-from clients.runner import RunnerClient
-from clients.sidecar.perception import DetectorClient, RewardClient, SceneVlmClient
-from reasoner.inbox import Inbox
-from reasoner.llm.anthropic import AnthropicPlanner
-from reasoner.llm.base import LlmConfig, LlmPlanner
-from reasoner.llm.openai import OpenAiPlanner
-from reasoner.llm.scripted import ScriptedPlanner
-from reasoner.loop import STEPS_MAX, Result, run_episode
-from reasoner.palette import OPERATOR, Palette, palette_of
-from reasoner.past import RATE_HZ, Past
-from reasoner.planner import Planner
-from reasoner.playbooks import Playbook, load_playbook
-from reasoner.server import OperatorServer, send
-from reasoner.tools import FRAME_MAX_AGE_MS, Judge, Tools
-from reasoner.watch import watch
-from schemas import terminal
-from schemas.body import read_body
-from schemas.commands import command
-from schemas.endpoints import program_endpoint
-from schemas.errors import (
+from vram_arbiter.clients import logs
+from vram_arbiter.clients.output_paths import check_output
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.sidecar.perception import DetectorClient, RewardClient, SceneVlmClient
+from vram_arbiter.reasoner.history import RATE_HZ, Past
+from vram_arbiter.reasoner.inbox import Inbox
+from vram_arbiter.reasoner.llm.anthropic import AnthropicPlanner
+from vram_arbiter.reasoner.llm.base import LlmConfig, LlmPlanner
+from vram_arbiter.reasoner.llm.openai import OpenAiPlanner
+from vram_arbiter.reasoner.llm.scripted import ScriptedPlanner
+from vram_arbiter.reasoner.loop import STEPS_MAX, Result, run_episode
+from vram_arbiter.reasoner.palette import OPERATOR, Palette, palette_of
+from vram_arbiter.reasoner.planner import Planner
+from vram_arbiter.reasoner.playbooks import Playbook, load_playbook
+from vram_arbiter.reasoner.server import OperatorServer, send
+from vram_arbiter.reasoner.tools import FRAME_MAX_AGE_MS, Judge, Tools
+from vram_arbiter.reasoner.watch import watch
+from vram_arbiter.schemas.body import read_body
+from vram_arbiter.schemas.errors import (
     BadRequest,
     ConfigError,
     ReasonerUnreachable,
@@ -41,8 +38,11 @@ from schemas.errors import (
     SidecarUnavailable,
     VramError,
 )
-from schemas.manifest import RSkillManifest
-from schemas.version import add_version
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.runtime import terminal
+from vram_arbiter.schemas.runtime.endpoints import program_endpoint
+from vram_arbiter.schemas.runtime.telemetry.commands import command
+from vram_arbiter.schemas.runtime.version import add_version
 
 LLM_PLANNERS: dict[str, type[LlmPlanner]] = {"openai": OpenAiPlanner, "anthropic": AnthropicPlanner}
 MANAGED = ("detector", "scene-vlm", "reward")
@@ -54,7 +54,9 @@ EXIT_FAILED, EXIT_USAGE, EXIT_UNREACHABLE = 1, 2, 3
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="vram-reasoner", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="vram-reasoner",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_version(parser)
     what = parser.add_mutually_exclusive_group(required=True)
@@ -63,7 +65,9 @@ def _parser() -> argparse.ArgumentParser:
         "--say", metavar="TEXT", help="tell the planner of a running reasoner something, and end"
     )
     what.add_argument(
-        "--cancel", metavar="REASON", help="end the episode of a running reasoner and its goal, and end"
+        "--cancel",
+        metavar="REASON",
+        help="end the episode of a running reasoner and its goal, and end",
     )
     parser.add_argument(
         "--planner",
@@ -72,7 +76,10 @@ def _parser() -> argparse.ArgumentParser:
         help="openai, anthropic: VRAM_REASONER_LLM_{BASE_URL,MODEL,API_KEY,TIMEOUT_S,MAX_TOKENS} say where",
     )
     parser.add_argument(
-        "--playbook", type=Path, metavar="RSKILL.YAML", help="the procedure that a language model follows"
+        "--playbook",
+        type=Path,
+        metavar="RSKILL.YAML",
+        help="the procedure that a language model follows",
     )
     parser.add_argument(
         "--manage",
@@ -89,10 +96,18 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--listen", help="where to hear --say and --cancel (default: ipc://RUNTIME/reasoner.sock)"
     )
-    parser.add_argument("--runner", help="endpoint of the runner (default: ipc://RUNTIME/runner.sock)")
-    parser.add_argument("--detector", help='endpoint of the detector sidecar; "none": there is none')
-    parser.add_argument("--scene-vlm", help='endpoint of the scene-VLM sidecar; "none": there is none')
-    parser.add_argument("--log-format", choices=logs.FORMS, default="human", help="json: one object a line")
+    parser.add_argument(
+        "--runner", help="endpoint of the runner (default: ipc://RUNTIME/runner.sock)"
+    )
+    parser.add_argument(
+        "--detector", help='endpoint of the detector sidecar; "none": there is none'
+    )
+    parser.add_argument(
+        "--scene-vlm", help='endpoint of the scene-VLM sidecar; "none": there is none'
+    )
+    parser.add_argument(
+        "--log-format", choices=logs.FORMS, default="human", help="json: one object a line"
+    )
     parser.add_argument(
         "--reward",
         nargs="?",
@@ -111,7 +126,9 @@ def _parser() -> argparse.ArgumentParser:
 def main() -> int:
     arguments = _parser().parse_args()
     logs.set_up("vram-reasoner", "info", arguments.log_format, "%(asctime)s %(name)s %(message)s")
-    what = "task" if arguments.task is not None else "say" if arguments.say is not None else "cancel"
+    what = (
+        "task" if arguments.task is not None else "say" if arguments.say is not None else "cancel"
+    )
     try:
         with command("vram-reasoner", what):
             _main(arguments)
@@ -143,7 +160,9 @@ def _main(arguments: argparse.Namespace) -> None:
 def _check_task(task: str) -> None:
     """Raises BadRequest for one that no planner could work with."""
     if len(task) > TASK_MAX_CHARS:
-        raise BadRequest(f"the task has more than {TASK_MAX_CHARS} characters", hint="say it shorter")
+        raise BadRequest(
+            f"the task has more than {TASK_MAX_CHARS} characters", hint="say it shorter"
+        )
     try:
         task.encode()
     except UnicodeEncodeError:
@@ -157,7 +176,11 @@ def _complain(error: VramError, code: int) -> int:
 
 async def _speak(arguments: argparse.Namespace) -> None:
     said = arguments.say is not None
-    request = {"op": "say", "text": arguments.say} if said else {"op": "cancel", "reason": arguments.cancel}
+    request = (
+        {"op": "say", "text": arguments.say}
+        if said
+        else {"op": "cancel", "reason": arguments.cancel}
+    )
     await send(_endpoint(arguments.listen, "reasoner"), request)
 
 
@@ -171,13 +194,16 @@ async def _run(arguments: argparse.Namespace) -> Result:
         playbook = load_playbook(arguments.playbook) if arguments.playbook else None
         if playbook is not None and arguments.planner not in LLM_PLANNERS:
             raise ConfigError(
-                "a playbook is read by a language model", hint=f"--planner {' or '.join(LLM_PLANNERS)}"
+                "a playbook is read by a language model",
+                hint=f"--planner {' or '.join(LLM_PLANNERS)}",
             )
         inbox = Inbox()
         await stack.enter_async_context(
             OperatorServer(_endpoint(arguments.listen, "reasoner"), arguments.task, inbox)
         )
-        runner = await stack.enter_async_context(RunnerClient(_endpoint(arguments.runner, "runner")))
+        runner = await stack.enter_async_context(
+            RunnerClient(_endpoint(arguments.runner, "runner"))
+        )
         eyes = await stack.enter_async_context(RunnerClient(_endpoint(arguments.runner, "runner")))
         detector = vlm = None
         if arguments.detector != "none":
@@ -185,10 +211,14 @@ async def _run(arguments: argparse.Namespace) -> Result:
                 DetectorClient(_endpoint(arguments.detector, "detector"))
             )
         if arguments.scene_vlm != "none":
-            vlm = await stack.enter_async_context(SceneVlmClient(_endpoint(arguments.scene_vlm, "scene-vlm")))
+            vlm = await stack.enter_async_context(
+                SceneVlmClient(_endpoint(arguments.scene_vlm, "scene-vlm"))
+            )
         reward = None
         if arguments.reward is not None:
-            reward = await stack.enter_async_context(RewardClient(_endpoint(arguments.reward, "reward")))
+            reward = await stack.enter_async_context(
+                RewardClient(_endpoint(arguments.reward, "reward"))
+            )
         named = {"detector": detector, "scene-vlm": vlm, "reward": reward}
         components = {name: client for name, client in named.items() if client is not None}
         installed = await runner.skills()
@@ -243,11 +273,17 @@ def _checked(arguments: argparse.Namespace) -> LlmConfig | None:
     if not arguments.task.strip():
         raise ConfigError("--task says nothing", hint='e.g. --task "grab the red cube"')
     path: Path | None = arguments.result
-    if path is not None and (path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK)):
-        raise ConfigError(f"--result {path} cannot be written", hint="name a file in a folder of your own")
+    if path is not None and (
+        path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK)
+    ):
+        raise ConfigError(
+            f"--result {path} cannot be written", hint="name a file in a folder of your own"
+        )
     if arguments.planner == "scripted":
         return None
-    return LlmConfig.from_environ(os.environ, base_url=LLM_PLANNERS[arguments.planner].default_base_url)
+    return LlmConfig.from_environ(
+        os.environ, base_url=LLM_PLANNERS[arguments.planner].default_base_url
+    )
 
 
 async def _planner(

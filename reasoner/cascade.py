@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from reasoner.palette import Palette
-from reasoner.planner import Episode, Note, Outcome, Status, Step
-from schemas.tools import (
+from vram_arbiter.reasoner.palette import Palette
+from vram_arbiter.reasoner.planner import Episode, Note, Outcome, Status, Step
+from vram_arbiter.schemas.tools import (
     ExecuteRskill,
     LocateInView,
     QueryScene,
@@ -22,7 +22,9 @@ from schemas.tools import (
     skill_tool_name,
 )
 
-ANSWER_MAX_CHARS = 2000  # of the words; of the data, which are lists of numbers mostly, twice as many
+ANSWER_MAX_CHARS = (
+    2000  # of the words; of the data, which are lists of numbers mostly, twice as many
+)
 ITEMS_MAX = 64
 
 MEANING: dict[Status, str] = {
@@ -95,7 +97,10 @@ def conversation(episode: Episode, palette: Palette) -> list[Turn]:
     number = len(episode.steps)
     turns.append(_called(number, episode.running, palette))
     turns.append(
-        Answered(_id(number), json.dumps({"status": "running", "meaning": "the goal runs; it is not over"}))
+        Answered(
+            _id(number),
+            json.dumps({"status": "running", "meaning": "the goal runs; it is not over"}),
+        )
     )
     return turns + _notes(notes, number)
 
@@ -158,7 +163,9 @@ def _sayable(value: Any) -> Any:
 
 def _called(number: int, call: ToolCall, palette: Palette) -> Called:
     fields = call.model_dump(mode="json", exclude={"tool"}, exclude_defaults=True)
-    if not isinstance(call, ExecuteRskill) or call.rskill_id not in {skill.id for skill in palette.skills}:
+    if not isinstance(call, ExecuteRskill) or call.rskill_id not in {
+        skill.id for skill in palette.skills
+    }:
         return Called(_id(number), call.tool, fields)
     del fields["rskill_id"]
     fields.pop("goal_params_json", None)

@@ -15,12 +15,22 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
-from reasoner.inbox import Cancel, Danger, Inbox, Said
-from reasoner.palette import Palette
-from reasoner.planner import Episode, Finish, Note, Outcome, Planner, Step, benched
-from schemas import meters, telemetry, tracing
-from schemas.errors import EstopRequested, VramError
-from schemas.tools import ExecuteRskill, LocateInView, QueryScene, QueryTaskProgress, StopGoal, ToolCall, Wait
+from vram_arbiter.reasoner.inbox import Cancel, Danger, Inbox, Said
+from vram_arbiter.reasoner.palette import Palette
+from vram_arbiter.reasoner.planner import Episode, Finish, Note, Outcome, Planner, Step, benched
+from vram_arbiter.schemas.errors import EstopRequested, VramError
+from vram_arbiter.schemas.runtime.telemetry import meters
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.schemas.tools import (
+    ExecuteRskill,
+    LocateInView,
+    QueryScene,
+    QueryTaskProgress,
+    StopGoal,
+    ToolCall,
+    Wait,
+)
 
 if TYPE_CHECKING:
     from opentelemetry.trace import Span
@@ -85,7 +95,9 @@ async def run_episode(
 
     A cancelled episode cancels its goal and waits for it, at most `STOP_MAX_S`.
     """
-    loop = _Loop(Episode(task), planner, palette, dispatch, inbox or Inbox(), steps_max, think_max_s)
+    loop = _Loop(
+        Episode(task), planner, palette, dispatch, inbox or Inbox(), steps_max, think_max_s
+    )
     finish = await loop.run()
     log.info("%s: %s", "success" if finish.success else "failure", finish.reason)
     return _result(loop.episode, finish, palette)
@@ -122,7 +134,9 @@ class _Loop:
         message = asyncio.create_task(self._inbox.wait())
         try:
             while self._ask():
-                waited = {task for task in (message, self._thinking, self._acting) if task is not None}
+                waited = {
+                    task for task in (message, self._thinking, self._acting) if task is not None
+                }
                 await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
                 if message.done():
                     self._take_messages()
@@ -170,7 +184,9 @@ class _Loop:
                 return _NoDecision(False, f"the planner failed: {error}")
             except TimeoutError:
                 outcome = "timeout"
-                return _NoDecision(False, f"the planner failed: no decision within {self._think_max_s:g} s")
+                return _NoDecision(
+                    False, f"the planner failed: no decision within {self._think_max_s:g} s"
+                )
             finally:
                 tracing.note({telemetry.ATTR_OUTCOME: outcome})
 
@@ -253,7 +269,9 @@ class _Loop:
         elif isinstance(decision, Finish):
             self._finish = decision
         elif _stuck(self.episode, decision):
-            self._finish = Finish(False, f"the same call {REPEATS_MAX} times in a row: {decision.tool}")
+            self._finish = Finish(
+                False, f"the same call {REPEATS_MAX} times in a row: {decision.tool}"
+            )
         else:
             self._begin(decision)
 
@@ -276,7 +294,9 @@ class _Loop:
             self._remember(call, refusal)
             self._end_tick(refusal.status)
             if _refused_in_a_row(self.episode) >= REFUSALS_MAX:
-                self._finish = Finish(False, f"{REFUSALS_MAX} calls in a row were refused: {refusal.text}")
+                self._finish = Finish(
+                    False, f"{REFUSALS_MAX} calls in a row were refused: {refusal.text}"
+                )
             return
         self._call = call
         with tracing.inside(self._tick) if self._tick is not None else contextlib.nullcontext():
@@ -314,7 +334,9 @@ class _Loop:
         self._call_off()
         await asyncio.wait({self._acting}, timeout=STOP_MAX_S)
         if not self._acting.done():
-            log.error("%s did not end within %.0f s of its cancellation", self._call.tool, STOP_MAX_S)
+            log.error(
+                "%s did not end within %.0f s of its cancellation", self._call.tool, STOP_MAX_S
+            )
         elif self._acting.cancelled():
             self._remember(self._call, Outcome("canceled", "called off", "cancelled"))
         else:
@@ -345,7 +367,8 @@ def _is_look(call: ToolCall) -> bool:
 
 def _looks_in_a_row(episode: Episode) -> int:
     return next(
-        (n for n, step in enumerate(reversed(episode.steps)) if not _is_look(step.call)), len(episode.steps)
+        (n for n, step in enumerate(reversed(episode.steps)) if not _is_look(step.call)),
+        len(episode.steps),
     )
 
 
@@ -378,5 +401,8 @@ def _result(episode: Episode, finish: Finish, palette: Palette) -> Result:
             }
             for step in episode.steps
         ],
-        "notes": [{"source": note.source, "text": note.text, "after": note.after} for note in episode.notes],
+        "notes": [
+            {"source": note.source, "text": note.text, "after": note.after}
+            for note in episode.notes
+        ],
     }

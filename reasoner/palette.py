@@ -11,11 +11,11 @@ from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field
 from typing import Any
 
-from reasoner.params import misfits
-from schemas.body import NOBODY, Body
-from schemas.errors import BadRequest, CallerError, NotPermitted, UnknownSkill
-from schemas.manifest import Role, RSkillManifest
-from schemas.tools import (
+from vram_arbiter.reasoner.params import misfits
+from vram_arbiter.schemas.body import NOBODY, Body
+from vram_arbiter.schemas.errors import BadRequest, CallerError, NotPermitted, UnknownSkill
+from vram_arbiter.schemas.manifest import Role, RSkillManifest
+from vram_arbiter.schemas.tools import (
     EmitPrompt,
     ExecuteRskill,
     LifecycleTransition,
@@ -114,7 +114,9 @@ class Palette:
             if action in skill.actions:
                 return skill
         barred = [
-            f"{skill.id}: {skill.barred}" for skill in self.skills if action in skill.actions and skill.barred
+            f"{skill.id}: {skill.barred}"
+            for skill in self.skills
+            if action in skill.actions and skill.barred
         ]
         raise UnknownSkill(
             f"no installed skill can {action}",
@@ -123,22 +125,30 @@ class Palette:
 
     def without(self, benched: Set[str]) -> "Palette":
         """The same palette with these skills not to be had."""
-        return self if benched == self.benched else dataclasses.replace(self, benched=frozenset(benched))
+        return (
+            self
+            if benched == self.benched
+            else dataclasses.replace(self, benched=frozenset(benched))
+        )
 
     # -- is a call allowed? ----------------------------------------------------------------------------------------
     def check(self, call: ToolCall, *, goal_runs: bool = False) -> CallerError | None:
         """Why a call is not allowed, or None."""
         if isinstance(call, Wait | StopGoal):
             return (
-                None if goal_runs else NotPermitted("no goal runs", hint=f"choose from {_list(self.tools)}")
+                None
+                if goal_runs
+                else NotPermitted("no goal runs", hint=f"choose from {_list(self.tools)}")
             )
         if goal_runs:
             return NotPermitted(
-                f"a goal runs: {call.tool} has to wait", hint=f"choose from {_list(WHILE_A_GOAL_RUNS)}"
+                f"a goal runs: {call.tool} has to wait",
+                hint=f"choose from {_list(WHILE_A_GOAL_RUNS)}",
             )
         if self.only is not None and call.tool not in self.only:
             return NotPermitted(
-                f"{call.tool} is not a tool of this playbook", hint=f"choose from {_list(self.tools)}"
+                f"{call.tool} is not a tool of this playbook",
+                hint=f"choose from {_list(self.tools)}",
             )
         match call:
             case ExecuteRskill():
@@ -159,7 +169,8 @@ class Palette:
                 )
             case EmitPrompt() if call.target_topic not in self.topics:
                 return NotPermitted(
-                    f"nobody may be prompted at {call.target_topic}", hint=f"choose from {_list(self.topics)}"
+                    f"nobody may be prompted at {call.target_topic}",
+                    hint=f"choose from {_list(self.topics)}",
                 )
             case _:
                 return None
@@ -168,7 +179,9 @@ class Palette:
         skill = self.executable.get(call.rskill_id)
         choose = f"choose from {_names(self.executable)}"
         if skill is not None:
-            wrong = misfits(call.goal_params, skill.goal_params_schema) if call.goal_params_json else []
+            wrong = (
+                misfits(call.goal_params, skill.goal_params_schema) if call.goal_params_json else []
+            )
             return (
                 BadRequest(f"{skill.id}: {'; '.join(wrong[:8])}", hint="see its parameters")
                 if wrong
@@ -243,17 +256,19 @@ def palette_of(
 ) -> Palette:
     """Palette of installed manifests. Templates, models that do not fit the robot's `body` and, unless allowed, those whose licence forbids
     commercial use are listed but barred. A robot that does not say what it is gets what is made for any."""
-    skills = tuple(  # by name: the same skills read from folders in another order are the same prompt
-        Skill(
-            manifest.name,
-            str(manifest.kind),
-            manifest.description.strip(),
-            tuple(str(action) for action in manifest.actions),
-            manifest.goal_params_schema,
-            _barred(manifest, allow_noncommercial) or body.misfit(manifest),
-            manifest.latency_budget.max_execution_s or 0.0,
+    skills = (
+        tuple(  # by name: the same skills read from folders in another order are the same prompt
+            Skill(
+                manifest.name,
+                str(manifest.kind),
+                manifest.description.strip(),
+                tuple(str(action) for action in manifest.actions),
+                manifest.goal_params_schema,
+                _barred(manifest, allow_noncommercial) or body.misfit(manifest),
+                manifest.latency_budget.max_execution_s or 0.0,
+            )
+            for manifest in sorted(manifests, key=lambda manifest: manifest.name)
         )
-        for manifest in sorted(manifests, key=lambda manifest: manifest.name)
     )
     return Palette(
         skills,
@@ -272,9 +287,7 @@ def _barred(manifest: RSkillManifest, allow_noncommercial: bool) -> str:
         return f"its role is {manifest.role}, and only {Role.S1} acts"
     weightless = manifest.weights_uri is None  # nothing that a licence of weights could be about
     if not weightless and not allow_noncommercial and not manifest.is_commercial_use_allowed:
-        return (
-            f"its licence ({manifest.license}) does not allow commercial use; --allow-noncommercial lets it"
-        )
+        return f"its licence ({manifest.license}) does not allow commercial use; --allow-noncommercial lets it"
     return ""
 
 

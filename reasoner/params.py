@@ -44,7 +44,9 @@ def _is(value: Any, kind: Any) -> bool:
         return True  # a word that this check does not know refuses nothing
     if isinstance(value, bool):
         return bool in types
-    return isinstance(value, types) or (kind == "integer" and isinstance(value, float) and value.is_integer())
+    return isinstance(value, types) or (
+        kind == "integer" and isinstance(value, float) and value.is_integer()
+    )
 
 
 def _object(value: dict[str, Any], schema: Mapping[str, Any], path: str) -> list[str]:

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-from schemas.errors import SidecarUnavailable
-from schemas.tools import ExecuteRskill, QueryScene, ToolCall
+from vram_arbiter.schemas.errors import SidecarUnavailable
+from vram_arbiter.schemas.tools import ExecuteRskill, QueryScene, ToolCall
 
 UNSTARTABLE_MAX = 3
 
@@ -110,7 +110,10 @@ def benched(steps: Sequence[Step]) -> frozenset[str]:
     """Skills whose sidecar could not be started `UNSTARTABLE_MAX` times in a row: not worth another try in this episode."""
     streaks: dict[str, int] = {}
     for step in steps:
-        if isinstance(step.call, ExecuteRskill) and streaks.get(step.call.rskill_id, 0) < UNSTARTABLE_MAX:
+        if (
+            isinstance(step.call, ExecuteRskill)
+            and streaks.get(step.call.rskill_id, 0) < UNSTARTABLE_MAX
+        ):
             failed = step.outcome.code == SidecarUnavailable.code
             streaks[step.call.rskill_id] = streaks.get(step.call.rskill_id, 0) + 1 if failed else 0
     return frozenset(rskill for rskill, streak in streaks.items() if streak >= UNSTARTABLE_MAX)

@@ -8,10 +8,10 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from reasoner.palette import Palette
-from schemas.errors import ConfigError, ManifestInvalid
-from schemas.manifest import Kind, ManifestError, load_manifest
-from schemas.tools import TOOLS
+from vram_arbiter.reasoner.palette import Palette
+from vram_arbiter.schemas.errors import ConfigError, ManifestInvalid
+from vram_arbiter.schemas.manifest import Kind, ManifestError, load_manifest
+from vram_arbiter.schemas.tools import TOOLS
 
 BODY_MAX_BYTES = 16 * 1024
 
@@ -50,7 +50,7 @@ def load_playbook(file: Path) -> Playbook:
         manifest = load_manifest(file)
     except ManifestError as error:
         raise ManifestInvalid(
-            str(error), hint="`python -m schemas check FILE` shows every finding"
+            str(error), hint="`python -m vram_arbiter.schemas check FILE` shows every finding"
         ) from error
     contract = manifest.playbook
     if manifest.kind is not Kind.PLAYBOOK or contract is None:
@@ -58,7 +58,8 @@ def load_playbook(file: Path) -> Playbook:
     unknown = [name for name in contract.composes_tools if name not in TOOLS]
     if unknown:
         raise ManifestInvalid(
-            f"{file}: composes_tools: there is no tool {unknown[0]}", hint=f"choose from {', '.join(TOOLS)}"
+            f"{file}: composes_tools: there is no tool {unknown[0]}",
+            hint=f"choose from {', '.join(TOOLS)}",
         )
     return Playbook(
         manifest.name,

@@ -11,13 +11,19 @@ from typing import Any, Self
 
 from pydantic import ValidationError
 
-from clients.patience import answered
-from clients.serve import Message, Peer, RouterServer, reason_of
-from clients.transport import Transport
-from reasoner.inbox import Cancel, Inbox, Said
-from schemas.defaults import MESSAGE_MAX_BYTES
-from schemas.errors import BadRequest, ReasonerUnreachable, UnknownOp, VramError, from_wire
-from schemas.reasoner import OPS, REASONER_REQUEST, CancelEpisode, GetEpisode, Say
+from vram_arbiter.clients.net.dealer import Transport
+from vram_arbiter.clients.net.server import Message, Peer, RouterServer, reason_of
+from vram_arbiter.clients.net.timeouts import answered
+from vram_arbiter.reasoner.inbox import Cancel, Inbox, Said
+from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
+from vram_arbiter.schemas.errors import (
+    BadRequest,
+    ReasonerUnreachable,
+    UnknownOp,
+    VramError,
+    from_wire,
+)
+from vram_arbiter.schemas.reasoner import OPS, REASONER_REQUEST, CancelEpisode, GetEpisode, Say
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +106,9 @@ async def send(endpoint: str, request: Mapping[str, Any], *, timeout_s: float = 
 
     def hung_up() -> None:
         if not answer.done():
-            answer.set_exception(ReasonerUnreachable(f"{endpoint} hung up", hint="has the episode ended?"))
+            answer.set_exception(
+                ReasonerUnreachable(f"{endpoint} hung up", hint="has the episode ended?")
+            )
 
     def refused(error: VramError) -> None:
         if not answer.done():

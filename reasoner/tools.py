@@ -14,14 +14,20 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Protocol
 
-from clients.runner import Goal, RunnerClient
-from clients.sidecar.base import SidecarClient
-from clients.sidecar.perception import Detection, DetectorClient, Judgement, RewardClient, SceneVlmClient
-from reasoner.palette import Palette
-from reasoner.past import Past, Taken
-from reasoner.places import SAME_M
-from reasoner.planner import Outcome
-from schemas.errors import (
+from vram_arbiter.clients.runner import Goal, RunnerClient
+from vram_arbiter.clients.sidecar.base import SidecarClient
+from vram_arbiter.clients.sidecar.perception import (
+    Detection,
+    DetectorClient,
+    Judgement,
+    RewardClient,
+    SceneVlmClient,
+)
+from vram_arbiter.reasoner.history import Past, Taken
+from vram_arbiter.reasoner.palette import Palette
+from vram_arbiter.reasoner.planner import Outcome
+from vram_arbiter.reasoner.search_map import SAME_M
+from vram_arbiter.schemas.errors import (
     BadRequest,
     BadState,
     Evicted,
@@ -32,8 +38,8 @@ from schemas.errors import (
     RunnerUnreachable,
     VramError,
 )
-from schemas.goals import FrameReply, ResultPush
-from schemas.tools import (
+from vram_arbiter.schemas.goals import FrameReply, ResultPush
+from vram_arbiter.schemas.tools import (
     EmitPrompt,
     ExecuteRskill,
     LifecycleTransition,
@@ -42,17 +48,17 @@ from schemas.tools import (
     QueryTaskProgress,
     ToolCall,
 )
-from schemas.world import CameraModel
+from vram_arbiter.schemas.world import CameraModel
 
 log = logging.getLogger(__name__)
 
 FRAME_MAX_AGE_MS = 1000.0
-LOOKED_AT_MAX_S = (
-    5.0  # a picture's age when a model begins to look at it; one that waited for the card is not looked at
-)
+LOOKED_AT_MAX_S = 5.0  # a picture's age when a model begins to look at it; one that waited for the card is not looked at
 PLACE_MAX_S = 10.0  # a later answer says where something stood: an arm would reach for that
 LOOKS_MAX = 3  # with a new picture each, for one answer: behind the first wait the model is there
-GOAL_GRACE_S = 60.0  # beyond the goal's own deadline: loading the skill's model is not part of the motion
+GOAL_GRACE_S = (
+    60.0  # beyond the goal's own deadline: loading the skill's model is not part of the motion
+)
 GOAL_MAX_S = 600.0  # when the manifest sets the deadline, and sets none that is longer
 START_S = 90.0  # what the runner adds to a manifest's time of motion, to get there
 HEARD_LATE_S = 0.5  # for feedback that came while this process stood still; without it a goal that goes on would be called off
@@ -133,7 +139,9 @@ class Tools:
         detector = self._detector
         frame, detections = await _look(
             lambda: self._frame(call.camera),
-            lambda frame: detector.detect(frame["data"], call.query, fresh_s=_good_for_s(frame["age_ms"])),
+            lambda frame: detector.detect(
+                frame["data"], call.query, fresh_s=_good_for_s(frame["age_ms"])
+            ),
             answer_max_s=PLACE_MAX_S,
         )
         if (refusal := await self._not_permitted(self._detector)) is not None:
@@ -180,11 +188,15 @@ class Tools:
         vlm = self._scene_vlm
         frame, answer = await _look(
             lambda: self._frame(call.camera),
-            lambda frame: vlm.query(frame["data"], call.question, fresh_s=_good_for_s(frame["age_ms"])),
+            lambda frame: vlm.query(
+                frame["data"], call.question, fresh_s=_good_for_s(frame["age_ms"])
+            ),
         )
         if (refusal := await self._not_permitted(self._scene_vlm)) is not None:
             return refusal
-        return Outcome("answered", answer, data={"camera": frame["camera"], "question": call.question})
+        return Outcome(
+            "answered", answer, data={"camera": frame["camera"], "question": call.question}
+        )
 
     async def _progress(self, call: QueryTaskProgress) -> Outcome:
         """Judged by what the camera showed within the window, up to now: a camera that shows nothing now is no evidence."""
@@ -212,7 +224,9 @@ class Tools:
     async def _execute(self, call: ExecuteRskill) -> Outcome:
         goal = await self._send(call)
         limit_s = waits_s(call, self._palette, self._goal_grace_s)
-        patience = asyncio.create_task(_stands_still(goal, call)) if call.patience_s is not None else None
+        patience = (
+            asyncio.create_task(_stands_still(goal, call)) if call.patience_s is not None else None
+        )
         waiting = asyncio.create_task(goal.result(timeout_s=limit_s))
         try:
             either: set[asyncio.Task[Any]] = {waiting} if patience is None else {waiting, patience}
@@ -268,7 +282,9 @@ class Tools:
         except BadRequest:
             pass  # it never was accepted
         except (VramError, TimeoutError) as error:
-            log.error("goal %s may run: %s", goal_id, str(error) or "the runner did not say that it ended")
+            log.error(
+                "goal %s may run: %s", goal_id, str(error) or "the runner did not say that it ended"
+            )
 
     async def _until_ended(self, goal_id: str) -> None:
         while True:
@@ -286,7 +302,9 @@ class Tools:
         """
         component = self._components.get(call.node)
         if component is None:
-            return Outcome("refused", f"there is no component {call.node} to manage", "not_permitted")
+            return Outcome(
+                "refused", f"there is no component {call.node} to manage", "not_permitted"
+            )
         if call.transition == "configure":
             identity = await component.ping(timeout_s=IDENTITY_S)
             return Outcome("done", f"{call.node} serves {identity['rskill']}, {identity['state']}")
@@ -301,7 +319,9 @@ class Tools:
             if (refusal := await self._not_permitted(component)) is not None:
                 return refusal
             loaded = await component.load()
-            return Outcome("done", f"{call.node} is resident" + ("" if loaded["loaded"] else " as before"))
+            return Outcome(
+                "done", f"{call.node} is resident" + ("" if loaded["loaded"] else " as before")
+            )
         await component.unload()
         return Outcome("done", f"{call.node} leaves at its next safe point")
 
@@ -385,8 +405,12 @@ def _things(frame: FrameReply, detections: Sequence[Detection]) -> list[dict[str
     things: list[dict[str, Any]] = []
     for detection in detections:
         point = point_on_plane(frame, detection.box)
-        if point is not None and all(math.dist(point, thing["point_base_m"]) > SAME_M for thing in things):
-            things.append({"point_base_m": point, "score": detection.score, "box": list(detection.box)})
+        if point is not None and all(
+            math.dist(point, thing["point_base_m"]) > SAME_M for thing in things
+        ):
+            things.append(
+                {"point_base_m": point, "score": detection.score, "box": list(detection.box)}
+            )
     return things[:THINGS_MAX]
 
 
@@ -428,7 +452,9 @@ async def _stands_still(goal: Goal, call: ExecuteRskill) -> bool:
                 continue
             item = coming.result()
             coming = asyncio.ensure_future(anext(feedback))
-            if item["state"] not in BEFORE_MOTION and (best is None or item["progress"] > best + tolerance):
+            if item["state"] not in BEFORE_MOTION and (
+                best is None or item["progress"] > best + tolerance
+            ):
                 best, over, deadline_s = item["progress"], False, time_s() + call.patience_s
     except StopAsyncIteration:
         return False
@@ -460,7 +486,9 @@ async def _called_off(goal: Goal) -> ResultPush | None:
 def _how_it_went(result: ResultPush | None) -> str:
     """What became of a goal that was called off: nobody says `cancelled` of one that may still move the arm."""
     if result is None:
-        return "the goal was called off, but the runner has not said that it ended: it may still run"
+        return (
+            "the goal was called off, but the runner has not said that it ended: it may still run"
+        )
     return (
         "the goal was cancelled"
         if result["status"] == "canceled"
@@ -477,7 +505,9 @@ def _failed(error: VramError) -> Outcome:
     match error:
         case Evicted() | NotResident() | LeaseRevoking():
             return Outcome(
-                "evicted", f"the model is not resident, so nothing was looked at: {error}", error.code
+                "evicted",
+                f"the model is not resident, so nothing was looked at: {error}",
+                error.code,
             )
         case FrameStale():
             return Outcome("no_frame", str(error), error.code)

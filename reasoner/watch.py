@@ -8,9 +8,9 @@ import asyncio
 import logging
 from typing import Any
 
-from clients.runner import RunnerClient
-from reasoner.inbox import Danger, Inbox
-from schemas.errors import VramError
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.reasoner.inbox import Danger, Inbox
+from vram_arbiter.schemas.errors import VramError
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +28,9 @@ async def watch(
     except Exception as error:
         log.exception("the watch over the robot failed")
         inbox.put(
-            Danger(f"nobody looks after the robot any more: {type(error).__name__}: {error}", stop=True)
+            Danger(
+                f"nobody looks after the robot any more: {type(error).__name__}: {error}", stop=True
+            )
         )
 
 
@@ -51,7 +53,9 @@ async def _watch(runner: RunnerClient, inbox: Inbox, period_s: float, answer_s: 
                 return
             stale = _stale(state)
             if new := stale - told:
-                inbox.put(Danger(f"not to be trusted now, too old: {', '.join(sorted(new))}", stop=False))
+                inbox.put(
+                    Danger(f"not to be trusted now, too old: {', '.join(sorted(new))}", stop=False)
+                )
             told = stale
         await asyncio.sleep(period_s)
 

@@ -13,11 +13,11 @@ import sys
 from contextlib import nullcontext
 from importlib import import_module
 
-from clients import logs
-from schemas import terminal
-from schemas.commands import Command, command
-from schemas.errors import ConfigError, EstopRequested, ManifestInvalid, VramError
-from schemas.version import add_version
+from vram_arbiter.clients import logs
+from vram_arbiter.schemas.errors import ConfigError, EstopRequested, ManifestInvalid, VramError
+from vram_arbiter.schemas.runtime import terminal
+from vram_arbiter.schemas.runtime.telemetry.commands import Command, command
+from vram_arbiter.schemas.runtime.version import add_version
 
 COMMANDS = ("sim", "benchmark", "deploy", "estop", "replay")
 URGENT = "estop"  # it imports nothing of the others: a second of imports is a second of motion
@@ -35,7 +35,9 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         module = import_module(f"runner.cli.{name}")
         flags = module.add_parser(commands)
         add_version(flags)
-        flags.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
+        flags.add_argument(
+            "--log-level", default="info", choices=("debug", "info", "warning", "error")
+        )
         flags.add_argument(
             "--log-format", default="human", choices=logs.FORMS, help="json: one object a line"
         )
@@ -48,9 +50,14 @@ def main(argv: list[str] | None = None) -> int:
     """Console script `vram-runner`."""
     args = parse(argv)
     logs.set_up(
-        "vram-runner", args.log_level, args.log_format, "%(asctime)s runner %(levelname)s %(message)s"
+        "vram-runner",
+        args.log_level,
+        args.log_format,
+        "%(asctime)s runner %(levelname)s %(message)s",
     )
-    logging.getLogger("OpenGL").setLevel(logging.WARNING)  # it announces an accelerator that nobody needs
+    logging.getLogger("OpenGL").setLevel(
+        logging.WARNING
+    )  # it announces an accelerator that nobody needs
     try:
         # a stop has no span: no variable of the telemetry, and no port that the runner itself has, may refuse it
         urgent = args.command == URGENT

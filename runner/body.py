@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import get_args
 
-from runner.protocols import RobotDescription
-from schemas.body import NOT_A_ROBOT, Body, Capability
-from schemas.manifest.vocabulary import EmbodimentTag
-from schemas.robot import RobotEnvironment
+from vram_arbiter.runner.protocols import RobotDescription
+from vram_arbiter.schemas.body import NOT_A_ROBOT, Body, Capability
+from vram_arbiter.schemas.config.robot import RobotEnvironment
+from vram_arbiter.schemas.manifest.vocabulary import EmbodimentTag
 
 SO101 = "so101_follower"
 TWINS = ("so101_mujoco", "so101_kinematic")

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from runner.protocols import Skill, SkillKey
-from schemas.body import Body
-from schemas.endpoints import program_endpoint
-from schemas.errors import ManifestInvalid, UnknownSkill
-from schemas.manifest import Kind, ManifestError, RSkillManifest, load_manifest
+from vram_arbiter.runner.protocols import Skill, SkillKey
+from vram_arbiter.schemas.body import Body
+from vram_arbiter.schemas.errors import ManifestInvalid, UnknownSkill
+from vram_arbiter.schemas.manifest import Kind, ManifestError, RSkillManifest, load_manifest
+from vram_arbiter.schemas.runtime.endpoints import program_endpoint
 
 EXECUTABLE = frozenset({Kind.VLA, Kind.ROS_ACTION, Kind.ROS_SERVICE})
 NOT_EXECUTED = {
@@ -57,13 +57,15 @@ def read_manifests(paths: Iterable[Path]) -> list[RSkillManifest]:
             manifest = load_manifest(file)
         except ManifestError as error:
             raise ManifestInvalid(
-                str(error), hint="`python -m schemas check FILE` shows every finding"
+                str(error), hint="`python -m vram_arbiter.schemas check FILE` shows every finding"
             ) from error
         if manifest.name in manifests:
             raise ManifestInvalid(f"{manifest.name} is installed twice, again by {file}")
         manifests[manifest.name] = manifest
     if not manifests:
-        raise ManifestInvalid("no skill is installed", hint=f"--skills takes folders with {FILE_NAME} files")
+        raise ManifestInvalid(
+            "no skill is installed", hint=f"--skills takes folders with {FILE_NAME} files"
+        )
     return list(manifests.values())
 
 
@@ -159,4 +161,6 @@ def sidecar_endpoint(rskill_id: str, given: Mapping[str, str], environ: Mapping[
     """Where the policy of a skill is served: as given, else by its name, `OWNER/so101-grab` → `grab`."""
     repository = rskill_id.rpartition("/")[2]
     _, dash, rest = repository.partition("-")
-    return given.get(rskill_id) or program_endpoint(rest if dash else repository, environ, os.getuid())
+    return given.get(rskill_id) or program_endpoint(
+        rest if dash else repository, environ, os.getuid()
+    )

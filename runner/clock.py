@@ -9,7 +9,9 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-BUSY_TAIL_S = 0.001  # the kernel wakes a sleeper up to a millisecond late; the last one is spent awake
+BUSY_TAIL_S = (
+    0.001  # the kernel wakes a sleeper up to a millisecond late; the last one is spent awake
+)
 
 
 class Clock(Protocol):

@@ -13,9 +13,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from runner.protocols import Goal, SkillEnded
-from schemas.errors import InternalError, VramError
-from schemas.world import RunResult
+from vram_arbiter.runner.protocols import Goal, SkillEnded
+from vram_arbiter.schemas.errors import InternalError, VramError
+from vram_arbiter.schemas.world import RunResult
 
 log = logging.getLogger(__name__)
 
@@ -46,10 +46,14 @@ class Mailbox:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._posted: deque[tuple[Callable[[], Any], Callable[[Any, BaseException | None], None]]] = deque()
+        self._posted: deque[
+            tuple[Callable[[], Any], Callable[[Any, BaseException | None], None]]
+        ] = deque()
         self._closed = False
 
-    def post(self, work: Callable[[], Any], deliver: Callable[[Any, BaseException | None], None]) -> None:
+    def post(
+        self, work: Callable[[], Any], deliver: Callable[[Any, BaseException | None], None]
+    ) -> None:
         """Any thread. `deliver(result, error)` is called on the control thread. Raises InternalError when it has ended."""
         with self._lock:
             if self._closed or len(self._posted) >= MAILBOX_MAX:
@@ -147,7 +151,9 @@ class ControlThread:
             return error
         return None
 
-    def _settle(self, future: asyncio.Future[Any], result: Any, error: BaseException | None) -> None:
+    def _settle(
+        self, future: asyncio.Future[Any], result: Any, error: BaseException | None
+    ) -> None:
         def settle() -> None:
             if future.done():
                 return
@@ -182,16 +188,22 @@ class ControlThread:
         ended: asyncio.Future[SkillEnded] = self._loop.create_future()
         try:
             await self.call(
-                lambda: self.runner.begin_skill(skill, goal, lambda end: self._settle(ended, end, None))
+                lambda: self.runner.begin_skill(
+                    skill, goal, lambda end: self._settle(ended, end, None)
+                )
             )
             on_begun()
             futures: list[asyncio.Future[Any]] = [ended, self.ended]
             await asyncio.wait(futures, return_when=asyncio.FIRST_COMPLETED)
             if not ended.done():
-                raise InternalError("the control loop ended during the goal", hint="see the runner's log")
+                raise InternalError(
+                    "the control loop ended during the goal", hint="see the runner's log"
+                )
             return ended.result()
         finally:
-            if not ended.done():  # cancelled, deadline, or the loop died: the mailbox keeps the order
+            if (
+                not ended.done()
+            ):  # cancelled, deadline, or the loop died: the mailbox keeps the order
                 ended.cancel()
                 try:
                     taken_back(await self.call(self.runner.end_skill))

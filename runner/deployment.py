@@ -11,20 +11,20 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from runner.body import body_of
-from runner.catalogue import EXECUTABLE, Catalogue, Maker
-from runner.clock import Clock
-from runner.dataset.commit import check_folder
-from runner.dataset.recorder import whole_rate
-from runner.protocols import Hal, SensorReader
-from runner.safety.gate import RobotGate
-from runner.skills.sidecar_policy import wire_up
-from runner.world_state import JOINT_STATE
-from schemas.errors import ConfigError, ManifestInvalid, UnknownSkill
-from schemas.manifest import Kind, RSkillManifest
-from schemas.robot import RobotEnvironment, VlaSpec, robot_of
-from schemas.yamltext import Path as FieldPath
-from schemas.yamltext import Problem, YamlText, config_error, parse_yaml, read_text
+from vram_arbiter.runner.body import body_of
+from vram_arbiter.runner.catalogue import EXECUTABLE, Catalogue, Maker
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.dataset.commit import check_folder
+from vram_arbiter.runner.dataset.recorder import whole_rate
+from vram_arbiter.runner.protocols import Hal, SensorReader
+from vram_arbiter.runner.safety.gate import RobotGate
+from vram_arbiter.runner.skills.sidecar_policy import wire_up
+from vram_arbiter.runner.world_state import JOINT_STATE
+from vram_arbiter.schemas.config.robot import RobotEnvironment, VlaSpec, robot_of
+from vram_arbiter.schemas.errors import ConfigError, ManifestInvalid, UnknownSkill
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest
+from vram_arbiter.schemas.yamltext import Path as FieldPath
+from vram_arbiter.schemas.yamltext import Problem, YamlText, config_error, parse_yaml, read_text
 
 LICENCE_FLAG = "--allow-noncommercial"
 
@@ -39,20 +39,27 @@ class DeploymentFile:
     def error(self, *found: tuple[str, str]) -> ConfigError:
         """`(field, problem)` pairs as one error: `robot.yaml:7: sensors[0].backend_params.device: …`"""
         problems = [
-            Problem(self.source.line(_path(field)), field, _on_one_line(text)) for field, text in found
+            Problem(self.source.line(_path(field)), field, _on_one_line(text))
+            for field, text in found
         ]
         return config_error(self.source.name, sorted(problems, key=lambda problem: problem.line))
 
     def merged(self, errors: Iterable[ConfigError]) -> ConfigError:
         """Several located errors as one."""
-        return self.error(*((item["field"], item["problem"]) for e in errors for item in e.details["fields"]))
+        return self.error(
+            *((item["field"], item["problem"]) for e in errors for item in e.details["fields"])
+        )
 
     def located(self, error: ConfigError, section: str) -> ConfigError:
         """An adapter's mistakes, whose fields may be relative to its section, with this file's lines."""
         found = []
         for item in error.details.get("fields") or [{"field": "", "problem": error.message}]:
             field = str(item["field"])
-            full = field if field == section or field.startswith(f"{section}.") else f"{section}.{field}"
+            full = (
+                field
+                if field == section or field.startswith(f"{section}.")
+                else f"{section}.{field}"
+            )
             found.append((full.rstrip("."), str(item["problem"])))
         return self.error(*found)
 
@@ -74,9 +81,9 @@ class Parts:
 
 def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
     """Adapter, cameras and gate. Raises ConfigError with everything that they do not take."""
-    from runner.hal.factory import make_hal
-    from runner.hal.so101_kinematics import kinematics_for
-    from runner.sensors.factory import make_reader
+    from vram_arbiter.runner.hal.factory import make_hal
+    from vram_arbiter.runner.hal.so101_kinematics import kinematics_for
+    from vram_arbiter.runner.sensors.factory import make_reader
 
     robot = file.robot
     errors: list[ConfigError] = []
@@ -84,7 +91,9 @@ def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
     for index, sensor in enumerate(robot.sensors):
         if sensor.sensor_id == JOINT_STATE:
             errors.append(
-                file.error((f"sensors[{index}].sensor_id", f"no camera may be called {JOINT_STATE}"))
+                file.error(
+                    (f"sensors[{index}].sensor_id", f"no camera may be called {JOINT_STATE}")
+                )
             )
         try:
             readers.append(make_reader(sensor, clock))
@@ -186,7 +195,9 @@ def _folder_of(name: str) -> str:
     return name.rpartition("/")[2].removeprefix("rskill-")
 
 
-def misfits(robot: RobotEnvironment, parts: Parts, manifest: RSkillManifest) -> list[tuple[str, str]]:
+def misfits(
+    robot: RobotEnvironment, parts: Parts, manifest: RSkillManifest
+) -> list[tuple[str, str]]:
     """What of a skill does not fit this robot: its envelope; of a learnt policy its joints and cameras, too."""
     problems = []
     try:
@@ -201,7 +212,10 @@ def misfits(robot: RobotEnvironment, parts: Parts, manifest: RSkillManifest) -> 
         order = actuator.control_mode_semantics.joint_order
         if order is not None and order != joints:
             problems.append(
-                ("vla.id", f"{manifest.name} moves {', '.join(order)}; the robot has {', '.join(joints)}")
+                (
+                    "vla.id",
+                    f"{manifest.name} moves {', '.join(order)}; the robot has {', '.join(joints)}",
+                )
             )
     try:
         wiring = wire_up(manifest, joints, description.rest_pose_rad)
@@ -226,7 +240,9 @@ def _contradictions(spec: VlaSpec, manifest: RSkillManifest) -> list[tuple[str, 
     elif manifest.model_family is not None:
         said.append(("id", spec.id, manifest.model_family))
     for field in sorted(spec.quantization.model_fields_set if spec.quantization else ()):
-        wanted, there = (getattr(block, field) for block in (spec.quantization, manifest.quantization))
+        wanted, there = (
+            getattr(block, field) for block in (spec.quantization, manifest.quantization)
+        )
         said.append(("quantization", f"{field} {wanted}", f"{field} {there}"))
     return [
         (f"vla.{field}", f"{wanted} is not what {manifest.name} is installed with: {installed}")
@@ -254,7 +270,9 @@ def unused(robot: RobotEnvironment) -> list[str]:
 
 
 # -- for people ---------------------------------------------------------------------------------------------------------
-def plan(file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Iterable[tuple[str, str]]) -> str:
+def plan(
+    file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Iterable[tuple[str, str]]
+) -> str:
     """What would run, a line a part. `facts` are lines of whoever puts the program together."""
     robot, description = file.robot, parts.hal.description
     twin = ", simulated" if description.simulated else ""
@@ -262,7 +280,10 @@ def plan(file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Iterab
     able = ", ".join(f"{name} {value}" for name, value in body.capabilities.items())
     lines = [
         ("robot", f"{robot.robot_id}: {description.name} by {robot.hal.adapter}{twin}"),
-        ("body", f"{' and '.join(body.embodiment_tags) or 'not said: embodiment_tags is empty'}; {able}"),
+        (
+            "body",
+            f"{' and '.join(body.embodiment_tags) or 'not said: embodiment_tags is empty'}; {able}",
+        ),
     ]
     lines += [
         (
@@ -273,7 +294,9 @@ def plan(file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Iterab
     ]
     for sensor in robot.sensors:
         topic = f", published on {sensor.publish_topic}" if sensor.publish_topic else ""
-        text = f"{sensor.sensor_id} by {sensor.backend}, at most {sensor.max_age_ms:g} ms old{topic}"
+        text = (
+            f"{sensor.sensor_id} by {sensor.backend}, at most {sensor.max_age_ms:g} ms old{topic}"
+        )
         lines.append(("camera", text))
     lines.append(("rate", f"{robot.rate_hz:g} Hz; late actions: {robot.deadline_overrun_policy}"))
     if robot.safety is not None:
@@ -297,7 +320,9 @@ def plan(file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Iterab
 
 
 def _path(field: str) -> FieldPath:
-    return tuple(int(part) if part.isdecimal() else part for part in re.findall(r"[^.\[\]]+", field))
+    return tuple(
+        int(part) if part.isdecimal() else part for part in re.findall(r"[^.\[\]]+", field)
+    )
 
 
 def _on_one_line(text: str) -> str:

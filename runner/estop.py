@@ -23,11 +23,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol, Self
 
-from runner.control import Mailbox
-from runner.promptness import hasten
-from schemas.errors import AlreadyRunning, ConfigError, EstopRequested, InternalError
-from schemas.estop import REQUEST_MAX_BYTES, Answer, Reply, path_of, reason_in
-from schemas.runtime.peercred import credentials
+from vram_arbiter.runner.control import Mailbox
+from vram_arbiter.runner.realtime import hasten
+from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError, EstopRequested, InternalError
+from vram_arbiter.schemas.estop import REQUEST_MAX_BYTES, Answer, Reply, path_of, reason_in
+from vram_arbiter.schemas.runtime.peercred import credentials
 
 log = logging.getLogger(__name__)
 
@@ -112,7 +112,9 @@ class EstopServer:
         self._waking = threading.Lock()
         self._told = False  # `on_stop` was called
         self._obeying = False  # `obey_estop` is posted and has not run
-        self._spare: int | None = None  # a descriptor for the time when the process has used all others
+        self._spare: int | None = (
+            None  # a descriptor for the time when the process has used all others
+        )
         self._file: tuple[int, int] | None = None  # device and inode of the bound socket
         self._thread = threading.Thread(target=self._main, name="estop", daemon=True)
 
@@ -136,7 +138,9 @@ class EstopServer:
                 os.unlink(self.path)
         for connection in list(self._connections.values()):
             if connection.obey_by_s is not None:
-                self._reply(connection, Answer.HUNG, "the runner ended before its control loop obeyed")
+                self._reply(
+                    connection, Answer.HUNG, "the runner ended before its control loop obeyed"
+                )
             self._close(connection)
         self._selector.close()
         self._listener.close()
@@ -161,7 +165,9 @@ class EstopServer:
         try:
             with contextlib.suppress(FileNotFoundError):
                 if stat.S_ISSOCK(os.lstat(self.path).st_mode):
-                    os.unlink(self.path)  # of a runner that was killed: the caller holds the endpoint's lock
+                    os.unlink(
+                        self.path
+                    )  # of a runner that was killed: the caller holds the endpoint's lock
             os.fchmod(listener.fileno(), MODE)  # the file is never open to more than this
             listener.bind(self.path)
             os.chmod(self.path, MODE)  # the umask may have taken the group's share
@@ -170,7 +176,9 @@ class EstopServer:
         except OSError as error:
             listener.close()
             if error.errno == errno.EADDRINUSE:
-                raise AlreadyRunning(f"{self.path} exists and is not a socket", hint="remove it") from error
+                raise AlreadyRunning(
+                    f"{self.path} exists and is not a socket", hint="remove it"
+                ) from error
             raise ConfigError(
                 f"cannot serve the emergency stop on {self.path}: {error.strerror or error}",
                 hint="use a short path in a folder of your own",
@@ -202,9 +210,14 @@ class EstopServer:
 
     def _round(self, check_s: float) -> None:
         """Wait for work, and do at most one round of it."""
-        due = [check_s, *(c.obey_by_s or c.since_s + self._silent_s for c in self._connections.values())]
+        due = [
+            check_s,
+            *(c.obey_by_s or c.since_s + self._silent_s for c in self._connections.values()),
+        ]
         ready = self._selector.select(max(0.0, min(due) - time.monotonic()))
-        began_cpu_s = time.thread_time()  # waits for the interpreter are no work, and no reason to rest
+        began_cpu_s = (
+            time.thread_time()
+        )  # waits for the interpreter are no work, and no reason to rest
         for key, _ in ready:
             if key.fileobj is self._listener:
                 self._accept()
@@ -239,7 +252,9 @@ class EstopServer:
             except BlockingIOError:
                 return
             except OSError as error:
-                if error.errno in _NO_DESCRIPTOR and not (self._is_asked_for() and self._free_descriptor()):
+                if error.errno in _NO_DESCRIPTOR and not (
+                    self._is_asked_for() and self._free_descriptor()
+                ):
                     return
                 continue  # or it hung up meanwhile
             self._welcome(accepted)
@@ -316,7 +331,9 @@ class EstopServer:
         connection.obey_by_s = time.monotonic() + self._obey_s
         self._selector.unregister(connection.socket)  # one request a connection
         in_force = (
-            str(self._robot.estop.details.get("reason", "")) if self._robot.estop is not None else reason
+            str(self._robot.estop.details.get("reason", ""))
+            if self._robot.estop is not None
+            else reason
         )
         self._reply(connection, Answer.LATCHED if first else Answer.ALREADY, in_force)
         if not self._obeying:
@@ -337,7 +354,10 @@ class EstopServer:
     def _tell_outcome(self, error: EstopRequested | None, failure: BaseException | None) -> None:
         self._obeying = False
         if failure is not None:
-            answer, text = Answer.HUNG, f"the control loop did not obey the emergency stop: {failure}"
+            answer, text = (
+                Answer.HUNG,
+                f"the control loop did not obey the emergency stop: {failure}",
+            )
         elif error is not None and not error.details.get("told", True):
             answer, text = Answer.NOT_TOLD, error.message
         else:

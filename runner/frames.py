@@ -10,11 +10,11 @@ import asyncio
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
-from runner.clock import Clock
-from runner.control import ControlThread
-from schemas.errors import BadRequest, FrameStale, InternalError
-from schemas.goals import FrameReply
-from schemas.world import CameraModel
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.control import ControlThread
+from vram_arbiter.schemas.errors import BadRequest, FrameStale, InternalError
+from vram_arbiter.schemas.goals import FrameReply
+from vram_arbiter.schemas.world import CameraModel
 
 Encoding = Literal["jpeg", "png"]
 JPEG_QUALITY = 90

@@ -15,15 +15,15 @@ from typing import Any, Protocol
 
 from pydantic import ValidationError
 
-from clients.serve import Message, Peer, RouterServer
-from runner import frames
-from runner.catalogue import Catalogue
-from runner.clock import Clock
-from runner.control import ControlThread
-from runner.estop import OBEY_S, EstopServer
-from runner.one_goal import OneGoal, Performer
-from schemas.defaults import MESSAGE_MAX_BYTES
-from schemas.errors import (
+from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.runner import frames
+from vram_arbiter.runner.catalogue import Catalogue
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.control import ControlThread
+from vram_arbiter.runner.estop import OBEY_S, EstopServer
+from vram_arbiter.runner.one_goal import OneGoal, Performer
+from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
+from vram_arbiter.schemas.errors import (
     BadRequest,
     EstopRequested,
     InternalError,
@@ -31,7 +31,7 @@ from schemas.errors import (
     UnknownOp,
     VramError,
 )
-from schemas.goals import (
+from vram_arbiter.schemas.goals import (
     RUNNER_REQUEST,
     CancelGoal,
     GetFrame,
@@ -44,7 +44,7 @@ from schemas.goals import (
     SendGoal,
     ShutdownRunner,
 )
-from schemas.world import WorldState
+from vram_arbiter.schemas.world import WorldState
 
 log = logging.getLogger(__name__)
 
@@ -111,7 +111,9 @@ class GoalServer:
         loop = asyncio.get_running_loop()
 
         def on_stop(reason: str, pid: int, uid: int) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop has ended: the stop is latched all the same
+            with contextlib.suppress(
+                RuntimeError
+            ):  # the loop has ended: the stop is latched all the same
                 loop.call_soon_threadsafe(self._stopped, reason, pid, uid)
 
         async with contextlib.AsyncExitStack() as stack:
@@ -149,7 +151,11 @@ class GoalServer:
                 for task in (serving, stopping, ended):
                     task.cancel()
                 await asyncio.gather(serving, stopping, ended, return_exceptions=True)
-            if serving.done() and not serving.cancelled() and (error := serving.exception()) is not None:
+            if (
+                serving.done()
+                and not serving.cancelled()
+                and (error := serving.exception()) is not None
+            ):
                 raise error
 
     def result_of(self, goal_id: str) -> ResultPush | None:
@@ -167,7 +173,10 @@ class GoalServer:
             log.exception("request failed")
             await self._send(
                 peer,
-                _refusal(request_id, InternalError(f"{type(error).__name__}: {error}", hint="see the log")),
+                _refusal(
+                    request_id,
+                    InternalError(f"{type(error).__name__}: {error}", hint="see the log"),
+                ),
             )
         else:
             await self._send(peer, {"re": request_id, "ok": True, **reply})
@@ -208,7 +217,10 @@ class GoalServer:
                     return await self._control.call(self._ground_truth)
             case PingRunner():
                 goal = self._goals.goal
-                return {"pid": os.getpid(), "goal_id": goal.goal_id if goal else None} | self._identity
+                return {
+                    "pid": os.getpid(),
+                    "goal_id": goal.goal_id if goal else None,
+                } | self._identity
             case ShutdownRunner():
                 return {}
         raise UnknownOp("unknown request", details={"known": [*OPS]})

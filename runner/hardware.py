@@ -16,10 +16,10 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 
-from runner.clock import Clock
-from runner.loop import Applied, Decision
-from runner.pictures import FramePicture
-from runner.protocols import (
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.loop import Applied, Decision
+from vram_arbiter.runner.pictures import FramePicture
+from vram_arbiter.runner.protocols import (
     DeadlinePolicy,
     Goal,
     Hal,
@@ -29,11 +29,10 @@ from runner.protocols import (
     SkillEnded,
     Stepped,
 )
-from runner.skill_runner import Active, SkillRunner
-from runner.world_state import JOINT_STATE, WorldStateAggregator
-from schemas import telemetry, tracing
-from schemas.control import ControlMode
-from schemas.errors import (
+from vram_arbiter.runner.skill_runner import Active, SkillRunner
+from vram_arbiter.runner.world_state import JOINT_STATE, WorldStateAggregator
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import (
     BadRequest,
     Cancelled,
     EstopRequested,
@@ -42,7 +41,9 @@ from schemas.errors import (
     StateStale,
     VramError,
 )
-from schemas.world import Action
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.schemas.world import Action
 
 log = logging.getLogger(__name__)
 
@@ -166,7 +167,9 @@ class HardwareRunner(SkillRunner):
     def snapshot(self, camera: str, max_age_s: float) -> FramePicture:
         """The newest frame. Raises FrameStale when it is older than that, BadRequest for an unknown camera."""
         if camera not in self._readers:
-            raise BadRequest(f"there is no camera {camera!r}", hint=f"choose from {', '.join(self._readers)}")
+            raise BadRequest(
+                f"there is no camera {camera!r}", hint=f"choose from {', '.join(self._readers)}"
+            )
         return FramePicture(self._readers[camera].read_latest(max_age_s * 1e3))
 
     # -- one tick ------------------------------------------------------------------------------------------------------
@@ -181,7 +184,8 @@ class HardwareRunner(SkillRunner):
         with tracing.span(telemetry.SPAN_WORLD):
             self.world = world = self.aggregator.snapshot(self.clock.now_ns())  # 4
         decision = Decision(
-            sensors_ms=(sensed_s - started_s) * 1e3, world_state_ms=(self.clock.now_s() - sensed_s) * 1e3
+            sensors_ms=(sensed_s - started_s) * 1e3,
+            world_state_ms=(self.clock.now_s() - sensed_s) * 1e3,
         )
         if (active := self._active) is None:
             return decision
@@ -240,7 +244,9 @@ class HardwareRunner(SkillRunner):
         if now_s - self._stale_since_s < STALE_FAIL_S:
             return
         kind = StateStale if name == JOINT_STATE else FrameStale
-        self._end(SkillEnded({}, kind(problem, hint="the robot does not move on what is no longer so")))
+        self._end(
+            SkillEnded({}, kind(problem, hint="the robot does not move on what is no longer so"))
+        )
 
     def _why(self, name: str) -> str:
         known = name == JOINT_STATE or name in self._readers

@@ -19,11 +19,13 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
-from runner.clock import Clock, SystemClock
-from runner.protocols import DeadlineMissed, DeadlinePolicy
-from runner.timings import Timings, mean, percentile
-from schemas import meters, telemetry, tracing
-from schemas.world import Action, RunResult, TickResult
+from vram_arbiter.runner.clock import Clock, SystemClock
+from vram_arbiter.runner.protocols import DeadlineMissed, DeadlinePolicy
+from vram_arbiter.runner.timings import Timings, mean, percentile
+from vram_arbiter.schemas.runtime.telemetry import meters
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.schemas.world import Action, RunResult, TickResult
 
 _SHARES = {"p50": 0.5, "p99": 0.99, "max": 1.0}
 
@@ -75,14 +77,18 @@ class RunnerBase(ABC):
         self.deadline_misses = 0
         self.late_actions_withheld = 0
         self.save_dir: str | None = None  # folder of the dataset that this run is recorded into
-        self.traceparent: str | None = None  # of the goal that the ticks are for; they join its trace
+        self.traceparent: str | None = (
+            None  # of the goal that the ticks are for; they join its trace
+        )
         self.labels: dict[str, str] = {}  # of what the ticks measure: the goal's skill
         self.trace_ticks = 1.0  # share of the ticks that get spans, 0 to 1
         self._still = True  # no action was applied yet: until then every tick gets spans
         self._tick_credit = 0.0
         self._due_s: float | None = None  # when the present tick should have begun
         self.timings = Timings()
-        self.identity: dict[str, Any] = {}  # what it is that runs: robot, scene, seed; goes into the result
+        self.identity: dict[
+            str, Any
+        ] = {}  # what it is that runs: robot, scene, seed; goes into the result
         self._trace_id: str | None = None
 
     # -- what a subclass provides --
@@ -154,7 +160,9 @@ class RunnerBase(ABC):
         decision = self._decide(self.tick_idx)  # 1
         if decision.reset:  # a scene is built, no action can come too late
             deadline_s = math.inf
-        withheld = self.clock.now_s() > deadline_s and self.deadline_policy is not DeadlinePolicy.WARN  # 2
+        withheld = (
+            self.clock.now_s() > deadline_s and self.deadline_policy is not DeadlinePolicy.WARN
+        )  # 2
         if withheld and decision.action is not None:
             decision.action = None
             self.late_actions_withheld += 1
@@ -189,7 +197,12 @@ class RunnerBase(ABC):
         )
         self.tick_idx += 1
         self.timings.add(
-            started_s, late_ms, result.tick_ms, result.inference_ms, result.hal_ms, reset=decision.reset
+            started_s,
+            late_ms,
+            result.tick_ms,
+            result.inference_ms,
+            result.hal_ms,
+            reset=decision.reset,
         )
         meters.measure(telemetry.METRIC_TICK, result.tick_ms, self.labels)
         self._ticked(decision, result)

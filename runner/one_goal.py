@@ -14,16 +14,25 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
-from clients.packing import pack
-from clients.serve import Message, Peer
-from runner.catalogue import Catalogue
-from runner.clock import Clock
-from runner.control import ControlThread
-from runner.protocols import Goal, Progress, Skill, SkillEnded, SkillKey
-from runner.skills.residency import Residency
-from schemas import meters, telemetry, tracing
-from schemas.errors import BadRequest, BadState, EstopRequested, GoalRejected, InternalError, VramError
-from schemas.goals import FeedbackPush, ResultPush, SendGoal
+from vram_arbiter.clients._protocol.codec import pack
+from vram_arbiter.clients.net.server import Message, Peer
+from vram_arbiter.runner.catalogue import Catalogue
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.control import ControlThread
+from vram_arbiter.runner.protocols import Goal, Progress, Skill, SkillEnded, SkillKey
+from vram_arbiter.runner.skills.residency import Residency
+from vram_arbiter.schemas.errors import (
+    BadRequest,
+    BadState,
+    EstopRequested,
+    GoalRejected,
+    InternalError,
+    VramError,
+)
+from vram_arbiter.schemas.goals import FeedbackPush, ResultPush, SendGoal
+from vram_arbiter.schemas.runtime.telemetry import meters
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +41,9 @@ LISTENERS_MAX = 16  # of one goal: a client that comes back again and again take
 FEEDBACK_PERIOD_S = 0.2  # at most five a second
 FEEDBACK_QUIET_S = 1.0  # said again after this long even if nothing changed
 FINISHING = "finishing"
-FINISH_S = 8.0  # a skill that has not finished by then is left to itself; nobody waits longer for a result
+FINISH_S = (
+    8.0  # a skill that has not finished by then is left to itself; nobody waits longer for a result
+)
 
 Status = Literal["succeeded", "failed", "canceled", "deadline"]
 Tell = Callable[[Peer, Message], Awaitable[None]]
@@ -135,7 +146,8 @@ class OneGoal:
             )
         if request.goal_id in self._results:
             raise GoalRejected(
-                f"goal {request.goal_id} has ended", hint="ask for its result, or send a new goal_id"
+                f"goal {request.goal_id} has ended",
+                hint="ask for its result, or send a new goal_id",
             )
         if self._stopping.is_set():
             raise GoalRejected("the runner is stopping", hint="start it again")
@@ -152,7 +164,9 @@ class OneGoal:
         )
         running = _Running(goal, _identity(request), [peer], began_s=self._clock.now_s())
         self._running = running
-        running.task = asyncio.create_task(self._execute(running, make), name=f"goal {goal.goal_id}")
+        running.task = asyncio.create_task(
+            self._execute(running, make), name=f"goal {goal.goal_id}"
+        )
         return {"goal_id": goal.goal_id, "accepted": True}
 
     def cancel(self, goal_id: str) -> Message:
@@ -161,7 +175,9 @@ class OneGoal:
         if running is None or running.goal.goal_id != goal_id:
             if goal_id in self._results:
                 return {"goal_id": goal_id, "status": self._results[goal_id]["status"]}
-            raise BadRequest(f"there is no goal {goal_id}", hint="it never was accepted, or ended long ago")
+            raise BadRequest(
+                f"there is no goal {goal_id}", hint="it never was accepted, or ended long ago"
+            )
         self._stop(running)
         return {"goal_id": goal_id}
 
@@ -179,7 +195,9 @@ class OneGoal:
             return {key: value for key, value in result.items() if key != "push"}
         if self._running is not None and self._running.goal.goal_id == goal_id:
             raise BadState(f"goal {goal_id} is still running", hint="wait for its result")
-        raise BadRequest(f"there is no goal {goal_id}", hint=f"the last {RESULTS_KEPT} results are kept")
+        raise BadRequest(
+            f"there is no goal {goal_id}", hint=f"the last {RESULTS_KEPT} results are kept"
+        )
 
     # -- a goal --------------------------------------------------------------------------------------------------------
     async def _execute(self, running: _Running, make: Callable[[], Skill]) -> None:
@@ -214,8 +232,12 @@ class OneGoal:
             status, error, data = "deadline", None, running.so_far
         except VramError as raised:
             error = raised
-        except asyncio.CancelledError:  # our own cancel, or the server's end: the result still goes out
-            status, error = ("failed", running.stopped_by) if running.stopped_by else ("canceled", None)
+        except (
+            asyncio.CancelledError
+        ):  # our own cancel, or the server's end: the result still goes out
+            status, error = (
+                ("failed", running.stopped_by) if running.stopped_by else ("canceled", None)
+            )
             data = running.so_far
         except Exception as raised:
             log.exception("goal %s failed", goal.goal_id)
@@ -236,7 +258,9 @@ class OneGoal:
                 await skill.finish()
         except (VramError, TimeoutError) as error:
             log.warning(
-                "%s did not finish cleanly: %s", skill.key, str(error) or f"not within {FINISH_S:.0f} s"
+                "%s did not finish cleanly: %s",
+                skill.key,
+                str(error) or f"not within {FINISH_S:.0f} s",
             )
         except Exception:
             log.exception("%s did not finish cleanly", skill.key)
@@ -289,7 +313,9 @@ class OneGoal:
     # -- progress ------------------------------------------------------------------------------------------------------
     async def _tell(self, running: _Running) -> None:
         while True:
-            progress = self._robot.progress if running.phase == "running" else Progress(0.0, running.phase)
+            progress = (
+                self._robot.progress if running.phase == "running" else Progress(0.0, running.phase)
+            )
             now_s = self._clock.now_s()
             if progress != running.sent or now_s - running.sent_s >= FEEDBACK_QUIET_S:
                 running.sent, running.sent_s = progress, now_s

@@ -8,8 +8,8 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
-from schemas.errors import FrameStale, ModelError
-from schemas.world import CameraModel, FrameEncoding, SensorFrame
+from vram_arbiter.schemas.errors import FrameStale, ModelError
+from vram_arbiter.schemas.world import CameraModel, FrameEncoding, SensorFrame
 
 
 def as_rgb(frame: SensorFrame) -> Any:
@@ -35,7 +35,8 @@ def as_rgb(frame: SensorFrame) -> Any:
             bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)
             if bgr is None or bgr.shape[:2] != (frame.height, frame.width):
                 raise FrameStale(
-                    f"the {frame.encoding} of camera {frame.sensor_id} is broken", hint="look at the camera"
+                    f"the {frame.encoding} of camera {frame.sensor_id} is broken",
+                    hint="look at the camera",
                 )
             return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
         case encoding:

@@ -11,9 +11,16 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, ClassVar, NoReturn, Protocol, runtime_checkable
 
-from schemas.errors import TransientError, VramError
-from schemas.manifest import RSkillManifest
-from schemas.world import Action, JointState, RunResult, SensorFrame, TickResult, WorldState
+from vram_arbiter.schemas.errors import TransientError, VramError
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.world import (
+    Action,
+    JointState,
+    RunResult,
+    SensorFrame,
+    TickResult,
+    WorldState,
+)
 
 
 class DeadlineMissed(TransientError):

@@ -32,7 +32,9 @@ class Recorder:
         self.dropped = 0
         self.error: str = ""
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._queue: queue.Queue[tuple[Any, tuple[str, ...]] | None] = queue.Queue(maxsize=QUEUE_MAX)
+        self._queue: queue.Queue[tuple[Any, tuple[str, ...]] | None] = queue.Queue(
+            maxsize=QUEUE_MAX
+        )
         self._thread = threading.Thread(target=self._encode, name="recorder", daemon=True)
         self._thread.start()
 
@@ -65,13 +67,18 @@ class Recorder:
                 try:
                     if writer is None:
                         writer, size = self._open(rgb.shape[1], rgb.shape[0]), rgb.shape
-                    if rgb.shape != size:  # ffmpeg counts bytes: every later picture would be garbled
+                    if (
+                        rgb.shape != size
+                    ):  # ffmpeg counts bytes: every later picture would be garbled
                         raise RuntimeError(
                             f"the pictures were {size[1]} × {size[0]}, now one is {rgb.shape[1]} × {rgb.shape[0]}"
                         )
                     writer.send(_caption(rgb, lines))
                     self.written += 1
-                except (OSError, RuntimeError) as error:  # ffmpeg missing, disk full: the robot goes on
+                except (
+                    OSError,
+                    RuntimeError,
+                ) as error:  # ffmpeg missing, disk full: the robot goes on
                     self.error = str(error)
                     log.error("no video: %s", error)
         finally:
@@ -90,7 +97,16 @@ class Recorder:
             fps=self.fps,
             codec="libx264",
             macro_block_size=2,
-            output_params=["-preset", "veryfast", "-crf", "26", "-threads", "1", "-movflags", "+faststart"],
+            output_params=[
+                "-preset",
+                "veryfast",
+                "-crf",
+                "26",
+                "-threads",
+                "1",
+                "-movflags",
+                "+faststart",
+            ],
         )
         writer.send(None)
         return writer

@@ -16,10 +16,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from runner.clock import Clock
-from runner.control import Mailbox
-from runner.loop import Decision, RunnerBase
-from runner.protocols import (
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.control import Mailbox
+from vram_arbiter.runner.loop import Decision, RunnerBase
+from vram_arbiter.runner.protocols import (
     Act,
     DeadlinePolicy,
     Done,
@@ -34,9 +34,17 @@ from runner.protocols import (
     TickSink,
     Transition,
 )
-from schemas import meters, telemetry, tracing
-from schemas.errors import EstopRequested, InternalError, LimitExceeded, ModelError, VramError
-from schemas.world import Action, TickResult, WorldState
+from vram_arbiter.schemas.errors import (
+    EstopRequested,
+    InternalError,
+    LimitExceeded,
+    ModelError,
+    VramError,
+)
+from vram_arbiter.schemas.runtime.telemetry import meters
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.schemas.world import Action, TickResult, WorldState
 
 log = logging.getLogger(__name__)
 
@@ -244,7 +252,9 @@ class SkillRunner(RunnerBase):
             return
         if asked is not None and self.world is not None:
             told, targets = self._base_told(decision), dict(self._targets_now())
-            self.sink.tick(GoalTick(asked.goal, self.world, result, targets, told, self._transition()))
+            self.sink.tick(
+                GoalTick(asked.goal, self.world, result, targets, told, self._transition())
+            )
         if over is not None:
             self.sink.goal_ended(*over)
 
@@ -255,7 +265,11 @@ class SkillRunner(RunnerBase):
         limit = active.goal.max_ticks
         if limit is not None and self.tick_idx - active.began_tick >= limit:
             problem = f"not done within {limit} ticks"
-            self._end(SkillEnded({"truncated": True}, LimitExceeded(problem, details={"limit": "max_ticks"})))
+            self._end(
+                SkillEnded(
+                    {"truncated": True}, LimitExceeded(problem, details={"limit": "max_ticks"})
+                )
+            )
             return
         self._asked = active
         asked_s = self.clock.now_s()
@@ -269,7 +283,9 @@ class SkillRunner(RunnerBase):
             return
         except Exception as error:
             log.exception("skill %s failed", active.goal.rskill_id)
-            self._end(SkillEnded({}, InternalError(f"the skill failed: {type(error).__name__}: {error}")))
+            self._end(
+                SkillEnded({}, InternalError(f"the skill failed: {type(error).__name__}: {error}"))
+            )
             return
         decision.inference_ms = (self.clock.now_s() - asked_s) * 1e3
         meters.measure(telemetry.METRIC_INFERENCE, decision.inference_ms, self.labels)

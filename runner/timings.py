@@ -11,7 +11,9 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-TIMINGS_KEPT = 36_000  # twenty minutes at 30 Hz; older timings leave the percentiles, never the counts
+TIMINGS_KEPT = (
+    36_000  # twenty minutes at 30 Hz; older timings leave the percentiles, never the counts
+)
 
 
 def percentile(values: Sequence[float], share: float) -> float:

@@ -11,8 +11,8 @@ import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from schemas.errors import StateStale
-from schemas.world import Diagnostic, JointState, SensorFrame, WorldState
+from vram_arbiter.schemas.errors import StateStale
+from vram_arbiter.schemas.world import Diagnostic, JointState, SensorFrame, WorldState
 
 JOINT_STATE = "joint_state"  # its name among the components; no camera may be called so
 RATE_HZ = 30.0

@@ -1,4 +1,4 @@
-"""`python -m schemas check FILE…` and `python -m schemas export DIR`.
+"""`python -m vram_arbiter.schemas check FILE…` and `python -m vram_arbiter.schemas export DIR`.
 
 check   reads rSkill manifests and says `ok` or what is wrong, field by field. A folder stands for the `rskill.yaml` in it.
 export  writes the JSON Schema of every file and message into DIR.
@@ -11,24 +11,28 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from schemas import terminal
-from schemas.export import documents
-from schemas.manifest import ManifestError, load_manifest
-from schemas.runtime.printable import printable_lines
-from schemas.version import add_version
+from vram_arbiter.schemas.export import documents
+from vram_arbiter.schemas.manifest import ManifestError, load_manifest
+from vram_arbiter.schemas.runtime import terminal
+from vram_arbiter.schemas.runtime.printable import printable_lines
+from vram_arbiter.schemas.runtime.version import add_version
 
 
 @terminal.program
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse, call, print. Returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m schemas", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m vram_arbiter.schemas", description=__doc__.splitlines()[0]
+    )
     commands = parser.add_subparsers(dest="command", required=True)
     check = commands.add_parser("check", help="say `ok` or what is wrong with rSkill manifests")
     check.add_argument(
         "files", nargs="+", metavar="FILE", type=Path, help="an rskill.yaml, or a folder with one"
     )
     export = commands.add_parser("export", help="write JSON Schemas")
-    export.add_argument("folder", metavar="DIR", type=Path, help="folder to write to; made if missing")
+    export.add_argument(
+        "folder", metavar="DIR", type=Path, help="folder to write to; made if missing"
+    )
     for one in (parser, check, export):
         add_version(one)
     options = parser.parse_args(argv)

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from schemas.manifest.manifest import RSkillManifest
-from schemas.manifest.vocabulary import EmbodimentTag
+from vram_arbiter.schemas.manifest.manifest import RSkillManifest
+from vram_arbiter.schemas.manifest.vocabulary import EmbodimentTag
 
 ANY = "any"
 MULTI = "multi"
@@ -50,7 +50,9 @@ class Body(BaseModel):
                 if self.embodiment_tags
                 else "does not say what it is"
             )
-            found.append(("embodiment_tags", f"it is made for {' or '.join(tags)}; this robot {here}"))
+            found.append(
+                ("embodiment_tags", f"it is made for {' or '.join(tags)}; this robot {here}")
+            )
         for name, wanted in manifest.capabilities_required.items():
             have = self.capabilities.get(name)
             if not _has(have, wanted):
@@ -93,8 +95,6 @@ def _lacks(name: str, have: Capability | None, wanted: Capability) -> str:
         case False:
             return f"it is not for a robot with {name}"
         case int() | float():
-            return (
-                f"it needs {name} of at least {wanted:g}; this robot has {'none' if have is None else have}"
-            )
+            return f"it needs {name} of at least {wanted:g}; this robot has {'none' if have is None else have}"
         case _:
             return f"it needs {name} {wanted!r}; this robot has {'none' if have is None else repr(have)}"

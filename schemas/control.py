@@ -29,7 +29,9 @@ class ControlMode(StrEnum):
         return list(ControlMode).index(self)
 
 
-JOINT_MODES = frozenset({ControlMode.JOINT_POSITION, ControlMode.JOINT_VELOCITY, ControlMode.JOINT_TORQUE})
+JOINT_MODES = frozenset(
+    {ControlMode.JOINT_POSITION, ControlMode.JOINT_VELOCITY, ControlMode.JOINT_TORQUE}
+)
 CARTESIAN_MODES = frozenset(
     {ControlMode.CARTESIAN_POSE, ControlMode.CARTESIAN_DELTA, ControlMode.CARTESIAN_TWIST}
 )

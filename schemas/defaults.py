@@ -13,7 +13,9 @@ FENCE_GRACE_S = 5.0  # after ttl + grace without the arbiter a client unloads by
 MIN_RESIDENCY_S = 2.0
 PRIORITY = 50
 PRIORITY_MAX = 100
-THRASH_WINDOW_S = 60.0  # two consumers that throw each other out within so long are switching too often
+THRASH_WINDOW_S = (
+    60.0  # two consumers that throw each other out within so long are switching too often
+)
 THRASH_HOLD_MAX_S = 30.0
 AGEING_S_PER_POINT = 5.0  # one priority point per 5 s waited
 
@@ -42,7 +44,9 @@ RESIDUE_BYTES = 450 * MIB  # a live CUDA process keeps its context
 # Limits
 MESSAGE_MAX_BYTES = 1 * MIB
 IMAGE_MESSAGE_MAX_BYTES = 16 * MIB  # sidecar and runner wires only
-VALUES_MAX = 6144  # msgpack values of one message, at every depth: at most 4 ms of decoding and validating
+VALUES_MAX = (
+    6144  # msgpack values of one message, at every depth: at most 4 ms of decoding and validating
+)
 LISTED_MAX = 256  # keys of one map, items of one list
 CONNECTIONS_MAX = 2048  # with those that have not said hello
 SESSIONS_MAX = 1024

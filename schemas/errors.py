@@ -16,7 +16,9 @@ class VramError(Exception):
 
     code: ClassVar[str] = "internal"
 
-    def __init__(self, message: str, *, hint: str = "", details: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, message: str, *, hint: str = "", details: Mapping[str, Any] | None = None
+    ) -> None:
         super().__init__(f"{message} ({hint})" if hint else message)
         self.message = message
         self.hint = hint
@@ -24,7 +26,12 @@ class VramError(Exception):
 
     def to_wire(self) -> dict[str, Any]:
         """The `error` map of a reply."""
-        return {"code": self.code, "message": self.message, "hint": self.hint, "details": self.details}
+        return {
+            "code": self.code,
+            "message": self.message,
+            "hint": self.hint,
+            "details": self.details,
+        }
 
 
 class CallerError(VramError):
@@ -82,7 +89,9 @@ class VramInsufficient(CallerError):
 
 
 class HostRamInsufficient(TransientError):
-    code = "host_ram_insufficient"  # no room to park: details.needed_bytes, budget_bytes, booked_bytes
+    code = (
+        "host_ram_insufficient"  # no room to park: details.needed_bytes, budget_bytes, booked_bytes
+    )
 
 
 class LoadFailing(TransientError):
@@ -90,9 +99,7 @@ class LoadFailing(TransientError):
 
 
 class GangBroken(TransientError):
-    code = (
-        "gang_broken"  # another member was denied, lost or gave up before all were granted: details.gang, why
-    )
+    code = "gang_broken"  # another member was denied, lost or gave up before all were granted: details.gang, why
 
 
 class WouldDeadlock(CallerError):
@@ -153,7 +160,9 @@ class ArbiterUnreachable(TransientError):
 
 
 class UntrustedServer(OperatorError):
-    code = "untrusted_server"  # another user's process serves the socket: details.uid, user, endpoint
+    code = (
+        "untrusted_server"  # another user's process serves the socket: details.uid, user, endpoint
+    )
 
 
 class AlreadyRunning(OperatorError):
@@ -215,9 +224,7 @@ class EstopRequested(OperatorError):
 
 
 class RobotFault(OperatorError):
-    code = (
-        "robot_fault"  # the robot's hardware does not answer, or answers nonsense: cables, power, calibration
-    )
+    code = "robot_fault"  # the robot's hardware does not answer, or answers nonsense: cables, power, calibration
 
 
 class EnvironmentFailed(OperatorError):

@@ -13,8 +13,8 @@ nothing that a peer sends costs more than a copy of `REQUEST_MAX_BYTES`.
 from dataclasses import dataclass
 from enum import StrEnum
 
-from schemas.endpoints import socket_path
-from schemas.errors import BadFrame
+from vram_arbiter.schemas.errors import BadFrame
+from vram_arbiter.schemas.runtime.endpoints import socket_path
 
 SUFFIX = ".estop"
 PREFIX = b"VRAM-ESTOP/"

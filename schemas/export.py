@@ -1,7 +1,7 @@
 """JSON Schemas of everything that crosses a process border or lies in a file, made from the models themselves.
 
 One document a subject: `rskill.json` and the like have a root for editors, the documents of the wires list every message under
-`$defs`. Makes texts only; `python -m schemas export` writes them.
+`$defs`. Makes texts only; `python -m vram_arbiter.schemas export` writes them.
 """
 
 import importlib
@@ -12,12 +12,12 @@ from typing import Any, Literal, is_typeddict
 
 from pydantic import BaseModel, TypeAdapter
 
-import schemas
+from vram_arbiter import schemas
 
 ROOTS: dict[str, str] = {
-    "rskill": "schemas.manifest:RSkillManifest",
-    "arbiter": "schemas.config:ArbiterConfig",
-    "robot": "schemas.robot:RobotEnvironment",
+    "rskill": "vram_arbiter.schemas.manifest:RSkillManifest",
+    "arbiter": "vram_arbiter.schemas.config.arbiter:ArbiterConfig",
+    "robot": "vram_arbiter.schemas.config.robot:RobotEnvironment",
 }
 """Documents with a single root: name → `module:class`."""
 
@@ -32,7 +32,7 @@ def documents() -> dict[str, str]:
         model: type[BaseModel] = getattr(importlib.import_module(module), attribute)
         found[name] = model.model_json_schema()
     for name in modules():
-        module_schema = _of_module(importlib.import_module(f"schemas.{name}"))
+        module_schema = _of_module(importlib.import_module(f"vram_arbiter.schemas.{name}"))
         if module_schema["$defs"]:
             found[name] = {"title": f"schemas.{name}", **module_schema}
     return {
@@ -70,9 +70,9 @@ def _of_module(module: ModuleType) -> dict[str, Any]:
     inputs: list[tuple[str, Literal["validation"], TypeAdapter[Any]]] = [
         (model.__name__, mode, TypeAdapter(model)) for model in public_models(module)
     ]
-    schemas, definitions = TypeAdapter.json_schemas(inputs)
+    found, definitions = TypeAdapter.json_schemas(inputs)
     defs = dict(definitions.get("$defs", {}))
-    for (name, _), schema in schemas.items():
+    for (name, _), schema in found.items():
         if schema != {"$ref": f"#/$defs/{name}"}:
             defs[name] = schema
     return {"$defs": defs}

@@ -23,10 +23,10 @@ from typing import Annotated, Any, Literal, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from schemas.defaults import NAME_MAX_CHARS
-from schemas.errors import ConfigError, OutOfMemory
-from schemas.ids import ProcessKey
-from schemas.units import ByteSize, format_bytes
+from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
+from vram_arbiter.schemas.errors import ConfigError, OutOfMemory
+from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.units import ByteSize, format_bytes
 
 CARD_FILE = "gpu.json"
 LOG_FILE = "log.jsonl"
@@ -141,9 +141,7 @@ class Card:
     config: CardConfig
     processes: Mapping[str, ProcessFile]
     seq: int = 0
-    logged_bytes: int = (
-        0  # used bytes by the log; differs from `used_bytes` only after somebody edited a file by hand
-    )
+    logged_bytes: int = 0  # used bytes by the log; differs from `used_bytes` only after somebody edited a file by hand
 
     @property
     def used_bytes(self) -> int:
@@ -222,7 +220,9 @@ def read_card(texts: Mapping[str, str], log_tail: str) -> Change:
     newest = _last_line(log_tail)
     logged = int(newest.get("seq", 0))
     missing = [
-        p.last for p in processes.values() if p.last is not None and int(p.last.get("seq", 0)) > logged
+        p.last
+        for p in processes.values()
+        if p.last is not None and int(p.last.get("seq", 0)) > logged
     ]
     torn = bool(log_tail) and not log_tail.endswith("\n")
     steps: tuple[Step, ...] = ()
@@ -232,7 +232,10 @@ def read_card(texts: Mapping[str, str], log_tail: str) -> Change:
         steps = (Step("", None, ("\n" if torn else "") + lines),)
     newest = missing[-1] if missing else newest
     card = Card(
-        parse_config(texts[CARD_FILE]), processes, int(newest.get("seq", 0)), int(newest.get("used_after", 0))
+        parse_config(texts[CARD_FILE]),
+        processes,
+        int(newest.get("seq", 0)),
+        int(newest.get("used_after", 0)),
     )
     return Change(card, steps)
 
@@ -343,10 +346,14 @@ def empty_cache(card: Card, key: ProcessKey, now: float) -> Change:
     leak = min(process.cached_bytes, max(0, card.config.faults.leak_bytes - process.leaked_bytes))
     freed = process.cached_bytes - leak
     change, name = Change(card), file_name(key)
-    process = process.model_copy(update={"cached_bytes": freed, "leaked_bytes": process.leaked_bytes + leak})
+    process = process.model_copy(
+        update={"cached_bytes": freed, "leaked_bytes": process.leaked_bytes + leak}
+    )
     if leak:
         change = change.then(_step(name, process, now, "leak", leak, 0))
-    process = process.model_copy(update={"cached_bytes": 0, "returning": _later(process, freed, card, now)})
+    process = process.model_copy(
+        update={"cached_bytes": 0, "returning": _later(process, freed, card, now)}
+    )
     return change.then(_step(name, process, now, "free", freed, 0))
 
 
@@ -416,8 +423,12 @@ def _step(
             "used_after": card.logged_bytes + delta, "capacity": card.config.capacity_bytes,
         }  # fmt: skip
         written = process.model_copy(update={"last": dict(line)})
-        after = Card(card.config, {**card.processes, name: written}, card.seq + 1, card.logged_bytes + delta)
-        return Change(after, (Step(name, written.model_dump_json(exclude_defaults=True), _dump(line)),))
+        after = Card(
+            card.config, {**card.processes, name: written}, card.seq + 1, card.logged_bytes + delta
+        )
+        return Change(
+            after, (Step(name, written.model_dump_json(exclude_defaults=True), _dump(line)),)
+        )
 
     return transition
 
@@ -446,7 +457,9 @@ class FolderPlan:
     fresh_log: bool = False
 
 
-def plan_folder(wanted: CardConfig, existing: str | None, process_files: Iterable[str]) -> FolderPlan:
+def plan_folder(
+    wanted: CardConfig, existing: str | None, process_files: Iterable[str]
+) -> FolderPlan:
     """Make a card, or keep the one that is there: a restarted daemon must find what living processes still hold.
 
     Process files of an earlier boot are void. Raises ConfigError if the card is in use with another capacity.

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
-from schemas.traceparent import Traceparent
-from schemas.wire import Name, Seconds
+from vram_arbiter.schemas.runtime.telemetry.traceparent import Traceparent
+from vram_arbiter.schemas.wire import Name, Seconds
 
 
 class _Call(BaseModel):
@@ -51,7 +51,9 @@ class GetFrame(_Call):
 
     op: Literal["frame"]
     camera: str = ""
-    encoding: Literal["jpeg", "png"] = "jpeg"  # models want png: jpeg's artefacts cost them accuracy
+    encoding: Literal["jpeg", "png"] = (
+        "jpeg"  # models want png: jpeg's artefacts cost them accuracy
+    )
     max_age_ms: Annotated[float, Field(gt=0, le=60_000)] = 500.0
 
 
@@ -100,7 +102,9 @@ class FrameReply(TypedDict):
     height: int
     stamp_monotonic_ns: int
     age_ms: float
-    camera_model: NotRequired[dict[str, Any]]  # schemas.world.CameraModel: K, T_base_camera, support_plane_z
+    camera_model: NotRequired[
+        dict[str, Any]
+    ]  # schemas.world.CameraModel: K, T_base_camera, support_plane_z
 
 
 class FeedbackPush(TypedDict):

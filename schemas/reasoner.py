@@ -38,6 +38,8 @@ class PingReasoner(_Call):
     op: Literal["ping"]
 
 
-ReasonerRequest = Annotated[Say | CancelEpisode | GetEpisode | PingReasoner, Field(discriminator="op")]
+ReasonerRequest = Annotated[
+    Say | CancelEpisode | GetEpisode | PingReasoner, Field(discriminator="op")
+]
 REASONER_REQUEST: TypeAdapter[ReasonerRequest] = TypeAdapter(ReasonerRequest)
 OPS = ("say", "cancel", "state", "ping")

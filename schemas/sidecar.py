@@ -18,8 +18,8 @@ from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
-from schemas.traceparent import Traceparent
-from schemas.wire import Seconds, TokenPair
+from vram_arbiter.schemas.runtime.telemetry.traceparent import Traceparent
+from vram_arbiter.schemas.wire import Seconds, TokenPair
 
 ImageBytes = Annotated[bytes, Field(min_length=8, max_length=16 * 1024 * 1024)]
 Question = Annotated[str, Field(min_length=1, max_length=2000)]
@@ -96,7 +96,9 @@ class ScoreOp(_Look):
     n: Annotated[int, Field(ge=1, le=PICTURES_MAX)] | None = None
     width: Side | None = None
     height: Side | None = None
-    num_bins: Annotated[int, Field(ge=2, le=1000)] = 100  # of the field's wire; the checkpoint knows its own
+    num_bins: Annotated[int, Field(ge=2, le=1000)] = (
+        100  # of the field's wire; the checkpoint knows its own
+    )
 
     @model_validator(mode="after")
     def _one_way_to_send_pictures(self) -> Self:
@@ -113,7 +115,8 @@ class ScoreOp(_Look):
 
 
 OpRequest = Annotated[
-    PingOp | LoadOp | UnloadOp | ShutdownOp | DetectOp | QueryOp | ScoreOp, Field(discriminator="op")
+    PingOp | LoadOp | UnloadOp | ShutdownOp | DetectOp | QueryOp | ScoreOp,
+    Field(discriminator="op"),
 ]
 OP_REQUEST: TypeAdapter[OpRequest] = TypeAdapter(OpRequest)
 

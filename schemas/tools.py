@@ -14,10 +14,18 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
+from pydantic import (
+    AliasChoices,
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+)
 
-from schemas import strictjson
-from schemas.errors import BadRequest, UnknownOp
+from vram_arbiter.schemas import strictjson
+from vram_arbiter.schemas.errors import BadRequest, UnknownOp
 
 PROGRESS_WINDOW_MAX_S = 60.0
 TOOL_NAME_MAX_CHARS = 64  # what the public chat APIs accept
@@ -46,12 +54,15 @@ class ExecuteRskill(_Tool):
     ]
     prompt: Annotated[Text, Field(description="What the skill is to do, in words.")] = ""
     goal_params_json: Annotated[
-        Text, Field(description="JSON object with the skill's structured parameters; empty for none.")
+        Text,
+        Field(description="JSON object with the skill's structured parameters; empty for none."),
     ] = ""
     deadline_s: Annotated[
         float,
         Field(
-            ge=0, allow_inf_nan=False, description="Seconds until it is cancelled; 0: as the manifest says."
+            ge=0,
+            allow_inf_nan=False,
+            description="Seconds until it is cancelled; 0: as the manifest says.",
         ),
     ] = 0.0
     patience_s: Annotated[
@@ -95,7 +106,9 @@ class LocateInView(_Tool):
     """Look for an object in a camera's present picture. Moves nothing."""
 
     tool: Literal["locate_in_view"] = "locate_in_view"
-    query: Annotated[Text, Field(min_length=1, description="The object, in words, e.g. `red cube`.")]
+    query: Annotated[
+        Text, Field(min_length=1, description="The object, in words, e.g. `red cube`.")
+    ]
     camera: Annotated[
         str, Field(max_length=128, description="Name of the camera; empty: the default one.")
     ] = ""
@@ -108,7 +121,9 @@ class QueryScene(_Tool):
     """Ask a question about a camera's present picture and get a sentence back. Moves nothing."""
 
     tool: Literal["query_scene"] = "query_scene"
-    question: Annotated[Text, Field(min_length=1, description="A question that the picture can answer.")]
+    question: Annotated[
+        Text, Field(min_length=1, description="A question that the picture can answer.")
+    ]
     camera: Annotated[
         str, Field(max_length=128, description="Name of the camera; empty: the default one.")
     ] = ""
@@ -121,10 +136,15 @@ class QueryTaskProgress(_Tool):
     window_s: Annotated[
         float,
         Field(
-            gt=0, le=PROGRESS_WINDOW_MAX_S, allow_inf_nan=False, description="How far to look back, seconds."
+            gt=0,
+            le=PROGRESS_WINDOW_MAX_S,
+            allow_inf_nan=False,
+            description="How far to look back, seconds.",
         ),
     ] = 8.0
-    task: Annotated[Text, Field(description="Progress towards what, in words; empty: the present task.")] = ""
+    task: Annotated[
+        Text, Field(description="Progress towards what, in words; empty: the present task.")
+    ] = ""
 
 
 class LifecycleTransition(_Tool):
@@ -202,7 +222,9 @@ def parse_tool_call(name: str, arguments: str | Mapping[str, Any]) -> ToolCall:
     """
     if name not in TOOLS:
         raise UnknownOp(
-            f"there is no tool {name!r}", hint=f"choose from {', '.join(TOOLS)}", details={"known": [*TOOLS]}
+            f"there is no tool {name!r}",
+            hint=f"choose from {', '.join(TOOLS)}",
+            details={"known": [*TOOLS]},
         )
     arguments = read_arguments(name, arguments)
     try:
@@ -227,7 +249,9 @@ def skill_tool_name(rskill_id: str) -> str:
     )
     if len(name) <= TOOL_NAME_MAX_CHARS and re.fullmatch(f"{_PLAIN}/{_PLAIN}", rskill_id):
         return name
-    digits = hashlib.sha1(rskill_id.encode(errors="surrogatepass"), usedforsecurity=False).hexdigest()[:8]
+    digits = hashlib.sha1(
+        rskill_id.encode(errors="surrogatepass"), usedforsecurity=False
+    ).hexdigest()[:8]
     return f"{name[: TOOL_NAME_MAX_CHARS - 9]}_{digits}"
 
 

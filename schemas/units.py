@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import BeforeValidator, Field
 
-from schemas.sizes import format_bytes, parse_bytes
+from vram_arbiter.schemas.sizes import format_bytes, parse_bytes
 
 
 def _size(value: object) -> object:

@@ -17,10 +17,12 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
-from schemas import defaults as d
-from schemas.traceparent import Traceparent
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.runtime.telemetry.traceparent import Traceparent
 
-Name = Annotated[str, Field(min_length=1, max_length=d.NAME_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]+$")]
+Name = Annotated[
+    str, Field(min_length=1, max_length=d.NAME_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]+$")
+]
 LeaseIdText = Annotated[str, Field(min_length=1, max_length=64)]
 TokenPair = Annotated[tuple[int, int], Field(description="[epoch, serial]")]
 Serial = Annotated[int, Field(ge=0, lt=1 << 63)]
@@ -75,12 +77,14 @@ class LeaseSpec(_Frozen):
         "wait"  # what may be done to its own process if that outstays the deadline idle
     )
     standby: bool = False  # asked to leave, it comes back by itself when there is room
-    park_bytes: Bytes = 0  # host RAM that keeps its weights while it is away; 0: it cannot be parked
-    gang: Gang | None = None
-    parent: LeaseRef | None = None  # a sub-lease: carved at once out of that lease's bytes, on its card
-    independent: bool = (
-        False  # the process's own uses do not wait for this lease (a prefetch): no deadlock is seen in it
+    park_bytes: Bytes = (
+        0  # host RAM that keeps its weights while it is away; 0: it cannot be parked
     )
+    gang: Gang | None = None
+    parent: LeaseRef | None = (
+        None  # a sub-lease: carved at once out of that lease's bytes, on its card
+    )
+    independent: bool = False  # the process's own uses do not wait for this lease (a prefetch): no deadlock is seen in it
 
 
 class _Request(_Frozen):
@@ -141,7 +145,9 @@ class Yield(_OnLease):
 
 class Renew(_Request):
     op: Literal["renew"]
-    leases: Annotated[tuple[LeaseRef, ...], Field(max_length=d.LEASES_PER_CLIENT_MAX, fail_fast=True)]
+    leases: Annotated[
+        tuple[LeaseRef, ...], Field(max_length=d.LEASES_PER_CLIENT_MAX, fail_fast=True)
+    ]
 
 
 class RevokeAck(_OnLease):
@@ -192,7 +198,9 @@ class ReattachLease(_Frozen):
     lease_id: LeaseIdText
     token: TokenPair
     spec: LeaseSpec
-    state: Literal["loading", "held", "standby", "parked"]  # standby, parked: `token` is the last one
+    state: Literal[
+        "loading", "held", "standby", "parked"
+    ]  # standby, parked: `token` is the last one
     measured_bytes: Bytes | None = None
     use_ids: UseIds = ()
 
@@ -201,7 +209,9 @@ class Reattach(_Request):
     """After a reconnect: what this client still holds. The reply says per lease `kept` or why not."""
 
     op: Literal["reattach"]
-    leases: Annotated[tuple[ReattachLease, ...], Field(max_length=d.LEASES_PER_CLIENT_MAX, fail_fast=True)]
+    leases: Annotated[
+        tuple[ReattachLease, ...], Field(max_length=d.LEASES_PER_CLIENT_MAX, fail_fast=True)
+    ]
 
 
 class Oom(_Request):
@@ -376,7 +386,9 @@ class RevokePush(TypedDict):
         int
     ]  # what still runs on the lease (or its tree), whoever marked it; `unloading` is refused before 0
     children: NotRequired[int]  # sub-leases that have to leave first
-    park: NotRequired[bool]  # host RAM for its weights is booked until it lets go: release with `parked`
+    park: NotRequired[
+        bool
+    ]  # host RAM for its weights is booked until it lets go: release with `parked`
     traceparent: NotRequired[
         str
     ]  # of the eviction, or of whoever waits: the unloading belongs to that trace. W3C
@@ -431,7 +443,9 @@ class GpuView(TypedDict):
     sample_age_s: float | None
     pressure_bytes: int
     blocked: str  # why nothing is granted now, "" if grants are possible
-    processes: list[dict[str, Any]]  # {"pid", "name", "used_bytes", "lease_ids", "residue_bytes", "stowaway"}
+    processes: list[
+        dict[str, Any]
+    ]  # {"pid", "name", "used_bytes", "lease_ids", "residue_bytes", "stowaway"}
 
 
 class StatusReply(TypedDict):
@@ -445,7 +459,9 @@ class StatusReply(TypedDict):
     clients: int
     host_ram: NotRequired[dict[str, int]]  # {"budget_bytes", "parked_bytes"}
     drained: str  # who drained the arbiter and why; "" while it grants
-    problems: list[str]  # what is wrong with the daemon's own files, in words; empty when all is well
+    problems: list[
+        str
+    ]  # what is wrong with the daemon's own files, in words; empty when all is well
 
 
 class WhyReply(TypedDict):

@@ -11,9 +11,16 @@ import math
 from enum import StrEnum
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_serializer, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    field_serializer,
+    field_validator,
+    model_validator,
+)
 
-from schemas.control import ControlMode
+from vram_arbiter.schemas.control import ControlMode
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 UnitInterval = Annotated[float, Field(ge=0, le=1)]
@@ -152,7 +159,11 @@ class CameraModel(_Frozen):
         scale = (self.support_plane_z - origin[2]) / direction[2]
         if scale <= 0:
             return None
-        return (origin[0] + scale * direction[0], origin[1] + scale * direction[1], self.support_plane_z)
+        return (
+            origin[0] + scale * direction[0],
+            origin[1] + scale * direction[1],
+            self.support_plane_z,
+        )
 
 
 # -- detections ---------------------------------------------------------------------------------------------------
@@ -167,7 +178,9 @@ class Detection(_Frozen):
     @classmethod
     def _ordered(cls, box: Box2d) -> Box2d:
         if box[2] <= box[0] or box[3] <= box[1]:
-            raise ValueError("a box is x_min, y_min, x_max, y_max with x_max > x_min and y_max > y_min")
+            raise ValueError(
+                "a box is x_min, y_min, x_max, y_max with x_max > x_min and y_max > y_min"
+            )
         return box
 
     @property
@@ -197,14 +210,17 @@ class DetectedObject(_Frozen):
     x_max, y_max, z_max in the frame of `pose`. `track_id` is the tracker's own, a number or a
     word."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_by_name=True, validate_by_alias=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", validate_by_name=True, validate_by_alias=True
+    )
 
     label: Annotated[str, Field(min_length=1)]
     confidence: UnitInterval
     pose: Pose | None = None
     box: Box2d | None = None
     box_3d: Annotated[
-        tuple[Finite, Finite, Finite, Finite, Finite, Finite] | None, Field(validation_alias="bbox_3d")
+        tuple[Finite, Finite, Finite, Finite, Finite, Finite] | None,
+        Field(validation_alias="bbox_3d"),
     ] = None
     sensor_id: str = ""
     track_id: Index | str | None = None
@@ -257,7 +273,9 @@ class WorldState(_Frozen):
     @property
     def stale(self) -> tuple[str, ...]:
         """Components that must not be acted upon."""
-        return tuple(sorted(name for name, state in self.diagnostics.items() if state in ("stale", "error")))
+        return tuple(
+            sorted(name for name, state in self.diagnostics.items() if state in ("stale", "error"))
+        )
 
 
 # -- actions ------------------------------------------------------------------------------------------------------
@@ -311,7 +329,11 @@ class Action(_Frozen):
     @model_validator(mode="after")
     def _check(self) -> Self:
         wanted = PAYLOAD_OF_MODE[self.control_mode]
-        given = [name for name in dict.fromkeys(PAYLOAD_OF_MODE.values()) if getattr(self, name) is not None]
+        given = [
+            name
+            for name in dict.fromkeys(PAYLOAD_OF_MODE.values())
+            if getattr(self, name) is not None
+        ]
         if given != [wanted]:
             raise ValueError(
                 f"control_mode {self.control_mode} is carried by {wanted} alone, not by {', '.join(given) or 'nothing'}"
@@ -323,7 +345,9 @@ class Action(_Frozen):
         if len(widths) > 1:
             raise ValueError(f"the rows of {wanted} have different lengths: {sorted(widths)}")
         if self.joint_names is not None and widths and widths != {len(self.joint_names)}:
-            raise ValueError(f"joint_names has {len(self.joint_names)} names for rows of {widths.pop()}")
+            raise ValueError(
+                f"joint_names has {len(self.joint_names)} names for rows of {widths.pop()}"
+            )
         return self
 
     @property

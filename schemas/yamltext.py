@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from schemas.errors import ConfigError
+from vram_arbiter.schemas.errors import ConfigError
 
 Path = tuple[str | int, ...]
 """Keys and list positions from the top of a document to one value."""
@@ -28,7 +28,8 @@ NUMBER_MAX_CHARACTERS = 100
 
 _TAG = "tag:yaml.org,2002:"
 _TAGS = {
-    f"{_TAG}{name}" for name in ["null", "bool", "int", "float", "str", "seq", "map", "timestamp", "merge"]
+    f"{_TAG}{name}"
+    for name in ["null", "bool", "int", "float", "str", "seq", "map", "timestamp", "merge"]
 }
 
 
@@ -45,7 +46,9 @@ class Problem:
         """`arbiter.yaml:12: verify.tiemout_s: unknown key; …`"""
         place = ":".join(str(number) for number in (self.line, self.column) if number)
         where = f"{name}:{place}" if place else name
-        return f"{where}: {self.field}: {self.problem}" if self.field else f"{where}: {self.problem}"
+        return (
+            f"{where}: {self.field}: {self.problem}" if self.field else f"{where}: {self.problem}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +133,11 @@ class _Loader(yaml.SafeLoader):
         self._nodes += 1
         if self._depth > DEPTH_MAX or self._nodes > NODES_MAX:
             deep = self._depth > DEPTH_MAX
-            limit = f"nested deeper than {DEPTH_MAX} levels" if deep else f"more than {NODES_MAX} values"
+            limit = (
+                f"nested deeper than {DEPTH_MAX} levels"
+                if deep
+                else f"more than {NODES_MAX} values"
+            )
             mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
             raise yaml.composer.ComposerError(None, None, limit, mark)
         try:
@@ -181,7 +188,9 @@ class _Survey:
                 if size > NODES_MAX
                 else f"nested deeper than {DEPTH_MAX} levels"
             )
-            raise yaml.composer.ComposerError(None, None, f"{limit}, aliases expanded", node.start_mark)
+            raise yaml.composer.ComposerError(
+                None, None, f"{limit}, aliases expanded", node.start_mark
+            )
         self._open.discard(id(node))
         self._known[id(node)] = size, levels
         return size, levels
@@ -206,7 +215,9 @@ class _Survey:
             kind = node.tag.removeprefix(_TAG)
             self._say(node, path, f"{len(node.value)} characters are too many for the type {kind}")
         if "\0" in node.value or any("\ud800" <= character <= "\udfff" for character in node.value):
-            self._say(node, path, "holds a character that no text may hold (NUL or half a surrogate pair)")
+            self._say(
+                node, path, "holds a character that no text may hold (NUL or half a surrogate pair)"
+            )
 
     def _say(self, node: yaml.Node, path: Path, problem: str) -> None:
         mark = node.start_mark
@@ -256,7 +267,8 @@ def config_error(name: str, problems: list[Problem]) -> ConfigError:
         details={
             "file": name,
             "fields": [
-                {"line": p.line, "column": p.column, "field": p.field, "problem": p.problem} for p in problems
+                {"line": p.line, "column": p.column, "field": p.field, "problem": p.problem}
+                for p in problems
             ],
         },
     )

@@ -13,23 +13,24 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from clients import cuda, logs
-from clients.configs import configs_folder, shipped
-from clients.serve import path_of
-from schemas import defaults as d
-from schemas import telemetry, terminal
-from schemas.commands import command
-from schemas.endpoints import arbiter_endpoint, program_endpoint
-from schemas.errors import ConfigError, ModelError, NoGpu, VramError
-from schemas.extras import need
-from schemas.fakegpu import CARD_FILE, FOLDER_VARIABLE, parse_config
-from schemas.manifest import Kind, ManifestError, RSkillManifest
-from schemas.version import add_version
-from sidecars.adapters.base import ModelAdapter
-from sidecars.adapters.choose import make_adapter
-from sidecars.adapters.gpu_passthrough import is_passthrough, need_card
-from sidecars.device.memory import DeviceMemory, NoDevice
-from sidecars.settings import (
+from vram_arbiter.clients import cuda, logs
+from vram_arbiter.clients.configs import configs_folder, shipped
+from vram_arbiter.clients.net.server import path_of
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.errors import ConfigError, ModelError, NoGpu, VramError
+from vram_arbiter.schemas.fakegpu import CARD_FILE, FOLDER_VARIABLE, parse_config
+from vram_arbiter.schemas.manifest import Kind, ManifestError, RSkillManifest
+from vram_arbiter.schemas.runtime import terminal
+from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint, program_endpoint
+from vram_arbiter.schemas.runtime.extras import need
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry.commands import command
+from vram_arbiter.schemas.runtime.version import add_version
+from vram_arbiter.sidecars.adapters.base import ModelAdapter
+from vram_arbiter.sidecars.adapters.choose import make_adapter
+from vram_arbiter.sidecars.adapters.gpu_passthrough import is_passthrough, need_card
+from vram_arbiter.sidecars.device.memory import DeviceMemory, NoDevice
+from vram_arbiter.sidecars.settings import (
     NICE,
     REQUEST_TIMEOUT_S,
     WAIT_TIMEOUT_S,
@@ -39,7 +40,7 @@ from sidecars.settings import (
     read_footprints,
     read_model,
 )
-from sidecars.weights import Weights, cached
+from vram_arbiter.sidecars.weights import Weights, cached
 
 FOOTPRINTS = "models/footprints.yaml"
 _ENVIRONMENT = {  # of the model libraries, before they are imported: what they write and whom they tell
@@ -54,9 +55,11 @@ AdapterFor = Callable[[RSkillManifest, Weights], ModelAdapter]
 
 @terminal.program
 def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adapter) -> int:
-    """Entry point of `vram-sidecar` and `python -m sidecars`. `adapter_for` lets a program serve a model of its own."""
+    """Entry point of `vram-sidecar` and `python -m vram_arbiter.sidecars`. `adapter_for` lets a program serve a model of its own."""
     flags = _parser().parse_args(arguments)
-    service = f"vram-sidecar-{flags.name}"  # each a service of its own: a trace shows which model it was
+    service = (
+        f"vram-sidecar-{flags.name}"  # each a service of its own: a trace shows which model it was
+    )
     human = f"%(asctime)s {flags.name} %(levelname)s %(message)s"
     logs.set_up(service, flags.log_level, flags.log_format, human)
     try:
@@ -66,20 +69,30 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
             os.environ.setdefault(name, value)
         if flags.check:
             found = compare_weights(settings.manifest, settings.weights, adapter_for)
-            print(f"ok: {settings.manifest.name} from {settings.weights.source} as {adapter.kind}; {found}")
+            print(
+                f"ok: {settings.manifest.name} from {settings.weights.source} as {adapter.kind}; {found}"
+            )
             return 0
         if adapter_for is make_adapter:
             _need_packages(settings.manifest)
-        from sidecars.host import SidecarHost
+        from vram_arbiter.sidecars.host import SidecarHost
 
-        with command(service, "serve", serves=True, attributes={telemetry.ATTR_CONSUMER: flags.name}):
+        with command(
+            service, "serve", serves=True, attributes={telemetry.ATTR_CONSUMER: flags.name}
+        ):
             finished = asyncio.run(SidecarHost(settings, adapter, open_memory(settings)).serve())
         if not finished:
             logging.shutdown()
-            os._exit(0)  # the interpreter would wait for an import of many seconds that nobody needs any more
+            os._exit(
+                0
+            )  # the interpreter would wait for an import of many seconds that nobody needs any more
     except (VramError, ManifestError) as error:
         terminal.complain("vram-sidecar", error)
-        wrong = (ConfigError, ManifestError, ModelError) if flags.check else (ConfigError, ManifestError)
+        wrong = (
+            (ConfigError, ManifestError, ModelError)
+            if flags.check
+            else (ConfigError, ManifestError)
+        )
         return 2 if isinstance(error, wrong) else 1
     return 0
 
@@ -104,7 +117,9 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         entry = parse_footprint(flags.footprint)
     else:
         path = flags.footprints or configs / FOOTPRINTS
-        entry = footprint_for(manifest, read_footprints(path) if path.exists() or flags.footprints else {})
+        entry = footprint_for(
+            manifest, read_footprints(path) if path.exists() or flags.footprints else {}
+        )
     endpoint = flags.endpoint or program_endpoint(flags.name, os.environ, os.getuid())
     path_of(endpoint)  # refused before a model is read
     device = _device(flags.device)
@@ -116,7 +131,9 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         footprint=entry.on_wire(),
         endpoint=endpoint,
         device=device,
-        arbiter=None if flags.no_arbiter else flags.arbiter or arbiter_endpoint(os.environ, os.getuid()),
+        arbiter=None
+        if flags.no_arbiter
+        else flags.arbiter or arbiter_endpoint(os.environ, os.getuid()),
         stands_for=entry.stands_for,
         throttle_bytes_per_s=entry.throttle,
         gpu=flags.gpu or _gpu_of(device),
@@ -156,11 +173,11 @@ def open_memory(settings: Settings) -> DeviceMemory:
     if settings.device == "none":
         return NoDevice()
     if settings.device.startswith("fake:"):
-        from sidecars.device.fake import FakeMemory
+        from vram_arbiter.sidecars.device.fake import FakeMemory
 
         folder = Path(settings.device.removeprefix("fake:"))
         return FakeMemory(folder, settings.name, settings.footprint.residue_bytes)
-    from sidecars.device.cuda import CudaMemory
+    from vram_arbiter.sidecars.device.cuda import CudaMemory
 
     index = settings.device.partition(":")[2]
     return CudaMemory(int(index) if index else None, settings.footprint.residue_bytes)
@@ -178,7 +195,9 @@ def _device(text: str | None) -> str:
         or (kind == "cuda" and colon and rest.isdecimal())
     ):
         return text
-    raise ConfigError(f"--device {text} is not known", hint="write fake:FOLDER, cuda, cuda:1 or none")
+    raise ConfigError(
+        f"--device {text} is not known", hint="write fake:FOLDER, cuda, cuda:1 or none"
+    )
 
 
 def _gpu_of(device: str) -> str:
@@ -190,7 +209,8 @@ def _gpu_of(device: str) -> str:
         return parse_config(path.read_text()).uuid
     except OSError as error:
         raise NoGpu(  # it may come: the arbiter makes the card when it starts
-            f"{path} cannot be read: {error.strerror}", hint="start the arbiter with --gpu fake:8GiB"
+            f"{path} cannot be read: {error.strerror}",
+            hint="start the arbiter with --gpu fake:8GiB",
         ) from error
 
 
@@ -219,9 +239,22 @@ def _parser() -> argparse.ArgumentParser:
     add("--arbiter", metavar="EP", help="default: the arbiter's usual place")
     add("--no-arbiter", action="store_true", help="load at once, stay resident, ask nobody")
     add("--configs", type=Path, metavar="DIR", help="folder that local:// weights are looked up in")
-    add("--footprints", type=Path, metavar="FILE", help=f"default: {FOOTPRINTS} in the configs folder")
-    add("--footprint", metavar="PEAK[,STEADY[,RESIDUE]]", help="instead of the file, e.g. 5.3GB,5.3GB,450MiB")
-    add("--gpu", metavar="UUID|INDEX|any", help="which card to lease; default: the simulated one, else any")
+    add(
+        "--footprints",
+        type=Path,
+        metavar="FILE",
+        help=f"default: {FOOTPRINTS} in the configs folder",
+    )
+    add(
+        "--footprint",
+        metavar="PEAK[,STEADY[,RESIDUE]]",
+        help="instead of the file, e.g. 5.3GB,5.3GB,450MiB",
+    )
+    add(
+        "--gpu",
+        metavar="UUID|INDEX|any",
+        help="which card to lease; default: the simulated one, else any",
+    )
     add(
         "--priority",
         type=_number(int, 0, d.PRIORITY_MAX),

@@ -12,8 +12,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from schemas.errors import ModelError
-from sidecars.weights import Weights, from_pretrained, is_quantized
+from vram_arbiter.schemas.errors import ModelError
+from vram_arbiter.sidecars.weights import Weights, from_pretrained, is_quantized
 
 META = "meta"
 NAMES_SHOWN = 4
@@ -32,7 +32,9 @@ class Differences:
         kinds = {
             "missing from it": sorted(self.missing),
             "unknown to the model": sorted(self.foreign),
-            "of another shape": [f"{name} {shapes}" for name, shapes in sorted(self.misshapen.items())],
+            "of another shape": [
+                f"{name} {shapes}" for name, shapes in sorted(self.misshapen.items())
+            ],
         }
         parts = [f"{len(names)} {kind} ({_first(names)})" for kind, names in kinds.items() if names]
         if parts:
@@ -63,7 +65,8 @@ def load_transformers(cls: Any, weights: Weights, **options: Any) -> Any:
         missing=set(account["missing_keys"]),
         foreign=set(account["unexpected_keys"]),
         misshapen={
-            name: f"{tuple(has)}, not {tuple(needs)}" for name, has, needs in account["mismatched_keys"]
+            name: f"{tuple(has)}, not {tuple(needs)}"
+            for name, has, needs in account["mismatched_keys"]
         },
     )
     try:
@@ -97,7 +100,9 @@ def load_lerobot(cls: Any, weights: Weights, config: Any) -> Any:
 
 def _load_recorded(cls: Any, weights: Weights, config: Any, record: "_Record") -> Any:
     try:
-        model = from_pretrained(_recording(cls, record, config.device == META), weights, config=config)
+        model = from_pretrained(
+            _recording(cls, record, config.device == META), weights, config=config
+        )
     except ModelError:
         record.refuse_differences()  # the reason, where the loader told something vague
         raise
@@ -162,7 +167,9 @@ class _Record:
             else:
                 self._loaded.add(name)
         tied = {_identity(own[name]) for name in self._loaded}
-        self._found.missing = {name for name, tensor in own.items() if _identity(tensor) not in tied}
+        self._found.missing = {
+            name for name, tensor in own.items() if _identity(tensor) not in tied
+        }
         if self._found.foreign or self._found.misshapen:
             self.refuse_differences()
 
@@ -193,7 +200,9 @@ def _recording(cls: Any, record: _Record, without_bytes: bool) -> Any:
                 super().__init__(*arguments, **options)
             record.built = True
 
-        def load_state_dict(self, state_dict: Mapping[str, Any], *arguments: Any, **options: Any) -> Any:
+        def load_state_dict(
+            self, state_dict: Mapping[str, Any], *arguments: Any, **options: Any
+        ) -> Any:
             record.compare(self.state_dict(keep_vars=True), state_dict)
             with _silence():
                 result = super().load_state_dict(state_dict, *arguments, **options)
@@ -202,7 +211,9 @@ def _recording(cls: Any, record: _Record, without_bytes: bool) -> Any:
 
         @classmethod
         def _load_as_safetensor(cls, model: Any, file: str, device: str, strict: bool) -> Any:
-            return super()._load_as_safetensor(model, file, "cpu" if without_bytes else device, strict)
+            return super()._load_as_safetensor(
+                model, file, "cpu" if without_bytes else device, strict
+            )
 
     Recording.__name__ = cls.__name__
     return Recording
@@ -219,7 +230,11 @@ def _silence() -> Iterator[None]:
 def _identity(tensor: Any) -> Any:
     """The same for tied parameters, which a checkpoint holds once. A tensor without bytes has no
     address of its own."""
-    return (tensor.data_ptr(), tensor.shape) if tensor.numel() and tensor.device.type != META else id(tensor)
+    return (
+        (tensor.data_ptr(), tensor.shape)
+        if tensor.numel() and tensor.device.type != META
+        else id(tensor)
+    )
 
 
 def _first(names: Iterable[str]) -> str:

@@ -12,16 +12,16 @@ import signal
 from pathlib import Path
 from typing import Any, NoReturn
 
-from clients.aio import ArbiterClient
-from clients.serve import RouterServer
-from schemas.errors import VramError
-from schemas.sidecar import EndpointCall
-from sidecars.adapters.base import ModelAdapter, ModelCall
-from sidecars.device.memory import DeviceMemory
-from sidecars.residency import Residency
-from sidecars.settings import Settings
-from sidecars.wires import Wire, error_reply
-from sidecars.worker import Worker
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.net.server import RouterServer
+from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.sidecar import EndpointCall
+from vram_arbiter.sidecars.adapters.base import ModelAdapter, ModelCall
+from vram_arbiter.sidecars.device.memory import DeviceMemory
+from vram_arbiter.sidecars.residency import Residency
+from vram_arbiter.sidecars.settings import Settings
+from vram_arbiter.sidecars.wires import Wire, error_reply
+from vram_arbiter.sidecars.worker import Worker
 
 LAST_WORDS_S = 0.5  # until the answers that say so are with the kernel
 _log = logging.getLogger("sidecars")
@@ -52,24 +52,36 @@ class SidecarHost:
             stack.callback(worker.close)
             client = None
             if settings.arbiter is not None:
-                client = await stack.enter_async_context(ArbiterClient(settings.arbiter, name=settings.name))
+                client = await stack.enter_async_context(
+                    ArbiterClient(settings.arbiter, name=settings.name)
+                )
             server = await stack.enter_async_context(
                 RouterServer(settings.endpoint, error_reply, work_share=WORK_SHARE)
             )
-            residency = self._residency = Residency(settings, self._adapter, self._memory, worker, client)
-            background = [asyncio.create_task(server.serve(Wire(self, server.send).handle), name="serve")]
+            residency = self._residency = Residency(
+                settings, self._adapter, self._memory, worker, client
+            )
+            background = [
+                asyncio.create_task(server.serve(Wire(self, server.send).handle), name="serve")
+            ]
             residency.prepare()
             if client is None:
                 background.append(asyncio.create_task(self._load_at_start(residency), name="load"))
             elif settings.idle_release_s is not None:
                 background.append(
-                    asyncio.create_task(residency.release_when_idle(settings.idle_release_s), name="idle")
+                    asyncio.create_task(
+                        residency.release_when_idle(settings.idle_release_s), name="idle"
+                    )
                 )
-            _log.info("%s serves %s on %s", settings.name, settings.manifest.name, settings.endpoint)
+            _log.info(
+                "%s serves %s on %s", settings.name, settings.manifest.name, settings.endpoint
+            )
             stopped = asyncio.create_task(self._stopping.wait(), name="stopped")
             stuck = asyncio.create_task(worker.stuck.wait(), name="stuck")
             try:
-                await asyncio.wait([stopped, stuck, background[0]], return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait(
+                    [stopped, stuck, background[0]], return_when=asyncio.FIRST_COMPLETED
+                )
             finally:
                 stopped.cancel()
                 leaving = asyncio.create_task(residency.leave(), name="leave")
@@ -155,9 +167,13 @@ class SidecarHost:
     async def run(self, name: str, call: ModelCall) -> dict[str, Any]:
         residency = self._here
         if name == "reset" and call.token is None and residency.state != "resident":
-            return {"ok": True}  # a model that is not there has nothing to forget, and no reason to load
+            return {
+                "ok": True
+            }  # a model that is not there has nothing to forget, and no reason to load
         fresh_s = None if isinstance(call, EndpointCall) else call.fresh_s
-        return await residency.run(name, call.token, lambda: self._adapter.run(call), fresh_s=fresh_s)
+        return await residency.run(
+            name, call.token, lambda: self._adapter.run(call), fresh_s=fresh_s
+        )
 
     @property
     def _here(self) -> Residency:

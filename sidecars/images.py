@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from schemas.errors import BadRequest
+from vram_arbiter.schemas.errors import BadRequest
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -28,7 +28,11 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_DEPTHS = {0: (1, 2, 4, 8), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
 _JPEG = b"\xff\xd8"
 _JPEG_SCAN = 0xDA
-_JPEG_FRAMES = {0xC0, 0xC1, 0xC2}  # baseline, extended, progressive; Huffman-coded, as cameras write
+_JPEG_FRAMES = {
+    0xC0,
+    0xC1,
+    0xC2,
+}  # baseline, extended, progressive; Huffman-coded, as cameras write
 _JPEG_SEGMENTS = {0xC4, 0xDB, 0xDD, 0xFE, *range(0xE0, 0xF0)}  # tables, comments, application data
 
 
@@ -76,7 +80,9 @@ def _png(data: bytes) -> Header:
         at += 12 + length
         chunks += 1
         if chunks > CHUNKS_MAX:
-            raise BadRequest(f"a PNG of more than {CHUNKS_MAX} chunks", hint="write it with larger ones")
+            raise BadRequest(
+                f"a PNG of more than {CHUNKS_MAX} chunks", hint="write it with larger ones"
+            )
     return Header(width, height)
 
 
@@ -84,7 +90,9 @@ def _jpeg(data: bytes) -> Header:
     at, size = len(_JPEG), (0, 0)
     for _ in range(SEGMENTS_MAX):
         if data[at] != 0xFF:
-            raise BadRequest("the image cannot be decoded: a JPEG's segments do not join", hint=_HINT)
+            raise BadRequest(
+                "the image cannot be decoded: a JPEG's segments do not join", hint=_HINT
+            )
         kind = data[at + 1]
         if kind == 0xFF:  # padding
             at += 1

@@ -14,10 +14,9 @@ import time
 from collections.abc import AsyncIterator, Callable
 from typing import Any, Literal
 
-from clients.aio import ArbiterClient
-from clients.lease import Lease
-from schemas import meters, telemetry, tracing
-from schemas.errors import (
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.lease import Lease
+from vram_arbiter.schemas.errors import (
     BadState,
     Evicted,
     FrameStale,
@@ -33,10 +32,13 @@ from schemas.errors import (
     VramError,
     WaitTimeout,
 )
-from sidecars.adapters.base import ModelAdapter
-from sidecars.device.memory import Block, DeviceMemory, fill
-from sidecars.settings import Settings
-from sidecars.worker import Worker
+from vram_arbiter.schemas.runtime.telemetry import meters
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.sidecars.adapters.base import ModelAdapter
+from vram_arbiter.sidecars.device.memory import Block, DeviceMemory, fill
+from vram_arbiter.sidecars.settings import Settings
+from vram_arbiter.sidecars.worker import Worker
 
 State = Literal["unloaded", "waiting", "loading", "resident", "unloading"]
 Token = tuple[int, int]
@@ -70,7 +72,9 @@ class Residency:
         self._last_use_s = time.monotonic()
         self._resident_since_s = self._last_use_s
         self._obtaining: asyncio.Task[Lease | None] | None = None
-        self._unloads = 0  # times that somebody said so: whoever waited for the model then waits no longer
+        self._unloads = (
+            0  # times that somebody said so: whoever waited for the model then waits no longer
+        )
         self._calling: asyncio.Task[VramError | None] | None = None  # a lease on standby back
         self.lease: Lease | None = None
         self.state: State = "unloaded"
@@ -79,8 +83,12 @@ class Residency:
     # -- what the wire asks -------------------------------------------------------------------------------------------
     def prepare(self) -> None:
         """Begin the host work (imports, processors) that needs no lease. Repeats only after a failure."""
-        if self._prepared is None or (self._prepared.done() and self._prepared.exception() is not None):
-            self._prepared = asyncio.create_task(self._worker.run(self._prepare_blocking, abandon=True))
+        if self._prepared is None or (
+            self._prepared.done() and self._prepared.exception() is not None
+        ):
+            self._prepared = asyncio.create_task(
+                self._worker.run(self._prepare_blocking, abandon=True)
+            )
 
     async def load(self, timeout_s: float | None = None) -> bool:
         """Make the model resident; False if it was. `timeout_s` bounds the wait for the lease, not imports and loading.
@@ -153,7 +161,9 @@ class Residency:
                 if token is not None:
                     raise self._evicted() from error
                 if lease is not None:
-                    await self._until_left(lease, deadline)  # then there is a lease to ask for again
+                    await self._until_left(
+                        lease, deadline
+                    )  # then there is a lease to ask for again
 
     def token(self) -> Token | None:
         """Token of the lease under which the model is resident now."""
@@ -183,7 +193,9 @@ class Residency:
             if self.state != "unloaded":
                 await self._unload()
             await self._worker.run(self._memory.close)
-        except VramError as error:  # e.g. the card's folder is gone: there is nothing left to give back
+        except (
+            VramError
+        ) as error:  # e.g. the card's folder is gone: there is nothing left to give back
             _log.warning("leaving: %s", error)
         if lease is not None:
             await lease.release(exiting=True)
@@ -218,7 +230,9 @@ class Residency:
         except VramError as error:
             _log.info("whether anybody uses the lease is not known (%s): staying", error.code)
             return True
-        return any(view["lease_id"] == self.lease.lease_id and view["uses"] for view in status["leases"])
+        return any(
+            view["lease_id"] == self.lease.lease_id and view["uses"] for view in status["leases"]
+        )
 
     def _prepare_blocking(self) -> None:
         self._adapter.prepare()
@@ -302,7 +316,8 @@ class Residency:
                     ) from None
                 if lease.state in _LEAVING:
                     raise Loading(
-                        f"{self._settings.name} is still {lease.state}", hint="ask again, or wait longer"
+                        f"{self._settings.name} is still {lease.state}",
+                        hint="ask again, or wait longer",
                     ) from None
         if lease.state == "held":
             return True
@@ -376,7 +391,9 @@ class Residency:
 
     async def _load(self, lease: Lease | None) -> None:
         """Put the model on the card; on failure everything is taken back before the lease is."""
-        attributes = self._labels() | ({telemetry.ATTR_LEASE: lease.lease_id} if lease is not None else {})
+        attributes = self._labels() | (
+            {telemetry.ATTR_LEASE: lease.lease_id} if lease is not None else {}
+        )
         with tracing.span(telemetry.SPAN_SIDECAR_LOAD, attributes=attributes):
             await self._load_measured(lease)
 
@@ -442,7 +459,9 @@ class Residency:
         used = memory.used_bytes()
         if used is None or not (settings.device.startswith("fake:") or settings.stands_for):
             return loads  # a real model weighs what it weighs
-        paces = [pace for pace in (settings.throttle_bytes_per_s, memory.throttle_bytes_per_s()) if pace]
+        paces = [
+            pace for pace in (settings.throttle_bytes_per_s, memory.throttle_bytes_per_s()) if pace
+        ]
         pace = min(paces, default=None)
         self._blocks = fill(
             memory,
@@ -452,7 +471,9 @@ class Residency:
             wait=self._worker.stopping.wait,
         )
         if footprint.load_peak_bytes > footprint.steady_bytes:
-            memory.free(memory.allocate("load peak", footprint.load_peak_bytes - footprint.steady_bytes))
+            memory.free(
+                memory.allocate("load peak", footprint.load_peak_bytes - footprint.steady_bytes)
+            )
             memory.empty_cache()
         return loads
 

@@ -7,13 +7,13 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from schemas import defaults as d
-from schemas.errors import ConfigError
-from schemas.manifest import RSkillManifest, load_manifest
-from schemas.units import ByteSize, parse_bytes
-from schemas.wire import Footprint, LeaseSpec
-from schemas.yamltext import read_yaml
-from sidecars.weights import Weights, resolve
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
+from vram_arbiter.schemas.units import ByteSize, parse_bytes
+from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.schemas.yamltext import read_yaml
+from vram_arbiter.sidecars.weights import Weights, resolve
 
 NICE = 5  # a third of the cores' time beside one ordinary program, all of it when nobody else wants them
 WAIT_TIMEOUT_S = 120.0  # how long a request without a time limit of its own waits for the lease
@@ -39,7 +39,9 @@ class FootprintEntry(BaseModel):
         return self
 
     def on_wire(self) -> Footprint:
-        return Footprint(load_peak_bytes=self.load_peak, steady_bytes=self.steady, residue_bytes=self.residue)
+        return Footprint(
+            load_peak_bytes=self.load_peak, steady_bytes=self.steady, residue_bytes=self.residue
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +62,9 @@ class Settings:
     evictable: bool = True
     min_residency_s: float = d.MIN_RESIDENCY_S
     wait_timeout_s: float = WAIT_TIMEOUT_S
-    request_timeout_s: float = REQUEST_TIMEOUT_S  # a model that works longer is stuck, and the process ends
+    request_timeout_s: float = (
+        REQUEST_TIMEOUT_S  # a model that works longer is stuck, and the process ends
+    )
     nice: int = NICE
     idle_release_s: float | None = None  # None: resident until somebody else needs the room
     standby: bool = False  # once evicted, it comes back by itself when there is room
@@ -127,7 +131,9 @@ def parse_footprint(text: str) -> FootprintEntry:
         raise ConfigError(f"--footprint {text}: {_reason(error)}", hint=hint) from None
 
 
-def footprint_for(manifest: RSkillManifest, entries: Mapping[str, FootprintEntry]) -> FootprintEntry:
+def footprint_for(
+    manifest: RSkillManifest, entries: Mapping[str, FootprintEntry]
+) -> FootprintEntry:
     """The entry of a manifest, else what it declares for its number format. Raises ConfigError if nobody says anything."""
     if entry := entries.get(manifest.name):
         return entry
@@ -138,7 +144,10 @@ def footprint_for(manifest: RSkillManifest, entries: Mapping[str, FootprintEntry
         )
     declared = round(manifest.declared_vram_gb * GB)
     return FootprintEntry(
-        load_peak=declared, steady=declared, residue=min(declared, d.RESIDUE_BYTES), source="min_vram_gb"
+        load_peak=declared,
+        steady=declared,
+        residue=min(declared, d.RESIDUE_BYTES),
+        source="min_vram_gb",
     )
 
 

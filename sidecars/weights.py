@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from clients.configs import CONFIGS_VARIABLE
-from schemas.errors import ConfigError, ModelError, VramError
-from schemas.manifest import RSkillManifest
-from schemas.manifest.vocabulary import Dtype
+from vram_arbiter.clients.configs import CONFIGS_VARIABLE
+from vram_arbiter.schemas.errors import ConfigError, ModelError, VramError
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.manifest.vocabulary import Dtype
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,8 @@ def resolve(uri: str, configs: Path) -> Weights:
         )
     if not folder.is_dir():
         raise ConfigError(
-            f"no weights in {folder}", hint=f"{uri} is looked up below {configs}; see {CONFIGS_VARIABLE}"
+            f"no weights in {folder}",
+            hint=f"{uri} is looked up below {configs}; see {CONFIGS_VARIABLE}",
         )
     return Weights(str(folder), local=True)
 
@@ -49,7 +50,9 @@ def cached(weights: Weights) -> Weights | None:
     from huggingface_hub.errors import LocalEntryNotFoundError
 
     try:
-        folder = Path(snapshot_download(weights.source, revision=weights.revision, local_files_only=True))
+        folder = Path(
+            snapshot_download(weights.source, revision=weights.revision, local_files_only=True)
+        )
     except LocalEntryNotFoundError:
         return None
     return Weights(str(folder), local=True) if any(folder.glob("*.safetensors")) else None
@@ -93,7 +96,9 @@ def model_options(manifest: RSkillManifest, weights: Weights, device: str) -> di
 
     dtype = manifest.quantization.dtype
     options: dict[str, Any] = {"device_map": {"": device}, "low_cpu_mem_usage": True}
-    options["dtype"] = {Dtype.FP32: torch.float32, Dtype.FP16: torch.float16}.get(dtype, torch.bfloat16)
+    options["dtype"] = {Dtype.FP32: torch.float32, Dtype.FP16: torch.float16}.get(
+        dtype, torch.bfloat16
+    )
     if dtype is Dtype.INT4 and not is_quantized(weights):
         from transformers import BitsAndBytesConfig
 

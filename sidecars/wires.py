@@ -10,11 +10,19 @@ from typing import Any, Protocol
 
 from pydantic import ValidationError
 
-from clients.serve import Message, Peer
-from clients.sidecar import npy
-from schemas import meters, telemetry, tracing
-from schemas.errors import BadRequest, InternalError, LimitExceeded, UnknownOp, VramError
-from schemas.sidecar import (
+from vram_arbiter.clients.net.server import Message, Peer
+from vram_arbiter.clients.sidecar import npy
+from vram_arbiter.schemas.errors import (
+    BadRequest,
+    InternalError,
+    LimitExceeded,
+    UnknownOp,
+    VramError,
+)
+from vram_arbiter.schemas.runtime.telemetry import meters
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.schemas.sidecar import (
     ENDPOINT_REQUEST,
     OP_REQUEST,
     DetectOp,
@@ -43,7 +51,9 @@ class Host(Protocol):
 
     async def unload(self) -> None: ...
 
-    async def run(self, name: str, call: DetectOp | QueryOp | ScoreOp | EndpointCall) -> dict[str, Any]: ...
+    async def run(
+        self, name: str, call: DetectOp | QueryOp | ScoreOp | EndpointCall
+    ) -> dict[str, Any]: ...
 
     def stop(self) -> None: ...
 
@@ -65,7 +75,9 @@ class Wire:
         except Exception as error:  # noqa: BLE001  the outermost loop of a server: a defect of ours must not end it
             _log.exception("internal error while answering")
             reply = error_reply(
-                InternalError(f"{type(error).__name__}: {error}", hint="this is a defect; see the log")
+                InternalError(
+                    f"{type(error).__name__}: {error}", hint="this is a defect; see the log"
+                )
             )
         if isinstance(number := message.get("id"), int):
             reply = {**reply, "re": number}
@@ -91,7 +103,9 @@ class Wire:
             finally:
                 labels[telemetry.ATTR_OUTCOME] = outcome
                 tracing.note(labels)
-                meters.measure(telemetry.METRIC_SIDECAR_REQUEST, (time.monotonic() - began) * 1e3, labels)
+                meters.measure(
+                    telemetry.METRIC_SIDECAR_REQUEST, (time.monotonic() - began) * 1e3, labels
+                )
 
     async def _answer_by_the_model(self, name: str, call: Call) -> dict[str, Any]:
         if name == "unload":
@@ -123,18 +137,25 @@ def parse(message: Message, model_ops: frozenset[str]) -> Call:
     name = message.get(family)
     if not isinstance(name, str):
         raise BadRequest(
-            "a message names its op or endpoint", hint='e.g. {"op": "ping"}', details={"known": known}
+            "a message names its op or endpoint",
+            hint='e.g. {"op": "ping"}',
+            details={"known": known},
         )
     if name not in known:
         raise UnknownOp(
-            f"unknown {family} {name[:40]!r}", hint=f"known: {', '.join(known)}", details={"known": known}
+            f"unknown {family} {name[:40]!r}",
+            hint=f"known: {', '.join(known)}",
+            details={"known": known},
         )
     try:
         if family == "op":
             return OP_REQUEST.validate_python(message)
         call = ENDPOINT_REQUEST.validate_python({**message, "data": _unpack(message.get("data"))})
     except ValidationError as error:
-        fields = [_field(problem, family) for problem in error.errors(include_input=False, include_url=False)]
+        fields = [
+            _field(problem, family)
+            for problem in error.errors(include_input=False, include_url=False)
+        ]
         raise BadRequest(
             f"{name}: {fields[0]}", hint="see schemas/sidecar.py", details={"fields": fields}
         ) from None
@@ -171,12 +192,15 @@ def _timeout_s(call: Call) -> float | None:
             isinstance(value, bool) or not isinstance(value, int | float) or not value >= 0
         ):
             raise BadRequest(
-                "load: data.timeout_s must be seconds, 0 or more", details={"fields": ["data.timeout_s"]}
+                "load: data.timeout_s must be seconds, 0 or more",
+                details={"fields": ["data.timeout_s"]},
             )
         return value
     return None
 
 
 def _field(problem: Mapping[str, Any], family: str) -> str:
-    where = problem["loc"][1:] if family == "op" else problem["loc"]  # a union puts its tag, the op, in front
+    where = (
+        problem["loc"][1:] if family == "op" else problem["loc"]
+    )  # a union puts its tag, the op, in front
     return f"{'.'.join(str(part)[:64] for part in where) or 'the message'}: {problem['msg']}"

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from schemas.errors import ModelError, OutOfMemory, VramError, WaitTimeout
+from vram_arbiter.schemas.errors import ModelError, OutOfMemory, VramError, WaitTimeout
 
 
 class Worker:
@@ -81,7 +81,9 @@ class Worker:
         comes as ModelError, a full card as OutOfMemory. The work runs in the caller's context: its spans are the present span's children.
         """
         context = contextvars.copy_context()
-        future = asyncio.get_running_loop().run_in_executor(self._pool, context.run, self._guarded, work)
+        future = asyncio.get_running_loop().run_in_executor(
+            self._pool, context.run, self._guarded, work
+        )
         try:
             return await asyncio.shield(future)
         except asyncio.CancelledError:
@@ -103,9 +105,7 @@ class Worker:
         except VramError as error:
             _forget_locals(error)
             raise
-        except (
-            Exception
-        ) as error:  # any failure inside a model is an answer to the caller, not the end of the sidecar
+        except Exception as error:  # any failure inside a model is an answer to the caller, not the end of the sidecar
             _forget_locals(error)
             if (
                 type(error).__name__ == "OutOfMemoryError"
@@ -113,7 +113,9 @@ class Worker:
                 raise OutOfMemory(str(error)) from error
             if isinstance(error, ImportError):
                 raise ModelError(str(error), hint="pip install 'vram-arbiter[sidecars]'") from error
-            raise ModelError(f"{type(error).__name__}: {error}", hint="see the sidecar's log") from error
+            raise ModelError(
+                f"{type(error).__name__}: {error}", hint="see the sidecar's log"
+            ) from error
 
 
 def _seen(done: asyncio.Future[Any]) -> None:

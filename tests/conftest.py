@@ -4,14 +4,19 @@ import logging
 import os
 import signal
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
-from arbiter.testing import machines
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from tests.support import machines
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
 
 machines.register()
+# Programs that tests start import `tests.support` too.
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+)
 # MuJoCo reads it when it is first imported, by whichever test of this process that is.
 os.environ.setdefault("MUJOCO_GL", "egl")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

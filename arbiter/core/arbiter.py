@@ -16,29 +16,9 @@ It must not know how effects are performed, nor that a wire exists.
 from collections.abc import Set
 from typing import Any
 
-from arbiter.core import (
-    deadlock,
-    eviction,
-    expiry,
-    explain,
-    figures,
-    gangs,
-    grants,
-    growth,
-    invariants,
-    measure,
-    operators,
-    readings,
-    recovery,
-    refusals,
-    requests,
-    resizing,
-    resume,
-    subleases,
-    uses,
-)
-from arbiter.core.effects import Effect
-from arbiter.core.events import (
+from vram_arbiter.arbiter.core import invariants
+from vram_arbiter.arbiter.core.effects import Effect
+from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
     CancelRequested,
     ClientConnected,
@@ -65,10 +45,30 @@ from arbiter.core.events import (
     UseEnded,
     UseYielded,
 )
-from arbiter.core.sessions import concerns, on_connected, on_died, on_journal_failed, on_left
-from arbiter.core.settings import Settings
-from arbiter.core.state import Core, Refused
-from schemas.ids import ClientId, GpuId, ProcessKey
+from vram_arbiter.arbiter.core.eviction import eviction
+from vram_arbiter.arbiter.core.features import gangs, growth, resizing, subleases
+from vram_arbiter.arbiter.core.model.state import Core, Refused
+from vram_arbiter.arbiter.core.report import explain, figures
+from vram_arbiter.arbiter.core.requests import (
+    expiry,
+    operators,
+    recovery,
+    refusals,
+    requests,
+    resume,
+    uses,
+)
+from vram_arbiter.arbiter.core.requests.sessions import (
+    concerns,
+    on_connected,
+    on_died,
+    on_journal_failed,
+    on_left,
+)
+from vram_arbiter.arbiter.core.scheduling import deadlock, grants
+from vram_arbiter.arbiter.core.settings import Settings
+from vram_arbiter.arbiter.core.verification import measure, readings
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
 
 DUE_MAX = 64
 """Timers that one Tick serves. What is due beyond them is served by the next one, at once, so that thousands of waits that end together do

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from schemas.ids import ClientId, GpuId, ProcessKey, RequestId
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
+from vram_arbiter.schemas.ids import (
+    ClientId,
+    GpuId,
+    LeaseId,
+    ModelKey,
+    ProcessKey,
+    RequestId,
+    Token,
+    UseId,
+)
 
 DOUBT_KEY: Final = "doubt"
 """Key of a journal record that says why leases may be missing among the others. It outlives restarts until the core deletes it, once

@@ -15,11 +15,13 @@ Numbers are those of ARCHITECTURE.md:
   7. of a gang, until it is complete or broken, all that wait are charged or none
 """
 
-from arbiter.core import families, gangs
-from arbiter.core.lease import AWAY, Lease, LeaseState
-from arbiter.core.state import NOT_COUNTED, Core, Gpu
+from vram_arbiter.arbiter.core.features import families, gangs
+from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.state import NOT_COUNTED, Core, Gpu
 
-_UNUSED = tuple(state for state in LeaseState if state not in (LeaseState.HELD, LeaseState.REVOKING))
+_UNUSED = tuple(
+    state for state in LeaseState if state not in (LeaseState.HELD, LeaseState.REVOKING)
+)
 """States in which nobody may use a lease."""
 _UNUSED_HERE = (LeaseState.LOADING, LeaseState.UNLOADING, LeaseState.VERIFYING)
 """Those of them that a resident can be in."""
@@ -89,10 +91,13 @@ def _residents(gpu: Gpu, *, granted: bool) -> None:
             raise InvariantViolation(
                 2, f"{alone.id} is exclusive, yet {sorted(residents)} are on {gpu.info.id}"
             )
-        debts = [v.lease for v in gpu.verifications.values() if v.exclusive and v.lease not in residents]
+        debts = [
+            v.lease for v in gpu.verifications.values() if v.exclusive and v.lease not in residents
+        ]
         if debts:
             raise InvariantViolation(
-                2, f"{debts[0]} was exclusive on {gpu.info.id} and is not measured gone, yet somebody came"
+                2,
+                f"{debts[0]} was exclusive on {gpu.info.id} and is not measured gone, yet somebody came",
             )
         loading = [lease.id for lease in residents.in_state(LeaseState.LOADING)]
         if len(loading) > 1:
@@ -103,7 +108,9 @@ def _residents(gpu: Gpu, *, granted: bool) -> None:
 
 def _unused(lease: Lease) -> None:
     if (lease.uses or lease.yielded) and lease.state in _UNUSED:
-        raise InvariantViolation(3, f"{lease.id} is {lease.state} with {len(lease.all_uses())} uses")
+        raise InvariantViolation(
+            3, f"{lease.id} is {lease.state} with {len(lease.all_uses())} uses"
+        )
 
 
 def _charges(gpu: Gpu) -> None:
@@ -113,7 +120,9 @@ def _charges(gpu: Gpu) -> None:
         touched = ledger.touched | residents.touched
         for lease_id in sorted(touched):
             if lease_id in residents and not ledger.charges(lease_id):
-                raise InvariantViolation(4, f"{lease_id} is {residents[lease_id].state} and not charged")
+                raise InvariantViolation(
+                    4, f"{lease_id} is {residents[lease_id].state} and not charged"
+                )
         gpu.debts |= touched
         ledger.touched.clear()
         residents.touched.clear()
@@ -134,12 +143,16 @@ def _charges(gpu: Gpu) -> None:
 def _away(core: Core) -> None:
     parked = core.host.granted_bytes() if core.host.booked else 0
     if parked > core.host.budget_bytes:
-        raise InvariantViolation(4, f"{parked} bytes are parked, the budget is {core.host.budget_bytes}")
+        raise InvariantViolation(
+            4, f"{parked} bytes are parked, the budget is {core.host.budget_bytes}"
+        )
     for lease in core.away.values():
         if lease.state not in AWAY or lease.id not in core.leases:
             raise InvariantViolation(4, f"{lease.id} is {lease.state}, yet it counts as away")
         if lease.gpu is not None or lease.id in core.waiting:
-            raise InvariantViolation(4, f"{lease.id} is {lease.state}, yet it has a card or waits for one")
+            raise InvariantViolation(
+                4, f"{lease.id} is {lease.state}, yet it has a card or waits for one"
+            )
 
 
 def _tokens(core: Core) -> None:
@@ -172,10 +185,14 @@ def _waiters(core: Core) -> None:
         if head is None:
             continue
         if head.id not in core.waiting:
-            raise InvariantViolation(6, f"{head.id} is {head.state}, yet it is the head of {gpu.info.id}")
+            raise InvariantViolation(
+                6, f"{head.id} is {head.state}, yet it is the head of {gpu.info.id}"
+            )
         if head.grows is not None and head.grows not in gpu.residents:
             raise InvariantViolation(6, f"{head.id} waits to grow {head.grows}, which is not there")
         if head.wait_timeout_s is not None and ("wait", head.id) not in core.timers:
             raise InvariantViolation(6, f"{head.id} has a bound and no timer")
         if ("probe", gpu.info.id) not in core.timers:
-            raise InvariantViolation(6, f"nobody will read {gpu.info.id} again, and {head.id} waits")
+            raise InvariantViolation(
+                6, f"nobody will read {gpu.info.id} again, and {head.id} waits"
+            )

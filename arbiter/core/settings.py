@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, field
 
-from arbiter.core.scheduling import DEFAULT, SCHEDULING, Scheduling
-from schemas import defaults as d
-from schemas.ids import GpuId
+from vram_arbiter.arbiter.core.scheduling.policies import DEFAULT, SCHEDULING, Scheduling
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import GpuId
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,10 +9,10 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
-from arbiter.core import effects as fx
-from arbiter.core import events as ev
-from schemas.errors import JournalUnavailable
-from schemas.ids import ClientId, GpuId, ProcessKey, RequestId
+from vram_arbiter.arbiter.core import effects as fx
+from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.schemas.errors import JournalUnavailable
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +95,10 @@ class Executor:
         samples: list[fx.Sample] = []
         for effect in effects:
             if failed:
-                if isinstance(effect, fx.JournalPut) and (why := failed.get(effect.key)) is not None:
+                if (
+                    isinstance(effect, fx.JournalPut)
+                    and (why := failed.get(effect.key)) is not None
+                ):
                     refused[effect.key.removeprefix("lease:")] = why
                 if (why := refused.get(_lease_of(effect) or "")) is not None:
                     if isinstance(effect, fx.Reply):
@@ -119,7 +122,9 @@ class Executor:
             case fx.Reply(client, request, body):
                 self._outbox.reply(client, request, body)
             case fx.Push(client, body):
-                self._outbox.push(client, body if self._traces is None else self._traces.revoke(body))
+                self._outbox.push(
+                    client, body if self._traces is None else self._traces.revoke(body)
+                )
             case fx.Signal(process, kind):
                 self._signal(process, kind)
             case fx.Refuse(client, request, code, message, hint, details):
@@ -131,7 +136,9 @@ class Executor:
         if self.owed:
             self._write(())
 
-    def _write(self, records: Sequence[fx.JournalPut | fx.JournalDelete]) -> Mapping[str, JournalUnavailable]:
+    def _write(
+        self, records: Sequence[fx.JournalPut | fx.JournalDelete]
+    ) -> Mapping[str, JournalUnavailable]:
         """Write records, and delete what is owed. Keys of grants that could not be written, with the reason."""
         changes = [(e.key, e.record if isinstance(e, fx.JournalPut) else None) for e in records]
         owed: list[tuple[str, Mapping[str, Any] | None]] = []

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from arbiter.host.journal_files import is_corruption, put_aside
-from schemas import strictjson
+from vram_arbiter.arbiter.host.journal_files import is_corruption, put_aside
+from vram_arbiter.schemas import strictjson
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +66,9 @@ class _Question:
 class History:
     """Numbers and keeps events. `open` before the loop runs, `start` inside it, `close` at the end (writes what is left)."""
 
-    def __init__(self, store: "_Store | None", last_seq: int, wall: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self, store: "_Store | None", last_seq: int, wall: Callable[[], float] = time.time
+    ) -> None:
         self._store = store
         self._wall = wall
         self._last_seq = last_seq
@@ -79,10 +81,14 @@ class History:
         self._thread: threading.Thread | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
-        self.problem = "" if store is not None else "history is kept in memory only: its file cannot be used"
+        self.problem = (
+            "" if store is not None else "history is kept in memory only: its file cannot be used"
+        )
 
     @classmethod
-    def open(cls, folder: Path, max_events: int, days: float, wall: Callable[[], float] = time.time) -> Self:
+    def open(
+        cls, folder: Path, max_events: int, days: float, wall: Callable[[], float] = time.time
+    ) -> Self:
         """Open or make `history.sqlite`; numbering goes on where it ended. Never fails: without a disk it is memory only."""
         path = folder / "history.sqlite"
         for attempt in (1, 2):
@@ -128,7 +134,9 @@ class History:
         first = self._ring[0]["seq"] if self._ring else self._last_seq + 1
         if self._thread is None or after + 1 >= first:
             wanted = frozenset(kinds)
-            found = [e for e in self._ring if e["seq"] > after and (not wanted or e["kind"] in wanted)]
+            found = [
+                e for e in self._ring if e["seq"] > after and (not wanted or e["kind"] in wanted)
+            ]
             done({"events": found[:limit], "last_seq": self._last_seq})
             return
         self._flush()
@@ -167,7 +175,8 @@ class History:
             self._buffer.clear()
         elif self._loop is not None:  # the thread hangs in a write
             self.problem = (
-                self.problem or "the disk of the history does not answer: what does not fit in memory is lost"
+                self.problem
+                or "the disk of the history does not answer: what does not fit in memory is lost"
             )
             self._timer = self._loop.call_later(FLUSH_S, self._flush)
 
@@ -192,9 +201,13 @@ class History:
             except sqlite3.Error as error:
                 if not self.problem:  # a full disk is worth one line, not five a second
                     log.error("history: %s; events are kept in memory only until that ends", error)
-                self.problem = f"history cannot be written ({error}): events are kept in memory only"
+                self.problem = (
+                    f"history cannot be written ({error}): events are kept in memory only"
+                )
                 if isinstance(work, _Question):
-                    self._answer(work.done, {"events": [], "last_seq": self._last_seq, "problem": str(error)})
+                    self._answer(
+                        work.done, {"events": [], "last_seq": self._last_seq, "problem": str(error)}
+                    )
         store.close()
 
     def _answer(self, done: Done, body: Mapping[str, Any]) -> None:
@@ -209,9 +222,17 @@ def _event(seq: int, at_wall_s: object, text: str) -> Event:
     """One row. A damaged one keeps its number, so that a reader goes on behind it."""
     with contextlib.suppress(ValueError, TypeError):
         event = strictjson.loads(text, max_chars=EVENT_MAX_CHARS)
-        if isinstance(event, dict) and event.get("seq") == seq and {"kind", "at_wall_s"} <= event.keys():
+        if (
+            isinstance(event, dict)
+            and event.get("seq") == seq
+            and {"kind", "at_wall_s"} <= event.keys()
+        ):
             return event
-    return {"seq": seq, "at_wall_s": at_wall_s if isinstance(at_wall_s, float) else 0.0, "kind": "unreadable"}
+    return {
+        "seq": seq,
+        "at_wall_s": at_wall_s if isinstance(at_wall_s, float) else 0.0,
+        "kind": "unreadable",
+    }
 
 
 def _is_damage(error: sqlite3.DatabaseError | OSError) -> bool:
@@ -234,7 +255,9 @@ class _Store:
         self._db = sqlite3.connect(path, isolation_level=None, timeout=1.0, check_same_thread=False)
         try:
             path.chmod(0o600)
-            self._db.text_factory = lambda text: text.decode(errors="replace")  # damage need not be UTF-8
+            self._db.text_factory = lambda text: text.decode(
+                errors="replace"
+            )  # damage need not be UTF-8
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=NORMAL")
             self._db.executescript(_SCHEMA)
@@ -245,9 +268,13 @@ class _Store:
     def last_seq(self) -> int:
         """The number after which numbering goes on: never one that was given out before. Raises sqlite3.DatabaseError."""
         try:
-            row = self._db.execute("SELECT seq, kind FROM events ORDER BY seq DESC LIMIT 1").fetchone()
+            row = self._db.execute(
+                "SELECT seq, kind FROM events ORDER BY seq DESC LIMIT 1"
+            ).fetchone()
             if row is not None and row[0] > SEQ_MAX:
-                raise sqlite3.DatabaseError(f"an event has the number {row[0]}, more than {SEQ_MAX}")
+                raise sqlite3.DatabaseError(
+                    f"an event has the number {row[0]}, more than {SEQ_MAX}"
+                )
         except BaseException:
             self._db.close()
             raise
@@ -276,7 +303,9 @@ class _Store:
         )
         age_s = self._days * 86_400
         up_to = self._earlier if time.monotonic() - self._opened_at < age_s else sys.maxsize
-        self._db.execute("DELETE FROM events WHERE at_wall_s < ? AND seq <= ?", (wall_s - age_s, up_to))
+        self._db.execute(
+            "DELETE FROM events WHERE at_wall_s < ? AND seq <= ?", (wall_s - age_s, up_to)
+        )
 
     def find(self, after: int, limit: int, kinds: tuple[str, ...]) -> list[Event]:
         wanted = json.dumps(list(kinds))

@@ -17,8 +17,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NoReturn, Self
 
-from arbiter.core.events import DOUBT_KEY
-from arbiter.host.journal_files import (
+from vram_arbiter.arbiter.core.events import DOUBT_KEY
+from vram_arbiter.arbiter.host.journal_files import (
     SCHEMA_VERSION,
     Check,
     connect,
@@ -28,8 +28,8 @@ from arbiter.host.journal_files import (
     put_rows_aside,
     total_of,
 )
-from arbiter.host.seal import LastStart, Seal, digest, fresh_epoch, write_last_start
-from schemas.errors import ConfigError, JournalUnavailable
+from vram_arbiter.arbiter.host.seal import LastStart, Seal, digest, fresh_epoch, write_last_start
+from vram_arbiter.schemas.errors import ConfigError, JournalUnavailable
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,10 @@ _PUT = [
 ]
 _DELETE = [
     "",
-    *(f"DELETE FROM records WHERE key IN ({', '.join('?' * n)})" for n in range(1, AT_ONCE_MAX + 1)),
+    *(
+        f"DELETE FROM records WHERE key IN ({', '.join('?' * n)})"
+        for n in range(1, AT_ONCE_MAX + 1)
+    ),
 ]
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PASSING = frozenset((*_FULL, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM))
@@ -224,7 +227,8 @@ class Journal:
         except (sqlite3.Error, OSError) as error:
             self._failed(error)
             raise JournalUnavailable(
-                f"the journal cannot be written: {error}", hint="see the disk of the daemon's state folder"
+                f"the journal cannot be written: {error}",
+                hint="see the disk of the daemon's state folder",
             ) from error
         self._total = soon
         for key, own in fresh.items():
@@ -237,17 +241,23 @@ class Journal:
         except OSError as error:  # it is written, and accepted: the next change finds the seal unwritable before it is made
             self._failed(error)
         else:
-            if self._connection.total_changes > written:  # else nothing was written, which a full disk allows
+            if (
+                self._connection.total_changes > written
+            ):  # else nothing was written, which a full disk allows
                 self.problem = ""
 
     def _failed(self, error: Exception) -> None:
-        self.problem = f"the journal cannot be written ({error}): what is held stays, nothing new is granted"
+        self.problem = (
+            f"the journal cannot be written ({error}): what is held stays, nothing new is granted"
+        )
 
     def settle(self) -> None:
         """After a failure: can it be written again? Asked now and then, so that room on the disk is noticed without a request."""
         if self.problem:
             try:
-                self._connection.execute("INSERT OR REPLACE INTO meta VALUES ('settled', hex(randomblob(8)))")
+                self._connection.execute(
+                    "INSERT OR REPLACE INTO meta VALUES ('settled', hex(randomblob(8)))"
+                )
                 self._seal.write(self._total, self._total)
             except (sqlite3.Error, OSError) as error:
                 log.debug("journal: %s", error)
@@ -261,7 +271,9 @@ class Journal:
         else:
             self._connection.execute(_PUT[len(rows)], [value for row in rows for value in row])
 
-    def keep(self, name: Literal["learnt", "footprints"], learnt: Mapping[str, Mapping[str, Any]]) -> None:
+    def keep(
+        self, name: Literal["learnt", "footprints"], learnt: Mapping[str, Mapping[str, Any]]
+    ) -> None:
         """Keep what was learnt for the next start. Losing it costs estimates only: a failure is logged."""
         text = json.dumps(learnt, separators=(",", ":"))
         if text == self._kept.get(name):
@@ -312,7 +324,10 @@ def _learnt(meta: Mapping[str, str]) -> dict[str, dict[str, float]]:
     """Durations that `keep` wrote; anything else counts as nothing learnt."""
     try:
         found = _kept(meta, "learnt")
-        return {str(who): {str(what): float(s) for what, s in each.items()} for who, each in found.items()}
+        return {
+            str(who): {str(what): float(s) for what, s in each.items()}
+            for who, each in found.items()
+        }
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         return {}
 
@@ -322,7 +337,9 @@ def _footprints(meta: Mapping[str, str]) -> dict[str, dict[str, list[int]]]:
     try:
         found = _kept(meta, "footprints")
         return {
-            str(model): {str(part): [int(count) for count in counts] for part, counts in parts.items()}
+            str(model): {
+                str(part): [int(count) for count in counts] for part, counts in parts.items()
+            }
             for model, parts in found.items()
         }
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):

@@ -13,8 +13,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from arbiter.host.seal import EPOCH_MAX, LastStart, Seal, Sealed, digest, last_start, read_last_start
-from schemas import strictjson
+from vram_arbiter.arbiter.host.seal import (
+    EPOCH_MAX,
+    LastStart,
+    Seal,
+    Sealed,
+    digest,
+    last_start,
+    read_last_start,
+)
+from vram_arbiter.schemas import strictjson
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +48,9 @@ class Found:
     records: dict[str, dict[str, Any]] = field(default_factory=dict)
     digests: dict[str, int] = field(default_factory=dict)
     total: int = 0  # of the rows as they are, damaged ones too
-    damaged: dict[bytes, str] = field(default_factory=dict)  # key of a row that cannot be used → why
+    damaged: dict[bytes, str] = field(
+        default_factory=dict
+    )  # key of a row that cannot be used → why
     seal: Sealed | None = None
     seal_problem: str = ""
     last: LastStart | None = None
@@ -230,7 +240,8 @@ def put_rows_aside(folder: Path, found: Found) -> None:
     lines = []
     for key, problem in found.damaged.items():
         row = found.connection.execute(
-            "SELECT substr(CAST(json AS BLOB), 1, 65536) FROM records WHERE CAST(key AS BLOB) = ?", (key,)
+            "SELECT substr(CAST(json AS BLOB), 1, 65536) FROM records WHERE CAST(key AS BLOB) = ?",
+            (key,),
         ).fetchone()
         text = _decoded(row[0] if row else b"")
         lines.append(json.dumps({"key": _decoded(key), "problem": problem, "text": text}))
@@ -238,6 +249,8 @@ def put_rows_aside(folder: Path, found: Found) -> None:
     first = next(iter(found.damaged.items()))
     count = len(found.damaged)
     what = f"{count} records of the journal" if count > 1 else "a record of the journal"
-    found.problems.append(f"{what} could not be used: see {aside} ({_decoded(first[0])}: {first[1]})")
+    found.problems.append(
+        f"{what} could not be used: see {aside} ({_decoded(first[0])}: {first[1]})"
+    )
     found.put_aside = found.put_aside or aside
     log.error("%s", found.problems[-1])

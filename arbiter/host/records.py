@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from schemas import defaults as d
+from vram_arbiter.schemas import defaults as d
 
 Pid = Annotated[int, Field(ge=1, le=1 << 30)]
 Ticks = Annotated[int, Field(ge=0, lt=1 << 62)]
@@ -56,7 +56,9 @@ class _Estate(_Record):
 class LeaseRecord(_Record):
     lease_id: Id
     token: tuple[Count, Count]
-    state: Literal["loading", "held", "revoking", "unloading", "verifying", "parked", "standby", "debt"]
+    state: Literal[
+        "loading", "held", "revoking", "unloading", "verifying", "parked", "standby", "debt"
+    ]
     gpu: Id | None
     pid: Pid
     start_ticks: Ticks

@@ -19,7 +19,9 @@ class SuspendWatch:
     """`slept_s()` gives the seconds slept since it was last asked, each sleep once; 0.0 if there was none."""
 
     def __init__(
-        self, boottime: Callable[[], float] = _boottime, monotonic: Callable[[], float] = time.monotonic
+        self,
+        boottime: Callable[[], float] = _boottime,
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._boottime = boottime
         self._monotonic = monotonic

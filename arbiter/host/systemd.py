@@ -20,7 +20,9 @@ class Notifier:
             self._address = "\0" + self._address[1:]  # abstract namespace
         usec, pid = environ.get("WATCHDOG_USEC", ""), environ.get("WATCHDOG_PID", "")
         mine = not pid or pid == str(os.getpid())
-        self.watchdog_s: float | None = int(usec) / 1e6 if usec.isdecimal() and int(usec) and mine else None
+        self.watchdog_s: float | None = (
+            int(usec) / 1e6 if usec.isdecimal() and int(usec) and mine else None
+        )
         """The manager kills the daemon if it hears nothing for so long; None: no watchdog."""
 
     def ready(self, status: str) -> None:

@@ -12,15 +12,17 @@ from typing import Any
 import msgpack
 from pydantic import ValidationError
 
-from schemas.errors import BadRequest, UnknownOp, VramError
-from schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
-from schemas.wire import OPS, REQUEST, Request
+from vram_arbiter.schemas.errors import BadRequest, UnknownOp, VramError
+from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
+from vram_arbiter.schemas.wire import OPS, REQUEST, Request
 
 FIELDS_MAX = 20  # problems listed in one reply; the peer's text is never echoed at length
 KEYS_MAX = 64
 """Keys of one map: every unknown key makes validation build one more error. The largest map of the wire has 20."""
 _OPS = frozenset(OPS)
-_validate = REQUEST.validator.validate_python  # the adapter's own method only adds options that we do not use
+_validate = (
+    REQUEST.validator.validate_python
+)  # the adapter's own method only adds options that we do not use
 
 
 class Undecodable(Exception):
@@ -42,11 +44,14 @@ def decode(payload: bytes | bytearray | memoryview, size_max: int) -> Request:
     op = message.get("op")
     if not isinstance(op, str):
         problem = BadRequest(
-            "the request has no op", details={"fields": [{"field": "op", "problem": "missing or no text"}]}
+            "the request has no op",
+            details={"fields": [{"field": "op", "problem": "missing or no text"}]},
         )
         raise Undecodable(problem, request_id)
     if op not in _OPS:
-        raise Undecodable(UnknownOp(f"unknown op {op[:64]!r}", details={"known": list(OPS)}), request_id)
+        raise Undecodable(
+            UnknownOp(f"unknown op {op[:64]!r}", details={"known": list(OPS)}), request_id
+        )
     try:
         request: Request = _validate(message)
         return request
@@ -74,7 +79,9 @@ def _id(message: Mapping[Any, Any]) -> int | None:
 
 def _bad_request(op: str, error: ValidationError) -> BadRequest:
     fields = []
-    for finding in error.errors(include_url=False, include_context=False, include_input=False)[:FIELDS_MAX]:
+    for finding in error.errors(include_url=False, include_context=False, include_input=False)[
+        :FIELDS_MAX
+    ]:
         path = [str(part)[:64] for part in finding["loc"]]
         if path and path[0] == op:
             path = path[1:]  # the union's tag, no field of the message

@@ -8,8 +8,8 @@ import os
 import pwd
 from typing import Literal
 
-from schemas.errors import NotPermitted
-from schemas.runtime.peercred import Peer
+from vram_arbiter.schemas.errors import NotPermitted
+from vram_arbiter.schemas.runtime.peercred import Peer
 
 Role = Literal["client", "observer", "operator"]
 

@@ -1,8 +1,8 @@
 """Requests that can change the engine, turned into its events. Pure: no sessions, no sockets, no answers."""
 
-from arbiter.core import events as ev
-from schemas import wire as w
-from schemas.ids import ClientId, LeaseId, ModelKey, RequestId, Token, UseId
+from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.schemas import wire as w
+from vram_arbiter.schemas.ids import ClientId, LeaseId, ModelKey, RequestId, Token, UseId
 
 HOLDING = frozenset(("acquire", "reacquire", "reattach", "use_begin"))
 """Ops that can make the engine remember something of a client beyond its connection."""
@@ -20,7 +20,9 @@ def event_of(request: w.Request, client: ClientId, operator: str) -> ev.Event | 
         case w.Ready():
             return ev.ReadyReported(client, re, *_on_lease(request), request.measured_bytes)
         case w.UseBegin():
-            return ev.UseBegan(client, re, *_on_lease(request), UseId(request.use_id), request.label)
+            return ev.UseBegan(
+                client, re, *_on_lease(request), UseId(request.use_id), request.label
+            )
         case w.UseEnd():
             return ev.UseEnded(client, re, *_on_lease(request), UseId(request.use_id))
         case w.Yield():
@@ -34,11 +36,15 @@ def event_of(request: w.Request, client: ClientId, operator: str) -> ev.Event | 
         case w.Unloading():
             return ev.UnloadStarted(client, re, *_on_lease(request))
         case w.Release():
-            return ev.ReleaseReported(client, re, *_on_lease(request), request.exiting, request.parked)
+            return ev.ReleaseReported(
+                client, re, *_on_lease(request), request.exiting, request.parked
+            )
         case w.Cancel():
             return ev.CancelRequested(client, re, LeaseId(request.lease_id))
         case w.Reacquire():
-            return ev.Reacquired(client, re, *_on_lease(request), request.wait_timeout_s, request.traceparent)
+            return ev.Reacquired(
+                client, re, *_on_lease(request), request.wait_timeout_s, request.traceparent
+            )
         case w.Resize():
             size = request.footprint
             sizes = (size.load_peak_bytes, size.steady_bytes, size.residue_bytes)
@@ -46,7 +52,9 @@ def event_of(request: w.Request, client: ClientId, operator: str) -> ev.Event | 
         case w.Reattach():
             return ev.Reattached(client, re, tuple(_reattached(lease) for lease in request.leases))
         case w.Evict() | w.Pin() | w.Unpin() | w.ReleaseDead():
-            return ev.OperatorAsked(client, re, request.op, request.target, operator, request.reason)
+            return ev.OperatorAsked(
+                client, re, request.op, request.target, operator, request.reason
+            )
         case w.Drain() | w.Resume():
             return ev.OperatorAsked(client, re, request.op, "", operator, request.reason)
         case w.Oom():
@@ -74,7 +82,9 @@ def to_spec(spec: w.LeaseSpec) -> ev.Spec:
         standby=spec.standby,
         on_overstay=spec.on_overstay,
         park_bytes=spec.park_bytes,
-        parent=None if spec.parent is None else (LeaseId(spec.parent.lease_id), Token(*spec.parent.token)),
+        parent=None
+        if spec.parent is None
+        else (LeaseId(spec.parent.lease_id), Token(*spec.parent.token)),
         independent=spec.independent,
         gang=None if spec.gang is None else (spec.gang.id, spec.gang.size),
     )

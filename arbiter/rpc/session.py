@@ -10,16 +10,23 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from arbiter.core import events as ev
-from arbiter.core.explain import DAEMON_KINDS, NOTE_KINDS
-from arbiter.rpc import codec
-from arbiter.rpc.peer import Role, check_visible, how_to_operate, is_operator
-from arbiter.rpc.requests import BY_HAND, HOLDING, event_of
-from arbiter.rpc.shares import Budget, ProcessBudgets, WatchedProcesses, cost_of, share_of, spend
-from arbiter.telemetry import RefusalLog
-from schemas import wire as w
-from schemas.defaults import KIB, WIRE_VERSION
-from schemas.errors import (
+from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.arbiter.core.report.explain import DAEMON_KINDS, NOTE_KINDS
+from vram_arbiter.arbiter.log import RefusalLog
+from vram_arbiter.arbiter.rpc import codec
+from vram_arbiter.arbiter.rpc.peer import Role, check_visible, how_to_operate, is_operator
+from vram_arbiter.arbiter.rpc.requests import BY_HAND, HOLDING, event_of
+from vram_arbiter.arbiter.rpc.shares import (
+    Budget,
+    ProcessBudgets,
+    WatchedProcesses,
+    cost_of,
+    share_of,
+    spend,
+)
+from vram_arbiter.schemas import wire as w
+from vram_arbiter.schemas.defaults import KIB, WIRE_VERSION
+from vram_arbiter.schemas.errors import (
     BadRequest,
     BadState,
     LimitExceeded,
@@ -29,9 +36,9 @@ from schemas.errors import (
     VersionMismatch,
     VramError,
 )
-from schemas.ids import ClientId, ProcessKey, RequestId
-from schemas.runtime.peercred import Peer
-from schemas.runtime.zmtp import Oversize
+from vram_arbiter.schemas.ids import ClientId, ProcessKey, RequestId
+from vram_arbiter.schemas.runtime.peercred import Peer
+from vram_arbiter.schemas.runtime.zmtp import Oversize
 
 HISTORY_PAGE = 2000
 """Events in one reply, whatever was asked for: packing more would hold the loop for too long."""
@@ -84,7 +91,7 @@ class Decisions(Protocol):
 
 
 class Watch(Protocol):
-    """Deaths of processes (`arbiter.host.watch.ProcessWatch`), as sessions need them."""
+    """Deaths of processes (`arbiter.host.process_watch.ProcessWatch`), as sessions need them."""
 
     def take(self, process: ProcessKey, pidfd: int) -> bool:
         """Watch a process by a copy of `pidfd`. False: it was watched before. Raises OSError where no descriptor is left."""
@@ -175,7 +182,9 @@ class SessionTable:
         # the connection that each instance had before → the one that it has
         self._moved: dict[ClientId, ClientId] = {}
         self._watched = WatchedProcesses(settings.processes_max, settings.user_share)
-        self._casual: set[ProcessKey] = set()  # watched since a hello, and never had a lease or a use
+        self._casual: set[ProcessKey] = (
+            set()
+        )  # watched since a hello, and never had a lease or a use
         self._budgets = ProcessBudgets(settings.process_rate_per_s)
         self._too_fast = LimitExceeded(
             f"more than {settings.rate_per_s} requests a second of one connection, or {settings.process_rate_per_s} of one process; "
@@ -205,9 +214,13 @@ class SessionTable:
         entry, now = self._entries[connection.serial], self._clock()
         session, size_max = entry.session, self._settings.message_max_bytes
         if not spend(cost_of(payload), entry.budget, entry.process_budget, now):  # 1
-            request_id = None if isinstance(payload, Oversize) else codec.id_of(payload, REFUSED_MAX_BYTES)
+            request_id = (
+                None if isinstance(payload, Oversize) else codec.id_of(payload, REFUSED_MAX_BYTES)
+            )
             connection.send(codec.refusal(request_id, self._settings.epoch, self._too_fast))
-            self._log_refusal(connection, session, self._too_fast["code"], self._too_fast["message"])
+            self._log_refusal(
+                connection, session, self._too_fast["code"], self._too_fast["message"]
+            )
             return False
         try:
             if isinstance(payload, Oversize):  # 2
@@ -220,15 +233,22 @@ class SessionTable:
             if session is None:  # 3
                 if not isinstance(request, w.Hello):
                     raise UnknownSession(
-                        f"{request.op} before hello", hint="say hello first, then re-attach your leases"
+                        f"{request.op} before hello",
+                        hint="say hello first, then re-attach your leases",
                     )
                 self._hello(connection, entry, request, now)
                 return True
             session.heard_at = now
-            if session.role == "observer" and request.op not in _READS and request.op != "hello":  # 4
-                raise NotPermitted(f"an observer may not {request.op}", hint="say hello as a client")
+            if (
+                session.role == "observer" and request.op not in _READS and request.op != "hello"
+            ):  # 4
+                raise NotPermitted(
+                    f"an observer may not {request.op}", hint="say hello as a client"
+                )
             if request.op in BY_HAND and session.role != "operator":
-                raise NotPermitted(f"only an operator may {request.op}", hint="say hello as operator")
+                raise NotPermitted(
+                    f"only an operator may {request.op}", hint="say hello as operator"
+                )
             self._dispatch(session, request)  # 5
         except VramError as error:
             self._refuse(connection, request.id, error)
@@ -353,7 +373,9 @@ class SessionTable:
     def _connect(self, session: Session) -> None:
         uid = session.peer.uid
         self._decisions.post(
-            ev.ClientConnected(session.client, session.peer.process, uid, session.name, session.instance)
+            ev.ClientConnected(
+                session.client, session.peer.process, uid, session.name, session.instance
+            )
         )
 
     def _check_version(self, hello: w.Hello) -> None:
@@ -378,9 +400,14 @@ class SessionTable:
     def _hello_again(self, session: Session, hello: w.Hello) -> None:
         """A repeated hello is answered again; under another name it is another client's, which needs its own connection."""
         self._check_version(hello)
-        if (hello.name, hello.instance, hello.role) != (session.name, session.instance, session.role):
+        if (hello.name, hello.instance, hello.role) != (
+            session.name,
+            session.instance,
+            session.role,
+        ):
             raise BadState(
-                f"this connection already said hello as {session.name!r}", hint="open another connection"
+                f"this connection already said hello as {session.name!r}",
+                hint="open another connection",
             )
         self._welcome(session, hello)
 
@@ -400,10 +427,18 @@ class SessionTable:
                 self._sessions_of_user.get(peer.uid, 0), share_of(every, settings.user_share), "user_share",
                 f"uid {peer.uid}", lambda other: other.peer.uid == peer.uid, now,
             )  # fmt: skip
-        self._need(len(self._sessions), allowed, "sessions_max", "all clients", lambda other: True, now)
+        self._need(
+            len(self._sessions), allowed, "sessions_max", "all clients", lambda other: True, now
+        )
 
     def _need(
-        self, count: int, most: int, limit: str, whose: str, among: Callable[[Session], bool], now: float
+        self,
+        count: int,
+        most: int,
+        limit: str,
+        whose: str,
+        among: Callable[[Session], bool],
+        now: float,
     ) -> None:
         """Raises LimitExceeded where `count` sessions are as many as may be, and none of those `among` can leave."""
         if count < most:
@@ -464,11 +499,17 @@ class SessionTable:
     def _refuse(self, connection: Connection, request_id: int | None, error: VramError) -> None:
         connection.send(codec.refusal(request_id, self._settings.epoch, error.to_wire()))
         entry = self._entries.get(connection.serial)
-        self._log_refusal(connection, None if entry is None else entry.session, error.code, error.message)
+        self._log_refusal(
+            connection, None if entry is None else entry.session, error.code, error.message
+        )
 
-    def _log_refusal(self, connection: Connection, session: Session | None, code: str, message: str) -> None:
+    def _log_refusal(
+        self, connection: Connection, session: Session | None, code: str, message: str
+    ) -> None:
         peer = connection.peer
-        self._refusals.say(peer.uid, peer.process.pid, "" if session is None else session.name, code, message)
+        self._refusals.say(
+            peer.uid, peer.process.pid, "" if session is None else session.name, code, message
+        )
 
     def _dispatch(self, session: Session, request: w.Request) -> None:
         """Reads are answered here; everything that can change the engine becomes an event, whose effects answer."""
@@ -490,12 +531,16 @@ class SessionTable:
                 )
             case w.Why():
                 consumer = request.consumer
-                self._decisions.when_read(lambda: self.reply(client, re, self._decisions.why(consumer)))
+                self._decisions.when_read(
+                    lambda: self.reply(client, re, self._decisions.why(consumer))
+                )
             case w.History():
                 _check_kinds(request.kinds)
                 after = max(0, min(request.after, (1 << 63) - 1))
                 limit = min(request.limit, HISTORY_PAGE)
-                self._history(after, limit, request.kinds, lambda body: self.reply(client, re, body))
+                self._history(
+                    after, limit, request.kinds, lambda body: self.reply(client, re, body)
+                )
             case w.Subscribe():
                 self._subscribe(session, re)
             case w.Bye():
@@ -505,7 +550,9 @@ class SessionTable:
                 if request.op in HOLDING and not session.leased:
                     session.leased = True
                     self._casual.discard(session.peer.process)
-                event = event_of(request, client, _operator(session) if request.op in BY_HAND else "")
+                event = event_of(
+                    request, client, _operator(session) if request.op in BY_HAND else ""
+                )
                 assert event is not None, f"{request.op} is answered by nothing"
                 self._decisions.post(event)
 
@@ -544,7 +591,9 @@ def _check_kinds(kinds: Sequence[str]) -> None:
             close = difflib.get_close_matches(kind, _KINDS, n=1)
             hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(sorted(_KINDS))}"
             raise BadRequest(
-                f"no event is of the kind {kind[:64]!r}", hint=hint, details={"known": sorted(_KINDS)}
+                f"no event is of the kind {kind[:64]!r}",
+                hint=hint,
+                details={"known": sorted(_KINDS)},
             )
 
 

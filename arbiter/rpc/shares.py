@@ -6,8 +6,8 @@ router, which handles messages in turns over users and processes: a budget of a 
 
 from dataclasses import dataclass
 
-from schemas.ids import ProcessKey
-from schemas.runtime.zmtp import Oversize
+from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime.zmtp import Oversize
 
 CHARGE_BYTES = 1024
 """A request costs one, and one more for each of these many bytes."""

@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from clients.cli import quick
-from schemas.defaults import NAME_MAX_CHARS, REASON_MAX_CHARS
-from schemas.errors import ArbiterUnreachable, UntrustedServer, VramError
-from schemas.version import DISTRIBUTION, version
+from vram_arbiter.clients.cli import quick
+from vram_arbiter.schemas.defaults import NAME_MAX_CHARS, REASON_MAX_CHARS
+from vram_arbiter.schemas.errors import ArbiterUnreachable, UntrustedServer, VramError
+from vram_arbiter.schemas.runtime.version import DISTRIBUTION, version
 
 _EPILOG = (
     "Exit codes: 0 done · 1 the answer is no, or an error · 2 wrong usage · 3 the arbiter cannot be reached · "
@@ -51,7 +51,9 @@ def _one_line(most: int, *, needed: bool) -> Callable[[str], str]:
 Endpoint = Annotated[
     str | None, typer.Option(help="Where the arbiter serves.", envvar="VRAM_ARBITER_ENDPOINT")
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the reply as JSON (the shapes of schemas.wire).")]
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print the reply as JSON (the shapes of schemas.wire).")
+]
 
 
 def run_app(arguments: Sequence[str]) -> int:
@@ -61,7 +63,9 @@ def run_app(arguments: Sequence[str]) -> int:
     ):  # of a command too; what follows `run` and its flags is another program's
         print(f"{DISTRIBUTION} {version()}")
         return quick.OK
-    as_json = "--json" in arguments and arguments[0] != "run"  # what follows `run` is another program's
+    as_json = (
+        "--json" in arguments and arguments[0] != "run"
+    )  # what follows `run` is another program's
     try:
         result = app(args=list(arguments), prog_name="vramctl", standalone_mode=False)
     except typer.Abort:
@@ -124,24 +128,28 @@ def history(
         int, typer.Option("--limit", "-n", min=1, max=5000, help="At most so many events.")
     ] = 50,
     after: Annotated[
-        int | None, typer.Option(min=0, help="The first events after this number (default: the newest).")
+        int | None,
+        typer.Option(min=0, help="The first events after this number (default: the newest)."),
     ] = None,
     since: Annotated[
         str | None, typer.Option(help="Since 90s, 10m, 2h or 1d ago, 14:30, or 2026-11-21 14:30.")
     ] = None,
     consumer: Annotated[
         list[str] | None,
-        typer.Option("--consumer", "-c", help="Only about this consumer; may be given several times."),
+        typer.Option(
+            "--consumer", "-c", help="Only about this consumer; may be given several times."
+        ),
     ] = None,
     kind: Annotated[
         list[str] | None, typer.Option(help="Only this kind; may be given several times.")
     ] = None,
     follow: Annotated[
-        bool, typer.Option("--follow", "-f", help="Then every further one as it happens, until Ctrl-C.")
+        bool,
+        typer.Option("--follow", "-f", help="Then every further one as it happens, until Ctrl-C."),
     ] = False,
 ) -> None:
     """What happened: grants, evictions, verdicts, with their reasons. With --follow --json one JSON object a line."""
-    from clients.cli import history as past
+    from vram_arbiter.clients.cli import history as past
 
     try:
         since_wall_s = None if since is None else past.since_now(since)
@@ -159,7 +167,7 @@ def watch(
     events: Annotated[int, typer.Option(min=0, max=200, help="Events shown below the table.")] = 12,
 ) -> None:
     """Live view of leases and events; plain lines of events where the output is no terminal. Ctrl-C ends it."""
-    from clients.cli.watch import watch as live
+    from vram_arbiter.clients.cli.watch import watch as live
 
     raise typer.Exit(asyncio.run(live(endpoint, events)))
 
@@ -192,26 +200,38 @@ Remark = Annotated[
 
 
 @app.command()
-def evict(target: Target, reason: Because, as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+def evict(
+    target: Target, reason: Because, as_json: AsJson = False, endpoint: Endpoint = None
+) -> None:
     """Ask a holder to leave. In use, it finishes first; a pinned one is refused. Operators only."""
     raise typer.Exit(
-        quick.by_hand("evict", {"target": target, "reason": reason}, as_json=as_json, endpoint=endpoint)
+        quick.by_hand(
+            "evict", {"target": target, "reason": reason}, as_json=as_json, endpoint=endpoint
+        )
     )
 
 
 @app.command()
-def pin(target: Target, reason: Because, as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+def pin(
+    target: Target, reason: Because, as_json: AsJson = False, endpoint: Endpoint = None
+) -> None:
     """Nobody makes this lease leave until it is unpinned. Operators only."""
     raise typer.Exit(
-        quick.by_hand("pin", {"target": target, "reason": reason}, as_json=as_json, endpoint=endpoint)
+        quick.by_hand(
+            "pin", {"target": target, "reason": reason}, as_json=as_json, endpoint=endpoint
+        )
     )
 
 
 @app.command()
-def unpin(target: Target, reason: Remark = "", as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+def unpin(
+    target: Target, reason: Remark = "", as_json: AsJson = False, endpoint: Endpoint = None
+) -> None:
     """Undo an operator's pin. Operators only."""
     raise typer.Exit(
-        quick.by_hand("unpin", {"target": target, "reason": reason}, as_json=as_json, endpoint=endpoint)
+        quick.by_hand(
+            "unpin", {"target": target, "reason": reason}, as_json=as_json, endpoint=endpoint
+        )
     )
 
 
@@ -224,11 +244,15 @@ def drain(reason: Because, as_json: AsJson = False, endpoint: Endpoint = None) -
 @app.command()
 def resume(reason: Remark = "", as_json: AsJson = False, endpoint: Endpoint = None) -> None:
     """Grant again after a drain. Operators only."""
-    raise typer.Exit(quick.by_hand("resume", {"reason": reason}, as_json=as_json, endpoint=endpoint))
+    raise typer.Exit(
+        quick.by_hand("resume", {"reason": reason}, as_json=as_json, endpoint=endpoint)
+    )
 
 
 @app.command(name="release-dead")
-def release_dead(target: Target, reason: Because, as_json: AsJson = False, endpoint: Endpoint = None) -> None:
+def release_dead(
+    target: Target, reason: Because, as_json: AsJson = False, endpoint: Endpoint = None
+) -> None:
     """Give up the lease of a holder that is not heard of, before its ttl is over; its bytes are measured gone as ever.
 
     Refused in use, and for a holder that is heard of. Operators only.
@@ -242,17 +266,26 @@ def release_dead(target: Target, reason: Because, as_json: AsJson = False, endpo
 
 @app.command(context_settings={"allow_interspersed_args": False})
 def run(
-    command: Annotated[list[str], typer.Argument(help="The program and its arguments, after `--`.")],
+    command: Annotated[
+        list[str], typer.Argument(help="The program and its arguments, after `--`.")
+    ],
     vram: Annotated[str, typer.Option(help="Bytes that the program needs, e.g. 5GiB.")],
-    name: Annotated[str | None, typer.Option(help="Consumer's name (default: the program's).")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Consumer's name (default: the program's).")
+    ] = None,
     gpu: Annotated[str, typer.Option(help="uuid, index or any.")] = "any",
     priority: Annotated[
-        int, typer.Option(min=0, max=100, help="Below the 50 of other leases: a robot's models go first.")
+        int,
+        typer.Option(
+            min=0, max=100, help="Below the 50 of other leases: a robot's models go first."
+        ),
     ] = 40,
     wait: Annotated[
         float | None, typer.Option(min=0, help="Give up after so many seconds (default: never).")
     ] = None,
-    exclusive: Annotated[bool, typer.Option("--exclusive", help="No other model on that GPU.")] = False,
+    exclusive: Annotated[
+        bool, typer.Option("--exclusive", help="No other model on that GPU.")
+    ] = False,
     pin: Annotated[bool, typer.Option("--pin", help="Never end the program to make room.")] = False,
     on_revoke: Annotated[
         str,
@@ -263,7 +296,9 @@ def run(
     ] = "priority",
     grace: Annotated[
         float | None,
-        typer.Option(min=0, help="Seconds from SIGTERM to SIGKILL (default: as long as the program takes)."),
+        typer.Option(
+            min=0, help="Seconds from SIGTERM to SIGKILL (default: as long as the program takes)."
+        ),
     ] = None,
     endpoint: Endpoint = None,
 ) -> None:
@@ -276,8 +311,8 @@ def run(
     """
     from pydantic import ValidationError
 
-    from clients.cli.run import ON_REVOKE, RunSpec, lease_spec, run_leased
-    from schemas.sizes import parse_bytes
+    from vram_arbiter.clients.cli.run import ON_REVOKE, RunSpec, lease_spec, run_leased
+    from vram_arbiter.schemas.sizes import parse_bytes
 
     chosen = "pin" if pin else on_revoke
     if chosen not in ON_REVOKE:
@@ -305,7 +340,7 @@ def doctor(as_json: AsJson = False, endpoint: Endpoint = None) -> None:
     Exits 0 if all is well, 1 on any finding (a foreign package, a journal that cannot be written, a drained daemon, a GPU that cannot be
     read or is under pressure), 3 if the arbiter cannot be reached.
     """
-    from clients.cli.doctor import doctor as examine
+    from vram_arbiter.clients.cli.doctor import doctor as examine
 
     raise typer.Exit(examine(as_json=as_json, endpoint=endpoint))
 
@@ -319,7 +354,7 @@ def replay(context: typer.Context) -> None:
 
     See `vramctl replay --help`.
     """
-    from clients.cli.engine import run as start
+    from vram_arbiter.clients.cli.engine import run as start
 
     raise typer.Exit(start(["replay", *context.args]))
 
@@ -327,8 +362,8 @@ def replay(context: typer.Context) -> None:
 @app.command(context_settings=_PASSED_ON)
 def simulate(context: typer.Context) -> None:
     """Run a scenario through the engine, under one policy or several side by side; see `vramctl simulate --help`."""
-    from clients.cli.engine import run as start
-    from clients.cli.engine import with_scenario
+    from vram_arbiter.clients.cli.engine import run as start
+    from vram_arbiter.clients.cli.engine import with_scenario
 
     raise typer.Exit(start(["simulate", *with_scenario(context.args)]))
 
@@ -336,8 +371,10 @@ def simulate(context: typer.Context) -> None:
 @app.command(context_settings=_PASSED_ON)
 def demo(context: typer.Context) -> None:
     """Run find → navigate → grab on a simulated arm inside 8 GiB (needs the full install); see `vramctl demo --help`."""
-    from clients.cli.demo import demo as show
+    from vram_arbiter.clients.cli.demo import demo as show
 
     inner = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
     inner.command(context_settings=CONTEXT)(show)
-    raise typer.Exit(int(inner(args=context.args, prog_name="vramctl demo", standalone_mode=False) or 0))
+    raise typer.Exit(
+        int(inner(args=context.args, prog_name="vramctl demo", standalone_mode=False) or 0)
+    )

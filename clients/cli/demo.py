@@ -19,27 +19,34 @@ from typing import Annotated, Any
 
 import typer
 
-from clients.aio import ArbiterClient
-from clients.cli.demo_display import Display
-from clients.cli.demo_programs import Program, Programs
-from clients.cli.demo_report import CardStory, draw_timeline, read_log, read_samples, summarise
-from clients.configs import configs_folder
-from clients.runner import RunnerClient
-from clients.sidecar.perception import DetectorClient, SceneVlmClient
-from clients.sidecar.policy import PolicyClient
-from schemas import fakegpu, terminal
-from schemas.endpoints import RUNTIME_VARIABLE
-from schemas.errors import RunnerUnreachable, SidecarUnavailable, VramError
-from schemas.extras import need
-from schemas.units import parse_bytes
+from vram_arbiter.clients.cli.demo_display import Display
+from vram_arbiter.clients.cli.demo_programs import Program, Programs
+from vram_arbiter.clients.cli.demo_report import (
+    CardStory,
+    draw_timeline,
+    read_log,
+    read_samples,
+    summarise,
+)
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.configs import configs_folder
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.sidecar.perception import DetectorClient, SceneVlmClient
+from vram_arbiter.clients.sidecar.policy import PolicyClient
+from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.errors import RunnerUnreachable, SidecarUnavailable, VramError
+from vram_arbiter.schemas.runtime import terminal
+from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
+from vram_arbiter.schemas.runtime.extras import need
+from vram_arbiter.schemas.units import parse_bytes
 
 SIDECARS = {"detector": "so101-detector", "scene-vlm": "so101-scene-vlm", "grab": "so101-grab"}
 BUDGET = "8GiB"
-LOAD_BYTES_PER_S = (
-    2_500_000_000  # of the simulated card: about what safetensors' load_file reaches from the page cache
-)
+LOAD_BYTES_PER_S = 2_500_000_000  # of the simulated card: about what safetensors' load_file reaches from the page cache
 BOOT_S = 240.0
-LOOP_S = 400.0  # it takes one or two minutes; a machine with other work on its cores has time as well
+LOOP_S = (
+    400.0  # it takes one or two minutes; a machine with other work on its cores has time as well
+)
 POLL_S = 0.2
 
 
@@ -80,15 +87,28 @@ def demo(
             "without the arbiter nobody reads a real card; use --gpu fake:8GiB with --arbiter off"
         )
     try:
-        need("the demo", "torch", "lerobot", "transformers", "mujoco", "cv2", "matplotlib", extra="all")
+        need(
+            "the demo",
+            "torch",
+            "lerobot",
+            "transformers",
+            "mujoco",
+            "cv2",
+            "matplotlib",
+            extra="all",
+        )
         summary = asyncio.run(_demo(seed, arbiter == "on", gpu, out))
     except VramError as error:
         terminal.complain("vramctl demo", error)
         raise typer.Exit(1) from None
-    typer.echo(json.dumps({key: value for key, value in summary.items() if key != "loads"}, indent=2))
+    typer.echo(
+        json.dumps({key: value for key, value in summary.items() if key != "loads"}, indent=2)
+    )
     typer.echo(f"written: {out}/summary.json, {out}/timeline.png, {out}/episode.mp4")
     shown = (
-        (summary["completed"] and not summary["oom_events"]) if arbiter == "on" else summary["oom_events"] > 0
+        (summary["completed"] and not summary["oom_events"])
+        if arbiter == "on"
+        else summary["oom_events"] > 0
     )
     raise typer.Exit(0 if shown else 1)
 
@@ -96,10 +116,13 @@ def demo(
 async def _demo(seed: int, arbiter: bool, gpu: str, out: Path) -> dict[str, Any]:
     shutil.rmtree(out, ignore_errors=True)
     (out / "logs").mkdir(parents=True)
-    runtime = Path(tempfile.mkdtemp(prefix="vram-demo-"))  # short: ipc paths have at most 107 characters
+    runtime = Path(
+        tempfile.mkdtemp(prefix="vram-demo-")
+    )  # short: ipc paths have at most 107 characters
     try:
         programs = Programs(
-            out / "logs", {RUNTIME_VARIABLE: str(runtime), "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
+            out / "logs",
+            {RUNTIME_VARIABLE: str(runtime), "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"},
         )
         try:
             return await _episode(programs, runtime, seed=seed, arbiter=arbiter, gpu=gpu, out=out)
@@ -118,7 +141,9 @@ async def _episode(
     watch = Watch(time.monotonic(), time.time() - time.monotonic())
     async with contextlib.AsyncExitStack() as stack:
         runner = await stack.enter_async_context(RunnerClient(f"ipc://{runtime}/runner.sock"))
-        client = await _boot(programs, runtime, runner, stack, seed=seed, arbiter=arbiter, gpu=gpu, out=out)
+        client = await _boot(
+            programs, runtime, runner, stack, seed=seed, arbiter=arbiter, gpu=gpu, out=out
+        )
         target = (await runner.ground_truth())["target"]
         task = f"grab the {target}"
         watch.start_s = time.monotonic()
@@ -228,7 +253,11 @@ async def _until_up(programs: Programs, ping: Any) -> None:
 
 
 async def _watch(
-    programs: Programs, reasoner: Program, client: ArbiterClient | None, display: Display, watch: Watch
+    programs: Programs,
+    reasoner: Program,
+    client: ArbiterClient | None,
+    display: Display,
+    watch: Watch,
 ) -> None:
     """Follow the loop until the reasoner ends or the time is up."""
     ended = asyncio.create_task(reasoner.process.wait())

@@ -15,8 +15,8 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from schemas.runtime.printable import printable
-from schemas.units import format_bytes
+from vram_arbiter.schemas.runtime.printable import printable
+from vram_arbiter.schemas.units import format_bytes
 
 BAR_CELLS = 60
 EVENTS_SHOWN = 9
@@ -51,7 +51,9 @@ class Display:
         self._task = task
         self._arbiter = arbiter
         self._console = Console(file=sys.stdout)
-        self._live = Live(console=self._console, refresh_per_second=6) if self._console.is_terminal else None
+        self._live = (
+            Live(console=self._console, refresh_per_second=6) if self._console.is_terminal else None
+        )
         self._events: deque[str] = deque(maxlen=EVENTS_SHOWN)
         self._robot = ""
 
@@ -61,7 +63,10 @@ class Display:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         if self._live is not None:
             self._live.stop()
@@ -113,7 +118,9 @@ def _bar(gpu: Mapping[str, Any], leases: list[Mapping[str, Any]]) -> Text:
             cells += width
     bar.append("░" * max(0, BAR_CELLS - cells))
     used = gpu["measured_used_bytes"]
-    bar.append(f"  measured {'unknown' if used is None else format_bytes(used)} of {format_bytes(capacity)}")
+    bar.append(
+        f"  measured {'unknown' if used is None else format_bytes(used)} of {format_bytes(capacity)}"
+    )
     return bar
 
 

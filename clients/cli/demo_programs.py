@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from clients import traces
-from schemas.errors import SidecarUnavailable
+from vram_arbiter.clients._protocol import traces
+from vram_arbiter.schemas.errors import SidecarUnavailable
 
 STOP_GRACE_S = 15.0
 LOG_TAIL_LINES = 15

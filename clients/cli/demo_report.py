@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from schemas.defaults import GIB
-from schemas.units import format_bytes
+from vram_arbiter.schemas.defaults import GIB
+from vram_arbiter.schemas.units import format_bytes
 
 SPLIT = ("wait_ms", "drain_ms", "unload_ms", "verify_ms", "load_ms", "total_ms")
 COLOURS = {"detector": "#d1495b", "scene-vlm": "#3d7ea6", "grab": "#5b8c5a"}
@@ -46,7 +46,9 @@ def read_log(text: str, names: Mapping[int, str]) -> CardStory:
         except ValueError:
             continue
         points.append(
-            Point(entry["t"], names.get(entry["pid"], f"pid {entry['pid']}"), entry["process_bytes"])
+            Point(
+                entry["t"], names.get(entry["pid"], f"pid {entry['pid']}"), entry["process_bytes"]
+            )
         )
         peak = max(peak, entry["used_after"])
         if entry["op"] == "oom":
@@ -66,10 +68,14 @@ def read_samples(
     for at_s, gpu in samples:
         peak = max(peak, gpu["measured_used_bytes"] or 0)
         points += [
-            Point(at_s, names.get(process["pid"], f"pid {process['pid']}"), process["used_bytes"] or 0)
+            Point(
+                at_s, names.get(process["pid"], f"pid {process['pid']}"), process["used_bytes"] or 0
+            )
             for process in gpu["processes"]
         ]
-    refused = tuple(event["at_wall_s"] - wall_offset_s for event in events if event["kind"] == "oom")
+    refused = tuple(
+        event["at_wall_s"] - wall_offset_s for event in events if event["kind"] == "oom"
+    )
     return CardStory(tuple(points), peak, refused)
 
 
@@ -94,7 +100,9 @@ def summarise(
         "attempts": reasoner.get("attempts", 0),
         "oom_events": len(story.refused_at_s),
         "switches": sum(bool(event["switched"]) for event in switches),
-        "switches_verified": sum(bool(event["switched"] and event["verified"]) for event in switches),
+        "switches_verified": sum(
+            bool(event["switched"] and event["verified"]) for event in switches
+        ),
         "peak_bytes": story.peak_bytes,
         "capacity_bytes": capacity_bytes,
         "seconds": round(seconds, 1),
@@ -155,7 +163,12 @@ def draw_timeline(
             markersize=11,
             markeredgewidth=3,
         )
-    axes.set(xlabel="seconds", ylabel="GiB on the card", ylim=(0, capacity_bytes / GIB * 1.25), title=title)
+    axes.set(
+        xlabel="seconds",
+        ylabel="GiB on the card",
+        ylim=(0, capacity_bytes / GIB * 1.25),
+        title=title,
+    )
     if times:
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8)
     figure.savefig(path, dpi=110)

@@ -3,13 +3,15 @@
 import json
 import os
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
-import vramctl
-from clients.cli import quick
-from schemas.endpoints import arbiter_endpoint
-from schemas.runtime.printable import printable
-from schemas.sizes import format_bytes
+import vram_arbiter
+from vram_arbiter.clients.cli import quick
+from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
+from vram_arbiter.schemas.runtime.printable import printable
+from vram_arbiter.schemas.runtime.version import version
+from vram_arbiter.schemas.sizes import format_bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +26,7 @@ class Finding:
 def doctor(*, as_json: bool, endpoint: str | None) -> int:
     """Return 0 if all is well, 1 for a finding (an unhealthy daemon too), 3 if the arbiter cannot be reached."""
     where = endpoint or arbiter_endpoint(os.environ, os.getuid())
-    findings = [*_origins(), _driver(), Finding("endpoint", None, where)]
+    findings = [_origin(), _driver(), Finding("endpoint", None, where)]
     reachable, about = _arbiter(where)
     findings += about
     if as_json:
@@ -38,16 +40,9 @@ def doctor(*, as_json: bool, endpoint: str | None) -> int:
     return quick.NO if any(finding.ok is False for finding in findings) else quick.OK
 
 
-def _origins() -> list[Finding]:
-    """All six packages must come from one tree: other projects use the same common names."""
-    findings = []
-    for name, where in vramctl.origins().items():
-        if where is None:
-            findings.append(Finding(name, False, "not importable: reinstall vram-arbiter"))
-        else:
-            ours = vramctl.is_ours(where)
-            findings.append(Finding(name, ours, where if ours else f"{where} (not of this installation)"))
-    return findings
+def _origin() -> Finding:
+    """Return the folder that the product is imported from, and its version."""
+    return Finding("installation", True, f"{Path(vram_arbiter.__file__).parent} ({version()})")
 
 
 def _driver() -> Finding:
@@ -56,7 +51,9 @@ def _driver() -> Finding:
     try:
         pynvml.nvmlInit()
     except pynvml.NVMLError as error:
-        return Finding("nvidia driver", None, f"{error}; `vram-arbiter --gpu fake:8GiB` simulates a card")
+        return Finding(
+            "nvidia driver", None, f"{error}; `vram-arbiter --gpu fake:8GiB` simulates a card"
+        )
     try:
         cards = pynvml.nvmlDeviceGetCount()
         first = pynvml.nvmlDeviceGetHandleByIndex(0) if cards else None
@@ -87,12 +84,20 @@ def _arbiter(endpoint: str) -> tuple[bool, list[Finding]]:
     if not status.get("ok"):
         return True, [Finding("daemon", False, str(status["error"]["message"]))]
     about = [
-        Finding("daemon", True, f"{status['phase']}, epoch {status['epoch']}, {status['clients']} clients")
+        Finding(
+            "daemon",
+            True,
+            f"{status['phase']}, epoch {status['epoch']}, {status['clients']} clients",
+        )
     ]
     about += [Finding("files", False, problem) for problem in status.get("problems", ())]
     if status.get("drained"):
         about.append(
-            Finding("grants", False, f"drained by {status['drained']}: grant again with `vramctl resume`")
+            Finding(
+                "grants",
+                False,
+                f"drained by {status['drained']}: grant again with `vramctl resume`",
+            )
         )
     return True, about + [_card(gpu) for gpu in status["gpus"]]
 
@@ -101,13 +106,18 @@ def _card(gpu: dict[str, Any]) -> Finding:
     what = f"gpu {gpu['index']}"
     if gpu["measured_used_bytes"] is None:
         return Finding(
-            what, False, f"{gpu['name']}: the probe does not answer, nothing is granted ({gpu['blocked']})"
+            what,
+            False,
+            f"{gpu['name']}: the probe does not answer, nothing is granted ({gpu['blocked']})",
         )
     if gpu["pressure_bytes"]:
         over = format_bytes(gpu["pressure_bytes"])
         return Finding(what, False, f"{gpu['name']}: {over} more are held than were granted")
     if gpu["blocked"]:
         return Finding(what, None, f"{gpu['name']}: no grants now: {gpu['blocked']}")
-    reads = {"unified": "memory shared with the CPU, read from /proc/meminfo", "fake": "a simulated card"}
+    reads = {
+        "unified": "memory shared with the CPU, read from /proc/meminfo",
+        "fake": "a simulated card",
+    }
     source = gpu.get("source") or "?"
     return Finding(what, True, f"{gpu['name']}, its probe answers ({reads.get(source, source)})")

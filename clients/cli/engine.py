@@ -7,13 +7,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from clients.configs import configs_folder
+from vram_arbiter.clients.configs import configs_folder
 
-PROGRAM = "arbiter.replay"
+PROGRAM = "vram_arbiter.arbiter.lab"
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Start `python -m arbiter.replay ARGUMENTS` on this terminal and return its exit code (128+n if signal n ended it)."""
+    """Start `python -m vram_arbiter.arbiter.lab ARGUMENTS` on this terminal and return its exit code (128+n if signal n ended it)."""
     # Ctrl-C is the program's; it is waited for in any case
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -31,4 +31,6 @@ def with_scenario(arguments: Sequence[str]) -> list[str]:
     """A word that is no file but names a shipped scenario becomes its path."""
     folder = configs_folder(os.environ) / "scenarios"
     shipped = {path.stem: str(path) for path in folder.glob("*.yaml")}
-    return [shipped[word] if word in shipped and not Path(word).exists() else word for word in arguments]
+    return [
+        shipped[word] if word in shipped and not Path(word).exists() else word for word in arguments
+    ]

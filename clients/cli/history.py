@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from clients.cli import quick, text
-from clients.cli.quick import ENVELOPE, Message
+from vram_arbiter.clients.cli import quick, text
+from vram_arbiter.clients.cli.quick import ENVELOPE, Message
 
 LIMIT = 50
 PAGE = 2000  # events in one reply; more would not fit a message
@@ -74,7 +74,13 @@ def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = Non
 
     hidden = ENVELOPE | {"epoch"}
     return quick.answer(
-        "history", {}, endpoint=endpoint, as_json=as_json, lines=shown, hidden=hidden, question=question
+        "history",
+        {},
+        endpoint=endpoint,
+        as_json=as_json,
+        lines=shown,
+        hidden=hidden,
+        question=question,
     )[0]
 
 
@@ -142,7 +148,7 @@ async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None 
 
     Raises ArbiterUnreachable if nobody answers at first.
     """
-    from clients.aio import ArbiterClient
+    from vram_arbiter.clients.client import ArbiterClient
 
     def tell(event: Mapping[str, Any]) -> None:
         if wanted.keeps(event):
@@ -160,7 +166,9 @@ async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None 
     async with client:
         listening = asyncio.create_task(listen())
         try:
-            await asyncio.sleep(0)  # the subscription is on its way, so nothing falls between it and the past
+            await asyncio.sleep(
+                0
+            )  # the subscription is on its way, so nothing falls between it and the past
             await client.ping()
             past = await asyncio.to_thread(collect, wanted, client.endpoint)
             last = int(past.get("last_seq", 0))

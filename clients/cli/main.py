@@ -2,7 +2,7 @@
 
 import sys
 
-from clients.cli import quick
+from vram_arbiter.clients.cli import quick
 
 TELEMETRY_S = 1.0  # a person waits for the prompt: a collector that is away costs no more than this
 
@@ -22,11 +22,11 @@ def main() -> None:
     except KeyboardInterrupt:
         code = 130
     except OSError as error:
-        from schemas import terminal
+        from vram_arbiter.schemas.runtime import terminal
 
         code = terminal.no_room("vramctl", error)
     except ModuleNotFoundError as error:
-        from schemas import terminal
+        from vram_arbiter.schemas.runtime import terminal
 
         code = terminal.not_installed("vramctl", error)
     sys.exit(code)
@@ -34,10 +34,10 @@ def main() -> None:
 
 def _in_full(arguments: list[str]) -> int:
     """A command with everything that it may import, as a span where telemetry is asked for."""
-    from clients.cli.app import run_app
-    from schemas import terminal
-    from schemas.commands import command
-    from schemas.errors import ConfigError
+    from vram_arbiter.clients.cli.app import run_app
+    from vram_arbiter.schemas.errors import ConfigError
+    from vram_arbiter.schemas.runtime import terminal
+    from vram_arbiter.schemas.runtime.telemetry.commands import command
 
     try:
         with command("vramctl", arguments[0] if arguments else "", flush_s=TELEMETRY_S) as running:

@@ -13,16 +13,16 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from clients.cli import text
-from clients.packing import pack
-from schemas.defaults import WIRE_VERSION
-from schemas.endpoints import arbiter_endpoint
-from schemas.errors import UntrustedServer, VramError
+from vram_arbiter.clients._protocol.codec import pack
+from vram_arbiter.clients.cli import text
+from vram_arbiter.schemas.defaults import WIRE_VERSION
+from vram_arbiter.schemas.errors import UntrustedServer, VramError
+from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 
 if TYPE_CHECKING:
     import zmq
 
-    from clients.link import Link
+    from vram_arbiter.clients.net.link import Link
 
 OK, NO, USAGE, UNREACHABLE = 0, 1, 2, 3
 """Exit codes of `vramctl`: done; the answer is no, or an error; wrong usage; the arbiter cannot be reached."""
@@ -70,7 +70,10 @@ def ask(
         silent = Unreachable(f"no arbiter answers at {where} within {timeout_s:g} s", HANGS)
         if where.startswith("ipc:///") and not os.path.exists(where.removeprefix("ipc://")):
             _look(where)
-        with zmq.Context() as context, contextlib.closing(_link(context, where, deadline, silent)) as link:
+        with (
+            zmq.Context() as context,
+            contextlib.closing(_link(context, where, deadline, silent)) as link,
+        ):
             for message in (hello, {"op": op, "id": 2, **fields}):
                 link.send(pack(message))
             return _reply(link, where, deadline, silent)
@@ -83,7 +86,7 @@ def _link(
     context: "zmq.Context[zmq.Socket[bytes]]", where: str, deadline: float, silent: Unreachable
 ) -> "Link":
     """A link to an arbiter that may be believed. Raises Unreachable, UntrustedServer, ConfigError."""
-    from clients.link import Link
+    from vram_arbiter.clients.net.link import Link
 
     while True:
         link = Link(context, where, "arbiter")
@@ -105,7 +108,7 @@ def _reply(link: "Link", where: str, deadline: float, silent: Unreachable) -> Me
     import msgpack
     import zmq
 
-    from clients.link import ms_until
+    from vram_arbiter.clients.net.link import ms_until
 
     poller = zmq.Poller()
     poller.register(link.socket, zmq.POLLIN)
@@ -126,7 +129,7 @@ def _reply(link: "Link", where: str, deadline: float, silent: Unreachable) -> Me
 
 def _look(where: str) -> None:
     """Raises Unreachable if the kernel knows at once why nobody answers."""
-    from clients.reach import obstacle
+    from vram_arbiter.clients.net.diagnose import obstacle
 
     if found := obstacle(where):
         raise Unreachable(*found)
@@ -158,7 +161,9 @@ def answer(
         complain(reply["error"], as_json=as_json)
         return NO, {}
     if as_json:
-        print(json.dumps({key: value for key, value in reply.items() if key not in hidden}, indent=2))
+        print(
+            json.dumps({key: value for key, value in reply.items() if key not in hidden}, indent=2)
+        )
     elif said := lines(reply):
         print("\n".join(said))
     return OK, reply
@@ -175,7 +180,12 @@ def complain(error: Mapping[str, Any], *, as_json: bool) -> None:
 # -- commands ----------------------------------------------------------------------------------------------------------
 def status(*, as_json: bool = False, endpoint: str | None = None) -> int:
     return answer(
-        "status", {}, endpoint=endpoint, as_json=as_json, lines=text.status_lines, question=_all_pages
+        "status",
+        {},
+        endpoint=endpoint,
+        as_json=as_json,
+        lines=text.status_lines,
+        question=_all_pages,
     )[0]
 
 

@@ -16,15 +16,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from clients import cuda, traces
-from clients.aio import ArbiterClient
-from clients.cli.signals import Forwarding
-from clients.lease import Lease
-from schemas.defaults import NAME_MAX_CHARS
-from schemas.errors import VramError
-from schemas.runtime.printable import printable
-from schemas.sizes import format_bytes
-from schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.clients import cuda
+from vram_arbiter.clients._protocol import traces
+from vram_arbiter.clients.cli.signals import Forwarding
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.lease import Lease
+from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
+from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.runtime.printable import printable
+from vram_arbiter.schemas.sizes import format_bytes
+from vram_arbiter.schemas.wire import Footprint, LeaseSpec
 
 PRIORITY = 40
 """Below that of other leases: programs make room for a robot's models, and queue among themselves."""
@@ -65,7 +66,9 @@ def lease_spec(spec: RunSpec) -> LeaseSpec:
         model_id=spec.consumer,
         gpu=spec.gpu,
         mode="exclusive" if spec.exclusive else "shared",
-        footprint=Footprint(load_peak_bytes=spec.vram_bytes, steady_bytes=spec.vram_bytes, residue_bytes=0),
+        footprint=Footprint(
+            load_peak_bytes=spec.vram_bytes, steady_bytes=spec.vram_bytes, residue_bytes=0
+        ),
         priority=spec.priority,
         evictable=spec.on_revoke != "pin",
     )
@@ -78,7 +81,9 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
         code, problem = _why_not(spec.command[0])
         _say(f"{spec.command[0]}: {problem}")
         return code
-    async with ArbiterClient(endpoint, name=f"vramctl run {spec.consumer}"[:NAME_MAX_CHARS]) as client:
+    async with ArbiterClient(
+        endpoint, name=f"vramctl run {spec.consumer}"[:NAME_MAX_CHARS]
+    ) as client:
         run = _Run(spec, client)
         acquiring = client.acquire(
             lease_spec(spec),
@@ -90,7 +95,9 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
         lease = await _tell_why(client, asyncio.ensure_future(acquiring), spec.consumer)
         with Forwarding() as signals:
             try:
-                child = await asyncio.create_subprocess_exec(program, *spec.command[1:], env=_environ(lease))
+                child = await asyncio.create_subprocess_exec(
+                    program, *spec.command[1:], env=_environ(lease)
+                )
             except OSError as error:
                 _say(f"{program}: {error.strerror}")
                 await lease.release()
@@ -125,7 +132,9 @@ class _Run:
         if self.peak_bytes:
             asked = self._spec.vram_bytes
             more = ", more than was asked for" if self.peak_bytes > asked else ""
-            _say(f"peak {format_bytes(self.peak_bytes)} measured of {format_bytes(asked)} asked{more}")
+            _say(
+                f"peak {format_bytes(self.peak_bytes)} measured of {format_bytes(asked)} asked{more}"
+            )
         else:
             _say("peak not measured: no reading showed bytes of the program")
         return code
@@ -146,7 +155,9 @@ class _Run:
             self._wake.clear()
             self._decide(lease, {})
             with contextlib.suppress(VramError):
-                status = await self._client.ask("status")  # its first page has the heads of the queues
+                status = await self._client.ask(
+                    "status"
+                )  # its first page has the heads of the queues
                 self._measure(lease, status)
                 self._decide(lease, status)
             pause_s = LOOK_S
@@ -181,11 +192,15 @@ class _Run:
         waiting.append((push["wanted_by"], push.get("priority", self._spec.priority + 1)))
         consumer, priority = max(waiting, key=lambda one: one[1])
         if priority > self._spec.priority:
-            self._reason = push["reason"] if consumer == push["wanted_by"] else f"{consumer} needs the room"
+            self._reason = (
+                push["reason"] if consumer == push["wanted_by"] else f"{consumer} needs the room"
+            )
             self._client.spawn(self.end(), f"end of {lease.lease_id}")
         elif consumer not in self._told:
             self._told.add(consumer)
-            _say(f"{consumer} waits for its room (priority {priority}): it gets it when the program ends")
+            _say(
+                f"{consumer} waits for its room (priority {priority}): it gets it when the program ends"
+            )
 
     async def ended(self) -> None:
         if self._child is not None:
@@ -207,7 +222,9 @@ class _Run:
             await child.wait()
 
 
-async def _tell_why(client: ArbiterClient, acquiring: asyncio.Future[Lease], consumer: str) -> Lease:
+async def _tell_why(
+    client: ArbiterClient, acquiring: asyncio.Future[Lease], consumer: str
+) -> Lease:
     """The lease; a person who waits for it is told once whom for."""
     try:
         done, _ = await asyncio.wait({acquiring}, timeout=PATIENCE_S)
@@ -223,7 +240,11 @@ async def _tell_why(client: ArbiterClient, acquiring: asyncio.Future[Lease], con
 def _why_not(command: str) -> tuple[int, str]:
     """The exit code and the reason for a command that is not an executable file."""
     folders = [""] if os.sep in command else os.environ.get("PATH", os.defpath).split(os.pathsep)
-    found = [path for folder in folders if command and os.path.exists(path := os.path.join(folder, command))]
+    found = [
+        path
+        for folder in folders
+        if command and os.path.exists(path := os.path.join(folder, command))
+    ]
     if not found:
         return NOT_FOUND, "not found"
     return NOT_STARTED, "is a directory" if os.path.isdir(found[0]) else "permission denied"

@@ -6,7 +6,14 @@ import signal
 import threading
 from typing import Self
 
-FORWARDED = (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGCONT, signal.SIGWINCH)
+FORWARDED = (
+    signal.SIGTERM,
+    signal.SIGHUP,
+    signal.SIGUSR1,
+    signal.SIGUSR2,
+    signal.SIGCONT,
+    signal.SIGWINCH,
+)
 TYPED = frozenset({signal.SIGINT, signal.SIGQUIT})
 """A terminal sends these to the program as well (Ctrl-C, Ctrl-\\): they are passed on only when a process sent them."""
 SI_KERNEL = 128

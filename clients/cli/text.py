@@ -7,11 +7,23 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from schemas.runtime.printable import makes_printable, printable
-from schemas.sizes import format_bytes
+from vram_arbiter.schemas.runtime.printable import makes_printable, printable
+from vram_arbiter.schemas.sizes import format_bytes
 
 Message = Mapping[str, Any]
-_COLUMNS = ("LEASE", "CONSUMER", "MODEL", "GPU", "STATE", "CHARGE", "DRIFT", "USES", "PRIO", "PID", "SINCE")
+_COLUMNS = (
+    "LEASE",
+    "CONSUMER",
+    "MODEL",
+    "GPU",
+    "STATE",
+    "CHARGE",
+    "DRIFT",
+    "USES",
+    "PRIO",
+    "PID",
+    "SINCE",
+)
 _RIGHT = frozenset({"CHARGE", "DRIFT", "USES", "PRIO", "PID", "SINCE"})
 _NOT_SHOWN = frozenset(
     {"seq", "at_wall_s", "kind", "lease_id", "consumer", "reason", "gpu", "token", "traceparent"}
@@ -61,12 +73,16 @@ def status_lines(status: Message) -> list[str]:
         drift: not any(row[drift] for row in rows),
     }
     shown = [at for at in range(len(_COLUMNS)) if not hidden.get(at)]
-    return lines + table([_COLUMNS[at] for at in shown], [[row[at] for at in shown] for row in rows])
+    return lines + table(
+        [_COLUMNS[at] for at in shown], [[row[at] for at in shown] for row in rows]
+    )
 
 
 def _gpu_lines(gpu: Message) -> list[str]:
     size, known = format_bytes, gpu["measured_used_bytes"] is not None
-    room = gpu["capacity_bytes"] - gpu["reserve_bytes"] - gpu["charged_bytes"] - gpu["stowaway_bytes"]
+    room = (
+        gpu["capacity_bytes"] - gpu["reserve_bytes"] - gpu["charged_bytes"] - gpu["stowaway_bytes"]
+    )
     lines = [
         f"GPU {gpu['index']} {gpu['name']} ({gpu['gpu']})",
         f"  capacity {size(gpu['capacity_bytes'])}{' =' if known else ':'} reserve {size(gpu['reserve_bytes'])} + charged {size(gpu['charged_bytes'])}"
@@ -160,7 +176,10 @@ def why_lines(why: Message) -> list[str]:
 
 def _why_details(lease: Message) -> list[str]:
     size = format_bytes
-    lines = [f"  lease     {lease['lease_id']}, {lease['state']}", *_footprint_lines(lease.get("footprint"))]
+    lines = [
+        f"  lease     {lease['lease_id']}, {lease['state']}",
+        *_footprint_lines(lease.get("footprint")),
+    ]
     if lease["state"] != "queued":
         return lines
     lines.append(
@@ -196,12 +215,16 @@ def by_hand_lines(action: str, reply: Message) -> list[str]:
         return [f"given up: its bytes stay charged until they are measured gone ({reply['state']})"]
     name = f"{lease['consumer']} ({lease['lease_id']})"
     if action == "pin":
-        return [f"{name} is pinned: nobody makes it leave until `vramctl unpin {lease['lease_id']}`"]
+        return [
+            f"{name} is pinned: nobody makes it leave until `vramctl unpin {lease['lease_id']}`"
+        ]
     if action == "unpin":
         return [f"{name} is no longer pinned by an operator"]
     uses = lease["uses"]
     wait = f"finishes {plural(uses, 'use')}, then unloads" if uses else "unloads now"
-    return [f"{name} was asked to leave: it {wait}; follow it with `vramctl why {lease['consumer']}`"]
+    return [
+        f"{name} was asked to leave: it {wait}; follow it with `vramctl why {lease['consumer']}`"
+    ]
 
 
 def _footprint_lines(footprint: Message | None) -> list[str]:
@@ -223,7 +246,11 @@ def event_line(event: Message) -> str:
     at = event["at_wall_s"]
     clock = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at)) + f".{int(at * 1000) % 1000:03d}"
     who = " ".join(str(event[key]) for key in ("consumer", "lease_id") if event.get(key))
-    more = [_field(key, value) for key, value in event.items() if key not in _NOT_SHOWN and _plain(value)]
+    more = [
+        _field(key, value)
+        for key, value in event.items()
+        if key not in _NOT_SHOWN and _plain(value)
+    ]
     parts = [clock, f"{event['kind']:<14}", who, str(event.get("reason") or ""), " ".join(more)]
     return printable("  ".join(part for part in parts if part))
 

@@ -6,8 +6,8 @@ import sys
 from collections import deque
 from typing import Any
 
-from clients.aio import ArbiterClient
-from clients.cli import quick, text
+from vram_arbiter.clients.cli import quick, text
+from vram_arbiter.clients.client import ArbiterClient
 
 REFRESH_S = 0.5
 """Between two readings of the status; every event refreshes at once as well."""
@@ -15,7 +15,9 @@ REFRESH_S = 0.5
 
 async def watch(endpoint: str | None, events_shown: int) -> int:
     """Until Ctrl-C. Raises ArbiterUnreachable if nobody answers at first; later it waits for the arbiter to come back."""
-    client = ArbiterClient(endpoint, name="vramctl watch", role="observer", connect_timeout_s=quick.TIMEOUT_S)
+    client = ArbiterClient(
+        endpoint, name="vramctl watch", role="observer", connect_timeout_s=quick.TIMEOUT_S
+    )
     async with client:
         with contextlib.suppress(asyncio.CancelledError):
             if sys.stdout.isatty():
@@ -54,7 +56,8 @@ async def _live(client: ArbiterClient, events_shown: int) -> None:
                     ]
                 shown = [text.event_line(event) for event in newest][-events_shown or len(newest) :]
                 live.update(
-                    Text("\n".join([*lines, "", *shown]), no_wrap=True, overflow="ellipsis"), refresh=True
+                    Text("\n".join([*lines, "", *shown]), no_wrap=True, overflow="ellipsis"),
+                    refresh=True,
                 )
                 changed.clear()
                 with contextlib.suppress(TimeoutError):

@@ -13,12 +13,12 @@ from collections.abc import Mapping, Sequence
 from time import monotonic
 from typing import Any, Self, cast
 
-from clients import traces
-from clients.patience import answered
-from clients.sidecar.spawn import Child, SpawnSpec
-from clients.transport import Transport
-from schemas.errors import ModelError, SidecarUnavailable, VramError, from_wire
-from schemas.sidecar import LoadResult, PingResult
+from vram_arbiter.clients._protocol import traces
+from vram_arbiter.clients.net.dealer import Transport
+from vram_arbiter.clients.net.timeouts import answered
+from vram_arbiter.clients.sidecar.spawn import Child, SpawnSpec
+from vram_arbiter.schemas.errors import ModelError, SidecarUnavailable, VramError, from_wire
+from vram_arbiter.schemas.sidecar import LoadResult, PingResult
 
 Message = dict[str, Any]
 
@@ -74,7 +74,9 @@ class SidecarClient:
 
     async def load(self, timeout_s: float | None = None) -> LoadResult:
         """Make the model resident (the sidecar acquires its lease). `timeout_s` bounds the wait for the lease: WaitTimeout, OutOfMemory …"""
-        fields = {"timeout_s": timeout_s} if self.family == "op" else {"data": {"timeout_s": timeout_s}}
+        fields = (
+            {"timeout_s": timeout_s} if self.family == "op" else {"data": {"timeout_s": timeout_s}}
+        )
         limit_s = self._timeout_s if timeout_s is None else max(self._timeout_s, timeout_s)
         return cast(LoadResult, await self.call("load", fields, timeout_s=limit_s))
 
@@ -107,7 +109,9 @@ class SidecarClient:
             message["fresh_s"] = max(0.0, fresh_s - (monotonic() - began_s))
         if token is not None:
             message["token"] = [int(token[0]), int(token[1])]
-        return await self._exchange(op, message, self._timeout_s if timeout_s is None else timeout_s)
+        return await self._exchange(
+            op, message, self._timeout_s if timeout_s is None else timeout_s
+        )
 
     async def close(self) -> None:
         """End the child that we started (shutdown, SIGTERM, SIGKILL); leave an adopted one alone. Idempotent."""
@@ -208,7 +212,9 @@ class SidecarClient:
         failure = self.child.failure()
         await self._bury()
         self._drop("the sidecar ended")
-        if not await self._answers(self._connect_timeout_s if self._somebody_listens() else PROBE_S):
+        if not await self._answers(
+            self._connect_timeout_s if self._somebody_listens() else PROBE_S
+        ):
             raise failure
 
     async def _bury(self) -> None:
@@ -257,7 +263,9 @@ class SidecarClient:
 
     def _drop(self, reason: str) -> None:
         self._fail(
-            SidecarUnavailable(f"contact to {self.endpoint} lost: {reason}", hint="the next call tries again")
+            SidecarUnavailable(
+                f"contact to {self.endpoint} lost: {reason}", hint="the next call tries again"
+            )
         )
 
     def _fail(self, error: VramError) -> None:

@@ -9,7 +9,7 @@ import math
 import sys
 from typing import Any
 
-from schemas.errors import BadRequest
+from vram_arbiter.schemas.errors import BadRequest
 
 MARK = "__ndarray_class__"
 BYTES = "as_npy"
@@ -47,7 +47,9 @@ def unpack(value: Any) -> Any:
             if value.get(MARK) is True and BYTES in value:
                 found += 1
                 if found > ARRAYS_MAX:
-                    raise BadRequest(f"more than {ARRAYS_MAX} arrays in a message", hint="send fewer")
+                    raise BadRequest(
+                        f"more than {ARRAYS_MAX} arrays in a message", hint="send fewer"
+                    )
                 return _array(value[BYTES])
             return {key: plain(item) for key, item in value.items()}
         if isinstance(value, list | tuple):
@@ -82,5 +84,7 @@ def _array(payload: object) -> Any:
     needed, there = math.prod(shape) * dtype.itemsize, len(payload) - stream.tell()
     if needed != there:
         raise BadRequest(f"an array of {needed} bytes by its header has {there}", hint=_HINT)
-    flat = numpy.frombuffer(payload, dtype, offset=stream.tell()) if needed else numpy.empty(0, dtype)
+    flat = (
+        numpy.frombuffer(payload, dtype, offset=stream.tell()) if needed else numpy.empty(0, dtype)
+    )
     return flat.reshape(shape, order="F" if fortran else "C").copy()

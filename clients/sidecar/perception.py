@@ -4,9 +4,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from clients.sidecar.base import SidecarClient
-from schemas.errors import ModelError
-from schemas.sidecar import PICTURES_MAX
+from vram_arbiter.clients.sidecar.base import SidecarClient
+from vram_arbiter.schemas.errors import ModelError
+from vram_arbiter.schemas.sidecar import PICTURES_MAX
 
 MAX_SIDE = 1024
 
@@ -121,7 +121,10 @@ class RewardClient(SidecarClient):
         values = (*found.progress, *found.success, found.success_threshold)
         if not found.progress or not all(0.0 <= value <= 1.0 for value in values):
             raise ModelError("the reward model's answer is not in 0..1")
-        if len(found.progress) not in (1, sent) or len(found.success) not in (0, len(found.progress)):
+        if len(found.progress) not in (1, sent) or len(found.success) not in (
+            0,
+            len(found.progress),
+        ):
             raise ModelError(
                 f"the reward model judged {len(found.progress)} and {len(found.success)} of {sent} pictures"
             )

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from clients.sidecar import npy
-from clients.sidecar.base import SidecarClient
-from schemas.errors import ModelError
+from vram_arbiter.clients.sidecar import npy
+from vram_arbiter.clients.sidecar.base import SidecarClient
+from vram_arbiter.schemas.errors import ModelError
 
 
 class PolicyClient(SidecarClient):
@@ -41,7 +41,9 @@ class PolicyClient(SidecarClient):
             "observation": npy.pack(dict(observation)),
             "options": npy.pack(dict(options)) if options else None,
         }
-        result = npy.unpack(await self.call("get_action", {"data": data}, token=token, timeout_s=timeout_s))
+        result = npy.unpack(
+            await self.call("get_action", {"data": data}, token=token, timeout_s=timeout_s)
+        )
         if isinstance(result, list) and result:  # the field's servers answer [actions, info]
             result = result[0]
         if not isinstance(result, dict):

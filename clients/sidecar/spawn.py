@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from clients import traces
-from schemas.errors import SidecarUnavailable
+from vram_arbiter.clients._protocol import traces
+from vram_arbiter.schemas.errors import SidecarUnavailable
 
 BOOT_TIMEOUT_S = 120.0  # importing torch and lerobot takes ~8 s here, more on a busy machine
 TERM_TIMEOUT_S = 10.0
@@ -23,7 +23,7 @@ LOG_TAIL_BYTES = 4000
 
 @dataclass(frozen=True, slots=True)
 class SpawnSpec:
-    """How to start a sidecar, e.g. `[sys.executable, "-m", "sidecars", "--name", "grab", …]`.
+    """How to start a sidecar, e.g. `[sys.executable, "-m", "vram_arbiter.sidecars", "--name", "grab", …]`.
 
     `env` is added to this process' environment. `log` receives its output (None: a temporary file, for the error's details).
     """
@@ -59,7 +59,8 @@ class Child:
             )
         except OSError as error:
             raise SidecarUnavailable(
-                f"cannot start {spec.argv[0]}: {error.strerror}", hint="check the command of the sidecar"
+                f"cannot start {spec.argv[0]}: {error.strerror}",
+                hint="check the command of the sidecar",
             ) from error
         finally:
             os.close(handle)
@@ -85,7 +86,10 @@ class Child:
         """Why an exited child is of no use, with its exit code and the end of its log."""
         code = self._process.returncode
         if code == -signal.SIGKILL:
-            what, hint = "was killed (SIGKILL)", "if nobody did it: the machine's memory was full, see dmesg"
+            what, hint = (
+                "was killed (SIGKILL)",
+                "if nobody did it: the machine's memory was full, see dmesg",
+            )
         elif code is not None and code < 0:
             what, hint = f"died of {signal.Signals(-code).name}", "see its log"
         else:

@@ -8,8 +8,8 @@ Facts: the public API, version 2023-06-01. `POST /v1/messages` with `x-api-key`;
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
-from reasoner.cascade import Answered, Called, Thought, Turn, Words
-from reasoner.llm.base import Answer, Call, LlmPlanner
+from vram_arbiter.reasoner.cascade import Answered, Called, Thought, Turn, Words
+from vram_arbiter.reasoner.llm.base import Answer, Call, LlmPlanner
 
 VERSION = "2023-06-01"
 
@@ -80,7 +80,12 @@ def _block(turn: Turn) -> tuple[str, dict[str, Any]]:
         case Thought(text):
             return "assistant", {"type": "text", "text": text.strip() or "…"}
         case Called(call_id, name, arguments):
-            return "assistant", {"type": "tool_use", "id": call_id, "name": name, "input": arguments}
+            return "assistant", {
+                "type": "tool_use",
+                "id": call_id,
+                "name": name,
+                "input": arguments,
+            }
         case Answered(call_id, text, is_error):
             result = {"type": "tool_result", "tool_use_id": call_id, "content": text}
             return "user", result | {"is_error": True} if is_error else result

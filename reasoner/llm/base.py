@@ -12,12 +12,17 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 from urllib.parse import urlsplit
 
-from reasoner.cascade import Answered, Called, Thought, Turn, Words, conversation
-from reasoner.llm.http import RETRY_PAUSE_S, JsonHttp, check_installed, without_credentials
-from reasoner.palette import Palette
-from reasoner.planner import Episode, Finish, benched
-from schemas.errors import BadRequest, ConfigError, LlmError, NotPermitted, UnknownOp
-from schemas.tools import ToolCall, read_arguments
+from vram_arbiter.reasoner.cascade import Answered, Called, Thought, Turn, Words, conversation
+from vram_arbiter.reasoner.llm.http import (
+    RETRY_PAUSE_S,
+    JsonHttp,
+    check_installed,
+    without_credentials,
+)
+from vram_arbiter.reasoner.palette import Palette
+from vram_arbiter.reasoner.planner import Episode, Finish, benched
+from vram_arbiter.schemas.errors import BadRequest, ConfigError, LlmError, NotPermitted, UnknownOp
+from vram_arbiter.schemas.tools import ToolCall, read_arguments
 
 TRIES_MAX = 3
 TIMEOUT_S = 60.0
@@ -98,11 +103,15 @@ def _key(environ: Mapping[str, str]) -> str:
     """Without the white space that a file has around it. What no header carries is refused here: whoever sends it would show it."""
     key = environ.get(PREFIX + "API_KEY", "").strip()
     if not (key.isascii() and all(letter.isprintable() for letter in key)):
-        raise ConfigError(f"{PREFIX}API_KEY has letters that no key has", hint="printable ASCII on one line")
+        raise ConfigError(
+            f"{PREFIX}API_KEY has letters that no key has", hint="printable ASCII on one line"
+        )
     return key
 
 
-def _number(environ: Mapping[str, str], name: str, default: float, what: str, least: float = 0.0) -> float:
+def _number(
+    environ: Mapping[str, str], name: str, default: float, what: str, least: float = 0.0
+) -> float:
     text = environ.get(PREFIX + name) or str(default)
     try:
         number = float(text)
@@ -215,7 +224,9 @@ class LlmPlanner(ABC):
             ) from error
 
 
-def _decision(call: Call, palette: Palette, offered: set[str], *, goal_runs: bool) -> ToolCall | Finish:
+def _decision(
+    call: Call, palette: Palette, offered: set[str], *, goal_runs: bool
+) -> ToolCall | Finish:
     if call.name == "finish":
         return _finish(call.arguments)
     decoded = palette.parse(call.name, call.arguments)
@@ -246,7 +257,8 @@ def _told_back(call_id: str, call: Call, problem: str) -> list[Turn]:
     except BadRequest:
         arguments = {"unreadable": str(call.arguments)[:500]}
     name = "".join(
-        letter if letter.isascii() and (letter.isalnum() or letter in "_-") else "_" for letter in call.name
+        letter if letter.isascii() and (letter.isalnum() or letter in "_-") else "_"
+        for letter in call.name
     )
     return [
         Called(call_id, name[:64] or "unnamed", arguments),

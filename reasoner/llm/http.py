@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from typing import Any, Self
 from urllib.parse import urlsplit, urlunsplit
 
-from schemas import strictjson
-from schemas.errors import ConfigError, LlmError
+from vram_arbiter.schemas import strictjson
+from vram_arbiter.schemas.errors import ConfigError, LlmError
 
 log = logging.getLogger(__name__)
 
@@ -77,7 +77,8 @@ class JsonHttp:
             except _Busy as error:
                 problem = str(error)
         raise LlmError(
-            f"{shown}: {problem}, {TRIES_MAX} times", hint="is the server running, and does it keep up?"
+            f"{shown}: {problem}, {TRIES_MAX} times",
+            hint="is the server running, and does it keep up?",
         )
 
     async def _once(self, url: str, content: bytes) -> dict[str, Any]:
@@ -99,7 +100,9 @@ class JsonHttp:
         except httpx.TransportError as error:
             raise _Busy(f"{type(error).__name__}: {error}") from error
         except (httpx.HTTPError, httpx.InvalidURL) as error:
-            raise LlmError(f"{shown}: {error}", hint="is VRAM_REASONER_LLM_BASE_URL right?") from error
+            raise LlmError(
+                f"{shown}: {error}", hint="is VRAM_REASONER_LLM_BASE_URL right?"
+            ) from error
         if status in RETRY_STATUSES:
             raise _Busy(f"HTTP status {status}: {_complaint(answer)}")
         if status != 200:

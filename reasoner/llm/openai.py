@@ -7,8 +7,8 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from reasoner.cascade import Answered, Called, Thought, Turn, Words
-from reasoner.llm.base import Answer, Call, LlmConfig, LlmPlanner
+from vram_arbiter.reasoner.cascade import Answered, Called, Thought, Turn, Words
+from vram_arbiter.reasoner.llm.base import Answer, Call, LlmConfig, LlmPlanner
 
 __all__ = ["LlmConfig", "OpenAiPlanner"]
 

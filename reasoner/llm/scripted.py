@@ -8,11 +8,11 @@ import json
 import re
 from collections.abc import Generator
 
-from reasoner.palette import Palette
-from reasoner.places import Places, Point
-from reasoner.planner import Episode, Finish, Outcome, says_yes
-from schemas.errors import BadRequest, UnknownSkill
-from schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall, Wait
+from vram_arbiter.reasoner.palette import Palette
+from vram_arbiter.reasoner.planner import Episode, Finish, Outcome, says_yes
+from vram_arbiter.reasoner.search_map import Places, Point
+from vram_arbiter.schemas.errors import BadRequest, UnknownSkill
+from vram_arbiter.schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall, Wait
 
 ATTEMPTS_MAX = 3
 LOOKS_MAX = 3  # repeats of a locate that gave no answer about the scene
@@ -24,9 +24,12 @@ GRASP_CAMERA = "wrist"  # looks at the fingers: what they hold cannot hide behin
 
 NO_ANSWER = "the scene VLM gave no answer"
 
-_HOLDS = re.compile(r"(?<!\bnot )(?<!n't )\bhold(?:s|ing)?\s+(?!nothing\b|anything\b|no\b)", re.IGNORECASE)
+_HOLDS = re.compile(
+    r"(?<!\bnot )(?<!n't )\bhold(?:s|ing)?\s+(?!nothing\b|anything\b|no\b)", re.IGNORECASE
+)
 _TASK = re.compile(
-    r"\s*(?:grab|grasp|pick up|pick|fetch|take|lift)\s+(?:the\s+|a\s+|an\s+)?(.+?)\s*\.?\s*", re.IGNORECASE
+    r"\s*(?:grab|grasp|pick up|pick|fetch|take|lift)\s+(?:the\s+|a\s+|an\s+)?(.+?)\s*\.?\s*",
+    re.IGNORECASE,
 )
 
 Script = Generator[ToolCall, Outcome, Finish]
@@ -64,7 +67,9 @@ class ScriptedPlanner:
             return self._decision
         try:
             self._decision = (
-                self._script.send(episode.steps[-1].outcome) if episode.steps else next(self._script)
+                self._script.send(episode.steps[-1].outcome)
+                if episode.steps
+                else next(self._script)
             )
         except StopIteration as stop:
             self._decision = stop.value
@@ -153,7 +158,9 @@ def _approach(thing: str, navigate: str, places: Places) -> Generator[ToolCall, 
         best = places.best()
         if best is place or best is None or not places.joined:
             yield _drive(
-                navigate, places.from_base(best or place), "correct what the view from afar got wrong"
+                navigate,
+                places.from_base(best or place),
+                "correct what the view from afar got wrong",
             )
             return ""
         place, why = best, f"both views together say that the {thing} is here"
@@ -199,5 +206,8 @@ def _turn(navigate: str, angle_rad: float, why: str) -> ExecuteRskill:
 def _drive(navigate: str, point: Point, why: str) -> ExecuteRskill:
     target = {"target_point": {"x": point.x, "y": point.y, "z": point.z}}
     return ExecuteRskill(
-        rskill_id=navigate, deadline_s=NAVIGATE_DEADLINE_S, rationale=why, goal_params_json=json.dumps(target)
+        rskill_id=navigate,
+        deadline_s=NAVIGATE_DEADLINE_S,
+        rationale=why,
+        goal_params_json=json.dumps(target),
     )

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clients.outputs import check_output
-from runner.cli.common import (
+from vram_arbiter.clients.output_paths import check_output
+from vram_arbiter.runner.cli.common import (
     add_trace_flag,
     check_sidecars,
     connect_arbiter,
@@ -25,15 +25,15 @@ from runner.cli.common import (
     sidecars_given,
     warm_up,
 )
-from runner.sim.config import CONTROL_HZ
-from schemas.errors import ConfigError
-from schemas.extras import need
-from schemas.runtime.printable import printable_lines
+from vram_arbiter.runner.sim.config import CONTROL_HZ
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.extras import need
+from vram_arbiter.schemas.runtime.printable import printable_lines
 
 if TYPE_CHECKING:
-    from runner.sim.benchmark import Benchmark, Cell, Contestant
-    from runner.sim.tasks import Task
-    from runner.sim.worlds import World
+    from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, Contestant
+    from vram_arbiter.runner.sim.tasks import Task
+    from vram_arbiter.runner.sim.worlds import World
 
 log = logging.getLogger("runner")
 
@@ -41,11 +41,18 @@ REPORT = "benchmark.json"
 COLUMNS = ("world", "contestant", "success", "95 % interval", "steps", "reward", "errors")
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
+def add_parser(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+) -> argparse.ArgumentParser:
     """The flags of `vram-runner benchmark`."""
-    bench = commands.add_parser("benchmark", help="success rates of skills and policies, with videos")
+    bench = commands.add_parser(
+        "benchmark", help="success rates of skills and policies, with videos"
+    )
     bench.add_argument(
-        "--env", action="append", default=[], help="so101 (default) or gym:ID; may be given several times"
+        "--env",
+        action="append",
+        default=[],
+        help="so101 (default) or gym:ID; may be given several times",
     )
     bench.add_argument(
         "--scene",
@@ -54,13 +61,20 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         default=[],
         help="scene file of so101; may be given several times",
     )
-    bench.add_argument("--env-config", type=Path, help="how the gymnasium environment is to be read")
+    bench.add_argument(
+        "--env-config", type=Path, help="how the gymnasium environment is to be read"
+    )
     bench.add_argument(
         "--success", metavar="RULE", help="of a gymnasium environment: info:KEY or return:NUMBER"
     )
-    bench.add_argument("--task", help="in so101: grab or navigate; by default what the skill's actions say")
     bench.add_argument(
-        "--skill", action="append", default=[], help="an installed skill; may be given several times"
+        "--task", help="in so101: grab or navigate; by default what the skill's actions say"
+    )
+    bench.add_argument(
+        "--skill",
+        action="append",
+        default=[],
+        help="an installed skill; may be given several times",
     )
     bench.add_argument(
         "--policy", action="append", default=[],
@@ -69,15 +83,27 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     bench.add_argument("--episodes", type=positive_int, default=10, help="seeds a cell; default 10")
     bench.add_argument("--seed", type=int, default=0, help="the first one")
     bench.add_argument(
-        "--max-steps", type=positive_int, default=600, help="of an episode; default 600, 20 s of the SO-101"
+        "--max-steps",
+        type=positive_int,
+        default=600,
+        help="of an episode; default 600, 20 s of the SO-101",
     )
     bench.add_argument(
-        "--episode-seconds", type=positive, default=600.0, help="of an episode, on the wall; default 600"
+        "--episode-seconds",
+        type=positive,
+        default=600.0,
+        help="of an episode, on the wall; default 600",
     )
-    bench.add_argument("--out", type=Path, default=Path("out/benchmark"), help="folder of report and videos")
+    bench.add_argument(
+        "--out", type=Path, default=Path("out/benchmark"), help="folder of report and videos"
+    )
     bench.add_argument("--videos", action=argparse.BooleanOptionalAction, default=True)
     bench.add_argument(
-        "--skills", type=Path, nargs="+", action="extend", help="rskill.yaml files or folders of them"
+        "--skills",
+        type=Path,
+        nargs="+",
+        action="extend",
+        help="rskill.yaml files or folders of them",
     )
     bench.add_argument("--arbiter", help="the arbiter's endpoint")
     bench.add_argument("--no-arbiter", action="store_true", help="nobody arbitrates: mark no uses")
@@ -139,8 +165,8 @@ async def _stop_with(stopping: asyncio.Event, bench: Benchmark) -> None:
 
 
 def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
-    from runner.sim.benchmark import Benchmark
-    from runner.sim.sim_runner import SimRunner
+    from vram_arbiter.runner.sim.benchmark import Benchmark
+    from vram_arbiter.runner.sim.sim_runner import SimRunner
 
     world, task, arm = entry.world, entry.task, entry.world.arm
 
@@ -179,7 +205,7 @@ def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
 # -- what is to be played -------------------------------------------------------------------------------------------------
 def worlds_of(args: argparse.Namespace) -> list[World]:
     """Raises ConfigError for worlds that there are not, and files that could belong to several."""
-    from runner.sim.worlds import SO101, world_of
+    from vram_arbiter.runner.sim.worlds import SO101, world_of
 
     names = list(dict.fromkeys(args.env or [SO101]))
     others = [name for name in names if name != SO101]
@@ -192,8 +218,12 @@ def worlds_of(args: argparse.Namespace) -> list[World]:
     worlds = []
     for name in names:
         if name != SO101:
-            render = None if args.videos or args.skill else False  # a skill may look through `render`
-            worlds.append(world_of(name, env_config=args.env_config, success=args.success, render=render))
+            render = (
+                None if args.videos or args.skill else False
+            )  # a skill may look through `render`
+            worlds.append(
+                world_of(name, env_config=args.env_config, success=args.success, render=render)
+            )
             continue
         for scene in dict.fromkeys(args.scene) or [None]:
             world = world_of(name, scene=scene)
@@ -205,15 +235,17 @@ def worlds_of(args: argparse.Namespace) -> list[World]:
 
 def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
     """Every contestant in every world. Raises ConfigError and UnknownSkill before anything is played."""
-    from runner.catalogue import Catalogue, read_manifests
-    from runner.sim.benchmark import PolicyContestant, SkillContestant
-    from runner.sim.policies import policy_of
-    from runner.sim.tasks import EXPERT, GRAB, TASKS, expert_policy, task_of
-    from runner.sim.worlds import makers_of
-    from runner.skills.sidecar_policy import LOCKSTEP_WAIT_S
+    from vram_arbiter.runner.catalogue import Catalogue, read_manifests
+    from vram_arbiter.runner.sim.benchmark import PolicyContestant, SkillContestant
+    from vram_arbiter.runner.sim.policies import policy_of
+    from vram_arbiter.runner.sim.tasks import EXPERT, GRAB, TASKS, expert_policy, task_of
+    from vram_arbiter.runner.sim.worlds import makers_of
+    from vram_arbiter.runner.skills.sidecar_policy import LOCKSTEP_WAIT_S
 
     if not args.skill and not args.policy:
-        raise ConfigError("nobody is to play", hint="--skill RSKILL or --policy random, any number of them")
+        raise ConfigError(
+            "nobody is to play", hint="--skill RSKILL or --policy random, any number of them"
+        )
     if args.task is not None and args.task not in TASKS:
         raise ConfigError(f"--task {args.task} is no task", hint=" or ".join(TASKS))
     given_task = TASKS[args.task] if args.task is not None else None
@@ -246,7 +278,7 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
 
 def _check_names(entries: Sequence[Entry]) -> None:
     """Raises ConfigError for cells whose videos would overwrite each other's, and that nobody could tell apart in the report."""
-    from runner.sim.benchmark import file_name
+    from vram_arbiter.runner.sim.benchmark import file_name
 
     taken: dict[tuple[str, str], Entry] = {}
     for entry in entries:

@@ -12,16 +12,16 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clients.configs import configs_folder
-from clients.serve import check_free
-from runner import frames
-from runner.skill_runner import SkillRunner
-from schemas import estop
-from schemas.errors import ArbiterUnreachable, ConfigError
-from schemas.manifest import Kind, RSkillManifest
+from vram_arbiter.clients.configs import configs_folder
+from vram_arbiter.clients.net.server import check_free
+from vram_arbiter.runner import frames
+from vram_arbiter.runner.skill_runner import SkillRunner
+from vram_arbiter.schemas import estop
+from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 
 if TYPE_CHECKING:
-    from runner.dataset.recorder import DatasetRecorder
+    from vram_arbiter.runner.dataset.recorder import DatasetRecorder
 
 log = logging.getLogger("runner")
 
@@ -70,9 +70,15 @@ def add_trace_flag(parser: argparse.ArgumentParser) -> None:
 def add_serving_flags(parser: argparse.ArgumentParser) -> None:
     """Flags of every command that serves goals."""
     parser.add_argument(
-        "--skills", type=Path, nargs="+", action="extend", help="rskill.yaml files or folders of them"
+        "--skills",
+        type=Path,
+        nargs="+",
+        action="extend",
+        help="rskill.yaml files or folders of them",
     )
-    parser.add_argument("--endpoint", help="where goals are served; default ipc://RUNTIME/runner.sock")
+    parser.add_argument(
+        "--endpoint", help="where goals are served; default ipc://RUNTIME/runner.sock"
+    )
     parser.add_argument("--arbiter", help="the arbiter's endpoint")
     parser.add_argument("--no-arbiter", action="store_true", help="nobody arbitrates: mark no uses")
     parser.add_argument(
@@ -90,7 +96,9 @@ def add_serving_flags(parser: argparse.ArgumentParser) -> None:
 def sidecars_given(flags: list[str]) -> dict[str, str]:
     """`RSKILL=ENDPOINT` flags as a map. Raises ConfigError."""
     pairs = [flag.partition("=") for flag in flags]
-    if wrong := [flag for flag, (name, _, where) in zip(flags, pairs, strict=True) if not name or not where]:
+    if wrong := [
+        flag for flag, (name, _, where) in zip(flags, pairs, strict=True) if not name or not where
+    ]:
         raise ConfigError(f"--sidecar {wrong[0]} is not of the form RSKILL=ENDPOINT")
     return {name: where for name, _, where in pairs}
 
@@ -124,13 +132,15 @@ def warm_up() -> None:
 
 async def connect_arbiter(endpoint: str | None, stack: contextlib.AsyncExitStack) -> Any:
     """A plain client of the arbiter. A robot does not start half-safe: an arbiter that is missing is an error, said at once."""
-    from clients.aio import ArbiterClient
+    from vram_arbiter.clients.client import ArbiterClient
 
     try:
         return await stack.enter_async_context(ArbiterClient(endpoint, name="runner"))
     except ArbiterUnreachable as error:
         raise ArbiterUnreachable(
-            error.message, hint="start `vram-arbiter` first, or run with --no-arbiter", details=error.details
+            error.message,
+            hint="start `vram-arbiter` first, or run with --no-arbiter",
+            details=error.details,
         ) from error
 
 
@@ -141,7 +151,7 @@ async def record_into(
 
     Raises ConfigError for a folder or a rate that nothing can be recorded with, AlreadyRunning when somebody else records there.
     """
-    from runner.dataset.recorder import DatasetRecorder
+    from vram_arbiter.runner.dataset.recorder import DatasetRecorder
 
     recorder = DatasetRecorder(
         folder,

@@ -14,10 +14,10 @@ import re
 from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 
-from clients.configs import configs_folder, shipped
-from clients.runner import RunnerClient
-from runner.catalogue import Catalogue, Maker, read_manifests, sidecar_endpoint
-from runner.cli.common import (
+from vram_arbiter.clients.configs import configs_folder, shipped
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.runner.catalogue import Catalogue, Maker, read_manifests, sidecar_endpoint
+from vram_arbiter.runner.cli.common import (
     add_serving_flags,
     check_endpoint,
     check_sidecars,
@@ -27,9 +27,9 @@ from runner.cli.common import (
     record_into,
     sidecars_given,
 )
-from runner.clock import SystemClock
-from runner.control import ControlThread
-from runner.deployment import (
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.control import ControlThread
+from vram_arbiter.runner.deployment import (
     DeploymentFile,
     Parts,
     make_parts,
@@ -40,22 +40,22 @@ from runner.deployment import (
     unkept,
     unused,
 )
-from runner.goals import GoalServer
-from runner.hardware import HardwareRunner
-from runner.promptness import leaves_room, make_prompt
-from runner.protocols import DeadlinePolicy, Skill
-from runner.safety.estop_mark import EstopMark
-from runner.skills.ros_standins import TRAJECTORY, StandIn, StandIns
-from runner.skills.sidecar_policy import Arbiter
-from schemas.control import ControlMode
-from schemas.endpoints import program_endpoint, runtime_dir
-from schemas.errors import RunnerUnreachable, VramError
-from schemas.goals import ResultPush
-from schemas.manifest import Kind, RSkillManifest
-from schemas.robot import RobotEnvironment
-from schemas.runtime.folders import LockFile, private_folder
-from schemas.runtime.printable import printable_lines
-from schemas.world import RunResult
+from vram_arbiter.runner.goals import GoalServer
+from vram_arbiter.runner.hardware import HardwareRunner
+from vram_arbiter.runner.protocols import DeadlinePolicy, Skill
+from vram_arbiter.runner.realtime import leaves_room, make_prompt
+from vram_arbiter.runner.safety.estop_mark import EstopMark
+from vram_arbiter.runner.skills.ros_standins import TRAJECTORY, StandIn, StandIns
+from vram_arbiter.runner.skills.sidecar_policy import Arbiter
+from vram_arbiter.schemas.config.robot import RobotEnvironment
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import RunnerUnreachable, VramError
+from vram_arbiter.schemas.goals import ResultPush
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest
+from vram_arbiter.schemas.runtime.endpoints import program_endpoint, runtime_dir
+from vram_arbiter.schemas.runtime.folders import LockFile, private_folder
+from vram_arbiter.schemas.runtime.printable import printable_lines
+from vram_arbiter.schemas.world import RunResult
 
 log = logging.getLogger("runner")
 
@@ -66,7 +66,9 @@ MakeMakers = Callable[[Parts, Arbiter | None], Mapping[Kind, Maker]]
 """How skills of each kind are made for this robot, with or without an arbiter."""
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
+def add_parser(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+) -> argparse.ArgumentParser:
     """The flags of `vram-runner deploy`."""
     deploy = commands.add_parser("deploy", help="a robot, as a deployment file describes it")
     deploy.add_argument(
@@ -76,7 +78,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="deployment file (docs/runner.md), or the name of a shipped one",
     )
     deploy.add_argument(
-        "--dry-run", action="store_true", help="check everything, print what would run, open nothing"
+        "--dry-run",
+        action="store_true",
+        help="check everything, print what would run, open nothing",
     )
     deploy.add_argument(
         "--allow-noncommercial",
@@ -100,8 +104,8 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
 
     def make_makers(parts: Parts, arbiter: Arbiter | None) -> Mapping[Kind, Maker]:
         def make_policy(manifest: RSkillManifest) -> Skill:
-            from clients.sidecar.policy import PolicyClient
-            from runner.skills.sidecar_policy import SidecarPolicy, wire_up
+            from vram_arbiter.clients.sidecar.policy import PolicyClient
+            from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy, wire_up
 
             description = parts.hal.description
             wiring = wire_up(manifest, description.joint_names, description.rest_pose_rad)
@@ -117,7 +121,7 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
             )
 
         def make_trajectory(manifest: RSkillManifest) -> Skill:
-            from runner.skills.trajectory import FollowJointTrajectory
+            from vram_arbiter.runner.skills.trajectory import FollowJointTrajectory
 
             limits = parts.gate.for_skill(manifest, ()).limits
             return FollowJointTrajectory(
@@ -134,7 +138,9 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
 class Deploy:
     """One run of the command. `make_makers` decides which kinds of skills there are."""
 
-    def __init__(self, args: argparse.Namespace, file: DeploymentFile, make_makers: MakeMakers) -> None:
+    def __init__(
+        self, args: argparse.Namespace, file: DeploymentFile, make_makers: MakeMakers
+    ) -> None:
         self._args = args
         self._file = file
         self._make_makers = make_makers
@@ -162,7 +168,9 @@ class Deploy:
             claim(self._file.robot, stack)
             mark = EstopMark(_robot_file("robot", self._file.robot.robot_id, "estop"))
             mark.refuse_if_left()
-            arbiter = None if self._args.no_arbiter else await connect_arbiter(self._args.arbiter, stack)
+            arbiter = (
+                None if self._args.no_arbiter else await connect_arbiter(self._args.arbiter, stack)
+            )
             runner = self._runner(parts, mark)
             runner.trace_ticks = self._args.trace_ticks
             if (folder := self._file.robot.save_dir) is not None:
@@ -171,7 +179,9 @@ class Deploy:
             control = await self._start(runner, stack)
             if control is None:
                 return 0
-            await make_prompt(control, first=self._args.realtime and leaves_room(self._file.robot.rate_hz))
+            await make_prompt(
+                control, first=self._args.realtime and leaves_room(self._file.robot.rate_hz)
+            )
             catalogue = self._offered(parts, manifests, arbiter)
             server = GoalServer(
                 self._endpoint,
@@ -190,7 +200,9 @@ class Deploy:
         return self._conclude(runner, ended, failed)
 
     # -- steps -------------------------------------------------------------------------------------------------------
-    def _offered(self, parts: Parts, manifests: list[RSkillManifest], arbiter: Arbiter | None) -> Catalogue:
+    def _offered(
+        self, parts: Parts, manifests: list[RSkillManifest], arbiter: Arbiter | None
+    ) -> Catalogue:
         check_sidecars(sidecars_given(self._args.sidecar), manifests)
         makers = self._make_makers(parts, arbiter)
         return offered(self._file, parts, manifests, makers, self._args.allow_noncommercial)
@@ -198,7 +210,10 @@ class Deploy:
     def _facts(self, catalogue: Catalogue) -> list[tuple[str, str]]:
         given = sidecars_given(self._args.sidecar)
         sidecars = [
-            ("sidecar", f"of {manifest.name} at {sidecar_endpoint(manifest.name, given, os.environ)}")
+            (
+                "sidecar",
+                f"of {manifest.name} at {sidecar_endpoint(manifest.name, given, os.environ)}",
+            )
             for manifest in catalogue.executable()
             if manifest.kind is Kind.VLA
         ]
@@ -230,7 +245,9 @@ class Deploy:
             on_estop=latch,
         )
 
-    async def _start(self, runner: HardwareRunner, stack: contextlib.AsyncExitStack) -> ControlThread | None:
+    async def _start(
+        self, runner: HardwareRunner, stack: contextlib.AsyncExitStack
+    ) -> ControlThread | None:
         """The control thread with robot and cameras at work; None when a signal came first."""
         async with _stop_on(self._stopping, runner):
             try:
@@ -292,11 +309,15 @@ class Deploy:
         if ended is not None and ended["status"] != "canceled":
             key = robot.task.success_key if robot.task is not None else None
             success = ended["success"] and (key is None or ended["data"].get(key) is True)
-            log.info("task %s %s", "done:" if success else "not done:", ended["message"] or ended["data"])
+            log.info(
+                "task %s %s", "done:" if success else "not done:", ended["message"] or ended["data"]
+            )
         print(summary(result, runner, success, robot.robot_id))
         if not failed and success is not False:
             return 0
-        return 1 if runner.estop is None else 2  # 2: whoever restarts failed programs leaves this one alone
+        return (
+            1 if runner.estop is None else 2
+        )  # 2: whoever restarts failed programs leaves this one alone
 
 
 def claim(robot: RobotEnvironment, stack: contextlib.AsyncExitStack) -> None:

@@ -9,15 +9,17 @@ import argparse
 import asyncio
 import os
 
-from clients.estop import ANSWER_S, stop
-from schemas import terminal
-from schemas.endpoints import SYSTEM_RUNTIME, program_endpoint, socket_path
-from schemas.errors import ConfigError, RunnerUnreachable, UntrustedServer
-from schemas.estop import path_of
-from schemas.runtime.printable import printable
+from vram_arbiter.clients.estop import ANSWER_S, stop
+from vram_arbiter.schemas.errors import ConfigError, RunnerUnreachable, UntrustedServer
+from vram_arbiter.schemas.estop import path_of
+from vram_arbiter.schemas.runtime import terminal
+from vram_arbiter.schemas.runtime.endpoints import SYSTEM_RUNTIME, program_endpoint, socket_path
+from vram_arbiter.schemas.runtime.printable import printable
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
+def add_parser(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+) -> argparse.ArgumentParser:
     """The flags of `vram-runner estop`."""
     estop = commands.add_parser(
         "estop", help="stop a robot's motors; its runner refuses goals until it is started again"
@@ -63,7 +65,9 @@ def _there() -> list[str]:
 def _exists(endpoint: str) -> bool:
     try:
         return os.path.exists(path_of(endpoint)) or os.path.exists(socket_path(endpoint))
-    except ConfigError:  # a runtime folder that cannot be one: the other runner is stopped all the same
+    except (
+        ConfigError
+    ):  # a runtime folder that cannot be one: the other runner is stopped all the same
         return False
 
 

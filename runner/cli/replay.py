@@ -10,21 +10,25 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from runner.dataset.reader import Recorded, read_frame
-from runner.dataset.rows import ROBOT
-from schemas.errors import ConfigError
-from schemas.runtime.printable import printable_lines
+from vram_arbiter.runner.dataset.reader import Recorded, read_frame
+from vram_arbiter.runner.dataset.rows import ROBOT
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.printable import printable_lines
 
 TRACE_URL_VARIABLE = "VRAM_TRACE_URL"
 TRACE_FIELDS = ("{trace_id}", "{span_id}")
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
+def add_parser(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+) -> argparse.ArgumentParser:
     """The flags of `vram-runner replay`."""
     replay = commands.add_parser("replay", help="a recorded frame, its tick and its trace")
     replay.add_argument("--dataset", type=Path, required=True, help="folder that was recorded into")
     replay.add_argument("--frame", type=_index, required=True, help="from 0 on, over all episodes")
-    replay.add_argument("--episode", type=_index, help="count the frames from this episode's beginning")
+    replay.add_argument(
+        "--episode", type=_index, help="count the frames from this episode's beginning"
+    )
     replay.add_argument("--json", action="store_true", help="all of it, for programs")
     replay.add_argument(
         "--trace-url",
@@ -68,12 +72,19 @@ def as_text(recorded: Recorded, link: str | None) -> str:
     goal, tick = recorded.goal, recorded.tick
     lines = [
         ("frame", f"{recorded.frame} of {recorded.root} ({recorded.robot})"),
-        ("episode", f"{recorded.episode}, frame {recorded.frame_in_episode} at {recorded.at_s:.3f} s"),
+        (
+            "episode",
+            f"{recorded.episode}, frame {recorded.frame_in_episode} at {recorded.at_s:.3f} s",
+        ),
         ("task", recorded.task),
         ("goal", f"{goal['goal_id']}: {goal['skill']} {_outcome(goal)}".rstrip()),
     ]
     if recorded.trace_id:
-        kept = "" if recorded.trace_sampled else " (not sampled: the collector has no span of this tick)"
+        kept = (
+            ""
+            if recorded.trace_sampled
+            else " (not sampled: the collector has no span of this tick)"
+        )
         lines.append(("trace", f"{recorded.trace_id} span {recorded.span_id}{kept}"))
     else:
         lines.append(("trace", "none: no telemetry was configured"))
@@ -90,7 +101,9 @@ def as_text(recorded: Recorded, link: str | None) -> str:
         if so
     ]
     lines.append(("tick", ", ".join([f"{tick['index']}{chunk}", *said])))
-    lines.append(("times", ", ".join(f"{name} {ms:.2f} ms" for name, ms in recorded.timings_ms.items())))
+    lines.append(
+        ("times", ", ".join(f"{name} {ms:.2f} ms" for name, ms in recorded.timings_ms.items()))
+    )
     if tick["violations"]:
         lines.append(("safety", tick["violations"]))
     if recorded.units == ROBOT:

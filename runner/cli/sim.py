@@ -10,8 +10,8 @@ import logging
 import os
 from pathlib import Path
 
-from clients.outputs import check_output
-from runner.cli.common import (
+from vram_arbiter.clients.output_paths import check_output
+from vram_arbiter.runner.cli.common import (
     AS_FAST_AS_POSSIBLE_HZ,
     add_serving_flags,
     check_endpoint,
@@ -25,10 +25,10 @@ from runner.cli.common import (
     sidecars_given,
     warm_up,
 )
-from runner.control import ControlThread
-from schemas.endpoints import program_endpoint
-from schemas.errors import ConfigError, InternalError
-from schemas.extras import need
+from vram_arbiter.runner.control import ControlThread
+from vram_arbiter.schemas.errors import ConfigError, InternalError
+from vram_arbiter.schemas.runtime.endpoints import program_endpoint
+from vram_arbiter.schemas.runtime.extras import need
 
 log = logging.getLogger("runner")
 
@@ -40,17 +40,23 @@ def add_world_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--env", default="so101", help="so101 (default), or gym:ID for a gymnasium environment"
     )
-    parser.add_argument("--scene", type=Path, help="scene file of so101; without it the built-in table")
+    parser.add_argument(
+        "--scene", type=Path, help="scene file of so101; without it the built-in table"
+    )
     parser.add_argument(
         "--env-config", type=Path, help="how a gymnasium environment is to be read (docs/runner.md)"
     )
     parser.add_argument(
         "--success", metavar="RULE", help="of a gymnasium environment: info:KEY or return:NUMBER"
     )
-    parser.add_argument("--max-steps", type=positive_int, help="cut an episode off after so many steps")
+    parser.add_argument(
+        "--max-steps", type=positive_int, help="cut an episode off after so many steps"
+    )
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
+def add_parser(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+) -> argparse.ArgumentParser:
     """The flags of `vram-runner sim`."""
     sim = commands.add_parser("sim", help="the simulated SO-101 on a mobile base, or another world")
     add_world_flags(sim)
@@ -87,17 +93,17 @@ async def run(args: argparse.Namespace) -> int:
     endpoint = args.endpoint or program_endpoint("runner", os.environ, os.getuid())
     check_endpoint(endpoint)
     need("the simulator", "numpy", "cv2", extra="runner")
-    from runner.catalogue import Catalogue, read_manifests
-    from runner.clock import SystemClock
-    from runner.goals import GoalServer
-    from runner.promptness import leaves_room, make_prompt
-    from runner.protocols import DeadlinePolicy
-    from runner.recorder import Recorder
-    from runner.sim.policies import policy_of
-    from runner.sim.sim_runner import SimRunner
-    from runner.sim.truth import truth_as_wire
-    from runner.sim.worlds import makers_of, world_of
-    from runner.skills.sidecar_policy import LOCKSTEP_WAIT_S
+    from vram_arbiter.runner.catalogue import Catalogue, read_manifests
+    from vram_arbiter.runner.clock import SystemClock
+    from vram_arbiter.runner.goals import GoalServer
+    from vram_arbiter.runner.protocols import DeadlinePolicy
+    from vram_arbiter.runner.realtime import leaves_room, make_prompt
+    from vram_arbiter.runner.recorder import Recorder
+    from vram_arbiter.runner.sim.policies import policy_of
+    from vram_arbiter.runner.sim.sim_runner import SimRunner
+    from vram_arbiter.runner.sim.truth import truth_as_wire
+    from vram_arbiter.runner.sim.worlds import makers_of, world_of
+    from vram_arbiter.runner.skills.sidecar_policy import LOCKSTEP_WAIT_S
 
     world = world_of(
         args.env,
@@ -147,7 +153,9 @@ async def run(args: argparse.Namespace) -> int:
             runner.recorder = recorder  # from its first step on: it may be over before anybody asks
         runner.trace_ticks = args.trace_ticks
         if args.record is not None:
-            dataset = await record_into(args.record, runner, args.rate, str(runner.identity["robot"]), stack)
+            dataset = await record_into(
+                args.record, runner, args.rate, str(runner.identity["robot"]), stack
+            )
         control = await stack.enter_async_context(ControlThread(runner))
         await asyncio.to_thread(warm_up)
         await ready(control)
@@ -158,7 +166,9 @@ async def run(args: argparse.Namespace) -> int:
             control,
             runner,
             Catalogue(
-                manifests, makers_of(world, given, arbiter, period_s=period_s, wait_s=wait_s), body=world.body
+                manifests,
+                makers_of(world, given, arbiter, period_s=period_s, wait_s=wait_s),
+                body=world.body,
             ),
             clock,
             ground_truth=None if arm is None else lambda: truth_as_wire(arm),
@@ -180,7 +190,12 @@ async def run(args: argparse.Namespace) -> int:
         except TimeoutError:
             log.info("ending after %.0f s, as asked", args.max_seconds)
     result = runner.result()
-    log.info("%d ticks, %d late, p99 %.1f ms", result.n_ticks, result.budget_violations, result.p99_tick_ms)
+    log.info(
+        "%d ticks, %d late, p99 %.1f ms",
+        result.n_ticks,
+        result.budget_violations,
+        result.p99_tick_ms,
+    )
     print(result.model_dump_json())
     if args.timings is not None:
         try:

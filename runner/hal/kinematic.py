@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from runner.clock import Clock, SystemClock
-from runner.hal.base import HalBase
-from runner.protocols import RobotDescription
-from schemas.world import JointState
+from vram_arbiter.runner.clock import Clock, SystemClock
+from vram_arbiter.runner.hal.base import HalBase
+from vram_arbiter.runner.protocols import RobotDescription
+from vram_arbiter.schemas.world import JointState
 
 
 class KinematicTwin(HalBase):

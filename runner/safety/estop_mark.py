@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from schemas.errors import EstopRequested
+from vram_arbiter.schemas.errors import EstopRequested
 
 log = logging.getLogger(__name__)
 

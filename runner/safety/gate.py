@@ -12,21 +12,31 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from runner.protocols import RobotDescription
-from runner.safety.limits import EVERYWHERE, Kinematics, Limits, Vector3, outside_m, own_limits, tighten
-from runner.safety.ranges import CLAMP_TOLERANCE_RAD, JointRanges
-from schemas.control import ControlMode
-from schemas.manifest import RSkillManifest
-from schemas.manifest.contracts import SafetyEnvelope
-from schemas.world import Action, WorldState
+from vram_arbiter.runner.protocols import RobotDescription
+from vram_arbiter.runner.safety.limits import (
+    EVERYWHERE,
+    Kinematics,
+    Limits,
+    Vector3,
+    outside_m,
+    own_limits,
+    tighten,
+)
+from vram_arbiter.runner.safety.ranges import CLAMP_TOLERANCE_RAD, JointRanges
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
+from vram_arbiter.schemas.world import Action, WorldState
 
 MAX_STATE_AGE_S = 0.2  # an older joint state is not the robot's any more
-REFERENCE_AGE_S = (
-    0.2  # steps are measured from the last target while it is so young, else from where the robot is
-)
+REFERENCE_AGE_S = 0.2  # steps are measured from the last target while it is so young, else from where the robot is
 SPARE = 1.0  # so many periods a joint may be ahead of its speed limit: what a tick came late the next one comes early
-LATE_MAX = 1.5  # a late tick's step may be so much longer, no more: the servo makes it as fast as it can
-MAX_FOLLOWING_ERROR_RAD = 0.8  # a joint so far behind its target is blocked; servos lag by 0.1 s at most
+LATE_MAX = (
+    1.5  # a late tick's step may be so much longer, no more: the servo makes it as fast as it can
+)
+MAX_FOLLOWING_ERROR_RAD = (
+    0.8  # a joint so far behind its target is blocked; servos lag by 0.1 s at most
+)
 OVERSPEED = 1.5  # a measured speed of so many times the limit is a fault, not a servo's overshoot
 EASE_FROM = 0.8  # from this share of an effort limit on, a joint is not told to push harder
 SHORTENED_MIN = 0.5  # a tool step that would have to shrink to less than this share is withheld
@@ -217,7 +227,11 @@ class RobotGate:
 
     # -- efforts -----------------------------------------------------------------------------------------------------------
     def _yield(
-        self, targets: Targets, measured: Mapping[str, float], world: WorldState, problems: list[str]
+        self,
+        targets: Targets,
+        measured: Mapping[str, float],
+        world: WorldState,
+        problems: list[str],
     ) -> frozenset[str]:
         """Joints that push too hard get a target nearer to where they are. Withholding would keep up the pressure: targets stay."""
         yielding = set()
@@ -234,13 +248,17 @@ class RobotGate:
             low, high = self.limits.joints_rad[name]
             targets[name] = min(max(most, low), high)
             yielding.add(name)
-            problems.append(f"{name} pushes with {abs(effort):.2f} N·m, the limit is {limit:.2f}: it yields")
+            problems.append(
+                f"{name} pushes with {abs(effort):.2f} N·m, the limit is {limit:.2f}: it yields"
+            )
         return frozenset(yielding)
 
     def _effort_limit_nm(self, name: str) -> float:
         gripper = any(joint.gripper for joint in self._robot.joints if joint.name == name)
         if gripper and self._kinematics is not None:
-            return min(self.limits.torque_nm, self.limits.force_n * self._kinematics.gripper_lever_m)
+            return min(
+                self.limits.torque_nm, self.limits.force_n * self._kinematics.gripper_lever_m
+            )
         return self.limits.torque_nm
 
     def _last(self, name: str, measured: Mapping[str, float]) -> float:
@@ -295,13 +313,19 @@ class RobotGate:
                     f"{name}: {abs(step) / motion.elapsed_s:.2f} rad/s is beyond "
                     f"{self.limits.speeds_rad_s[name]:.2f} rad/s"
                 )
-                if excess > CLAMP_TOLERANCE_RAD and name not in grippers:  # a gripper just closes more slowly
+                if (
+                    excess > CLAMP_TOLERANCE_RAD and name not in grippers
+                ):  # a gripper just closes more slowly
                     raise _Withheld(said)
                 problems.append(said)
                 low, high = self.limits.joints_rad[name]
-                targets[name] = min(max(motion.start[name] + math.copysign(longest, step), low), high)
+                targets[name] = min(
+                    max(motion.start[name] + math.copysign(longest, step), low), high
+                )
             behind = abs(targets[name] - motion.measured[name])
-            if behind > MAX_FOLLOWING_ERROR_RAD and name not in grippers:  # a grasp is meant to block
+            if (
+                behind > MAX_FOLLOWING_ERROR_RAD and name not in grippers
+            ):  # a grasp is meant to block
                 # withholding would keep up the pressure; a policy that goes on from its far target is withheld as too fast
                 problems.append(
                     f"{name} is {behind:.2f} rad behind its target: it does not follow, and is let go"
@@ -367,7 +391,9 @@ class RobotGate:
                 depth = zone.depth_m(point)
                 if depth <= EPSILON:
                     continue
-                said = f"the {name} at {_place(point)} m is inside the no-go zone {zone.name or index}"
+                said = (
+                    f"the {name} at {_place(point)} m is inside the no-go zone {zone.name or index}"
+                )
                 if depth >= zone.depth_m(now[name]) - EPSILON:
                     raise _Withheld(said)
                 problems.append(f"{said}, on its way out")

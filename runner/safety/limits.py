@@ -14,13 +14,16 @@ from typing import Annotated, Protocol, Self
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from runner.protocols import RobotDescription
-from schemas.errors import ConfigError
-from schemas.manifest.contracts import SafetyEnvelope
-from schemas.yamltext import Problem, config_error
+from vram_arbiter.runner.protocols import RobotDescription
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
+from vram_arbiter.schemas.yamltext import Problem, config_error
 
 Vector3 = tuple[float, float, float]
-EVERYWHERE: tuple[Vector3, Vector3] = ((-math.inf, -math.inf, -math.inf), (math.inf, math.inf, math.inf))
+EVERYWHERE: tuple[Vector3, Vector3] = (
+    (-math.inf, -math.inf, -math.inf),
+    (math.inf, math.inf, math.inf),
+)
 
 POSITIVE = (
     "max_ee_speed_m_s",
@@ -121,7 +124,11 @@ class Limits:
 
     @property
     def needs_kinematics(self) -> bool:
-        return self.box != EVERYWHERE or bool(self.zones) or min(self.ee_speed_m_s, self.ee_step_m) < math.inf
+        return (
+            self.box != EVERYWHERE
+            or bool(self.zones)
+            or min(self.ee_speed_m_s, self.ee_step_m) < math.inf
+        )
 
 
 def own_limits(robot: RobotDescription) -> Limits:
@@ -186,7 +193,9 @@ def _refuse_what_is_wrong(
         if least > most:
             problems.append(
                 Problem(
-                    0, f"{name}.workspace_box_min_xyz", f"the workspace is empty: {axis} {least} > {most}"
+                    0,
+                    f"{name}.workspace_box_min_xyz",
+                    f"the workspace is empty: {axis} {least} > {most}",
                 )
             )
     for index, zone in enumerate(envelope.no_go_zones):
@@ -195,7 +204,9 @@ def _refuse_what_is_wrong(
         except ValidationError as error:
             wrong = [item["msg"] for item in error.errors() if item["type"] == "value_error"]
             text = wrong[0] if wrong else "give min_xyz and max_xyz, or center_xyz and radius_m"
-            problems.append(Problem(0, f"{name}.no_go_zones[{index}]", text.removeprefix("Value error, ")))
+            problems.append(
+                Problem(0, f"{name}.no_go_zones[{index}]", text.removeprefix("Value error, "))
+            )
     if kinematics is None:
         asked = [key for key in NEEDS_KINEMATICS if key in envelope.model_fields_set]
         problems += [
@@ -215,7 +226,9 @@ def error_of(problems: list[Problem]) -> ConfigError:
     return config_error("safety", problems)
 
 
-def _intersection(box: tuple[Vector3, Vector3], envelope: SafetyEnvelope) -> tuple[Vector3, Vector3]:
+def _intersection(
+    box: tuple[Vector3, Vector3], envelope: SafetyEnvelope
+) -> tuple[Vector3, Vector3]:
     low = envelope.workspace_box_min_xyz or EVERYWHERE[0]
     high = envelope.workspace_box_max_xyz or EVERYWHERE[1]
     return _vector(map(max, box[0], low)), _vector(map(min, box[1], high))

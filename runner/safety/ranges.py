@@ -10,10 +10,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from schemas.control import ControlMode
-from schemas.world import Action, WorldState
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.world import Action, WorldState
 
-CLAMP_TOLERANCE_RAD = 0.15  # beyond this an out-of-range target is a mistake, not an aim at the stop
+CLAMP_TOLERANCE_RAD = (
+    0.15  # beyond this an out-of-range target is a mistake, not an aim at the stop
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,6 @@ A reader takes frames in on a thread of its own and leaves the newest in a `Late
 waits for a camera. What no camera gave is never served: no frame, an old frame and a broken source are all `FrameStale`.
 """
 
-from runner.sensors.slot import Feed, FrameTee, LatestSlot, SlotReader
+from vram_arbiter.runner.sensors.slot import Feed, FrameTee, LatestSlot, SlotReader
 
 __all__ = ["Feed", "FrameTee", "LatestSlot", "SlotReader"]

@@ -8,15 +8,15 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 
-from runner.clock import Clock
-from runner.sensors.params import refuse_field
-from runner.sensors.slot import FrameTee, SlotReader
-from schemas.robot import SensorBackend, SensorReaderConfig
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.sensors.params import refuse_field
+from vram_arbiter.runner.sensors.slot import FrameTee, SlotReader
+from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig
 
 BACKENDS: Mapping[SensorBackend, str] = {
-    SensorBackend.OPENCV_THREAD: "runner.sensors.opencv_thread",
-    SensorBackend.GSTREAMER: "runner.sensors.gstreamer",
-    SensorBackend.ROS2_IMAGE: "runner.sensors.ros2_image",
+    SensorBackend.OPENCV_THREAD: "vram_arbiter.runner.sensors.opencv_thread",
+    SensorBackend.GSTREAMER: "vram_arbiter.runner.sensors.gstreamer",
+    SensorBackend.ROS2_IMAGE: "vram_arbiter.runner.sensors.ros2_image",
 }
 """Backend → module."""
 
@@ -29,7 +29,7 @@ def make_reader(config: SensorReaderConfig, clock: Clock) -> SlotReader:
         raise refuse_field(config, "backend", f"{config.backend} is reserved; choose from {known}")
     tee: FrameTee | None = None
     if config.publish_to_ros:
-        from runner.sensors.ros2_image import make_tee
+        from vram_arbiter.runner.sensors.ros2_image import make_tee
 
         tee = make_tee(config)
     reader: SlotReader = importlib.import_module(module).make(config, clock, tee)

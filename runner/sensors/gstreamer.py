@@ -15,18 +15,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from runner.clock import Clock
-from runner.sensors.params import read_params, refuse, refuse_field
-from runner.sensors.pipelines import CAPS, SINK, GStreamerParams, build
-from runner.sensors.platform import probe_platform
-from runner.sensors.slot import Feed, FrameTee, SlotReader
-from schemas.errors import ConfigError, FrameStale
-from schemas.robot import SensorReaderConfig
-from schemas.world import FrameEncoding, SensorFrame
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.sensors.params import read_params, refuse, refuse_field
+from vram_arbiter.runner.sensors.pipelines import CAPS, SINK, GStreamerParams, build
+from vram_arbiter.runner.sensors.platform import probe_platform
+from vram_arbiter.runner.sensors.slot import Feed, FrameTee, SlotReader
+from vram_arbiter.schemas.config.robot import SensorReaderConfig
+from vram_arbiter.schemas.errors import ConfigError, FrameStale
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 log = logging.getLogger(__name__)
 
-START_S = 10.0  # the longest that opening a source and, for a file, decoding its first picture may take
+START_S = (
+    10.0  # the longest that opening a source and, for a file, decoding its first picture may take
+)
 STOP_S = 2.0  # how long `stop` waits for a driver; its thread then ends by itself, deaf
 CLOCK_LOOKS = 5  # at both clocks, to know how far apart they are: the closest pair counts
 POLL_NS = 50_000_000  # how soon a stop or an error of a source without pictures is noticed
@@ -69,7 +71,10 @@ def load() -> Libraries:
         gi.require_version("GstApp", "1.0")
         gi.require_version("GstVideo", "1.0")
         from gi.repository import GLib, Gst, GstApp, GstVideo
-    except (ImportError, ValueError) as error:  # ValueError: its word for a description that is not installed
+    except (
+        ImportError,
+        ValueError,
+    ) as error:  # ValueError: its word for a description that is not installed
         raise ConfigError(
             f"GStreamer cannot be used here: {error}",
             hint="Debian, Ubuntu: install the system's packages that docs/runner.md names, then pip install 'vram-arbiter[gstreamer]'",
@@ -99,7 +104,9 @@ def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> Slot
         raise refuse_field(config, "backend", f"{error.message}; {error.hint}") from error
     text = build(params, probe_platform().platform)
     try:
-        _parse(libraries, text)  # opens nothing; a typing error is said now, not when the robot is on
+        _parse(
+            libraries, text
+        )  # opens nothing; a typing error is said now, not when the robot is on
     except ValueError as error:
         field = "pipeline" if params.pipeline is not None else "source"
         raise refuse(config, field, str(error)) from error
@@ -133,7 +140,14 @@ def _explain(problem: str) -> str:
         return problem
     package = PACKAGES.get(found[1])
     advice = f"install {package}" if package else "gst-inspect-1.0 lists what is installed"
-    if found[1] in ("nvh264dec", "nvh265dec", "h264parse", "h265parse", "nvv4l2decoder", "nvvidconv"):
+    if found[1] in (
+        "nvh264dec",
+        "nvh265dec",
+        "h264parse",
+        "h265parse",
+        "nvv4l2decoder",
+        "nvvidconv",
+    ):
         advice += ", or say platform: cpu_only to decode on the CPU"
     return f"{problem}; {advice}"
 
@@ -189,7 +203,8 @@ class GStreamerReader(SlotReader):
             self._thread.join(STOP_S)
             if self._thread.is_alive():
                 log.warning(
-                    "camera %s: its driver does not let go; the thread is left behind", self.sensor_id
+                    "camera %s: its driver does not let go; the thread is left behind",
+                    self.sensor_id,
                 )
             self._thread = None
 
@@ -227,7 +242,12 @@ class _Run:
     def __init__(
         self, libraries: Libraries, text: str, params: GStreamerParams, sensor_id: str, clock: Clock
     ) -> None:
-        self._libraries, self._params, self._sensor_id, self._clock = libraries, params, sensor_id, clock
+        self._libraries, self._params, self._sensor_id, self._clock = (
+            libraries,
+            params,
+            sensor_id,
+            clock,
+        )
         self._gst = libraries.gst
         self._over = False
         try:
@@ -267,7 +287,9 @@ class _Run:
         message = self._bus.timed_pop_filtered(POLL_NS if at_end else 0, self._wanted)
         if message is not None and message.type == self._gst.MessageType.ERROR:
             raise _Broken(_words(message))
-        self._over |= message is not None  # may come before the last picture was taken out of the sink
+        self._over |= (
+            message is not None
+        )  # may come before the last picture was taken out of the sink
         if sample is not None:
             return self._frame(sample)
         if self._over and self._params.loop:
@@ -323,7 +345,9 @@ class _Run:
         stride, offset, row = meta.stride[0], meta.offset[0], info.width * pixel_bytes
         data = buffer.extract_dup(0, buffer.get_size())
         if stride < row or offset + stride * (info.height - 1) + row > len(data):
-            raise _Broken(f"a picture of {info.width} × {info.height} came with {len(data)} bytes only")
+            raise _Broken(
+                f"a picture of {info.width} × {info.height} came with {len(data)} bytes only"
+            )
         if stride == row:
             return info.width, info.height, data[offset : offset + row * info.height]
         view = memoryview(data)

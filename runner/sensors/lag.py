@@ -34,5 +34,7 @@ class LagMeter:
             self._window_end_ns = arrival_ns + round(WINDOW_S * 1e9)
         behind_ns = arrival_ns - pts_ns
         self._least_ns = behind_ns if self._least_ns is None else min(self._least_ns, behind_ns)
-        least_ns = self._least_ns if self._before_ns is None else min(self._least_ns, self._before_ns)
+        least_ns = (
+            self._least_ns if self._before_ns is None else min(self._least_ns, self._before_ns)
+        )
         return arrival_ns - (behind_ns - least_ns)

@@ -13,12 +13,12 @@ from urllib.parse import urlsplit, urlunsplit
 
 from pydantic import Field, model_validator
 
-from runner.clock import Clock
-from runner.sensors.lag import LagMeter
-from runner.sensors.params import BackendParams, read_params, refuse, require_module
-from runner.sensors.slot import Feed, FrameTee, SlotReader
-from schemas.robot import SensorReaderConfig
-from schemas.world import FrameEncoding, SensorFrame
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.sensors.lag import LagMeter
+from vram_arbiter.runner.sensors.params import BackendParams, read_params, refuse, require_module
+from vram_arbiter.runner.sensors.slot import Feed, FrameTee, SlotReader
+from vram_arbiter.schemas.config.robot import SensorReaderConfig
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 FPS_MAX = 1000.0
 RECONNECT_MAX_S = 8.0  # the pause between two tries doubles up to this
@@ -62,14 +62,18 @@ class OpenCvParams(BackendParams):
     def _fits_the_source(self) -> Self:
         given = [name for name in ("device", "path", "url") if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError(f"give one of device, path and url, not {' and '.join(given) or 'none'}")
+            raise ValueError(
+                f"give one of device, path and url, not {' and '.join(given) or 'none'}"
+            )
         unneeded = self.model_fields_set - _NEEDED[given[0]] - {given[0], "encoding"}
         if unneeded:
             raise ValueError(f"not for a {given[0]}: {', '.join(sorted(unneeded))}")
         if (self.width is None) != (self.height is None):
             raise ValueError("width and height go together")
         if self.url is not None and urlsplit(self.url).scheme not in URL_SCHEMES:
-            raise ValueError(f"url begins with one of {', '.join(f'{name}://' for name in URL_SCHEMES)}")
+            raise ValueError(
+                f"url begins with one of {', '.join(f'{name}://' for name in URL_SCHEMES)}"
+            )
         return self
 
     @property
@@ -121,7 +125,10 @@ class OpenCvReader(SlotReader):
     def _run_begins(self, feed: Feed) -> None:
         self._stopping = threading.Event()
         self._thread = threading.Thread(
-            target=self._run, args=(feed, self._stopping), name=f"camera-{self.sensor_id}", daemon=True
+            target=self._run,
+            args=(feed, self._stopping),
+            name=f"camera-{self.sensor_id}",
+            daemon=True,
         )
         self._thread.start()
 
@@ -155,7 +162,9 @@ class OpenCvReader(SlotReader):
             lag = LagMeter() if params.stamp == "source" else None
             try:
                 while (
-                    opened and not stopping.is_set() and (frame := self._take(cv2, capture, lag)) is not None
+                    opened
+                    and not stopping.is_set()
+                    and (frame := self._take(cv2, capture, lag)) is not None
                 ):
                     self.deliver(feed, frame)
                     taken += 1
@@ -166,9 +175,13 @@ class OpenCvReader(SlotReader):
             failures = 1 if taken else failures + 1
             problem = "broke off" if taken else "gives no picture" if opened else "cannot be opened"
             if failures > params.reconnect_tries:
-                feed.end(f"{params.label} {problem}, given up after {params.reconnect_tries} new tries")
+                feed.end(
+                    f"{params.label} {problem}, given up after {params.reconnect_tries} new tries"
+                )
                 return
-            feed.interrupt(f"{params.label} {problem}, new try {failures} of {params.reconnect_tries}")
+            feed.interrupt(
+                f"{params.label} {problem}, new try {failures} of {params.reconnect_tries}"
+            )
             if stopping.wait(min(params.reconnect_s * 2 ** min(failures - 1, 16), RECONNECT_MAX_S)):
                 return
 
@@ -191,7 +204,9 @@ class OpenCvReader(SlotReader):
                     self.deliver(feed, frame)
                     taken += 1
                     due_s = max(due_s + 1 / fps, self.clock.now_s())
-                    stopping.wait(due_s - self.clock.now_s())  # the last picture, too, stays for its time
+                    stopping.wait(
+                        due_s - self.clock.now_s()
+                    )  # the last picture, too, stays for its time
             finally:
                 capture.release()
             if stopping.is_set():
@@ -213,7 +228,12 @@ class OpenCvReader(SlotReader):
             capture.open(
                 params.url,
                 cv2.CAP_FFMPEG,
-                [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, timeout_ms],
+                [
+                    cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
+                    timeout_ms,
+                    cv2.CAP_PROP_READ_TIMEOUT_MSEC,
+                    timeout_ms,
+                ],
             )
         return capture
 

@@ -11,15 +11,17 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from schemas.errors import ConfigError
-from schemas.robot import SensorReaderConfig
-from schemas.yamltext import Problem, YamlText, config_error, problems_of
+from vram_arbiter.schemas.config.robot import SensorReaderConfig
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.yamltext import Problem, YamlText, config_error, problems_of
 
 
 class BackendParams(BaseModel):
     """Base of each backend's parameters. Strict: the text "0" is no device number."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
+    )
 
 
 def read_params[P: BackendParams](config: SensorReaderConfig, model: type[P]) -> P:
@@ -53,7 +55,10 @@ def require_module(config: SensorReaderConfig, module: str, distribution: str, e
 def _error(config: SensorReaderConfig, found: list[tuple[str, str]]) -> ConfigError:
     return _named(
         config,
-        [Problem(0, f"backend_params.{field}" if field else "backend_params", text) for field, text in found],
+        [
+            Problem(0, f"backend_params.{field}" if field else "backend_params", text)
+            for field, text in found
+        ],
     )
 
 

@@ -14,8 +14,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from runner.sensors.params import BackendParams
-from runner.sensors.platform import Platform
+from vram_arbiter.runner.sensors.params import BackendParams
+from vram_arbiter.runner.sensors.platform import Platform
 
 SINK = "sink"
 FPS_MAX = 1000.0
@@ -69,7 +69,12 @@ class GStreamerParams(BackendParams):
         if (self.pipeline is None) == (self.source is None):
             raise ValueError("give either pipeline or source")
         kind = "pipeline" if self.source is None else self.source
-        if unneeded := self.model_fields_set - _NEEDED[kind] - _OPTIONAL[kind] - {kind, "source", "encoding"}:
+        if (
+            unneeded := self.model_fields_set
+            - _NEEDED[kind]
+            - _OPTIONAL[kind]
+            - {kind, "source", "encoding"}
+        ):
             raise ValueError(f"not for {kind}: {', '.join(sorted(unneeded))}")
         if missing := sorted(name for name in _NEEDED[kind] if getattr(self, name) is None):
             raise ValueError(f"source {kind} needs {', '.join(missing)}")
@@ -89,14 +94,20 @@ class GStreamerParams(BackendParams):
             )
         if self.path is not None:
             demuxer(self.path, self.codec_used)
-        if self.encoding == "depth16" and (self.source not in ("v4l2", "test") or self.codec_used != "raw"):
+        if self.encoding == "depth16" and (
+            self.source not in ("v4l2", "test") or self.codec_used != "raw"
+        ):
             raise ValueError(
                 "depth16 is taken only from a raw v4l2 source: a decoded picture has no depth in it"
             )
         if self.encoding == "jpeg" and self.source != "test" and self.codec_used != "mjpeg":
-            raise ValueError("encoding jpeg hands on what the camera sends: it goes with codec mjpeg")
+            raise ValueError(
+                "encoding jpeg hands on what the camera sends: it goes with codec mjpeg"
+            )
         if self.encoding == "jpeg" and self.source in ("rtsp", "file") and self.width is not None:
-            raise ValueError("encoding jpeg hands pictures on as they are: leave width and height away")
+            raise ValueError(
+                "encoding jpeg hands pictures on as they are: leave width and height away"
+            )
 
     @property
     def codec_used(self) -> Codec:
@@ -128,8 +139,16 @@ CAPS: Mapping[Encoding, str] = {
 }
 """What the appsink accepts, by the encoding of the frames."""
 
-_COMPRESSED: Mapping[Codec, str] = {"mjpeg": "image/jpeg", "h264": "video/x-h264", "h265": "video/x-h265"}
-_DEPAY: Mapping[Codec, str] = {"mjpeg": "rtpjpegdepay", "h264": "rtph264depay", "h265": "rtph265depay"}
+_COMPRESSED: Mapping[Codec, str] = {
+    "mjpeg": "image/jpeg",
+    "h264": "video/x-h264",
+    "h265": "video/x-h265",
+}
+_DEPAY: Mapping[Codec, str] = {
+    "mjpeg": "rtpjpegdepay",
+    "h264": "rtph264depay",
+    "h265": "rtph265depay",
+}
 _DEMUXERS = {
     ".mp4": "qtdemux",
     ".m4v": "qtdemux",
@@ -169,7 +188,9 @@ def demuxer(path: str, codec: Codec) -> str:
             f"path must end in one of {', '.join(_DEMUXERS)}; for anything else write a pipeline"
         )
     if suffix == ".avi" and codec != "mjpeg":
-        raise ValueError(f"an .avi file with {codec} says too little about its pictures; put it into .mp4")
+        raise ValueError(
+            f"an .avi file with {codec} says too little about its pictures; put it into .mp4"
+        )
     return _DEMUXERS[suffix]
 
 
@@ -208,7 +229,11 @@ def _asked(params: GStreamerParams) -> str:
 def _source(params: GStreamerParams) -> list[str]:
     codec = params.codec_used
     if params.source == "v4l2":
-        form = CAPS["depth16"] if params.encoding == "depth16" else _COMPRESSED.get(codec, "video/x-raw")
+        form = (
+            CAPS["depth16"]
+            if params.encoding == "depth16"
+            else _COMPRESSED.get(codec, "video/x-raw")
+        )
         return [f"v4l2src device={quoted(params.device or '')}", form + _asked(params)]
     if params.source == "rtsp":
         microseconds = RTSP_TIMEOUT_S * 1_000_000
@@ -228,7 +253,9 @@ def _decode(params: GStreamerParams, platform: Platform) -> list[str]:
     scaled = _size(params) if params.source in ("rtsp", "file") else ""
     elements = [_DECODERS[platform][codec]]
     if params.source != "file":
-        elements.append(_LATEST_ONLY)  # whoever converts too slowly loses pictures instead of falling behind
+        elements.append(
+            _LATEST_ONLY
+        )  # whoever converts too slowly loses pictures instead of falling behind
     if platform is Platform.TEGRA:
         # only there are decoded pictures in NVMM memory; the engine that brings them out of it scales as well
         elements += ["nvvidconv", f"video/x-raw,format=BGRx{scaled}"]

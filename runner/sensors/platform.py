@@ -39,7 +39,9 @@ def probe_platform(root: Path = Path("/")) -> PlatformReport:
     """Look at the machine whose file system begins at `root`. Tegra is asked first: new Jetsons show a PC's device files as well."""
     if (root / TEGRA_RELEASE).exists():
         return PlatformReport(Platform.TEGRA, f"/{TEGRA_RELEASE} exists")
-    if board := next((text for text in _texts(root / BOARD) if text.startswith("nvidia,tegra")), None):
+    if board := next(
+        (text for text in _texts(root / BOARD) if text.startswith("nvidia,tegra")), None
+    ):
         return PlatformReport(Platform.TEGRA, f"the board is {board}")
     cards = sorted(path.name for path in root.glob(CARDS))
     if cards:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Literal
 
-from schemas.errors import ConfigError
+from vram_arbiter.schemas.errors import ConfigError
 
 MessageKind = Literal["image", "compressed"]
 """`sensor_msgs/Image` or `sensor_msgs/CompressedImage`."""
@@ -53,8 +53,12 @@ def dds_type(kind: MessageKind) -> Any:
     from cyclonedds.idl import make_idl_struct
     from cyclonedds.idl.types import int32, sequence, uint8, uint32
 
-    time = make_idl_struct("Time_", "builtin_interfaces.msg.dds_.Time_", {"sec": int32, "nanosec": uint32})
-    header = make_idl_struct("Header_", "std_msgs.msg.dds_.Header_", {"stamp": time, "frame_id": str})
+    time = make_idl_struct(
+        "Time_", "builtin_interfaces.msg.dds_.Time_", {"sec": int32, "nanosec": uint32}
+    )
+    header = make_idl_struct(
+        "Header_", "std_msgs.msg.dds_.Header_", {"stamp": time, "frame_id": str}
+    )
     if kind == "image":
         fields = {
             "header": header, "height": uint32, "width": uint32, "encoding": str, "is_bigendian": uint8, "step": uint32,
@@ -92,7 +96,9 @@ def qos_of(reliability: str, *, writer: bool) -> Any:
         Policy.Durability.Volatile,
         Policy.History.KeepLast(1),
         Policy.DataRepresentation(use_cdrv0_representation=True),
-        *((Policy.WriterDataLifecycle(autodispose=False),) if writer else ()),  # ROS disposes of nothing
+        *(
+            (Policy.WriterDataLifecycle(autodispose=False),) if writer else ()
+        ),  # ROS disposes of nothing
     )
 
 

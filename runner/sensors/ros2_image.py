@@ -8,9 +8,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from runner.clock import Clock
-from runner.sensors.params import BackendParams, read_params, refuse, refuse_field, require_module
-from runner.sensors.ros2_dds import (
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.sensors.params import (
+    BackendParams,
+    read_params,
+    refuse,
+    refuse_field,
+    require_module,
+)
+from vram_arbiter.runner.sensors.ros2_dds import (
     DOMAIN_MAX,
     MessageKind,
     cdr_of,
@@ -22,7 +28,7 @@ from runner.sensors.ros2_dds import (
     qos_of,
     sample_of,
 )
-from runner.sensors.ros2_messages import (
+from vram_arbiter.runner.sensors.ros2_messages import (
     Picture,
     RosCompressedImage,
     RosImage,
@@ -32,17 +38,21 @@ from runner.sensors.ros2_messages import (
     read_image,
     write_cdr,
 )
-from runner.sensors.slot import Feed, FrameTee, SlotReader
-from schemas.errors import ConfigError
-from schemas.robot import SensorReaderConfig
-from schemas.world import SensorFrame
+from vram_arbiter.runner.sensors.slot import Feed, FrameTee, SlotReader
+from vram_arbiter.schemas.config.robot import SensorReaderConfig
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.world import SensorFrame
 
 log = logging.getLogger(__name__)
 
-TAKE_MAX = 4  # samples a turn: the reader keeps one, and there may be words about a publisher beside it
+TAKE_MAX = (
+    4  # samples a turn: the reader keeps one, and there may be words about a publisher beside it
+)
 WAIT_S = 1.0  # the longest that the thread sleeps in DDS; what happens wakes it
 STOP_S = 2.0
-AHEAD_MAX_NS = 50_000_000  # a stamp may lie so far in the future: clocks of two machines never agree fully
+AHEAD_MAX_NS = (
+    50_000_000  # a stamp may lie so far in the future: clocks of two machines never agree fully
+)
 _RELIABILITY = 11  # DDS's number for the policy that two sides can disagree about
 
 
@@ -82,7 +92,9 @@ def make_tee(config: SensorReaderConfig) -> RosImagePublisher:
     """What publishes a camera's frames on its `publish_topic`. Raises ConfigError."""
     require_module(config, "cyclonedds", "Cyclone DDS", "ros2")
     try:
-        return RosImagePublisher(config.publish_topic or "", domain_of(), rate_hz=config.publish_rate_hz)
+        return RosImagePublisher(
+            config.publish_topic or "", domain_of(), rate_hz=config.publish_rate_hz
+        )
     except ValueError as error:
         raise refuse_field(config, "publish_topic", str(error)) from error
 
@@ -128,7 +140,9 @@ class RosImageReader(SlotReader):
                 Topic(participant, dds_topic(self._topic), dds_type(self._params.message)),
                 qos=qos_of(self._params.reliability, writer=False),
             )
-            reader.set_status_mask(DDSStatus.SubscriptionMatched | DDSStatus.RequestedIncompatibleQos)
+            reader.set_status_mask(
+                DDSStatus.SubscriptionMatched | DDSStatus.RequestedIncompatibleQos
+            )
             guard = self._guard = GuardCondition(participant)
             waitset = WaitSet(participant)
             data = ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any)
@@ -172,7 +186,9 @@ class RosImageReader(SlotReader):
     def _look_at_publishers(self, feed: Feed, reader: Any) -> None:
         from cyclonedds.core import DDSStatus
 
-        changes = reader.take_status(DDSStatus.SubscriptionMatched | DDSStatus.RequestedIncompatibleQos)
+        changes = reader.take_status(
+            DDSStatus.SubscriptionMatched | DDSStatus.RequestedIncompatibleQos
+        )
         if not changes:
             return
         matched = reader.get_subscription_matched_status()
@@ -192,11 +208,15 @@ class RosImageReader(SlotReader):
 
     def _take(self, feed: Feed, reader: Any) -> None:
         samples = reader.take(N=TAKE_MAX)
-        newest = next((sample for sample in reversed(samples) if sample.sample_info.valid_data), None)
+        newest = next(
+            (sample for sample in reversed(samples) if sample.sample_info.valid_data), None
+        )
         if newest is None:
             return
         try:
-            message = (read_image if self._params.message == "image" else read_compressed)(cdr_of(newest))
+            message = (read_image if self._params.message == "image" else read_compressed)(
+                cdr_of(newest)
+            )
             picture = picture_of(message)
             frame = self._frame(message, picture, newest.sample_info.source_timestamp)
         except ValueError as error:
@@ -204,7 +224,9 @@ class RosImageReader(SlotReader):
         else:
             self.deliver(feed, frame)
 
-    def _frame(self, message: RosImage | RosCompressedImage, picture: Picture, sent_ns: int) -> SensorFrame:
+    def _frame(
+        self, message: RosImage | RosCompressedImage, picture: Picture, sent_ns: int
+    ) -> SensorFrame:
         """Raises ValueError for a stamp of the future."""
         now_ns, wall_ns = self.clock.now_ns(), self.clock.wall_ns()
         taken_ns = (message.stamp_ns or sent_ns) if self._params.stamp == "header" else wall_ns
@@ -269,7 +291,9 @@ class RosImagePublisher:
         self.published += 1
         due_ns = self._next_ns + self._period_ns
         self._next_ns = (
-            due_ns if due_ns > frame.stamp_monotonic_ns else frame.stamp_monotonic_ns + self._period_ns
+            due_ns
+            if due_ns > frame.stamp_monotonic_ns
+            else frame.stamp_monotonic_ns + self._period_ns
         )
 
     def close(self) -> None:
@@ -288,5 +312,7 @@ class RosImagePublisher:
                 self._writer = DataWriter(participant, topic, qos=qos_of("reliable", writer=True))
             self._kind = kind
         elif kind != self._kind:
-            raise ValueError("a topic carries one type: the camera changed between JPEG and plain pictures")
+            raise ValueError(
+                "a topic carries one type: the camera changed between JPEG and plain pictures"
+            )
         return self._writer

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from schemas.world import FrameEncoding
+from vram_arbiter.schemas.world import FrameEncoding
 
 NANOSECONDS = 1_000_000_000
 STAMP_END_NS = 2**31 * NANOSECONDS
@@ -76,7 +76,9 @@ def picture_of(message: RosImage | RosCompressedImage) -> Picture:
         return _compressed(message)
     known = _ENCODINGS.get(message.encoding)
     if known is None:
-        raise ValueError(f"encoding {message.encoding!r} is not supported, only {', '.join(_ENCODINGS)}")
+        raise ValueError(
+            f"encoding {message.encoding!r} is not supported, only {', '.join(_ENCODINGS)}"
+        )
     encoding, per_pixel = known
     if not (0 < message.width <= SIDE_MAX and 0 < message.height <= SIDE_MAX):
         raise ValueError(f"a picture of {message.width} × {message.height} pixels")
@@ -113,7 +115,9 @@ def message_of(picture: Picture, stamp_ns: int, frame_id: str) -> RosImage | Ros
     if name is None:
         raise ValueError(f"{picture.encoding} has no name in ROS")
     step = len(picture.data) // picture.height
-    return RosImage(stamp_ns, frame_id, picture.height, picture.width, name, False, step, picture.data)
+    return RosImage(
+        stamp_ns, frame_id, picture.height, picture.width, name, False, step, picture.data
+    )
 
 
 def jpeg_size(data: bytes) -> tuple[int, int, int]:

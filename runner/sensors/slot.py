@@ -10,9 +10,9 @@ import threading
 from abc import ABC, abstractmethod
 from typing import Protocol
 
-from runner.clock import Clock
-from schemas.errors import FrameStale
-from schemas.world import SensorFrame
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.schemas.errors import FrameStale
+from vram_arbiter.schemas.world import SensorFrame
 
 NOT_STARTED = "its reader was not started"
 STOPPED = "its reader was stopped"
@@ -115,7 +115,10 @@ class LatestSlot:
         with self._changed:
             if feed is not self._feed or self._ended:
                 return False
-            if self._frame is not None and frame.stamp_monotonic_ns < self._frame.stamp_monotonic_ns:
+            if (
+                self._frame is not None
+                and frame.stamp_monotonic_ns < self._frame.stamp_monotonic_ns
+            ):
                 return False
             self._frame, self._reason = frame, ""
             self._changed.notify_all()
@@ -155,7 +158,9 @@ class SlotReader(ABC):
     `start` twice or `stop` twice does no harm. After `stop` every read raises FrameStale; `start` begins anew.
     """
 
-    def __init__(self, sensor_id: str, max_age_ms: float, clock: Clock, tee: FrameTee | None = None) -> None:
+    def __init__(
+        self, sensor_id: str, max_age_ms: float, clock: Clock, tee: FrameTee | None = None
+    ) -> None:
         self.sensor_id = sensor_id
         self.clock = clock
         self.slot = LatestSlot(sensor_id, max_age_ms, clock)

@@ -12,16 +12,23 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from runner.protocols import RobotDescription, SafetyGate, Stepped
-from runner.safety.gate import RobotGate
-from runner.safety.limits import Kinematics, Limits
-from runner.sim.config import CONTROL_HZ
-from runner.sim.environment import EnvStep
-from runner.skills.motion import bounded
-from schemas.control import ControlMode
-from schemas.errors import EnvironmentFailed, InternalError, ModelError
-from schemas.manifest import RSkillManifest
-from schemas.world import Action, CameraModel, JointState, Pose, SensorFrame, WorldState
+from vram_arbiter.runner.protocols import RobotDescription, SafetyGate, Stepped
+from vram_arbiter.runner.safety.gate import RobotGate
+from vram_arbiter.runner.safety.limits import Kinematics, Limits
+from vram_arbiter.runner.sim.config import CONTROL_HZ
+from vram_arbiter.runner.sim.environment import EnvStep
+from vram_arbiter.runner.skills.motion import bounded
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import EnvironmentFailed, InternalError, ModelError
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.world import (
+    Action,
+    CameraModel,
+    JointState,
+    Pose,
+    SensorFrame,
+    WorldState,
+)
 
 REACH_SHARE = 0.98  # of the longest step: rounding must not reach the gate
 
@@ -32,7 +39,9 @@ class MobileArm(Protocol):
     def reset(self, seed: int) -> None: ...
 
     def step(
-        self, arm_target: Mapping[str, float] | None, base_velocity: tuple[float, float, float] | None = None
+        self,
+        arm_target: Mapping[str, float] | None,
+        base_velocity: tuple[float, float, float] | None = None,
     ) -> None: ...
 
     @property
@@ -61,7 +70,9 @@ class SimulatedTime:
     def check(self, action: Action, world: WorldState) -> tuple[Action | None, tuple[str, ...]]:
         stamp_ns = round(self.arm.time_s * 1e9)
         joints = world.joint_state.model_copy(update={"stamp_ns": stamp_ns})
-        return self.gate.check(action, world.model_copy(update={"stamp_ns": stamp_ns, "joint_state": joints}))
+        return self.gate.check(
+            action, world.model_copy(update={"stamp_ns": stamp_ns, "joint_state": joints})
+        )
 
 
 class ArmEnvironment:
@@ -91,7 +102,9 @@ class ArmEnvironment:
         self._limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in robot.joints}
         self._gate = RobotGate(robot, rate_hz=CONTROL_HZ, kinematics=kinematics, sent=self.sent)
 
-    def about(self, *, prepare: Callable[[int], None] | None, judge: Callable[[], bool], steady: int) -> None:
+    def about(
+        self, *, prepare: Callable[[int], None] | None, judge: Callable[[], bool], steady: int
+    ) -> None:
         """From the next reset on episodes are about this."""
         self._prepare, self._judge, self._steady = prepare, judge, steady
 
@@ -101,7 +114,9 @@ class ArmEnvironment:
             if self._prepare is not None:
                 self._prepare(seed)
         except ValueError as error:  # objects that do not fit, a model that cannot be built
-            raise EnvironmentFailed(f"the scene of seed {seed} cannot be set up: {error}") from error
+            raise EnvironmentFailed(
+                f"the scene of seed {seed} cannot be set up: {error}"
+            ) from error
         self._in_a_row = 0
         self._targets = self.arm.joint_state()
         self._random = random.Random(f"actions-{seed}")
@@ -118,7 +133,9 @@ class ArmEnvironment:
                 stamp_ns=stamp_ns,
             ),
             base_pose=Pose(
-                xyz=(x, y, 0.0), quat_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)), frame_id="map"
+                xyz=(x, y, 0.0),
+                quat_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)),
+                frame_id="map",
             ),
             image_frames=dict(frames) if frames is not None else None,
         )
@@ -172,7 +189,9 @@ class ArmEnvironment:
         row = []
         for name, (low, high) in self._limits.items():
             reach = REACH_SHARE * self._gate.limits.speeds_rad_s[name] / CONTROL_HZ
-            row.append(min(max(self._targets[name] + self._random.uniform(-reach, reach), low), high))
+            row.append(
+                min(max(self._targets[name] + self._random.uniform(-reach, reach), low), high)
+            )
         return _joint_action(tuple(self._limits), row)
 
     @property
@@ -211,10 +230,14 @@ class ArmEnvironment:
 
 
 def _joint_action(names: tuple[str, ...], row: Sequence[float]) -> Action:
-    return Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(tuple(row),), joint_names=names)
+    return Action(
+        control_mode=ControlMode.JOINT_POSITION, joint_targets=(tuple(row),), joint_names=names
+    )
 
 
-def _commands(action: Action | None) -> tuple[dict[str, float] | None, tuple[float, float, float] | None]:
+def _commands(
+    action: Action | None,
+) -> tuple[dict[str, float] | None, tuple[float, float, float] | None]:
     """Arm target by joint name and base velocity of an action; (None, None) holds."""
     if action is None:
         return None, None

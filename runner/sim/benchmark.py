@@ -17,18 +17,21 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from runner.protocols import Goal, Skill, SkillEnded, Stepped
-from runner.recorder import Recorder
-from runner.sim.environment import Environment
-from runner.sim.policies import Policy
-from runner.sim.sim_runner import SimRunner
-from schemas import telemetry, tracing
-from schemas.errors import Cancelled, LimitExceeded, ModelError, VramError
+from vram_arbiter.runner.protocols import Goal, Skill, SkillEnded, Stepped
+from vram_arbiter.runner.recorder import Recorder
+from vram_arbiter.runner.sim.environment import Environment
+from vram_arbiter.runner.sim.policies import Policy
+from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.schemas.errors import Cancelled, LimitExceeded, ModelError, VramError
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
 log = logging.getLogger(__name__)
 
 Z_95: Final = 1.959964  # the normal distribution's 97.5 % point
-ERRORS_IN_A_ROW_MAX: Final = 3  # a sidecar that is not there will not be there for the next seed either
+ERRORS_IN_A_ROW_MAX: Final = (
+    3  # a sidecar that is not there will not be there for the next seed either
+)
 VIDEO_HZ: Final = 30.0
 
 Told = tuple[str, dict[str, Any]]
@@ -41,7 +44,9 @@ def wilson(successes: int, of: int) -> tuple[float, float] | None:
     share, square = successes / of, Z_95**2
     middle = share + square / (2 * of)
     half = Z_95 * math.sqrt(share * (1 - share) / of + square / (4 * of * of))
-    return max(0.0, (middle - half) / (1 + square / of)), min(1.0, (middle + half) / (1 + square / of))
+    return max(0.0, (middle - half) / (1 + square / of)), min(
+        1.0, (middle + half) / (1 + square / of)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,13 +107,17 @@ class Cell:
         self.episodes.append(played)
         if self.judged:
             self.episodes = [
-                replace(one, success=False) if one.success is None and (one.failed or not one.error) else one
+                replace(one, success=False)
+                if one.success is None and (one.failed or not one.error)
+                else one
                 for one in self.episodes
             ]
 
     def summary(self) -> dict[str, Any]:
         """Sums, as they go into the report."""
-        rewards = [played.total_reward for played in self.episodes if played.total_reward is not None]
+        rewards = [
+            played.total_reward for played in self.episodes if played.total_reward is not None
+        ]
         steps = [played.steps for played in self.episodes if not played.unjudged_error]
         return {
             "world": self.world,
@@ -223,7 +232,9 @@ class Benchmark:
                         cell.why = "stopped"
                         return cell
                     cell.add(played)
-                    log.info("%s, %s, seed %d: %s", cell.world, cell.contestant, seed, _verdict(played))
+                    log.info(
+                        "%s, %s, seed %d: %s", cell.world, cell.contestant, seed, _verdict(played)
+                    )
                     last = cell.episodes[-ERRORS_IN_A_ROW_MAX:]
                     if len(last) == ERRORS_IN_A_ROW_MAX and all(one.unjudged_error for one in last):
                         cell.why = f"given up after {len(last)} errors in a row: {played.message}"
@@ -234,7 +245,9 @@ class Benchmark:
                 await self._on(worker, self.runner.deactivate)
                 await _quietly(contestant.release())
 
-    async def _play(self, worker: ThreadPoolExecutor, contestant: Contestant, seed: int) -> Played | None:
+    async def _play(
+        self, worker: ThreadPoolExecutor, contestant: Contestant, seed: int
+    ) -> Played | None:
         """None: stopped in its middle."""
         began_s = time.monotonic()
         path = self._video_of(contestant.name, seed)
@@ -247,12 +260,21 @@ class Benchmark:
                 traceparent = tracing.traceparent()
                 prompt, params = await self._on(worker, lambda: self._reset(seed))
                 goal = Goal(
-                    f"seed-{seed}", contestant.name, prompt=prompt, params=params, traceparent=traceparent
+                    f"seed-{seed}",
+                    contestant.name,
+                    prompt=prompt,
+                    params=params,
+                    traceparent=traceparent,
                 )
-                self.runner.caption = (f"{contestant.name}, seed {seed}", *([prompt] if prompt else []))
+                self.runner.caption = (
+                    f"{contestant.name}, seed {seed}",
+                    *([prompt] if prompt else []),
+                )
                 try:
                     await self._unless_stopped(contestant.begin(goal))
-                    played = await self._on(worker, lambda: self._episode(contestant, goal, seed, recorder))
+                    played = await self._on(
+                        worker, lambda: self._episode(contestant, goal, seed, recorder)
+                    )
                 finally:
                     await _quietly(contestant.finish())
         except Cancelled:
@@ -265,7 +287,9 @@ class Benchmark:
                 await asyncio.to_thread(recorder.close)
         if played is None:
             return None
-        video = str(path) if recorder is not None and recorder.written and not recorder.error else None
+        video = (
+            str(path) if recorder is not None and recorder.written and not recorder.error else None
+        )
         return replace(played, seconds=round(time.monotonic() - began_s, 3), video=video)
 
     # -- worker thread -------------------------------------------------------------------------------------------------

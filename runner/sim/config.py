@@ -13,9 +13,16 @@ from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from schemas.yamltext import read_yaml, validated
+from vram_arbiter.schemas.yamltext import read_yaml, validated
 
-ARM_JOINTS: Final = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+ARM_JOINTS: Final = (
+    "shoulder_pan",
+    "shoulder_lift",
+    "elbow_flex",
+    "wrist_flex",
+    "wrist_roll",
+    "gripper",
+)
 BASE_JOINTS: Final = ("base_x", "base_y", "base_yaw")
 CONTROL_HZ: Final = 30.0
 CONTROL_DT_S: Final = 1.0 / CONTROL_HZ

@@ -1,4 +1,4 @@
-"""Writes the datasets that the training scripts read: `python -m runner.sim.dataset grab|scenes --out DIR`.
+"""Writes the datasets that the training scripts read: `python -m vram_arbiter.runner.sim.dataset grab|scenes --out DIR`.
 
 `scenes`: PNG frames of the front and wrist cameras and `labels.jsonl`, one JSON object a frame (boxes, names, what is held).
 `grab`: demonstrations as plain .npy arrays and `info.json`, because a step is two tiny images and six numbers: random
@@ -19,12 +19,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
-from runner.sim.env import SimEnv
-from runner.sim.expert import CLOSED_RAD, GrabExpert
-from runner.sim.kinematics import ArmKinematics
-from runner.sim.learned import LoadedPolicy
-from runner.sim.navigate import standoff_pose
+from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
+from vram_arbiter.runner.sim.env import SimEnv
+from vram_arbiter.runner.sim.expert import CLOSED_RAD, GrabExpert
+from vram_arbiter.runner.sim.kinematics import ArmKinematics
+from vram_arbiter.runner.sim.learned import LoadedPolicy
+from vram_arbiter.runner.sim.navigate import standoff_pose
 
 # What the grab policy looks at: crops as fractions of the image (x0, y0, x1, y1), and the size they are averaged down to.
 VIEWS: Final[dict[str, tuple[tuple[float, float, float, float], tuple[int, int]]]] = {
@@ -55,13 +55,17 @@ def policy_view(image: Any, camera: str) -> Any:
     return cv2.resize(crop, size, interpolation=cv2.INTER_AREA)
 
 
-def stand_before(env: SimEnv, name: str, rng: random.Random, *, error_m: float = NAVIGATION_ERROR_M) -> None:
+def stand_before(
+    env: SimEnv, name: str, rng: random.Random, *, error_m: float = NAVIGATION_ERROR_M
+) -> None:
     """Put the base where an imperfect navigation would have left it in front of an object."""
     x, y, _ = env.ground_truth().objects[name].position_map
     goal = standoff_pose((x, y), env.config)
     env.place(
         (
-            min(goal.x_m + rng.uniform(-error_m, error_m), standoff_pose((9.0, 0.0), env.config).x_m),
+            min(
+                goal.x_m + rng.uniform(-error_m, error_m), standoff_pose((9.0, 0.0), env.config).x_m
+            ),
             goal.y_m + rng.uniform(-error_m, error_m),
             goal.yaw_rad + rng.uniform(-NAVIGATION_ERROR_RAD, NAVIGATION_ERROR_RAD),
         ),
@@ -128,7 +132,11 @@ def scene_captures(env: SimEnv, kinematics: ArmKinematics, seed: int) -> Iterato
     angle, miss = rng.uniform(-math.pi, math.pi), rng.random() < 0.34
     reach = rng.uniform(0.040, 0.055) if miss else 0.0
     expert = GrabExpert(
-        env, kinematics, name, offset_m=(reach * math.cos(angle), reach * math.sin(angle)), retry=not miss
+        env,
+        kinematics,
+        name,
+        offset_m=(reach * math.cos(angle), reach * math.sin(angle)),
+        retry=not miss,
     )
     shot = rng.randint(5, 35)
     for step in range(90):
@@ -144,7 +152,10 @@ def scene_captures(env: SimEnv, kinematics: ArmKinematics, seed: int) -> Iterato
     yield capture(env, "wrist", "after")
     # the same hold in another arm pose, seen from elsewhere on the way back
     pose = list(env.joint_state().values())
-    wiggle = [a + rng.uniform(-0.2, 0.2) for a in pose[:4]] + [pose[4] + rng.uniform(-0.5, 0.5), CLOSED_RAD]
+    wiggle = [a + rng.uniform(-0.2, 0.2) for a in pose[:4]] + [
+        pose[4] + rng.uniform(-0.5, 0.5),
+        CLOSED_RAD,
+    ]
     turn = (rng.uniform(-0.1, 0.0), rng.uniform(-0.2, 0.2), rng.uniform(-0.3, 0.3))
     for _ in range(12):
         env.step(wiggle, turn)
@@ -167,7 +178,9 @@ def write_scenes(out: Path, count: int, seed: int) -> dict[str, int]:
                 if written == count:
                     break
                 file = f"images/{written:06d}_{shot.label['camera']}.png"
-                if not cv2.imwrite(str(out / file), shot.image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+                if not cv2.imwrite(
+                    str(out / file), shot.image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]
+                ):
                     raise OSError(f"cannot write {out / file}")
                 labels.write(json.dumps({"file": file, **shot.label}) + "\n")
                 held[shot.label["camera"]] += shot.label["held"] is not None
@@ -241,7 +254,9 @@ def demonstrate(
     return demo, env.held_object() == name
 
 
-def write_grab(out: Path, episodes: int, seed: int, policy: LoadedPolicy | None = None) -> dict[str, int]:
+def write_grab(
+    out: Path, episodes: int, seed: int, policy: LoadedPolicy | None = None
+) -> dict[str, int]:
     """Record `episodes` successful demonstrations. Returns episodes, steps and discarded failures."""
     import numpy as np
 
@@ -264,10 +279,13 @@ def write_grab(out: Path, episodes: int, seed: int, policy: LoadedPolicy | None 
                         "the expert fails too often: the scene and the expert do not fit together"
                     )
     for key in ("front", "wrist"):
-        np.save(out / f"{key}.npy", np.stack([image for demo in kept for image in getattr(demo, key)]))
+        np.save(
+            out / f"{key}.npy", np.stack([image for demo in kept for image in getattr(demo, key)])
+        )
     for key in ("state", "action", "point"):
         np.save(
-            out / f"{key}.npy", np.asarray([row for d in kept for row in getattr(d, key)], dtype=np.float32)
+            out / f"{key}.npy",
+            np.asarray([row for d in kept for row in getattr(d, key)], dtype=np.float32),
         )
     lengths = [len(demo.action) for demo in kept]
     np.save(out / "episode_length.npy", np.asarray(lengths, dtype=np.int64))
@@ -293,7 +311,9 @@ def write_grab(out: Path, episodes: int, seed: int, policy: LoadedPolicy | None 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of the dataset writer."""
-    parser = argparse.ArgumentParser(prog="python -m runner.sim.dataset", description="Write training data.")
+    parser = argparse.ArgumentParser(
+        prog="python -m vram_arbiter.runner.sim.dataset", description="Write training data."
+    )
     kinds = parser.add_subparsers(dest="kind", required=True)
     grab = kinds.add_parser("grab", help="demonstrations of the scripted expert")
     grab.add_argument("--episodes", type=int, default=200)
@@ -308,11 +328,15 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     began = time.monotonic()
     counts = (
-        write_grab(args.out, args.episodes, args.seed, LoadedPolicy(args.policy) if args.policy else None)
+        write_grab(
+            args.out, args.episodes, args.seed, LoadedPolicy(args.policy) if args.policy else None
+        )
         if args.kind == "grab"
         else write_scenes(args.out, args.count, args.seed)
     )
-    print(json.dumps({"out": str(args.out), **counts, "seconds": round(time.monotonic() - began, 1)}))
+    print(
+        json.dumps({"out": str(args.out), **counts, "seconds": round(time.monotonic() - began, 1)})
+    )
     return 0
 
 

@@ -12,9 +12,16 @@ from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
-from runner.sim.config import ARM_JOINTS, BASE_JOINTS, CONTROL_DT_S, REST_POSE, SceneConfig, wrap_angle
-from runner.sim.layout import Layout, make_layout
-from runner.sim.scene import (
+from vram_arbiter.runner.sim.config import (
+    ARM_JOINTS,
+    BASE_JOINTS,
+    CONTROL_DT_S,
+    REST_POSE,
+    SceneConfig,
+    wrap_angle,
+)
+from vram_arbiter.runner.sim.layout import Layout, make_layout
+from vram_arbiter.runner.sim.scene import (
     ARM_PREFIX,
     FIXED_FINGER_GEOM,
     GRASP_SITE,
@@ -22,9 +29,11 @@ from runner.sim.scene import (
     build_model,
     load_mujoco,
 )
-from schemas.world import CameraModel
+from vram_arbiter.schemas.world import CameraModel
 
-HELD_LIFT_M = 0.03  # a thing is held when its centre is this far above where it would rest on the table
+HELD_LIFT_M = (
+    0.03  # a thing is held when its centre is this far above where it would rest on the table
+)
 MAX_BASE_SPEED_M_S = 0.5
 MAX_BASE_TURN_RAD_S = 1.2
 CENTRE_HEIGHT_M = 0.0165  # mean height of an object's centre above the table, over the vocabulary
@@ -95,7 +104,8 @@ class SimEnv:
         self._base_u = [int(self._model.actuator(n).id) for n in BASE_JOINTS]
         self._base_body = int(self._model.body("base_link").id)
         self._fingers = tuple(
-            int(self._model.geom(ARM_PREFIX + n).id) for n in (FIXED_FINGER_GEOM, MOVING_FINGER_GEOM)
+            int(self._model.geom(ARM_PREFIX + n).id)
+            for n in (FIXED_FINGER_GEOM, MOVING_FINGER_GEOM)
         )
         self._geom_of = {o.name: int(self._model.geom(o.name).id) for o in self._layout.objects}
         self.place(self._layout.base_start, REST_POSE)
@@ -127,7 +137,10 @@ class SimEnv:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
 
@@ -167,8 +180,12 @@ class SimEnv:
         dt = self.config.timestep_s
         for _ in range(self._substeps):
             yaw = float(self._data.ctrl[uyaw])
-            self._data.ctrl[ux] += dt * shrink * (twist[0] * math.cos(yaw) - twist[1] * math.sin(yaw))
-            self._data.ctrl[uy] += dt * shrink * (twist[0] * math.sin(yaw) + twist[1] * math.cos(yaw))
+            self._data.ctrl[ux] += (
+                dt * shrink * (twist[0] * math.cos(yaw) - twist[1] * math.sin(yaw))
+            )
+            self._data.ctrl[uy] += (
+                dt * shrink * (twist[0] * math.sin(yaw) + twist[1] * math.cos(yaw))
+            )
             self._data.ctrl[uyaw] += dt * turn
             mujoco.mj_step(self._model, self._data)
         mujoco.mj_forward(self._model, self._data)
@@ -203,7 +220,8 @@ class SimEnv:
     def joint_limits(self) -> dict[str, tuple[float, float]]:
         """Lowest and highest joint target in rad, by name."""
         return {
-            n: (float(low), float(high)) for n, (low, high) in zip(ARM_JOINTS, self._arm_range, strict=True)
+            n: (float(low), float(high))
+            for n, (low, high) in zip(ARM_JOINTS, self._arm_range, strict=True)
         }
 
     def base_pose(self) -> tuple[float, float, float]:

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from runner.protocols import SafetyGate, Stepped
-from schemas.world import Action, CameraModel, SensorFrame, WorldState
+from vram_arbiter.runner.protocols import SafetyGate, Stepped
+from vram_arbiter.schemas.world import Action, CameraModel, SensorFrame, WorldState
 
 
 @dataclass(frozen=True, slots=True)

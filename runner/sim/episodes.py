@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from schemas.world import TickResult
+from vram_arbiter.schemas.world import TickResult
 
 EPISODES_KEPT = 10_000  # a live run may have any number; older ones are counted, no longer listed
 

@@ -1,4 +1,4 @@
-"""Closed-loop success rate of a grab policy: `python -m runner.sim.evaluate --policy DIR --episodes 40`.
+"""Closed-loop success rate of a grab policy: `python -m vram_arbiter.runner.sim.evaluate --policy DIR --episodes 40`.
 
 Loads the checkpoint through lerobot's own factory, as the sidecar does, puts the base where navigation would leave it, and
 lets the policy act. The verdict is the simulator's ground truth. Must not know leases, goals or sockets.
@@ -15,10 +15,10 @@ import sys
 import time
 from pathlib import Path
 
-from runner.sim.dataset import NAVIGATION_ERROR_M, stand_before
-from runner.sim.env import SimEnv
-from runner.sim.expert import RestController
-from runner.sim.learned import OWN_POLICIES, LoadedPolicy
+from vram_arbiter.runner.sim.dataset import NAVIGATION_ERROR_M, stand_before
+from vram_arbiter.runner.sim.env import SimEnv
+from vram_arbiter.runner.sim.expert import RestController
+from vram_arbiter.runner.sim.learned import OWN_POLICIES, LoadedPolicy
 
 MAX_STEPS = 120
 
@@ -57,15 +57,21 @@ def attempt(env: SimEnv, policy: LoadedPolicy, seed: int, *, tries: int, error_m
             x, _, _ = env.ground_truth().objects[env.target].position_map
             if not 0 <= x - env.config.table_edge_x_m <= env.config.table_depth_m:
                 break  # pushed off the table: no retry will find it
-            stand_before(env, env.target, random.Random(f"evaluation-{seed}-{number}"), error_m=error_m)
+            stand_before(
+                env, env.target, random.Random(f"evaluation-{seed}-{number}"), error_m=error_m
+            )
     return Attempt(seed, env.target, False, tries, env.steps - began, env.held_object())
 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of the evaluation."""
-    parser = argparse.ArgumentParser(prog="python -m runner.sim.evaluate", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m vram_arbiter.runner.sim.evaluate", description=__doc__
+    )
     parser.add_argument("--policy", type=Path, required=True)
-    parser.add_argument("--plugin", default=OWN_POLICIES, help="module that registers the policy type")
+    parser.add_argument(
+        "--plugin", default=OWN_POLICIES, help="module that registers the policy type"
+    )
     parser.add_argument("--episodes", type=int, default=40)
     parser.add_argument("--seed", type=int, default=900_000, help="first scene seed")
     parser.add_argument("--tries", type=int, default=1)

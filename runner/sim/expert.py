@@ -8,10 +8,10 @@ from __future__ import annotations
 import enum
 import math
 
-from runner.sim.config import ARM_JOINTS, CONTROL_DT_S, REST_POSE
-from runner.sim.env import SimEnv
-from runner.sim.kinematics import ArmKinematics
-from runner.skills.motion import bounded
+from vram_arbiter.runner.sim.config import ARM_JOINTS, CONTROL_DT_S, REST_POSE
+from vram_arbiter.runner.sim.env import SimEnv
+from vram_arbiter.runner.sim.kinematics import ArmKinematics
+from vram_arbiter.runner.skills.motion import bounded
 
 OPEN_RAD = 0.80
 CLOSED_RAD = -0.10
@@ -108,7 +108,9 @@ class GrabExpert:
         """Enter the next phase when the present one has done its work, or the first again when it went wrong."""
         grip = self._env.joint_state()["gripper"]
         match self.phase:
-            case Phase.APPROACH if aside < 0.007 and gz - oz < HOVER_M + 0.02 and grip > 0.9 * OPEN_RAD:
+            case Phase.APPROACH if (
+                aside < 0.007 and gz - oz < HOVER_M + 0.02 and grip > 0.9 * OPEN_RAD
+            ):
                 self._enter(Phase.DESCEND)
             case Phase.DESCEND if gz - low < 0.004 and aside < 0.008:
                 self._enter(Phase.CLOSE)
@@ -117,9 +119,13 @@ class GrabExpert:
             case Phase.CLOSE:
                 least, most = CLOSE_STEPS
                 still = abs(self._env.joint_velocity()["gripper"]) < STILL_RAD_S
-                if grip < GRIPPING_RAD and (self._in_phase > most or (self._in_phase > least and still)):
+                if grip < GRIPPING_RAD and (
+                    self._in_phase > most or (self._in_phase > least and still)
+                ):
                     self._enter(Phase.LIFT)
-            case Phase.LIFT | Phase.DONE if self._retry and not NARROWEST_HOLD_RAD < grip < GRIPPING_RAD:
+            case Phase.LIFT | Phase.DONE if (
+                self._retry and not NARROWEST_HOLD_RAD < grip < GRIPPING_RAD
+            ):
                 self._enter(Phase.APPROACH)
             case _:
                 pass
@@ -134,7 +140,9 @@ class GrabExpert:
             abs(a - b) < CARRY_REACHED_RAD for a, b in zip(here, CARRY_POSE, strict=True)
         ):
             self._enter(Phase.DONE)
-        arm = [a + min(max(b - a, -LEAD_RAD), LEAD_RAD) for a, b in zip(here, CARRY_POSE, strict=True)]
+        arm = [
+            a + min(max(b - a, -LEAD_RAD), LEAD_RAD) for a, b in zip(here, CARRY_POSE, strict=True)
+        ]
         return [*arm, CLOSED_RAD]
 
     def _towards(self, goal: tuple[float, float, float], grip: float) -> list[float]:
@@ -157,7 +165,8 @@ class RestController:
     def act(self) -> list[float]:
         """The next joint target; the same pose again once at rest."""
         self._target = [
-            bounded(here, there, self._stride) for here, there in zip(self._target, REST_POSE, strict=True)
+            bounded(here, there, self._stride)
+            for here, there in zip(self._target, REST_POSE, strict=True)
         ]
         return list(self._target)
 
@@ -167,7 +176,9 @@ class RestController:
         return all(abs(a - b) < 1e-6 for a, b in zip(self._target, REST_POSE, strict=True))
 
 
-def run_expert(env: SimEnv, expert: GrabExpert, *, max_steps: int = 150, settle_steps: int = 6) -> bool:
+def run_expert(
+    env: SimEnv, expert: GrabExpert, *, max_steps: int = 150, settle_steps: int = 6
+) -> bool:
     """Let the expert finish; whether anything is held at the end."""
     for _ in range(max_steps):
         env.step(expert.act())

@@ -11,10 +11,10 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from schemas.control import JOINT_MODES, ControlMode
-from schemas.errors import ConfigError
-from schemas.manifest.vocabulary import EmbodimentTag
-from schemas.yamltext import read_yaml, validated
+from vram_arbiter.schemas.control import JOINT_MODES, ControlMode
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.manifest.vocabulary import EmbodimentTag
+from vram_arbiter.schemas.yamltext import read_yaml, validated
 
 RENDER: Final = "render"  # the camera that is the environment's own `render()`
 SUCCESS_KEYS: Final = ("is_success", "success")  # of `info`, where nothing else is said
@@ -47,7 +47,9 @@ class GymConfig(BaseModel):
     cameras: dict[str, str] = {}
     control_mode: ControlMode = ControlMode.JOINT_POSITION
     actions: tuple[str, ...] = ()
-    embodiment_tags: tuple[EmbodimentTag, ...] = ()  # which robot it is; skills for others are refused then
+    embodiment_tags: tuple[
+        EmbodimentTag, ...
+    ] = ()  # which robot it is; skills for others are refused then
     hold: Held | None = None
     success: str = ""
 

@@ -21,13 +21,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from runner.protocols import Stepped
-from runner.sim.environment import EnvStep
-from runner.sim.gym_config import RENDER, SUCCESS_KEYS, GymConfig
-from runner.sim.gym_spaces import ActionRow, Leaf, NoNumbers, leaves
-from schemas.control import ControlMode
-from schemas.errors import ConfigError, EnvironmentFailed, ModelError
-from schemas.world import PAYLOAD_OF_MODE, Action, JointState, SensorFrame, WorldState
+from vram_arbiter.runner.protocols import Stepped
+from vram_arbiter.runner.sim.environment import EnvStep
+from vram_arbiter.runner.sim.gym_config import RENDER, SUCCESS_KEYS, GymConfig
+from vram_arbiter.runner.sim.gym_spaces import ActionRow, Leaf, NoNumbers, leaves
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import ConfigError, EnvironmentFailed, ModelError
+from vram_arbiter.schemas.world import PAYLOAD_OF_MODE, Action, JointState, SensorFrame, WorldState
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +90,9 @@ class GymEnv:
     Raises ConfigError for an id, a file or spaces that do not fit.
     """
 
-    def __init__(self, env_id: str, config: GymConfig | None = None, *, render: bool | None = None) -> None:
+    def __init__(
+        self, env_id: str, config: GymConfig | None = None, *, render: bool | None = None
+    ) -> None:
         self.env_id = env_id
         self.config = config or GymConfig()
         self._render_wanted = render
@@ -101,7 +103,9 @@ class GymEnv:
         self._observation: Any = None
         self._sent: dict[str, float] = {}
         kind, _, least = self.config.success.partition(":")
-        self._unearned = kind == "return" and float(least) <= 0  # whoever does nothing has that return
+        self._unearned = (
+            kind == "return" and float(least) <= 0
+        )  # whoever does nothing has that return
         try:
             self._check_spaces()
             self._row = self._action_row()
@@ -159,7 +163,9 @@ class GymEnv:
 
     def _parts_observed(self) -> dict[str, Leaf]:
         parts = list(leaves(self._env.observation_space))
-        if twice := [path for path, count in Counter(part.path for part in parts).items() if count > 1]:
+        if twice := [
+            path for path, count in Counter(part.path for part in parts).items() if count > 1
+        ]:
             raise ConfigError(f"two parts of {self.env_id}'s observation are called {twice[0]}")
         return {part.path: part for part in parts}
 
@@ -191,10 +197,14 @@ class GymEnv:
             "`state` is the path of the vector that holds the joints, or of parts that do",
         )
         parts = tuple(
-            p for path, p in self._observed.items() if not at or path == at or path.startswith(f"{at}.")
+            p
+            for path, p in self._observed.items()
+            if not at or path == at or path.startswith(f"{at}.")
         )
         if not parts:
-            raise ConfigError(f"{self.env_id} has no numbers at {at!r}: there is no such part", hint=hint)
+            raise ConfigError(
+                f"{self.env_id} has no numbers at {at!r}: there is no such part", hint=hint
+            )
         for part in parts:
             if part.picture and part.path != at:
                 raise ConfigError(
@@ -203,7 +213,9 @@ class GymEnv:
         try:
             size = sum(part.size for part in parts)
         except NoNumbers as error:
-            raise ConfigError(f"{self.env_id} has no numbers at {at!r}: {error}", hint=hint) from error
+            raise ConfigError(
+                f"{self.env_id} has no numbers at {at!r}: {error}", hint=hint
+            ) from error
         for name, index in (*self.config.joints.items(), *self.config.velocities.items()):
             if index >= size:
                 raise ConfigError(f"joint {name} has index {index} in the {size} numbers at {at!r}")
@@ -252,7 +264,9 @@ class GymEnv:
                 continue
             try:
                 picture = view.of(self._observation)
-                as_promised = picture.dtype == view.space.dtype and picture.shape == view.space.shape
+                as_promised = (
+                    picture.dtype == view.space.dtype and picture.shape == view.space.shape
+                )
             except (NoNumbers, AttributeError):
                 as_promised = False
             if not as_promised:
@@ -279,9 +293,14 @@ class GymEnv:
         joints, parts = self.config.joints, self._state or self._shown
         if not self._said_what_is_shown:
             self._said_what_is_shown = True
-            kept = {*(part.path for part in parts), *(view.path for view in self._views.values() if view)}
+            kept = {
+                *(part.path for part in parts),
+                *(view.path for view in self._views.values() if view),
+            }
             if left := [part for path, part in self._observed.items() if path not in kept]:
-                text = ", ".join(f"{part.path or 'itself'} ({type(part.space).__name__})" for part in left)
+                text = ", ".join(
+                    f"{part.path or 'itself'} ({type(part.space).__name__})" for part in left
+                )
                 log.warning("%s: not recorded of its observation: %s", self.env_id, text)
         try:
             numbers = [number for part in parts for number in part.numbers(self._observation)]
@@ -291,7 +310,11 @@ class GymEnv:
             ) from error
         if joints:
             return {name: numbers[index] for name, index in joints.items()}
-        return dict(zip((name for part in parts for name in part.names("observation")), numbers, strict=True))
+        return dict(
+            zip(
+                (name for part in parts for name in part.names("observation")), numbers, strict=True
+            )
+        )
 
     @property
     def acted(self) -> dict[str, float]:
@@ -319,7 +342,9 @@ class GymEnv:
         self._sent = dict(zip(self._gate.names, row, strict=True))
         self._steps += 1
         self._total_reward += reward
-        self._last = EnvStep(reward, terminated, truncated, self._success(info), unearned=self._unearned)
+        self._last = EnvStep(
+            reward, terminated, truncated, self._success(info), unearned=self._unearned
+        )
         return self._last
 
     def gate(self, skill: Stepped) -> SpaceGate:
@@ -336,7 +361,9 @@ class GymEnv:
         try:
             row = tuple(self._row.row_of(raw))
         except NoNumbers as error:
-            raise ModelError(f"{reprlib.repr(raw)} is no action of {self.env_id}: {error}") from error
+            raise ModelError(
+                f"{reprlib.repr(raw)} is no action of {self.env_id}: {error}"
+            ) from error
         payload = row if mode is ControlMode.COMPOSITE_MODE else (row,)
         return Action.model_validate({"control_mode": mode, PAYLOAD_OF_MODE[mode]: payload})
 
@@ -377,7 +404,11 @@ class GymEnv:
             picture = self._env.render()
         except Exception as error:
             raise self._failed("render", error) from error
-        if not isinstance(picture, np.ndarray) or picture.shape[2:] != (3,) or picture.dtype != np.uint8:
+        if (
+            not isinstance(picture, np.ndarray)
+            or picture.shape[2:] != (3,)
+            or picture.dtype != np.uint8
+        ):
             raise EnvironmentFailed(
                 f"{self.env_id} renders no picture (uint8, height × width × 3)",
                 hint="it needs the render mode rgb_array; leave videos out, or name a camera of its observation",
@@ -439,7 +470,9 @@ def _make(env_id: str, config: GymConfig, *, pictures: bool) -> Any:
         import gymnasium
         from gymnasium.envs.registration import load_env_creator
     except ImportError as error:
-        raise ConfigError("gymnasium is not installed", hint="pip install 'vram-arbiter[runner]'") from error
+        raise ConfigError(
+            "gymnasium is not installed", hint="pip install 'vram-arbiter[runner]'"
+        ) from error
     kwargs = dict(config.kwargs)
     try:
         if ":" in env_id:  # MODULE:ID registers by importing

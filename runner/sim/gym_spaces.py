@@ -14,7 +14,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-CHOICES_MAX: Final = 2**40  # beyond it the parts of [-1, 1] are hardly more than a float's own steps
+CHOICES_MAX: Final = (
+    2**40
+)  # beyond it the parts of [-1, 1] are hardly more than a float's own steps
 BIT_FROM: Final = 0.5
 
 Keys = tuple[Any, ...]
@@ -58,7 +60,9 @@ class Leaf:
         from gymnasium import spaces
 
         space = self.space
-        return isinstance(space, spaces.Box) and space.dtype.name == "uint8" and len(space.shape) > 1
+        return (
+            isinstance(space, spaces.Box) and space.dtype.name == "uint8" and len(space.shape) > 1
+        )
 
     def names(self, otherwise: str) -> list[str]:
         """Of its numbers; `otherwise` stands for the path of a space that has no parts."""
@@ -84,7 +88,9 @@ class Leaf:
         except (TypeError, ValueError) as error:
             raise NoNumbers(f"{self.path or 'it'} is not made of numbers: {error}") from error
         if len(values) != self.size:
-            raise NoNumbers(f"{self.path or 'it'} has {len(values)} numbers, {self.size} were promised")
+            raise NoNumbers(
+                f"{self.path or 'it'} has {len(values)} numbers, {self.size} were promised"
+            )
         return [float(value) for value in values]
 
 
@@ -168,13 +174,18 @@ def _limits(leaf: Leaf) -> list[tuple[float, float]]:
         case spaces.Discrete():
             far = [abs(int(space.start)) + int(space.n)]
         case spaces.MultiDiscrete():
-            far = [abs(int(at)) + int(n) for at, n in zip(space.start.flat, space.nvec.flat, strict=True)]
+            far = [
+                abs(int(at)) + int(n)
+                for at, n in zip(space.start.flat, space.nvec.flat, strict=True)
+            ]
         case spaces.MultiBinary():
             return [(0.0, 1.0)] * size
         case spaces.Box():
             return [(float(low), float(high)) for low, high in _bounds(space)]
     if max(far, default=0) > CHOICES_MAX:
-        raise NoNumbers(f"{leaf.path or 'it'} is {space}: such choices cannot be told apart as floats")
+        raise NoNumbers(
+            f"{leaf.path or 'it'} is {space}: such choices cannot be told apart as floats"
+        )
     return [(-1.0, 1.0)] * size
 
 
@@ -184,7 +195,9 @@ def _check_keys(space: Any, element: Any, where: str) -> None:
 
     if isinstance(space, spaces.Dict):
         if not isinstance(element, Mapping) or set(element) != set(space.spaces):
-            raise NoNumbers(f"{where} must have exactly the keys {', '.join(map(str, space.spaces))}")
+            raise NoNumbers(
+                f"{where} must have exactly the keys {', '.join(map(str, space.spaces))}"
+            )
         for key, part in space.spaces.items():
             _check_keys(part, element[key], str(key))
     elif isinstance(space, spaces.Tuple):
@@ -214,7 +227,9 @@ def _row_of(leaf: Leaf, element: Any) -> list[float]:
 def _middle(leaf: Leaf, value: float, start: int, n: int) -> float:
     """The middle of a choice's share of [-1, 1]."""
     if not value.is_integer() or not start <= int(value) < start + n:
-        raise NoNumbers(f"{value:g} is no choice of {leaf.path or leaf.space}: {start} to {start + n - 1}")
+        raise NoNumbers(
+            f"{value:g} is no choice of {leaf.path or leaf.space}: {start} to {start + n - 1}"
+        )
     return -1 + (2 * (int(value) - start) + 1) / n
 
 

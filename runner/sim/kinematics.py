@@ -10,8 +10,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from runner.sim.config import ARM_JOINTS, SceneConfig
-from runner.sim.scene import GRASP_SITE, arm_spec, load_mujoco
+from vram_arbiter.runner.sim.config import ARM_JOINTS, SceneConfig
+from vram_arbiter.runner.sim.scene import GRASP_SITE, arm_spec, load_mujoco
 
 DAMPING = 0.02
 TILT_WEIGHT_M = 0.05  # one radian of tilt is traded against this much position error

@@ -9,7 +9,7 @@ import dataclasses
 import math
 import random
 
-from runner.sim.config import COLOURS, SHAPES, ObjectSpec, SceneConfig
+from vram_arbiter.runner.sim.config import COLOURS, SHAPES, ObjectSpec, SceneConfig
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -55,7 +55,8 @@ def make_layout(seed: int, config: SceneConfig, *, names: tuple[str, ...] | None
         raise ValueError("object names must differ: a name is how the robot tells them apart")
     spots = _spots(rng, len(pairs), config)
     objects = tuple(
-        _make_object(rng, colour, shape, spot) for (colour, shape), spot in zip(pairs, spots, strict=True)
+        _make_object(rng, colour, shape, spot)
+        for (colour, shape), spot in zip(pairs, spots, strict=True)
     )
     start = (
         rng.uniform(*config.start_x_m),
@@ -65,7 +66,11 @@ def make_layout(seed: int, config: SceneConfig, *, names: tuple[str, ...] | None
     shade = rng.uniform(0.9, 1.08)
     table = rng.choice(TABLES)
     look = Look(
-        table_rgb=(min(1.0, table[0] * shade), min(1.0, table[1] * shade), min(1.0, table[2] * shade)),
+        table_rgb=(
+            min(1.0, table[0] * shade),
+            min(1.0, table[1] * shade),
+            min(1.0, table[2] * shade),
+        ),
         floor_rgb=rng.choice(FLOORS),
         ambient=rng.uniform(0.32, 0.46),
         diffuse=rng.uniform(0.42, 0.62),
@@ -101,7 +106,10 @@ def _spots(rng: random.Random, count: int, config: SceneConfig) -> list[tuple[fl
     for _ in range(PLACING_TRIES):
         spots: list[tuple[float, float]] = []
         for _ in range(PLACING_TRIES):
-            spot = (rng.uniform(near, far), rng.uniform(-config.zone_half_width_m, config.zone_half_width_m))
+            spot = (
+                rng.uniform(near, far),
+                rng.uniform(-config.zone_half_width_m, config.zone_half_width_m),
+            )
             if all(math.dist(spot, other) >= config.object_spacing_m for other in spots):
                 spots.append(spot)
             if len(spots) == count:
@@ -109,8 +117,12 @@ def _spots(rng: random.Random, count: int, config: SceneConfig) -> list[tuple[fl
     raise ValueError(f"{count} objects {config.object_spacing_m} m apart do not fit on the zone")
 
 
-def _make_object(rng: random.Random, colour: str, shape: str, spot: tuple[float, float]) -> ObjectSpec:
+def _make_object(
+    rng: random.Random, colour: str, shape: str, spot: tuple[float, float]
+) -> ObjectSpec:
     size = {"cube": (0.027, 0.031), "ball": (0.032, 0.035), "cylinder": (0.027, 0.031)}[shape]
     width = rng.uniform(*size)
     height = rng.uniform(0.036, 0.042) if shape == "cylinder" else width
-    return ObjectSpec(colour, shape, width, height, spot[0], spot[1], rng.uniform(-math.pi, math.pi))
+    return ObjectSpec(
+        colour, shape, width, height, spot[0], spot[1], rng.uniform(-math.pi, math.pi)
+    )

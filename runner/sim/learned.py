@@ -11,17 +11,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from runner.sim.env import SimEnv
+from vram_arbiter.runner.sim.env import SimEnv
 
-OWN_POLICIES = (
-    "sidecars.compact_act"  # registers the demo's policy type; loaded by name, as any lerobot plug-in
-)
+OWN_POLICIES = "vram_arbiter.sidecars.models.compact_act"  # registers the demo's policy type; loaded by name, as any lerobot plug-in
 
 
 class LoadedPolicy:
     """A checkpoint with its processors; predicts joint targets from the env's cameras and joints."""
 
-    def __init__(self, folder: Path, plugin: str | None = OWN_POLICIES, execute: int | None = None) -> None:
+    def __init__(
+        self, folder: Path, plugin: str | None = OWN_POLICIES, execute: int | None = None
+    ) -> None:
         from lerobot.configs import PreTrainedConfig
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
@@ -29,7 +29,9 @@ class LoadedPolicy:
             importlib.import_module(plugin)
         config = PreTrainedConfig.from_pretrained(folder)
         config.device = "cpu"
-        self._policy = get_policy_class(config.type).from_pretrained(folder, config=config, strict=True)
+        self._policy = get_policy_class(config.type).from_pretrained(
+            folder, config=config, strict=True
+        )
         self._before, self._after = make_pre_post_processors(config, pretrained_path=str(folder))
         self._cameras = [key.rsplit(".", 1)[1] for key in config.image_features]
         self.execute = execute or config.n_action_steps
@@ -43,7 +45,9 @@ class LoadedPolicy:
         import torch
 
         observation: dict[str, Any] = {
-            f"observation.images.{camera}": torch.from_numpy(env.render(camera)).permute(2, 0, 1).float()
+            f"observation.images.{camera}": torch.from_numpy(env.render(camera))
+            .permute(2, 0, 1)
+            .float()
             / 255
             for camera in self._cameras
         }

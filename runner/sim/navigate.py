@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from runner.sim.config import SceneConfig, wrap_angle
+from vram_arbiter.runner.sim.config import SceneConfig, wrap_angle
 
 EDGE_CLEARANCE_M = 0.025
 REACHED_M = 0.006
@@ -63,7 +63,11 @@ class PlanarController:
     ) -> None:
         self.goal = goal
         self._config, self._gain, self._dt = config, gain_per_s, control_dt_s
-        self._max_speed, self._max_turn, self._max_accel = max_speed_m_s, max_turn_rad_s, max_accel_m_s2
+        self._max_speed, self._max_turn, self._max_accel = (
+            max_speed_m_s,
+            max_turn_rad_s,
+            max_accel_m_s2,
+        )
         self._speed = 0.0
 
     def distance_m(self, pose: Pose2D) -> float:

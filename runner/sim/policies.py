@@ -15,10 +15,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from runner.protocols import Act, Done, SkillKey, StepOutcome
-from runner.sim.environment import Environment
-from schemas.errors import ConfigError, ModelError, VramError
-from schemas.world import Action, WorldState
+from vram_arbiter.runner.protocols import Act, Done, SkillKey, StepOutcome
+from vram_arbiter.runner.sim.environment import Environment
+from vram_arbiter.schemas.errors import ConfigError, ModelError, VramError
+from vram_arbiter.schemas.world import Action, WorldState
 
 RANDOM: Final = "random"
 SCRIPTED: Final = "scripted:"
@@ -78,7 +78,9 @@ def policy_of(name: str) -> Policy:
         return Policy(name, lambda env, seed: lambda world: env.sample())
     where = name.removeprefix(SCRIPTED)
     if not name.startswith(SCRIPTED) or not where:
-        raise ConfigError(f"there is no policy {name!r}", hint="random, scripted:MODULE or scripted:FILE.py")
+        raise ConfigError(
+            f"there is no policy {name!r}", hint="random, scripted:MODULE or scripted:FILE.py"
+        )
     make = getattr(_load(where), "make", None)
     if not callable(make):
         raise ConfigError(f"{where} has no function `make(env, seed)`")

@@ -1,4 +1,4 @@
-"""Writes what the progress model is trained on: `python -m runner.sim.progress --out DIR --episodes 240`.
+"""Writes what the progress model is trained on: `python -m vram_arbiter.runner.sim.progress --out DIR --episodes 240`.
 
 Grabs of the scripted expert, two in five made to miss, as small wrist pictures, and for every object on the table how far a grab of *that* object
 is: the same picture is progress for one instruction and none for another. Everything is told by the simulator's truth, nothing by time:
@@ -17,11 +17,11 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-from runner.sim.config import REST_POSE
-from runner.sim.dataset import stand_before
-from runner.sim.env import GroundTruth, SimEnv
-from runner.sim.expert import CLOSED_RAD, GrabExpert
-from runner.sim.kinematics import ArmKinematics
+from vram_arbiter.runner.sim.config import REST_POSE
+from vram_arbiter.runner.sim.dataset import stand_before
+from vram_arbiter.runner.sim.env import GroundTruth, SimEnv
+from vram_arbiter.runner.sim.expert import CLOSED_RAD, GrabExpert
+from vram_arbiter.runner.sim.kinematics import ArmKinematics
 
 FORMAT: Final = "grab-progress/1"
 CAMERA: Final = "wrist"
@@ -110,7 +110,8 @@ def write(out: Path, episodes: int, seed: int) -> dict[str, int]:
         "camera": CAMERA,
         "seed": seed,
         "episodes": [
-            {"length": len(grab.images), "progress": grab.progress, "held": grab.held} for grab in grabs
+            {"length": len(grab.images), "progress": grab.progress, "held": grab.held}
+            for grab in grabs
         ],
     }
     (out / "info.json").write_text(json.dumps(info) + "\n", encoding="utf-8")
@@ -120,14 +121,18 @@ def write(out: Path, episodes: int, seed: int) -> dict[str, int]:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of the writer."""
-    parser = argparse.ArgumentParser(prog="python -m runner.sim.progress", description="Write training data.")
+    parser = argparse.ArgumentParser(
+        prog="python -m vram_arbiter.runner.sim.progress", description="Write training data."
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--episodes", type=int, default=240)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args(argv)
     began = time.monotonic()
     counts = write(args.out, args.episodes, args.seed)
-    print(json.dumps({"out": str(args.out), **counts, "seconds": round(time.monotonic() - began, 1)}))
+    print(
+        json.dumps({"out": str(args.out), **counts, "seconds": round(time.monotonic() - began, 1)})
+    )
     return 0
 
 

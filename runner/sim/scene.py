@@ -13,11 +13,11 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from runner.sim.config import COLOURS, SceneConfig
-from runner.sim.layout import Layout
+from vram_arbiter.runner.sim.config import COLOURS, SceneConfig
+from vram_arbiter.runner.sim.layout import Layout
 
 if TYPE_CHECKING:
-    from runner.sim.config import CameraSpec, ObjectSpec
+    from vram_arbiter.runner.sim.config import CameraSpec, ObjectSpec
 
 ARM_PREFIX = "arm/"
 GRASP_SITE = "grasp"
@@ -73,7 +73,9 @@ def build_model(layout: Layout, config: SceneConfig) -> Any:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
-    framebuffer = getattr(spec.visual, "global")  # `global` is a keyword: attribute access by name only
+    framebuffer = getattr(
+        spec.visual, "global"
+    )  # `global` is a keyword: attribute access by name only
     framebuffer.offwidth = max(c.width_px for c in config.cameras.values())
     framebuffer.offheight = max(c.height_px for c in config.cameras.values())
     spec.visual.quality.shadowsize = 1024
@@ -111,7 +113,12 @@ def _add_world(spec: Any, layout: Layout, config: SceneConfig, mujoco: Any) -> N
         castshadow=True,
     )
     world.add_geom(
-        name="floor", type=plane, size=[4, 4, 0.1], rgba=[*layout.look.floor_rgb, 1], contype=1, conaffinity=1
+        name="floor",
+        type=plane,
+        size=[4, 4, 0.1],
+        rgba=[*layout.look.floor_rgb, 1],
+        contype=1,
+        conaffinity=1,
     )
     half = [config.table_depth_m / 2, config.table_width_m / 2, 0.012]
     centre = config.table_edge_x_m + half[0]
@@ -151,7 +158,9 @@ def _add_base(spec: Any, config: SceneConfig, mujoco: Any) -> Any:
     base.explicitinertial = True
     half_x, half_y = config.base_half_size_m
     top = config.mount_in_base_m[2]
-    offset = config.mount_in_base_m[0] + 0.05 - half_x  # the front face is 5 cm before the arm's axis
+    offset = (
+        config.mount_in_base_m[0] + 0.05 - half_x
+    )  # the front face is 5 cm before the arm's axis
     base.add_geom(
         name="base_body",
         type=box,
@@ -205,7 +214,9 @@ def arm_spec(mujoco: Any) -> Any:
         body.gravcomp = 1.0  # the servos hold the arm's own weight; what is grasped still pulls
     box, capsule = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE
 
-    def dress(body: str, kind: Any, rgba: tuple[float, ...], solid: bool = False, **where: Any) -> None:
+    def dress(
+        body: str, kind: Any, rgba: tuple[float, ...], solid: bool = False, **where: Any
+    ) -> None:
         bits = _ROBOT_BITS if solid else _SEEN_ONLY
         arm.body(body).add_geom(type=kind, rgba=list(rgba), mass=0, group=1, **bits, **where)
 
@@ -298,7 +309,9 @@ def _add_camera(parent: Any, name: str, camera: CameraSpec) -> None:
     right = np.cross(np.asarray(camera.up, dtype=float), back)
     right /= np.linalg.norm(right)
     up = np.cross(back, right)
-    parent.add_camera(name=name, pos=eye.tolist(), fovy=camera.fovy_deg, quat=_quat(right, up, back))
+    parent.add_camera(
+        name=name, pos=eye.tolist(), fovy=camera.fovy_deg, quat=_quat(right, up, back)
+    )
 
 
 def _quat(right: Any, up: Any, back: Any) -> list[float]:

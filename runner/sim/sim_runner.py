@@ -15,17 +15,23 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from runner.clock import Clock
-from runner.frames import Snapshot
-from runner.loop import Applied, Decision
-from runner.protocols import DeadlinePolicy, Goal, SafetyGate, SkillEnded, Stepped, Transition
-from runner.recorder import Recorder
-from runner.sim.environment import Environment, EnvStep
-from runner.sim.episodes import Episode, EpisodeView
-from runner.skill_runner import SkillRunner
-from schemas import telemetry, tracing
-from schemas.control import ControlMode
-from schemas.errors import (
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.frames import Snapshot
+from vram_arbiter.runner.loop import Applied, Decision
+from vram_arbiter.runner.protocols import (
+    DeadlinePolicy,
+    Goal,
+    SafetyGate,
+    SkillEnded,
+    Stepped,
+    Transition,
+)
+from vram_arbiter.runner.recorder import Recorder
+from vram_arbiter.runner.sim.environment import Environment, EnvStep
+from vram_arbiter.runner.sim.episodes import Episode, EpisodeView
+from vram_arbiter.runner.skill_runner import SkillRunner
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import (
     EnvironmentFailed,
     GoalRejected,
     InternalError,
@@ -33,7 +39,9 @@ from schemas.errors import (
     ModelError,
     VramError,
 )
-from schemas.world import FrameEncoding, SensorFrame, TickResult
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame, TickResult
 
 log = logging.getLogger(__name__)
 
@@ -91,7 +99,9 @@ class SimRunner(SkillRunner):
         self._rendered_in: dict[
             str, int
         ] = {}  # the tick of the last picture that a request has cost, by camera
-        self._shown: Mapping[str, float] | None = None  # by a world that is no robot, before this tick's step
+        self._shown: Mapping[str, float] | None = (
+            None  # by a world that is no robot, before this tick's step
+        )
         self._view = EpisodeView()
 
     # -- life --------------------------------------------------------------------------------------------------------
@@ -142,7 +152,9 @@ class SimRunner(SkillRunner):
             goal = Goal(f"seed-{seed}", name, traceparent=tracing.traceparent())
 
         def ended(end: SkillEnded) -> None:
-            span.set_attribute(telemetry.ATTR_OUTCOME, "ok" if end.error is None else end.error.code)
+            span.set_attribute(
+                telemetry.ATTR_OUTCOME, "ok" if end.error is None else end.error.code
+            )
             span.end()
             self._policy_ended(end)
 
@@ -193,7 +205,9 @@ class SimRunner(SkillRunner):
         result = super().tick()
         self._view.add(result)
         if self.period_s is None and result.step_idx is None and result.terminated is False:
-            self.clock.sleep_s(IDLE_S)  # a world that stands still is not looked at as fast as possible
+            self.clock.sleep_s(
+                IDLE_S
+            )  # a world that stands still is not looked at as fast as possible
         return result
 
     def _success(self) -> bool | None:
@@ -214,9 +228,13 @@ class SimRunner(SkillRunner):
         frames: dict[str, SensorFrame] | None = None
         try:
             if active is not None and (self._follows or active.skill.wants_frames()):  # 3
-                cameras = dict.fromkeys((*active.skill.cameras, *(self._cameras if self._follows else ())))
+                cameras = dict.fromkeys(
+                    (*active.skill.cameras, *(self._cameras if self._follows else ()))
+                )
                 with tracing.span(telemetry.SPAN_SENSORS):
-                    frames = {camera: self._sensor_frame(self._render(camera)) for camera in cameras}
+                    frames = {
+                        camera: self._sensor_frame(self._render(camera)) for camera in cameras
+                    }
                     self._shown = self.env.shown() if self._follows else None
         except EnvironmentFailed as error:
             self._broken_off(error)
@@ -228,12 +246,15 @@ class SimRunner(SkillRunner):
         except ValidationError as error:  # a state that is not finite: nobody may act on it
             self.world = None
             self._end(
-                SkillEnded({}, InternalError(f"the robot's state is invalid: {error.errors()[0]['msg']}"))
+                SkillEnded(
+                    {}, InternalError(f"the robot's state is invalid: {error.errors()[0]['msg']}")
+                )
             )
             return Decision(safety_violations=("the robot's state is invalid",))
         self.world = world
         decision = Decision(
-            sensors_ms=(sensed_s - started_s) * 1e3, world_state_ms=(self.clock.now_s() - sensed_s) * 1e3
+            sensors_ms=(sensed_s - started_s) * 1e3,
+            world_state_ms=(self.clock.now_s() - sensed_s) * 1e3,
         )
         if active is not None:
             self._ask_skill(active, world, decision)  # 5, 6
@@ -329,7 +350,12 @@ class SimRunner(SkillRunner):
         reward = self._view.total_reward
         if step.reward is not None:
             reward = (reward or 0.0) + step.reward
-        story = {"episode": self.episode_idx, "steps": steps, "total_reward": reward, "success": step.success}
+        story = {
+            "episode": self.episode_idx,
+            "steps": steps,
+            "total_reward": reward,
+            "success": step.success,
+        }
         error: VramError | None = None
         if step.success is None:
             error = ModelError(

@@ -12,14 +12,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from runner.sim.arm_env import ArmEnvironment
-from runner.sim.dataset import stand_before
-from runner.sim.env import SimEnv
-from runner.sim.expert import GrabExpert
-from runner.sim.kinematics import ArmKinematics
-from runner.sim.policies import Policy, Step
-from schemas.errors import ConfigError
-from schemas.manifest import RSkillManifest
+from vram_arbiter.runner.sim.arm_env import ArmEnvironment
+from vram_arbiter.runner.sim.dataset import stand_before
+from vram_arbiter.runner.sim.env import SimEnv
+from vram_arbiter.runner.sim.expert import GrabExpert
+from vram_arbiter.runner.sim.kinematics import ArmKinematics
+from vram_arbiter.runner.sim.policies import Policy, Step
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.manifest import RSkillManifest
 
 HELD_STEPS: Final = 8  # a thing that is held this long, above the table, does not slip out any more
 STANDS_M: Final = 0.03  # of the grasp spot: what the grab policy was trained to make up for

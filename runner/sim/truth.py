@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from runner.sim.env import SimEnv
+from vram_arbiter.runner.sim.env import SimEnv
 
 
 def truth_as_wire(env: SimEnv) -> dict[str, Any]:

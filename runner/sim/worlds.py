@@ -11,22 +11,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from runner.body import SIMULATED
-from runner.catalogue import Maker, sidecar_endpoint
-from runner.hal.so101 import so101
-from runner.hal.so101_kinematics import kinematics_for
-from runner.protocols import MobileBase, Skill
-from runner.sim.arm_env import ArmEnvironment
-from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
-from runner.sim.env import MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S, SimEnv
-from runner.sim.environment import Environment
-from runner.sim.gym_config import RENDER, GymConfig
-from runner.sim.gym_env import GymEnv
-from runner.skills.ros_standins import NAVIGATE, TRAJECTORY, StandIn, StandIns
-from schemas.body import Body
-from schemas.control import ControlMode
-from schemas.errors import ConfigError, ManifestInvalid
-from schemas.manifest import Kind, RSkillManifest
+from vram_arbiter.runner.body import SIMULATED
+from vram_arbiter.runner.catalogue import Maker, sidecar_endpoint
+from vram_arbiter.runner.hal.so101 import so101
+from vram_arbiter.runner.hal.so101_kinematics import kinematics_for
+from vram_arbiter.runner.protocols import MobileBase, Skill
+from vram_arbiter.runner.sim.arm_env import ArmEnvironment
+from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
+from vram_arbiter.runner.sim.env import MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S, SimEnv
+from vram_arbiter.runner.sim.environment import Environment
+from vram_arbiter.runner.sim.gym_config import RENDER, GymConfig
+from vram_arbiter.runner.sim.gym_env import GymEnv
+from vram_arbiter.runner.skills.ros_standins import NAVIGATE, TRAJECTORY, StandIn, StandIns
+from vram_arbiter.schemas.body import Body
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import ConfigError, ManifestInvalid
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 
 SO101: Final = "so101"
 GYM: Final = "gym:"
@@ -64,7 +64,9 @@ def so101_world(scene_file: Path | None) -> World:
         name=SO101,
         make=lambda: environment,
         cameras=cameras,
-        video_camera=next((name for name in (OVERVIEW, *scene.cameras) if name in scene.cameras), OVERVIEW),
+        video_camera=next(
+            (name for name in (OVERVIEW, *scene.cameras) if name in scene.cameras), OVERVIEW
+        ),
         video_every=3,  # ten pictures a second at 30 Hz
         joints=ARM_JOINTS,
         rest=dict(zip(ARM_JOINTS, REST_POSE, strict=True)),
@@ -103,7 +105,9 @@ def world_of(
     """The world of `--env` and the flags beside it. Raises ConfigError for flags that do not go together."""
     if env == SO101:
         if env_config is not None or success is not None:
-            raise ConfigError("--env-config and --success are for --env gym:ID; the scene file is --scene")
+            raise ConfigError(
+                "--env-config and --success are for --env gym:ID; the scene file is --scene"
+            )
         return so101_world(scene)
     if not env.startswith(GYM) or env == GYM:
         raise ConfigError(f"--env {env} is no world", hint="so101, or gym:ID, e.g. gym:CartPole-v1")
@@ -119,10 +123,10 @@ def makers_of(
     world: World, given: Mapping[str, str], arbiter: Any, *, period_s: float, wait_s: float
 ) -> dict[Kind, Maker]:
     """Who makes the installed skills that can act in this world."""
-    from clients.sidecar.policy import PolicyClient
-    from runner.skills.navigate import Navigate
-    from runner.skills.sidecar_policy import SidecarPolicy, wire_up
-    from runner.skills.trajectory import FollowJointTrajectory
+    from vram_arbiter.clients.sidecar.policy import PolicyClient
+    from vram_arbiter.runner.skills.navigate import Navigate
+    from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy, wire_up
+    from vram_arbiter.runner.skills.trajectory import FollowJointTrajectory
 
     def make_policy(manifest: RSkillManifest) -> Skill:
         if not world.joints:
@@ -134,7 +138,10 @@ def makers_of(
         client = PolicyClient(sidecar_endpoint(manifest.name, given, os.environ))
         speeds, sent = None, None
         if world.environment is not None and wiring.rollout.targets_lead:
-            speeds, sent = world.environment.limits_for(manifest).speeds_rad_s, world.environment.sent
+            speeds, sent = (
+                world.environment.limits_for(manifest).speeds_rad_s,
+                world.environment.sent,
+            )
         return SidecarPolicy(
             manifest,
             wiring,

@@ -9,10 +9,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from enum import StrEnum
 
-from runner.protocols import Goal, SkillKey, StepOutcome
-from schemas.errors import BadState
-from schemas.manifest import RSkillManifest
-from schemas.world import WorldState
+from vram_arbiter.runner.protocols import Goal, SkillKey, StepOutcome
+from vram_arbiter.schemas.errors import BadState
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.world import WorldState
 
 
 class SkillState(StrEnum):

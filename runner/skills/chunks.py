@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from schemas.errors import ModelError
+from vram_arbiter.schemas.errors import ModelError
 
 Row = tuple[float, ...]
 Rows = Sequence[Row]
@@ -87,7 +87,9 @@ class ChunkPlayer:
 
     def _collect(self, future: concurrent.futures.Future[Rows]) -> None:
         """Take the rows of an answered request. Raises what it failed with."""
-        self._late = self._late or (not self._rows and (future.cancelled() or future.exception() is not None))
+        self._late = self._late or (
+            not self._rows and (future.cancelled() or future.exception() is not None)
+        )
         try:
             rows = future.result()
         except (TimeoutError, concurrent.futures.CancelledError) as error:

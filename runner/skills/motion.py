@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from schemas.errors import ModelError
-from schemas.world import WorldState
+from vram_arbiter.schemas.errors import ModelError
+from vram_arbiter.schemas.world import WorldState
 
 SPEED_RAD_S = 1.6
 REACHED_RAD = 0.06  # servos under load stop a little short
@@ -50,7 +50,8 @@ class JointRamp:
     def next_target(self) -> dict[str, float]:
         """The next joint targets; the goal itself once they are there."""
         self._target = {
-            name: bounded(here, self._goal[name], self._stride) for name, here in self._target.items()
+            name: bounded(here, self._goal[name], self._stride)
+            for name, here in self._target.items()
         }
         return dict(self._target)
 
@@ -59,7 +60,9 @@ class JointRamp:
         if self._target != self._goal:
             return False
         self._settling += 1
-        arrived = all(abs(measured[name] - goal) <= REACHED_RAD for name, goal in self._goal.items())
+        arrived = all(
+            abs(measured[name] - goal) <= REACHED_RAD for name, goal in self._goal.items()
+        )
         return arrived or self._settling > SETTLE_STEPS_MAX
 
 

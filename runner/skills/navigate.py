@@ -12,18 +12,20 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from runner.protocols import Act, Done, Goal, Hold, StepOutcome
-from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
-from runner.sim.navigate import PlanarController, Pose2D, standoff_pose, to_map
-from runner.skills.base import SkillBase
-from runner.skills.motion import JointRamp, is_at, joint_positions
-from runner.skills.ros_goals import parse_goal
-from schemas.control import ControlMode
-from schemas.errors import BadRequest, GoalRejected, ModelError
-from schemas.manifest import RSkillManifest
-from schemas.world import Action, Finite, WorldState
+from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
+from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
+from vram_arbiter.runner.sim.navigate import PlanarController, Pose2D, standoff_pose, to_map
+from vram_arbiter.runner.skills.base import SkillBase
+from vram_arbiter.runner.skills.motion import JointRamp, is_at, joint_positions
+from vram_arbiter.runner.skills.ros_goals import parse_goal
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import BadRequest, GoalRejected, ModelError
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.world import Action, Finite, WorldState
 
-SETTLE_STEPS = 8  # standing still at the goal, so that the next picture is sharp and the pose is final
+SETTLE_STEPS = (
+    8  # standing still at the goal, so that the next picture is sharp and the pose is final
+)
 STUCK_STEPS = 120  # four seconds at 30 Hz without coming closer
 CLOSER_M, CLOSER_RAD = 0.002, 0.005  # what counts as closer
 FOLDED_JOINTS = ARM_JOINTS[:-1]  # the gripper may hold something
@@ -181,7 +183,9 @@ class Navigate(SkillBase):
     def _fold_arm(self, world: WorldState) -> Action | None:
         """The next step towards the folded pose, or None once the arm is there."""
         rest = {
-            name: value for name, value in zip(ARM_JOINTS, REST_POSE, strict=True) if name in FOLDED_JOINTS
+            name: value
+            for name, value in zip(ARM_JOINTS, REST_POSE, strict=True)
+            if name in FOLDED_JOINTS
         }
         measured = joint_positions(world, FOLDED_JOINTS)
         if self._fold is None:

@@ -10,14 +10,12 @@ import asyncio
 import logging
 from collections.abc import Callable
 
-from runner.protocols import Goal, Skill, SkillKey
-from schemas.errors import VramError
+from vram_arbiter.runner.protocols import Goal, Skill, SkillKey
+from vram_arbiter.schemas.errors import VramError
 
 log = logging.getLogger(__name__)
 
-EVICT_S = (
-    30.0  # a skill that needs longer to leave is left behind: whoever measures the card decides what is free
-)
+EVICT_S = 30.0  # a skill that needs longer to leave is left behind: whoever measures the card decides what is free
 CLOSE_S = 3.0  # the runner ends: its sidecar may be ending too
 
 
@@ -82,5 +80,7 @@ async def _release(skill: Skill, timeout_s: float) -> None:
             await skill.release()
     except (VramError, TimeoutError) as error:  # its process may be gone
         log.warning(
-            "%s did not release cleanly: %s", skill.key, str(error) or f"not within {timeout_s:.0f} s"
+            "%s did not release cleanly: %s",
+            skill.key,
+            str(error) or f"not within {timeout_s:.0f} s",
         )

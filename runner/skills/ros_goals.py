@@ -11,8 +11,8 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from schemas.errors import BadRequest
-from schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.errors import BadRequest
+from vram_arbiter.schemas.manifest import RSkillManifest
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -21,7 +21,9 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     for key, value in over.items():
         known = merged.get(key)
         merged[key] = (
-            merge(known, value) if isinstance(known, Mapping) and isinstance(value, Mapping) else value
+            merge(known, value)
+            if isinstance(known, Mapping) and isinstance(value, Mapping)
+            else value
         )
     return merged
 
@@ -30,7 +32,9 @@ def parse_goal[Message: BaseModel](
     message: type[Message], manifest: RSkillManifest, params: Mapping[str, Any]
 ) -> Message:
     """The goal's parameters over the manifest's defaults. Raises BadRequest, field by field."""
-    defaults = json.loads(manifest.ros_integration.default_goal_json) if manifest.ros_integration else {}
+    defaults = (
+        json.loads(manifest.ros_integration.default_goal_json) if manifest.ros_integration else {}
+    )
     try:
         return message.model_validate(merge(defaults, params))
     except ValidationError as error:

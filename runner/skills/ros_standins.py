@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
-from runner.protocols import Skill
-from schemas.control import ControlMode
-from schemas.manifest import RSkillManifest
+from vram_arbiter.runner.protocols import Skill
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.manifest import RSkillManifest
 
 NAVIGATE = "nav2_msgs/NavigateToPose"
 TRAJECTORY = "control_msgs/FollowJointTrajectory"

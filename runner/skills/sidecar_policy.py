@@ -19,15 +19,14 @@ from typing import Any, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from clients.sidecar.policy import PolicyClient
-from runner.pictures import as_rgb
-from runner.protocols import Act, Done, Goal, Hold, StepOutcome
-from runner.skills.base import SkillBase
-from runner.skills.chunks import ChunkPlayer, Row
-from runner.skills.motion import JointRamp, bounded, is_at, joint_positions
-from schemas import telemetry, tracing
-from schemas.control import ControlMode
-from schemas.errors import (
+from vram_arbiter.clients.sidecar.policy import PolicyClient
+from vram_arbiter.runner.pictures import as_rgb
+from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
+from vram_arbiter.runner.skills.base import SkillBase
+from vram_arbiter.runner.skills.chunks import ChunkPlayer, Row
+from vram_arbiter.runner.skills.motion import JointRamp, bounded, is_at, joint_positions
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import (
     BadState,
     Evicted,
     FrameStale,
@@ -42,9 +41,11 @@ from schemas.errors import (
     VramError,
     WaitTimeout,
 )
-from schemas.manifest import RSkillManifest
-from schemas.sidecar import LoadResult
-from schemas.world import Action, SensorFrame, WorldState
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.schemas.sidecar import LoadResult
+from vram_arbiter.schemas.world import Action, SensorFrame, WorldState
 
 log = logging.getLogger(__name__)
 
@@ -55,14 +56,25 @@ CHUNK_TIMEOUT_S = 30.0  # a policy that needs longer for one chunk is gone
 LOCKSTEP_WAIT_S = 2.0  # how long one tick of a simulator waits with its world
 ROLLOUT_S = 5.0  # of motion, unless the manifest says otherwise
 STEP_SHARE = 0.98  # of the longest step: rounding must not reach the gate
-STILL_WINDOW = 20  # steps over which targets that move less than STILL_RAD mean that the policy has ended
+STILL_WINDOW = (
+    20  # steps over which targets that move less than STILL_RAD mean that the policy has ended
+)
 STILL_RAD = 0.01
 STILL_FROM = 0.5  # share of the rollout before which standing still is just waiting
 STATE_KEY, TASK_KEY, IMAGES_PREFIX = "observation.state", "task", "observation.images."
 ACTION_KEY = "action"
 
 # The lease went between `load` and the use: load again. Anything else is the goal's failure.
-_AGAIN = (LeaseRevoking, StaleToken, UnknownLease, LeaseLost, LeaseExpired, Evicted, NotResident, BadState)
+_AGAIN = (
+    LeaseRevoking,
+    StaleToken,
+    UnknownLease,
+    LeaseLost,
+    LeaseExpired,
+    Evicted,
+    NotResident,
+    BadState,
+)
 
 
 class Use(Protocol):
@@ -74,7 +86,7 @@ class Use(Protocol):
 
 
 class Arbiter(Protocol):
-    """What is needed of `clients.aio.ArbiterClient`."""
+    """What is needed of `clients.client.ArbiterClient`."""
 
     async def begin_use(self, lease_id: str, token: Sequence[int], label: str = "") -> Use: ...
 
@@ -91,7 +103,9 @@ class Rollout(BaseModel):
     """The part of `policy_extras` that the runner reads; other keys belong to the sidecar's adapter."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
-    rollout_steps: int | None = Field(default=None, ge=1, le=100_000)  # None: latency_budget.max_execution_s
+    rollout_steps: int | None = Field(
+        default=None, ge=1, le=100_000
+    )  # None: latency_budget.max_execution_s
     stop_when_still: bool = True
     views: dict[str, View] = Field(default_factory=dict)
     prefetch_at: int = Field(default=0, ge=0, le=1000)
@@ -113,7 +127,9 @@ class Wiring:
     rollout_s: float
 
 
-def wire_up(manifest: RSkillManifest, joints: tuple[str, ...], rest: Mapping[str, float] | None) -> Wiring:
+def wire_up(
+    manifest: RSkillManifest, joints: tuple[str, ...], rest: Mapping[str, float] | None
+) -> Wiring:
     """Read the manifest. Raises ManifestInvalid when it does not say what it looks at or does not fit the joints."""
     aliases = manifest.image_preprocessing.aliases if manifest.image_preprocessing else {}
     robot_name = {model: robot for robot, model in aliases.items()}
@@ -122,7 +138,9 @@ def wire_up(manifest: RSkillManifest, joints: tuple[str, ...], rest: Mapping[str
         if sensor.modality == "rgb" and sensor.vla_feature_key:
             name = sensor.vla_feature_key.rpartition(".")[2]
             camera = robot_name.get(name, name)
-            cameras[camera] = IMAGES_PREFIX + camera  # the sidecar renames it to what the checkpoint calls it
+            cameras[camera] = (
+                IMAGES_PREFIX + camera
+            )  # the sidecar renames it to what the checkpoint calls it
     if not cameras:
         raise ManifestInvalid(
             f"{manifest.name} names no camera",
@@ -140,7 +158,9 @@ def wire_up(manifest: RSkillManifest, joints: tuple[str, ...], rest: Mapping[str
     try:
         rollout = Rollout.model_validate(manifest.policy_extras)
     except ValidationError as error:
-        raise ManifestInvalid(f"{manifest.name}: policy_extras: {error.errors()[0]['msg']}") from error
+        raise ManifestInvalid(
+            f"{manifest.name}: policy_extras: {error.errors()[0]['msg']}"
+        ) from error
     rollout_s = manifest.latency_budget.max_execution_s or ROLLOUT_S
     return Wiring(cameras, joints, start, degrees, manifest.n_action_steps, rollout, rollout_s)
 
@@ -201,7 +221,9 @@ class SidecarPolicy(SkillBase):
         self._traceparent = goal.traceparent
         self._task = goal.prompt or self.manifest.default_prompt or ""
         if not self._task:
-            raise ModelError(f"{self.key} needs a prompt", hint="say what to do, e.g. `grab the red cube`")
+            raise ModelError(
+                f"{self.key} needs a prompt", hint="say what to do, e.g. `grab the red cube`"
+            )
         await self._occupy(goal)
         await self._client.reset({TASK_KEY: self._task}, token=self._token)
         self._ramp, self._running, self._commanded = None, False, None
@@ -228,7 +250,9 @@ class SidecarPolicy(SkillBase):
                 if attempt == LOAD_TRIES_MAX:
                     raise
                 log.info(
-                    "%s was made to leave before the goal began (%s); loading again", self.key, error.code
+                    "%s was made to leave before the goal began (%s); loading again",
+                    self.key,
+                    error.code,
                 )
                 await asyncio.sleep(RETRY_S)
 
@@ -236,7 +260,10 @@ class SidecarPolicy(SkillBase):
         """A goal that is over before the model is there takes its load back: nobody else leaves the card for it."""
         try:
             return await self._client.load(timeout_s=goal.deadline_s or None)
-        except (asyncio.CancelledError, WaitTimeout):  # a policy on standby is called back behind its request
+        except (
+            asyncio.CancelledError,
+            WaitTimeout,
+        ):  # a policy on standby is called back behind its request
             with contextlib.suppress(VramError, TimeoutError):
                 async with asyncio.timeout(WITHDRAW_S):
                     if (await self._client.ping(timeout_s=WITHDRAW_S)).get("wanted"):
@@ -260,11 +287,15 @@ class SidecarPolicy(SkillBase):
         finally:
             await self._client.close()
 
-    async def _fetch(self, observation: Mapping[str, Any], token: tuple[int, ...] | None) -> list[Row]:
+    async def _fetch(
+        self, observation: Mapping[str, Any], token: tuple[int, ...] | None
+    ) -> list[Row]:
         """The tick that asked is the span's parent; the goal, where that tick is not recorded."""
         parent = None if tracing.recorded() else self._traceparent
         with tracing.span(telemetry.SPAN_CHUNK, parent, {telemetry.ATTR_SKILL: self.key.rskill_id}):
-            answer = await self._client.get_action(observation, token=token, timeout_s=CHUNK_TIMEOUT_S)
+            answer = await self._client.get_action(
+                observation, token=token, timeout_s=CHUNK_TIMEOUT_S
+            )
             return self._rows(answer)
 
     # -- control thread ------------------------------------------------------------------------------------------------
@@ -327,7 +358,9 @@ class SidecarPolicy(SkillBase):
             return False
         if len(self._recent) < STILL_WINDOW:
             return False
-        return all(max(column) - min(column) < STILL_RAD for column in zip(*self._recent, strict=True))
+        return all(
+            max(column) - min(column) < STILL_RAD for column in zip(*self._recent, strict=True)
+        )
 
     def _observation(self, world: WorldState, measured: Mapping[str, float]) -> dict[str, Any]:
         import numpy as np
@@ -335,12 +368,17 @@ class SidecarPolicy(SkillBase):
         values = [measured[name] for name in self._wiring.joints]
         if self._wiring.degrees:
             values = [math.degrees(value) for value in values]
-        observation: dict[str, Any] = {STATE_KEY: np.asarray(values, dtype=np.float32), TASK_KEY: self._task}
+        observation: dict[str, Any] = {
+            STATE_KEY: np.asarray(values, dtype=np.float32),
+            TASK_KEY: self._task,
+        }
         frames = world.image_frames or {}
         for camera, key in self._wiring.cameras.items():
             frame = frames.get(camera)
             if frame is None or frame.data is None or camera in world.stale:
-                raise FrameStale(f"no frame of camera {camera}", hint="nothing moves without a picture")
+                raise FrameStale(
+                    f"no frame of camera {camera}", hint="nothing moves without a picture"
+                )
             observation[key] = _picture(frame, self._wiring.rollout.views.get(camera))
         return observation
 
@@ -368,7 +406,9 @@ class SidecarPolicy(SkillBase):
                 f"actions of shape {actions.shape}; (steps, {len(self._wiring.joints)}) is expected"
             )
         if not np.isfinite(actions).all():
-            raise ModelError("the policy commands numbers that are not finite", hint="its weights are broken")
+            raise ModelError(
+                "the policy commands numbers that are not finite", hint="its weights are broken"
+            )
         if self._wiring.degrees:
             actions = np.radians(actions)
         return [tuple(map(float, row)) for row in actions[: self._wiring.steps_per_chunk]]
@@ -391,7 +431,8 @@ def _picture(frame: SensorFrame, view: View | None) -> Any:
         return picture
     x0, y0, x1, y1 = view.crop
     picture = picture[
-        round(y0 * frame.height) : round(y1 * frame.height), round(x0 * frame.width) : round(x1 * frame.width)
+        round(y0 * frame.height) : round(y1 * frame.height),
+        round(x0 * frame.width) : round(x1 * frame.width),
     ]
     if view.size_px is not None:
         import cv2

@@ -13,15 +13,15 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, FailFast, Field
 
-from runner.protocols import Act, Done, Goal, StepOutcome
-from runner.safety.limits import Limits
-from runner.skills.base import SkillBase
-from runner.skills.motion import REACHED_RAD, joint_positions
-from runner.skills.ros_goals import parse_goal
-from schemas.control import ControlMode
-from schemas.errors import BadRequest, GoalRejected
-from schemas.manifest import RSkillManifest
-from schemas.world import Action, WorldState
+from vram_arbiter.runner.protocols import Act, Done, Goal, StepOutcome
+from vram_arbiter.runner.safety.limits import Limits
+from vram_arbiter.runner.skills.base import SkillBase
+from vram_arbiter.runner.skills.motion import REACHED_RAD, joint_positions
+from vram_arbiter.runner.skills.ros_goals import parse_goal
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import BadRequest, GoalRejected
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.world import Action, WorldState
 
 POINTS_MAX = 2000
 JOINTS_MAX = 64
@@ -29,7 +29,9 @@ LONGEST_S = 600.0
 ARRIVE_S = 1.5  # after the last point, when the goal does not say (`goal_time_tolerance`)
 SLACK = 1.001  # of a speed limit: times are rounded to nanoseconds
 
-FIRST = FailFast()  # a message of a thousand wrong items costs the event loop one error, not a thousand
+FIRST = (
+    FailFast()
+)  # a message of a thousand wrong items costs the event loop one error, not a thousand
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -107,9 +109,7 @@ def problem_of(asked: TrajectoryParams, limits: Limits) -> str:
             if not low <= position <= high:
                 return f"trajectory.points[{index}]: {name} {position:g} rad is outside [{low:g}, {high:g}]"
     if points[0].time_from_start.seconds <= 0:
-        return (
-            "trajectory.points[0]: time_from_start must be above 0: the arm is somewhere else when it begins"
-        )
+        return "trajectory.points[0]: time_from_start must be above 0: the arm is somewhere else when it begins"
     for index, (here, there) in enumerate(pairwise(points), start=1):
         if wrong := too_fast(names, here.positions, there.positions, _gap_s(here, there), limits):
             return f"trajectory.points[{index}]: {wrong}"
@@ -117,7 +117,11 @@ def problem_of(asked: TrajectoryParams, limits: Limits) -> str:
 
 
 def too_fast(
-    names: tuple[str, ...], start: tuple[float, ...], end: tuple[float, ...], gap_s: float, limits: Limits
+    names: tuple[str, ...],
+    start: tuple[float, ...],
+    end: tuple[float, ...],
+    gap_s: float,
+    limits: Limits,
 ) -> str:
     """Which joint would have to be faster than it may; empty: none."""
     if gap_s <= 0:
@@ -173,7 +177,11 @@ class FollowJointTrajectory(SkillBase):
             told = {} if self._sent is None else self._sent()
             self._start_at = tuple(told.get(name, measured[name]) for name in names)
             if wrong := too_fast(
-                names, self._start_at, points[0].positions, points[0].time_from_start.seconds, self._limits
+                names,
+                self._start_at,
+                points[0].positions,
+                points[0].time_from_start.seconds,
+                self._limits,
             ):
                 raise BadRequest(
                     f"trajectory.points[0]: {wrong} from where the arm is", hint="nothing was moved"
@@ -183,9 +191,13 @@ class FollowJointTrajectory(SkillBase):
         last_s = points[-1].time_from_start.seconds
         self.fraction = min(0.99, elapsed_s / last_s)
         if elapsed_s - self._period_s >= last_s:  # the last point has been sent
-            errors = {n: abs(a - b) for n, a, b in zip(names, here, points[-1].positions, strict=True)}
+            errors = {
+                n: abs(a - b) for n, a, b in zip(names, here, points[-1].positions, strict=True)
+            }
             if all(error <= self._tolerance_rad(name) for name, error in errors.items()):
-                return Done({"positions_rad": measured, "error_rad": round(max(errors.values()), 4)})
+                return Done(
+                    {"positions_rad": measured, "error_rad": round(max(errors.values()), 4)}
+                )
             if elapsed_s > last_s + (self._asked.goal_time_tolerance.seconds or ARRIVE_S):
                 worst = max(errors, key=lambda name: errors[name])
                 raise GoalRejected(
@@ -203,7 +215,11 @@ class FollowJointTrajectory(SkillBase):
 
     def _tolerance_rad(self, name: str) -> float:
         assert self._asked is not None, "only asked while a goal runs"
-        given = [one.position for one in self._asked.goal_tolerance if one.name == name and one.position > 0]
+        given = [
+            one.position
+            for one in self._asked.goal_tolerance
+            if one.name == name and one.position > 0
+        ]
         return min(given, default=REACHED_RAD)
 
     def _target(self, elapsed_s: float) -> tuple[float, ...]:
@@ -214,6 +230,8 @@ class FollowJointTrajectory(SkillBase):
             at_s = point.time_from_start.seconds
             if elapsed_s < at_s:
                 share = (elapsed_s - before_s) / (at_s - before_s)
-                return tuple(a + share * (b - a) for a, b in zip(before, point.positions, strict=True))
+                return tuple(
+                    a + share * (b - a) for a, b in zip(before, point.positions, strict=True)
+                )
             before_s, before = at_s, point.positions
         return before

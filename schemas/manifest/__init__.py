@@ -1,9 +1,9 @@
 """rSkill manifests: the field's `rskill.yaml` files, read unchanged and checked field by field."""
 
-from schemas.manifest.load import load_manifest, parse_manifest
-from schemas.manifest.manifest import RSkillManifest
-from schemas.manifest.problems import ManifestError, Problem
-from schemas.manifest.vocabulary import Kind, License, ModelFamily, Role, SkillAction
+from vram_arbiter.schemas.manifest.load import load_manifest, parse_manifest
+from vram_arbiter.schemas.manifest.manifest import RSkillManifest
+from vram_arbiter.schemas.manifest.problems import ManifestError, Problem
+from vram_arbiter.schemas.manifest.vocabulary import Kind, License, ModelFamily, Role, SkillAction
 
 __all__ = [
     "Kind",

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from schemas.control import CARTESIAN_MODES, GRIPPER_MODES, ControlMode
-from schemas.manifest.problems import Problem, raise_if
-from schemas.manifest.vocabulary import (
+from vram_arbiter.schemas.control import CARTESIAN_MODES, GRIPPER_MODES, ControlMode
+from vram_arbiter.schemas.manifest.problems import Problem, raise_if
+from vram_arbiter.schemas.manifest.vocabulary import (
     DetectorEngine,
     DetectorMode,
     Dtype,
@@ -72,7 +72,9 @@ class ActuatorRequirement(Block):
             given = getattr(self.control_mode_semantics, field) is not None
             if given != needed:
                 verb = "is required for" if needed else "is not allowed for"
-                problems.append(Problem(("control_mode_semantics", field), f"{verb} {self.kind.value!r}"))
+                problems.append(
+                    Problem(("control_mode_semantics", field), f"{verb} {self.kind.value!r}")
+                )
         raise_if(problems)
         return self
 
@@ -136,7 +138,8 @@ class RosIntegration(Block):
     package: Annotated[str, Field(min_length=1, max_length=200)]
     interface_type: Annotated[str, Field(min_length=1, max_length=200)]
     interface_name: Annotated[
-        str, Field(max_length=200, pattern=r"^/.*$", description="a full ROS name that starts with '/'")
+        str,
+        Field(max_length=200, pattern=r"^/.*$", description="a full ROS name that starts with '/'"),
     ]
     result_trajectory_field: Annotated[str, Field(max_length=200)] | None = None
     default_goal_json: Annotated[str, Field(min_length=2, max_length=10_000)]
@@ -197,7 +200,9 @@ class RewardContract(Block):
         low, high = self.progress_range
         if not high > low:
             problems.append(
-                Problem(("progress_range",), f"must be [low, high] with high > low, not [{low}, {high}]")
+                Problem(
+                    ("progress_range",), f"must be [low, high] with high > low, not [{low}, {high}]"
+                )
             )
         if self.check_floor > self.success_threshold:
             problems.append(

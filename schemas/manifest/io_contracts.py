@@ -5,10 +5,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from schemas.control import CARTESIAN_MODES, GRIPPER_MODES, JOINT_MODES, ControlMode
-from schemas.manifest.contracts import Block, Finite, PositiveInt
-from schemas.manifest.problems import Problem, raise_if
-from schemas.manifest.vocabulary import JOINT_SPACE_LAYOUTS, TASK_SPACE_LAYOUTS, ActionRepresentation
+from vram_arbiter.schemas.control import CARTESIAN_MODES, GRIPPER_MODES, JOINT_MODES, ControlMode
+from vram_arbiter.schemas.manifest.contracts import Block, Finite, PositiveInt
+from vram_arbiter.schemas.manifest.problems import Problem, raise_if
+from vram_arbiter.schemas.manifest.vocabulary import (
+    JOINT_SPACE_LAYOUTS,
+    TASK_SPACE_LAYOUTS,
+    ActionRepresentation,
+)
 
 FileUri = Annotated[
     str,
@@ -23,16 +27,20 @@ class Processors(Block):
     """The two files that turn observations into a policy's input and its output into actions."""
 
     preprocessor_uri: Annotated[
-        FileUri, Field(description="a file: hf://OWNER/REPO[@REV]/FILE.EXT or local://FOLDER/FILE.EXT")
+        FileUri,
+        Field(description="a file: hf://OWNER/REPO[@REV]/FILE.EXT or local://FOLDER/FILE.EXT"),
     ]
     postprocessor_uri: Annotated[
-        FileUri, Field(description="a file: hf://OWNER/REPO[@REV]/FILE.EXT or local://FOLDER/FILE.EXT")
+        FileUri,
+        Field(description="a file: hf://OWNER/REPO[@REV]/FILE.EXT or local://FOLDER/FILE.EXT"),
     ]
 
     @model_validator(mode="after")
     def _distinct(self) -> Self:
         if self.preprocessor_uri == self.postprocessor_uri:
-            raise_if([Problem(("postprocessor_uri",), "must be another file than preprocessor_uri")])
+            raise_if(
+                [Problem(("postprocessor_uri",), "must be another file than preprocessor_uri")]
+            )
         return self
 
 
@@ -71,7 +79,10 @@ class StateContract(Block):
 
     layout: (
         Annotated[
-            str, Field(pattern=r"^[a-z0-9][a-z0-9_]*$", description="the name of a layout, e.g. 'rc365'")
+            str,
+            Field(
+                pattern=r"^[a-z0-9][a-z0-9_]*$", description="the name of a layout, e.g. 'rc365'"
+            ),
         ]
         | None
     ) = None
@@ -86,17 +97,21 @@ class StateContract(Block):
             if needed:
                 problems.append(
                     Problem(
-                        ("bindings",), f"is required for layout {self.layout!r}, with {' and '.join(needed)}"
+                        ("bindings",),
+                        f"is required for layout {self.layout!r}, with {' and '.join(needed)}",
                     )
                 )
         elif needed:
             for field in needed:
                 if not getattr(self.bindings, field):
-                    problems.append(Problem(("bindings", field), f"is required for layout {self.layout!r}"))
+                    problems.append(
+                        Problem(("bindings", field), f"is required for layout {self.layout!r}")
+                    )
         elif self.layout is None or self.layout in JOINT_SPACE_LAYOUTS:
             problems.append(
                 Problem(
-                    ("bindings",), f"is not allowed for layout {self.layout!r}: joint values need no source"
+                    ("bindings",),
+                    f"is not allowed for layout {self.layout!r}: joint values need no source",
                 )
             )
         raise_if(problems)
@@ -134,7 +149,9 @@ class ActionSlot(Block):
         problems = []
         if self.width < 1:
             problems.append(
-                Problem(("range",), f"must be [first, last] with last ≥ first, not {list(self.range)}")
+                Problem(
+                    ("range",), f"must be [first, last] with last ≥ first, not {list(self.range)}"
+                )
             )
         if self.discard:
             problems += [
@@ -169,7 +186,9 @@ class ActionSlot(Block):
                 )
             )
         if mode is ControlMode.COMPOSITE_MODE and self.width != 1:
-            problems.append(Problem(("range",), f"must cover one value for {mode.value!r}, not {self.width}"))
+            problems.append(
+                Problem(("range",), f"must cover one value for {mode.value!r}, not {self.width}")
+            )
         return problems
 
 
@@ -205,7 +224,10 @@ class ActionContract(Block):
             first, last = slot.range
             if last >= self.dim:
                 problems.append(
-                    Problem(("slots", index, "range"), f"ends at {last}, beyond the {self.dim} values of dim")
+                    Problem(
+                        ("slots", index, "range"),
+                        f"ends at {last}, beyond the {self.dim} values of dim",
+                    )
                 )
             for value in range(first, min(last, self.dim - 1) + 1):
                 if value in owner:

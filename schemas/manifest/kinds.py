@@ -5,8 +5,8 @@ Works on plain values, so that the same rules judge a half-written file and a fi
 
 from collections.abc import Mapping
 
-from schemas.manifest.problems import Problem
-from schemas.manifest.vocabulary import PROCESSOR_FAMILIES, Kind
+from vram_arbiter.schemas.manifest.problems import Problem
+from vram_arbiter.schemas.manifest.vocabulary import PROCESSOR_FAMILIES, Kind
 
 KINDS = tuple(Kind)
 

@@ -10,12 +10,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from schemas.errors import ConfigError
-from schemas.manifest.kinds import KINDS, check_kind
-from schemas.manifest.manifest import RSkillManifest
-from schemas.manifest.problems import ManifestError, Problem, from_validation_error
-from schemas.manifest.vocabulary import Kind
-from schemas.yamltext import YamlText, parse_yaml, read_text
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.manifest.kinds import KINDS, check_kind
+from vram_arbiter.schemas.manifest.manifest import RSkillManifest
+from vram_arbiter.schemas.manifest.problems import ManifestError, Problem, from_validation_error
+from vram_arbiter.schemas.manifest.vocabulary import Kind
+from vram_arbiter.schemas.yamltext import YamlText, parse_yaml, read_text
 
 
 def load_manifest(path: str | FilePath) -> RSkillManifest:
@@ -37,7 +37,9 @@ def parse_manifest(content: str | bytes, source: str = "rskill.yaml") -> RSkillM
     except ValidationError as error:
         problems = _with_kind_rules(from_validation_error(error, RSkillManifest, data), data)
         located = [replace(problem, line=document.line(problem.path)) for problem in problems]
-        raise ManifestError(source, sorted(located, key=lambda problem: problem.line or 0)) from error
+        raise ManifestError(
+            source, sorted(located, key=lambda problem: problem.line or 0)
+        ) from error
 
 
 def _with_kind_rules(problems: list[Problem], data: Mapping[str, Any]) -> list[Problem]:
@@ -46,7 +48,9 @@ def _with_kind_rules(problems: list[Problem], data: Mapping[str, Any]) -> list[P
     if kind not in KINDS:
         return problems
     known = {problem.path for problem in problems}
-    return problems + [problem for problem in check_kind(Kind(kind), data) if problem.path not in known]
+    return problems + [
+        problem for problem in check_kind(Kind(kind), data) if problem.path not in known
+    ]
 
 
 def _read_yaml(content: str | bytes, source: str) -> YamlText:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, StringConstraints, model_validator
 
-from schemas.manifest.contracts import (
+from vram_arbiter.schemas.manifest.contracts import (
     ActuatorRequirement,
     Block,
     DetectorContract,
@@ -28,10 +28,15 @@ from schemas.manifest.contracts import (
     SensorRequirement,
     Share,
 )
-from schemas.manifest.io_contracts import ActionContract, ImagePreprocessing, Processors, StateContract
-from schemas.manifest.kinds import check_kind
-from schemas.manifest.problems import Problem, raise_if
-from schemas.manifest.vocabulary import (
+from vram_arbiter.schemas.manifest.io_contracts import (
+    ActionContract,
+    ImagePreprocessing,
+    Processors,
+    StateContract,
+)
+from vram_arbiter.schemas.manifest.kinds import check_kind
+from vram_arbiter.schemas.manifest.problems import Problem, raise_if
+from vram_arbiter.schemas.manifest.vocabulary import (
     COMMERCIAL_LICENSES,
     JOINT_SPACE_LAYOUTS,
     TASK_SPACE_LAYOUTS,
@@ -79,7 +84,8 @@ class RSkillManifest(Block):
     model_family: ModelFamily | None = None
 
     embodiment_tags: Annotated[
-        tuple[EmbodimentTag, ...], Field(min_length=1, description="the robots it is made for, or 'any'")
+        tuple[EmbodimentTag, ...],
+        Field(min_length=1, description="the robots it is made for, or 'any'"),
     ]
     embodiment_extra: EmbodimentExtra | None = None
     capabilities_required: dict[str, bool | float | int | str] = Field(default_factory=dict)
@@ -89,7 +95,8 @@ class RSkillManifest(Block):
     runtime: Runtime = Runtime.PYTORCH
     quantization: Quantization = Quantization()
     weights_uri: Annotated[
-        WeightsUri | None, Field(description="a place of weights: hf://OWNER/REPO[@REVISION] or local://PATH")
+        WeightsUri | None,
+        Field(description="a place of weights: hf://OWNER/REPO[@REVISION] or local://PATH"),
     ] = None
     min_vram_gb: dict[Dtype, Positive] | None = None
 
@@ -104,8 +111,12 @@ class RSkillManifest(Block):
     evaluated_tasks: tuple[str, ...] = ()
     sim_env_control_mode: str | None = None
     paper_url: Annotated[WebUrl | None, Field(description="a http(s) address")] = None
-    dataset_uri: Annotated[HubUri | None, Field(description="of the form hf://OWNER/REPO[@REVISION]")] = None
-    source_repo: Annotated[HubUri | None, Field(description="of the form hf://OWNER/REPO[@REVISION]")] = None
+    dataset_uri: Annotated[
+        HubUri | None, Field(description="of the form hf://OWNER/REPO[@REVISION]")
+    ] = None
+    source_repo: Annotated[
+        HubUri | None, Field(description="of the form hf://OWNER/REPO[@REVISION]")
+    ] = None
 
     description: Annotated[str, Field(min_length=1, max_length=500)]
     default_prompt: Annotated[str, Field(min_length=1, max_length=500)] | None = None
@@ -132,7 +143,9 @@ class RSkillManifest(Block):
     @model_validator(mode="after")
     def _check(self) -> Self:
         values = {name: getattr(self, name) for name in type(self).model_fields}
-        raise_if([*check_kind(self.kind, values), *self._check_embodiment(), *self._check_fallback()])
+        raise_if(
+            [*check_kind(self.kind, values), *self._check_embodiment(), *self._check_fallback()]
+        )
         return self
 
     def _check_embodiment(self) -> list[Problem]:

@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from schemas.errors import ManifestInvalid
-from schemas.yamltext import only_counts_wrong_entries
+from vram_arbiter.schemas.errors import ManifestInvalid
+from vram_arbiter.schemas.yamltext import only_counts_wrong_entries
 
 Path = tuple[str | int, ...]
 
@@ -92,7 +92,9 @@ def _nearest(value: object, words: Sequence[str]) -> str:
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
-def from_validation_error(error: ValidationError, model: type[BaseModel], data: object) -> list[Problem]:
+def from_validation_error(
+    error: ValidationError, model: type[BaseModel], data: object
+) -> list[Problem]:
     """All findings of a ValidationError of `model` over `data`, in the order of the fields, one per place and message."""
     problems: dict[Problem, None] = {}
     for item in error.errors(include_url=False):
@@ -133,7 +135,9 @@ def _message(item: Any, path: Path, model: type[BaseModel]) -> str:
         case "extra_forbidden":
             owner = _model_at(model, path[:-1])
             names = list(owner.model_fields) if owner else []
-            return "there is no such field" + (_nearest(path[-1], names) or f"; known: {', '.join(names)}")
+            return "there is no such field" + (
+                _nearest(path[-1], names) or f"; known: {', '.join(names)}"
+            )
         case "enum" | "literal_error":
             words = _words(annotation)
             return one_of(value, words) if words else f"{value!r}: {item['msg']}"
@@ -211,7 +215,9 @@ def _model_in(annotation: object) -> type[BaseModel] | None:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for argument in (
-        get_args(annotation) if get_origin(annotation) in (Union, types.UnionType, Annotated) else ()
+        get_args(annotation)
+        if get_origin(annotation) in (Union, types.UnionType, Annotated)
+        else ()
     ):
         if found := _model_in(argument):
             return found
@@ -222,7 +228,9 @@ def _arguments(annotation: object, origins: tuple[type, ...]) -> tuple[object, .
     if get_origin(annotation) in origins:
         return get_args(annotation)
     for argument in (
-        get_args(annotation) if get_origin(annotation) in (Union, types.UnionType, Annotated) else ()
+        get_args(annotation)
+        if get_origin(annotation) in (Union, types.UnionType, Annotated)
+        else ()
     ):
         if found := _arguments(argument, origins):
             return found

@@ -45,7 +45,9 @@ class License(StrEnum):
     UNKNOWN = "unknown"
 
 
-COMMERCIAL_LICENSES = frozenset({License.APACHE_2_0, License.MIT, License.BSD, License.NVIDIA_OPEN_MODEL})
+COMMERCIAL_LICENSES = frozenset(
+    {License.APACHE_2_0, License.MIT, License.BSD, License.NVIDIA_OPEN_MODEL}
+)
 
 
 class ModelFamily(StrEnum):

@@ -13,9 +13,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from schemas.endpoints import runtime_dir
-from schemas.errors import AlreadyRunning, ConfigError
-from schemas.runtime.trust import ROOT, trusts
+from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError
+from vram_arbiter.schemas.runtime.endpoints import runtime_dir
+from vram_arbiter.schemas.runtime.trust import ROOT, trusts
 
 CHOOSE: Final = "choose a folder that this program may write"
 LEFT_MAX_BYTES: Final = 256
@@ -30,7 +30,9 @@ def socket_folder(
         default = Path(runtime_dir(environ, os.getuid()))
     except ConfigError:
         default = None
-    private_folder(folder, group, make=default is not None and folder == default.absolute(), shared=shared)
+    private_folder(
+        folder, group, make=default is not None and folder == default.absolute(), shared=shared
+    )
 
 
 def private_folder(
@@ -176,7 +178,11 @@ class LockFile:
             if folder is not None:
                 os.close(folder)
         found = os.fstat(fd)
-        if stat.S_ISREG(found.st_mode) and found.st_nlink == 1 and found.st_uid in (os.geteuid(), ROOT):
+        if (
+            stat.S_ISREG(found.st_mode)
+            and found.st_nlink == 1
+            and found.st_uid in (os.geteuid(), ROOT)
+        ):
             return fd
         os.close(fd)
         raise ConfigError(

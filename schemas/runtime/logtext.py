@@ -3,7 +3,7 @@
 import logging
 from types import TracebackType
 
-from schemas.runtime.printable import printable, printable_lines
+from vram_arbiter.schemas.runtime.printable import printable, printable_lines
 
 
 class PrintableFormatter(logging.Formatter):
@@ -14,6 +14,7 @@ class PrintableFormatter(logging.Formatter):
 
     def formatException(
         self,
-        ei: tuple[type[BaseException], BaseException, TracebackType | None] | tuple[None, None, None],
+        ei: tuple[type[BaseException], BaseException, TracebackType | None]
+        | tuple[None, None, None],
     ) -> str:
         return printable_lines(super().formatException(ei))

@@ -9,8 +9,8 @@ from typing import Any
 
 import msgpack
 
-from schemas.defaults import LISTED_MAX, MESSAGE_MAX_BYTES, VALUES_MAX
-from schemas.errors import BadFrame, MessageTooLarge
+from vram_arbiter.schemas.defaults import LISTED_MAX, MESSAGE_MAX_BYTES, VALUES_MAX
+from vram_arbiter.schemas.errors import BadFrame, MessageTooLarge
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,8 @@ def unpack_map(payload: bytes | bytearray | memoryview, limits: UnpackLimits) ->
         ) from None
     if not isinstance(message, dict):
         raise BadFrame(
-            f"expected a msgpack map, got {type(message).__name__}", hint="send one msgpack map per message"
+            f"expected a msgpack map, got {type(message).__name__}",
+            hint="send one msgpack map per message",
         )
     return message
 
@@ -117,7 +118,9 @@ def _sizes() -> bytes:
         sizes[first] = 0
     # float 32/64, uint 8..64, int 8..64, fixext 1..16
     for first, size in zip(
-        (*range(0xCA, 0xD4), *range(0xD4, 0xD9)), (5, 9, 2, 3, 5, 9, 2, 3, 5, 9, 3, 4, 6, 10, 18), strict=True
+        (*range(0xCA, 0xD4), *range(0xD4, 0xD9)),
+        (5, 9, 2, 3, 5, 9, 2, 3, 5, 9, 3, 4, 6, 10, 18),
+        strict=True,
     ):
         sizes[first] = size
     return bytes(sizes)

@@ -11,7 +11,7 @@ import socket
 import struct
 from dataclasses import dataclass
 
-from schemas.ids import ProcessKey
+from vram_arbiter.schemas.ids import ProcessKey
 
 SO_PEERPIDFD = 77
 """Linux ≥ 6.5, asm-generic/socket.h; the socket module of Python 3.12 does not name it."""
@@ -39,7 +39,9 @@ class Peer:
 
 def credentials(sock: socket.socket) -> tuple[int, int, int]:
     """Return pid, uid and gid of the peer of a connected unix socket."""
-    pid, uid, gid = _UCRED.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size))
+    pid, uid, gid = _UCRED.unpack(
+        sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size)
+    )
     return pid, uid, gid
 
 

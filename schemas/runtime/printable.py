@@ -14,7 +14,8 @@ def printable(text: object) -> str:
     if said.isprintable():
         return said
     return "".join(
-        letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii") for letter in said
+        letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
+        for letter in said
     )
 
 

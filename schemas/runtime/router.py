@@ -24,13 +24,21 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from schemas.defaults import KIB, MESSAGE_MAX_BYTES, MIB
-from schemas.errors import ConfigError
-from schemas.ids import ProcessKey
-from schemas.runtime.peercred import Peer, PeerGone, identify
-from schemas.runtime.turns import Turns
-from schemas.runtime.zmtp import Heartbeat, Message, Oversize, Ready, ServerConnection, ZmtpError, encode
-from schemas.runtime.zmtp import Limits as WireLimits
+from vram_arbiter.schemas.defaults import KIB, MESSAGE_MAX_BYTES, MIB
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime.peercred import Peer, PeerGone, identify
+from vram_arbiter.schemas.runtime.turns import Turns
+from vram_arbiter.schemas.runtime.zmtp import (
+    Heartbeat,
+    Message,
+    Oversize,
+    Ready,
+    ServerConnection,
+    ZmtpError,
+    encode,
+)
+from vram_arbiter.schemas.runtime.zmtp import Limits as WireLimits
 
 log = logging.getLogger(__name__)
 
@@ -138,7 +146,9 @@ class Connection(asyncio.Protocol):
         self._user = user
         self._transport: asyncio.Transport | None = None
         limits = router.limits
-        self._wire = ServerConnection(WireLimits(limits.stranger_message_max_bytes, limits.skip_max_bytes))
+        self._wire = ServerConnection(
+            WireLimits(limits.stranger_message_max_bytes, limits.skip_max_bytes)
+        )
         self._delimiter = False
         self._resting = False  # over its rate
         self._clogged = False  # bytes wait for the peer to read
@@ -487,7 +497,9 @@ class Router:
                 sock.close()
                 continue
             connection = self._enter(peer)
-            opening = loop.create_task(loop.connect_accepted_socket(partial(_the, connection), sock))  # 4
+            opening = loop.create_task(
+                loop.connect_accepted_socket(partial(_the, connection), sock)
+            )  # 4
             self._opening.add(opening)
             opening.add_done_callback(self._opened)
         if self.limits.work_share < 1:  # 5
@@ -518,7 +530,9 @@ class Router:
         """
         limits, total = self.limits, self._connections_max
         process = self._processes.get(peer.process)
-        if process is not None and len(process.connections) >= max(1, int(total * limits.process_share)):
+        if process is not None and len(process.connections) >= max(
+            1, int(total * limits.process_share)
+        ):
             return self._evict_stranger(lambda other: other.process == peer.process)
         user = self._users.get(peer.uid)
         if user is not None and user.connections >= max(1, int(total * limits.user_share)):
@@ -602,7 +616,9 @@ class Router:
         more = True
         if not self._turns:
             now = self._loop_or_fail.time()
-            self._credit_s = min(TURN_S, self._credit_s + (now - self._credit_at) * self._direct_share)
+            self._credit_s = min(
+                TURN_S, self._credit_s + (now - self._credit_at) * self._direct_share
+            )
             self._credit_at = now
             if self._credit_s > 0:
                 more = connection.handle()

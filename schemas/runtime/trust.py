@@ -12,7 +12,7 @@ import struct
 from collections.abc import Mapping
 from typing import Final, Literal
 
-from schemas.errors import ConfigError, UntrustedServer
+from vram_arbiter.schemas.errors import ConfigError, UntrustedServer
 
 USERS_VARIABLE: Final = "VRAM_ARBITER_SERVER_USERS"
 ROOT: Final = 0
@@ -40,17 +40,23 @@ def check_server(connected: socket.socket, program: Program, where: str) -> None
 
 def server_uid(connected: socket.socket) -> int:
     """The uid of the process that called listen() on the other end of a connected unix socket (SO_PEERCRED)."""
-    _, uid, _ = _UCRED.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size))
+    _, uid, _ = _UCRED.unpack(
+        connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size)
+    )
     return int(uid)
 
 
 def frame_uid(peer_address: object) -> int | None:
     """The uid in libzmq's `Peer-Address` of a frame (`localhost:UID:GID:PID` on ipc), None where it names none."""
     parts = peer_address.rsplit(":", 3) if isinstance(peer_address, str) else []
-    return int(parts[1]) if len(parts) == 4 and all(part.isdecimal() for part in parts[1:]) else None
+    return (
+        int(parts[1]) if len(parts) == 4 and all(part.isdecimal() for part in parts[1:]) else None
+    )
 
 
-def check_uid(uid: int, program: Program, where: str, environ: Mapping[str, str] | None = None) -> None:
+def check_uid(
+    uid: int, program: Program, where: str, environ: Mapping[str, str] | None = None
+) -> None:
     """Raises UntrustedServer unless a `program` that `uid` serves may be believed."""
     if trusts(uid, program, environ):
         return

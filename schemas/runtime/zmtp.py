@@ -194,7 +194,9 @@ class ServerConnection:
         self._flags, self._missing, self._body = flags, size, b""
         if flags & COMMAND:
             if size > COMMAND_MAX_BYTES:
-                raise ZmtpError(f"a command of {size} bytes, at most {COMMAND_MAX_BYTES} are allowed")
+                raise ZmtpError(
+                    f"a command of {size} bytes, at most {COMMAND_MAX_BYTES} are allowed"
+                )
         elif not self._ready:
             raise ZmtpError("a message before READY")
         else:

@@ -2,7 +2,7 @@
 
 from typing import Any, Literal, Protocol
 
-from schemas.sidecar import DetectOp, EndpointCall, QueryOp, ScoreOp
+from vram_arbiter.schemas.sidecar import DetectOp, EndpointCall, QueryOp, ScoreOp
 
 ModelCall = DetectOp | QueryOp | ScoreOp | EndpointCall
 

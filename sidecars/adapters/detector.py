@@ -6,13 +6,13 @@ import re
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from schemas.errors import BadRequest, ModelError
-from schemas.manifest import RSkillManifest
-from schemas.sidecar import QUERIES_MAX, DetectionResult, DetectOp
-from sidecars.adapters.base import ModelCall
-from sidecars.checkpoints import load_transformers
-from sidecars.images import decode, within
-from sidecars.weights import Weights, from_pretrained, model_options
+from vram_arbiter.schemas.errors import BadRequest, ModelError
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.sidecar import QUERIES_MAX, DetectionResult, DetectOp
+from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.checkpoints import load_transformers
+from vram_arbiter.sidecars.images import decode, within
+from vram_arbiter.sidecars.weights import Weights, from_pretrained, model_options
 
 NORM = 1000  # the field's grounding answers count boxes in thousandths of the image
 _SEPARATOR = re.compile(r"\s*(?:</c>|,|\s\.(?:\s|$))\s*")  # </c> is how the field joins its labels
@@ -33,7 +33,11 @@ class DetectorAdapter:
         self._model: Any = None
 
     def prepare(self) -> None:
-        from transformers import MODEL_FOR_ZERO_SHOT_OBJECT_DETECTION_MAPPING, AutoConfig, AutoProcessor
+        from transformers import (
+            MODEL_FOR_ZERO_SHOT_OBJECT_DETECTION_MAPPING,
+            AutoConfig,
+            AutoProcessor,
+        )
 
         self._processor = from_pretrained(AutoProcessor, self._weights)
         config = from_pretrained(AutoConfig, self._weights)
@@ -45,7 +49,9 @@ class DetectorAdapter:
         from transformers import AutoModelForZeroShotObjectDetection
 
         options = model_options(self._manifest, self._weights, device)
-        self._model = load_transformers(AutoModelForZeroShotObjectDetection, self._weights, **options)
+        self._model = load_transformers(
+            AutoModelForZeroShotObjectDetection, self._weights, **options
+        )
 
     def unload(self) -> None:
         self._model = None
@@ -56,7 +62,9 @@ class DetectorAdapter:
         picture = decode(call.image)
         width, height = picture.size
         shrunk = within(picture, min(call.max_side, self._contract.max_side or call.max_side))
-        threshold = self._contract.score_threshold if call.score_threshold is None else call.score_threshold
+        threshold = (
+            self._contract.score_threshold if call.score_threshold is None else call.score_threshold
+        )
         found = self._detect(shrunk, labels, threshold, (height, width))
         return {
             "ok": True,
@@ -70,9 +78,9 @@ class DetectorAdapter:
     ) -> list[DetectionResult]:
         import torch
 
-        inputs = self._processor(images=picture, text=[labels], truncation=True, return_tensors="pt").to(
-            self._model.device
-        )
+        inputs = self._processor(
+            images=picture, text=[labels], truncation=True, return_tensors="pt"
+        ).to(self._model.device)
         with torch.inference_mode():
             outputs = self._model(**inputs)
         post_process = self._processor.post_process_grounded_object_detection
@@ -83,7 +91,9 @@ class DetectorAdapter:
             "target_sizes": [size],
             "threshold": threshold,
         }
-        (result,) = post_process(outputs, **{name: value for name, value in options.items() if name in known})
+        (result,) = post_process(
+            outputs, **{name: value for name, value in options.items() if name in known}
+        )
         names = result.get("text_labels") or [labels[int(index)] for index in result["labels"]]
         found = [
             _detection(str(name), float(score), box.tolist(), size)
@@ -121,7 +131,9 @@ def grounding_answer(found: list[DetectionResult], width: int, height: int) -> s
     return "".join(parts)
 
 
-def _detection(label: str, score: float, box: list[float], size: tuple[int, int]) -> DetectionResult | None:
+def _detection(
+    label: str, score: float, box: list[float], size: tuple[int, int]
+) -> DetectionResult | None:
     """Cut to the picture; None if nothing is left of it. Raises ModelError for what is no number: cutting would put the picture's edge there."""
     if not all(map(math.isfinite, (score, *box))):
         raise ModelError("the detector's box is no number", hint="its weights are broken")

@@ -7,11 +7,11 @@ finite numbers. On a simulated card (`fake:FOLDER`) the bytes are simulated like
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from schemas.errors import BadRequest, ConfigError, NoGpu
-from schemas.manifest import RSkillManifest
-from schemas.manifest.vocabulary import Modality
-from schemas.sidecar import EndpointCall
-from sidecars.adapters.base import ModelCall
+from vram_arbiter.schemas.errors import BadRequest, ConfigError, NoGpu
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.manifest.vocabulary import Modality
+from vram_arbiter.schemas.sidecar import EndpointCall
+from vram_arbiter.sidecars.adapters.base import ModelCall
 
 ADAPTER = "gpu_passthrough"
 STATE_KEY = "observation.state"
@@ -46,7 +46,8 @@ class GpuPassthroughAdapter:
         }
         if not self._sizes:
             raise ConfigError(
-                f"{manifest.name} names no camera", hint="give a sensor of modality rgb a vla_feature_key"
+                f"{manifest.name} names no camera",
+                hint="give a sensor of modality rgb a vla_feature_key",
             )
         self._device: str | None = None
         self._pose: Any = None
@@ -71,7 +72,8 @@ class GpuPassthroughAdapter:
             raise BadRequest("get_action needs data.observation, a map")
         state = _state(observation)
         brightness = {
-            name: self._brightness(_pixels(observation, name, *size)) for name, size in self._sizes.items()
+            name: self._brightness(_pixels(observation, name, *size))
+            for name, size in self._sizes.items()
         }
         if self._pose is None or self._pose.shape != state.shape:
             self._pose = state
@@ -93,7 +95,9 @@ def _state(observation: Mapping[str, Any]) -> Any:
     try:
         state = np.array(observation[STATE_KEY], dtype=np.float32)
     except KeyError:
-        raise BadRequest(f"the observation lacks {STATE_KEY}", hint=f"it has {sorted(observation)}") from None
+        raise BadRequest(
+            f"the observation lacks {STATE_KEY}", hint=f"it has {sorted(observation)}"
+        ) from None
     except (TypeError, ValueError):
         raise BadRequest(f"{STATE_KEY} must be numbers") from None
     if state.ndim != 1 or not len(state) or not np.isfinite(state).all():
@@ -111,7 +115,9 @@ def _pixels(observation: Mapping[str, Any], name: str, height: int, width: int) 
     if pixels is None:
         raise BadRequest(f"the observation lacks {name}", hint=f"it has {sorted(observation)}")
     if not isinstance(pixels, np.ndarray) or pixels.dtype != np.uint8 or pixels.ndim != 3:
-        raise BadRequest(f"{name} must be uint8 (H, W, 3)", hint="nothing is put in the place of a picture")
+        raise BadRequest(
+            f"{name} must be uint8 (H, W, 3)", hint="nothing is put in the place of a picture"
+        )
     if pixels.shape[2] != 3 or pixels.shape[0] < height or pixels.shape[1] < width:
         raise BadRequest(f"{name} must be at least ({height}, {width}, 3), not {pixels.shape}")
     return pixels

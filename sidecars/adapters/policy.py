@@ -4,16 +4,18 @@ import importlib
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from schemas.errors import BadRequest, ModelError
-from schemas.manifest import RSkillManifest
-from schemas.sidecar import EndpointCall
-from sidecars.adapters.base import ModelCall
-from sidecars.checkpoints import META, load_lerobot, need_statistics
-from sidecars.images import decode
-from sidecars.weights import Weights, from_pretrained
+from vram_arbiter.schemas.errors import BadRequest, ModelError
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.sidecar import EndpointCall
+from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.checkpoints import META, load_lerobot, need_statistics
+from vram_arbiter.sidecars.images import decode
+from vram_arbiter.sidecars.weights import Weights, from_pretrained
 
 IMAGE_PREFIX = "observation.images."
-_OWN_POLICIES = ("sidecars.compact_act",)  # policy types of ours, by lerobot's naming convention
+_OWN_POLICIES = (
+    "vram_arbiter.sidecars.models.compact_act",
+)  # policy types of ours, by lerobot's naming convention
 
 
 class PolicyAdapter:
@@ -55,7 +57,9 @@ class PolicyAdapter:
                 self._config,
                 pretrained_path=self._weights.source,
                 pretrained_revision=self._weights.revision,
-                preprocessor_overrides={"device_processor": {"device": "cpu" if device == META else device}},
+                preprocessor_overrides={
+                    "device_processor": {"device": "cpu" if device == META else device}
+                },
             )
         except (OSError, ValueError, KeyError, ImportError) as error:
             raise ModelError(
@@ -102,10 +106,14 @@ class PolicyAdapter:
         given = {self._feature_name(name): (name, value) for name, value in observation.items()}
         for feature, spec in self._config.input_features.items():
             if feature not in given:
-                raise BadRequest(f"the observation lacks {feature}", hint=f"it has {sorted(observation)}")
+                raise BadRequest(
+                    f"the observation lacks {feature}", hint=f"it has {sorted(observation)}"
+                )
             name, value = given[feature]
             visual = spec.type.value == "VISUAL"
-            batch[feature] = self._image(name, value) if visual else _vector(name, value, spec.shape)
+            batch[feature] = (
+                self._image(name, value) if visual else _vector(name, value, spec.shape)
+            )
         return batch
 
     def _feature_name(self, name: str) -> str:
@@ -139,9 +147,9 @@ class PolicyAdapter:
         image = torch.tensor(np.ascontiguousarray(pixels)).permute(2, 0, 1).to(torch.float32) / 255
         if rules is not None and rules.resize_width and rules.resize_height:
             size = (rules.resize_height, rules.resize_width)
-            image = torch.nn.functional.interpolate(image[None], size=size, mode="bilinear", antialias=True)[
-                0
-            ]
+            image = torch.nn.functional.interpolate(
+                image[None], size=size, mode="bilinear", antialias=True
+            )[0]
         return image
 
 
@@ -152,14 +160,17 @@ def _vector(name: str, value: Any, shape: tuple[int, ...]) -> Any:
     try:
         numbers = np.asarray(value, dtype=np.float32)
     except (TypeError, ValueError):
-        raise BadRequest(f"{name} must be numbers of shape {tuple(shape)}, not {_shape(value)}") from None
+        raise BadRequest(
+            f"{name} must be numbers of shape {tuple(shape)}, not {_shape(value)}"
+        ) from None
     if numbers.ndim == len(shape) + 1 and len(numbers) == 1:
         numbers = numbers[0]
     if numbers.shape != tuple(shape):
         raise BadRequest(f"{name} must have shape {tuple(shape)}, not {numbers.shape}")
     if not np.isfinite(numbers).all():
         raise BadRequest(
-            f"{name} has numbers that are not finite", hint="a stale or missing sensor must stop the goal"
+            f"{name} has numbers that are not finite",
+            hint="a stale or missing sensor must stop the goal",
         )
     return torch.from_numpy(np.ascontiguousarray(numbers))
 

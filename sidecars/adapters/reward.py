@@ -4,15 +4,17 @@ import importlib
 import math
 from typing import Any, Literal
 
-from schemas.errors import BadRequest, ModelError
-from schemas.manifest import RSkillManifest
-from schemas.sidecar import ScoreOp
-from sidecars.adapters.base import ModelCall
-from sidecars.checkpoints import load_lerobot
-from sidecars.images import decode_all
-from sidecars.weights import Weights, from_pretrained
+from vram_arbiter.schemas.errors import BadRequest, ModelError
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.sidecar import ScoreOp
+from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.checkpoints import load_lerobot
+from vram_arbiter.sidecars.images import decode_all
+from vram_arbiter.sidecars.weights import Weights, from_pretrained
 
-_OWN_MODELS = ("sidecars.compact_progress",)  # reward types of ours, by lerobot's naming convention
+_OWN_MODELS = (
+    "vram_arbiter.sidecars.models.compact_progress",
+)  # reward types of ours, by lerobot's naming convention
 BYTES_A_PIXEL = 3
 
 
@@ -65,7 +67,9 @@ class RewardAdapter:
     def run(self, call: ModelCall) -> dict[str, Any]:
         assert isinstance(call, ScoreOp)
         if self._contract.instruction_required and not call.task.strip():
-            raise BadRequest("score needs a task: progress towards what?", hint="say the instruction")
+            raise BadRequest(
+                "score needs a task: progress towards what?", hint="say the instruction"
+            )
         progress, success = self._score(_pictures(call), call.task)
         low, high = self._contract.progress_range
         return {
@@ -92,7 +96,9 @@ class RewardAdapter:
 
     def _picture_key(self) -> str:
         known = [
-            key for key, feature in self._config.input_features.items() if feature.type.value == "VISUAL"
+            key
+            for key, feature in self._config.input_features.items()
+            if feature.type.value == "VISUAL"
         ]
         if len(known) != 1:
             raise ModelError(
@@ -116,13 +122,20 @@ def _pictures(call: ScoreOp) -> Any:
         taken = decode_all(call.images)
         if len({picture.size for picture in taken}) > 1:
             sizes = ", ".join(sorted({f"{picture.width} x {picture.height}" for picture in taken}))
-            raise BadRequest(f"pictures of different sizes: {sizes}", hint="send one camera's pictures")
+            raise BadRequest(
+                f"pictures of different sizes: {sizes}", hint="send one camera's pictures"
+            )
         stack = np.stack([np.asarray(picture) for picture in taken])
-    return torch.from_numpy(np.ascontiguousarray(stack)).permute(0, 3, 1, 2).to(torch.float32)[None] / 255
+    return (
+        torch.from_numpy(np.ascontiguousarray(stack)).permute(0, 3, 1, 2).to(torch.float32)[None]
+        / 255
+    )
 
 
 def _shares(values: list[float], what: str) -> list[float]:
     """Cut to 0..1 like lerobot does; a number that is none is no opinion."""
     if not all(math.isfinite(value) for value in values):
-        raise ModelError(f"the reward model's {what} is no number", hint="it says nothing about the task")
+        raise ModelError(
+            f"the reward model's {what} is no number", hint="it says nothing about the task"
+        )
     return [min(1.0, max(0.0, value)) for value in values]

@@ -2,14 +2,16 @@
 
 from typing import Any, Literal
 
-from schemas.manifest import RSkillManifest
-from schemas.sidecar import QueryOp
-from sidecars.adapters.base import ModelCall
-from sidecars.checkpoints import load_transformers
-from sidecars.images import decode, within
-from sidecars.weights import Weights, from_pretrained, model_options
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.sidecar import QueryOp
+from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.checkpoints import load_transformers
+from vram_arbiter.sidecars.images import decode, within
+from vram_arbiter.sidecars.weights import Weights, from_pretrained, model_options
 
-ANSWER_MAX_S = 120.0  # then it is cut off, as by max_new_tokens: below the time that counts as stuck
+ANSWER_MAX_S = (
+    120.0  # then it is cut off, as by max_new_tokens: below the time that counts as stuck
+)
 
 
 class SceneVlmAdapter:
@@ -57,7 +59,9 @@ class SceneVlmAdapter:
             tokenize=False,
             enable_thinking=False,  # of templates that know it; it would eat the tokens of the answer
         )
-        inputs = self._processor(text=[prompt], images=[picture], return_tensors="pt").to(self._model.device)
+        inputs = self._processor(text=[prompt], images=[picture], return_tensors="pt").to(
+            self._model.device
+        )
         with torch.inference_mode():
             output = self._model.generate(
                 **inputs, max_new_tokens=max_new_tokens, do_sample=False, max_time=ANSWER_MAX_S

@@ -3,10 +3,10 @@
 import os
 from typing import Any
 
-from clients import cuda
-from schemas.defaults import RESIDUE_BYTES
-from schemas.errors import BadState, NoGpu, OutOfMemory
-from sidecars.device.memory import Block
+from vram_arbiter.clients import cuda
+from vram_arbiter.schemas.defaults import RESIDUE_BYTES
+from vram_arbiter.schemas.errors import BadState, NoGpu, OutOfMemory
+from vram_arbiter.sidecars.device.memory import Block
 
 _ALLOCATOR_VARIABLE = "PYTORCH_CUDA_ALLOC_CONF"
 _CHECK_VARIABLE = "PYTORCH_NVML_BASED_CUDA_CHECK"
@@ -69,7 +69,9 @@ class CudaMemory:
         self._touched = True
         self._number += 1
         try:
-            tensor = self._torch.empty(size_bytes, dtype=self._torch.uint8, device=self.torch_device)
+            tensor = self._torch.empty(
+                size_bytes, dtype=self._torch.uint8, device=self.torch_device
+            )
         except self._torch.OutOfMemoryError as error:
             raise self.out_of_memory(error, size_bytes) from error
         self._ballast[self._number] = tensor
@@ -120,7 +122,9 @@ class CudaMemory:
         try:
             pynvml.nvmlInit()
             uuid = str(self._torch.cuda.get_device_properties(self._index).uuid)
-            handle = pynvml.nvmlDeviceGetHandleByUUID(uuid if uuid.startswith("GPU-") else f"GPU-{uuid}")
+            handle = pynvml.nvmlDeviceGetHandleByUUID(
+                uuid if uuid.startswith("GPU-") else f"GPU-{uuid}"
+            )
             listed = {
                 process.pid: process.usedGpuMemory
                 for process in pynvml.nvmlDeviceGetComputeRunningProcesses(handle)

@@ -12,11 +12,11 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from schemas import fakegpu
-from schemas.defaults import RESIDUE_BYTES
-from schemas.errors import NoGpu
-from schemas.ids import ProcessKey
-from sidecars.device.memory import Block
+from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.defaults import RESIDUE_BYTES
+from vram_arbiter.schemas.errors import NoGpu
+from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.sidecars.device.memory import Block
 
 
 class FakeMemory:
@@ -38,28 +38,36 @@ class FakeMemory:
         )  # flock guards against other processes, not against our own threads
         self._number = 0
         if not (folder / fakegpu.CARD_FILE).exists():
-            raise NoGpu(f"no simulated card in {folder}", hint="start the arbiter with --gpu fake:8GiB")
+            raise NoGpu(
+                f"no simulated card in {folder}", hint="start the arbiter with --gpu fake:8GiB"
+            )
 
     def bind(self, gpu: str) -> str | None:
         return None  # the lease names the GPU of this folder
 
     def touch(self) -> None:
         """Raises SimulatedOutOfMemory if not even the context fits."""
-        self._do(lambda card, now: fakegpu.touch(card, self._key, self._name, self._context_bytes, now))
+        self._do(
+            lambda card, now: fakegpu.touch(card, self._key, self._name, self._context_bytes, now)
+        )
 
     def allocate(self, label: str, size_bytes: int) -> Block:
         """Raises SimulatedOutOfMemory."""
 
         def change(card: fakegpu.Card, now: float) -> fakegpu.Change:
             touched = fakegpu.touch(card, self._key, self._name, self._context_bytes, now)
-            return touched.then(lambda c: fakegpu.allocate(c, self._key, self._name, label, size_bytes, now))
+            return touched.then(
+                lambda c: fakegpu.allocate(c, self._key, self._name, label, size_bytes, now)
+            )
 
         self._do(change)
         self._number += 1
         return Block(label, size_bytes, self._number)
 
     def free(self, block: Block) -> None:
-        self._do(lambda card, now: fakegpu.free(card, self._key, block.label, block.size_bytes, now))
+        self._do(
+            lambda card, now: fakegpu.free(card, self._key, block.label, block.size_bytes, now)
+        )
 
     def empty_cache(self) -> None:
         self._do(lambda card, now: fakegpu.empty_cache(card, self._key, now))
@@ -69,7 +77,9 @@ class FakeMemory:
         return process.own_bytes if process else 0
 
     def throttle_bytes_per_s(self) -> int | None:
-        return fakegpu.parse_config((self._folder / fakegpu.CARD_FILE).read_text()).throttle_bytes_per_s
+        return fakegpu.parse_config(
+            (self._folder / fakegpu.CARD_FILE).read_text()
+        ).throttle_bytes_per_s
 
     def close(self) -> None:
         """Destroy the context and all that is left, as an orderly exit does."""
@@ -93,7 +103,9 @@ class FakeMemory:
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
-        lock = os.open(self._folder / fakegpu.LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660)
+        lock = os.open(
+            self._folder / fakegpu.LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660
+        )
         try:
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield

@@ -70,7 +70,9 @@ def read_frames(folder: Path, cameras: Sequence[str] | None = None) -> list[Fram
     """All frames of a data set (of these cameras), in file order. Raises BadDataset."""
     labels = folder / LABELS_FILE
     if not labels.is_file():
-        raise BadDataset(f"{labels} is missing: make a data set with `python -m runner.sim.dataset scenes`")
+        raise BadDataset(
+            f"{labels} is missing: make a data set with `python -m vram_arbiter.runner.sim.dataset scenes`"
+        )
     frames: list[Frame] = []
     for number, line in enumerate(labels.read_text(encoding="utf-8").splitlines(), start=1):
         if not line.strip():
@@ -90,7 +92,12 @@ def _frame(folder: Path, raw: Mapping[str, Any]) -> Frame:
     objects = tuple(
         SeenObject(
             name=f"{item['colour']} {item['shape']}",
-            box=(float(item["box"][0]), float(item["box"][1]), float(item["box"][2]), float(item["box"][3])),
+            box=(
+                float(item["box"][0]),
+                float(item["box"][1]),
+                float(item["box"][2]),
+                float(item["box"][3]),
+            ),
             pixels=int(item["pixels"]),
         )
         for item in raw["objects"]
@@ -113,7 +120,9 @@ def visible_names(frame: Frame) -> list[str]:
     return [o.name for o in sorted(frame.objects, key=lambda o: o.box[0] + o.box[2]) if o.clear]
 
 
-def split_by_scene(frames: Sequence[Frame], held_out: float, seed: int) -> tuple[list[Frame], list[Frame]]:
+def split_by_scene(
+    frames: Sequence[Frame], held_out: float, seed: int
+) -> tuple[list[Frame], list[Frame]]:
     """(training, held-out) frames; whole scenes go to one side, at least one scene to each."""
     scenes = sorted({frame.scene for frame in frames})
     if len(scenes) < 2:
@@ -146,7 +155,9 @@ def load_pixels(frames: Sequence[Frame], size: tuple[int, int]) -> Any:
     for index, frame in enumerate(frames):
         with Image.open(frame.image) as image:
             rgb = image.convert("RGB")
-            out[index] = np.asarray(rgb if rgb.size == size else rgb.resize(size, Image.Resampling.BICUBIC))
+            out[index] = np.asarray(
+                rgb if rgb.size == size else rgb.resize(size, Image.Resampling.BICUBIC)
+            )
     return torch.from_numpy(out).permute(0, 3, 1, 2)
 
 

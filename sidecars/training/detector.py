@@ -1,6 +1,6 @@
 """Trains the demo's open-vocabulary detector: a small OwlViT from scratch, saved as any zero-shot hub checkpoint.
 
-`python -m sidecars.training.detector --data DIR --out DIR [--smoke]`. DIR holds `labels.jsonl` and PNGs. The result is
+`python -m vram_arbiter.sidecars.training.detector --data DIR --out DIR [--smoke]`. DIR holds `labels.jsonl` and PNGs. The result is
 read by `AutoProcessor` and `AutoModelForZeroShotObjectDetection` like google/owlvit-base-patch32. This script must not
 know the simulator or the sidecar that will serve the model.
 
@@ -20,9 +20,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from sidecars.training import common, queries
-from sidecars.training.common import Frame
-from sidecars.training.detector_report import (
+from vram_arbiter.sidecars.training import common, queries
+from vram_arbiter.sidecars.training.common import Frame
+from vram_arbiter.sidecars.training.detector_report import (
     CARD,
     area,
     card_rows,
@@ -56,7 +56,9 @@ class Recipe:
     budget_s: float = 3600.0
     max_steps: int = 3000
     held_out: float = 0.12
-    split_seed: int = 7  # not the seed of the run: a run that goes on from another keeps its held-out scenes
+    split_seed: int = (
+        7  # not the seed of the run: a run that goes on from another keeps its held-out scenes
+    )
     strange_queries: int = 10
     word_steps: int = 250
 
@@ -73,7 +75,14 @@ def build_tokenizer(folder: Path, words: Sequence[str]) -> None:
 
     alphabet = common.byte_alphabet()
     tokens, merges = common.learn_merges(words, suffix="</w>")
-    vocab = [PAD, *alphabet, *(letter + "</w>" for letter in alphabet), *dict.fromkeys(tokens), START, END]
+    vocab = [
+        PAD,
+        *alphabet,
+        *(letter + "</w>" for letter in alphabet),
+        *dict.fromkeys(tokens),
+        START,
+        END,
+    ]
     tokenizer = CLIPTokenizer(
         vocab={token: index for index, token in enumerate(vocab)},
         merges=merges,
@@ -138,7 +147,11 @@ def build_model(recipe: Recipe, tokenizer: Any) -> Any:
                 inner = name.endswith(("out_proj", "fc2"))
                 depth = (2 * recipe.layers) ** -0.5 if inner else 1.0
                 module.weight.normal_(std=depth * module.in_features**-0.5)
-        for head in (model.box_head.dense2, model.class_head.logit_shift, model.class_head.logit_scale):
+        for head in (
+            model.box_head.dense2,
+            model.class_head.logit_shift,
+            model.class_head.logit_scale,
+        ):
             head.weight.mul_(0.1)
         vision.position_embedding.weight[1:] = 0.3 * _sine_table(side, recipe.width)
         vision.patch_embedding.weight.normal_(std=(3 * recipe.patch_px**2) ** -0.5)
@@ -154,7 +167,9 @@ def _sine_table(side: int, width: int) -> Any:
     at = torch.arange(side, dtype=torch.float32)[:, None] / side
     angles = at * (2 * torch.pi * torch.logspace(-0.5, 0.9, quarter, 2.0 * 2.0))
     line = torch.cat([angles.sin(), angles.cos()], dim=1)
-    grid = torch.cat([line[:, None].expand(side, side, -1), line[None].expand(side, side, -1)], dim=-1)
+    grid = torch.cat(
+        [line[:, None].expand(side, side, -1), line[None].expand(side, side, -1)], dim=-1
+    )
     return torch.nn.functional.pad(grid.reshape(side * side, -1), (0, width - 4 * quarter))
 
 
@@ -172,7 +187,9 @@ def teach_words(
     basis = torch.linalg.qr(torch.randn(recipe.text_width, recipe.text_width))[0]
     code = {word: basis[i] for i, word in enumerate([*colours, *shapes, ""])}
     text, project = model.owlvit.text_model, model.owlvit.text_projection
-    optimizer = torch.optim.AdamW([*text.parameters(), *project.parameters()], lr=2e-3, weight_decay=0.01)
+    optimizer = torch.optim.AdamW(
+        [*text.parameters(), *project.parameters()], lr=2e-3, weight_decay=0.01
+    )
     reached = 0.0
     for step in range(recipe.word_steps):
         for group in optimizer.param_groups:
@@ -182,7 +199,9 @@ def teach_words(
             for _ in range(4)
             for q in queries.sample_queries(rng, colours, shapes, 3 * recipe.strange_queries)
         ]
-        batch = tokenizer([q.text for q in asked], padding="max_length", truncation=True, return_tensors="pt")
+        batch = tokenizer(
+            [q.text for q in asked], padding="max_length", truncation=True, return_tensors="pt"
+        )
         wanted = torch.stack(
             [
                 sum(
@@ -233,7 +252,9 @@ def make_targets(things: Sequence[Sequence[tuple[str, Any, bool]]], side: int) -
             x0, y0, x1, y1 = (float(v) for v in box)
             cx, cy, w, h = (x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0
             boxes[b, t] = torch.tensor([cx, cy, w, h])
-            touched[b, :, t] = (mx + half > x0) & (mx - half < x1) & (my + half > y0) & (my - half < y1)
+            touched[b, :, t] = (
+                (mx + half > x0) & (mx - half < x1) & (my + half > y0) & (my - half < y1)
+            )
             if clear:
                 core = ((mx - cx).abs() < 0.3 * w) & ((my - cy).abs() < 0.3 * h)
                 core[((mx - cx) ** 2 + (my - cy) ** 2).argmin()] = True
@@ -271,7 +292,9 @@ def loss_of(
             answers[b, t] = torch.tensor([float(query.matches(colour, shape)) for query in asked])
     owned = targets.owner >= 0
     owner = targets.owner.clamp(min=0)
-    wanted = torch.gather(answers, 1, owner[..., None].expand(-1, -1, len(asked))) * owned[..., None]
+    wanted = (
+        torch.gather(answers, 1, owner[..., None].expand(-1, -1, len(asked))) * owned[..., None]
+    )
     # a patch that touches a thing without owning it may say either to the thing's own queries
     unsure = torch.einsum("bpt,btq->bpq", targets.touched.float(), answers) > 0
     weight = 1.0 - (unsure & (wanted == 0)).float()
@@ -337,13 +360,19 @@ def take_over(model: Any, start: Path) -> None:
     weights = OwlViTForObjectDetection.from_pretrained(start, local_files_only=True).state_dict()
     name = "owlvit.vision_model.embeddings.patch_embedding.weight"
     old, new = weights[name], model.state_dict()[name]
-    scaled = torch.nn.functional.interpolate(old, new.shape[-2:], mode="bicubic", align_corners=False)
+    scaled = torch.nn.functional.interpolate(
+        old, new.shape[-2:], mode="bicubic", align_corners=False
+    )
     weights[name] = scaled * (old.shape[-1] / new.shape[-1]) ** 2
     model.load_state_dict(weights)
 
 
 def train(
-    recipe: Recipe, frames: Sequence[Frame], words: Sequence[str], out: Path, start: Path | None = None
+    recipe: Recipe,
+    frames: Sequence[Frame],
+    words: Sequence[str],
+    out: Path,
+    start: Path | None = None,
 ) -> tuple[Any, Any, dict[str, Any]]:
     """Train on `frames`, from the weights of `start` if given; returns (processor, model, figures of the run)."""
     import torch
@@ -387,7 +416,10 @@ def train(
         images, things = augment(rng, generator, pixels[chosen], picked, recipe.image_px)
         asked = queries.sample_queries(rng, colours, shapes, recipe.strange_queries)
         text = processor.tokenizer(
-            [query.text for query in asked], padding="max_length", truncation=True, return_tensors="pt"
+            [query.text for query in asked],
+            padding="max_length",
+            truncation=True,
+            return_tensors="pt",
         )
         targets = make_targets(things, recipe.image_px // recipe.patch_px)
         loss = loss_of(
@@ -402,7 +434,10 @@ def train(
         if done - shown >= 0.05:
             shown = done
             recent = sum(losses[-50:]) / len(losses[-50:])
-            print(f"{time.monotonic() - started:6.0f} s  step {step:5d}  loss {recent:.3f}", flush=True)
+            print(
+                f"{time.monotonic() - started:6.0f} s  step {step:5d}  loss {recent:.3f}",
+                flush=True,
+            )
     model.eval()
     return (
         processor,
@@ -425,7 +460,9 @@ def run(recipe: Recipe, data: Path, out: Path, start: Path | None = None) -> dic
     training, testing = common.split_by_scene(frames, recipe.held_out, recipe.split_seed)
     out.mkdir(parents=True, exist_ok=True)
     names = sorted({name for frame in frames for name in frame.present})
-    words = queries.every_word(sorted({n.split()[0] for n in names}), sorted({n.split()[1] for n in names}))
+    words = queries.every_word(
+        sorted({n.split()[0] for n in names}), sorted({n.split()[1] for n in names})
+    )
     _, trained, figures = train(recipe, training, words, out, start)
     trained.save_pretrained(out)
     processor = AutoProcessor.from_pretrained(out, local_files_only=True)
@@ -452,19 +489,29 @@ def run(recipe: Recipe, data: Path, out: Path, start: Path | None = None) -> dic
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line; 2 for a folder that is no data set."""
-    parser = argparse.ArgumentParser(prog="python -m sidecars.training.detector", description=__doc__)
-    parser.add_argument("--data", type=Path, required=True, help="folder with labels.jsonl and images")
+    parser = argparse.ArgumentParser(
+        prog="python -m vram_arbiter.sidecars.training.detector", description=__doc__
+    )
+    parser.add_argument(
+        "--data", type=Path, required=True, help="folder with labels.jsonl and images"
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder for the checkpoint")
     parser.add_argument(
         "--start-from", type=Path, help="checkpoint of this script whose training is to go on"
     )
     parser.add_argument("--steps", type=int, help="steps, if not the recipe's")
-    parser.add_argument("--budget-s", type=float, help="seconds after which to end, learning rate and all")
-    parser.add_argument("--smoke", action="store_true", help="a toy size, seconds, only to see that all runs")
+    parser.add_argument(
+        "--budget-s", type=float, help="seconds after which to end, learning rate and all"
+    )
+    parser.add_argument(
+        "--smoke", action="store_true", help="a toy size, seconds, only to see that all runs"
+    )
     parser.add_argument("--seed", type=int, default=Recipe().seed)
     parser.add_argument("--threads", type=int, default=Recipe().threads)
     args = parser.parse_args(argv)
-    recipe = dataclasses.replace(SMOKE if args.smoke else Recipe(), seed=args.seed, threads=args.threads)
+    recipe = dataclasses.replace(
+        SMOKE if args.smoke else Recipe(), seed=args.seed, threads=args.threads
+    )
     if args.budget_s is not None:
         recipe = dataclasses.replace(recipe, budget_s=args.budget_s)
     if args.steps is not None:

@@ -11,8 +11,8 @@ import time
 from collections.abc import Sequence
 from typing import Any, Final
 
-from sidecars.training import queries
-from sidecars.training.common import Frame
+from vram_arbiter.sidecars.training import queries
+from vram_arbiter.sidecars.training.common import Frame
 
 
 def area(box: Sequence[float]) -> float:
@@ -51,7 +51,9 @@ class Trial:
         """Distance of the box centres in pixels of the frame."""
         assert self.truth is not None
         a, b = self.truth, self.box
-        return float(((a[0] + a[2] - b[0] - b[2]) ** 2 + (a[1] + a[3] - b[1] - b[3]) ** 2) ** 0.5 / 2)
+        return float(
+            ((a[0] + a[2] - b[0] - b[2]) ** 2 + (a[1] + a[3] - b[1] - b[3]) ** 2) ** 0.5 / 2
+        )
 
 
 def run_trials(processor: Any, model: Any, frames: Sequence[Frame], seed: int) -> list[Trial]:
@@ -68,7 +70,9 @@ def run_trials(processor: Any, model: Any, frames: Sequence[Frame], seed: int) -
     trials: list[Trial] = []
     for frame in frames:
         asked = [
-            q for q in queries.sample_queries(rng, colours, shapes, 4) if q.known == (q.shape is not None)
+            q
+            for q in queries.sample_queries(rng, colours, shapes, 4)
+            if q.known == (q.shape is not None)
         ]
         asked += [
             queries.Query(f"{rng.choice(colours)} {thing}", None, None, known=False)
@@ -88,7 +92,9 @@ def run_trials(processor: Any, model: Any, frames: Sequence[Frame], seed: int) -
             hits = [seen for seen in frame.objects if query.matches(seen.colour, seen.shape)]
             if hits and not hits[0].clear:
                 continue
-            trials.append(Trial(frame.stage, query.known, hits[0].box if hits else None, score, tuple(box)))
+            trials.append(
+                Trial(frame.stage, query.known, hits[0].box if hits else None, score, tuple(box))
+            )
     return trials
 
 
@@ -137,7 +143,10 @@ def inference_ms(processor: Any, model: Any, frame: Frame) -> float:
         with torch.inference_mode():
             outputs = model(**inputs)
         processor.post_process_grounded_object_detection(
-            outputs, threshold=0.3, target_sizes=[(rgb.height, rgb.width)], text_labels=[["red cube"]]
+            outputs,
+            threshold=0.3,
+            target_sizes=[(rgb.height, rgb.width)],
+            text_labels=[["red cube"]],
         )
         times.append(1000 * (time.perf_counter() - began))
     return round(sorted(times)[len(times) // 2], 1)
@@ -151,12 +160,12 @@ pipeline_tag: zero-shot-object-detection
 # so101-detector
 
 The demo's open-vocabulary detector: an OwlViT of {parameters} parameters, trained from scratch on frames of the simulated
-tabletop by `python -m sidecars.training.detector` (no pretrained weights). It stands in for a production detector, is read by
+tabletop by `python -m vram_arbiter.sidecars.training.detector` (no pretrained weights). It stands in for a production detector, is read by
 `AutoProcessor` / `AutoModelForZeroShotObjectDetection` like one, and knows coloured cubes, balls and cylinders only.
 
 - Camera `{camera}`; frames are scaled to {image_px} x {image_px} by the processor. Recommended `score_threshold`: {threshold}.
 - Query with free text (`red cube`, `a photo of a blue ball`, `green object`). Several boxes may lie on one thing: take the best.
-- Data: `python -m runner.sim.dataset scenes --count 8000 --seed 1`; {train_frames} frames to train, {test_frames} held out by scene.
+- Data: `python -m vram_arbiter.runner.sim.dataset scenes --count 8000 --seed 1`; {train_frames} frames to train, {test_frames} held out by scene.
 - Training: seed {seed}, {steps} steps of {batch}, {train_s} s on {threads} thread(s), bfloat16 autocast; checkpoint float32, {bytes} bytes.
 - One query on one image: {inference_ms} ms on one core, pre- and post-processing included.
 

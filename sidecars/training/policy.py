@@ -1,6 +1,6 @@
-"""Trains the small grab policy on recorded demonstrations: `python -m sidecars.training.policy --data DIR --out DIR`.
+"""Trains the small grab policy on recorded demonstrations: `python -m vram_arbiter.sidecars.training.policy --data DIR --out DIR`.
 
-Reads a folder written by `python -m runner.sim.dataset grab`; writes a lerobot checkpoint (config, weights, processors).
+Reads a folder written by `python -m vram_arbiter.runner.sim.dataset grab`; writes a lerobot checkpoint (config, weights, processors).
 Seeded; about ten minutes on two cores. `--smoke` runs a few seconds of the same code. Must not know the simulator.
 """
 
@@ -63,11 +63,13 @@ def _load_folder(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     path = folder / "info.json"
     if not path.is_file():
         raise BadDemonstrations(
-            f"{path} is missing: record with `python -m runner.sim.dataset grab --out {folder}`"
+            f"{path} is missing: record with `python -m vram_arbiter.runner.sim.dataset grab --out {folder}`"
         )
     info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     if info.get("format") != FORMAT:
-        raise BadDemonstrations(f"{path} says format {info.get('format')!r}, this script reads {FORMAT!r}")
+        raise BadDemonstrations(
+            f"{path} says format {info.get('format')!r}, this script reads {FORMAT!r}"
+        )
     arrays = {
         key: np.load(folder / f"{key}.npy")
         for key in (*CAMERAS, "state", "action", "point", "episode_length")
@@ -85,9 +87,11 @@ def make_config(info: dict[str, Any], *, action_steps: int) -> Any:
     """The policy's configuration for this data: cameras at their full size, crops from the data's own description."""
     from lerobot.configs import FeatureType, PolicyFeature
 
-    from sidecars.compact_act import CompactActConfig
+    from vram_arbiter.sidecars.models.compact_act import CompactActConfig
 
-    inputs = {"observation.state": PolicyFeature(type=FeatureType.STATE, shape=(len(info["joints"]),))}
+    inputs = {
+        "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(len(info["joints"]),))
+    }
     views = {}
     for camera in CAMERAS:
         width, height = info["views"][camera]["camera_px"]
@@ -99,7 +103,9 @@ def make_config(info: dict[str, Any], *, action_steps: int) -> Any:
         ]
     return CompactActConfig(
         input_features=inputs,
-        output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(len(info["joints"]),))},
+        output_features={
+            "action": PolicyFeature(type=FeatureType.ACTION, shape=(len(info["joints"]),))
+        },
         views=views,
         n_action_steps=action_steps,
         device="cpu",
@@ -159,7 +165,9 @@ class Batches:
         # past the end the arm just stays: the last target goes on for a while and is worth learning
         pad = ahead > last + AFTER_END_STEPS
         state, action = self._stats["observation.state"], self._stats["action"]
-        noisy = self._state[pick] + 0.004 * torch.randn(size, self._state.shape[1], generator=self._generator)
+        noisy = self._state[pick] + 0.004 * torch.randn(
+            size, self._state.shape[1], generator=self._generator
+        )
         batch: dict[str, Any] = {
             "observation.state": (noisy - state["mean"]) / state["std"],
             "observation.point": self._point[pick],
@@ -178,9 +186,9 @@ class Batches:
         image = images.float() / 255
         gain = 1 + 0.06 * torch.randn(count, 3, 1, 1, generator=self._generator)
         light = 0.05 * torch.randn(count, 1, 1, 1, generator=self._generator)
-        image = (image * gain + light + 0.01 * torch.randn(image.shape, generator=self._generator)).clamp(
-            0, 1
-        )
+        image = (
+            image * gain + light + 0.01 * torch.randn(image.shape, generator=self._generator)
+        ).clamp(0, 1)
         # one shift for the whole batch is cheap, and every batch has another
         dx, dy = (int(v) for v in torch.randint(-1, 2, (2,), generator=self._generator))
         padded = F.pad(image, (1, 1, 1, 1), mode="replicate")
@@ -206,7 +214,7 @@ def train(
     import torch
     from lerobot.policies.factory import make_pre_post_processors
 
-    from sidecars.compact_act.modeling_compact_act import CompactActPolicy
+    from vram_arbiter.sidecars.models.compact_act.modeling_compact_act import CompactActPolicy
 
     random.seed(seed)
     torch.manual_seed(seed)
@@ -220,7 +228,9 @@ def train(
         policy = CompactActPolicy.from_pretrained(init, config=config)
     batches = Batches(data, config, stats, seed)
     optimizer = torch.optim.AdamW(
-        policy.get_optim_params(), lr=config.optimizer_lr, weight_decay=config.optimizer_weight_decay
+        policy.get_optim_params(),
+        lr=config.optimizer_lr,
+        weight_decay=config.optimizer_weight_decay,
     )
     averaged = torch.optim.swa_utils.AveragedModel(
         policy, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.998)
@@ -236,7 +246,9 @@ def train(
         warm = min(1.0, (step + 1) / warm_steps)
         for group in optimizer.param_groups:
             group["lr"] = (
-                config.optimizer_lr * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * progress)))
+                config.optimizer_lr
+                * warm
+                * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * progress)))
             )
         policy.train()
         loss, parts = policy(batches.draw(batch_size))
@@ -261,9 +273,15 @@ def train(
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of the policy trainer."""
-    parser = argparse.ArgumentParser(prog="python -m sidecars.training.policy", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m vram_arbiter.sidecars.training.policy", description=__doc__
+    )
     parser.add_argument(
-        "--data", type=Path, required=True, nargs="+", help="folders written by runner.sim.dataset grab"
+        "--data",
+        type=Path,
+        required=True,
+        nargs="+",
+        help="folders written by runner.sim.dataset grab",
     )
     parser.add_argument("--init", type=Path, help="checkpoint to go on from")
     parser.add_argument("--out", type=Path, required=True, help="checkpoint folder")

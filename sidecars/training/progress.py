@@ -1,6 +1,6 @@
-"""Trains the small progress model: `python -m sidecars.training.progress --data DIR --out DIR`.
+"""Trains the small progress model: `python -m vram_arbiter.sidecars.training.progress --data DIR --out DIR`.
 
-Reads a folder written by `python -m runner.sim.progress`; writes a lerobot reward model (config, weights) and its model card with the held-out
+Reads a folder written by `python -m vram_arbiter.runner.sim.progress`; writes a lerobot reward model (config, weights) and its model card with the held-out
 figures. Seeded; under three minutes on two cores. `--smoke` runs a few seconds of the same code. Must not know the simulator.
 """
 
@@ -19,9 +19,7 @@ from typing import Any, Final
 
 FORMAT: Final = "grab-progress/1"
 HELD_OUT: Final = 0.12  # of the tries, the last ones: a try is never parted
-ABOUT_WORK: Final = (
-    0.55  # of the training questions ask for the thing that the grab is about; the others for anything else
-)
+ABOUT_WORK: Final = 0.55  # of the training questions ask for the thing that the grab is about; the others for anything else
 ABSENT: Final = 0.1  # ask for what is not on the table
 SURE: Final = 0.5
 
@@ -58,11 +56,13 @@ def load(folder: Path) -> Pictures:
     path = folder / "info.json"
     if not path.is_file():
         raise BadProgressData(
-            f"{path} is missing: record with `python -m runner.sim.progress --out {folder}`"
+            f"{path} is missing: record with `python -m vram_arbiter.runner.sim.progress --out {folder}`"
         )
     info = json.loads(path.read_text(encoding="utf-8"))
     if info.get("format") != FORMAT:
-        raise BadProgressData(f"{path} says format {info.get('format')!r}, this script reads {FORMAT!r}")
+        raise BadProgressData(
+            f"{path} says format {info.get('format')!r}, this script reads {FORMAT!r}"
+        )
     images = np.load(folder / "images.npy")
     progress: list[dict[str, float]] = []
     held: list[dict[str, bool]] = []
@@ -79,7 +79,7 @@ def load(folder: Path) -> Pictures:
 
 def make_config(data: Pictures) -> Any:
     """The model's configuration for this data."""
-    from sidecars.compact_progress import CompactProgressConfig
+    from vram_arbiter.sidecars.models.compact_progress import CompactProgressConfig
 
     height, width = data.images.shape[1:3]
     return CompactProgressConfig(
@@ -120,11 +120,16 @@ def batch_of(
     """Tensors for so many (picture, thing) pairs; `rng` (a torch generator) adds tint, light and noise."""
     import torch
 
-    from sidecars.compact_progress.modeling_compact_progress import PROGRESS_KEY, SUCCESS_KEY, WORDS_KEY
-    from sidecars.compact_progress.processor_compact_progress import words_of
+    from vram_arbiter.sidecars.models.compact_progress.modeling_compact_progress import (
+        PROGRESS_KEY,
+        SUCCESS_KEY,
+        WORDS_KEY,
+    )
+    from vram_arbiter.sidecars.models.compact_progress.processor_compact_progress import words_of
 
     pictures = (
-        torch.from_numpy(data.images[[index for index, _ in questions]]).permute(0, 3, 1, 2).float() / 255
+        torch.from_numpy(data.images[[index for index, _ in questions]]).permute(0, 3, 1, 2).float()
+        / 255
     )
     if rng is not None:
         count = len(questions)
@@ -136,8 +141,12 @@ def batch_of(
     return {
         config.image_key: pictures[:, None],
         WORDS_KEY: torch.tensor(words),
-        PROGRESS_KEY: torch.tensor([[data.progress[index].get(name, 0.0)] for index, name in questions]),
-        SUCCESS_KEY: torch.tensor([[float(data.held[index].get(name, False))] for index, name in questions]),
+        PROGRESS_KEY: torch.tensor(
+            [[data.progress[index].get(name, 0.0)] for index, name in questions]
+        ),
+        SUCCESS_KEY: torch.tensor(
+            [[float(data.held[index].get(name, False))] for index, name in questions]
+        ),
     }
 
 
@@ -147,7 +156,9 @@ def train(
     """Train, write the checkpoint, return the last running losses. Ends early, and well, at the limit: the rate follows time."""
     import torch
 
-    from sidecars.compact_progress.modeling_compact_progress import CompactProgressRewardModel
+    from vram_arbiter.sidecars.models.compact_progress.modeling_compact_progress import (
+        CompactProgressRewardModel,
+    )
 
     torch.manual_seed(seed)
     rng, generator = random.Random(f"progress-{seed}"), torch.Generator().manual_seed(seed)
@@ -168,7 +179,9 @@ def train(
             break
         warm = min(1.0, (step + 1) / max(1, min(100, steps // 10)))
         for group in optimizer.param_groups:
-            group["lr"] = config.optimizer_lr * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * share)))
+            group["lr"] = (
+                config.optimizer_lr * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * share)))
+            )
         picked = rng.choices(learn, k=batch_size)
         model.train()
         loss, parts = model(
@@ -184,7 +197,10 @@ def train(
             running[key] = value if key not in running else 0.95 * running[key] + 0.05 * value
         if done % 100 == 0:
             line = {"step": done, "s": round(time.monotonic() - began, 1)}
-            print(json.dumps(line | {key: round(value, 4) for key, value in running.items()}), flush=True)
+            print(
+                json.dumps(line | {key: round(value, 4) for key, value in running.items()}),
+                flush=True,
+            )
     best = (
         averaged.module if done >= 500 else model
     )  # a short run's average still holds the untrained weights
@@ -200,16 +216,22 @@ def judge(data: Pictures, checkpoint: Path) -> dict[str, float]:
     from lerobot.configs.rewards import RewardModelConfig
     from lerobot.rewards.factory import get_reward_model_class
 
-    import sidecars.compact_progress  # noqa: F401  # registers the type
+    import vram_arbiter.sidecars.models.compact_progress  # noqa: F401  # registers the type
 
     config = RewardModelConfig.from_pretrained(checkpoint)
     model = get_reward_model_class(config.type).from_pretrained(checkpoint, config=config)
     _, kept = split(data)
-    asked: dict[str, list[tuple[int, str]]] = {"held": [], "another is held": [], "nothing is held": []}
+    asked: dict[str, list[tuple[int, str]]] = {
+        "held": [],
+        "another is held": [],
+        "nothing is held": [],
+    }
     for index in kept:
         holds = any(data.held[index].values())
         for name, held in data.held[index].items():
-            asked["held" if held else "another is held" if holds else "nothing is held"].append((index, name))
+            asked["held" if held else "another is held" if holds else "nothing is held"].append(
+                (index, name)
+            )
     figures: dict[str, float] = {}
     errors: list[float] = []
     for group, questions in asked.items():
@@ -222,7 +244,9 @@ def judge(data: Pictures, checkpoint: Path) -> dict[str, float]:
             right += int(((success > SURE) == (batch["success"] > SURE)).sum())
             gaps = (progress - batch["progress"]).abs()[:, 0].tolist()
             errors += [
-                gap for gap, (index, name) in zip(gaps, part, strict=True) if name == data.about(index)
+                gap
+                for gap, (index, name) in zip(gaps, part, strict=True)
+                if name == data.about(index)
             ]
         figures[group] = round(right / max(1, len(questions)), 4)
         figures[f"{group}: asked"] = len(questions)
@@ -238,8 +262,8 @@ library_name: lerobot
 ---
 # so101-progress
 
-The demo's reward model: lerobot type `compact_progress`, trained from scratch by `python -m sidecars.training.progress` on
-`python -m runner.sim.progress` (wrist camera, two grabs in five miss on purpose). It stands in for Robometer-4B, judges each picture by itself, and knows
+The demo's reward model: lerobot type `compact_progress`, trained from scratch by `python -m vram_arbiter.sidecars.training.progress` on
+`python -m vram_arbiter.runner.sim.progress` (wrist camera, two grabs in five miss on purpose). It stands in for Robometer-4B, judges each picture by itself, and knows
 the tabletop's colours and shapes only: an instruction has to name one thing by both.
 
 Progress is the simulator's truth, not time: nearing the named thing up to 0.5, both fingers on it 0.6, held from 0.7, carried 1. The policy's own grabs look
@@ -258,7 +282,9 @@ Mean error of progress for the thing that the grab is about: {error}. Trained {s
 def card(figures: dict[str, float], trained: dict[str, float]) -> str:
     """The model card."""
     groups = [name for name in figures if f"{name}: asked" in figures]
-    rows = "\n".join(f"| {name} | {figures[f'{name}: asked']:.0f} | {figures[name]:.2%} |" for name in groups)
+    rows = "\n".join(
+        f"| {name} | {figures[f'{name}: asked']:.0f} | {figures[name]:.2%} |" for name in groups
+    )
     return CARD.format(
         held_out=int(figures["held-out pictures"]), rows=rows, error=figures["progress error"],
         steps=int(trained["steps"]), seconds=round(trained["seconds"]),
@@ -267,8 +293,12 @@ def card(figures: dict[str, float], trained: dict[str, float]) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of the trainer."""
-    parser = argparse.ArgumentParser(prog="python -m sidecars.training.progress", description=__doc__)
-    parser.add_argument("--data", type=Path, required=True, help="folder written by runner.sim.progress")
+    parser = argparse.ArgumentParser(
+        prog="python -m vram_arbiter.sidecars.training.progress", description=__doc__
+    )
+    parser.add_argument(
+        "--data", type=Path, required=True, help="folder written by runner.sim.progress"
+    )
     parser.add_argument("--out", type=Path, required=True, help="checkpoint folder")
     parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--batch-size", type=int, default=32)
@@ -295,7 +325,9 @@ def main(argv: list[str] | None = None) -> int:
     )
     figures = judge(data, args.out)
     (args.out / "README.md").write_text(card(figures, trained), encoding="utf-8")
-    print(json.dumps({"out": str(args.out), **figures} | {k: round(v, 4) for k, v in trained.items()}))
+    print(
+        json.dumps({"out": str(args.out), **figures} | {k: round(v, 4) for k, v in trained.items()})
+    )
     return 0
 
 

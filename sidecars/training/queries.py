@@ -50,9 +50,14 @@ def every_word(colours: Sequence[str], shapes: Sequence[str]) -> list[str]:
         *(s for s in shapes if s not in SHAPE_WORDS),
     }
     words.update(
-        word for shape in shapes for phrase in SHAPE_WORDS.get(shape, (shape,)) for word in phrase.split()
+        word
+        for shape in shapes
+        for phrase in SHAPE_WORDS.get(shape, (shape,))
+        for word in phrase.split()
     )
-    words.update(word for phrase in PHRASES for word in phrase.replace("{}", " ").replace(".", " ").split())
+    words.update(
+        word for phrase in PHRASES for word in phrase.replace("{}", " ").replace(".", " ").split()
+    )
     return sorted(words)
 
 
@@ -71,7 +76,9 @@ def sample_queries(
         if colour in OTHER_COLOURS and rng.random() < 0.6:
             noun = _shape_word(rng, rng.choice(shapes))
         elif rng.random() < 0.4:
-            noun = "".join(rng.choice("abcdefghijklmnopqrstuvwxyz") for _ in range(rng.randint(3, 8)))
+            noun = "".join(
+                rng.choice("abcdefghijklmnopqrstuvwxyz") for _ in range(rng.randint(3, 8))
+            )
         else:
             noun = rng.choice(OTHER_THINGS)
         text = noun if noun in OTHER_THINGS and rng.random() < 0.3 else f"{colour} {noun}"

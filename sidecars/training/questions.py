@@ -43,7 +43,11 @@ LIST: Final = (
     "What objects do you see?",
     "List the objects.",
 )
-SYNONYMS: Final = {"cube": ("cube", "block"), "ball": ("ball", "sphere"), "cylinder": ("cylinder", "can")}
+SYNONYMS: Final = {
+    "cube": ("cube", "block"),
+    "ball": ("ball", "sphere"),
+    "cylinder": ("cylinder", "can"),
+}
 NOTHING: Final = "nothing"
 
 
@@ -60,7 +64,9 @@ def said(rng: random.Random, template: str, name: str) -> str:
     return text.replace(" a orange", " an orange")
 
 
-def grasped(rng: random.Random, name: str, held: str | None, template: str | None = None) -> tuple[str, str]:
+def grasped(
+    rng: random.Random, name: str, held: str | None, template: str | None = None
+) -> tuple[str, str]:
     """(question, answer) whether a named thing is held."""
     question = said(rng, template or rng.choice(GRASPED), name)
     if held == name:

@@ -1,6 +1,6 @@
 """Trains the demo's scene VLM: a small Qwen3.5 from scratch, saved as any image-text-to-text hub checkpoint.
 
-`python -m sidecars.training.scene_vlm --data DIR --out DIR [--smoke]`. DIR holds `labels.jsonl` and PNGs. The result is read
+`python -m vram_arbiter.sidecars.training.scene_vlm --data DIR --out DIR [--smoke]`. DIR holds `labels.jsonl` and PNGs. The result is read
 by `AutoProcessor` and `AutoModelForImageTextToText` like Qwen/Qwen3.5-4B: chat template, `generate`. This script must not know
 the simulator or the sidecar that will serve the model.
 
@@ -21,9 +21,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from sidecars.training import common, questions
-from sidecars.training.common import Frame, visible_names
-from sidecars.training.scene_vlm_report import CARD, Asker, card_rows, evaluate, inference_ms, share
+from vram_arbiter.sidecars.training import common, questions
+from vram_arbiter.sidecars.training.common import Frame, visible_names
+from vram_arbiter.sidecars.training.scene_vlm_report import (
+    CARD,
+    Asker,
+    card_rows,
+    evaluate,
+    inference_ms,
+    share,
+)
 
 SPECIALS: Final = (
     "<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>",
@@ -52,12 +59,20 @@ class Recipe:
     seed: int = 7
     threads: int = 1
     cameras: tuple[str, ...] = ("wrist",)
-    grid: tuple[int, int] = (14, 10)  # patches across and down; even, as 2 x 2 of them make one token
+    grid: tuple[int, int] = (
+        14,
+        10,
+    )  # patches across and down; even, as 2 x 2 of them make one token
     patch_px: int = 16
     vision_width: int = 128
     vision_layers: int = 3
     width: int = 128
-    layer_types: tuple[str, ...] = ("linear_attention", "full_attention", "full_attention", "full_attention")
+    layer_types: tuple[str, ...] = (
+        "linear_attention",
+        "full_attention",
+        "full_attention",
+        "full_attention",
+    )
     batch: int = 16
     questions_per_image: int = 3
     vision_steps: int = 1200
@@ -66,7 +81,9 @@ class Recipe:
     language_budget_s: float = 3600.0
     learning_rate: float = 1.0e-3
     held_out: float = 0.12
-    split_seed: int = 0  # not the seed of the run: a run that goes on from another keeps its held-out scenes
+    split_seed: int = (
+        0  # not the seed of the run: a run that goes on from another keeps its held-out scenes
+    )
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -244,7 +261,9 @@ class Heads:
                 shows[row, self.names.index(seen.name)] = 1.0
                 weight[row, self.names.index(seen.name)] = float(seen.clear)
         logits = self.held(mean)
-        visible = functional.binary_cross_entropy_with_logits(self.shows(mean), shows, weight=weight)
+        visible = functional.binary_cross_entropy_with_logits(
+            self.shows(mean), shows, weight=weight
+        )
         right = float((logits.argmax(dim=1) == held).float().mean())
         return functional.cross_entropy(logits, held) + visible, right
 
@@ -290,7 +309,9 @@ def ask_about(rng: random.Random, frame: Frame, names: Sequence[str]) -> tuple[s
     if kind < 0.66:
         draw = rng.random()
         alike = [
-            n for n in names if n != frame.held and set(n.split(" ")) & set((frame.held or "").split(" "))
+            n
+            for n in names
+            if n != frame.held and set(n.split(" ")) & set((frame.held or "").split(" "))
         ]
         if frame.held is not None and draw < 0.45:
             name = frame.held
@@ -309,7 +330,9 @@ def ask_about(rng: random.Random, frame: Frame, names: Sequence[str]) -> tuple[s
     return questions.listing(rng, seen)
 
 
-def encode(processor: Any, pairs: Sequence[tuple[str, str]], image_token_count: int) -> tuple[Any, Any, Any]:
+def encode(
+    processor: Any, pairs: Sequence[tuple[str, str]], image_token_count: int
+) -> tuple[Any, Any, Any]:
     """(ids, attention mask, labels) of chats, left-padded; labels only on the answers."""
     import torch
 
@@ -370,12 +393,18 @@ def take_over(model: Any, start: Path) -> None:
     earlier = type(model).from_pretrained(start, local_files_only=True)
     weights = earlier.state_dict()
     if earlier.config.text_config.layer_types != model.config.text_config.layer_types:
-        weights = {name: value for name, value in weights.items() if name.startswith("model.visual.")}
+        weights = {
+            name: value for name, value in weights.items() if name.startswith("model.visual.")
+        }
     model.load_state_dict(weights, strict=False)
 
 
 def train(
-    recipe: Recipe, frames: Sequence[Frame], names: Sequence[str], out: Path, start: Path | None = None
+    recipe: Recipe,
+    frames: Sequence[Frame],
+    names: Sequence[str],
+    out: Path,
+    start: Path | None = None,
 ) -> tuple[Any, dict[str, Any]]:
     """All stages on `frames`, from the weights of `start` if given; saves the processor; returns (model, figures)."""
     import torch
@@ -423,7 +452,10 @@ def train(
             chosen = [order[i] for i in next(batches)]
             picked = [frames[i] for i in chosen]
             patches = to_patches(augment(pixels[chosen], generator), recipe)
-            with torch.autocast("cpu", dtype=torch.bfloat16), torch.set_grad_enabled(stage != "language"):
+            with (
+                torch.autocast("cpu", dtype=torch.bfloat16),
+                torch.set_grad_enabled(stage != "language"),
+            ):
                 tokens = image_tokens(model, patches, recipe)
             tokens = tokens.float()
             if stage == "vision":
@@ -441,7 +473,9 @@ def train(
             if step % max(1, steps // 20) == 0:
                 last = seen[-30:]
                 shown = f"right {sum(r for r, _ in last) / len(last):.3f}  loss {sum(v for _, v in last) / len(last):.3f}"
-                print(f"{time.monotonic() - started:6.0f} s  {stage} {step:5d}  {shown}", flush=True)
+                print(
+                    f"{time.monotonic() - started:6.0f} s  {stage} {step:5d}  {shown}", flush=True
+                )
         figures[f"{stage}_steps"] = len(seen)
     figures["train_s"] = round(time.monotonic() - started, 1)
     model.eval()
@@ -506,20 +540,34 @@ def report(
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line; 2 for a folder that is no data set."""
-    parser = argparse.ArgumentParser(prog="python -m sidecars.training.scene_vlm", description=__doc__)
-    parser.add_argument("--data", type=Path, required=True, help="folder with labels.jsonl and images")
+    parser = argparse.ArgumentParser(
+        prog="python -m vram_arbiter.sidecars.training.scene_vlm", description=__doc__
+    )
+    parser.add_argument(
+        "--data", type=Path, required=True, help="folder with labels.jsonl and images"
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder for the checkpoint")
     parser.add_argument(
         "--start-from", type=Path, help="checkpoint of this script whose training is to go on"
     )
-    parser.add_argument("--vision-steps", type=int, help="steps of the first stage, if not the recipe's")
-    parser.add_argument("--steps", type=int, help="steps of the language stage, if not the recipe's")
-    parser.add_argument("--budget-s", type=float, help="seconds after which the language stage ends")
-    parser.add_argument("--smoke", action="store_true", help="a toy size, seconds, only to see that all runs")
+    parser.add_argument(
+        "--vision-steps", type=int, help="steps of the first stage, if not the recipe's"
+    )
+    parser.add_argument(
+        "--steps", type=int, help="steps of the language stage, if not the recipe's"
+    )
+    parser.add_argument(
+        "--budget-s", type=float, help="seconds after which the language stage ends"
+    )
+    parser.add_argument(
+        "--smoke", action="store_true", help="a toy size, seconds, only to see that all runs"
+    )
     parser.add_argument("--seed", type=int, default=Recipe().seed)
     parser.add_argument("--threads", type=int, default=Recipe().threads)
     args = parser.parse_args(argv)
-    recipe = dataclasses.replace(SMOKE if args.smoke else Recipe(), seed=args.seed, threads=args.threads)
+    recipe = dataclasses.replace(
+        SMOKE if args.smoke else Recipe(), seed=args.seed, threads=args.threads
+    )
     if args.vision_steps is not None:
         recipe = dataclasses.replace(recipe, vision_steps=args.vision_steps)
     if args.budget_s is not None:

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from sidecars.training import questions
-from sidecars.training.common import Frame, visible_names
+from vram_arbiter.sidecars.training import questions
+from vram_arbiter.sidecars.training.common import Frame, visible_names
 
 
 class Asker:
@@ -35,14 +35,18 @@ class Asker:
             [{"role": "user", "content": content}], add_generation_prompt=True, tokenize=False
         )
         with Image.open(image) as picture:
-            inputs = self.processor(text=[prompt], images=[picture.convert("RGB")], return_tensors="pt")
+            inputs = self.processor(
+                text=[prompt], images=[picture.convert("RGB")], return_tensors="pt"
+            )
         with torch.inference_mode():
             output = self.model.generate(**inputs, max_new_tokens=max_new_tokens, do_sample=False)
         answer = output[0, inputs["input_ids"].shape[1] :]
         return str(self.processor.decode(answer, skip_special_tokens=True)).strip()
 
 
-def evaluate(asker: Asker, frames: Sequence[Frame], names: Sequence[str], seed: int) -> list[dict[str, Any]]:
+def evaluate(
+    asker: Asker, frames: Sequence[Frame], names: Sequence[str], seed: int
+) -> list[dict[str, Any]]:
     """One row a question: group, right (the yes or no, or the whole answer), exact, frame, question, truth, answer.
 
     Every frame is asked whether its target-to-be is grasped: the held thing (`held`), another one while something is held
@@ -63,7 +67,10 @@ def evaluate(asker: Asker, frames: Sequence[Frame], names: Sequence[str], seed: 
         seen = visible_names(frame)
         hidden = {o.name for o in frame.objects if not o.clear}
         pairs.append(
-            ("in view?", questions.present(rng, rng.choice([n for n in names if n not in hidden]), seen))
+            (
+                "in view?",
+                questions.present(rng, rng.choice([n for n in names if n not in hidden]), seen),
+            )
         )
         if not hidden:
             pairs.append(("list", questions.listing(rng, seen)))
@@ -104,14 +111,14 @@ pipeline_tag: image-text-to-text
 # so101-scene-vlm
 
 The demo's scene VLM: a Qwen3.5 (`Qwen3_5ForConditionalGeneration`) of {parameters} parameters, trained from scratch on frames of
-the simulated tabletop by `python -m sidecars.training.scene_vlm` (no pretrained weights). It stands in for Qwen3.5-4B, is read by
+the simulated tabletop by `python -m vram_arbiter.sidecars.training.scene_vlm` (no pretrained weights). It stands in for Qwen3.5-4B, is read by
 `AutoProcessor` / `AutoModelForImageTextToText` like it, and talks about coloured cubes, balls and cylinders only.
 
 - Camera: `{camera}` (320 x 240). It shows both fingers in profile and what is between them at a constant place; from the front camera
   a held thing is mostly hidden behind the gripper. Other cameras were not trained. Frames are scaled to {size} by the processor.
 - Ask `Has the robot gripper grasped the red cube?` (or: is it held, what is held, what is in view). Answers begin with `Yes,` or
   `No,` and say why: `Yes, the gripper holds the red cube.`, `No, the gripper is empty.`, `No, the gripper holds the blue ball.`
-- Data: `python -m runner.sim.dataset scenes --count 8000 --seed 1`; {train_frames} frames to train, {test_frames} held out by scene. A
+- Data: `python -m vram_arbiter.runner.sim.dataset scenes --count 8000 --seed 1`; {train_frames} frames to train, {test_frames} held out by scene. A
   third of the grabs misses on purpose: closed gripper beside or above the thing, things knocked over.
 - Training: seed {seed}; {vision_steps} steps of {batch} for the vision tower through throw-away heads, then {language_steps}
   for the language model and {both_steps} for both; {train_s} s on {threads} thread(s), bfloat16 autocast; checkpoint float32, {bytes} bytes.
@@ -131,7 +138,9 @@ def card_rows(rows: Sequence[dict[str, Any]]) -> str:
     grasp = ("held", "holds another", "empty")
     groups = {"grasped? (all)": [r for r in rows if r["group"] in grasp]}
     groups |= {f"grasped? {g}": [r for r in rows if r["group"] == g] for g in grasp}
-    groups |= {g: [r for r in rows if r["group"] == g] for g in ("what is held", "in view?", "list")}
+    groups |= {
+        g: [r for r in rows if r["group"] == g] for g in ("what is held", "in view?", "list")
+    }
     return "\n".join(
         f"| {name} | {len(some)} | {share(some, 'right'):.2%} | {share(some, 'exact'):.2%} |"
         for name, some in groups.items()

@@ -2,8 +2,8 @@
 
 import pytest
 
-from arbiter.testing.busy import busy_driver
-from arbiter.testing.core_driver import CoreDriver
+from tests.support.busy import busy_driver
+from tests.support.core_driver import CoreDriver
 
 
 @pytest.fixture(scope="session")

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 PATIENCE_S = 60
@@ -24,10 +24,12 @@ GIB = 1 << 30
 Make = Callable[..., ArbiterProcess]
 
 
-def run(arbiter: ArbiterProcess, *arguments: str, **environ: str) -> "subprocess.CompletedProcess[str]":
-    """`python -m arbiter` with exactly these flags, to its end."""
+def run(
+    arbiter: ArbiterProcess, *arguments: str, **environ: str
+) -> "subprocess.CompletedProcess[str]":
+    """`python -m vram_arbiter.arbiter` with exactly these flags, to its end."""
     return subprocess.run(
-        [sys.executable, "-m", "arbiter", *arguments],
+        [sys.executable, "-m", "vram_arbiter.arbiter", *arguments],
         env={**arbiter.environ, **environ},
         capture_output=True,
         text=True,
@@ -40,7 +42,9 @@ def test_help_documents_the_exit_codes(make_arbiter: Make) -> None:
     done = run(make_arbiter(), "--help")
     assert done.returncode == 0
     for code in ("0", "2", "3", "4", "70"):
-        assert re.search(rf"^  {code} +\w", done.stdout, re.MULTILINE), f"exit code {code} is not documented"
+        assert re.search(rf"^  {code} +\w", done.stdout, re.MULTILINE), (
+            f"exit code {code} is not documented"
+        )
 
 
 def test_version_and_check_config(make_arbiter: Make) -> None:
@@ -107,7 +111,9 @@ def test_a_second_daemon_on_the_socket_is_refused_and_the_first_serves_on(
 ) -> None:
     client = connect().hello()
     lease = client.granted("holder", GIB)
-    done = run(arbiter_daemon, "--gpu", "fake:8GiB", "--state-dir", str(arbiter_daemon.runtime / "other"))
+    done = run(
+        arbiter_daemon, "--gpu", "fake:8GiB", "--state-dir", str(arbiter_daemon.runtime / "other")
+    )
     assert done.returncode == 3
     assert f"pid {arbiter_daemon.pid}" in done.stderr
     assert [found["lease_id"] for found in client.ask("status")["leases"]] == [lease["lease_id"]]
@@ -117,7 +123,13 @@ def test_a_second_daemon_on_the_socket_is_refused_and_the_first_serves_on(
 def test_a_second_daemon_on_the_state_folder_is_refused(arbiter_daemon: ArbiterProcess) -> None:
     endpoint = f"ipc://{arbiter_daemon.runtime}/other.sock"
     done = run(
-        arbiter_daemon, "--gpu", "fake:8GiB", "--endpoint", endpoint, "--state-dir", str(arbiter_daemon.state)
+        arbiter_daemon,
+        "--gpu",
+        "fake:8GiB",
+        "--endpoint",
+        endpoint,
+        "--state-dir",
+        str(arbiter_daemon.state),
     )
     assert done.returncode == 3
     assert f"pid {arbiter_daemon.pid}" in done.stderr
@@ -244,4 +256,6 @@ def test_history_and_subscription_over_the_wire(connect: Callable[..., WireClien
     assert event["lease_id"] == lease["lease_id"]
     history = client.ask("history", kinds=["started", "granted"])
     assert notes(history) == ["started", "granted"]
-    assert client.ask("history", after=history["events"][0]["seq"], kinds=["started"])["events"] == []
+    assert (
+        client.ask("history", after=history["events"][0]["seq"], kinds=["started"])["events"] == []
+    )

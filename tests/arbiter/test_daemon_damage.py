@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 GIB = 1 << 30
@@ -28,7 +28,7 @@ PATIENCE_S = 60.0
 HOLDER = """
 import asyncio, sys
 from pathlib import Path
-from clients.aio import ArbiterClient
+from clients.client import ArbiterClient
 from schemas.wire import Footprint, LeaseSpec
 from sidecars.device.fake import FakeMemory
 
@@ -110,7 +110,9 @@ def test_a_damaged_journal_grants_nothing_beside_a_holder_in_use(damage: str) ->
         database = arbiter.state / "journal.sqlite"
         shutil.copytree(arbiter.state, arbiter.state.with_name("before"))
         with holder_in_use(arbiter) as holder:
-            holder.send_signal(signal.SIGSTOP)  # it cannot tell the next daemon what the journal does not
+            holder.send_signal(
+                signal.SIGSTOP
+            )  # it cannot tell the next daemon what the journal does not
             arbiter.kill()
             DAMAGES[damage](database)
             arbiter.start()
@@ -119,11 +121,17 @@ def test_a_damaged_journal_grants_nothing_beside_a_holder_in_use(damage: str) ->
                 status = client.ask("status")
                 assert (waiting["state"], status["phase"]) == ("queued", "recovering"), waiting
                 assert any("journal" in problem for problem in status["problems"])
-                assert any(e["kind"].startswith("journal_") for e in client.ask("history")["events"])
+                assert any(
+                    e["kind"].startswith("journal_") for e in client.ask("history")["events"]
+                )
                 assert client.ask("subscribe")["ok"]
                 holder.send_signal(signal.SIGCONT)
-                client.push("event", PATIENCE_S, where=lambda push: push["event"]["kind"] == "reattached")
-                (lease,) = (one for one in client.ask("status")["leases"] if one["consumer"] == "holder")
+                client.push(
+                    "event", PATIENCE_S, where=lambda push: push["event"]["kind"] == "reattached"
+                )
+                (lease,) = (
+                    one for one in client.ask("status")["leases"] if one["consumer"] == "holder"
+                )
                 assert (lease["state"], lease["uses"]) == ("held", 1)
                 assert not [push for push in client.pushes if push["push"] == "granted"]
                 told, _ = holder.communicate("end\n", timeout=PATIENCE_S)

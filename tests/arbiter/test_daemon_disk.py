@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 PATIENCE_S = 60
@@ -118,7 +118,9 @@ def wait_until(client: WireClient, good: Callable[[], bool]) -> None:
     raise AssertionError(f"never: {client.ask('status')}")
 
 
-def test_a_full_disk_blocks_grants_and_nothing_else(arbiter: ArbiterProcess, disk: Tmpfs | SizeLimit) -> None:
+def test_a_full_disk_blocks_grants_and_nothing_else(
+    arbiter: ArbiterProcess, disk: Tmpfs | SizeLimit
+) -> None:
     arbiter.start(BEAT)
     with WireClient(arbiter.endpoint) as client:
         client.hello().ask("subscribe")
@@ -130,12 +132,16 @@ def test_a_full_disk_blocks_grants_and_nothing_else(arbiter: ArbiterProcess, dis
         assert client.ask("ready", **goes_on)["ok"]
         disk.fill()
         answer = client.acquire("refused", GIB)
-        refused = answer if not answer["ok"] else client.push("denied")  # it waited for a reading of the card
+        refused = (
+            answer if not answer["ok"] else client.push("denied")
+        )  # it waited for a reading of the card
         assert refused["error"]["code"] == "journal_unavailable"
-        assert any("journal cannot be written" in problem for problem in client.ask("status")["problems"])
+        assert any(
+            "journal cannot be written" in problem for problem in client.ask("status")["problems"]
+        )
         arbiter.wait_for("journal cannot be written", PATIENCE_S)
         doctor = subprocess.run(
-            [sys.executable, "-m", "clients", "doctor"],
+            [sys.executable, "-m", "vram_arbiter.clients", "doctor"],
             env=arbiter.environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
         )  # fmt: skip
         assert doctor.returncode == 1, "a daemon that can grant nothing is not healthy"
@@ -145,7 +151,9 @@ def test_a_full_disk_blocks_grants_and_nothing_else(arbiter: ArbiterProcess, dis
 
         assert client.ask("unloading", **goes_on)["ok"]
         assert client.ask("release", **goes_on)["ok"]
-        wait_until(client, lambda: consumers(client) == ["stays"])  # its record could not be deleted
+        wait_until(
+            client, lambda: consumers(client) == ["stays"]
+        )  # its record could not be deleted
 
         disk.free()
         wait_until(client, lambda: client.ask("status")["problems"] == [])

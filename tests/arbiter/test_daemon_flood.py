@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
-from schemas import defaults as d
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
+from vram_arbiter.schemas import defaults as d
 
 FLOODER = """
 import sys, zmq, msgpack
-from arbiter.testing.wire import WireClient
+from tests.support.wire import WireClient
 client = WireClient(sys.argv[1]).hello("flooder")
 print("up", flush=True)
 while True:

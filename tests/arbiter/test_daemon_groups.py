@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
+from tests.support.process import ArbiterProcess
 
 pytestmark = pytest.mark.e2e
 Make = Callable[..., ArbiterProcess]
 NOBODY = 65534
 CLIENT = """
 import json, os, sys
-from arbiter.testing.wire import WireClient
+from tests.support.wire import WireClient
 endpoint, role, primary, other = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
 os.setgroups([other]); os.setresgid(primary, primary, primary); os.setresuid(65534, 65534, 65534)
 with WireClient(endpoint) as client:
@@ -31,7 +31,11 @@ with WireClient(endpoint) as client:
 
 def groups() -> tuple[str, str]:
     """Two groups of this machine that neither root nor `nobody` is in by its account."""
-    names = [g.gr_name for g in grp.getgrall() if g.gr_gid not in (0, NOBODY) and "nobody" not in g.gr_mem]
+    names = [
+        g.gr_name
+        for g in grp.getgrall()
+        if g.gr_gid not in (0, NOBODY) and "nobody" not in g.gr_mem
+    ]
     return names[0], names[1]
 
 
@@ -58,7 +62,9 @@ def test_a_member_of_the_group_may_lease_and_only_operators_act_by_hand(make_arb
     assert refused["error"]["code"] == "not_permitted"
     assert operators in refused["error"]["hint"], "the hint names the group"
     leased = speak(arbiter, "client", members, members)
-    assert leased["error"]["message"] == "only an operator may drain", "the lease was granted, no more"
+    assert leased["error"]["message"] == "only an operator may drain", (
+        "the lease was granted, no more"
+    )
     assert speak(arbiter, "operator", operators, members)["ok"]
 
 

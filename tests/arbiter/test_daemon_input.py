@@ -9,8 +9,8 @@ import msgpack
 import pytest
 import zmq
 
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 GIB = 1 << 30
@@ -79,7 +79,9 @@ def test_unknown_ops_wrong_fields_and_wrong_order(holder: WireClient, connect: C
     assert error_of(unknown) == "unknown_op"
     assert "acquire" in unknown["error"]["details"]["known"]
     wrong = client.ask(
-        "acquire", nonce="n", spec={"consumer": "c", "model_id": "m", "footprint": {"load_peak_bytes": "x"}}
+        "acquire",
+        nonce="n",
+        spec={"consumer": "c", "model_id": "m", "footprint": {"load_peak_bytes": "x"}},
     )
     assert error_of(wrong) == "bad_request"
     assert {"spec.footprint.load_peak_bytes", "spec.footprint.steady_bytes"} == {
@@ -93,7 +95,7 @@ def test_another_process_cannot_speak_for_a_lease(
 ) -> None:
     lease = holder.ask("status")["leases"][0]
     script = (
-        "import sys; from arbiter.testing.wire import WireClient\n"
+        "import sys; from tests.support.wire import WireClient\n"
         "with WireClient(sys.argv[1]) as c:\n"
         "    c.hello('thief')\n"
         "    reply = c.ask('release', lease_id=sys.argv[2], token=[int(n) for n in sys.argv[3:5]])\n"
@@ -112,19 +114,27 @@ def test_a_forged_token_is_stale(holder: WireClient) -> None:
     lease = holder.ask("status")["leases"][0]
     epoch, serial = lease["token"]
     for token in ([epoch, serial + 1], [epoch + 1, serial], [0, 0], [-1, -1]):
-        assert error_of(holder.ask("release", lease_id=lease["lease_id"], token=token)) == "stale_token"
+        assert (
+            error_of(holder.ask("release", lease_id=lease["lease_id"], token=token))
+            == "stale_token"
+        )
     assert error_of(holder.ask("release", lease_id="L9-9", token=[9, 9])) == "unknown_lease"
     assert still_held(holder)
 
 
-def test_a_flood_is_limited_and_others_are_served(make_arbiter: Callable[..., ArbiterProcess]) -> None:
+def test_a_flood_is_limited_and_others_are_served(
+    make_arbiter: Callable[..., ArbiterProcess],
+) -> None:
     """The limit is low, so that a machine too busy to flood a daemon exceeds it all the same."""
     arbiter = make_arbiter(config="limits: {rate_per_client_per_s: 50}\n").start()
     with WireClient(arbiter.endpoint) as holder, WireClient(arbiter.endpoint) as flooder:
         holder.hello("holder").granted("holder", GIB)
         flooder.hello("flooder")
         ids = [flooder.send("ping") for _ in range(500)]
-        codes = [reply["error"]["code"] if not (reply := flooder.reply(id_))["ok"] else "ok" for id_ in ids]
+        codes = [
+            reply["error"]["code"] if not (reply := flooder.reply(id_))["ok"] else "ok"
+            for id_ in ids
+        ]
         assert "limit_exceeded" in codes
         assert codes[0] == "ok"
         assert still_held(holder)
@@ -143,7 +153,7 @@ def test_hundreds_of_clients_that_vanish_at_once_cost_nothing(
     holder = WireClient(arbiter_daemon.endpoint).hello("holder")
     assert holder.granted("holder", GIB)["state"] == "loading"
     script = (
-        "import os, sys; from arbiter.testing.wire import WireClient\n"
+        "import os, sys; from tests.support.wire import WireClient\n"
         "clients = [WireClient(sys.argv[1]).hello(f'c{n}', instance=f'c{n}') for n in range(200)]\n"
         "for n, c in enumerate(clients): c.acquire(f'c{n}', 7 << 30)\n"
         "print('ready', flush=True); sys.stdin.read()\n"

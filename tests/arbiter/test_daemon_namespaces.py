@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 PATIENCE_S = 60
@@ -18,7 +18,7 @@ GIB = 1 << 30
 UNSHARE = ["unshare", "--pid", "--fork", "--kill-child", "--mount-proc"]
 INSIDE = """
 import os, sys
-from arbiter.testing.wire import WireClient
+from tests.support.wire import WireClient
 with WireClient(sys.argv[1]) as client:
     client.hello("inside").granted("inside", 1 << 30)
     print(os.getpid(), flush=True)
@@ -37,7 +37,9 @@ def can_unshare() -> bool:
 
 pytestmark = [
     pytest.mark.e2e,
-    pytest.mark.skipif(not can_unshare(), reason="pid namespaces cannot be made here (unshare, root)"),
+    pytest.mark.skipif(
+        not can_unshare(), reason="pid namespaces cannot be made here (unshare, root)"
+    ),
 ]
 
 

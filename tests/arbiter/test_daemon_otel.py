@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.collector import Collector, ReceivedSpan
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from tests.support.collector import Collector, ReceivedSpan
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 GIB = 1 << 30
@@ -48,7 +48,11 @@ def hand_over(arbiter: ArbiterProcess) -> dict[str, Any]:
                 "consumer": "policy",
                 "model_id": "policy",
                 "ttl_s": 600.0,
-                "footprint": {"load_peak_bytes": 5 * GIB, "steady_bytes": 4 * GIB, "residue_bytes": 0},
+                "footprint": {
+                    "load_peak_bytes": 5 * GIB,
+                    "steady_bytes": 4 * GIB,
+                    "residue_bytes": 0,
+                },
             },
         )
         assert queued["state"] == "queued", queued
@@ -67,7 +71,13 @@ def test_a_handover_is_one_trace(make_arbiter: Make, collector: Collector) -> No
     revoke = hand_over(arbiter)
     arbiter.stop()
     spans = {span.name: span for span in collector.spans() if span.trace_id == TRACE}
-    assert set(spans) == {"lease.acquire", "lease.queue", "lease.evict", "lease.verify", "lease.load"}
+    assert set(spans) == {
+        "lease.acquire",
+        "lease.queue",
+        "lease.evict",
+        "lease.verify",
+        "lease.load",
+    }
     acquire, evict = spans["lease.acquire"], spans["lease.evict"]
     assert acquire.parent_id == PARENT
     assert {spans[name].parent_id for name in ("lease.queue", "lease.evict", "lease.load")} == {
@@ -166,7 +176,7 @@ def test_off_imports_nothing_and_passes_the_trace_on(make_arbiter: Make) -> None
     arbiter.start()
     assert hand_over(arbiter)["traceparent"] == HERS, "the waiter's own: there is no span of ours"
     arbiter.stop()
-    assert "arbiter.host.executor" in arbiter.log
+    assert "vram_arbiter.arbiter.host.executor" in arbiter.log
     assert "opentelemetry" not in arbiter.log
     assert "prometheus_client" not in arbiter.log
 
@@ -174,7 +184,10 @@ def test_off_imports_nothing_and_passes_the_trace_on(make_arbiter: Make) -> None
 @pytest.mark.parametrize(
     ("environ", "words"),
     [
-        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "collector"}, "OTEL_EXPORTER_OTLP_ENDPOINT: 'collector' is no URL"),
+        (
+            {"OTEL_EXPORTER_OTLP_ENDPOINT": "collector"},
+            "OTEL_EXPORTER_OTLP_ENDPOINT: 'collector' is no URL",
+        ),
         (
             {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://x", "OTEL_EXPORTER_OTLP_PROTOCOL": "grpc"},
             "http/protobuf",

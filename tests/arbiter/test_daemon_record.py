@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import pytest
 
-from arbiter.replay import runner
-from arbiter.replay.logfile import FOLDER
-from arbiter.testing.process import ArbiterProcess
+from tests.support.process import ArbiterProcess
+from vram_arbiter.arbiter.eventlog import replay as runner
+from vram_arbiter.arbiter.eventlog.logfile import FOLDER
 
 pytestmark = pytest.mark.e2e
 PATIENCE_S = 60
@@ -19,7 +19,7 @@ Make = Callable[..., ArbiterProcess]
 
 def vramctl(arbiter: ArbiterProcess, *arguments: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
-        [sys.executable, "-m", "clients", *arguments],
+        [sys.executable, "-m", "vram_arbiter.clients", *arguments],
         env=arbiter.environ,
         capture_output=True,
         text=True,

@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 
-from arbiter.daemon import boot_id
-from arbiter.host.journal import Journal
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import TTL_S, WireClient
-from schemas import fakegpu
-from schemas.ids import ProcessKey
-from schemas.runtime.peercred import start_ticks
+from tests.support.process import ArbiterProcess
+from tests.support.wire import TTL_S, WireClient
+from vram_arbiter.arbiter.daemon import boot_id
+from vram_arbiter.arbiter.host.journal import Journal
+from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime.peercred import start_ticks
 
 pytestmark = pytest.mark.e2e
 GIB = 1 << 30
@@ -33,7 +33,9 @@ def occupy(arbiter: ArbiterProcess, size: int) -> None:
     ticks = start_ticks(os.getpid())
     assert ticks is not None
     key = ProcessKey(os.getpid(), ticks)
-    process = fakegpu.ProcessFile(pid=key.pid, start_ticks=key.start_ticks, name="test", allocated_bytes=size)
+    process = fakegpu.ProcessFile(
+        pid=key.pid, start_ticks=key.start_ticks, name="test", allocated_bytes=size
+    )
     path = arbiter.card / fakegpu.file_name(key)
     temporary = path.with_name(".new")
     temporary.write_text(process.model_dump_json())
@@ -53,7 +55,9 @@ def hold(client: WireClient, arbiter: ArbiterProcess, name: str, size: int) -> d
 def reattach(client: WireClient, on: dict[str, Any], name: str, size: int) -> dict[str, Any]:
     spec = {"consumer": name, "model_id": name, "ttl_s": TTL_S,
             "footprint": {"load_peak_bytes": size, "steady_bytes": size, "residue_bytes": 0}}  # fmt: skip
-    reply = client.ask("reattach", leases=[{**on, "spec": spec, "state": "held", "measured_bytes": size}])
+    reply = client.ask(
+        "reattach", leases=[{**on, "spec": spec, "state": "held", "measured_bytes": size}]
+    )
     assert reply["ok"], reply
     answer = reply["leases"][0]
     assert isinstance(answer, dict)
@@ -116,10 +120,14 @@ def test_a_user_that_is_stopped_while_the_daemon_restarts_keeps_the_holder(
                     assert sidecar.ask("subscribe")["ok"]
                     runner.send_signal(signal.SIGCONT)
                     again = sidecar.push(
-                        "event", timeout_s=30.0, where=lambda push: push["event"]["kind"] == "use_began"
+                        "event",
+                        timeout_s=30.0,
+                        where=lambda push: push["event"]["kind"] == "use_began",
                     )
                     assert again["event"]["resumed"]
-                    assert runner.communicate("end\n", timeout=30.0)[0] == "None\n", "its use was not lost"
+                    assert runner.communicate("end\n", timeout=30.0)[0] == "None\n", (
+                        "its use was not lost"
+                    )
                 assert sidecar.push("revoke", where=lambda push: push["uses"] == 0)
                 assert sidecar.ask("unloading", **on)["ok"]
                 occupy(arbiter, 0)
@@ -128,7 +136,10 @@ def test_a_user_that_is_stopped_while_the_daemon_restarts_keeps_the_holder(
 
 
 def leases(client: WireClient) -> list[tuple[str, str, list[int] | None]]:
-    return [(lease["consumer"], lease["state"], lease["token"]) for lease in client.ask("status")["leases"]]
+    return [
+        (lease["consumer"], lease["state"], lease["token"])
+        for lease in client.ask("status")["leases"]
+    ]
 
 
 def test_leases_survive_kill_9_of_the_daemon(make_arbiter: Make) -> None:
@@ -157,14 +168,18 @@ def test_leases_survive_kill_9_of_the_daemon(make_arbiter: Make) -> None:
         assert granted["token"] > on["token"], "tokens grow across restarts"
 
 
-def test_leases_survive_an_orderly_restart_and_go_with_their_dead_holder(make_arbiter: Make) -> None:
+def test_leases_survive_an_orderly_restart_and_go_with_their_dead_holder(
+    make_arbiter: Make,
+) -> None:
     arbiter = make_arbiter().start()
     with WireClient(arbiter.endpoint) as client:
         client.hello()
         hold(client, arbiter, "holder", 5 * GIB)
     assert arbiter.stop() == 0
     journal = Journal.open(arbiter.state, boot_id())  # its holder dies unseen
-    journal.apply([(key, {**record, "start_ticks": 1}) for key, record in journal.opened.records.items()])
+    journal.apply(
+        [(key, {**record, "start_ticks": 1}) for key, record in journal.opened.records.items()]
+    )
     journal.close()
     for file in arbiter.card.glob(f"{os.getpid()}-*.json"):
         file.unlink()
@@ -174,7 +189,9 @@ def test_leases_survive_an_orderly_restart_and_go_with_their_dead_holder(make_ar
 
 
 @pytest.mark.parametrize("damage", ["garbage", "record"])
-def test_a_corrupt_journal_is_reported_and_the_holder_is_believed(make_arbiter: Make, damage: str) -> None:
+def test_a_corrupt_journal_is_reported_and_the_holder_is_believed(
+    make_arbiter: Make, damage: str
+) -> None:
     arbiter = make_arbiter().start()
     with WireClient(arbiter.endpoint) as client:
         on = hold(client.hello(), arbiter, "holder", 5 * GIB)
@@ -187,7 +204,9 @@ def test_a_corrupt_journal_is_reported_and_the_holder_is_believed(make_arbiter: 
     else:
         aside = arbiter.state / "journal.records"
         journal = Journal.open(arbiter.state, boot_id())
-        journal.apply([(key, {**record, "pid": 1 << 40}) for key, record in journal.opened.records.items()])
+        journal.apply(
+            [(key, {**record, "pid": 1 << 40}) for key, record in journal.opened.records.items()]
+        )
         journal.close()
     arbiter.start()
     aside = aside.with_name(f"{aside.name}.corrupt-1")
@@ -201,7 +220,9 @@ def test_a_corrupt_journal_is_reported_and_the_holder_is_believed(make_arbiter: 
         assert str(aside) in status["problems"][0]
         kinds = [event["kind"] for event in client.ask("history")["events"]]
         assert "journal_put_aside" in kinds
-        assert client.acquire("waiter", GIB)["state"] == "queued", "somebody may hold what nobody remembers"
+        assert client.acquire("waiter", GIB)["state"] == "queued", (
+            "somebody may hold what nobody remembers"
+        )
         assert reattach(client, on, "holder", 5 * GIB)["kept"]
         assert ("holder", "held", on["token"]) in leases(client)
 
@@ -213,7 +234,9 @@ def test_a_grant_that_cannot_be_written_is_refused_and_not_charged(make_arbiter:
         blocker = sqlite3.connect(arbiter.state / "journal.sqlite", isolation_level=None)
         blocker.execute("BEGIN IMMEDIATE")
         answer = client.acquire("first", 5 * GIB)
-        refused = answer if not answer["ok"] else client.push("denied")  # it waited for a reading of the card
+        refused = (
+            answer if not answer["ok"] else client.push("denied")
+        )  # it waited for a reading of the card
         assert refused["error"]["code"] == "journal_unavailable"
         blocker.execute("ROLLBACK")
         blocker.close()

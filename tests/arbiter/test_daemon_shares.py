@@ -10,7 +10,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
+from tests.support.process import ArbiterProcess
 
 pytestmark = [
     pytest.mark.e2e,
@@ -20,7 +20,7 @@ GREEDY, OTHER = 54_321, 54_322
 SESSIONS_MAX, PROCESSES = 40, 4
 AS_USER = """
 import json, os, sys
-from arbiter.testing.wire import WireClient
+from tests.support.wire import WireClient
 endpoint, uid, gid = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 os.setgroups([gid]); os.setresgid(gid, gid, gid); os.setresuid(uid, uid, uid)
 """
@@ -58,7 +58,9 @@ def test_the_processes_of_one_user_leave_room_for_another(
 ) -> None:
     """One peer took every session: no other user, and no operator, could connect."""
     group = next(g for g in grp.getgrall() if g.gr_gid != 0)
-    limits = f"sessions_max: {SESSIONS_MAX}, process_share: 0.25, user_share: 0.5, operator_reserve: 2"
+    limits = (
+        f"sessions_max: {SESSIONS_MAX}, process_share: 0.25, user_share: 0.5, operator_reserve: 2"
+    )
     arbiter = make_arbiter(config=f"limits: {{{limits}}}\nwire: {{group: {group.gr_name}}}\n")
     arbiter.runtime.chmod(0o755)
     arbiter.start()

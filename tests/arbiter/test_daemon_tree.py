@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 GIB = 1 << 30
@@ -29,10 +29,14 @@ sys.stdin.readline()
 
 
 @pytest.fixture
-def arbiter(make_arbiter: Callable[..., ArbiterProcess], request: pytest.FixtureRequest) -> ArbiterProcess:
+def arbiter(
+    make_arbiter: Callable[..., ArbiterProcess], request: pytest.FixtureRequest
+) -> ArbiterProcess:
     """Reads its card ten times a second, and waits for bytes for a minute, or as long as `indirect` parametrization says."""
     timeout_s = getattr(request, "param", 60)
-    return make_arbiter(config=f"probe: {{period_s: 0.1}}\nverify: {{timeout_s: {timeout_s}}}\n").start()
+    return make_arbiter(
+        config=f"probe: {{period_s: 0.1}}\nverify: {{timeout_s: {timeout_s}}}\n"
+    ).start()
 
 
 @pytest.fixture
@@ -43,10 +47,12 @@ def observer(arbiter: ArbiterProcess) -> Iterator[WireClient]:
 
 
 @contextlib.contextmanager
-def job(arbiter: ArbiterProcess, size: int, *extra: str) -> Iterator[tuple["subprocess.Popen[str]", int]]:
+def job(
+    arbiter: ArbiterProcess, size: int, *extra: str
+) -> Iterator[tuple["subprocess.Popen[str]", int]]:
     """`vramctl run` of a child that holds `size` until its stdin closes: (vramctl, the child's pid)."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "clients", "run", "--vram", "5GiB", "--name", "job", "--",
+        [sys.executable, "-m", "vram_arbiter.clients", "run", "--vram", "5GiB", "--name", "job", "--",
          *extra, sys.executable, "-c", CHILD, str(arbiter.card), str(size)],
         env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
@@ -76,14 +82,18 @@ def told(observer: WireClient, *kinds: str) -> list[dict[str, Any]]:
     return events
 
 
-def wait_told(observer: WireClient, kind: str, where: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+def wait_told(
+    observer: WireClient, kind: str, where: Callable[[dict[str, Any]], bool]
+) -> dict[str, Any]:
     event: dict[str, Any] = observer.push(
         "event", PATIENCE_S, lambda push: push["event"]["kind"] == kind and where(push["event"])
     )["event"]
     return event
 
 
-@pytest.mark.parametrize("through", [[], ["sh", "-c", '"$@"; exit $?', "sh"]], ids=["child", "grandchild"])
+@pytest.mark.parametrize(
+    "through", [[], ["sh", "-c", '"$@"; exit $?', "sh"]], ids=["child", "grandchild"]
+)
 def test_the_bytes_of_a_child_are_those_of_the_lease(
     arbiter: ArbiterProcess, observer: WireClient, through: list[str]
 ) -> None:
@@ -92,9 +102,17 @@ def test_the_bytes_of_a_child_are_those_of_the_lease(
         gpu = seen(observer, lambda gpu: any(process["used_bytes"] for process in gpu["processes"]))
         (process,) = gpu["processes"]
         assert child != vramctl.pid
-        assert (process["pid"], process["used_bytes"], process["stowaway"]) == (vramctl.pid, 4 * GIB, False)
+        assert (process["pid"], process["used_bytes"], process["stowaway"]) == (
+            vramctl.pid,
+            4 * GIB,
+            False,
+        )
         assert process["name"].endswith(" (job)")
-        assert (gpu["charged_bytes"], gpu["stowaway_bytes"], gpu["pressure_bytes"]) == (5 * GIB, 0, 0)
+        assert (gpu["charged_bytes"], gpu["stowaway_bytes"], gpu["pressure_bytes"]) == (
+            5 * GIB,
+            0,
+            0,
+        )
     verified = wait_told(observer, "verified", lambda event: event["consumer"] == "job")
     assert (verified["verdict"], verified["before_bytes"]) == ("verified", 4 * GIB)
     gpu = seen(observer, lambda gpu: not gpu["charged_bytes"])
@@ -117,7 +135,9 @@ def test_the_child_of_a_killed_owner_is_a_stowaway_and_contests_its_debt(
         assert verdict["verdict"] == "contested"
         assert verdict["culprits"] == [{"pid": child, "name": "job", "bytes": 4 * GIB}]
         gpu = seen(observer, lambda gpu: not gpu["charged_bytes"])
-        assert gpu["stowaway_bytes"] == 4 * GIB, "charged once: the debt is over, the orphan is still there"
+        assert gpu["stowaway_bytes"] == 4 * GIB, (
+            "charged once: the debt is over, the orphan is still there"
+        )
     seen(observer, lambda gpu: not gpu["stowaway_bytes"])
 
 

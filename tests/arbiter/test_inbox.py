@@ -6,10 +6,10 @@ from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 from typing import Any
 
-from arbiter.core.effects import Effect, Note
-from arbiter.core.events import ClientLeft, Event, Resumed, Tick
-from arbiter.inbox import ANSWERS_AT_ONCE, QUESTIONS_MAX, Inbox
-from schemas.ids import ClientId, GpuId
+from vram_arbiter.arbiter.core.effects import Effect, Note
+from vram_arbiter.arbiter.core.events import ClientLeft, Event, Resumed, Tick
+from vram_arbiter.arbiter.inbox import ANSWERS_AT_ONCE, QUESTIONS_MAX, Inbox
+from vram_arbiter.schemas.ids import ClientId, GpuId
 
 PATIENCE_S = 60.0
 

@@ -22,7 +22,9 @@ def rows() -> list[tuple[str, list[str]]]:
 
 def functions(path: Path) -> set[str]:
     tree = ast.parse(path.read_text())
-    return {node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)}
+    return {
+        node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    }
 
 
 def test_every_test_that_the_page_names_exists() -> None:
@@ -49,7 +51,9 @@ def test_every_complaint_has_a_row_and_its_tests_carry_its_number() -> None:
             assert carried is None or not first.isdigit() or carried[1] == first, name
 
 
-@pytest.mark.parametrize("path", sorted(TESTS.glob("**/test_neighbours*.py")), ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path", sorted(TESTS.glob("**/test_neighbours*.py")), ids=lambda path: path.name
+)
 def test_every_test_of_a_complaint_is_on_the_page_or_beside_one_that_is(path: Path) -> None:
     named = {name for _, names in rows() for name in names}
     numbers = {number[1] for name in named if (number := re.search(r"::test_(\d+)_", name))}

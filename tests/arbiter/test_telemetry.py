@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from arbiter import telemetry
-from arbiter.telemetry import REFUSALS_BURST, REFUSED_USERS_MAX, RefusalLog
+from vram_arbiter.arbiter import log as telemetry
+from vram_arbiter.arbiter.log import REFUSALS_BURST, REFUSED_USERS_MAX, RefusalLog
 
 EVENT = {"seq": 4, "at_wall_s": 1.0, "kind": "granted", "lease_id": "L1-4", "consumer": "detector",
          "charge_bytes": 5 << 30, "waited_s": 1.25, "reason": "fits"}  # fmt: skip
@@ -29,7 +29,9 @@ def test_an_event_for_people(capsys: pytest.CaptureFixture[str]) -> None:
     telemetry.set_up_logging("human", "info")
     telemetry.log_event(EVENT)
     line = capsys.readouterr().err
-    assert line.endswith('info     granted L1-4 (detector): charge=5 GiB, waited_s=1.25, reason="fits"\n')
+    assert line.endswith(
+        'info     granted L1-4 (detector): charge=5 GiB, waited_s=1.25, reason="fits"\n'
+    )
 
 
 def test_an_event_for_programs(capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 PATIENCE_S = 60
@@ -94,7 +94,9 @@ def test_without_a_watchdog_none_is_fed(make_arbiter: Make) -> None:
 
 
 @pytest.mark.parametrize("defect", [CORE, JOURNAL, LOOP], ids=["core", "journal", "loop"])
-def test_a_stuck_part_stops_feeding_it_and_the_manager_learns_where(make_arbiter: Make, defect: str) -> None:
+def test_a_stuck_part_stops_feeding_it_and_the_manager_learns_where(
+    make_arbiter: Make, defect: str
+) -> None:
     arbiter = make_arbiter()
     pipe = planted(arbiter, defect)
     arbiter.start({"WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6))})
@@ -120,13 +122,13 @@ def test_a_stuck_part_stops_feeding_it_and_the_manager_learns_where(make_arbiter
         os.close(writer)
     assert "in wait_for_ever" in arbiter.log, "the log names the line that was stuck"
 
-    arbiter.program = [sys.executable, "-m", "arbiter"]
+    arbiter.program = [sys.executable, "-m", "vram_arbiter.arbiter"]
     arbiter.start()
     with WireClient(arbiter.endpoint) as client:
         leases = client.hello().ask("status")["leases"]
-        assert [(lease["lease_id"], lease["token"]) for lease in leases if lease["consumer"] == "holder"] == [
-            (kept["lease_id"], kept["token"])
-        ]
+        assert [
+            (lease["lease_id"], lease["token"]) for lease in leases if lease["consumer"] == "holder"
+        ] == [(kept["lease_id"], kept["token"])]
 
 
 def test_what_was_stuck_for_a_while_feeds_it_again(make_arbiter: Make) -> None:

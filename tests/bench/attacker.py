@@ -1,9 +1,9 @@
-"""One attack of `arbiter.testing.attacks` for some seconds: ATTACK SOCKET SECONDS."""
+"""One attack of `tests.support.attacks` for some seconds: ATTACK SOCKET SECONDS."""
 
 import sys
 import time
 
-from arbiter.testing.attacks import ATTACKS
+from tests.support.attacks import ATTACKS
 
 if __name__ == "__main__":
     print("up", flush=True)

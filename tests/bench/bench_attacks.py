@@ -4,10 +4,10 @@ import time
 
 from harness import SHIPPED, Peer, Suite, arbiter, elapsed_us, helper, pause
 
-from arbiter.rpc import codec
-from arbiter.testing.attacks import ATTACKS
-from arbiter.testing.costly import COSTLY
-from schemas.defaults import MESSAGE_MAX_BYTES
+from tests.support.attacks import ATTACKS
+from tests.support.costly import COSTLY
+from vram_arbiter.arbiter.rpc import codec
+from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 
 CALM_PAUSE_S = 0.002
 """Between a calm client's requests: it stays below the rate limit."""
@@ -18,10 +18,14 @@ MESSAGE_MAX_US = 5_000
 def run(suite: Suite) -> None:
     for name, message in COSTLY.items():
         samples = [cost_us(message) for _ in range(suite.size(50, 5))]
-        suite.limit(f"a message, decoded: {name}", samples, p99_max_us=MESSAGE_MAX_US, note="processor time")
+        suite.limit(
+            f"a message, decoded: {name}", samples, p99_max_us=MESSAGE_MAX_US, note="processor time"
+        )
     seconds = suite.size(10, 1)
     for name in ATTACKS:
-        suite.limit(f"a request under {name}", requests_under(name, seconds), p99_max_us=REQUEST_P99_MAX_US)
+        suite.limit(
+            f"a request under {name}", requests_under(name, seconds), p99_max_us=REQUEST_P99_MAX_US
+        )
 
 
 def cost_us(message: bytes) -> float:

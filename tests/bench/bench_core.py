@@ -7,11 +7,20 @@ from typing import Any
 
 from harness import SLIVER, Suite, p50
 
-from arbiter.core import events as ev
-from arbiter.core.arbiter import Arbiter
-from arbiter.core.effects import Push, Reply, Sample
-from arbiter.core.settings import GpuInfo, Settings
-from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
+from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.arbiter.core.arbiter import Arbiter
+from vram_arbiter.arbiter.core.effects import Push, Reply, Sample
+from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
+from vram_arbiter.schemas.ids import (
+    ClientId,
+    GpuId,
+    LeaseId,
+    ModelKey,
+    ProcessKey,
+    RequestId,
+    Token,
+    UseId,
+)
 
 CARD = GpuId("GPU-0")
 STEP_S = 0.001
@@ -24,7 +33,9 @@ class Bench:
     def __init__(self, leases: int, waiters: int) -> None:
         self.capacity = leases * SLIVER
         gpu = GpuInfo(CARD, 0, "bench", self.capacity, 0)
-        settings = Settings(epoch=1, gpus=(gpu,), leases_per_client_max=PER_CLIENT, verify_tolerance_bytes=0)
+        settings = Settings(
+            epoch=1, gpus=(gpu,), leases_per_client_max=PER_CLIENT, verify_tolerance_bytes=0
+        )
         self.core = Arbiter(settings, 0.0)
         self.now = 1.0
         self.requests = 0
@@ -32,7 +43,9 @@ class Bench:
         self.queued: list[tuple[ClientId, LeaseId]] = []
         self.samples: dict[str, list[float]] = {}
         clients = [ClientId(f"{n:04x}") for n in range((leases + 2 * waiters) // PER_CLIENT + 4)]
-        holders = leases // PER_CLIENT + 1  # whoever waits holds nothing: nobody stands in his own way
+        holders = (
+            leases // PER_CLIENT + 1
+        )  # whoever waits holds nothing: nobody stands in his own way
         for number, client in enumerate(clients):
             process = ProcessKey(1000 + number, 1)
             self.handle(ev.ClientConnected(client, process, 0, f"c{number}", f"i{number}"))
@@ -54,7 +67,9 @@ class Bench:
         self.now += STEP_S
         start = time.perf_counter()
         effects = self.core.handle(event, self.now)
-        self.samples.setdefault(type(event).__name__, []).append((time.perf_counter() - start) * 1e6)
+        self.samples.setdefault(type(event).__name__, []).append(
+            (time.perf_counter() - start) * 1e6
+        )
         for effect in effects:
             if isinstance(effect, Push) and effect.body["push"] == "granted":
                 raise RuntimeError("nobody fits on this card")

@@ -77,7 +77,9 @@ def waiters_memory(suite: Suite) -> None:
             peer.reply(peer.want())
         grown = rss_bytes(daemon.pid) - before
     name = f"memory per waiter, of {many}"
-    suite.figure(name, grown / many / 1024, "KB", at_most=4.0, note="as the daemon's resident set grows")
+    suite.figure(
+        name, grown / many / 1024, "KB", at_most=4.0, note="as the daemon's resident set grows"
+    )
 
 
 def fill_history(peer: Peer) -> None:
@@ -120,7 +122,9 @@ def disconnects(suite: Suite) -> None:
         witness.close()
     survived = f"{many} simultaneous disconnects survived"
     whole = float(waiting == many and forgotten)
-    suite.figure(survived, whole, "", at_least=1.0, note="1: every wait has ended, no invariant was violated")
+    suite.figure(
+        survived, whole, "", at_least=1.0, note="1: every wait has ended, no invariant was violated"
+    )
     suite.figure(f"{many} simultaneous disconnects: all forgotten after", took_ms, "ms")
     suite.time("acquire + release right after that", after)
     name = f"memory that stays when {many} waiters are gone"

@@ -19,7 +19,9 @@ def run(suite: Suite) -> None:
     name = "death of a holder: waitpid to the next grant"
     suite.limit(name, over, p50_max_us=1000.0, p99_max_us=10_000.0, note="p99 of 60 is the worst")
     suite.time(
-        "death of a holder: SIGKILL to waitpid", [reaped for _, reaped in samples], "the kernel's part"
+        "death of a holder: SIGKILL to waitpid",
+        [reaped for _, reaped in samples],
+        "the kernel's part",
     )
 
 

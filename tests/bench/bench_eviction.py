@@ -11,10 +11,10 @@ from pathlib import Path
 
 from harness import GIB, WIDE, Peer, Suite, arbiter
 
-from arbiter.host.gpu.fake import locked
-from arbiter.testing.process import ArbiterProcess
-from schemas import fakegpu
-from schemas.ids import ProcessKey
+from tests.support.process import ArbiterProcess
+from vram_arbiter.arbiter.host.gpu.fake import locked
+from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.ids import ProcessKey
 
 LAG_S = 0.15
 NO_HOLD = "scheduling:\n  thrash_hold_max_s: 0\n"
@@ -31,7 +31,9 @@ def run(suite: Suite) -> None:
         later = [evict(daemon, peers, LAG_S) for _ in range(suite.size(40, 5))]
     suite.time("eviction: acquire to revoke", [asked for asked, _, _ in at_once])
     suite.time("eviction: the holder's part", [held for _, held, _ in at_once])
-    suite.time("eviction: release to grant, memory back at once", [noticed for _, _, noticed in at_once])
+    suite.time(
+        "eviction: release to grant, memory back at once", [noticed for _, _, noticed in at_once]
+    )
     added = [asked + noticed for asked, _, noticed in at_once]
     suite.limit("eviction: added by the arbiter", added, p99_max_us=5000.0)
     name = f"eviction: memory back to grant, {LAG_S * 1000:.0f} ms late"

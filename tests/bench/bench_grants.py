@@ -41,16 +41,25 @@ def run(suite: Suite) -> None:
             locks = redis_locks.RedisLocks(path, "one")
             stack.callback(locks.close)
             calls["usual"] = lambda: elapsed_us(usual)
-            calls["redis"] = lambda: elapsed_us(lambda: (locks.take(b"alone"), locks.give_back(b"alone")))
+            calls["redis"] = lambda: elapsed_us(
+                lambda: (locks.take(b"alone"), locks.give_back(b"alone"))
+            )
         found = in_turns(rounds, calls)
     suite.time(FLOOR, found[FLOOR], "200 bytes each way, validated")
     suite.compare("ping", found["ping"], found[FLOOR], "F", None)
     suite.compare("grant: acquire on a free card", found["grant"], found[FLOOR], "F", 1.5)
     suite.compare(
-        "grant: acquire on a free card, by p99", found["grant"], found[FLOOR], "F's p99", 2.0, of=p99
+        "grant: acquire on a free card, by p99",
+        found["grant"],
+        found[FLOOR],
+        "F's p99",
+        2.0,
+        of=p99,
     )
     if "redis" in found:
-        suite.time("Redis: take + give back, alone", found["usual"], "redis-py's lock; appended to its log")
+        suite.time(
+            "Redis: take + give back, alone", found["usual"], "redis-py's lock; appended to its log"
+        )
         suite.time("Redis: the same, spoken by hand", found["redis"])
         suite.compare("acquire + release, alone", found["cycle"], found["usual"], "Redis", 1.6)
     else:

@@ -18,7 +18,9 @@ class Line:
     """Clients of one daemon that take turns in a fixed order: one holds, the others wait."""
 
     def __init__(self, endpoint: str, clients: int) -> None:
-        self.peers = [Peer(endpoint, f"w{index}").hello() for index in range(min(clients, CONNECTIONS_MAX))]
+        self.peers = [
+            Peer(endpoint, f"w{index}").hello() for index in range(min(clients, CONNECTIONS_MAX))
+        ]
         self.queue: deque[Peer] = deque()
         self.holder, self.lease = self.peers[0], self.peers[0].acquire()
         for number in range(1, clients):

@@ -18,7 +18,9 @@ def run(suite: Suite) -> None:
         if not suite.quick:
             pause(QUIET_AFTER_S)
         share = busy_percent(daemon.pid, suite.size(10, 2))
-        suite.figure("memory of the daemon at rest", rss_bytes(daemon.pid) / 2**20, "MB", at_most=55.0)
+        suite.figure(
+            "memory of the daemon at rest", rss_bytes(daemon.pid) / 2**20, "MB", at_most=55.0
+        )
         suite.figure("CPU of the daemon at rest", share, "% of a core", at_most=0.3)
         peer = Peer(daemon.endpoint, "resident").hello()
         peer.ready(peer.acquire())
@@ -29,14 +31,18 @@ def run(suite: Suite) -> None:
         def start(code: str) -> float:
             command = [sys.executable, "-c", code]
             return elapsed_us(
-                lambda: subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL)
+                lambda: subprocess.run(
+                    command, env=environment, check=True, stdout=subprocess.DEVNULL
+                )
             )
 
         calls = {"bare": lambda: start("pass"), "status": lambda: start(STATUS)}
         found = in_turns(suite.size(60, 5), calls, chunk=5)
         peer.close()
     suite.time("bare Python's start", found["bare"])
-    suite.compare("start of vramctl status, answered", found["status"], found["bare"], "bare Python", 6.0)
+    suite.compare(
+        "start of vramctl status, answered", found["status"], found["bare"], "bare Python", 6.0
+    )
 
 
 def busy_percent(pid: int, seconds: float) -> float:

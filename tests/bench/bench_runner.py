@@ -26,12 +26,12 @@ from typing import Any
 
 from harness import SHIPPED, arbiter, p50, p99
 
-from arbiter.testing.process import ArbiterProcess
-from clients.runner import RunnerClient
-from clients.sidecar.perception import DetectorClient
-from clients.sidecar.policy import PolicyClient
-from schemas.errors import RunnerUnreachable, SidecarUnavailable
-from schemas.estop import REPLY_MAX_BYTES, Answer, path_of, reply_in, request
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.sidecar.perception import DetectorClient
+from vram_arbiter.clients.sidecar.policy import PolicyClient
+from vram_arbiter.schemas.errors import RunnerUnreachable, SidecarUnavailable
+from vram_arbiter.schemas.estop import REPLY_MAX_BYTES, Answer, path_of, reply_in, request
 
 ROOT = Path(__file__).parents[2]
 SKILLS = {"detector": "so101-detector", "grab": "so101-grab"}
@@ -45,7 +45,9 @@ JITTER_MAX_US = 2000.0
 STOP_MAX_US = 10_000.0
 STOPS = 200
 STOP_PAUSE_S = 0.01
-NO_HOLD = "scheduling:\n  thrash_hold_max_s: 0\n"  # it would slow down on purpose what is measured here
+NO_HOLD = (
+    "scheduling:\n  thrash_hold_max_s: 0\n"  # it would slow down on purpose what is measured here
+)
 FOOTPRINT = "5GB,5GB,450MiB"  # of each, on 8 GiB; without the simulated bandwidth of a real load there are more switches in a second
 BOOT_S = 240.0
 SETTLE_S = 3.0  # after the start: imports, first pictures, page cache
@@ -72,7 +74,9 @@ class RunnerRow:
 def run(*, quick: bool, out: Path) -> list[RunnerRow]:
     """Measure and write. Raises RuntimeError when a program ends by itself."""
     with arbiter(SHIPPED + NO_HOLD) as daemon:
-        measured = asyncio.run(_measure(daemon, rounds=1 if quick else 4, stretch_s=4.0 if quick else 15.0))
+        measured = asyncio.run(
+            _measure(daemon, rounds=1 if quick else 4, stretch_s=4.0 if quick else 15.0)
+        )
     rows = measured.rows()
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps([asdict(row) for row in rows], indent=1, ensure_ascii=False) + "\n")
@@ -84,7 +88,8 @@ def table(rows: Sequence[RunnerRow]) -> str:
     lines = [f"{'':46}{'p50 µs':>12}{'p99 µs':>12}{'idle p99':>12}{'ratio':>8}  {'':5}target"]
     for row in rows:
         cells = "".join(
-            f"{'' if x is None else f'{x:.0f}':>12}" for x in (row.p50_us, row.p99_us, row.idle_p99_us)
+            f"{'' if x is None else f'{x:.0f}':>12}"
+            for x in (row.p50_us, row.p99_us, row.idle_p99_us)
         )
         ratio = "" if row.ratio is None else f"{row.ratio:.2f}"
         ok = {True: "ok", False: "MISS", None: ""}[row.ok]
@@ -175,7 +180,9 @@ def _decide_us(ticks: Sequence[Tick]) -> list[float]:
 def _uneven(stretches: Sequence[Sequence[Tick]]) -> list[float]:
     """How much more or less than a period lies between the starts of neighbours in a stretch, however long the loop stood still. A slot that a
     long tick ate counts as a whole period."""
-    gaps = [b["started_s"] - a["started_s"] for ticks in stretches for a, b in itertools.pairwise(ticks)]
+    gaps = [
+        b["started_s"] - a["started_s"] for ticks in stretches for a, b in itertools.pairwise(ticks)
+    ]
     return [abs(gap - 1 / RATE_HZ) * 1e6 for gap in gaps]
 
 
@@ -191,9 +198,13 @@ async def _measure(daemon: ArbiterProcess, rounds: int, stretch_s: float) -> Mea
     words = ["runner", "sim", "--seed", "1", "--video", str(video), "--timings", str(timings)]
     async with AsyncExitStack() as stack:
         sidecars = {name: stack.enter_context(_sidecar(daemon, name)) for name in SKILLS}
-        detector = await stack.enter_async_context(DetectorClient(f"ipc://{daemon.runtime}/detector.sock"))
+        detector = await stack.enter_async_context(
+            DetectorClient(f"ipc://{daemon.runtime}/detector.sock")
+        )
         grab = await stack.enter_async_context(PolicyClient(f"ipc://{daemon.runtime}/grab.sock"))
-        runner = await stack.enter_async_context(RunnerClient(f"ipc://{daemon.runtime}/runner.sock"))
+        runner = await stack.enter_async_context(
+            RunnerClient(f"ipc://{daemon.runtime}/runner.sock")
+        )
         with _program(daemon, "runner", words) as process:
             await _until_up(runner.ping, [process, *sidecars.values()])
             for sidecar in (detector, grab):
@@ -218,7 +229,9 @@ async def _measure(daemon: ArbiterProcess, rounds: int, stretch_s: float) -> Mea
     return found
 
 
-async def _switch(runner: RunnerClient, detector: DetectorClient, grab: PolicyClient) -> list[float]:
+async def _switch(
+    runner: RunnerClient, detector: DetectorClient, grab: PolicyClient
+) -> list[float]:
     """Detector in and policy out, with a picture of the runner's as a reasoner would send; then the other way. Microseconds of each."""
     began = time.perf_counter()
     frame = await runner.frame("front", encoding="png")
@@ -229,7 +242,11 @@ async def _switch(runner: RunnerClient, detector: DetectorClient, grab: PolicyCl
 
 
 async def _drive(
-    found: Measured, runner: RunnerClient, detector: DetectorClient, grab: PolicyClient, stretch_s: float
+    found: Measured,
+    runner: RunnerClient,
+    detector: DetectorClient,
+    grab: PolicyClient,
+    stretch_s: float,
 ) -> None:
     """The robot turns on the spot, to and fro, and every third tick renders a picture for the video: first with nothing beside, then with switches."""
 
@@ -336,7 +353,9 @@ async def _goal(runner: RunnerClient) -> float:
     return (time.perf_counter() - began) * 1e6
 
 
-async def _start_another(daemon: ArbiterProcess, others: list["subprocess.Popen[bytes]"]) -> Stretch:
+async def _start_another(
+    daemon: ArbiterProcess, others: list["subprocess.Popen[bytes]"]
+) -> Stretch:
     """A further sidecar process comes up beside the runner and imports all its libraries."""
     began = time.monotonic()
     with _sidecar(daemon, "third", "so101-grab") as process:
@@ -361,18 +380,35 @@ async def _until_up(ping: Callable[[], Any], programs: Sequence["subprocess.Pope
 
 
 @contextmanager
-def _sidecar(daemon: ArbiterProcess, name: str, skill: str = "") -> Iterator["subprocess.Popen[bytes]"]:
+def _sidecar(
+    daemon: ArbiterProcess, name: str, skill: str = ""
+) -> Iterator["subprocess.Popen[bytes]"]:
     manifest = ROOT / "configs/rskills" / (skill or SKILLS[name]) / "rskill.yaml"
-    words = ["sidecars", "--name", name, "--rskill", str(manifest), "--device", f"fake:{daemon.card}"]
-    with _program(daemon, name, [*words, "--min-residency-s", "0", "--footprint", FOOTPRINT]) as process:
+    words = [
+        "sidecars",
+        "--name",
+        name,
+        "--rskill",
+        str(manifest),
+        "--device",
+        f"fake:{daemon.card}",
+    ]
+    with _program(
+        daemon, name, [*words, "--min-residency-s", "0", "--footprint", FOOTPRINT]
+    ) as process:
         yield process
 
 
 @contextmanager
-def _program(daemon: ArbiterProcess, name: str, words: Sequence[str]) -> Iterator["subprocess.Popen[bytes]"]:
+def _program(
+    daemon: ArbiterProcess, name: str, words: Sequence[str]
+) -> Iterator["subprocess.Popen[bytes]"]:
     """`python -m WORDS` in the daemon's runtime folder. What it said is shown when anything goes wrong."""
     log = daemon.runtime / f"{name}.log"
-    environ = daemon.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}  # as the demo starts them
+    environ = daemon.environ | {
+        "HF_HUB_OFFLINE": "1",
+        "OMP_NUM_THREADS": "1",
+    }  # as the demo starts them
     with log.open("ab") as sink:
         process = subprocess.Popen(
             [sys.executable, "-m", *words], cwd=ROOT, env=environ, stdout=sink, stderr=sink

@@ -25,7 +25,9 @@ def run(suite: Suite) -> None:
         suite.figure("throughput of 16 clients, of Redis's", per_s / redis_per_s, "x", at_least=0.5)
     else:
         suite.skipped("throughput of 16 clients, of Redis's", redis_locks.missing())
-    suite.figure("fairness, 128 clients: least / greatest share", fairness(ours), "x", at_least=0.95)
+    suite.figure(
+        "fairness, 128 clients: least / greatest share", fairness(ours), "x", at_least=0.95
+    )
     if path:
         suite.figure("Redis: fairness, 128 clients", fairness(theirs), "x")
 
@@ -36,7 +38,9 @@ def fairness(counts: list[int]) -> float:
 
 def load(kind: str, address: str, clients: int, seconds: float) -> list[int]:
     """Cycles of every client within so many seconds: several processes with several connections each."""
-    workers = [spawn("contender.py", kind, address, str(clients // PROCESSES)) for _ in range(PROCESSES)]
+    workers = [
+        spawn("contender.py", kind, address, str(clients // PROCESSES)) for _ in range(PROCESSES)
+    ]
     try:
         for word in ("go", "stop"):
             for worker in workers:

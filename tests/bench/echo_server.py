@@ -6,7 +6,7 @@ import threading
 import msgpack
 import zmq
 
-from schemas.wire import REQUEST
+from vram_arbiter.schemas.wire import REQUEST
 
 PAD = "x" * 160
 

@@ -22,7 +22,7 @@ from typing import Any
 import msgpack
 import zmq
 
-from arbiter.testing.process import ArbiterProcess
+from tests.support.process import ArbiterProcess
 
 HERE = Path(__file__).parent
 ANSWER_TIMEOUT_S = 30.0
@@ -100,7 +100,17 @@ class Suite:
         ratio = of(samples) / of(floor)
         target = None if at_most is None else f"<= {at_most:g} x {against}"
         ok = None if at_most is None else ratio <= at_most
-        row = Row(name, p50(samples), p99(samples), of(floor), ratio, target, ok, against=against, note=note)
+        row = Row(
+            name,
+            p50(samples),
+            p99(samples),
+            of(floor),
+            ratio,
+            target,
+            ok,
+            against=against,
+            note=note,
+        )
         self.rows.append(row)
 
     def limit(
@@ -118,7 +128,9 @@ class Suite:
         if p50_max_us is not None:
             target = f"p50 <= {p50_max_us / 1000:g} ms, {target}"
             ok = ok and p50(samples) <= p50_max_us
-        row = Row(name, p50(samples), worst, ratio=worst / p99_max_us, target=target, ok=ok, note=note)
+        row = Row(
+            name, p50(samples), worst, ratio=worst / p99_max_us, target=target, ok=ok, note=note
+        )
         self.rows.append(row)
 
     def figure(
@@ -134,9 +146,17 @@ class Suite:
         """A figure that is no time."""
         row = Row(name, value=value, unit=unit, note=note)
         if at_most is not None:
-            row.target, row.ok, row.ratio = f"<= {at_most:g} {unit}", value <= at_most, value / at_most
+            row.target, row.ok, row.ratio = (
+                f"<= {at_most:g} {unit}",
+                value <= at_most,
+                value / at_most,
+            )
         elif at_least is not None:
-            row.target, row.ok, row.ratio = f">= {at_least:g} {unit}", value >= at_least, value / at_least
+            row.target, row.ok, row.ratio = (
+                f">= {at_least:g} {unit}",
+                value >= at_least,
+                value / at_least,
+            )
         self.rows.append(row)
 
     def skipped(self, name: str, why: str) -> None:
@@ -150,7 +170,9 @@ class Suite:
             elif row.p50_us is None:
                 cells = row.note or ""
             else:
-                cells = f"{_number(row.p50_us):>10}{_number(row.p99_us):>10}{_number(row.floor_us):>10}"
+                cells = (
+                    f"{_number(row.p50_us):>10}{_number(row.p99_us):>10}{_number(row.floor_us):>10}"
+                )
             ratio = "" if row.ratio is None else f"{row.ratio:.2f}"
             ok = {True: "ok", False: "MISS", None: ""}[row.ok]
             lines.append(f"{row.name:58}{cells:>30}{ratio:>8}  {ok:5}{row.target or ''}".rstrip())
@@ -158,7 +180,9 @@ class Suite:
 
     def write(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps([asdict(row) for row in self.rows], indent=1, ensure_ascii=False) + "\n")
+        path.write_text(
+            json.dumps([asdict(row) for row in self.rows], indent=1, ensure_ascii=False) + "\n"
+        )
 
 
 def _number(value: float | None) -> str:
@@ -205,7 +229,10 @@ class Peer:
     """One connection that speaks the wire by hand. Raises RuntimeError with the daemon's words for a refusal."""
 
     def __init__(
-        self, endpoint: str, name: str = "peer", context: "zmq.Context[zmq.Socket[bytes]] | None" = None
+        self,
+        endpoint: str,
+        name: str = "peer",
+        context: "zmq.Context[zmq.Socket[bytes]] | None" = None,
     ) -> None:
         self.socket: zmq.Socket[bytes] = (context or zmq.Context.instance()).socket(zmq.DEALER)
         self.socket.setsockopt(zmq.LINGER, 0)
@@ -250,7 +277,9 @@ class Peer:
             self._replies[message["re"]] = message
 
     def greet(self) -> int:
-        return self.send("hello", name=self.name, instance=f"{self.name}-{os.getpid()}-{id(self)}", version=1)
+        return self.send(
+            "hello", name=self.name, instance=f"{self.name}-{os.getpid()}-{id(self)}", version=1
+        )
 
     def hello(self) -> "Peer":
         self.reply(self.greet())
@@ -351,7 +380,10 @@ def helper(script: str, *arguments: str) -> Iterator[None]:
 @contextmanager
 def floor() -> Iterator[Callable[[], float]]:
     """A blocking ROUTER that validates and answers, and nothing else; yields a call that takes one round trip's microseconds."""
-    with tempfile.TemporaryDirectory(prefix="vb") as folder, helper("echo_server.py", f"ipc://{folder}/e"):
+    with (
+        tempfile.TemporaryDirectory(prefix="vb") as folder,
+        helper("echo_server.py", f"ipc://{folder}/e"),
+    ):
         peer = Peer(f"ipc://{folder}/e", "floor")
         pad = "x" * 160
         try:

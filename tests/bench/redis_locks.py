@@ -141,14 +141,19 @@ def redis() -> Iterator[str]:
         path = f"{folder}/redis.sock"
         options = {"port": "0", "unixsocket": path, "dir": folder, "save": "", "appendonly": "yes"}
         options |= {"appendfsync": "no", "logfile": f"{folder}/log", "maxclients": "20000"}
-        command = ["redis-server", *(word for key, value in options.items() for word in (f"--{key}", value))]
+        command = [
+            "redis-server",
+            *(word for key, value in options.items() for word in (f"--{key}", value)),
+        ]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
         try:
             deadline = time.monotonic() + START_S
             while not os.path.exists(path):
                 if process.poll() is not None or time.monotonic() > deadline:
                     log = Path(folder, "log")
-                    raise RuntimeError(f"redis did not start: {log.read_text() if log.exists() else ''}")
+                    raise RuntimeError(
+                        f"redis did not start: {log.read_text() if log.exists() else ''}"
+                    )
                 threading.Event().wait(0.01)
             yield path
         finally:

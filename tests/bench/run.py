@@ -43,7 +43,9 @@ def main() -> int:
     parser.add_argument(
         "--only", action="append", choices=[*SUBJECTS, RUNNER], help="one subject; may be repeated"
     )
-    parser.add_argument("--out", type=Path, default=Path("out/bench/arbiter.json"), help="where the rows go")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/bench/arbiter.json"), help="where the rows go"
+    )
     options = parser.parse_args()
     suite = Suite(quick=options.quick)
     names = options.only or [*SUBJECTS, RUNNER]

@@ -9,7 +9,19 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-KEYS = {"name", "p50_us", "p99_us", "floor_us", "ratio", "target", "ok", "value", "unit", "against", "note"}
+KEYS = {
+    "name",
+    "p50_us",
+    "p99_us",
+    "floor_us",
+    "ratio",
+    "target",
+    "ok",
+    "value",
+    "unit",
+    "against",
+    "note",
+}
 
 
 def bench(out: Path, *subjects: str) -> list[dict[str, object]]:
@@ -24,7 +36,10 @@ def bench(out: Path, *subjects: str) -> list[dict[str, object]]:
         str(out.with_name("arbiter.json")),
     ]
     done = subprocess.run(
-        command, env=os.environ | {"PYTHONPATH": str(HERE.parents[1])}, capture_output=True, text=True
+        command,
+        env=os.environ | {"PYTHONPATH": str(HERE.parents[1])},
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     found: list[dict[str, object]] = json.loads(out.read_text())
@@ -36,7 +51,9 @@ def bench(out: Path, *subjects: str) -> list[dict[str, object]]:
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, object]]:
     """What one short run over a few subjects writes."""
-    return bench(tmp_path_factory.mktemp("bench") / "deep" / "arbiter.json", "grants", "eviction", "death")
+    return bench(
+        tmp_path_factory.mktemp("bench") / "deep" / "arbiter.json", "grants", "eviction", "death"
+    )
 
 
 def test_every_row_has_the_documented_fields(rows: list[dict[str, object]]) -> None:
@@ -90,7 +107,9 @@ def test_a_loop_that_stood_still_is_in_the_figures_however_long() -> None:
     ticks = [tick(at) for at in (0.0, 1 / 30, 5 + 1 / 30, 10.0, 10 + 1 / 30, 20.0, 20 + 1 / 30)]
     alone, beside, starting = [(10.0, 11.0)], [(0.0, 6.0)], [(20.0, 21.0)]
     one = [1.0]
-    found = Measured(ticks, alone, beside, starting, alone, beside, one, one, one, alone, one, one, one)
+    found = Measured(
+        ticks, alone, beside, starting, alone, beside, one, one, one, alone, one, one, one
+    )
     (uneven,) = [row for row in found.rows() if "from one start to the next" in row.name]
     assert uneven.p99_us == pytest.approx(5e6, rel=0.05)
     assert uneven.idle_p99_us == pytest.approx(0.0, abs=1.0)

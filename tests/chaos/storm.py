@@ -26,15 +26,15 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from arbiter.host.gpu.fake import locked
-from arbiter.testing.attacks import ATTACKS
-from arbiter.testing.fakegpu_check import check_log
-from arbiter.testing.forkserver import Child, ForkServer
-from arbiter.testing.lease_check import Finding, Hindrance, Story, check_leases, read_lines
-from arbiter.testing.process import ArbiterProcess
-from clients.aio import ArbiterClient
-from schemas import fakegpu
-from schemas.errors import VramError
+from tests.support.attacks import ATTACKS
+from tests.support.fakegpu_check import check_log
+from tests.support.forkserver import Child, ForkServer
+from tests.support.lease_check import Finding, Hindrance, Story, check_leases, read_lines
+from tests.support.process import ArbiterProcess
+from vram_arbiter.arbiter.host.gpu.fake import locked
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.errors import VramError
 
 STEPS = {
     "queued": "waiting",
@@ -91,7 +91,9 @@ class Storm:
         self._traces.mkdir()
         self._mounted = self._mount_state()
         self._forks = ForkServer(
-            Path(__file__).with_name("worker.py"), self._arbiter.environ, self._arbiter.runtime / "errors.log"
+            Path(__file__).with_name("worker.py"),
+            self._arbiter.environ,
+            self._arbiter.runtime / "errors.log",
         )
         self._slots: dict[int, Child] = {}
         self._born = 0
@@ -164,7 +166,9 @@ class Storm:
             file.writelines(json.dumps(event) + "\n" for event in self._whole_history())
         lines = read_lines(path.read_text() for path in self._traces.iterdir())
         (kept / "traces.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-        (kept / "hindrances.json").write_text(json.dumps([asdict(found) for found in self._hindrances]))
+        (kept / "hindrances.json").write_text(
+            json.dumps([asdict(found) for found in self._hindrances])
+        )
         (kept / "outages.json").write_text(json.dumps(self._outages))
 
     def _finding(self, rule: str, text: str) -> None:
@@ -172,7 +176,9 @@ class Storm:
 
     # -- processes -----------------------------------------------------------------------------------------------------
     def _spawn(self, kind: str, name: str, what: str) -> Child:
-        child = self._forks.spawn(kind, name, what, str(self._arbiter.card), str(self._traces), name=name)
+        child = self._forks.spawn(
+            kind, name, what, str(self._arbiter.card), str(self._traces), name=name
+        )
         self._children.append(child)
         return child
 
@@ -191,7 +197,11 @@ class Storm:
         ) as client:
             async for event in client.subscribe():
                 self._heard(event)
-                if event["kind"] == "ready" and self._user is not None and self._random.random() < 0.3:
+                if (
+                    event["kind"] == "ready"
+                    and self._user is not None
+                    and self._random.random() < 0.3
+                ):
                     self._start(self._tell_user(client, str(event["lease_id"])))
 
     async def _tell_user(self, client: ArbiterClient, lease: str) -> None:
@@ -233,7 +243,9 @@ class Storm:
         """Every cell of step × role × signal in a shuffled order, again and again; faults of card and disk in between."""
         while time.monotonic() < end or not self._enough():
             if not self._plan:
-                self._plan = [(s, r, h) for s in STEPS.values() for r in ROLES for h in ("kill", "stop")]
+                self._plan = [
+                    (s, r, h) for s in STEPS.values() for r in ROLES for h in ("kill", "stop")
+                ]
                 self._plan += [
                     ("any time", "machine", fault)
                     for fault in (*CARD_FAULTS, *DISK_FAULTS, *ATTACK_FAULTS) * 2
@@ -275,7 +287,10 @@ class Storm:
         elif role == "waiter":
             names = set(self._queued.values()) - {holder} or {holder}
         else:
-            names = {child.name for child in self._slots.values()} - {holder, *self._queued.values()}
+            names = {child.name for child in self._slots.values()} - {
+                holder,
+                *self._queued.values(),
+            }
         found = [child for child in self._slots.values() if child.name in names]
         return self._random.choice(found) if found else None
 
@@ -364,7 +379,9 @@ class Storm:
                 self._tally.count(fault)
                 self._born += 1
                 attack = fault.removeprefix("attack: ")
-                self._strangers.append(self._spawn("attacker", f"x-{self._born}", f"{attack}:{pause_s:.2f}"))
+                self._strangers.append(
+                    self._spawn("attacker", f"x-{self._born}", f"{attack}:{pause_s:.2f}")
+                )
             case _:
                 self._tally.count(fault)
                 faulty: dict[str, Any] = {
@@ -421,7 +438,15 @@ class Storm:
         """A small disk for the daemon's state, where mounting is permitted."""
         self._arbiter.state.mkdir(mode=0o700)
         mounted = subprocess.run(
-            ["mount", "-t", "tmpfs", "-o", f"size={STATE_BYTES},mode=0700", "none", str(self._arbiter.state)],
+            [
+                "mount",
+                "-t",
+                "tmpfs",
+                "-o",
+                f"size={STATE_BYTES},mode=0700",
+                "none",
+                str(self._arbiter.state),
+            ],
             check=False,
             capture_output=True,
         )
@@ -469,9 +494,13 @@ class Storm:
                 and all(gpu["measured_used_bytes"] == 0 for gpu in status["gpus"])
             )
 
-        async with ArbiterClient(self._arbiter.endpoint, name="settled", connect_timeout_s=30.0) as client:
+        async with ArbiterClient(
+            self._arbiter.endpoint, name="settled", connect_timeout_s=30.0
+        ) as client:
             if not await _eventually(lambda: clean(client), CALM_S):
-                self._finding("leak", f"something is left after everybody has gone: {json.dumps(status)}")
+                self._finding(
+                    "leak", f"something is left after everybody has gone: {json.dumps(status)}"
+                )
         fds = len(os.listdir(f"/proc/{self._arbiter.pid}/fd"))
         memory = Path(f"/proc/{self._arbiter.pid}/status").read_text()
         rss = next(line for line in memory.splitlines() if line.startswith("VmRSS")).split()[1]
@@ -504,7 +533,9 @@ class Storm:
             "faults": {
                 "total": sum(self._tally.by_kind.values()),
                 "by_kind": dict(sorted(self._tally.by_kind.items())),
-                "by_step": {step: dict(sorted(kinds.items())) for step, kinds in self._tally.by_step.items()},
+                "by_step": {
+                    step: dict(sorted(kinds.items())) for step, kinds in self._tally.by_step.items()
+                },
             },
             "disk": "tmpfs and file limit" if self._mounted else "file limit only",
             **_figures(story),
@@ -522,7 +553,9 @@ class Storm:
     def _whole_history(self) -> list[dict[str, Any]]:
         """What the subscriber heard and what the disk kept: each may miss what the other has."""
         found = dict(self._events)
-        with contextlib.closing(sqlite3.connect(self._arbiter.state / "history.sqlite")) as database:
+        with contextlib.closing(
+            sqlite3.connect(self._arbiter.state / "history.sqlite")
+        ) as database:
             for (text,) in database.execute("SELECT json FROM events"):
                 event = json.loads(text)
                 found[event["seq"], event["at_wall_s"]] = event

@@ -42,7 +42,9 @@ def storm_module() -> Iterator[ModuleType]:
 
 
 @pytest.fixture
-def storm(storm_module: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+def storm(
+    storm_module: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> SimpleNamespace:
     """`.run`: a storm that has started nothing; `.arbiter`: what it believes to be the daemon."""
     arbiter = Arbiter(tmp_path)
     monkeypatch.setattr(storm_module, "ArbiterProcess", lambda **_: arbiter)
@@ -59,7 +61,9 @@ def test_a_full_disk_is_emptied_for_a_start(storm: SimpleNamespace) -> None:
     assert not storm.run._disk_is_full
 
 
-def test_a_disk_that_is_emptied_while_a_start_fails_is_worth_another_try(storm: SimpleNamespace) -> None:
+def test_a_disk_that_is_emptied_while_a_start_fails_is_worth_another_try(
+    storm: SimpleNamespace,
+) -> None:
     """Regression (seed 11): the storm fell over with a start that had found the disk full."""
     storm.arbiter.succeeds_at = 2
     storm.run._disk_is_full = True

@@ -1,5 +1,5 @@
 """What a process of the storm does: a consumer that leases and loads for ever, a stranger that takes bytes without asking, or a
-user that marks uses on other people's leases. Not a test module; run by `arbiter.testing.forkserver`.
+user that marks uses on other people's leases. Not a test module; run by `tests.support.forkserver`.
 
 A consumer writes down what it does, and when, in a trace of JSON lines: the checker's second witness beside the arbiter's history.
 It is honest but not careful: it loads after its grant without looking twice, as real programs do.
@@ -17,15 +17,15 @@ from collections.abc import Coroutine, Sequence
 from pathlib import Path
 from typing import Any
 
-from arbiter.testing.attacks import ATTACKS
-from clients.aio import ArbiterClient
-from clients.lease import Lease
-from schemas.endpoints import arbiter_endpoint
-from schemas.errors import VramError
-from schemas.fakegpu import SimulatedOutOfMemory
-from schemas.wire import Footprint, LeaseSpec
-from sidecars.device.fake import FakeMemory
-from sidecars.device.memory import Block
+from tests.support.attacks import ATTACKS
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.lease import Lease
+from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.fakegpu import SimulatedOutOfMemory
+from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
+from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.sidecars.device.fake import FakeMemory
+from vram_arbiter.sidecars.device.memory import Block
 
 MIB = 1 << 20
 CHUNKS = 3
@@ -43,7 +43,13 @@ class Trace:
         self._name = name
 
     def say(self, event: str, **facts: object) -> None:
-        line = {"t": time.monotonic(), "pid": os.getpid(), "name": self._name, "event": event, **facts}
+        line = {
+            "t": time.monotonic(),
+            "pid": os.getpid(),
+            "name": self._name,
+            "event": event,
+            **facts,
+        }
         os.write(self._file, (json.dumps(line) + "\n").encode())
 
 
@@ -78,7 +84,9 @@ class Consumer:
             mode=draw.choice(["shared", "shared", "shared", "exclusive"]),
             priority=draw.choice([40, 50, 50, 60]),
             on_deadline=draw.choice(["wait", "wait", "deny"]),
-            footprint=Footprint(load_peak_bytes=peak, steady_bytes=steady, residue_bytes=self._residue),
+            footprint=Footprint(
+                load_peak_bytes=peak, steady_bytes=steady, residue_bytes=self._residue
+            ),
         )
 
     async def _round(self, client: ArbiterClient) -> None:

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
-from clients import records as r
-from clients.protocol import ClientProtocol
-from schemas import wire
+from vram_arbiter.clients._protocol import records as r
+from vram_arbiter.clients._protocol.protocol import ClientProtocol
+from vram_arbiter.schemas import wire
 
 SPEC = wire.LeaseSpec(
     consumer="detector",
@@ -13,10 +13,19 @@ SPEC = wire.LeaseSpec(
     ttl_s=9.0,
     footprint=wire.Footprint(load_peak_bytes=5, steady_bytes=4, residue_bytes=1),
 ).model_dump(mode="json")
-WELCOME = {"version": 1, "boot_id": "b", "server": "s", "role": "client", "heartbeat_s": 2.0, "grace_s": 5.0}
+WELCOME = {
+    "version": 1,
+    "boot_id": "b",
+    "server": "s",
+    "role": "client",
+    "heartbeat_s": 2.0,
+    "grace_s": 5.0,
+}
 
 
-def view(lease_id: str = "L1-1", token: list[int] | None = None, state: str = "loading") -> dict[str, Any]:
+def view(
+    lease_id: str = "L1-1", token: list[int] | None = None, state: str = "loading"
+) -> dict[str, Any]:
     return {"lease_id": lease_id, "token": token, "state": state, "gpu": "GPU-1"}
 
 
@@ -50,7 +59,9 @@ class Wire:
         return [message for message in self.sent() if message["op"] == op]
 
     def reply(self, request: Mapping[str, Any], **body: Any) -> None:
-        self.connection.receive({"re": request["id"], "epoch": self.epoch, "ok": True, **body}, self.now)
+        self.connection.receive(
+            {"re": request["id"], "epoch": self.epoch, "ok": True, **body}, self.now
+        )
 
     def refuse(self, request: Mapping[str, Any], code: str, **details: Any) -> None:
         error = {"code": code, "message": "no", "hint": "", "details": details}
@@ -95,10 +106,17 @@ class Wire:
         return self.one("reattach")
 
 
-def evict(link: Wire, record: r.LeaseRecord, asleep: str = "standby", then: str | None = None) -> None:
+def evict(
+    link: Wire, record: r.LeaseRecord, asleep: str = "standby", then: str | None = None
+) -> None:
     """The holder is asked, lets go, and hears how the lease waits."""
     link.push(
-        "revoke", lease_id=record.lease_id, token=list(record.token), reason="", wanted_by="", park=True
+        "revoke",
+        lease_id=record.lease_id,
+        token=list(record.token),
+        reason="",
+        wanted_by="",
+        park=True,
     )
     link.holdings.release(record, False, link.now, 5.0, asleep=asleep)
     message = link.one("release")

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from clients.aio import ArbiterClient
-from clients.connection import REQUEST_TIMEOUT_S
-from clients.records import Eviction
-from schemas.defaults import STATUS_PAGE
-from schemas.errors import (
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
+from vram_arbiter.clients._protocol.records import Eviction
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.schemas.defaults import STATUS_PAGE
+from vram_arbiter.schemas.errors import (
     ArbiterUnreachable,
     LeaseLost,
     LeaseRevoking,
@@ -28,8 +28,8 @@ from schemas.errors import (
     VramInsufficient,
     WaitTimeout,
 )
-from schemas.wire import LeaseSpec
-from sidecars.device.fake import FakeMemory
+from vram_arbiter.schemas.wire import LeaseSpec
+from vram_arbiter.sidecars.device.fake import FakeMemory
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
@@ -58,7 +58,9 @@ async def test_acquire_ready_use_release(arbiter_daemon: ArbiterProcess, spec: S
             await lease.ready()
 
 
-async def test_an_evicted_holder_hears_by_whom_and_why(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+async def test_an_evicted_holder_hears_by_whom_and_why(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
     """After an eviction every call on the lease said that it "was released", as if its holder had wanted that."""
     async with (
         ArbiterClient(arbiter_daemon.endpoint, name="t") as client,
@@ -80,7 +82,9 @@ async def test_an_evicted_holder_hears_by_whom_and_why(arbiter_daemon: ArbiterPr
         assert second.evicted.reason.endswith(": lunch")
 
 
-async def test_status_is_whole_though_it_comes_in_pages(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+async def test_status_is_whole_though_it_comes_in_pages(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
     """The daemon answers `status` in pages: thousands of waiters in one reply held its loop for seconds."""
     waiters = STATUS_PAGE + 40
     async with contextlib.AsyncExitStack() as stack:
@@ -98,7 +102,10 @@ async def test_status_is_whole_though_it_comes_in_pages(arbiter_daemon: ArbiterP
             {"leases": waiters + 1, "waiting": waiters},
         )
         whole = await clients[0].status()
-        assert [lease.get("position") for lease in whole["leases"]] == [None, *range(1, waiters + 1)]
+        assert [lease.get("position") for lease in whole["leases"]] == [
+            None,
+            *range(1, waiters + 1),
+        ]
         assert "next" not in whole
         vramctl = str(Path(sys.executable).with_name("vramctl"))
         command = [vramctl, "status", "--json", "--endpoint", arbiter_daemon.endpoint]
@@ -137,7 +144,9 @@ async def test_a_plain_function_may_unload(
     assert (unloaded, lease.state, caplog.messages) == (["a"], "gone", [])
 
 
-async def test_closing_the_client_gives_up_its_leases(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+async def test_closing_the_client_gives_up_its_leases(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
     unloaded = asyncio.Event()
 
     async def unload() -> None:
@@ -173,7 +182,9 @@ async def test_leaving_does_not_wait_for_an_arbiter_that_is_away(
         assert unloaded.is_set()
 
 
-async def test_revoked_at_the_safe_point_and_not_before(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+async def test_revoked_at_the_safe_point_and_not_before(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
     story: list[str] = []
 
     async def unload() -> None:
@@ -267,7 +278,9 @@ async def test_wait_timeout_says_who_blocked(arbiter_daemon: ArbiterProcess, spe
             assert late.value.details["why"]["blockers"][0]["consumer"] == "a"
 
 
-async def test_a_cancelled_acquire_leaves_the_queue(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+async def test_a_cancelled_acquire_leaves_the_queue(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
     async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
@@ -302,7 +315,9 @@ async def test_an_acquire_cancelled_at_any_moment_leaks_nothing(
         assert (whole.state, await states(client)) == ("loading", {"whole": "loading"})
 
 
-async def test_callbacks_that_raise_do_not_keep_the_lease(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+async def test_callbacks_that_raise_do_not_keep_the_lease(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
     async def unload() -> None:
         raise ValueError("a bug of the holder")
 
@@ -338,7 +353,10 @@ async def test_a_word_that_the_arbiter_refuses_is_said_again(
 
         monkeypatch.setattr(client.protocol.holdings, "unloading", counted)
         monkeypatch.setattr(client, "reply", refused_once)
-        async with ArbiterClient(arbiter_daemon.endpoint, name="other") as other, asyncio.timeout(WAIT_S):
+        async with (
+            ArbiterClient(arbiter_daemon.endpoint, name="other") as other,
+            asyncio.timeout(WAIT_S),
+        ):
             await (await other.acquire(spec("b", 5))).release()
             await lease.wait_gone()
         assert len(said) == 2
@@ -374,7 +392,9 @@ async def test_nobody_at_the_endpoint(tmp_path: Path) -> None:
         await client.status()
 
 
-async def test_an_observer_may_look_but_not_acquire(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+async def test_an_observer_may_look_but_not_acquire(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
     async with ArbiterClient(arbiter_daemon.endpoint, name="t", role="observer") as client:
         assert (await client.status())["clients"] == 1
         with pytest.raises(VramError, match="observer"):
@@ -407,7 +427,9 @@ async def test_subscribers_see_events_in_order(arbiter_daemon: ArbiterProcess, s
             kind for kind in kinds if kind != "queued"
         ]  # where the first reading of the card is still under way
         assert kinds == ["granted", "ready", "switch", "released"]
-        assert [event["kind"] for event in (await client.history(kinds=["granted"]))["events"]] == ["granted"]
+        assert [event["kind"] for event in (await client.history(kinds=["granted"]))["events"]] == [
+            "granted"
+        ]
 
 
 async def test_a_restart_of_the_daemon_is_ridden_out(
@@ -423,7 +445,9 @@ async def test_a_restart_of_the_daemon_is_ridden_out(
         assert process is not None
         process.kill()
         process.wait()
-        await until(lambda: not client.connected)  # the socket's monitor says so, no heartbeat has to run out
+        await until(
+            lambda: not client.connected
+        )  # the socket's monitor says so, no heartbeat has to run out
         asked = asyncio.create_task(client.status())
         await asyncio.to_thread(arbiter.start)
         await until(lambda: client.connected and client.epoch > pinned.token[0])
@@ -436,7 +460,9 @@ async def test_a_restart_of_the_daemon_is_ridden_out(
         assert lease.token > pinned.token
 
 
-async def test_self_fencing(make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until) -> None:
+async def test_self_fencing(
+    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
+) -> None:
     lost: list[VramError] = []
     unloaded = asyncio.Event()
 
@@ -445,7 +471,9 @@ async def test_self_fencing(make_arbiter: Callable[..., ArbiterProcess], spec: S
 
     arbiter = make_arbiter().start()
     async with ArbiterClient(arbiter.endpoint, name="t") as client:
-        lease = await client.acquire(spec("a", 5), unload=unload, on_lost=lambda _, error: lost.append(error))
+        lease = await client.acquire(
+            spec("a", 5), unload=unload, on_lost=lambda _, error: lost.append(error)
+        )
         await lease.ready()
         process = arbiter.process
         assert process is not None

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from clients.aio import ArbiterClient
-from clients.lease import Lease, LeaseState, Use
-from schemas.errors import (
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.lease import Lease, LeaseState, Use
+from vram_arbiter.schemas.errors import (
     BadState,
     GangBroken,
     LeaseRevoking,
@@ -18,8 +18,8 @@ from schemas.errors import (
     VramInsufficient,
     WouldDeadlock,
 )
-from schemas.wire import Footprint, LeaseRef, LeaseSpec
-from sidecars.device.fake import FakeMemory
+from vram_arbiter.schemas.wire import Footprint, LeaseRef, LeaseSpec
+from vram_arbiter.sidecars.device.fake import FakeMemory
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
@@ -64,7 +64,10 @@ async def on_standby(client: ArbiterClient, spec: Spec, model: Model) -> Lease:
 async def parkable(client: ArbiterClient, spec: Spec, model: Model) -> Lease:
     """A detector that is resident, and may keep its weights in host RAM when it leaves."""
     detector = await client.acquire(
-        spec("detector", 5, park_bytes=5 * GIB), unload=model.unload, park=model.park, on_return=model.load
+        spec("detector", 5, park_bytes=5 * GIB),
+        unload=model.unload,
+        park=model.park,
+        on_return=model.load,
     )
     await detector.ready()
     return detector
@@ -177,7 +180,9 @@ async def test_weights_are_parked_where_the_budget_has_room(
     model = Model()
     async with ArbiterClient(arbiter.endpoint, name="t") as client:
         detector = await parkable(client, spec, model)
-        policy = await client.acquire(spec("policy", 4, park_bytes=5 * GIB), WAIT_S, unload=model.unload)
+        policy = await client.acquire(
+            spec("policy", 4, park_bytes=5 * GIB), WAIT_S, unload=model.unload
+        )
         await policy.ready()
         assert (detector.state, model.did) == ("parked", ["park"])
         await detector.reacquire(WAIT_S)
@@ -201,7 +206,9 @@ async def test_who_parks_hears_how_it_ended_not_how_it_was_meant(
         detector = await parkable(client, spec, model)
         parking = asyncio.create_task(detector.park())
         while not parking.done():
-            detector.revoke_asked({}, False)  # as the arbiter says it again and again while somebody waits
+            detector.revoke_asked(
+                {}, False
+            )  # as the arbiter says it again and again while somebody waits
             await asyncio.sleep(0)
         await parking
         assert (detector.state, model.did) == ("gone", ["park", "unload"])
@@ -330,7 +337,9 @@ async def test_a_sub_lease_is_carved_out_of_its_parents(
         parent = LeaseRef(lease_id=root.lease_id, token=root.token)
         with pytest.raises(ParentTooSmall):
             await sidecar.acquire(spec("policy", 6, parent=parent))
-        leaf = await sidecar.acquire(spec("policy", 4, parent=parent), unload=model.unload, on_revoke=told)
+        leaf = await sidecar.acquire(
+            spec("policy", 4, parent=parent), unload=model.unload, on_revoke=told
+        )
         await leaf.ready()
         await root.ready()
         async with root.use("grab"):
@@ -348,7 +357,9 @@ async def test_a_sub_lease_is_carved_out_of_its_parents(
         await detector.give_up()
 
 
-async def test_a_job_that_waits_for_its_own_room_is_told(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+async def test_a_job_that_waits_for_its_own_room_is_told(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
     """It holds in use what it would itself have to give up: that would never end. Another task of the process may wait."""
     async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
         job = await client.acquire(spec("job", 5))
@@ -361,7 +372,9 @@ async def test_a_job_that_waits_for_its_own_room_is_told(arbiter_daemon: Arbiter
                 await client.acquire(spec("llm", 5))
             assert [link["consumer"] for link in told.value.details["cycle"]] == ["llm"]
             assert "job" in str(told.value)
-            prefetch = asyncio.ensure_future(client.acquire(spec("next", 5, independent=True), WAIT_S))
+            prefetch = asyncio.ensure_future(
+                client.acquire(spec("next", 5, independent=True), WAIT_S)
+            )
         await job.give_up()
         assert (await beside).state == "loading"
         await (await beside).give_up()

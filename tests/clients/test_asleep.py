@@ -4,10 +4,10 @@ from typing import Any
 
 from protocol_wire import WELCOME, Wire, evict, view
 
-from clients import records as r
-from clients.connection import REQUEST_TIMEOUT_S
-from clients.records import Message
-from schemas.errors import ArbiterUnreachable, LeaseLost, WaitTimeout
+from vram_arbiter.clients._protocol import records as r
+from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
+from vram_arbiter.clients._protocol.records import Message
+from vram_arbiter.schemas.errors import ArbiterUnreachable, LeaseLost, WaitTimeout
 
 
 def test_an_evicted_lease_comes_back_under_a_new_token(link: Wire) -> None:
@@ -50,7 +50,9 @@ def test_a_lease_on_standby_is_attached_again_and_may_have_returned_meanwhile(li
     record = link.hold()
     evict(link, record, "parked")
     request = link.reconnect()
-    assert [(item["lease_id"], item["state"]) for item in request["leases"]] == [(record.lease_id, "parked")]
+    assert [(item["lease_id"], item["state"]) for item in request["leases"]] == [
+        (record.lease_id, "parked")
+    ]
     kept = {"lease_id": record.lease_id, "kept": True, "lease": view(token=None, state="parked")}
     link.reply(request, leases=[kept])
     assert link.told() == [r.Up(1)]
@@ -100,7 +102,10 @@ def test_one_requests_end_that_drops_another_does_not_stop_the_clock(link: Wire)
     link.reply(link.one("reacquire"), state="queued", lease=view(state="queued"))
     link.told()
     reattach = link.reconnect()
-    link.reply(reattach, leases=[{"lease_id": record.lease_id, "kept": True, "lease": view(state="queued")}])
+    link.reply(
+        reattach,
+        leases=[{"lease_id": record.lease_id, "kept": True, "lease": view(state="queued")}],
+    )
     link.one("reacquire")
     link.connection.contact_lost("test")
     link.told()
@@ -116,7 +121,12 @@ def left_unheard(link: Wire) -> r.LeaseRecord:
     """Evicted, and the arbiter is gone for longer than anybody waits for its answer."""
     record = link.hold()
     link.push(
-        "revoke", lease_id=record.lease_id, token=list(record.token), reason="", wanted_by="", park=False
+        "revoke",
+        lease_id=record.lease_id,
+        token=list(record.token),
+        reason="",
+        wanted_by="",
+        park=False,
     )
     link.connection.contact_lost("test")
     link.holdings.release(record, False, link.now, 5.0, asleep="standby")
@@ -128,12 +138,16 @@ def left_unheard(link: Wire) -> r.LeaseRecord:
     return record
 
 
-def back_in_contact(link: Wire, record: r.LeaseRecord, *, kept: bool = True, **lease: Any) -> list[Message]:
+def back_in_contact(
+    link: Wire, record: r.LeaseRecord, *, kept: bool = True, **lease: Any
+) -> list[Message]:
     """The arbiter is back and hears what is attached again; returns what else it is told."""
     link.connection.connected(link.now)
     link.reply(link.one("hello"), **WELCOME)
     attach = link.one("reattach")
-    assert [(item["lease_id"], item["state"]) for item in attach["leases"]] == [(record.lease_id, "standby")]
+    assert [(item["lease_id"], item["state"]) for item in attach["leases"]] == [
+        (record.lease_id, "standby")
+    ]
     link.reply(attach, leases=[{"lease_id": record.lease_id, "kept": kept, "lease": view(**lease)}])
     return link.sent()
 

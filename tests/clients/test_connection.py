@@ -2,9 +2,9 @@
 
 from protocol_wire import WELCOME, Wire, view
 
-from clients import records as r
-from clients.connection import HELLO_TIMEOUT_S, SILENCE_BEATS
-from schemas.errors import ArbiterUnreachable, VersionMismatch
+from vram_arbiter.clients._protocol import records as r
+from vram_arbiter.clients._protocol.connection import HELLO_TIMEOUT_S, SILENCE_BEATS
+from vram_arbiter.schemas.errors import ArbiterUnreachable, VersionMismatch
 
 
 # -- greeting ---------------------------------------------------------------------------------------------------------
@@ -81,7 +81,11 @@ def test_an_unanswered_request_ends_at_its_deadline(link: Wire) -> None:
 
 
 def test_replies_nobody_asked_for_and_unknown_pushes_are_ignored(link: Wire) -> None:
-    for message in ({"re": 999, "ok": True}, {"re": None, "ok": False, "error": {}}, {"push": "news"}):
+    for message in (
+        {"re": 999, "ok": True},
+        {"re": None, "ok": False, "error": {}},
+        {"push": "news"},
+    ):
         link.connection.receive({"epoch": 1, **message}, link.now)
     assert link.told() == []
 

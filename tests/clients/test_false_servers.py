@@ -18,17 +18,19 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from clients.aio import ArbiterClient
-from clients.cli import quick
-from clients.runner import RunnerClient
-from clients.sidecar.perception import DetectorClient
-from clients.sidecar.spawn import SpawnSpec
-from clients.sync import SyncArbiterClient
-from reasoner.server import send
-from schemas.errors import ConfigError, UntrustedServer
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.cli import quick
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.sidecar.perception import DetectorClient
+from vram_arbiter.clients.sidecar.spawn import SpawnSpec
+from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.reasoner.server import send
+from vram_arbiter.schemas.errors import ConfigError, UntrustedServer
 
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="only root can start a server of another user")
+pytestmark = pytest.mark.skipif(
+    os.geteuid() != 0, reason="only root can start a server of another user"
+)
 
 SCRIPT = Path(__file__).parents[1] / "schemas/runtime/false_server.py"
 DEADLINE_S = 60.0
@@ -42,7 +44,9 @@ def false_server(folder: Path, name: str) -> Iterator[Heard]:
     owner = folder.stat().st_uid
     os.chown(folder, nobody, -1)
     command = [sys.executable, str(SCRIPT), str(folder), name, str(nobody)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as child:
         said: list[str] = []
 
         def heard() -> list[str]:
@@ -119,7 +123,10 @@ def test_vramctl_says_who_serves_there(folder: Path) -> None:
     with false_server(folder, "s") as heard:
         for command in (["status"], ["status", "--json"], ["resume"], ["watch"]):
             done = subprocess.run(
-                [sys.executable, "-m", "clients", *command], env=environ, capture_output=True, text=True
+                [sys.executable, "-m", "vram_arbiter.clients", *command],
+                env=environ,
+                capture_output=True,
+                text=True,
             )
             assert done.returncode == quick.UNREACHABLE, done
             if "--json" in command:
@@ -147,7 +154,7 @@ def test_a_lease_is_not_told_to_a_server_that_took_the_arbiters_place(
         lease.ready()
         assert arbiter_daemon.stop() == 0
         with (
-            caplog.at_level(logging.ERROR, "clients.aio"),
+            caplog.at_level(logging.ERROR, "vram_arbiter.clients.client"),
             false_server(arbiter_daemon.runtime, "arbiter.sock") as heard,
         ):
             deadline = time.monotonic() + DEADLINE_S

@@ -2,8 +2,8 @@
 
 from protocol_wire import Wire
 
-from clients import records as r
-from clients.connection import REQUEST_TIMEOUT_S
+from vram_arbiter.clients._protocol import records as r
+from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
 
 
 def test_a_use_on_anothers_lease_is_begun_again_until_it_ends(link: Wire) -> None:

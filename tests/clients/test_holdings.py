@@ -3,9 +3,9 @@
 import pytest
 from protocol_wire import Wire, view
 
-from clients import records as r
-from clients.connection import HELLO_TIMEOUT_S
-from schemas.errors import (
+from vram_arbiter.clients._protocol import records as r
+from vram_arbiter.clients._protocol.connection import HELLO_TIMEOUT_S
+from vram_arbiter.schemas.errors import (
     BadState,
     LeaseExpired,
     LeaseLost,
@@ -124,7 +124,9 @@ def test_reattachment_says_what_is_held_and_used(link: Wire) -> None:
     loading = link.grant("n2", "L1-3", 4)
     link.told()
     reattach = link.reconnect()
-    shown = [(e["lease_id"], e["state"], e["measured_bytes"], e["use_ids"]) for e in reattach["leases"]]
+    shown = [
+        (e["lease_id"], e["state"], e["measured_bytes"], e["use_ids"]) for e in reattach["leases"]
+    ]
     assert shown == [("L1-1", "held", 4, ["u1"]), ("L1-3", "loading", None, [])]
     assert link.connection.phase == "reattaching"
     link.epoch = 2
@@ -209,7 +211,9 @@ def test_a_resize_outlives_the_daemon(link: Wire, ends: str) -> None:
     link.told()
     link.now += 2.0
     attach = link.reconnect()
-    link.reply(attach, leases=[{"lease_id": record.lease_id, "kept": True, "lease": view(state="held")}])
+    link.reply(
+        attach, leases=[{"lease_id": record.lease_id, "kept": True, "lease": view(state="held")}]
+    )
     again = link.one("resize")
     assert (again["footprint"], again["wait_timeout_s"]) == (FOOTPRINT, 3.0)
     if ends == "refused":
@@ -220,7 +224,9 @@ def test_a_resize_outlives_the_daemon(link: Wire, ends: str) -> None:
             link.push("resized", lease_id=record.lease_id, token=list(record.token), charge_bytes=9)
     (resized,) = [event for event in link.told() if isinstance(event, r.Resized)]
     assert isinstance(resized.error, VramInsufficient) == (ends == "refused")
-    link.reply(link.reconnect(), leases=[{"lease_id": record.lease_id, "kept": True, "lease": view()}])
+    link.reply(
+        link.reconnect(), leases=[{"lease_id": record.lease_id, "kept": True, "lease": view()}]
+    )
     assert link.said("resize") == [], "its end was told"
 
 
@@ -235,7 +241,9 @@ def test_a_resize_that_was_answered_or_is_on_the_way_is_said_once(link: Wire, fi
         else:
             link.refuse(message, "vram_insufficient")
     link.told()
-    link.reply(link.reconnect(), leases=[{"lease_id": record.lease_id, "kept": True, "lease": view()}])
+    link.reply(
+        link.reconnect(), leases=[{"lease_id": record.lease_id, "kept": True, "lease": view()}]
+    )
     assert len(link.said("resize")) == (1 if first == "silent" else 0)
 
 

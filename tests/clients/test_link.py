@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from clients.link import Link
+from vram_arbiter.clients.net.link import Link
 
 DEADLINE_S = 60.0
 
@@ -54,7 +54,9 @@ def test_the_last_words_before_a_hang_up_are_heard(
         server.close(0)
 
 
-def test_a_link_is_for_one_server(context: "zmq.Context[zmq.Socket[bytes]]", tmp_path: Path) -> None:
+def test_a_link_is_for_one_server(
+    context: "zmq.Context[zmq.Socket[bytes]]", tmp_path: Path
+) -> None:
     """What was queued for the first is not sent to the second, whatever user serves then."""
     server = served(context, tmp_path / "s")
     link = Link(context, f"ipc://{tmp_path}/s", "runner")
@@ -76,7 +78,9 @@ def test_a_link_is_for_one_server(context: "zmq.Context[zmq.Socket[bytes]]", tmp
         server.close(0)
 
 
-def test_where_nothing_listens_it_ends(context: "zmq.Context[zmq.Socket[bytes]]", tmp_path: Path) -> None:
+def test_where_nothing_listens_it_ends(
+    context: "zmq.Context[zmq.Socket[bytes]]", tmp_path: Path
+) -> None:
     (tmp_path / "file").touch()
     for name in ("nothing", "file", "\udcff"):
         link = Link(context, f"ipc://{tmp_path}/{name}", "arbiter")
@@ -85,7 +89,9 @@ def test_where_nothing_listens_it_ends(context: "zmq.Context[zmq.Socket[bytes]]"
         link.close()
 
 
-def test_descriptors_do_not_pile_up(context: "zmq.Context[zmq.Socket[bytes]]", tmp_path: Path) -> None:
+def test_descriptors_do_not_pile_up(
+    context: "zmq.Context[zmq.Socket[bytes]]", tmp_path: Path
+) -> None:
     """A client whose server is away tries for as long as it lives."""
 
     def tried(times: int) -> None:

@@ -14,12 +14,12 @@ from typing import Any
 
 import pytest
 
-from clients.aio import ArbiterClient
-from clients.patience import answered
-from clients.runner import RunnerClient
-from clients.serve import Message, Peer, RouterServer
-from clients.sidecar.base import SidecarClient
-from reasoner import server as reasoner
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.clients.net.timeouts import answered
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.sidecar.base import SidecarClient
+from vram_arbiter.reasoner import server as reasoner
 
 PATIENCE_S = 60.0
 LIMIT_S = 0.5
@@ -41,7 +41,9 @@ asyncio.run(ask())
 class Answering:
     """A server in a thread of its own, so that it answers while the client's loop stands still."""
 
-    def __init__(self, endpoint: str, before: Callable[[Peer], None], after: Callable[[Peer], None]) -> None:
+    def __init__(
+        self, endpoint: str, before: Callable[[Peer], None], after: Callable[[Peer], None]
+    ) -> None:
         self.endpoint = endpoint
         self._before, self._after = before, after
         self._stopped: asyncio.Event | None = None
@@ -79,7 +81,8 @@ def serve() -> Iterator[Callable[..., str]]:
         made: list[Answering] = []
 
         def start(
-            before: Callable[[Peer], None] = lambda _: None, after: Callable[[Peer], None] = lambda _: None
+            before: Callable[[Peer], None] = lambda _: None,
+            after: Callable[[Peer], None] = lambda _: None,
         ) -> str:
             made.append(Answering(f"ipc://{folder}/s.sock", before, after))
             return made[-1].endpoint
@@ -109,7 +112,9 @@ async def ask_reasoner(endpoint: str) -> None:
 
 
 @pytest.mark.parametrize("ask", [connect, ping_runner, ping_sidecar, ask_reasoner])
-def test_an_answer_that_came_while_the_loop_stood_still_counts(serve: Callable[..., str], ask: Any) -> None:
+def test_an_answer_that_came_while_the_loop_stood_still_counts(
+    serve: Callable[..., str], ask: Any
+) -> None:
     """Regression: a program that imported something for longer than its time limit said that nobody had answered."""
     asked, standing, said = threading.Event(), threading.Event(), threading.Event()
 
@@ -137,7 +142,9 @@ def test_an_answer_that_came_while_the_loop_stood_still_counts(serve: Callable[.
 
 
 @pytest.mark.parametrize("ask", [connect, ping_runner, ping_sidecar, ask_reasoner])
-def test_a_loop_that_stood_still_before_it_could_ask_still_asks(serve: Callable[..., str], ask: Any) -> None:
+def test_a_loop_that_stood_still_before_it_could_ask_still_asks(
+    serve: Callable[..., str], ask: Any
+) -> None:
     """A client says nothing before it knows whose server it is: its connection is noticed on its loop."""
     endpoint = serve()
 
@@ -149,7 +156,9 @@ def test_a_loop_that_stood_still_before_it_could_ask_still_asks(serve: Callable[
     asyncio.run(run())
 
 
-def test_an_answer_that_came_while_the_process_was_stopped_counts(serve: Callable[..., str]) -> None:
+def test_an_answer_that_came_while_the_process_was_stopped_counts(
+    serve: Callable[..., str],
+) -> None:
     stopped: list[int] = []
 
     def stop(peer: Peer) -> None:

@@ -1,4 +1,4 @@
-"""The runner's client against a stand-in runner on `clients.serve`, in the same loop."""
+"""The runner's client against a stand-in runner on `clients.net.server`, in the same loop."""
 
 import asyncio
 import contextlib
@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from clients.runner import RunnerClient
-from clients.serve import Peer, RouterServer
-from schemas.errors import (
+from vram_arbiter.clients.net.server import Peer, RouterServer
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.schemas.errors import (
     BadRequest,
     BadState,
     FrameStale,
@@ -19,7 +19,7 @@ from schemas.errors import (
     UnknownSkill,
     VramError,
 )
-from schemas.goals import RUNNER_REQUEST
+from vram_arbiter.schemas.goals import RUNNER_REQUEST
 
 pytestmark = pytest.mark.anyio
 
@@ -62,7 +62,11 @@ class FakeRunner:
                 self.sender = peer
             case "result":
                 if self.result is None:
-                    raise BadState("it is running") if self.sender else BadRequest("there is no such goal")
+                    raise (
+                        BadState("it is running")
+                        if self.sender
+                        else BadRequest("there is no such goal")
+                    )
                 return self.result
             case "frame":
                 if message["camera"] == "blind":
@@ -129,13 +133,17 @@ async def test_cancel_and_a_result_that_is_late(fake: FakeRunner, client: Runner
     assert (await goal.result())["status"] == "canceled"
 
 
-async def test_a_result_whose_push_was_missed_is_fetched(fake: FakeRunner, client: RunnerClient) -> None:
+async def test_a_result_whose_push_was_missed_is_fetched(
+    fake: FakeRunner, client: RunnerClient
+) -> None:
     goal = await client.send_goal("ns/grab")
     fake.result = {"goal_id": goal.goal_id, **RESULT}
     assert (await goal.result(timeout_s=10.0))["success"]
 
 
-async def test_a_goal_that_a_restarted_runner_forgot(fake: FakeRunner, client: RunnerClient) -> None:
+async def test_a_goal_that_a_restarted_runner_forgot(
+    fake: FakeRunner, client: RunnerClient
+) -> None:
     goal = await client.send_goal("ns/grab")
     fake.sender = None
     with pytest.raises(BadRequest):

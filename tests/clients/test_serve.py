@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.wire import WireClient
-from clients.runner import RunnerClient
-from clients.serve import Message, Peer, RouterServer, check_free
-from schemas.errors import AlreadyRunning, ConfigError, RobotFault, VramError
+from tests.support.wire import WireClient
+from vram_arbiter.clients.net.server import Message, Peer, RouterServer, check_free
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError, RobotFault, VramError
 
 ANSWER = bytes(16 << 20)  # far more than the kernel takes in one go
 
@@ -52,7 +52,11 @@ def test_words_that_utf8_has_no_bytes_for_reach_the_other_side(tmp_path: Path) -
             async def handle(peer: Peer, message: Message) -> None:
                 heard.append(message)
                 error = RobotFault("no file \udcff")
-                answer = {"ok": True} if message["op"] == "ping" else {"ok": False, "error": error.to_wire()}
+                answer = (
+                    {"ok": True}
+                    if message["op"] == "ping"
+                    else {"ok": False, "error": error.to_wire()}
+                )
                 await server.send(peer, {"re": message["id"], **answer})
 
             serving = asyncio.create_task(server.serve(handle))
@@ -68,7 +72,9 @@ def test_words_that_utf8_has_no_bytes_for_reach_the_other_side(tmp_path: Path) -
     assert said == "no file \\udcff"
 
 
-def test_an_endpoint_is_free_when_its_server_has_ended_and_when_it_never_began(tmp_path: Path) -> None:
+def test_an_endpoint_is_free_when_its_server_has_ended_and_when_it_never_began(
+    tmp_path: Path,
+) -> None:
     endpoint = f"ipc://{tmp_path}/s.sock"
 
     async def one_after_the_other() -> None:

@@ -16,9 +16,16 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from clients.serve import IMAGES_MAX_BYTES, WAITING_MAX, Message, Peer, RouterServer, check_free
-from schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MESSAGE_MAX_BYTES
-from schemas.errors import ConfigError, VramError
+from vram_arbiter.clients.net.server import (
+    IMAGES_MAX_BYTES,
+    WAITING_MAX,
+    Message,
+    Peer,
+    RouterServer,
+    check_free,
+)
+from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MESSAGE_MAX_BYTES
+from vram_arbiter.schemas.errors import ConfigError, VramError
 
 WAIT_S = 60.0
 
@@ -39,7 +46,11 @@ class Server:
         self.peers.append(peer)
         if message["op"] == "wait":
             await self.go_on.wait()
-        answer: Message = {"ok": True, "re": message.get("id"), "size": len(message.get("image", b""))}
+        answer: Message = {
+            "ok": True,
+            "re": message.get("id"),
+            "size": len(message.get("image", b"")),
+        }
         if message["op"] == "fat":
             answer["data"] = bytes(IMAGE_MESSAGE_MAX_BYTES)
         await self.server.send(peer, answer)
@@ -122,7 +133,17 @@ def test_the_first_message_may_be_the_largest_picture(tmp_path: Path, kind: int)
         (b"\x91" * 5000 + b"\xc0", "bad_frame"),
         (msgpack.packb([1]), "bad_frame"),
     ],
-    ids=["empty maps", "text", "too large", "long list", "many keys", "empty", "invalid", "deep", "no map"],
+    ids=[
+        "empty maps",
+        "text",
+        "too large",
+        "long list",
+        "many keys",
+        "empty",
+        "invalid",
+        "deep",
+        "no map",
+    ],
 )
 def test_a_message_that_costs_too_much_is_refused_and_its_sender_served_on(
     tmp_path: Path, message: bytes, code: str
@@ -174,7 +195,9 @@ def test_a_user_has_a_share_of_waiting_requests_in_number_and_in_bytes(tmp_path:
             refusal = await client.answer()
             assert refusal["code"] == "limit_exceeded"
             assert "bytes of requests" in refusal["message"]
-            assert (await client.ask({"op": "ping", "id": 99}))["re"] == 99  # what is small is answered
+            assert (await client.ask({"op": "ping", "id": 99}))[
+                "re"
+            ] == 99  # what is small is answered
             server.go_on.set()
             assert {(await client.answer())["re"] for _ in range(8)} == set(range(8))
             server.go_on.clear()
@@ -186,7 +209,9 @@ def test_a_user_has_a_share_of_waiting_requests_in_number_and_in_bytes(tmp_path:
     run(scenario)
 
 
-def test_a_peer_that_does_not_read_its_answers_delays_no_other_and_holds_little(tmp_path: Path) -> None:
+def test_a_peer_that_does_not_read_its_answers_delays_no_other_and_holds_little(
+    tmp_path: Path,
+) -> None:
     async def scenario() -> None:
         path = tmp_path / "s.sock"
         async with serving(path) as server:
@@ -195,9 +220,13 @@ def test_a_peer_that_does_not_read_its_answers_delays_no_other_and_holds_little(
             loop = asyncio.get_running_loop()
             await loop.sock_connect(greedy, str(path))
             greeting = bytes.fromhex("ff00000000000000017f03014e554c4c") + bytes(48)
-            ready = b"\x04)\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER\x08Identity\x00\x00\x00\x00"
+            ready = (
+                b"\x04)\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER\x08Identity\x00\x00\x00\x00"
+            )
             request = msgpack.packb({"op": "fat"})
-            await loop.sock_sendall(greedy, greeting + ready + (bytes((0, len(request))) + request) * 1000)
+            await loop.sock_sendall(
+                greedy, greeting + ready + (bytes((0, len(request))) + request) * 1000
+            )
             client = Client(path)
             assert (await client.ask({"op": "ping", "id": 1}))["ok"]
             for number in range(100):

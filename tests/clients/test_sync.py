@@ -7,10 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from clients.sync import SyncArbiterClient
-from schemas.errors import ArbiterUnreachable, BadState, LeaseLost, LeaseRevoking, VramInsufficient
-from schemas.wire import LeaseSpec
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.schemas.errors import (
+    ArbiterUnreachable,
+    BadState,
+    LeaseLost,
+    LeaseRevoking,
+    VramInsufficient,
+)
+from vram_arbiter.schemas.wire import LeaseSpec
 
 pytestmark = pytest.mark.e2e
 
@@ -54,7 +60,9 @@ def test_revoked_between_uses_in_a_worker_thread(client: SyncArbiterClient, spec
     lease.ready()
     granted: list[str] = []
     with lease.use("goal"):
-        waiter = threading.Thread(target=lambda: granted.append(client.acquire(spec("b", 5)).lease_id))
+        waiter = threading.Thread(
+            target=lambda: granted.append(client.acquire(spec("b", 5)).lease_id)
+        )
         waiter.start()
         assert asked.wait(PATIENCE_S)
         with pytest.raises(LeaseRevoking), lease.use():

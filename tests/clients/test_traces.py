@@ -9,16 +9,16 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from clients import traces
-from clients.aio import ArbiterClient
-from clients.lease import Lease
-from clients.runner import RunnerClient
-from clients.serve import Message, Peer, RouterServer
-from clients.sidecar.policy import PolicyClient
-from clients.sync import SyncArbiterClient
-from schemas import tracing
-from schemas.wire import LeaseSpec
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients._protocol import traces
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.lease import Lease
+from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.sidecar.policy import PolicyClient
+from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.schemas.wire import LeaseSpec
 
 PARENT = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
 OTHER = "00-1af7651916cd43dd8448eb211c80319d-c7ad6b7169203332-01"
@@ -27,7 +27,7 @@ Spec = Callable[..., LeaseSpec]
 
 def test_a_program_that_does_not_trace_does_not_import_the_api() -> None:
     code = (
-        "import sys, clients.aio, clients.sync, clients.runner, clients.sidecar.policy, clients.traces as t\n"
+        "import sys, clients.client, clients.sync, clients.runner, clients.sidecar.policy, clients._protocol.traces as t\n"
         "assert t.present() is None and t.along({'a': 1}) == {'a': 1}\n"
         "with t.joined('00-1-2-01'): pass\n"
         "print([name for name in sys.modules if name.startswith('opentelemetry')])"
@@ -61,11 +61,15 @@ def test_what_is_left_out_of_a_trace_is_named_all_the_same() -> None:
 
 
 def traced_in(history: Message, consumer: str) -> set[str | None]:
-    return {event.get("traceparent") for event in history["events"] if event.get("consumer") == consumer}
+    return {
+        event.get("traceparent") for event in history["events"] if event.get("consumer") == consumer
+    }
 
 
 @pytest.mark.e2e
-def test_the_arbiter_hears_of_the_trace_of_an_acquire(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+def test_the_arbiter_hears_of_the_trace_of_an_acquire(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
     async def story() -> None:
         async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
             with tracing.joined(PARENT):
@@ -109,7 +113,9 @@ def test_a_model_that_is_called_back_is_loaded_in_the_trace_of_who_wants_it(
 
         async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
             with tracing.joined(PARENT):
-                model = await client.acquire(spec("model", 5, standby=True), unload=unload, on_return=load)
+                model = await client.acquire(
+                    spec("model", 5, standby=True), unload=unload, on_return=load
+                )
                 await model.ready()
                 big = await client.acquire(spec("big", 5), unload=unload)
                 await big.ready()
@@ -133,7 +139,9 @@ def test_goals_and_sidecars_requests_carry_it(tmp_path: Path) -> None:
             heard[str(message.get("op") or message.get("endpoint"))] = message
             await server.send(peer, {"re": message["id"], "ok": True, "action": []})
 
-        async with RouterServer(f"ipc://{tmp_path}/s.sock", lambda error: error.to_wire()) as server:
+        async with RouterServer(
+            f"ipc://{tmp_path}/s.sock", lambda error: error.to_wire()
+        ) as server:
             serving = asyncio.create_task(server.serve(answer))
             runner, policy = RunnerClient(server.endpoint), PolicyClient(server.endpoint)
             with tracing.joined(PARENT):
@@ -150,7 +158,7 @@ def test_goals_and_sidecars_requests_carry_it(tmp_path: Path) -> None:
 
 
 def test_the_models_thread_is_in_its_requests_trace() -> None:
-    from sidecars.worker import Worker
+    from vram_arbiter.sidecars.worker import Worker
 
     async def story() -> tuple[Any, Any]:
         worker = Worker()

@@ -2,9 +2,9 @@
 
 from protocol_wire import SPEC, Wire, view
 
-from clients import records as r
-from clients.connection import WAIT_SLACK_S
-from schemas.errors import VramInsufficient, WaitTimeout
+from vram_arbiter.clients._protocol import records as r
+from vram_arbiter.clients._protocol.connection import WAIT_SLACK_S
+from vram_arbiter.schemas.errors import VramInsufficient, WaitTimeout
 
 
 def test_granted_at_once(link: Wire) -> None:
@@ -119,7 +119,9 @@ def test_a_grant_that_crosses_the_cancel_is_handed_back(link: Wire) -> None:
     assert link.holdings.held == {}
 
 
-def test_a_cancelled_acquire_that_was_never_answered_is_cleared_up_after_a_reconnect(link: Wire) -> None:
+def test_a_cancelled_acquire_that_was_never_answered_is_cleared_up_after_a_reconnect(
+    link: Wire,
+) -> None:
     link.waits.acquire("n1", SPEC, link.now)
     link.sent()
     link.waits.cancel("n1", link.now)

@@ -11,11 +11,11 @@ import os
 import sys
 from pathlib import Path
 
-from clients.aio import ArbiterClient
-from clients.lease import Lease
-from schemas.wire import Footprint, LeaseSpec
-from sidecars.device.fake import FakeMemory
-from sidecars.device.memory import Block
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.lease import Lease
+from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.sidecars.device.fake import FakeMemory
+from vram_arbiter.sidecars.device.memory import Block
 
 TTL_S = 120.0  # a daemon that is started again on a busy machine is away for seconds, and nobody is to fence himself
 PAUSE = frozenset(os.environ.get("VRAM_TEST_PAUSE", "").split(","))

@@ -9,10 +9,10 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from schemas.manifest import RSkillManifest
-from schemas.sidecar import EndpointCall
-from sidecars.__main__ import main
-from sidecars.weights import Weights
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.sidecar import EndpointCall
+from vram_arbiter.sidecars.__main__ import main
+from vram_arbiter.sidecars.weights import Weights
 
 LOOK_S = 0.005
 

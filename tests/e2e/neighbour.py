@@ -1,4 +1,4 @@
-"""A consumer with the habits that users of the neighbours complain about. Not a test module; run by `arbiter.testing.forkserver`.
+"""A consumer with the habits that users of the neighbours complain about. Not a test module; run by `tests.support.forkserver`.
 
 Arguments: NAME BYTES CARD_FOLDER HABITS (JSON). It says `waiting`, `loading`, `ready`, `unloading`, `gone`. Habits: `slow` loads when it is told
 `go`, `stuck` never ends its unloading, `deaf` ignores SIGTERM, `again` asks for its lease again in the very moment it has lost it,
@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from clients.aio import ArbiterClient
-from schemas.wire import Footprint, LeaseSpec
-from sidecars.device.fake import FakeMemory
-from sidecars.device.memory import Block
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.sidecars.device.fake import FakeMemory
+from vram_arbiter.sidecars.device.memory import Block
 
 RESIDUE = 256 << 20
 TTL_S = 120.0  # one that is stopped for a while, on a busy machine, has its lease still

@@ -1,4 +1,4 @@
-"""A consumer that stops at every step of its life and goes on when it is told `go`. Not a test module; run by `arbiter.testing.forkserver`.
+"""A consumer that stops at every step of its life and goes on when it is told `go`. Not a test module; run by `tests.support.forkserver`.
 
 Arguments: NAME BYTES CARD_FOLDER RESIDUE_BYTES. It says `waiting`, `loading`, `ready`, `in_use`, `unloading`, `released`; it waits for `go`
 after `loading`, `in_use` and `unloading`. `use` begins a use, which the next `go` ends.
@@ -10,9 +10,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from clients.aio import ArbiterClient
-from schemas.wire import Footprint, LeaseSpec
-from sidecars.device.fake import FakeMemory
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.sidecars.device.fake import FakeMemory
 
 TTL_S = 120.0  # a daemon that is started again on a busy machine is away for seconds, and nobody is to fence himself
 

@@ -11,10 +11,10 @@ from collections.abc import Callable
 
 import pytest
 
-from arbiter.testing.attacks import ATTACKS
-from arbiter.testing.honest import Honest
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from tests.support.attacks import ATTACKS
+from tests.support.honest import Honest
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 ATTACK_S = 1.5
@@ -25,7 +25,7 @@ MEMORY_MAX_KIB = 64 * 1024
 OPEN_FILES = 512
 ATTACKER = """
 import sys, time
-from arbiter.testing.attacks import ATTACKS
+from tests.support.attacks import ATTACKS
 print("attacking", flush=True)
 ATTACKS[sys.argv[1]](sys.argv[2], time.monotonic() + float(sys.argv[3]))
 """
@@ -58,7 +58,9 @@ def test_an_attack_costs_others_little_and_leaves_nothing(
                 assert client.ask("ping")["ok"]
                 took_s.append(time.monotonic() - began)
                 memory_kib = max(memory_kib, honest.memory_kib_now() - honest.memory_kib)
-                with WireClient(arbiter.endpoint) as late:  # another process of the same user finds room too
+                with WireClient(
+                    arbiter.endpoint
+                ) as late:  # another process of the same user finds room too
                     assert late.hello("late", instance="late").ask("bye")["ok"]
             assert attacker.returncode == 0
         assert sorted(took_s)[int(0.99 * len(took_s))] <= P99_MAX_S

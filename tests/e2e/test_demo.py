@@ -17,7 +17,7 @@ GIB = 1 << 30
 def run_demo(out: Path, *arguments: str) -> tuple[int, dict[str, Any]]:
     for module in ("torch", "lerobot", "mujoco"):
         pytest.importorskip(module, reason="needs the full install")
-    command = [sys.executable, "-m", "clients", "demo", "--out", str(out), *arguments]
+    command = [sys.executable, "-m", "vram_arbiter.clients", "demo", "--out", str(out), *arguments]
     ended = subprocess.run(
         command,
         capture_output=True,

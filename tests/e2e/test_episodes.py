@@ -19,18 +19,18 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.fakegpu_check import check_log
-from arbiter.testing.process import ArbiterProcess
-from clients.aio import ArbiterClient
-from clients.cli.quick import UNREACHABLE
-from clients.runner import Goal as AcceptedGoal
-from clients.runner import RunnerClient
-from clients.sidecar.perception import DetectorClient
-from clients.sidecar.policy import PolicyClient
-from runner.protocols import Goal
-from runner.skills.sidecar_policy import SidecarPolicy, wire_up
-from schemas.errors import GoalRejected, UnknownSkill, WaitTimeout
-from schemas.manifest import parse_manifest
+from tests.support.fakegpu_check import check_log
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.cli.quick import UNREACHABLE
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.runner import Goal as AcceptedGoal
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.sidecar.perception import DetectorClient
+from vram_arbiter.clients.sidecar.policy import PolicyClient
+from vram_arbiter.runner.protocols import Goal
+from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy, wire_up
+from vram_arbiter.schemas.errors import GoalRejected, UnknownSkill, WaitTimeout
+from vram_arbiter.schemas.manifest import parse_manifest
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(295)]
 
@@ -102,7 +102,7 @@ class Programs:
         self.sidecar("detector", DETECTOR_BYTES, "--standby", "--min-residency-s", "0")
         self.sidecar("policy", POLICY_BYTES, "--idle-release-s", "0.2", "--min-residency-s", "1")
         skills = [str(self.runtime / "policy"), str(ROOT / "configs/rskills/so101-navigate")]
-        self.start("runner", "-m", "runner", "sim", "--skills", *skills, "--seed", "1")
+        self.start("runner", "-m", "vram_arbiter.runner", "sim", "--skills", *skills, "--seed", "1")
 
     def sidecar(self, model: str, size: int, *flags: str, name: str = "") -> None:
         name, folder = name or model, self.runtime / model
@@ -189,7 +189,9 @@ class Stage:
             await asyncio.sleep(0.02)
         listening = asyncio.create_task(stage._listen())
         stack.callback(listening.cancel)
-        while not stage.events:  # subscribed: a use of nobody's is refused, a ping is not told; a look is
+        while (
+            not stage.events
+        ):  # subscribed: a use of nobody's is refused, a ping is not told; a look is
             await stage.detector.detect(b"\x89PNG\r\n\x1a\n", "cube")
             await asyncio.sleep(0.02)
         stage.events.clear()
@@ -209,14 +211,18 @@ class Stage:
         return found
 
     def first(self, kind: str, consumer: str) -> dict[str, Any] | None:
-        return next((e for e in self.events if (e["kind"], e.get("consumer")) == (kind, consumer)), None)
+        return next(
+            (e for e in self.events if (e["kind"], e.get("consumer")) == (kind, consumer)), None
+        )
 
     async def under_way(self) -> None:
         """A goal has its policy in use and the detector is away. What was before its policy's last load is forgotten: on a slow machine
         the policy may have been idle, and gone, between a load and the use that it was for."""
         assert await self.leases() == {"policy": "held", "detector": "standby"}
         loads = [
-            n for n, e in enumerate(self.events) if (e["kind"], e.get("consumer")) == ("ready", "policy")
+            n
+            for n, e in enumerate(self.events)
+            if (e["kind"], e.get("consumer")) == ("ready", "policy")
         ]
         del self.events[: loads[-1]]
 
@@ -262,7 +268,10 @@ class Stage:
         assert ended["seq"] < gone["seq"] < granted["seq"] < ready["seq"], self.events
         assert gone["verdict"] in verdicts, gone
         assert granted["reason"] == "back from standby: there is room and nobody waits"
-        assert sum(e["kind"] == "granted" and e.get("consumer") == "detector" for e in self.events) == 1
+        assert (
+            sum(e["kind"] == "granted" and e.get("consumer") == "detector" for e in self.events)
+            == 1
+        )
         await self.detector.load()  # the arbiter's word is a moment ahead of the sidecar's
         (shown,) = (await self.arbiter.status())["leases"]
         assert (await self.detector.ping(timeout_s=WAIT_S))["token"] == shown["token"]
@@ -282,9 +291,11 @@ def programs() -> Iterator[Programs]:
 # -- how a goal ends -----------------------------------------------------------------------------------------------------
 async def done(stage: Stage) -> None:
     goal = await stage.goal_under_way()
-    for _ in range(20):  # an operator asks again where nobody answered in the seconds that he is made to wait
+    for _ in range(
+        20
+    ):  # an operator asks again where nobody answered in the seconds that he is made to wait
         shown = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "clients", "status", env=stage.programs.arbiter.environ, stdout=asyncio.subprocess.PIPE
+            sys.executable, "-m", "vram_arbiter.clients", "status", env=stage.programs.arbiter.environ, stdout=asyncio.subprocess.PIPE
         )  # fmt: skip
         said = (await shown.communicate())[0].decode()
         if shown.returncode != UNREACHABLE:
@@ -355,9 +366,10 @@ async def policy_killed(stage: Stage) -> None:
     goal = await stage.goal_under_way()
     stage.programs.kill("policy")
     result = await goal.result(WAIT_S)
-    assert (result["status"], result["code"] in ("sidecar_unavailable", "lease_lost")) == ("failed", True), (
-        result
-    )
+    assert (result["status"], result["code"] in ("sidecar_unavailable", "lease_lost")) == (
+        "failed",
+        True,
+    ), result
     await stage.detector_is_back(after="lost")
 
 
@@ -399,7 +411,9 @@ async def canceled_while_loading(stage: Stage) -> None:
     await stage.until("granted", "policy")
     async with PolicyClient(f"ipc://{stage.programs.runtime}/policy.sock") as policy:
         await goal.cancel()
-        while (await policy.ping(timeout_s=WAIT_S))["state"] != "unloading":  # the runner has told it
+        while (await policy.ping(timeout_s=WAIT_S))[
+            "state"
+        ] != "unloading":  # the runner has told it
             await asyncio.sleep(0.01)
     stage.programs.tell("slow_load", False)
     assert (await goal.result(WAIT_S))["status"] == "canceled"
@@ -413,7 +427,7 @@ async def reasoner_killed(stage: Stage) -> None:
     with server:
         stage.programs.tell("hold", True)
         stage.programs.start(
-            "reasoner", "-m", "reasoner", "--task", "hold still", "--planner", "openai", "--detector", "none", "--scene-vlm", "none",
+            "reasoner", "-m", "vram_arbiter.reasoner", "--task", "hold still", "--planner", "openai", "--detector", "none", "--scene-vlm", "none",
             VRAM_REASONER_LLM_BASE_URL=server.url, VRAM_REASONER_LLM_MODEL="m",
         )  # fmt: skip
         await stage.until("use_began", "policy", BOOT_S)
@@ -452,7 +466,9 @@ async def called_back(stage: Stage) -> None:
     joints = tuple(JOINTS.strip("[]").split(", "))
     where = f"ipc://{programs.runtime}/spare.sock"
     async with PolicyClient(where, connect_timeout_s=BOOT_S) as sidecar:
-        skill = SidecarPolicy(manifest, wire_up(manifest, joints, None), sidecar, stage.arbiter, period_s=0.1)
+        skill = SidecarPolicy(
+            manifest, wire_up(manifest, joints, None), sidecar, stage.arbiter, period_s=0.1
+        )
         goal = Goal("g", SKILL, prompt="hold still", deadline_s=DEADLINE_S)
         await skill.start(goal)
         await skill.finish()
@@ -470,10 +486,14 @@ async def called_back(stage: Stage) -> None:
                 await asyncio.sleep(0.02)
         while (await stage.leases()).get("detector") != "held":  # it had been asked to leave
             await asyncio.sleep(0.02)
-        assert sum((e["kind"], e.get("consumer")) == ("granted", "spare") for e in stage.events) == 1
+        assert (
+            sum((e["kind"], e.get("consumer")) == ("granted", "spare") for e in stage.events) == 1
+        )
 
 
-def test_a_policy_is_called_back_from_standby_only_as_long_as_its_goal_wants_it(programs: Programs) -> None:
+def test_a_policy_is_called_back_from_standby_only_as_long_as_its_goal_wants_it(
+    programs: Programs,
+) -> None:
     """Regression: the detector left the card for a goal that had been canceled, and stayed away."""
     try:
         programs.play(called_back)
@@ -512,13 +532,17 @@ async def one_after_the_other(stage: Stage) -> None:
         held = await policy.ping(timeout_s=WAIT_S)
         assert held["token"] is not None
         await stack.enter_async_context(stage.arbiter.use(held["lease_id"], held["token"]))
-        stage.programs.tell("hold", False)  # from one use to the next: no moment in which it could be idle
+        stage.programs.tell(
+            "hold", False
+        )  # from one use to the next: no moment in which it could be idle
         await call
         for prompt in ("hold still", "go on holding still"):
             goal = await stage.runner.send_goal(SKILL, prompt=prompt, deadline_s=DEADLINE_S)
             assert (await goal.result(WAIT_S))["status"] == "succeeded"
         assert await stage.leases() == {"policy": "held", "detector": "standby"}
-        assert sum((e["kind"], e.get("consumer")) == ("granted", "policy") for e in stage.events) == 1
+        assert (
+            sum((e["kind"], e.get("consumer")) == ("granted", "policy") for e in stage.events) == 1
+        )
     await stage.detector_is_back(after="ready")
 
 
@@ -530,7 +554,9 @@ def test_the_next_goal_with_other_words_loads_nothing_and_lets_nothing_back_in_b
 
 async def without_a_gpu(stage: Stage) -> None:
     before = await stage.detector.ping(timeout_s=WAIT_S)
-    goal = await stage.runner.send_goal("vram-arbiter/so101-navigate", goal_params={"turn_rad": 0.1})
+    goal = await stage.runner.send_goal(
+        "vram-arbiter/so101-navigate", goal_params={"turn_rad": 0.1}
+    )
     assert (await goal.result(WAIT_S))["status"] == "succeeded"
     assert await stage.leases() == {"detector": "held"}
     assert (await stage.detector.ping(timeout_s=WAIT_S))["token"] == before["token"]
@@ -573,7 +599,9 @@ class Script:
     def __init__(self, arguments: dict[str, Any], name: str) -> None:
         function = {"name": name, "arguments": json.dumps(arguments)}
         call = {"id": "c", "type": "function", "function": function}
-        said = {"choices": [{"message": {"role": "assistant", "content": None, "tool_calls": [call]}}]}
+        said = {
+            "choices": [{"message": {"role": "assistant", "content": None, "tool_calls": [call]}}]
+        }
 
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
@@ -587,7 +615,9 @@ class Script:
 
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self._server.daemon_threads = True
-        self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.02})
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, kwargs={"poll_interval": 0.02}
+        )
         self.url = f"http://127.0.0.1:{self._server.server_port}"
 
     def __enter__(self) -> "Script":

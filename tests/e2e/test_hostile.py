@@ -13,10 +13,10 @@ from typing import Any
 import msgpack
 import pytest
 
-from arbiter.testing.honest import Honest
-from arbiter.testing.hostile import BOMBS, Forger
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from tests.support.honest import Honest
+from tests.support.hostile import BOMBS, Forger
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 GIB, MIB = 1 << 30, 1 << 20
@@ -25,7 +25,7 @@ LARGE_BYTES = 8192
 ATTACKER = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from arbiter.testing.wire import WireClient
+from tests.support.wire import WireClient
 import json, msgpack, os, zmq
 endpoint, words = sys.argv[2], json.loads(sys.argv[3])
 def done(**facts):
@@ -122,7 +122,9 @@ def test_waits_that_are_asked_for_and_given_up_without_end_leave_nothing(
             answer = churner.ask("release", lease_id=lease["lease_id"], token=lease["token"])
         else:
             answer = churner.ask("cancel", lease_id=waiting["lease"]["lease_id"])
-        assert answer["ok"] or answer["error"]["code"] == "bad_state", answer  # granted in the same breath
+        assert answer["ok"] or answer["error"]["code"] == "bad_state", (
+            answer
+        )  # granted in the same breath
         if not answer["ok"]:
             lease = churner.push("granted")["lease"]
             assert churner.ask("release", lease_id=lease["lease_id"], token=lease["token"])["ok"]
@@ -172,11 +174,15 @@ def test_bombs_and_giants_are_answered_or_cut_off(honest: Honest, connect: Conne
     honest.is_served()
 
 
-def test_thousands_of_forged_frames_are_answered_one_by_one(honest: Honest, connect: Connect) -> None:
+def test_thousands_of_forged_frames_are_answered_one_by_one(
+    honest: Honest, connect: Connect
+) -> None:
     """Valid requests, mutants and noise, with the honest one's lease and token among them."""
     forger = Forger(random.Random(5))
     forger.lease_ids += [honest.on["lease_id"], "honest"]
-    liar = connect().hello("liar", role="observer")  # an observer can change nothing, whatever it knows
+    liar = connect().hello(
+        "liar", role="observer"
+    )  # an observer can change nothing, whatever it knows
     for number in range(1500):
         frame = forger.frame() if number % 2 else msgpack.packb(forger.request(id=number))
         if len(frame) > LARGE_BYTES:
@@ -257,7 +263,9 @@ done(code=answer["error"]["code"])
     honest.is_alone()
 
 
-def test_a_reconnect_storm_under_one_instance_is_one_session(honest: Honest, connect: Connect) -> None:
+def test_a_reconnect_storm_under_one_instance_is_one_session(
+    honest: Honest, connect: Connect
+) -> None:
     storm = attack(
         honest.arbiter,
         """

@@ -16,11 +16,11 @@ from typing import Any
 
 import pytest
 
-from arbiter.host.gpu.fake import make_card
-from arbiter.testing.fakegpu_check import check_log
-from clients.aio import ArbiterClient
-from schemas.endpoints import RUNTIME_VARIABLE
-from schemas.errors import ArbiterUnreachable
+from tests.support.fakegpu_check import check_log
+from vram_arbiter.arbiter.host.gpu.fake import make_card
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.schemas.errors import ArbiterUnreachable
+from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
 
 pytestmark = pytest.mark.e2e
 
@@ -47,7 +47,9 @@ class Child:
                 self.seen.append(json.loads(line))
                 if self.seen[-1]["event"] == event:
                     return self.seen[-1]
-        pytest.fail(f"the child ended ({self.process.returncode}) before {event!r}; it said {self.seen}")
+        pytest.fail(
+            f"the child ended ({self.process.returncode}) before {event!r}; it said {self.seen}"
+        )
 
     def tell(self, command: str) -> None:
         assert self.process.stdin is not None
@@ -85,7 +87,12 @@ class Box:
 
     async def arbiter(self) -> Child:
         return await self._start(
-            "-m", "arbiter", "--gpu", f"fake:{self.card}", "--state-dir", str(self.runtime / "state")
+            "-m",
+            "vram_arbiter.arbiter",
+            "--gpu",
+            f"fake:{self.card}",
+            "--state-dir",
+            str(self.runtime / "state"),
         )
 
     async def consumer(self, name: str, gib: float, pause: str = "") -> Child:
@@ -96,7 +103,10 @@ class Box:
     @contextlib.asynccontextmanager
     async def client(self) -> AsyncIterator[ArbiterClient]:
         async with ArbiterClient(
-            f"ipc://{self.runtime}/arbiter.sock", name="test", role="operator", connect_timeout_s=PATIENCE_S
+            f"ipc://{self.runtime}/arbiter.sock",
+            name="test",
+            role="operator",
+            connect_timeout_s=PATIENCE_S,
         ) as client:
             yield client
 
@@ -233,7 +243,9 @@ def test_the_daemon_killed_in_the_middle_of_a_switch() -> None:
         await daemon.kill()
         await box.arbiter()
         status = await box.status(
-            lambda status: set(consumers(status)) == {"holder", "waiter"} and status["phase"] == "serving"
+            lambda status: (
+                set(consumers(status)) == {"holder", "waiter"} and status["phase"] == "serving"
+            )
         )
         (lease,) = (lease for lease in status["leases"] if lease["consumer"] == "holder")
         assert lease["lease_id"] == granted["lease_id"]

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.fakegpu_check import check_log
-from arbiter.testing.forkserver import Child, ForkServer
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
-from clients.cli.quick import UNREACHABLE
-from schemas import fakegpu
+from tests.support.fakegpu_check import check_log
+from tests.support.forkserver import Child, ForkServer
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
+from vram_arbiter.clients.cli.quick import UNREACHABLE
+from vram_arbiter.schemas import fakegpu
 
 pytestmark = pytest.mark.e2e
 GIB, MIB = 1 << 30, 1 << 20
@@ -84,7 +84,7 @@ class Stage:
         """What an operator sees, who asks again where nobody answered in the seconds that he is made to wait."""
         for _ in range(20):
             done = subprocess.run(
-                [sys.executable, "-m", "clients", *arguments],
+                [sys.executable, "-m", "vram_arbiter.clients", *arguments],
                 env=self.arbiter.environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
             )  # fmt: skip
             if done.returncode != UNREACHABLE:
@@ -94,7 +94,9 @@ class Stage:
     def used_when(self, name: str) -> int:
         """Bytes on the card, of everybody, in the moment before `name` touched it first."""
         used = 0
-        for line in map(json.loads, (self.arbiter.card / fakegpu.LOG_FILE).read_text().splitlines()):
+        for line in map(
+            json.loads, (self.arbiter.card / fakegpu.LOG_FILE).read_text().splitlines()
+        ):
             if line["name"] == name:
                 return used
             used = line["used_after"]
@@ -151,14 +153,18 @@ def until(ask: Callable[[], str], word: str) -> str:
     raise AssertionError(f"never {word!r}: {said}")
 
 
-def test_1_the_next_one_loads_when_the_memory_is_back_and_nothing_stays_failed(stage: Stage) -> None:
+def test_1_the_next_one_loads_when_the_memory_is_back_and_nothing_stays_failed(
+    stage: Stage,
+) -> None:
     """llama-swap#97: it starts too early, fails, and the failed state then stays."""
     stage.configure(release_lag_s=0.6)
     first = stage.spawn("first-1", 5)
     first.until("ready")
     second = stage.spawn("second-1", 5)
     second.until("ready")
-    assert stage.used_when("second-1") == RESIDUE, "nothing but the context that the first one keeps"
+    assert stage.used_when("second-1") == RESIDUE, (
+        "nothing but the context that the first one keeps"
+    )
     assert stage.event("verified", consumer="first-1")["verdict"] == "verified"
     stage.configure(release_lag_s=0.15)
 
@@ -193,7 +199,9 @@ def test_2_an_unload_that_does_not_unload_is_named_until_its_process_ends(stage:
     waiter.until("ready")
 
 
-def test_3_a_holder_that_is_stopping_for_ever_is_named_and_ended_only_where_it_agreed(stage: Stage) -> None:
+def test_3_a_holder_that_is_stopping_for_ever_is_named_and_ended_only_where_it_agreed(
+    stage: Stage,
+) -> None:
     """ollama#7606 and others "Stopping…"; llama-swap#125, #138: only SIGKILL helped, and children stayed behind."""
     patient = stage.spawn("patient", 5, stuck=True)
     patient.until("ready")
@@ -269,7 +277,9 @@ def test_13_a_second_authority_on_the_same_card_does_not_give_away_what_the_firs
         with WireClient(other.endpoint) as client:
             assert client.hello("elsewhere").acquire("elsewhere", 5 * GIB)["state"] == "queued"
             while not (seen := client.ask("status"))["gpus"][0]["stowaway_bytes"]:
-                client.receive(0.02)  # it has just started: its first reading of the card may be under way
+                client.receive(
+                    0.02
+                )  # it has just started: its first reading of the card may be under way
             assert seen["gpus"][0]["stowaway_bytes"] == 5 * GIB
             assert [lease["state"] for lease in seen["leases"]] == ["queued"]
     finally:
@@ -287,16 +297,23 @@ def test_14_after_a_restart_it_is_said_who_lives_and_who_has_exited(stage: Stage
     stage.arbiter.start()
     stage.watch()
     assert f"silent-14 (pid {silent.pid}) must come back first" in stage.vramctl("status")
-    until(lambda: stage.vramctl("history", "--kind", "lost", "-c", "exits-14"), f"process {exits.pid} died")
+    until(
+        lambda: stage.vramctl("history", "--kind", "lost", "-c", "exits-14"),
+        f"process {exits.pid} died",
+    )
     waiter = stage.spawn("waiter-14", 1)
     stage.event("queued", consumer="waiter-14")
     silent.signal(signal.SIGCONT)
     waiter.until("ready")
 
 
-def test_17_a_program_that_crashes_in_its_load_does_not_empty_the_card_for_each_start(stage: Stage) -> None:
+def test_17_a_program_that_crashes_in_its_load_does_not_empty_the_card_for_each_start(
+    stage: Stage,
+) -> None:
     """A supervisor starts it again at once, every time. The model that works stays, and the program is told the cause."""
-    for _ in range(8):  # after that it is refused for a minute: however slowly the rest of this goes, it is
+    for _ in range(
+        8
+    ):  # after that it is refused for a minute: however slowly the rest of this goes, it is
         start = stage.spawn("crashes", 5, slow=True)
         start.until("loading")
         start.kill()
@@ -310,7 +327,9 @@ def test_17_a_program_that_crashes_in_its_load_does_not_empty_the_card_for_each_
     assert "held, idle" in stage.vramctl("status")
 
 
-def test_21_whoever_was_made_to_leave_and_starts_again_at_once_does_not_get_in_between(stage: Stage) -> None:
+def test_21_whoever_was_made_to_leave_and_starts_again_at_once_does_not_get_in_between(
+    stage: Stage,
+) -> None:
     """OpenRAL ADR-0050: within 15 ms an autostarted node activates again and takes the memory that was made free."""
     detector = stage.spawn("detector-21", 5, again=True)
     detector.until("ready")

@@ -21,8 +21,8 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 PATIENCE_S = 60
@@ -65,10 +65,14 @@ class Service(ArbiterProcess):
 
     def command(self, *more: str) -> list[str]:
         (line,) = [line for line in UNIT.read_text().splitlines() if line.startswith("ExecStart=")]
-        words = shlex.split(line.removeprefix("ExecStart=").replace("$ARBITER_OPTIONS", self.options))
+        words = shlex.split(
+            line.removeprefix("ExecStart=").replace("$ARBITER_OPTIONS", self.options)
+        )
         assert Path(words[0]).name == "vram-arbiter"
-        named = [self.group if word in ("vram-arbiter", "vram-operators") else word for word in words[1:]]
-        return [*self.wrapper, sys.executable, "-m", "arbiter", *named, *more]
+        named = [
+            self.group if word in ("vram-arbiter", "vram-operators") else word for word in words[1:]
+        ]
+        return [*self.wrapper, sys.executable, "-m", "vram_arbiter.arbiter", *named, *more]
 
 
 @pytest.fixture
@@ -89,7 +93,9 @@ def test_the_units_command_line_serves_where_the_manager_says(service: Service) 
     assert stat.S_IMODE(socket.parent.stat().st_mode) == 0o1770, "as the manager made it"
     with WireClient(service.endpoint) as client:
         status = client.hello(role="operator").ask("status")
-        assert status["gpus"][0]["reserve_bytes"] == GIB, "arbiter.yaml of the configuration folder is read"
+        assert status["gpus"][0]["reserve_bytes"] == GIB, (
+            "arbiter.yaml of the configuration folder is read"
+        )
     assert (service.runtime / "lib" / "journal.sqlite").exists()
     assert service.stop() == 0
     service.wait_for("STOPPING=1", PATIENCE_S)
@@ -150,7 +156,9 @@ def status_when(service: Service, good: Callable[[dict[str, Any]], bool]) -> dic
 @pytest.mark.parametrize(
     "number", [signal.SIGTERM, signal.SIGABRT, signal.SIGKILL], ids=["stop", "watchdog", "kill"]
 )
-def test_a_holder_outlives_the_service_with_its_lease(service: Service, number: signal.Signals) -> None:
+def test_a_holder_outlives_the_service_with_its_lease(
+    service: Service, number: signal.Signals
+) -> None:
     service.start()
     holder = Holder(service)
     try:
@@ -188,7 +196,7 @@ os.execvp(sys.argv[1], sys.argv[1:])
 """
 STRANGER = """
 import os, sys
-from arbiter.testing.wire import WireClient
+from tests.support.wire import WireClient
 os.setgroups([]); os.setresgid(65534, 65534, 65534); os.setresuid(65534, 65534, 65534)
 with WireClient(sys.argv[1]) as client:
     lease = client.hello("stranger", role="operator").granted("stranger", 1 << 30)
@@ -212,7 +220,8 @@ def restricted() -> list[str]:
 
 
 @pytest.mark.skipif(
-    os.getuid() != 0 or shutil.which("setpriv") is None, reason="needs root and setpriv to drop privileges"
+    os.getuid() != 0 or shutil.which("setpriv") is None,
+    reason="needs root and setpriv to drop privileges",
 )
 def test_without_any_capability_it_serves_and_watches_other_users() -> None:
     """A holder of another user connects through the operators' group; its death is seen through /proc and a pidfd all the same."""
@@ -240,7 +249,9 @@ def test_without_any_capability_it_serves_and_watches_other_users() -> None:
             assert (lease["lease_id"], lease["pid"]) == (lease_id, stranger.pid)
             stranger.kill()
             stranger.wait(PATIENCE_S)
-            gone = watcher.push("event", where=lambda push: push["event"]["kind"] in ("lost", "cancelled"))
+            gone = watcher.push(
+                "event", where=lambda push: push["event"]["kind"] in ("lost", "cancelled")
+            )
             assert gone["event"]["lease_id"] == lease_id
     finally:
         service.close()

@@ -15,11 +15,11 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.fakegpu_check import check_log
-from arbiter.testing.forkserver import Child, ForkServer
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
-from schemas import fakegpu
+from tests.support.fakegpu_check import check_log
+from tests.support.forkserver import Child, ForkServer
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
+from vram_arbiter.schemas import fakegpu
 
 pytestmark = pytest.mark.e2e
 GIB, MIB = 1 << 30, 1 << 20

@@ -20,12 +20,12 @@ from typing import Any
 import pytest
 import yaml
 
-from arbiter.testing.collector import Collector, ReceivedSpan
-from arbiter.testing.process import ArbiterProcess
-from clients.runner import RunnerClient
-from clients.sidecar.base import SidecarClient
-from schemas import telemetry
-from schemas.errors import VramError
+from tests.support.collector import Collector, ReceivedSpan
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.sidecar.base import SidecarClient
+from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(280)]
 
@@ -138,12 +138,16 @@ def test_one_trace_runs_from_the_decision_to_the_first_action(
         except (AssertionError, VramError, subprocess.TimeoutExpired):
             print(programs.log.read_text(errors="replace")[-6000:])
             raise
-        assert codes == [1, 0, 0, 0], "the reasoner's task was broken off, the others ended in order"
+        assert codes == [1, 0, 0, 0], (
+            "the reasoner's task was broken off, the others ended in order"
+        )
         assert arbiter.stop() == 0
     judge(Trace(collector.spans()), collector)
 
 
-def played(arbiter: ArbiterProcess, programs: Programs, collector: Collector, folder: Path) -> list[int]:
+def played(
+    arbiter: ArbiterProcess, programs: Programs, collector: Collector, folder: Path
+) -> list[int]:
     """Start the programs, let the arm move, end them. Their exit codes, the last started first."""
     (folder / "rskill.yaml").write_text(DETECTOR_MANIFEST)
     echo = str(ROOT / "tests/sidecars/echo_sidecar.py")
@@ -156,13 +160,29 @@ def played(arbiter: ArbiterProcess, programs: Programs, collector: Collector, fo
         "--footprint",
         "5.3GB,5.3GB,450MiB",
     ]
-    grab = ["--name", "grab", "--rskill", str(GRAB / "rskill.yaml"), "--footprint", "4.3GB,4.3GB,450MiB"]
+    grab = [
+        "--name",
+        "grab",
+        "--rskill",
+        str(GRAB / "rskill.yaml"),
+        "--footprint",
+        "4.3GB,4.3GB,450MiB",
+    ]
     programs.start(echo, str(folder), *detector, *device)
-    programs.start("-m", "sidecars", *grab, *device)
-    programs.start("-m", "runner", "sim", "--seed", "1", "--skills", str(endless(folder)))
+    programs.start("-m", "vram_arbiter.sidecars", *grab, *device)
+    programs.start(
+        "-m", "vram_arbiter.runner", "sim", "--seed", "1", "--skills", str(endless(folder))
+    )
     asyncio.run(all_up(arbiter.runtime))
     programs.start(
-        "-m", "reasoner", "--task", "grab the red cube", "--planner", "openai", "--scene-vlm", "none"
+        "-m",
+        "vram_arbiter.reasoner",
+        "--task",
+        "grab the red cube",
+        "--planner",
+        "openai",
+        "--scene-vlm",
+        "none",
     )
     collector.wait(
         lambda: bool(collector.spans(telemetry.SPAN_SEND)), "action that reaches the robot", MOVES_S
@@ -198,7 +218,9 @@ class Trace:
         self._by_id = {span.span_id: span for span in spans}
 
     def named(self, name: str) -> list[ReceivedSpan]:
-        return sorted((span for span in self.spans if span.name == name), key=lambda span: span.start_ns)
+        return sorted(
+            (span for span in self.spans if span.name == name), key=lambda span: span.start_ns
+        )
 
     def above(self, span: ReceivedSpan) -> list[ReceivedSpan]:
         """Parent, its parent, and so on up to the root. Raises KeyError for a parent that never was exported."""
@@ -252,7 +274,9 @@ def judge(trace: Trace, collector: Collector) -> None:
 
     (acquire,) = trace.below(load, telemetry.SPAN_ACQUIRE)
     assert (acquire.service, acquire.attributes[telemetry.ATTR_CONSUMER]) == (ARBITER, "grab")
-    assert [len(trace.below(acquire, name)) for name in (telemetry.SPAN_QUEUE, telemetry.SPAN_LOAD)] == [1, 1]
+    assert [
+        len(trace.below(acquire, name)) for name in (telemetry.SPAN_QUEUE, telemetry.SPAN_LOAD)
+    ] == [1, 1]
     (evict,) = trace.below(acquire, telemetry.SPAN_EVICT)
     assert (evict.service, evict.attributes[telemetry.ATTR_CONSUMER]) == (ARBITER, "detector")
     (verify,) = trace.below(evict, telemetry.SPAN_VERIFY)
@@ -270,8 +294,14 @@ def judge(trace: Trace, collector: Collector) -> None:
         span.service: span.attributes[telemetry.ATTR_EXIT_CODE]
         for span in trace.named(telemetry.SPAN_COMMAND)
     }
-    assert codes == {REASONER: 1, RUNNER: 0, POLICY: 0, DETECTOR: 0, ARBITER: 0}, "SIGTERM loses nothing"
-    others = {span.name for span in trace.spans if span.service == RUNNER and span.trace_id != first.trace_id}
+    assert codes == {REASONER: 1, RUNNER: 0, POLICY: 0, DETECTOR: 0, ARBITER: 0}, (
+        "SIGTERM loses nothing"
+    )
+    others = {
+        span.name
+        for span in trace.spans
+        if span.service == RUNNER and span.trace_id != first.trace_id
+    }
     assert others == {telemetry.SPAN_COMMAND}, "a robot that waits records nothing"
     for service, metric in (
         (RUNNER, telemetry.METRIC_TICK),

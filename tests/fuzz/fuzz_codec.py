@@ -13,17 +13,17 @@ import atheris
 
 with atheris.instrument_imports(
     include=[
-        "arbiter.rpc.codec",
-        "schemas.runtime.msgpack_codec",
-        "schemas.wire",
-        "schemas.errors",
+        "vram_arbiter.arbiter.rpc.codec",
+        "vram_arbiter.schemas.runtime.msgpack_codec",
+        "vram_arbiter.schemas.wire",
+        "vram_arbiter.schemas.errors",
         "msgpack",
     ]
 ):
-    from arbiter.rpc import codec
-    from arbiter.testing.hostile import BOMBS, Forger, pack
-    from schemas.defaults import MESSAGE_MAX_BYTES
-    from schemas.wire import OPS
+    from tests.support.hostile import BOMBS, Forger, pack
+    from vram_arbiter.arbiter.rpc import codec
+    from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
+    from vram_arbiter.schemas.wire import OPS
 
 ANSWER_MAX_BYTES = 16_384
 SEEDS_PER_OP = 4

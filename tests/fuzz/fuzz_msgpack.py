@@ -11,10 +11,10 @@ from pathlib import Path
 import atheris
 import msgpack
 
-with atheris.instrument_imports(include=["schemas.runtime.msgpack_codec"]):
-    from arbiter.testing.hostile import BOMBS
-    from schemas.errors import BadFrame, MessageTooLarge
-    from schemas.runtime.msgpack_codec import UnpackLimits, count_values, unpack_map
+with atheris.instrument_imports(include=["vram_arbiter.schemas.runtime.msgpack_codec"]):
+    from tests.support.hostile import BOMBS
+    from vram_arbiter.schemas.errors import BadFrame, MessageTooLarge
+    from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, count_values, unpack_map
 
 LIMITS = UnpackLimits(
     message_max_bytes=2048, values_max=32, keys_max=8, items_max=16, beside_binary_max_bytes=512

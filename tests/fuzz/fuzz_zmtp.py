@@ -11,8 +11,8 @@ from pathlib import Path
 
 import atheris
 
-with atheris.instrument_imports(include=["schemas.runtime.zmtp"]):
-    from schemas.runtime.zmtp import (
+with atheris.instrument_imports(include=["vram_arbiter.schemas.runtime.zmtp"]):
+    from vram_arbiter.schemas.runtime.zmtp import (
         COMMAND_MAX_BYTES,
         GREETING,
         READY,
@@ -46,7 +46,9 @@ def read(data: bytes, pieces: int) -> list[Event | str]:
         try:
             while (event := connection.next_event()) is not None:
                 found.append(
-                    Message(bytes(event.payload), event.delimiter) if isinstance(event, Message) else event
+                    Message(bytes(event.payload), event.delimiter)
+                    if isinstance(event, Message)
+                    else event
                 )
         except ZmtpError:
             return [*found, "error"]

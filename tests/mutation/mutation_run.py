@@ -94,7 +94,9 @@ def _qualified(parsed: Any, function: Any) -> str:
     return str(function.name.value)
 
 
-def choose(sample: int, seed: int, only: Mapping[str, str], folder: Path = CORE) -> tuple[int, list[Mutant]]:
+def choose(
+    sample: int, seed: int, only: Mapping[str, str], folder: Path = CORE
+) -> tuple[int, list[Mutant]]:
     """How many mutants there are, and `sample` of them by chance (0: all), or exactly those of `only`: their names and diffs."""
     found = [item for path in sorted(folder.glob("*.py")) for item in _of_file(path)]
     if only:
@@ -130,14 +132,18 @@ def _of_file(path: Path) -> list[tuple[str, Path, Any, Any]]:
 def _materialise(name: str, path: Path, parsed: Any, mutation: Any) -> Mutant:
     before = parsed.code
     after = parsed.deep_replace(mutation.original_node, mutation.mutated_node).code
-    lines = list(difflib.unified_diff(before.splitlines(), after.splitlines(), lineterm="", n=0))[2:]
+    lines = list(difflib.unified_diff(before.splitlines(), after.splitlines(), lineterm="", n=0))[
+        2:
+    ]
     changed: set[int] = set()
     for entry in lines:
         if entry.startswith("@@"):
             first, _, count = entry.split()[1].removeprefix("-").partition(",")
             changed |= set(range(int(first), int(first) + int(count or 1)))
     diff = "\n".join(entry for entry in lines if not entry.startswith("@@"))
-    return Mutant(name, path.stem, sorted(changed | _statement(before, min(changed, default=0))), diff, after)
+    return Mutant(
+        name, path.stem, sorted(changed | _statement(before, min(changed, default=0))), diff, after
+    )
 
 
 def _statement(source: str, line: int) -> set[int]:
@@ -146,7 +152,9 @@ def _statement(source: str, line: int) -> set[int]:
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.stmt) and node.lineno <= line <= (node.end_lineno or node.lineno):
             inner = [
-                child.lineno for child in ast.walk(node) if isinstance(child, ast.stmt) and child is not node
+                child.lineno
+                for child in ast.walk(node)
+                if isinstance(child, ast.stmt) and child is not node
             ]
             end = min(inner, default=(node.end_lineno or node.lineno) + 1)
             span = set(range(node.lineno, max(end, node.lineno + 1)))
@@ -170,7 +178,9 @@ def swap(module: Any, source: str) -> int:
     return changed
 
 
-def _functions(module: str, names: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, FunctionType]]:
+def _functions(
+    module: str, names: dict[str, Any], prefix: str = ""
+) -> Iterator[tuple[str, FunctionType]]:
     for name, value in list(names.items()):
         if isinstance(value, type) and value.__module__ == module and not prefix:
             yield from _functions(module, dict(vars(value)), f"{name}.")
@@ -258,7 +268,9 @@ class Trials:
             self._reap()
         return True
 
-    def _as_they_are(self, items: list[pytest.Item]) -> tuple[dict[str, list[str]], dict[str, float]] | None:
+    def _as_they_are(
+        self, items: list[pytest.Item]
+    ) -> tuple[dict[str, list[str]], dict[str, float]] | None:
         """The tests without a mutant: all pass, and this is what each comes by."""
         kept = self.folder / "coverage.json"
         pid = os.fork()
@@ -268,7 +280,9 @@ class Trials:
             self._run(
                 items,
                 None,
-                lambda: kept.write_text(json.dumps([coverage.tests, coverage.durations], default=list)),
+                lambda: kept.write_text(
+                    json.dumps([coverage.tests, coverage.durations], default=list)
+                ),
             )
         os.waitpid(pid, 0)
         if not kept.exists():
@@ -287,7 +301,9 @@ class Trials:
             os.dup2(nowhere, 1)
             os.dup2(nowhere, 2)
             resource.setrlimit(resource.RLIMIT_AS, (MEMORY_MAX_BYTES, MEMORY_MAX_BYTES))
-            if mutant is not None and not swap(importlib.import_module(mutant.module), mutant.source):
+            if mutant is not None and not swap(
+                importlib.import_module(mutant.module), mutant.source
+            ):
                 status = NO_EFFECT
                 os._exit(status)
             for item, following in zip(items, [*items[1:], None], strict=True):
@@ -315,12 +331,22 @@ class Trials:
         self.tried += 1
         if self.tried % 20 == 0:
             counts = dict(Counter(mutant.outcome for mutant in self.mutants if mutant.outcome))
-            print(f"{self.tried} of {len(self.mutants)} tried: {counts}", file=sys.stderr, flush=True)
+            print(
+                f"{self.tried} of {len(self.mutants)} tried: {counts}", file=sys.stderr, flush=True
+            )
 
 
 def run(mutants: list[Mutant], jobs: int) -> None:
     """Try all mutants, `jobs` at a time; each knows its outcome afterwards."""
-    options = [TESTS, "--ignore-glob=*_machine.py", "-qq", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    options = [
+        TESTS,
+        "--ignore-glob=*_machine.py",
+        "-qq",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:xdist",
+    ]
     limits = ["-o", f"timeout={TEST_TIMEOUT_S}", "-o", "faulthandler_timeout=0"]
     os.chdir(ROOT)
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()) as said:
@@ -345,7 +371,9 @@ def summary(existing: int, tried: list[Mutant], known: list[dict[str, str]]) -> 
         **{kind: counts[kind] for kind in ("killed", "survived", "equivalent", "no effect")},
         "score": round(counts["killed"] / counted, 4) if counted else None,
         "survivors": [
-            {"name": m.name, "line": m.lines[-1], "diff": m.diff} for m in tried if m.outcome == "survived"
+            {"name": m.name, "line": m.lines[-1], "diff": m.diff}
+            for m in tried
+            if m.outcome == "survived"
         ],
         "killed_by": {m.name: m.killer for m in tried if m.outcome == "killed"},
     }
@@ -355,7 +383,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--sample", type=int, default=300, help="this many by chance; 0: all (hours)")
+    parser.add_argument(
+        "--sample", type=int, default=300, help="this many by chance; 0: all (hours)"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--again", type=Path, help="the survivors of this report")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)

@@ -22,7 +22,7 @@ from hypothesis import Phase, seed, settings
 from hypothesis.reporting import with_reporter
 from hypothesis.stateful import RuleBasedStateMachine, run_state_machine_as_test
 
-from arbiter.testing import machines as profiles
+from tests.support import machines as profiles
 
 ROOT = Path(__file__).resolve().parents[2]
 MACHINES = {  # name → file and class; whoever stands here walks in the night
@@ -138,7 +138,12 @@ def night(todo: Sequence[Portion], jobs: int, stop_at: int) -> list[Portion]:
 def summary(done: Sequence[Portion], wall_s: float) -> dict[str, Any]:
     """The report: all, each machine, and the failures with the line that tells them again."""
     failures = [asdict(one) | {"again": one.again} for one in done if one.failure]
-    total: dict[str, Any] = {"histories": 0, "events": 0, "wall_s": round(wall_s, 1), "machines": {}}
+    total: dict[str, Any] = {
+        "histories": 0,
+        "events": 0,
+        "wall_s": round(wall_s, 1),
+        "machines": {},
+    }
     for one in done:
         mine = total["machines"].setdefault(
             one.machine, {"histories": 0, "events": 0, "cpu_s": 0.0, "reached": Counter()}
@@ -164,7 +169,9 @@ def main() -> int:
     parser.add_argument("--machine", choices=sorted(MACHINES), help="this one alone")
     parser.add_argument("--seed", type=int, help="the first portion's; without it the day chooses")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--stop-at", type=int, default=3, help="begin no more after so many failures")
+    parser.add_argument(
+        "--stop-at", type=int, default=3, help="begin no more after so many failures"
+    )
     parser.add_argument("--out", type=Path, default=ROOT / "out/nightly/report.json")
     options = parser.parse_args()
     first = int(time.time()) // 86_400 * SPREAD if options.seed is None else options.seed
@@ -176,7 +183,8 @@ def main() -> int:
     options.out.write_text(json.dumps(report, indent=1) + "\n")
     print(
         json.dumps(
-            {key: value for key, value in report.items() if key not in ("seeds", "failures")}, indent=1
+            {key: value for key, value in report.items() if key not in ("seeds", "failures")},
+            indent=1,
         )
     )
     return 1 if report["failures"] else 0

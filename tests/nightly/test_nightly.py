@@ -9,7 +9,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
-from arbiter.testing.machines import walk
+from tests.support.machines import walk
 
 
 class Sound(RuleBasedStateMachine):

@@ -36,7 +36,9 @@ def install_into(
             shutil.copy2(TREE / name, target)
     (packages / "dependencies.pth").write_text(f"{dependencies}\n")
 
-    (prefix / "pyvenv.cfg").write_text(f"home = {python.parent}\ninclude-system-site-packages = false\n")
+    (prefix / "pyvenv.cfg").write_text(
+        f"home = {python.parent}\ninclude-system-site-packages = false\n"
+    )
     programs = prefix / "bin"
     programs.mkdir()
     (programs / "python").symlink_to(python)

@@ -97,7 +97,9 @@ class Machine:
                 str(Path(__file__).with_name("boot_machine.sh")), str(self._scratch), str(TREE),
                 str(self._scratch / "prefix"), sys.base_prefix, str(DEPENDENCIES),
             ]  # fmt: skip
-            into_cgroup = f'echo $$ >{self._cgroup}/cgroup.procs && exec setpriv --pdeathsig KILL "$@"'
+            into_cgroup = (
+                f'echo $$ >{self._cgroup}/cgroup.procs && exec setpriv --pdeathsig KILL "$@"'
+            )
             with (self._scratch / "console").open("wb") as console:
                 self._process = subprocess.Popen(
                     ["sh", "-c", into_cgroup, "sh", *boot],
@@ -115,7 +117,9 @@ class Machine:
                         raise RuntimeError(f"systemd did not come up:\n{self.console}")
             finally:
                 os.close(gone)
-        children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children").read_text().split()
+        children = (
+            Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children").read_text().split()
+        )
         self._init_pid = int(children[0])
         self._init = os.pidfd_open(self._init_pid)
 
@@ -153,7 +157,10 @@ class Machine:
     def start(self, unit: str) -> None:
         """Start a unit. Fails the test with the unit's log if it does not come up."""
         done = subprocess.run(
-            self.inside("systemctl", "start", unit), capture_output=True, text=True, timeout=2 * PATIENCE_S
+            self.inside("systemctl", "start", unit),
+            capture_output=True,
+            text=True,
+            timeout=2 * PATIENCE_S,
         )
         assert done.returncode == 0, f"{done.stderr}\n{self.log(unit)}\n{self.console}"
 

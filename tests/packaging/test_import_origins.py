@@ -1,10 +1,11 @@
-"""The six import names are common words: they must mean this tree, and the base install must stay light.
+"""Everything is imported as `vram_arbiter`, and the base install must stay light.
 
 Everything runs in a fresh interpreter in an empty folder: inside pytest the tree itself lies on the path and the answer
 would always be the wished one.
 """
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -30,7 +31,7 @@ HEAVY = (
 )
 
 BASE_MODULES = [
-    ".".join(path.relative_to(TREE).with_suffix("").parts)
+    ".".join(("vram_arbiter", *path.relative_to(TREE).with_suffix("").parts))
     for package in ("arbiter", "clients", "schemas")
     for path in sorted((TREE / package).rglob("*.py"))
     if path.name not in ("__init__.py", "__main__.py")
@@ -39,27 +40,64 @@ BASE_MODULES = [
 
 def in_a_fresh_interpreter(code: str, folder: Path) -> str:
     result = subprocess.run(
-        [sys.executable, "-P", "-c", code], cwd=folder, capture_output=True, text=True, timeout=120
+        [sys.executable, "-P", "-c", code],
+        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert result.returncode == 0, result.stderr
     return result.stdout
 
 
-def test_all_import_names_come_from_this_tree(tmp_path: Path) -> None:
+def test_the_product_has_one_import_name(tmp_path: Path) -> None:
     code = f"""
 import importlib.util, json
+import vram_arbiter
 specs = {{name: importlib.util.find_spec(name) for name in {PACKAGES!r}}}
-print(json.dumps({{name: spec and list(spec.submodule_search_locations or []) for name, spec in specs.items()}}))
+bare = [name for name, spec in specs.items() if spec is not None]
+print(json.dumps([list(vram_arbiter.__path__), bare]))
 """
-    origins = json.loads(in_a_fresh_interpreter(code, tmp_path))
-    assert origins == {name: [str(TREE / name)] for name in PACKAGES}, (
-        "another installed package uses one of our names"
+    assert json.loads(in_a_fresh_interpreter(code, tmp_path)) == [
+        [str(TREE / "src/vram_arbiter")],
+        [],
+    ]
+
+
+def test_no_code_imports_the_bare_names() -> None:
+    """A project with its own `schemas/` or `clients/` would hide ours."""
+    found = subprocess.run(
+        ["git", "grep", "-nE", rf"^ *(from|import) ({'|'.join(PACKAGES)})(\\.| )", "--", "*.py"],
+        cwd=TREE, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert (found.returncode, found.stdout) == (1, ""), found.stdout + found.stderr
+
+
+def test_a_project_with_its_own_schemas_and_clients_can_use_ours(tmp_path: Path) -> None:
+    for name in PACKAGES:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise RuntimeError('of another project')\n")
+    code = (
+        "import vram_arbiter.clients.client, vram_arbiter.arbiter.daemon, vram_arbiter.schemas.wire"
     )
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, timeout=120)
+    doctor = subprocess.run(
+        [sys.executable, "-m", "vram_arbiter.clients", "doctor"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert "installation" in doctor.stdout, doctor.stderr
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_packages_say_that_they_are_typed(package: str) -> None:
-    assert (TREE / package / "py.typed").is_file()
+def test_packages_are_reached_through_links(package: str) -> None:
+    link = TREE / "src/vram_arbiter" / package
+    assert link.is_symlink()
+    assert link.resolve() == TREE / package
+
+
+def test_the_package_is_typed() -> None:
+    assert (TREE / "src/vram_arbiter/py.typed").is_file()
 
 
 def test_the_base_packages_import_nothing_heavy(tmp_path: Path) -> None:
@@ -82,7 +120,7 @@ print(json.dumps(culprits))
 def test_the_programs_start_without_their_models(package: str, tmp_path: Path) -> None:
     code = f"""
 import importlib, json, sys
-importlib.import_module("{package}.__main__")
+importlib.import_module("vram_arbiter.{package}.__main__")
 print(json.dumps([heavy for heavy in {HEAVY!r} if heavy in sys.modules]))
 """
     assert json.loads(in_a_fresh_interpreter(code, tmp_path)) == []

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from installed import TREE, install_into
 
-from arbiter.testing.process import ArbiterProcess
-from clients.sync import SyncArbiterClient
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.sync import SyncArbiterClient
 
 pytestmark = pytest.mark.e2e
 PAGE = (TREE / "README.md").read_text(encoding="utf-8")
@@ -116,5 +116,9 @@ def test_the_example_runs_as_printed(arbiter_daemon: ArbiterProcess, tmp_path: P
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "detecting\n", "")
     with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
-        kinds = [event["kind"] for event in client.history()["events"] if event.get("consumer") == "detector"]
+        kinds = [
+            event["kind"]
+            for event in client.history()["events"]
+            if event.get("consumer") == "detector"
+        ]
     assert {"granted", "ready", "use_began", "use_ended", "released"} <= set(kinds)

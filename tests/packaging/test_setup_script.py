@@ -134,7 +134,9 @@ def installed(project: Path) -> list[str]:
     return [line.rpartition(" ")[2] for line in lines if line.startswith("uv pip")]
 
 
-def test_without_gstreamer_everything_else_is_installed_and_what_is_missing_is_said(full: Path) -> None:
+def test_without_gstreamer_everything_else_is_installed_and_what_is_missing_is_said(
+    full: Path,
+) -> None:
     result = set_up(full, "full")
     assert result.returncode == 0, result.stderr
     assert "cameras through GStreamer are left out" in result.stderr
@@ -162,7 +164,9 @@ def test_root_gets_the_libraries_by_apt(full: Path) -> None:
     assert result.returncode == 0, result.stderr
     assert "left out" not in result.stderr
     first, second = [
-        line for line in (full / "log").read_text(encoding="utf-8").splitlines() if line.startswith("apt-get")
+        line
+        for line in (full / "log").read_text(encoding="utf-8").splitlines()
+        if line.startswith("apt-get")
     ][:2]
     assert first == "apt-get update -qq"
     assert second.startswith("apt-get install -y -qq")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.manifest import load_manifest
+from vram_arbiter.schemas.manifest import load_manifest
 
 TREE = Path(__file__).parents[2]
 MANIFESTS = sorted((TREE / "configs").rglob("rskill.yaml"))
@@ -27,7 +27,11 @@ def test_shipped_manifest_loads_without_a_warning(path: Path) -> None:
 
 
 def test_constraints_are_plain_versions() -> None:
-    odd = [line for line in CONSTRAINTS if not re.fullmatch(r"[A-Za-z0-9._-]+==[0-9][0-9A-Za-z.]*", line)]
+    odd = [
+        line
+        for line in CONSTRAINTS
+        if not re.fullmatch(r"[A-Za-z0-9._-]+==[0-9][0-9A-Za-z.]*", line)
+    ]
     assert not odd, "no addresses, no local paths, no local version labels"
 
 
@@ -37,9 +41,9 @@ def test_every_dependency_is_constrained() -> None:
         *project["dependencies"],
         *(name for extra in project["optional-dependencies"].values() for name in extra),
     ]
-    names = {re.split(r"[\[<>=!~; ]", text, maxsplit=1)[0].lower().replace("_", "-") for text in wanted} - {
-        "vram-arbiter"
-    }
+    names = {
+        re.split(r"[\[<>=!~; ]", text, maxsplit=1)[0].lower().replace("_", "-") for text in wanted
+    } - {"vram-arbiter"}
     assert names <= {line.partition("==")[0].lower().replace("_", "-") for line in CONSTRAINTS}
 
 

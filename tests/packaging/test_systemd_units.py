@@ -13,11 +13,16 @@ from pathlib import Path
 
 import pytest
 
-from schemas.config import load_config
+from vram_arbiter.schemas.config.arbiter import load_config
 
 TREE = Path(__file__).parents[2]
 SOURCES = TREE / "configs" / "systemd"
-UNITS = ("vram-arbiter.service", "vram-sidecar@.service", "vram-runner@.service", "vram-reasoner@.service")
+UNITS = (
+    "vram-arbiter.service",
+    "vram-sidecar@.service",
+    "vram-runner@.service",
+    "vram-reasoner@.service",
+)
 HOLDERS = UNITS[1:]
 EXPOSURES_MAX = {
     "system/vram-arbiter.service": 1.0,
@@ -67,7 +72,10 @@ def installed(tmp_path: Path) -> Path:
 
 def install(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [str(TREE / ".ci" / "install-units"), *arguments], capture_output=True, text=True, timeout=60
+        [str(TREE / ".ci" / "install-units"), *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
     )
 
 
@@ -114,7 +122,12 @@ def test_every_unit_may_open_many_connections(name: str) -> None:
 
 def test_a_sidecar_reaches_the_gpu_of_a_jetson() -> None:
     allowed = unit("vram-sidecar@.service")["Service", "DeviceAllow"]
-    for device in ("/dev/nvmap", "/dev/nvhost-gpu", "/dev/nvhost-ctrl-gpu", "/dev/nvgpu/igpu0/channel"):
+    for device in (
+        "/dev/nvmap",
+        "/dev/nvhost-gpu",
+        "/dev/nvhost-ctrl-gpu",
+        "/dev/nvgpu/igpu0/channel",
+    ):
         assert f"{device} rw" in allowed
     assert "video" in unit("vram-sidecar@.service")["Service", "SupplementaryGroups"][0]
 
@@ -128,7 +141,13 @@ def test_the_runner_reaches_cameras_buses_and_realtime() -> None:
 
 
 def analyze(*arguments: str, **environ: str) -> subprocess.CompletedProcess[str]:
-    plain = {**os.environ, "LC_ALL": "C", "SYSTEMD_LOG_LEVEL": "warning", "SYSTEMD_COLORS": "0", **environ}
+    plain = {
+        **os.environ,
+        "LC_ALL": "C",
+        "SYSTEMD_LOG_LEVEL": "warning",
+        "SYSTEMD_COLORS": "0",
+        **environ,
+    }
     return subprocess.run(
         ["systemd-analyze", *arguments], env=plain, capture_output=True, text=True, timeout=60
     )
@@ -177,8 +196,12 @@ def test_other_processes_stay_visible_and_the_cards_reachable() -> None:
     assert "AF_UNIX" in found["Service", "RestrictAddressFamilies"][0]
     kill = settings_of((SOURCES / "system/vram-arbiter.service.d/kill.conf.example").read_text())
     assert kill["Service", "AmbientCapabilities"] == ["CAP_KILL"]
-    assert found["Service", "AmbientCapabilities"] == [""], "opt-in means that it is not there by itself"
-    online = settings_of((SOURCES / "system/vram-arbiter.service.d/telemetry.conf.example").read_text())
+    assert found["Service", "AmbientCapabilities"] == [""], (
+        "opt-in means that it is not there by itself"
+    )
+    online = settings_of(
+        (SOURCES / "system/vram-arbiter.service.d/telemetry.conf.example").read_text()
+    )
     assert (online["Service", "IPAddressAllow"], found["Service", "IPAddressDeny"]) == (
         ["localhost"],
         ["any"],
@@ -199,7 +222,9 @@ def test_all_programs_meet_in_one_folder() -> None:
 
 
 def test_every_user_of_a_unit_is_created() -> None:
-    created = re.findall(r"^u (\S+)", (SOURCES / "sysusers.d/vram-arbiter.conf").read_text(), re.MULTILINE)
+    created = re.findall(
+        r"^u (\S+)", (SOURCES / "sysusers.d/vram-arbiter.conf").read_text(), re.MULTILINE
+    )
     used = {unit(name)["Service", "User"][0] for name in UNITS}
     assert used == set(created)
 
@@ -227,7 +252,11 @@ def test_the_prefix_takes_the_place_of_the_usual_one(installed: Path) -> None:
         assert "/opt/vram-arbiter" not in text
         assert f"ExecStart={installed.parent}/prefix/bin/vram-" in text
         assert path.stat().st_mode & 0o777 == 0o644
-    assert {path.name for path in (installed / "etc").iterdir()} == {"systemd", "sysusers.d", "tmpfiles.d"}
+    assert {path.name for path in (installed / "etc").iterdir()} == {
+        "systemd",
+        "sysusers.d",
+        "tmpfiles.d",
+    }
 
 
 def test_the_installer_refuses_what_cannot_work(tmp_path: Path) -> None:
@@ -263,11 +292,14 @@ def test_users_and_folders_are_made_below_a_root_of_their_own(installed: Path) -
     users = dict(line.split(":", 1) for line in (installed / "etc/passwd").read_text().splitlines())
     assert {"vram-arbiter", "vram-sidecar", "vram-robot"} <= users.keys()
     groups = {
-        line.split(":")[0]: line.split(":")[3] for line in (installed / "etc/group").read_text().splitlines()
+        line.split(":")[0]: line.split(":")[3]
+        for line in (installed / "etc/group").read_text().splitlines()
     }
     assert set(groups["vram-arbiter"].split(",")) == {"vram-sidecar", "vram-robot"}
 
-    below_root("systemd-tmpfiles", "--create", snippet=installed / "etc/tmpfiles.d/vram-arbiter.conf")
+    below_root(
+        "systemd-tmpfiles", "--create", snippet=installed / "etc/tmpfiles.d/vram-arbiter.conf"
+    )
     folder = (installed / "run/vram-arbiter").stat()
     assert folder.st_mode & 0o7777 == 0o1770
     assert folder.st_uid == int(users["vram-arbiter"].split(":")[1])

@@ -78,13 +78,17 @@ def leases(
         return None
     status = json.loads(asked.stdout)
     granted = {
-        lease["consumer"]: lease for lease in status["leases"] if lease["state"] in ("loading", "held")
+        lease["consumer"]: lease
+        for lease in status["leases"]
+        if lease["state"] in ("loading", "held")
     }
     return granted if status["phase"] == "serving" else None
 
 
 @contextmanager
-def held(machine: Machine, name: str, *options: str, user: str | None = None) -> Iterator[dict[str, Any]]:
+def held(
+    machine: Machine, name: str, *options: str, user: str | None = None
+) -> Iterator[dict[str, Any]]:
     """A program that runs under a lease."""
     command = ["vramctl", "run", "--endpoint", ENDPOINT, "--name", name, "--vram", "1GiB", *options]
     process = subprocess.Popen(machine.inside(*command, "--", "sleep", "1000", user=user))
@@ -149,7 +153,15 @@ def test_the_unit_of_a_user_starts_in_the_manager_of_a_user(machine: Machine) ->
     """Such a manager has no privileges: a setting that drops capabilities keeps a unit from starting there."""
     home, runtime = "/tmp/home", "/run/user/robot"
     machine.run(
-        "install", "-d", "-o", "vram-robot", "-m", "700", home, runtime, f"{home}/.config/vram-arbiter"
+        "install",
+        "-d",
+        "-o",
+        "vram-robot",
+        "-m",
+        "700",
+        home,
+        runtime,
+        f"{home}/.config/vram-arbiter",
     )
     machine.write(f"{home}/.config/vram-arbiter/arbiter.env", 'ARBITER_OPTIONS="--gpu fake:8GiB"\n')
     machine.write(
@@ -179,7 +191,9 @@ asyncio.run(load())
 @pytest.mark.heavy
 def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
     """A model loads under a lease, a robot is stopped, and a task fails because of that, each as its unit's user."""
-    machine.run("chmod", "-R", "g+rwX", "/run/vram-arbiter/fakegpu")  # a driver serves several users
+    machine.run(
+        "chmod", "-R", "g+rwX", "/run/vram-arbiter/fakegpu"
+    )  # a driver serves several users
     skill = "schemas/_configs/rskills/so101-progress/rskill.yaml"
     options = f"--rskill /opt/vram-arbiter/lib/python3*/site-packages/{skill} --device fake:/run/vram-arbiter/fakegpu"
     options = machine.run("sh", "-c", f"echo {options}").strip()

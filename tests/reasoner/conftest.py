@@ -8,9 +8,17 @@ from typing import Any
 
 import pytest
 
-from clients.serve import Message, Peer, RouterServer
-from schemas.errors import BadRequest, FrameStale, GoalRejected, VramError
-from schemas.goals import RUNNER_REQUEST, CancelGoal, GetFrame, GetResult, GetSkills, GetState, SendGoal
+from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.schemas.errors import BadRequest, FrameStale, GoalRejected, VramError
+from vram_arbiter.schemas.goals import (
+    RUNNER_REQUEST,
+    CancelGoal,
+    GetFrame,
+    GetResult,
+    GetSkills,
+    GetState,
+    SendGoal,
+)
 
 
 class Runner:
@@ -180,4 +188,6 @@ def a_runner(tmp_path: Path) -> Callable[[], AbstractAsyncContextManager[Runner]
 
 @pytest.fixture
 def a_sidecar(tmp_path: Path) -> Callable[[str], AbstractAsyncContextManager[Sidecar]]:
-    return lambda rskill: _served(Sidecar(f"ipc://{tmp_path}/{rskill.replace('/', '-')}.sock", rskill))
+    return lambda rskill: _served(
+        Sidecar(f"ipc://{tmp_path}/{rskill.replace('/', '-')}.sock", rskill)
+    )

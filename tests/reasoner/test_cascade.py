@@ -5,10 +5,26 @@ import typing
 
 import pytest
 
-from reasoner.cascade import ANSWER_MAX_CHARS, MEANING, Answered, Called, Words, conversation, told
-from reasoner.palette import Palette, Skill
-from reasoner.planner import UNSTARTABLE_MAX, Episode, Note, Outcome, Status, Step, benched
-from schemas.tools import ExecuteRskill, LocateInView, QueryScene
+from vram_arbiter.reasoner.cascade import (
+    ANSWER_MAX_CHARS,
+    MEANING,
+    Answered,
+    Called,
+    Words,
+    conversation,
+    told,
+)
+from vram_arbiter.reasoner.palette import Palette, Skill
+from vram_arbiter.reasoner.planner import (
+    UNSTARTABLE_MAX,
+    Episode,
+    Note,
+    Outcome,
+    Status,
+    Step,
+    benched,
+)
+from vram_arbiter.schemas.tools import ExecuteRskill, LocateInView, QueryScene
 
 PALETTE = Palette((Skill("lab/grab", "vla", "grab", ("grasp",)),))
 GRAB = ExecuteRskill(rskill_id="lab/grab")
@@ -29,7 +45,9 @@ def test_answers_say_who_answers_and_stay_quotations() -> None:
     assert "\n" not in fields["text"]
     assert "\x00" not in fields["text"]
     assert json.loads(json.dumps(fields)) == fields
-    assert len(told(LocateInView(query="x"), Outcome("found", "x" * 9000))["text"]) == ANSWER_MAX_CHARS
+    assert (
+        len(told(LocateInView(query="x"), Outcome("found", "x" * 9000))["text"]) == ANSWER_MAX_CHARS
+    )
     turns = conversation(
         Episode("task", [Step(QueryScene(question="?"), Outcome("answered", words))]), PALETTE
     )
@@ -56,7 +74,10 @@ def test_notes_stand_where_they_were_said_and_a_running_goal_has_no_result_yet()
 
 def test_a_skill_is_benched_after_three_starts_in_a_row_that_failed_and_for_good() -> None:
     def step(code: str) -> Step:
-        return Step(ExecuteRskill(rskill_id="lab/grab"), Outcome("failed" if code else "succeeded", "", code))
+        return Step(
+            ExecuteRskill(rskill_id="lab/grab"),
+            Outcome("failed" if code else "succeeded", "", code),
+        )
 
     gone = step("sidecar_unavailable")
     assert benched([gone] * (UNSTARTABLE_MAX - 1)) == frozenset()
@@ -78,7 +99,9 @@ def test_what_a_skill_or_a_model_says_can_always_be_told_and_has_an_end() -> Non
     (*_, answered) = conversation(episode, PALETTE)
     assert isinstance(answered, Answered)
     assert len(answered.text) < 4 * ANSWER_MAX_CHARS
-    strict = json.loads(answered.text, parse_constant=lambda text: pytest.fail(f"{text} is no JSON"))
+    strict = json.loads(
+        answered.text, parse_constant=lambda text: pytest.fail(f"{text} is no JSON")
+    )
     assert strict["data"]["label"].startswith("xxx")
 
 

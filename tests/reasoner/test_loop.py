@@ -6,15 +6,24 @@ from typing import Any
 
 import pytest
 
-from reasoner import loop as looping
-from reasoner.inbox import WORDS_MAX, Cancel, Danger, Inbox, Said
-from reasoner.loop import LOOKS_IN_A_ROW_MAX, REFUSALS_MAX, Result, run_episode
-from reasoner.palette import Palette, Skill
-from reasoner.planner import Episode, Finish, Outcome
-from schemas.errors import LlmError
-from schemas.tools import ExecuteRskill, LocateInView, QueryScene, StopGoal, ToolCall, Wait
+from vram_arbiter.reasoner import loop as looping
+from vram_arbiter.reasoner.inbox import WORDS_MAX, Cancel, Danger, Inbox, Said
+from vram_arbiter.reasoner.loop import LOOKS_IN_A_ROW_MAX, REFUSALS_MAX, Result, run_episode
+from vram_arbiter.reasoner.palette import Palette, Skill
+from vram_arbiter.reasoner.planner import Episode, Finish, Outcome
+from vram_arbiter.schemas.errors import LlmError
+from vram_arbiter.schemas.tools import (
+    ExecuteRskill,
+    LocateInView,
+    QueryScene,
+    StopGoal,
+    ToolCall,
+    Wait,
+)
 
-PALETTE = Palette((Skill("lab/grab", "vla", "grab", ("grasp",)), Skill("lab/eye", "vlm", "look", ("query",))))
+PALETTE = Palette(
+    (Skill("lab/grab", "vla", "grab", ("grasp",)), Skill("lab/eye", "vlm", "look", ("query",)))
+)
 GRAB = ExecuteRskill(rskill_id="lab/grab")
 NEVER = asyncio.Event
 
@@ -29,7 +38,9 @@ class Planner:
         self.dropped = 0
 
     async def decide(self, episode: Episode) -> ToolCall | Finish:
-        self.asked.append(Episode(episode.task, [*episode.steps], [*episode.notes], episode.running))
+        self.asked.append(
+            Episode(episode.task, [*episode.steps], [*episode.notes], episode.running)
+        )
         decision = self._decide(episode)
         if decision is not None:
             return decision
@@ -129,7 +140,9 @@ def test_a_result_passes_a_planner_that_hangs_and_makes_it_think_again() -> None
 def test_words_reach_a_thinking_planner_by_asking_it_again() -> None:
     async def story() -> tuple[Result, Planner]:
         inbox = Inbox()
-        planner = Planner(lambda episode: Finish(False, "told to leave it") if episode.notes else None)
+        planner = Planner(
+            lambda episode: Finish(False, "told to leave it") if episode.notes else None
+        )
         episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
         await planner.hanging.wait()
         inbox.put(Said("leave it"))
@@ -143,7 +156,9 @@ def test_words_reach_a_thinking_planner_by_asking_it_again() -> None:
 def test_a_danger_that_stops_nothing_is_told_to_a_thinking_planner() -> None:
     async def story() -> Result:
         inbox = Inbox()
-        planner = Planner(lambda episode: Finish(False, episode.notes[0].source) if episode.notes else None)
+        planner = Planner(
+            lambda episode: Finish(False, episode.notes[0].source) if episode.notes else None
+        )
         episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
         await planner.hanging.wait()
         inbox.put(Danger("the front camera is stale", stop=False))
@@ -225,7 +240,9 @@ def test_beside_a_goal_it_goes_on_unless_the_planner_clearly_stops_it(
                 return decision
             return Finish(True, "after the goal") if episode.steps else GRAB
 
-        episode = asyncio.create_task(run_episode("x", Planner(decide), PALETTE, robot, inbox=inbox))
+        episode = asyncio.create_task(
+            run_episode("x", Planner(decide), PALETTE, robot, inbox=inbox)
+        )
         await robot.begun.wait()
         inbox.put(Said("?"))
         await consulted.wait()
@@ -249,7 +266,9 @@ def test_a_planner_that_fails_beside_a_goal_does_not_stop_it() -> None:
                 raise LlmError("the model is away")
             return Finish(True, "done") if episode.steps else GRAB
 
-        episode = asyncio.create_task(run_episode("x", Planner(decide), PALETTE, robot, inbox=inbox))
+        episode = asyncio.create_task(
+            run_episode("x", Planner(decide), PALETTE, robot, inbox=inbox)
+        )
         await robot.begun.wait()
         inbox.put(Said("?"))
         await consulted.wait()
@@ -261,7 +280,9 @@ def test_a_planner_that_fails_beside_a_goal_does_not_stop_it() -> None:
 
 def test_a_planner_that_never_decides_is_given_up() -> None:
     async def story() -> Result:
-        return await run_episode("x", Planner(lambda episode: None), PALETTE, Robot(), think_max_s=0.05)
+        return await run_episode(
+            "x", Planner(lambda episode: None), PALETTE, Robot(), think_max_s=0.05
+        )
 
     assert play(story)["reason"] == "the planner failed: no decision within 0.05 s"
 
@@ -282,7 +303,9 @@ def test_an_emergency_stop_is_not_discussed_with_the_planner() -> None:
 def test_an_episode_that_is_cancelled_takes_its_goal_with_it() -> None:
     async def story() -> Robot:
         robot = Robot()
-        episode = asyncio.create_task(run_episode("x", Planner(lambda episode: GRAB), PALETTE, robot))
+        episode = asyncio.create_task(
+            run_episode("x", Planner(lambda episode: GRAB), PALETTE, robot)
+        )
         await robot.begun.wait()
         episode.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -309,7 +332,9 @@ def test_refusals_looks_and_steps_have_limits() -> None:
     assert len(answers) == LOOKS_IN_A_ROW_MAX
     assert curious["steps"][-1]["code"] == "limit_exceeded"
     short = play(
-        lambda: story(lambda episode: QueryScene(question=f"and {len(episode.steps)}?"), steps_max=3)
+        lambda: story(
+            lambda episode: QueryScene(question=f"and {len(episode.steps)}?"), steps_max=3
+        )
     )
     assert short["reason"] == "gave up after 3 steps"
 

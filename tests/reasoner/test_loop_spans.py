@@ -8,14 +8,16 @@ from typing import Any
 
 import pytest
 
-from schemas import telemetry
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 pytestmark = pytest.mark.heavy  # the OpenTelemetry SDK
 
 
 def test_each_turn_of_an_episode_is_a_tick_with_its_decisions_and_its_tool() -> None:
     program = str(Path(__file__).parent / "trace_an_episode.py")
-    done = subprocess.run([sys.executable, program], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [sys.executable, program], capture_output=True, text=True, timeout=60, check=True
+    )
     said = json.loads(done.stdout)
     spans: list[dict[str, Any]] = sorted(said["spans"], key=lambda span: span["start"])
     (task,) = [span for span in spans if span["parent"] is None]
@@ -35,4 +37,6 @@ def test_each_turn_of_an_episode_is_a_tick_with_its_decisions_and_its_tool() -> 
     assert below(finished) == [(plan, "finish")]
     (acted,) = [span for span in spans if span["name"] == tool]
     assert acted["attributes"][telemetry.ATTR_SKILL] == "lab/grab"
-    assert said["handed_on"].split("-")[2] == acted["span_id"], "the runner's goal is the tool's child"
+    assert said["handed_on"].split("-")[2] == acted["span_id"], (
+        "the runner's goal is the tool's child"
+    )

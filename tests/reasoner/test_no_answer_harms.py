@@ -14,18 +14,18 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from arbiter.core.effects import Push, Refuse
-from arbiter.testing.core_driver import Consumer, CoreDriver
-from reasoner.cascade import Turn
-from reasoner.llm.base import Answer, Call, LlmConfig, LlmPlanner
-from reasoner.loop import Result, run_episode
-from reasoner.palette import OPERATOR, Palette, Skill
-from reasoner.planner import Episode, Finish
-from reasoner.tools import Tools
-from schemas import defaults as d
-from schemas.errors import GoalRejected, LeaseRevoking, LlmError, WaitTimeout
-from schemas.ids import LeaseId
-from schemas.tools import ToolCall, skill_tool_name
+from tests.support.core_driver import Consumer, CoreDriver
+from vram_arbiter.arbiter.core.effects import Push, Refuse
+from vram_arbiter.reasoner.cascade import Turn
+from vram_arbiter.reasoner.llm.base import Answer, Call, LlmConfig, LlmPlanner
+from vram_arbiter.reasoner.loop import Result, run_episode
+from vram_arbiter.reasoner.palette import OPERATOR, Palette, Skill
+from vram_arbiter.reasoner.planner import Episode, Finish
+from vram_arbiter.reasoner.tools import Tools
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.errors import GoalRejected, LeaseRevoking, LlmError, WaitTimeout
+from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.tools import ToolCall, skill_tool_name
 
 pytest.importorskip("httpx", reason="needs the reasoner extra")
 
@@ -63,7 +63,9 @@ class World:
         for lease in self.uses:
             state = self.driver.state(lease)
             assert state in ("held", "revoking"), f"{lease} is in use and {state}"
-        lost = [e.body for e in self.driver.effects if isinstance(e, Push) and e.body["push"] == "lost"]
+        lost = [
+            e.body for e in self.driver.effects if isinstance(e, Push) and e.body["push"] == "lost"
+        ]
         assert not lost, f"a lease was taken away: {lost}"
 
     # -- what everybody does while time passes -------------------------------------------------------------------
@@ -118,7 +120,11 @@ class World:
         peak, steady = SIZES[name]
         consumer = self.sidecars[name]
         lease = consumer.acquire(
-            peak, steady, residue_bytes=RESIDUE, min_residency_s=d.MIN_RESIDENCY_S, wait_timeout_s=WAIT_S
+            peak,
+            steady,
+            residue_bytes=RESIDUE,
+            min_residency_s=d.MIN_RESIDENCY_S,
+            wait_timeout_s=WAIT_S,
         )
         while self.driver.state(lease) not in ("loading", "over"):
             self.step()
@@ -274,11 +280,13 @@ class Model(LlmPlanner):
         try:
             match what:
                 case "goal" if (
-                    "policy" not in self.world.leases or self.world.leases["policy"] not in self.world.uses
+                    "policy" not in self.world.leases
+                    or self.world.leases["policy"] not in self.world.uses
                 ):
                     self.world.begin("policy", 9.0, self.world.runner)
                 case "long goal" if (
-                    "policy" not in self.world.leases or self.world.leases["policy"] not in self.world.uses
+                    "policy" not in self.world.leases
+                    or self.world.leases["policy"] not in self.world.uses
                 ):
                     self.world.begin("policy", 40.0, self.world.runner)
                 case "look":
@@ -301,14 +309,23 @@ TEXT = st.text(max_size=20)
 ARGUMENTS: dict[str, st.SearchStrategy[dict[str, Any]]] = {
     "execute_rskill": st.fixed_dictionaries(
         {"rskill_id": SKILLS},
-        optional={"prompt": TEXT, "goal_params_json": TEXT, "deadline_s": NUMBERS, "patience_s": NUMBERS},
+        optional={
+            "prompt": TEXT,
+            "goal_params_json": TEXT,
+            "deadline_s": NUMBERS,
+            "patience_s": NUMBERS,
+        },
     ),
-    "locate_in_view": st.fixed_dictionaries({"query": TEXT}, optional={"camera": TEXT, "detector": TEXT}),
+    "locate_in_view": st.fixed_dictionaries(
+        {"query": TEXT}, optional={"camera": TEXT, "detector": TEXT}
+    ),
     "query_scene": st.fixed_dictionaries({"question": TEXT}, optional={"camera": TEXT}),
     "lifecycle_transition": st.fixed_dictionaries(
         {
             "node": NODES,
-            "transition": st.sampled_from(["configure", "activate", "deactivate", "cleanup", "shutdown"]),
+            "transition": st.sampled_from(
+                ["configure", "activate", "deactivate", "cleanup", "shutdown"]
+            ),
         }
     ),
     "emit_prompt": st.fixed_dictionaries(
@@ -334,7 +351,9 @@ def calls(draw: st.DrawFn) -> Call:
         return Call("c", skill_tool_name(rskill), fields)
     name = draw(st.sampled_from(list(ARGUMENTS)))
     if draw(st.integers(0, 7)) == 0:
-        return Call("c", name, draw(st.one_of(TEXT, st.just("[" * 5000), st.just('{"rskill_id": NaN}'))))
+        return Call(
+            "c", name, draw(st.one_of(TEXT, st.just("[" * 5000), st.just('{"rskill_id": NaN}')))
+        )
     return Call("c", name, draw(ARGUMENTS[name]))
 
 
@@ -345,7 +364,9 @@ BESIDE = st.sampled_from(["", "", "", "goal", "long goal", "look", "wait"])
 
 @settings(max_examples=80, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(st.lists(st.tuples(st.one_of(GOOD, GOOD, GOOD, ANSWERS), BESIDE), min_size=1, max_size=14))
-def test_no_answer_evicts_a_holder_in_use_or_fills_the_card(answers: list[tuple[Answer, str]]) -> None:
+def test_no_answer_evicts_a_holder_in_use_or_fills_the_card(
+    answers: list[tuple[Answer, str]],
+) -> None:
     world, results, runner = _play(list(answers))
     assert set(runner.executed) <= EXECUTABLE, "nothing but a vla and a ros_action was executed"
     for result in results:
@@ -361,14 +382,18 @@ def test_the_world_switches_when_it_is_asked_to() -> None:
     """The property above would hold of a world in which nothing happens."""
     look = Answer("", (Call("c", "locate_in_view", {"query": "cube"}),))
     grab = Answer("", (Call("c", skill_tool_name("lab/grab"), {}),))
-    off = Answer("", (Call("c", "lifecycle_transition", {"node": "detector", "transition": "deactivate"}),))
+    off = Answer(
+        "", (Call("c", "lifecycle_transition", {"node": "detector", "transition": "deactivate"}),)
+    )
     world, (result,), runner = _play(
         [(look, ""), (grab, ""), (look, "long goal"), (off, ""), (look, "wait"), (look, "wait")]
     )
     assert runner.executed == ["lab/grab"]
     statuses = [(step["call"]["tool"], step["status"], step["code"]) for step in result["steps"]]
     assert statuses[:2] == [("locate_in_view", "not_seen", ""), ("execute_rskill", "succeeded", "")]
-    assert statuses[2] == ("locate_in_view", "error", "wait_timeout"), "the goal of somebody else is in use"
+    assert statuses[2] == ("locate_in_view", "error", "wait_timeout"), (
+        "the goal of somebody else is in use"
+    )
     assert statuses[3] == ("lifecycle_transition", "refused", "bad_state")
     assert statuses[-1] == ("locate_in_view", "not_seen", "")
     assert world.switches >= 2
@@ -379,7 +404,11 @@ def _play(answers: list[tuple[Answer, str]]) -> tuple[World, list[Result], Runne
         world = World()
         runner, detector, vlm = Runner(world), Eye(world, "detector"), Eye(world, "scene-vlm")
         tools = Tools(
-            runner, detector, vlm, palette=PALETTE, components={"detector": detector, "scene-vlm": vlm}
+            runner,
+            detector,
+            vlm,
+            palette=PALETTE,
+            components={"detector": detector, "scene-vlm": vlm},
         )
         results = []
         async with Model(answers, world) as model:

@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from reasoner.inbox import Cancel, Inbox, Said
-from reasoner.loop import run_episode
-from reasoner.palette import Palette
-from reasoner.planner import Episode, Finish, Outcome
-from reasoner.server import OperatorServer, send
-from schemas.errors import AlreadyRunning, BadRequest, ReasonerUnreachable, UnknownOp
-from schemas.tools import ToolCall
+from vram_arbiter.reasoner.inbox import Cancel, Inbox, Said
+from vram_arbiter.reasoner.loop import run_episode
+from vram_arbiter.reasoner.palette import Palette
+from vram_arbiter.reasoner.planner import Episode, Finish, Outcome
+from vram_arbiter.reasoner.server import OperatorServer, send
+from vram_arbiter.schemas.errors import AlreadyRunning, BadRequest, ReasonerUnreachable, UnknownOp
+from vram_arbiter.schemas.tools import ToolCall
 
 
 def play(story: Callable[[], Any]) -> Any:
@@ -78,7 +78,9 @@ def test_a_cancel_over_the_socket_ends_an_episode_whose_planner_hangs(tmp_path: 
     async def story() -> str:
         inbox = Inbox()
         async with OperatorServer(endpoint, "x", inbox):
-            episode = asyncio.create_task(run_episode("x", Hanging(), Palette(()), dispatch, inbox=inbox))
+            episode = asyncio.create_task(
+                run_episode("x", Hanging(), Palette(()), dispatch, inbox=inbox)
+            )
             await send(endpoint, {"op": "cancel", "reason": "lunch"})
             return (await episode)["reason"]
 
@@ -91,7 +93,9 @@ def test_a_cancel_is_not_refused_for_its_words(tmp_path: Path) -> None:
     async def story() -> list[Any]:
         inbox = Inbox()
         async with OperatorServer(endpoint, "tidy up", inbox):
-            await send(endpoint, {"op": "cancel", "reason": "the cat\n" * 1000, "by": "a newer client"})
+            await send(
+                endpoint, {"op": "cancel", "reason": "the cat\n" * 1000, "by": "a newer client"}
+            )
         return inbox.take()
 
     (cancel,) = play(story)

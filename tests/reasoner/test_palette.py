@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reasoner.palette import EXECUTABLE_KINDS, OPERATOR, Palette, Skill, palette_of
-from schemas.body import Body
-from schemas.errors import BadRequest, NotPermitted, UnknownSkill
-from schemas.manifest import Kind, RSkillManifest, parse_manifest
-from schemas.tools import (
+from vram_arbiter.reasoner.palette import EXECUTABLE_KINDS, OPERATOR, Palette, Skill, palette_of
+from vram_arbiter.schemas.body import Body
+from vram_arbiter.schemas.errors import BadRequest, NotPermitted, UnknownSkill
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest, parse_manifest
+from vram_arbiter.schemas.tools import (
     EmitPrompt,
     ExecuteRskill,
     LifecycleTransition,
@@ -40,7 +40,9 @@ BY_KIND = {
 
 def manifest(kind: str, *, name: str = "", role: str = "", license: str = "mit") -> RSkillManifest:
     role = role or ("s2" if kind == "playbook" else "s1")
-    head = f'name: "{name or "lab/" + kind}"\nlicense: "{license}"\nrole: "{role}"\nkind: "{kind}"\n'
+    head = (
+        f'name: "{name or "lab/" + kind}"\nlicense: "{license}"\nrole: "{role}"\nkind: "{kind}"\n'
+    )
     return parse_manifest(head + BASE + BY_KIND[kind])
 
 
@@ -78,8 +80,14 @@ def test_only_three_kinds_move_anything() -> None:
 def test_looking_and_asking_are_independent(can_locate: bool, can_query: bool) -> None:
     found = palette(manifest("vla"), can_locate=can_locate, can_query=can_query)
     offered = {function["function"]["name"] for function in found.functions()}
-    assert ("locate_in_view" in offered) == can_locate == (found.check(LocateInView(query="x")) is None)
-    assert ("query_scene" in offered) == can_query == (found.check(QueryScene(question="x")) is None)
+    assert (
+        ("locate_in_view" in offered)
+        == can_locate
+        == (found.check(LocateInView(query="x")) is None)
+    )
+    assert (
+        ("query_scene" in offered) == can_query == (found.check(QueryScene(question="x")) is None)
+    )
 
 
 @pytest.mark.parametrize(
@@ -94,7 +102,9 @@ def test_a_licence_that_forbids_commercial_use_bars_a_skill(license: str, commer
     gated, open_ = palette(skill, eye), palette(skill, eye, allow_noncommercial=True)
     call = ExecuteRskill(rskill_id="lab/vla")
     assert (gated.check(call) is None) == commercial
-    assert (gated.permits("lab/vlm") is None) == commercial, "a model that is only asked is a model too"
+    assert (gated.permits("lab/vlm") is None) == commercial, (
+        "a model that is only asked is a model too"
+    )
     assert open_.check(call) is None
     assert open_.permits("lab/vlm") is None
     assert gated.permits("lab/not-installed") is None
@@ -106,12 +116,16 @@ def test_a_licence_that_forbids_commercial_use_bars_a_skill(license: str, commer
 
 def test_a_skill_without_weights_has_no_licence_of_weights() -> None:
     assert (
-        palette(manifest("ros_action", license="unknown")).check(ExecuteRskill(rskill_id="lab/ros_action"))
+        palette(manifest("ros_action", license="unknown")).check(
+            ExecuteRskill(rskill_id="lab/ros_action")
+        )
         is None
     )
 
 
-ARM = Body(embodiment_tags=("so101_follower",), capabilities={"can_lift_kg": 0.25, "has_vision": True})
+ARM = Body(
+    embodiment_tags=("so101_follower",), capabilities={"can_lift_kg": 0.25, "has_vision": True}
+)
 
 
 def test_a_skill_for_another_robot_is_not_offered() -> None:
@@ -137,7 +151,8 @@ def test_a_robot_that_does_not_say_what_it_is_gets_what_is_made_for_any() -> Non
 def test_capabilities_count_by_value(kg: float, fits: bool) -> None:
     """The defect of the field: any arm that can lift at all was offered skills that lift fifty kilograms."""
     found = palette(
-        skill_for("any", name="lab/lift", needs=f"{{can_lift_kg: {kg}, has_vision: true}}"), body=ARM
+        skill_for("any", name="lab/lift", needs=f"{{can_lift_kg: {kg}, has_vision: true}}"),
+        body=ARM,
     )
     assert (found.check(ExecuteRskill(rskill_id="lab/lift")) is None) == fits
     assert bool(found.executable) == fits
@@ -165,7 +180,9 @@ def test_lifecycle_only_for_nodes_on_the_list() -> None:
     nobody, some = palette(manifest("vla")), palette(manifest("vla"), managed=["detector"])
     call = LifecycleTransition(node="detector", transition="activate")
     assert isinstance(nobody.check(call), NotPermitted)
-    assert "lifecycle_transition" not in {function["function"]["name"] for function in nobody.functions()}
+    assert "lifecycle_transition" not in {
+        function["function"]["name"] for function in nobody.functions()
+    }
     assert some.check(call) is None
     kernel = LifecycleTransition(node="safety_kernel", transition="deactivate")
     assert "may not be managed" in str(some.check(kernel))
@@ -224,14 +241,17 @@ JSON = st.recursive(
     | st.floats(allow_nan=False, allow_infinity=False)
     | st.integers(-(1 << 63), (1 << 63) - 1)
     | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    ),
     max_leaves=12,
 )
 
 
 @given(
     schema=st.dictionaries(
-        st.sampled_from(["type", "enum", "required", "properties", "items", "minimum", "minItems"]), JSON
+        st.sampled_from(["type", "enum", "required", "properties", "items", "minimum", "minItems"]),
+        JSON,
     ),
     value=JSON,
 )

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from reasoner.palette import Palette, Skill
-from reasoner.playbooks import BODY_MAX_BYTES, load_playbook
-from schemas.errors import ConfigError, ManifestInvalid
-from schemas.tools import EmitPrompt, ExecuteRskill, LocateInView, QueryScene
+from vram_arbiter.reasoner.palette import Palette, Skill
+from vram_arbiter.reasoner.playbooks import BODY_MAX_BYTES, load_playbook
+from vram_arbiter.schemas.errors import ConfigError, ManifestInvalid
+from vram_arbiter.schemas.tools import EmitPrompt, ExecuteRskill, LocateInView, QueryScene
 
 PALETTE = Palette(
     (

@@ -15,7 +15,7 @@ NOBODY = ["--runner", "ipc:///proc/none/runner.sock", "--detector", "none", "--s
 
 def reasoner(runtime: Path, *arguments: str, **environ: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "reasoner", *arguments],
+        [sys.executable, "-m", "vram_arbiter.reasoner", *arguments],
         capture_output=True,
         text=True,
         timeout=120,
@@ -31,7 +31,9 @@ def test_usage(tmp_path: Path) -> None:
     ended = reasoner(tmp_path, "--say", "hello")
     assert ended.returncode == 3
     assert "no reasoner answers" in ended.stderr
-    ended = reasoner(tmp_path, "--task", "grab the cube", "--playbook", "/nonexistent/rskill.yaml", *NOBODY)
+    ended = reasoner(
+        tmp_path, "--task", "grab the cube", "--playbook", "/nonexistent/rskill.yaml", *NOBODY
+    )
     assert ended.returncode == 2
     assert "cannot be read" in ended.stderr
     assert "Traceback" not in ended.stderr
@@ -91,7 +93,9 @@ def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: A
         async def silent(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             asked_for.append(await reader.readuntil(b"\r\n\r\n"))
             length = next(
-                line for line in asked_for[0].lower().split(b"\r\n") if line.startswith(b"content-length")
+                line
+                for line in asked_for[0].lower().split(b"\r\n")
+                if line.startswith(b"content-length")
             )
             asked_for.append(await reader.readexactly(int(length.split(b":")[1])))
             asked.set()
@@ -108,7 +112,7 @@ def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: A
         async with a_runner() as runner, asyncio.timeout(200):
             runner.skills = [manifest]
             process = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", "reasoner", "--task", "drive home", "--planner", "anthropic", "--detector", "none",
+                sys.executable, "-m", "vram_arbiter.reasoner", "--task", "drive home", "--planner", "anthropic", "--detector", "none",
                 "--scene-vlm", "none", "--playbook", str(tmp_path / "rskill.yaml"), "--result", str(tmp_path / "result.json"), env=environ, stderr=asyncio.subprocess.PIPE,
             )  # fmt: skip
             try:

@@ -5,12 +5,12 @@ from collections.abc import Callable
 
 import pytest
 
-from reasoner.llm.scripted import PLACES_MAX, ScriptedPlanner, object_of
-from reasoner.loop import REPEATS_MAX, Result, run_episode
-from reasoner.palette import Palette, Skill
-from reasoner.planner import Episode, Finish, Outcome
-from schemas.errors import BadRequest, LlmError, UnknownSkill
-from schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall
+from vram_arbiter.reasoner.llm.scripted import PLACES_MAX, ScriptedPlanner, object_of
+from vram_arbiter.reasoner.loop import REPEATS_MAX, Result, run_episode
+from vram_arbiter.reasoner.palette import Palette, Skill
+from vram_arbiter.reasoner.planner import Episode, Finish, Outcome
+from vram_arbiter.schemas.errors import BadRequest, LlmError, UnknownSkill
+from vram_arbiter.schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall
 
 NAVIGATE = Skill("lab/navigate", "ros_action", "drive", ("navigate",))
 GRAB = Skill("lab/grab", "vla", "grab", ("pick", "grasp"))
@@ -63,7 +63,13 @@ def test_finds_drives_corrects_grabs_and_asks() -> None:
 
 def test_retries_at_most_three_times() -> None:
     def world(call: ToolCall, _: int) -> Outcome:
-        return FOUND if isinstance(call, LocateInView) else NO if isinstance(call, QueryScene) else DONE
+        return (
+            FOUND
+            if isinstance(call, LocateInView)
+            else NO
+            if isinstance(call, QueryScene)
+            else DONE
+        )
 
     result, calls = play(world)
     assert result["status"] == "failure"
@@ -103,14 +109,20 @@ def test_evicted_is_not_absent() -> None:
                 return DONE
 
     result, calls = play(world)
-    assert [call.tool for call in calls][1:4] == ["locate_in_view", "locate_in_view", "execute_rskill"]
+    assert [call.tool for call in calls][1:4] == [
+        "locate_in_view",
+        "locate_in_view",
+        "execute_rskill",
+    ]
     assert "target_point" in calls[3].model_dump_json()
     assert result["status"] == "success"
 
 
 def test_a_detector_that_cannot_look_makes_nobody_turn_away() -> None:
     def world(call: ToolCall, _: int) -> Outcome:
-        return Outcome("error", "CUDA out of memory", "oom") if isinstance(call, LocateInView) else YES
+        return (
+            Outcome("error", "CUDA out of memory", "oom") if isinstance(call, LocateInView) else YES
+        )
 
     result, calls = play(world)
     assert not any(isinstance(call, ExecuteRskill) for call in calls)
@@ -211,9 +223,13 @@ def test_a_planner_that_repeats_itself_or_fails_ends_the_episode() -> None:
 
 def sees(base_pose: list[float] | None, *things: tuple[float, float, float]) -> Outcome:
     """What `locate_in_view` says of things at (x, y) from the base, with their scores, best first."""
-    seen = [{"point_base_m": [x, y, 0.2], "score": score, "box": [0, 0, 9, 9]} for x, y, score in things]
+    seen = [
+        {"point_base_m": [x, y, 0.2], "score": score, "box": [0, 0, 9, 9]} for x, y, score in things
+    ]
     data = {"point_base_m": seen[0]["point_base_m"], "seen": seen}
-    return Outcome("found", "there", data=data if base_pose is None else data | {"base_pose": base_pose})
+    return Outcome(
+        "found", "there", data=data if base_pose is None else data | {"base_pose": base_pose}
+    )
 
 
 def looks_of(*looks: Outcome) -> Callable[[ToolCall, int], Outcome]:
@@ -274,11 +290,19 @@ def grabs_and_places(answer: Outcome) -> list[str]:
     """Which arm skills follow each other when the scene VLM always says this."""
 
     def world(call: ToolCall, _: int) -> Outcome:
-        return FOUND if isinstance(call, LocateInView) else answer if isinstance(call, QueryScene) else DONE
+        return (
+            FOUND
+            if isinstance(call, LocateInView)
+            else answer
+            if isinstance(call, QueryScene)
+            else DONE
+        )
 
     _, calls = play(world, Palette((NAVIGATE, GRAB, PLACE, DETECTOR)))
     return [
-        call.rskill_id for call in calls if isinstance(call, ExecuteRskill) and call.rskill_id != NAVIGATE.id
+        call.rskill_id
+        for call in calls
+        if isinstance(call, ExecuteRskill) and call.rskill_id != NAVIGATE.id
     ]
 
 
@@ -298,6 +322,8 @@ def test_what_the_hand_holds_is_put_down_before_it_looks_again() -> None:
         Outcome("error", "CUDA out of memory", "oom"),
     ],
 )
-def test_a_hand_of_which_nobody_says_that_it_holds_something_puts_nothing_down(answer: Outcome) -> None:
+def test_a_hand_of_which_nobody_says_that_it_holds_something_puts_nothing_down(
+    answer: Outcome,
+) -> None:
     """It would press on what it has missed, which stands there."""
     assert grabs_and_places(answer) == [GRAB.id] * 3

@@ -7,16 +7,29 @@ from typing import Any
 
 import pytest
 
-from clients.runner import RunnerClient
-from clients.sidecar.perception import RewardClient
-from reasoner.loop import run_episode
-from reasoner.palette import Palette, Skill
-from reasoner.past import KEPT_MAX, SHOWN_MAX, Past, Taken, spread
-from reasoner.planner import Episode, Finish
-from reasoner.tools import LOOKED_AT_MAX_S, Judge, Tools
-from schemas.errors import BadRequest, Evicted, FrameStale, ModelError, NotPermitted, OutOfMemory, VramError
-from schemas.goals import FrameReply
-from schemas.tools import PROGRESS_WINDOW_MAX_S, ExecuteRskill, QueryTaskProgress, ToolCall
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.sidecar.perception import RewardClient
+from vram_arbiter.reasoner.history import KEPT_MAX, SHOWN_MAX, Past, Taken, spread
+from vram_arbiter.reasoner.loop import run_episode
+from vram_arbiter.reasoner.palette import Palette, Skill
+from vram_arbiter.reasoner.planner import Episode, Finish
+from vram_arbiter.reasoner.tools import LOOKED_AT_MAX_S, Judge, Tools
+from vram_arbiter.schemas.errors import (
+    BadRequest,
+    Evicted,
+    FrameStale,
+    ModelError,
+    NotPermitted,
+    OutOfMemory,
+    VramError,
+)
+from vram_arbiter.schemas.goals import FrameReply
+from vram_arbiter.schemas.tools import (
+    PROGRESS_WINDOW_MAX_S,
+    ExecuteRskill,
+    QueryTaskProgress,
+    ToolCall,
+)
 
 ASK = QueryTaskProgress()
 TASK = "grab the red cube"
@@ -41,7 +54,13 @@ class Camera:
 
     def shows(self, image: bytes, age_ms: float = 0.0) -> None:
         self.next = FrameReply(
-            camera="wrist", encoding="png", data=image, width=1, height=1, stamp_monotonic_ns=1, age_ms=age_ms
+            camera="wrist",
+            encoding="png",
+            data=image,
+            width=1,
+            height=1,
+            stamp_monotonic_ns=1,
+            age_ms=age_ms,
         )
 
     async def __call__(self) -> FrameReply:
@@ -111,7 +130,11 @@ PALETTE = Palette((Skill("lab/grab", "vla", "", ("grasp",)),), can_judge=True)
 
 
 def ask(
-    a_runner: Any, a_sidecar: Any, prepare: Callable[[Any, Any], None], call: ToolCall = ASK, **barred: str
+    a_runner: Any,
+    a_sidecar: Any,
+    prepare: Callable[[Any, Any], None],
+    call: ToolCall = ASK,
+    **barred: str,
 ) -> Any:
     """The outcome, and what the sidecar was asked."""
 
@@ -194,7 +217,9 @@ def test_no_answer_is_never_no_progress(
         {"progress": [0.5], "success": [0.9], "success_threshold": float("nan")}, {"progress": [0.5], "success": [0.9], "success_threshold": -1.0},
     ],
 )  # fmt: skip
-def test_a_strange_answer_is_an_error(a_runner: Any, a_sidecar: Any, judgement: dict[str, Any]) -> None:
+def test_a_strange_answer_is_an_error(
+    a_runner: Any, a_sidecar: Any, judgement: dict[str, Any]
+) -> None:
     def strange(runner: Any, sidecar: Any) -> None:
         sidecar.judgement = judgement
 
@@ -211,7 +236,9 @@ def test_without_a_fresh_picture_nothing_is_judged(a_runner: Any, a_sidecar: Any
 
 
 def test_a_barred_model_is_not_asked(a_runner: Any, a_sidecar: Any) -> None:
-    outcome, asked = ask(a_runner, a_sidecar, lambda runner, sidecar: None, barred="it is made for go2")
+    outcome, asked = ask(
+        a_runner, a_sidecar, lambda runner, sidecar: None, barred="it is made for go2"
+    )
     assert (outcome.status, asked) == ("refused", [])
     assert "made for go2" in outcome.text
 
@@ -222,8 +249,12 @@ def test_its_flag_is_its_own() -> None:
     alone = Palette((), can_locate=False, can_query=False, can_judge=True)
     assert isinstance(without.check(ASK), NotPermitted)
     assert alone.check(ASK) is None
-    assert {function["function"]["name"] for function in alone.functions()} == {"query_task_progress"}
-    assert "query_task_progress" not in {function["function"]["name"] for function in without.functions()}
+    assert {function["function"]["name"] for function in alone.functions()} == {
+        "query_task_progress"
+    }
+    assert "query_task_progress" not in {
+        function["function"]["name"] for function in without.functions()
+    }
     assert isinstance(alone.check(ASK, goal_runs=True), NotPermitted)
 
 
@@ -236,7 +267,9 @@ class Believes:
     async def decide(self, episode: Episode) -> ToolCall | Finish:
         done = len(episode.steps)
         return (
-            self.calls[done] if done < len(self.calls) else Finish(False, "the planner decides, nobody else")
+            self.calls[done]
+            if done < len(self.calls)
+            else Finish(False, "the planner decides, nobody else")
         )
 
 
@@ -260,7 +293,9 @@ def test_an_opinion_begins_and_ends_nothing(a_runner: Any, a_sidecar: Any) -> No
             scored = sidecar.asked.count("score")
             await runner.feed(0.1)
             assert not episode.done()
-            assert sidecar.asked.count("score") == scored == 1, "nobody asks by himself while a goal runs"
+            assert sidecar.asked.count("score") == scored == 1, (
+                "nobody asks by himself while a goal runs"
+            )
             assert runner.cancelled == []
             await runner.end("failed", code="limit_exceeded", message="not grasped")
             looking.cancel()

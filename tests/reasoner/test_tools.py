@@ -7,15 +7,23 @@ from typing import Any, cast
 
 import pytest
 
-from clients.runner import Goal, RunnerClient
-from clients.sidecar.perception import DetectorClient, SceneVlmClient
-from reasoner.inbox import Cancel, Danger, Inbox, Said
-from reasoner.loop import run_episode
-from reasoner.palette import Palette, Skill
-from reasoner.planner import Episode, Finish, Outcome
-from reasoner.tools import GOAL_MAX_S, LOOKED_AT_MAX_S, LOOKS_MAX, PLACE_MAX_S, Tools, _stands_still, waits_s
-from reasoner.watch import watch
-from schemas.errors import (
+from vram_arbiter.clients.runner import Goal, RunnerClient
+from vram_arbiter.clients.sidecar.perception import DetectorClient, SceneVlmClient
+from vram_arbiter.reasoner.inbox import Cancel, Danger, Inbox, Said
+from vram_arbiter.reasoner.loop import run_episode
+from vram_arbiter.reasoner.palette import Palette, Skill
+from vram_arbiter.reasoner.planner import Episode, Finish, Outcome
+from vram_arbiter.reasoner.tools import (
+    GOAL_MAX_S,
+    LOOKED_AT_MAX_S,
+    LOOKS_MAX,
+    PLACE_MAX_S,
+    Tools,
+    _stands_still,
+    waits_s,
+)
+from vram_arbiter.reasoner.watch import watch
+from vram_arbiter.schemas.errors import (
     BadState,
     Evicted,
     FrameStale,
@@ -29,7 +37,7 @@ from schemas.errors import (
     VramError,
     WaitTimeout,
 )
-from schemas.tools import (
+from vram_arbiter.schemas.tools import (
     EmitPrompt,
     ExecuteRskill,
     LifecycleTransition,
@@ -38,7 +46,7 @@ from schemas.tools import (
     StopGoal,
     ToolCall,
 )
-from schemas.world import CameraModel
+from vram_arbiter.schemas.world import CameraModel
 
 GRAB = ExecuteRskill(rskill_id="lab/grab", prompt="grab it", deadline_s=30)
 LOOK = LocateInView(query="red cube")
@@ -57,7 +65,12 @@ def test_a_goals_end_becomes_an_outcome(a_runner: Any) -> None:
     async def story() -> list[tuple[str, str]]:
         found = []
         async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-            for status, code in (("succeeded", ""), ("failed", "oom"), ("canceled", ""), ("deadline", "")):
+            for status, code in (
+                ("succeeded", ""),
+                ("failed", "oom"),
+                ("canceled", ""),
+                ("deadline", ""),
+            ):
                 runner.accepted.clear()
                 doing = asyncio.create_task(Tools(client, None, None)(GRAB))
                 await runner.accepted.wait()
@@ -66,7 +79,12 @@ def test_a_goals_end_becomes_an_outcome(a_runner: Any) -> None:
                 found.append((outcome.status, outcome.code))
         return found
 
-    assert play(story) == [("succeeded", ""), ("failed", "oom"), ("canceled", ""), ("failed", "deadline")]
+    assert play(story) == [
+        ("succeeded", ""),
+        ("failed", "oom"),
+        ("canceled", ""),
+        ("failed", "deadline"),
+    ]
 
 
 def test_a_goal_nobody_waits_for_any_more_is_cancelled_and_its_end_is_heard(a_runner: Any) -> None:
@@ -118,7 +136,9 @@ def test_patience_counts_motion_and_not_the_wait_for_the_card(a_runner: Any) -> 
 
     async def loads(runner: Any) -> None:
         await runner.feed(0.0, "acquiring")
-        await asyncio.sleep(0.6)  # twice the patience: what is tested is that time passes without a cancel
+        await asyncio.sleep(
+            0.6
+        )  # twice the patience: what is tested is that time passes without a cancel
         await runner.end()
 
     outcome, cancelled = play(lambda: story(patient, loads))
@@ -152,7 +172,9 @@ def test_progress_that_was_told_while_the_reasoner_stood_still_counts() -> None:
 
 
 @contextlib.asynccontextmanager
-async def looking(a_runner: Any, a_sidecar: Any) -> AsyncIterator[tuple[Any, Any, DetectorClient, Tools]]:
+async def looking(
+    a_runner: Any, a_sidecar: Any
+) -> AsyncIterator[tuple[Any, Any, DetectorClient, Tools]]:
     """A runner with a camera, one sidecar that is both models, its detector's client, and the tools over all of them."""
     async with (
         a_runner() as runner,
@@ -185,7 +207,9 @@ def test_a_model_that_did_not_look_never_says_that_nothing_is_there(
         assert (outcome.status, outcome.code) == (status, error.code)
 
 
-def test_looked_not_seen_answered_and_no_frame_are_four_things(a_runner: Any, a_sidecar: Any) -> None:
+def test_looked_not_seen_answered_and_no_frame_are_four_things(
+    a_runner: Any, a_sidecar: Any
+) -> None:
     async def story() -> list[str]:
         async with looking(a_runner, a_sidecar) as (runner, sidecar, _, tools):
             found = [(await tools(LOOK)).status, (await tools(ASK)).status]
@@ -198,7 +222,9 @@ def test_looked_not_seen_answered_and_no_frame_are_four_things(a_runner: Any, a_
     assert play(story) == ["not_seen", "answered", "error", "no_frame", "no_frame"]
 
 
-def test_a_look_tells_all_places_best_first_and_where_the_base_stood(a_runner: Any, a_sidecar: Any) -> None:
+def test_a_look_tells_all_places_best_first_and_where_the_base_stood(
+    a_runner: Any, a_sidecar: Any
+) -> None:
     """Boxes that lie on one thing are that one thing."""
     down = CameraModel(
         K=((100.0, 0.0, 50.0), (0.0, 100.0, 50.0), (0.0, 0.0, 1.0)),
@@ -239,7 +265,9 @@ def test_a_look_tells_all_places_best_first_and_where_the_base_stood(a_runner: A
         {"score": 7.0},
     ],
 )
-def test_a_place_that_is_no_number_is_no_place(a_runner: Any, a_sidecar: Any, wrong: dict[str, Any]) -> None:
+def test_a_place_that_is_no_number_is_no_place(
+    a_runner: Any, a_sidecar: Any, wrong: dict[str, Any]
+) -> None:
     """Regression: it was `found` at (nan, nan) m from the base."""
 
     async def story() -> Any:
@@ -291,8 +319,13 @@ def test_a_picture_that_waited_for_the_card_is_not_looked_at_and_a_new_one_is(
 
     looked = "not_seen" if call is LOOK else "answered"
     found, limits = play(story)
-    assert (found, len(limits)) == ("no_frame" if late == LOOKS_MAX else looked, min(late + 1, LOOKS_MAX))
-    assert all(0.0 < limit < LOOKED_AT_MAX_S for limit in limits), "what the picture's age left of it"
+    assert (found, len(limits)) == (
+        "no_frame" if late == LOOKS_MAX else looked,
+        min(late + 1, LOOKS_MAX),
+    )
+    assert all(0.0 < limit < LOOKED_AT_MAX_S for limit in limits), (
+        "what the picture's age left of it"
+    )
 
 
 def test_what_was_seen_before_the_detector_was_loaded_is_no_place(
@@ -431,7 +464,9 @@ def test_a_goal_whose_runner_is_gone_is_not_called_cancelled(
                 client = await stack.enter_async_context(RunnerClient(runner.endpoint))
                 doing = asyncio.create_task(Tools(client, None, None)(GRAB))
                 await runner.accepted.wait()
-                client._timeout_s = client._connect_timeout_s = 0.3  # of no use any more: nobody will answer
+                client._timeout_s = client._connect_timeout_s = (
+                    0.3  # of no use any more: nobody will answer
+                )
             return await doing
 
     outcome = play(story)
@@ -463,18 +498,24 @@ def test_a_goal_that_is_cancelled_twice_is_waited_for_all_the_same(a_runner: Any
             while not runner.cancelled:
                 await asyncio.sleep(0.01)
             inbox.put(Cancel("at once"))
-            await asyncio.wait({episode}, timeout=0.3)  # what is tested is that time passes without an end
+            await asyncio.wait(
+                {episode}, timeout=0.3
+            )  # what is tested is that time passes without an end
             waits = not episode.done()
             runner.result_error = None
             await runner.end("canceled")
             result = await episode
-            return ("waited" if waits else "left it running"), [step["status"] for step in result["steps"]]
+            return ("waited" if waits else "left it running"), [
+                step["status"] for step in result["steps"]
+            ]
 
     assert play(story) == ("waited", ["canceled"])
 
 
 @pytest.mark.parametrize("ended", [InternalError("a defect"), LimitExceeded("too many")])
-def test_a_goal_whose_result_cannot_be_asked_for_is_called_off(a_runner: Any, ended: VramError) -> None:
+def test_a_goal_whose_result_cannot_be_asked_for_is_called_off(
+    a_runner: Any, ended: VramError
+) -> None:
     """Regression: the goal went on without anybody who waited for it."""
 
     async def story() -> tuple[str, str, int]:
@@ -486,7 +527,9 @@ def test_a_goal_whose_result_cannot_be_asked_for_is_called_off(a_runner: Any, en
     assert play(story) == ("failed", ended.code, 1)
 
 
-def test_a_model_whose_licence_is_barred_is_not_loaded_either(a_runner: Any, a_sidecar: Any) -> None:
+def test_a_model_whose_licence_is_barred_is_not_loaded_either(
+    a_runner: Any, a_sidecar: Any
+) -> None:
     """Regression: it was not asked, but `lifecycle_transition` put it on the card."""
 
     async def story() -> tuple[str, str, list[str]]:
@@ -496,8 +539,12 @@ def test_a_model_whose_licence_is_barred_is_not_loaded_either(a_runner: Any, a_s
             a_sidecar("lab/eye") as sidecar,
             DetectorClient(sidecar.endpoint) as detector,
         ):
-            palette = Palette((Skill("lab/eye", "detector", "", ("detect",), barred="its licence"),))
-            tools = Tools(client, detector, None, palette=palette, components={"detector": detector})
+            palette = Palette(
+                (Skill("lab/eye", "detector", "", ("detect",), barred="its licence"),)
+            )
+            tools = Tools(
+                client, detector, None, palette=palette, components={"detector": detector}
+            )
             outcome = await tools(LifecycleTransition(node="detector", transition="activate"))
             return outcome.status, outcome.code, sidecar.asked
 

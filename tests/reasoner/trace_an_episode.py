@@ -11,12 +11,12 @@ from opentelemetry.sdk.trace import TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 
-from reasoner.inbox import Inbox, Said
-from reasoner.loop import run_episode
-from reasoner.palette import Palette, Skill
-from reasoner.planner import Episode, Finish, Outcome
-from schemas import tracing
-from schemas.tools import ExecuteRskill, ToolCall
+from vram_arbiter.reasoner.inbox import Inbox, Said
+from vram_arbiter.reasoner.loop import run_episode
+from vram_arbiter.reasoner.palette import Palette, Skill
+from vram_arbiter.reasoner.planner import Episode, Finish, Outcome
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.schemas.tools import ExecuteRskill, ToolCall
 
 PALETTE = Palette((Skill("lab/grab", "vla", "grab", ("grasp",)),))
 

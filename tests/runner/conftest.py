@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from runner.protocols import DeadlinePolicy, Joint, MobileBase, RobotDescription
-from runner.sim.arm_env import ArmEnvironment
-from runner.sim.sim_runner import SimRunner
-from schemas.world import CameraModel
+from vram_arbiter.runner.protocols import DeadlinePolicy, Joint, MobileBase, RobotDescription
+from vram_arbiter.runner.sim.arm_env import ArmEnvironment
+from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.schemas.world import CameraModel
 
 sys.path.insert(0, str(Path(__file__).parent))  # for the helpers beside it
 
@@ -56,7 +56,9 @@ class KinematicEnv:
         self.base = (0.0, 0.0, 0.0)
 
     def step(
-        self, arm_target: Mapping[str, float] | None, base_velocity: tuple[float, float, float] | None = None
+        self,
+        arm_target: Mapping[str, float] | None,
+        base_velocity: tuple[float, float, float] | None = None,
     ) -> None:
         if self.fails:
             raise ValueError("the physics blew up")

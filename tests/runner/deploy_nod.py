@@ -8,13 +8,13 @@ from collections.abc import Mapping
 
 from small_robots import Nod
 
-from runner.__main__ import parse
-from runner.catalogue import Maker
-from runner.cli.deploy import Deploy
-from runner.deployment import Parts, read_deployment
-from runner.skills.sidecar_policy import Arbiter
-from schemas.errors import ConfigError, EstopRequested, VramError
-from schemas.manifest import Kind
+from vram_arbiter.runner.__main__ import parse
+from vram_arbiter.runner.catalogue import Maker
+from vram_arbiter.runner.cli.deploy import Deploy
+from vram_arbiter.runner.deployment import Parts, read_deployment
+from vram_arbiter.runner.skills.sidecar_policy import Arbiter
+from vram_arbiter.schemas.errors import ConfigError, EstopRequested, VramError
+from vram_arbiter.schemas.manifest import Kind
 
 STEPS = os.environ.get("NOD_STEPS")
 CAMERAS = tuple(filter(None, os.environ.get("NOD_CAMERAS", "").split(",")))
@@ -22,7 +22,11 @@ CAMERAS = tuple(filter(None, os.environ.get("NOD_CAMERAS", "").split(",")))
 
 def makers(parts: Parts, arbiter: Arbiter | None) -> Mapping[Kind, Maker]:
     steps = int(STEPS) if STEPS else None
-    return {Kind.ROS_ACTION: lambda manifest: Nod(manifest, cameras=CAMERAS, steps=steps, all_joints=True)}
+    return {
+        Kind.ROS_ACTION: lambda manifest: Nod(
+            manifest, cameras=CAMERAS, steps=steps, all_joints=True
+        )
+    }
 
 
 def main() -> int:

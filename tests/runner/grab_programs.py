@@ -9,16 +9,14 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
+from tests.support.process import ArbiterProcess
 
 ROOT = Path(__file__).parents[2]
 SKILLS = ROOT / "configs/rskills"
 SKILL = SKILLS / "so101-grab/rskill.yaml"
 GRAB = "vram-arbiter/so101-grab"
 SCENARIO_S = 280.0
-GOAL_S = (
-    200.0  # of a goal, with its policy's first load: on a busy machine importing torch alone takes a minute
-)
+GOAL_S = 200.0  # of a goal, with its policy's first load: on a busy machine importing torch alone takes a minute
 
 
 def need_checkpoint() -> None:
@@ -33,7 +31,15 @@ class GrabPrograms:
     def __init__(self, arbiter: ArbiterProcess, *runner: str) -> None:
         self.log = arbiter.runtime / "programs.log"
         environ = arbiter.environ | {"OMP_NUM_THREADS": "1"}
-        sidecar = ["sidecars", "--name", "grab", "--rskill", str(SKILL), "--device", f"fake:{arbiter.card}"]
+        sidecar = [
+            "sidecars",
+            "--name",
+            "grab",
+            "--rskill",
+            str(SKILL),
+            "--device",
+            f"fake:{arbiter.card}",
+        ]
         with self.log.open("ab") as log:
             self.sidecar, self.runner = (
                 subprocess.Popen(

@@ -56,7 +56,13 @@ class Point(gymnasium.Env[Any, Any]):
         self.steps += 1
         self.at = np.asarray(action, float)
         gap = float(np.abs(self.at - self.mark).max())
-        return self._look(), -gap, gap < 0.05, False, {"is_success": gap < 0.05} if self.told else {}
+        return (
+            self._look(),
+            -gap,
+            gap < 0.05,
+            False,
+            {"is_success": gap < 0.05} if self.told else {},
+        )
 
     def render(self) -> Any:
         return self._look()["pixels"]["top"]
@@ -87,7 +93,9 @@ class Hand(gymnasium.Env[Any, Any]):
                 "gripper": spaces.Discrete(3, start=-1),
                 "heat": spaces.Box(0, 255, (4, 4), np.uint8),
                 "order": spaces.Text(20),
-                "views": spaces.Tuple((spaces.Box(0, 255, (16, 16, 3), np.uint8), spaces.MultiBinary(2))),
+                "views": spaces.Tuple(
+                    (spaces.Box(0, 255, (16, 16, 3), np.uint8), spaces.MultiBinary(2))
+                ),
             }
         )
         self.taken: list[Any] = []

@@ -3,16 +3,16 @@
 import asyncio
 from collections.abc import Callable
 
-from runner.clock import Clock
-from runner.hal.kinematic import KinematicTwin
-from runner.hal.so101 import so101
-from runner.protocols import Act, Done, Goal, StepOutcome
-from runner.sensors import Feed, SlotReader
-from runner.skills.base import SkillBase
-from schemas.control import ControlMode
-from schemas.errors import RobotFault
-from schemas.manifest import RSkillManifest
-from schemas.world import Action, FrameEncoding, JointState, SensorFrame, WorldState
+from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.hal.kinematic import KinematicTwin
+from vram_arbiter.runner.hal.so101 import so101
+from vram_arbiter.runner.protocols import Act, Done, Goal, StepOutcome
+from vram_arbiter.runner.sensors import Feed, SlotReader
+from vram_arbiter.runner.skills.base import SkillBase
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import RobotFault
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.world import Action, FrameEncoding, JointState, SensorFrame, WorldState
 
 
 class FedCamera(SlotReader):

@@ -13,15 +13,15 @@ from typing import Any
 import pytest
 from small_robots import FedCamera, Nod, Twin
 
-from clients.runner import RunnerClient
-from runner.catalogue import Catalogue
-from runner.clock import SystemClock
-from runner.control import ControlThread
-from runner.goals import GoalServer
-from runner.hardware import HardwareRunner
-from runner.safety.ranges import JointRanges
-from schemas.errors import EstopRequested
-from schemas.manifest import Kind, load_manifest
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.runner.catalogue import Catalogue
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.control import ControlThread
+from vram_arbiter.runner.goals import GoalServer
+from vram_arbiter.runner.hardware import HardwareRunner
+from vram_arbiter.runner.safety.ranges import JointRanges
+from vram_arbiter.schemas.errors import EstopRequested
+from vram_arbiter.schemas.manifest import Kind, load_manifest
 
 pytestmark = pytest.mark.e2e
 

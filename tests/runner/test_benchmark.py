@@ -15,14 +15,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.__main__ import main
-from runner.cli.benchmark import add_parser, worlds_of
-from runner.sim.benchmark import Benchmark, Cell, PolicyContestant, file_name, wilson
-from runner.sim.gym_config import GymConfig
-from runner.sim.gym_env import GymEnv
-from runner.sim.policies import Policy, policy_of
-from runner.sim.sim_runner import SimRunner
-from schemas.errors import SidecarUnavailable
+from vram_arbiter.runner.__main__ import main
+from vram_arbiter.runner.cli.benchmark import add_parser, worlds_of
+from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, PolicyContestant, file_name, wilson
+from vram_arbiter.runner.sim.gym_config import GymConfig
+from vram_arbiter.runner.sim.gym_env import GymEnv
+from vram_arbiter.runner.sim.policies import Policy, policy_of
+from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.schemas.errors import SidecarUnavailable
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
@@ -87,7 +87,9 @@ def test_one_reset_a_seed_and_the_same_seeds_play_the_same(run_async: Run) -> No
         return cell
 
     first, second = play(), play()
-    assert [(e.seed, e.success, e.steps) for e in first.episodes] == [(n, True, 3) for n in range(20, 25)]
+    assert [(e.seed, e.success, e.steps) for e in first.episodes] == [
+        (n, True, 3) for n in range(20, 25)
+    ]
     assert [e.total_reward for e in first.episodes] == [e.total_reward for e in second.episodes]
     assert (first.complete, first.success_rate, first.errors) == (True, 1.0, 0)
 
@@ -106,7 +108,8 @@ def test_a_policy_with_a_defect_fails_and_one_that_gives_up_is_judged(run_async:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize(
-    ("least", "steps", "success"), [(-100, 0, False), (-100, 3, False), (-100, 6, True), (-1, 6, False)]
+    ("least", "steps", "success"),
+    [(-100, 0, False), (-100, 3, False), (-100, 6, True), (-1, 6, False)],
 )
 def test_who_leaves_before_it_costs_anything_has_not_succeeded(
     run_async: Run, least: int, steps: int, success: bool
@@ -114,7 +117,10 @@ def test_who_leaves_before_it_costs_anything_has_not_succeeded(
     """Rewards of a pendulum are costs: whoever does nothing has the greatest return."""
     config = GymConfig(success=f"return:{least}")
     runner = SimRunner(
-        lambda: GymEnv("Pendulum-v1", config, render=False), rate_hz=0, ends_with_skill=True, max_steps=5
+        lambda: GymEnv("Pendulum-v1", config, render=False),
+        rate_hz=0,
+        ends_with_skill=True,
+        max_steps=5,
     )
 
     def make(env: Any, seed: int) -> Any:
@@ -124,12 +130,16 @@ def test_who_leaves_before_it_costs_anything_has_not_succeeded(
     cell: Cell = run_async(
         Benchmark(runner, world="pendulum").run(PolicyContestant(Policy("quits", make)), (0,))
     )
-    assert [(e.success, e.steps, e.truncated) for e in cell.episodes] == [(success, min(steps, 5), True)]
+    assert [(e.success, e.steps, e.truncated) for e in cell.episodes] == [
+        (success, min(steps, 5), True)
+    ]
 
 
 @pytest.mark.heavy
 def test_nobody_judges_a_world_that_says_nothing(run_async: Run) -> None:
-    cell: Cell = run_async(Counted(told=False).bench.run(PolicyContestant(policy_of(SEEK)), (12, 13)))
+    cell: Cell = run_async(
+        Counted(told=False).bench.run(PolicyContestant(policy_of(SEEK)), (12, 13))
+    )
     assert [(e.success, e.error) for e in cell.episodes] == [(None, ""), (None, "model_error")]
     assert cell.summary()["success_rate"] is None
     assert (cell.judged, cell.errors) == (0, 1)
@@ -203,8 +213,8 @@ def test_stopping_within_an_episode_keeps_what_was_played(run_async: Run) -> Non
 
 @pytest.mark.heavy
 def test_a_contestant_that_never_acts_does_not_play_for_ever(run_async: Run) -> None:
-    from runner.protocols import Hold
-    from runner.sim.policies import PolicyPlayer
+    from vram_arbiter.runner.protocols import Hold
+    from vram_arbiter.runner.sim.policies import PolicyPlayer
 
     class Still(PolicyPlayer):
         def step(self, world: Any) -> Any:
@@ -243,7 +253,10 @@ def test_worlds_contestants_and_seeds_make_a_report_a_table_and_videos(
         "--out",
         str(tmp_path),
     ]
-    assert main(["benchmark", "--env", POINT, "--env", "gym:Pendulum-v1", "--max-steps", "9", *flags]) == 1
+    assert (
+        main(["benchmark", "--env", POINT, "--env", "gym:Pendulum-v1", "--max-steps", "9", *flags])
+        == 1
+    )
     cells = report(tmp_path)["cells"]
     assert [(c["world"], c["contestant"], c["successes"], c["judged"]) for c in cells] == [
         (POINT, "random", 0, 2),
@@ -267,7 +280,12 @@ def test_a_skill_and_the_expert_in_our_own_scene(tmp_path: Path) -> None:
     common = ["benchmark", "--no-arbiter", "--no-videos", "--out", str(tmp_path)]
     assert main([*common, "--skill", "vram-arbiter/so101-navigate", "--episodes", "2"]) == 0
     (cell,) = report(tmp_path)["cells"]
-    assert (cell["world"], cell["task"], cell["successes"], cell["judged"]) == ("so101", "navigate", 2, 2)
+    assert (cell["world"], cell["task"], cell["successes"], cell["judged"]) == (
+        "so101",
+        "navigate",
+        2,
+        2,
+    )
     assert cell["revision"]
     assert all(played["steps"] > 10 and played["video"] is None for played in cell["episodes"])
     assert main([*common, "--policy", "expert", "--episodes", "1", "--max-steps", "150"]) == 0
@@ -306,7 +324,10 @@ def test_without_videos_a_skill_sees_what_it_saw_with_them() -> None:
     for flags, cameras in (
         (["--skill", "any"], ("top", "render")),
         (["--skill", "any", "--no-videos"], ("top", "render")),
-        (["--policy", "random", "--no-videos"], ("top",)),  # it looks through no camera: nothing is rendered
+        (
+            ["--policy", "random", "--no-videos"],
+            ("top",),
+        ),  # it looks through no camera: nothing is rendered
     ):
         (world,) = worlds_of(parser.parse_args(["benchmark", "--env", POINT, *flags]))
         env = world.make()
@@ -346,11 +367,23 @@ def test_two_cells_of_one_name_do_not_overwrite_each_others_videos(
 @pytest.mark.e2e
 def test_a_signal_ends_it_with_a_report_of_what_was_played(tmp_path: Path) -> None:
     argv = [
-        *(sys.executable, "-m", "runner", "benchmark", "--env", POINT, "--policy", SEEK, "--no-videos"),
+        *(
+            sys.executable,
+            "-m",
+            "vram_arbiter.runner",
+            "benchmark",
+            "--env",
+            POINT,
+            "--policy",
+            SEEK,
+            "--no-videos",
+        ),
         *("--episodes", "1000000", "--out", str(tmp_path)),
     ]
     environ = os.environ | {"PYTHONPATH": f"{ROOT}:{HERE}"}
-    process = subprocess.Popen(argv, cwd=ROOT, env=environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process = subprocess.Popen(
+        argv, cwd=ROOT, env=environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
     try:
         assert process.stderr is not None
         while b"seed 20:" not in (line := process.stderr.readline()):

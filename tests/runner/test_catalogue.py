@@ -2,12 +2,12 @@
 
 import pytest
 
-from runner.body import SIMULATED
-from runner.catalogue import EXECUTABLE, Catalogue, Maker
-from runner.protocols import Skill
-from schemas.body import Body
-from schemas.errors import UnknownSkill
-from schemas.manifest import Kind, RSkillManifest
+from vram_arbiter.runner.body import SIMULATED
+from vram_arbiter.runner.catalogue import EXECUTABLE, Catalogue, Maker
+from vram_arbiter.runner.protocols import Skill
+from vram_arbiter.schemas.body import Body
+from vram_arbiter.schemas.errors import UnknownSkill
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 
 ARM = [{"kind": "joint_position", "control_mode_semantics": {"mode": "absolute"}}]
 ROS = {"package": "p", "interface_type": "T", "interface_name": "/t", "default_goal_json": "{}"}
@@ -67,21 +67,29 @@ def test_every_kind_runs_or_is_refused_with_the_way_to_use_it(kind: Kind) -> Non
     if kind in EXECUTABLE:
         assert with_makers.find(f"lab/{kind}")[2].kind is kind
     else:
-        with pytest.raises(UnknownSkill, match=f"is a {kind} and cannot be executed: .*{REASON[kind]}"):
+        with pytest.raises(
+            UnknownSkill, match=f"is a {kind} and cannot be executed: .*{REASON[kind]}"
+        ):
             with_makers.find(f"lab/{kind}")
         assert with_makers.executable() == []
     with pytest.raises(UnknownSkill, match=f"is a {kind} and cannot be executed: .*{REASON[kind]}"):
         without.find(f"lab/{kind}")
-    assert any("listed, not executed" in line and REASON[kind] in line for line in without.summary())
+    assert any(
+        "listed, not executed" in line and REASON[kind] in line for line in without.summary()
+    )
     assert [listed["name"] for listed in without.as_wire()] == [f"lab/{kind}"]
 
 
 def test_a_goal_for_another_robot_is_refused_whoever_asks() -> None:
     found = Catalogue(
-        [manifest(Kind.VLA, "go2"), manifest(Kind.ROS_ACTION, "mobile_base")], EVERY_MAKER, body=SIMULATED
+        [manifest(Kind.VLA, "go2"), manifest(Kind.ROS_ACTION, "mobile_base")],
+        EVERY_MAKER,
+        body=SIMULATED,
     )
     assert [one.name for one in found.executable()] == ["lab/ros_action"]
-    with pytest.raises(UnknownSkill, match="made for go2; this robot is so101_follower and mobile_base"):
+    with pytest.raises(
+        UnknownSkill, match="made for go2; this robot is so101_follower and mobile_base"
+    ):
         found.find("lab/vla")
     assert len(found.as_wire()) == 2, "whoever plans hears why"
     assert Body.model_validate(found.body_as_wire()) == SIMULATED

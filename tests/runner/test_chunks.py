@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from runner.skills.chunks import ChunkPlayer, Played
-from schemas.errors import Evicted, ModelError
+from vram_arbiter.runner.skills.chunks import ChunkPlayer, Played
+from vram_arbiter.schemas.errors import Evicted, ModelError
 
 Row = tuple[float, ...]
 
@@ -62,7 +62,9 @@ def test_without_prefetch_the_observation_is_taken_after_the_last_row() -> None:
     assert player.next_row("o0") is None
     assert not player.wants_observation()
     policy.answer()
-    assert [player.next_row(None) for _ in range(3)] == [Played(0, (0.0, float(i))) for i in range(3)]
+    assert [player.next_row(None) for _ in range(3)] == [
+        Played(0, (0.0, float(i))) for i in range(3)
+    ]
     assert player.wants_observation()
     assert player.next_row("o3") is None
     assert policy.asked == ["o0", "o3"]

@@ -1,6 +1,6 @@
 """precise_sleep: asleep up to the last millisecond, awake for that one."""
 
-from runner.clock import BUSY_TAIL_S, SystemClock, precise_sleep
+from vram_arbiter.runner.clock import BUSY_TAIL_S, SystemClock, precise_sleep
 
 
 class Ticking:

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from runner.control import MAILBOX_MAX, ControlThread, Mailbox
-from runner.protocols import Goal, Hold, SkillKey, StepOutcome
-from runner.sim.sim_runner import SimRunner
-from schemas.errors import BadState, InternalError
-from schemas.world import WorldState
+from vram_arbiter.runner.control import MAILBOX_MAX, ControlThread, Mailbox
+from vram_arbiter.runner.protocols import Goal, Hold, SkillKey, StepOutcome
+from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.schemas.errors import BadState, InternalError
+from vram_arbiter.schemas.world import WorldState
 
 Run = Callable[[Any], Any]
 Make = Callable[..., SimRunner]

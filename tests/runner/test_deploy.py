@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from clients.runner import RunnerClient
-from runner.cli.deploy import claim
-from schemas.errors import AlreadyRunning, EstopRequested, InternalError, UnknownSkill
-from schemas.robot import HalConfig, RobotEnvironment
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.runner.cli.deploy import claim
+from vram_arbiter.schemas.config.robot import HalConfig, RobotEnvironment
+from vram_arbiter.schemas.errors import AlreadyRunning, EstopRequested, InternalError, UnknownSkill
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
 
@@ -202,9 +202,20 @@ def test_the_emergency_stop_of_a_real_process(start: Start, tmp_path: Path) -> N
 
     async def body(client: RunnerClient) -> None:
         goal = await under_way(client)
-        argv = [sys.executable, "-m", "runner", "estop", "--reason", "test", "--endpoint", client.endpoint]
+        argv = [
+            sys.executable,
+            "-m",
+            "vram_arbiter.runner",
+            "estop",
+            "--reason",
+            "test",
+            "--endpoint",
+            client.endpoint,
+        ]
         said, complaint = b"", b"has not obeyed"
-        while b"has not obeyed" in complaint:  # within a second, which a busy machine may need for less
+        while (
+            b"has not obeyed" in complaint
+        ):  # within a second, which a busy machine may need for less
             program = await asyncio.create_subprocess_exec(
                 *argv, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
             )
@@ -287,13 +298,16 @@ def test_a_port_has_one_runner_whatever_its_robots_are_called(
 
     def robot(robot_id: str, port: Path) -> RobotEnvironment:
         return RobotEnvironment(
-            robot_id=robot_id, hal=HalConfig(adapter="lerobot:so101_follower", transport={"port": str(port)})
+            robot_id=robot_id,
+            hal=HalConfig(adapter="lerobot:so101_follower", transport={"port": str(port)}),
         )
 
     async def scenario() -> None:
         async with contextlib.AsyncExitStack() as stack:
             claim(robot("left", bus), stack)
-            with pytest.raises(AlreadyRunning, match=rf"pid {os.getpid()}\) already uses port .*by-id"):
+            with pytest.raises(
+                AlreadyRunning, match=rf"pid {os.getpid()}\) already uses port .*by-id"
+            ):
                 claim(robot("right", link), stack)
             claim(robot("other", tmp_path / "ttyACM1"), stack)
 
@@ -318,9 +332,7 @@ def test_a_signal_while_it_waits_for_a_camera_ends_it_at_once(start: Start, tmp_
 
     with socket.create_server(("127.0.0.1", 0)) as listening:  # accepts, and never says a word
         port = listening.getsockname()[1]
-        more = (
-            f"  - {{sensor_id: silent, backend_params: {{url: 'rtsp://127.0.0.1:{port}/', timeout_s: 60}}}}\n"
-        )
+        more = f"  - {{sensor_id: silent, backend_params: {{url: 'rtsp://127.0.0.1:{port}/', timeout_s: 60}}}}\n"
         process = start(more=more)
         listening.settimeout(60)
         connection, _ = listening.accept()  # it waits for a picture now

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from grab_programs import GOAL_S, GRAB, SKILL, GrabPrograms, need_checkpoint
 
-from arbiter.testing.process import ArbiterProcess
-from clients.aio import ArbiterClient
-from clients.runner import RunnerClient
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.runner import RunnerClient
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(340)]
 
@@ -32,8 +32,8 @@ def _videos(folder: Path) -> dict[str, Path]:
     """A second of what both cameras see when the base stands before the object, arm at rest: the policy knows such pictures."""
     import cv2
 
-    from runner.sim.dataset import stand_before
-    from runner.sim.env import SimEnv
+    from vram_arbiter.runner.sim.dataset import stand_before
+    from vram_arbiter.runner.sim.env import SimEnv
 
     paths = {}
     with SimEnv() as env:
@@ -43,7 +43,9 @@ def _videos(folder: Path) -> dict[str, Path]:
             picture = env.render(name)[:, :, ::-1]
             paths[name] = folder / f"{name}.avi"
             height, width = picture.shape[:2]
-            writer = cv2.VideoWriter(str(paths[name]), cv2.VideoWriter.fourcc(*"MJPG"), 30, (width, height))
+            writer = cv2.VideoWriter(
+                str(paths[name]), cv2.VideoWriter.fourcc(*"MJPG"), 30, (width, height)
+            )
             assert writer.isOpened()
             for _ in range(30):
                 writer.write(picture)

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from clients.runner import RunnerClient
-from schemas.errors import UnknownSkill
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.schemas.errors import UnknownSkill
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
 
@@ -37,7 +37,7 @@ def test_the_arm_goes_where_the_trajectory_says(tmp_path: Path) -> None:
     )
     environ = os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path), "OMP_NUM_THREADS": "1"}
     command = [
-        sys.executable, "-m", "runner", "deploy", "--config", str(config), "--no-arbiter",
+        sys.executable, "-m", "vram_arbiter.runner", "deploy", "--config", str(config), "--no-arbiter",
         "--skills", str(ROOT / "configs/rskills/so101-move"), str(ROOT / "configs/rskills/so101-navigate"),
     ]  # fmt: skip
     process = subprocess.Popen(command, cwd=ROOT, env=environ, stderr=subprocess.PIPE, text=True)
@@ -51,14 +51,21 @@ def test_the_arm_goes_where_the_trajectory_says(tmp_path: Path) -> None:
             angles = dict(zip(joints["name"], joints["position"], strict=True))
             assert angles["shoulder_pan"] == pytest.approx(-0.4, abs=0.06)
             assert angles["wrist_flex"] == pytest.approx(1.2, abs=0.06)
-            assert angles["elbow_flex"] == pytest.approx(1.05, abs=0.02), "joints that are not named stay"
+            assert angles["elbow_flex"] == pytest.approx(1.05, abs=0.02), (
+                "joints that are not named stay"
+            )
 
             # half of the servos' speed is this robot's limit: said before anything moves
             result = await (
-                await client.send_goal(SKILL, goal_params=points((0.0, 1.0), (1.9, 1.0), (-0.9, 1.0)))
+                await client.send_goal(
+                    SKILL, goal_params=points((0.0, 1.0), (1.9, 1.0), (-0.9, 1.0))
+                )
             ).result(120)
             assert (result["status"], result["code"]) == ("failed", "bad_request")
-            assert "points[2]: shoulder_pan would have to make 2.80 rad/s; at most 2.35" in result["message"]
+            assert (
+                "points[2]: shoulder_pan would have to make 2.80 rad/s; at most 2.35"
+                in result["message"]
+            )
             result = await (await client.send_goal(SKILL)).result(120)
             assert "an empty one moves nothing" in result["message"]
             joints = (await client.state())["world"]["joint_state"]

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from runner.__main__ import main, parse
-from runner.clock import SystemClock
-from runner.deployment import make_parts, read_deployment
-from schemas.errors import ConfigError
+from vram_arbiter.runner.__main__ import main, parse
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.deployment import make_parts, read_deployment
+from vram_arbiter.schemas.errors import ConfigError
 
 pytestmark = pytest.mark.heavy  # the SO-101's kinematics
 
@@ -31,7 +31,9 @@ def test_the_shipped_twin_passes(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.fixture
-def dry_run(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> DryRun:
+def dry_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> DryRun:
     """Exit code, stdout and stderr of a dry run of this text; fails when it leaves anything behind."""
     runtime = tmp_path / "runtime"
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(runtime))
@@ -50,7 +52,9 @@ def dry_run(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pyt
 def licensed(tmp_path: Path, licence: str, manifest: Path = NAVIGATE) -> Path:
     folder = tmp_path / "skills" / licence
     folder.mkdir(parents=True)
-    text = re.sub(r'license: "[^"]+"', f'license: "{licence}"', manifest.read_text(encoding="utf-8"))
+    text = re.sub(
+        r'license: "[^"]+"', f'license: "{licence}"', manifest.read_text(encoding="utf-8")
+    )
     (folder / "rskill.yaml").write_text(text, encoding="utf-8")
     return folder
 
@@ -97,7 +101,10 @@ def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_ro
 ) -> None:
     folder = tmp_path / "skills" / "careful"
     folder.mkdir(parents=True)
-    text = GRAB.read_text(encoding="utf-8") + "envelope: {human_in_loop_required: [grasp], max_force_n: 5}\n"
+    text = (
+        GRAB.read_text(encoding="utf-8")
+        + "envelope: {human_in_loop_required: [grasp], max_force_n: 5}\n"
+    )
     (folder / "rskill.yaml").write_text(text, encoding="utf-8")
     sensors = "sensors: [{sensor_id: front, backend_params: {device: 0}}, {sensor_id: wrist, backend_params: {device: 1}}]\n"
     _, out, err = dry_run(TWIN + sensors, skills=folder)
@@ -145,7 +152,8 @@ def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_ro
             r"robot\.yaml:5: vla\.id: vram-arbiter/so101-navigate is not offered here: it is made for mobile_base; this robot is so101_follower",
         ),
         (
-            TWIN + "embodiment_tags: [mobile_base]\ntask: {id: t}\nvla:\n  id: vram-arbiter/so101-navigate\n",
+            TWIN
+            + "embodiment_tags: [mobile_base]\ntask: {id: t}\nvla:\n  id: vram-arbiter/so101-navigate\n",
             r"robot\.yaml:6: vla\.id: .* is not offered here: this runner has no ROS 2 action client; it stands in for control_msgs/FollowJointTrajectory, not for nav2_msgs/NavigateToPose",
         ),
         (
@@ -192,7 +200,8 @@ def test_a_file_that_is_not_there_is_named(capsys: pytest.CaptureFixture[str]) -
 
 def test_a_task_needs_the_cameras_that_its_skill_looks_at(dry_run: DryRun) -> None:
     code, _, err = dry_run(
-        TWIN + "sensors:\n  - {sensor_id: front, backend_params: {device: 0}}\n" + GRAB_TASK, skills=GRAB
+        TWIN + "sensors:\n  - {sensor_id: front, backend_params: {device: 0}}\n" + GRAB_TASK,
+        skills=GRAB,
     )
     assert code == 2
     assert re.search(
@@ -241,7 +250,9 @@ def test_the_fields_own_files_are_read_as_the_field_means_them(dry_run: DryRun) 
 @pytest.mark.parametrize(
     "field", ["weights_uri: 'hf://other/weights'", "runtime: onnx", "quantization: int4"]
 )
-def test_the_file_cannot_ask_for_other_weights_than_are_installed(dry_run: DryRun, field: str) -> None:
+def test_the_file_cannot_ask_for_other_weights_than_are_installed(
+    dry_run: DryRun, field: str
+) -> None:
     cameras = "".join(
         f"  - {{sensor_id: {name}, backend_params: {{device: 0}}}}\n" for name in ("front", "wrist")
     )
@@ -274,23 +285,32 @@ def test_a_licence_may_be_overruled_by_a_flag(dry_run: DryRun, tmp_path: Path) -
     assert "so101-grab 0.1.0 (nvidia_non_commercial)" in out
 
 
-def test_serving_goals_offers_only_what_is_licensed_and_fits(dry_run: DryRun, tmp_path: Path) -> None:
+def test_serving_goals_offers_only_what_is_licensed_and_fits(
+    dry_run: DryRun, tmp_path: Path
+) -> None:
     code, out, _ = dry_run(TWIN, skills=licensed(tmp_path, "unknown"))
     assert code == 0
-    assert re.search(r"skill +vram-arbiter/so101-navigate is not offered: its licence, unknown", out), out
+    assert re.search(
+        r"skill +vram-arbiter/so101-navigate is not offered: its licence, unknown", out
+    ), out
     code, out, _ = dry_run(TWIN, skills=GRAB)
     assert code == 0
     assert re.search(
-        r"skill +vram-arbiter/so101-grab is not offered: .*looks at front, wrist; there is none", out
+        r"skill +vram-arbiter/so101-grab is not offered: .*looks at front, wrist; there is none",
+        out,
     ), out
 
 
-def test_a_skill_for_another_robot_or_beyond_this_one_is_refused(dry_run: DryRun, tmp_path: Path) -> None:
+def test_a_skill_for_another_robot_or_beyond_this_one_is_refused(
+    dry_run: DryRun, tmp_path: Path
+) -> None:
     """By tag, and by the value of a capability; the file may say more of the robot than its adapter does."""
     folder = tmp_path / "skills"
     folder.mkdir()
     needs = "capabilities_required: {can_lift_kg: 0.5, has_vision: true}\nkind: "
-    (folder / "rskill.yaml").write_text(GRAB.read_text(encoding="utf-8").replace("kind: ", needs, 1))
+    (folder / "rskill.yaml").write_text(
+        GRAB.read_text(encoding="utf-8").replace("kind: ", needs, 1)
+    )
     cameras = "".join(
         f"  - {{sensor_id: {name}, backend_params: {{device: 0}}}}\n" for name in ("front", "wrist")
     )
@@ -323,7 +343,9 @@ PLACES = [
 ]  # fmt: skip
 
 
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(place=st.sampled_from(PLACES), value=st.sampled_from(VALUES))
 def test_any_value_in_a_deployment_is_taken_or_found_fault_with(
     tmp_path: Path, place: str, value: str

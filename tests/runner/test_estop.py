@@ -22,11 +22,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from clients.estop import stop
-from runner.__main__ import main
-from runner.control import Mailbox
-from runner.estop import CONNECTIONS_PER_UID, SILENT_S, EstopServer
-from schemas.errors import (
+from vram_arbiter.clients.estop import stop
+from vram_arbiter.runner.__main__ import main
+from vram_arbiter.runner.control import Mailbox
+from vram_arbiter.runner.estop import CONNECTIONS_PER_UID, SILENT_S, EstopServer
+from vram_arbiter.schemas.errors import (
     AlreadyRunning,
     BadFrame,
     ConfigError,
@@ -34,7 +34,7 @@ from schemas.errors import (
     InternalError,
     RunnerUnreachable,
 )
-from schemas.estop import (
+from vram_arbiter.schemas.estop import (
     PREFIX,
     Answer,
     Reply,
@@ -245,7 +245,9 @@ def test_a_stop_is_read_by_a_process_that_has_no_descriptor_left(
     with serve(), socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
         client.settimeout(WAIT_S)
         taken: list[int] = []
-        resource.setrlimit(resource.RLIMIT_NOFILE, (max(map(int, os.listdir("/proc/self/fd"))) + 8, hard))
+        resource.setrlimit(
+            resource.RLIMIT_NOFILE, (max(map(int, os.listdir("/proc/self/fd"))) + 8, hard)
+        )
         try:
             with contextlib.suppress(OSError):
                 while True:
@@ -306,7 +308,9 @@ def test_the_socket_of_a_killed_runner_is_taken_over_and_nothing_else(
     with pytest.raises(AlreadyRunning, match="not a socket"), serve():
         pass
     with pytest.raises(ConfigError, match="the socket path has"):
-        path_of(f"ipc:///{'x' * 103}")  # fits the goal socket, and leaves no room for its emergency stop's
+        path_of(
+            f"ipc:///{'x' * 103}"
+        )  # fits the goal socket, and leaves no room for its emergency stop's
     with pytest.raises(ConfigError, match=r"no-such-folder/s\.estop: No such file"):
         EstopServer(
             f"ipc://{tmp_path}/no-such-folder/s", robot, robot.mailbox, on_stop=lambda *_: None
@@ -361,7 +365,9 @@ def test_a_false_runner_is_not_believed_that_the_motors_hold(
 
 
 @given(st.binary(max_size=600), st.sampled_from([b"", PREFIX, PREFIX + b"1\tlatched\t"]))
-def test_no_packet_is_anything_but_a_request_a_reply_or_refused(packet: bytes, prefix: bytes) -> None:
+def test_no_packet_is_anything_but_a_request_a_reply_or_refused(
+    packet: bytes, prefix: bytes
+) -> None:
     reason = reason_in(prefix + packet)
     assert (reason is not None) == (prefix + packet).startswith(PREFIX)
     assert reason is None or (reason.isprintable() and len(reason) <= 500)
@@ -370,7 +376,9 @@ def test_no_packet_is_anything_but_a_request_a_reply_or_refused(packet: bytes, p
 
 
 @given(st.sampled_from(Answer), st.integers(0, 1 << 63), st.text(), st.text())
-def test_a_reply_is_read_as_it_was_written(answer: Answer, stopped_ns: int, robot: str, text: str) -> None:
+def test_a_reply_is_read_as_it_was_written(
+    answer: Answer, stopped_ns: int, robot: str, text: str
+) -> None:
     read = reply_in(Reply(answer, stopped_ns, robot, text).encode())
     assert (read.answer, read.stopped_ns) == (answer, stopped_ns)
     assert (read.robot, read.text) == (one_line(robot), one_line(text))

@@ -6,14 +6,14 @@ from typing import Any
 import pytest
 from small_robots import FedCamera, Nod, Twin
 
-from runner.hardware import HardwareRunner
-from runner.protocols import Act, Done, Goal, GoalTick, Hold, SkillEnded
-from runner.safety.ranges import JointRanges
-from runner.skills.base import SkillState
-from schemas.control import ControlMode
-from schemas.errors import ModelError
-from schemas.manifest import load_manifest
-from schemas.world import Action
+from vram_arbiter.runner.hardware import HardwareRunner
+from vram_arbiter.runner.protocols import Act, Done, Goal, GoalTick, Hold, SkillEnded
+from vram_arbiter.runner.safety.ranges import JointRanges
+from vram_arbiter.runner.skills.base import SkillState
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import ModelError
+from vram_arbiter.schemas.manifest import load_manifest
+from vram_arbiter.schemas.world import Action
 
 GOAL, NEXT = Goal("g", "test/skill"), Goal("h", "test/skill")
 TWIST = Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.3, 0.0, 0.0, 0.0, 0.0, 0.1),))
@@ -64,7 +64,9 @@ class Scripted:
 
 
 def told(*row: float) -> Act:
-    return Act(Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), joint_names=NAMES))
+    return Act(
+        Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), joint_names=NAMES)
+    )
 
 
 @pytest.fixture
@@ -76,7 +78,9 @@ def sim(make_runner: Callable[..., Any]) -> tuple[Any, Follower]:
     return runner, follower
 
 
-def test_each_tick_says_which_targets_are_in_force_and_the_end_comes_last(sim: tuple[Any, Follower]) -> None:
+def test_each_tick_says_which_targets_are_in_force_and_the_end_comes_last(
+    sim: tuple[Any, Follower],
+) -> None:
     runner, follower = sim
     runner.begin_skill(
         Scripted(told(0.1, -1.0), Hold("thinking"), Act(TWIST), Done({})), GOAL, lambda _: None
@@ -86,7 +90,10 @@ def test_each_tick_says_which_targets_are_in_force_and_the_end_comes_last(sim: t
     assert [tick.result for tick in follower.ticks] == results[:4]
     assert [tick.targets["shoulder_pan"] for tick in follower.ticks] == [0.1] * 4  # a hold keeps it
     assert follower.ticks[0].targets["elbow_flex"] == 1.05  # where the world began
-    assert [tick.base_velocity for tick in follower.ticks][1:3] == [(0.0, 0.0, 0.0), (0.3, 0.0, 0.1)]
+    assert [tick.base_velocity for tick in follower.ticks][1:3] == [
+        (0.0, 0.0, 0.0),
+        (0.3, 0.0, 0.1),
+    ]
     assert [tick.result.action_applied for tick in follower.ticks] == [True, False, True, False]
     assert follower.heard[-1][2].error is None
     assert runner.result().metadata["recorded"] == {"heard": 5}
@@ -101,7 +108,9 @@ def test_an_error_ends_the_goal_after_its_own_tick(sim: tuple[Any, Follower]) ->
     assert isinstance(follower.heard[-1][2].error, ModelError)
 
 
-def test_a_goal_that_is_taken_back_ends_before_the_next_one_begins(sim: tuple[Any, Follower]) -> None:
+def test_a_goal_that_is_taken_back_ends_before_the_next_one_begins(
+    sim: tuple[Any, Follower],
+) -> None:
     runner, follower = sim
     runner.begin_skill(Scripted(Hold("a"), Hold("b")), GOAL, lambda _: None)
     runner.tick()
@@ -126,12 +135,16 @@ def test_nobody_follows_unless_asked(make_runner: Callable[..., Any]) -> None:
     assert runner.result().save_dir is None
 
 
-def test_a_policy_that_plays_by_itself_is_followed_like_a_goal(make_runner: Callable[..., Any]) -> None:
-    from runner.dataset.rows import row_of
-    from runner.sim.policies import policy_of
+def test_a_policy_that_plays_by_itself_is_followed_like_a_goal(
+    make_runner: Callable[..., Any],
+) -> None:
+    from vram_arbiter.runner.dataset.rows import row_of
+    from vram_arbiter.runner.sim.policies import policy_of
 
     follower = Follower()
-    runner = make_runner(rate_hz=0, seed=7, episodes=2, max_steps=3, policy=policy_of("random").play)
+    runner = make_runner(
+        rate_hz=0, seed=7, episodes=2, max_steps=3, policy=policy_of("random").play
+    )
     runner.sink = follower
     runner.activate()
     runner.run()

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from runner import frames
-from runner.clock import SystemClock
-from runner.control import ControlThread
-from schemas.errors import BadRequest, FrameStale
-from schemas.world import CameraModel
+from vram_arbiter.runner import frames
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.control import ControlThread
+from vram_arbiter.schemas.errors import BadRequest, FrameStale
+from vram_arbiter.schemas.world import CameraModel
 
 pytestmark = pytest.mark.heavy  # pictures: numpy, OpenCV
 
@@ -26,11 +26,18 @@ def test_the_first_camera_is_the_default(make_runner: Make, run_async: Run) -> N
     async def scenario() -> None:
         runner = make_runner(rate_hz=200.0, cameras=("front", "wrist"))
         async with ControlThread(runner) as control:
-            for camera, encoding, magic in (("", "png", b"\x89PNG"), ("wrist", "jpeg", b"\xff\xd8")):
-                reply = await frames.fetch(control, runner, SystemClock(), camera, 60_000.0, encoding)
+            for camera, encoding, magic in (
+                ("", "png", b"\x89PNG"),
+                ("wrist", "jpeg", b"\xff\xd8"),
+            ):
+                reply = await frames.fetch(
+                    control, runner, SystemClock(), camera, 60_000.0, encoding
+                )
                 assert reply["camera"] == (camera or "front")
                 assert reply["data"].startswith(magic)
-                picture = cv2.imdecode(np.frombuffer(reply["data"], dtype=np.uint8), cv2.IMREAD_COLOR)
+                picture = cv2.imdecode(
+                    np.frombuffer(reply["data"], dtype=np.uint8), cv2.IMREAD_COLOR
+                )
                 assert picture.shape == (24, 32, 3) == (reply["height"], reply["width"], 3)
                 assert 0 <= reply["age_ms"] <= 60_000
                 CameraModel.model_validate(reply["camera_model"])
@@ -45,7 +52,9 @@ def test_png_is_lossless_and_in_rgb_order() -> None:
     import numpy as np
 
     picture = np.random.default_rng(1).integers(0, 255, (6, 8, 3), dtype=np.uint8)
-    decoded = cv2.imdecode(np.frombuffer(frames.encode(picture, "png"), dtype=np.uint8), cv2.IMREAD_COLOR)
+    decoded = cv2.imdecode(
+        np.frombuffer(frames.encode(picture, "png"), dtype=np.uint8), cv2.IMREAD_COLOR
+    )
     assert (decoded[..., ::-1] == picture).all()
 
 

@@ -12,17 +12,17 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from clients.runner import RunnerClient
-from runner.catalogue import Catalogue, read_manifests
-from runner.clock import SystemClock
-from runner.control import ControlThread
-from runner.goals import GoalServer
-from runner.one_goal import LISTENERS_MAX
-from runner.protocols import Act, Done, Goal, Hold, StepOutcome
-from runner.sim.sim_runner import SimRunner
-from runner.skills.base import SkillBase
-from schemas.control import ControlMode
-from schemas.errors import (
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.runner.catalogue import Catalogue, read_manifests
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.control import ControlThread
+from vram_arbiter.runner.goals import GoalServer
+from vram_arbiter.runner.one_goal import LISTENERS_MAX
+from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
+from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.runner.skills.base import SkillBase
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import (
     AlreadyRunning,
     BadRequest,
     BadState,
@@ -34,8 +34,8 @@ from schemas.errors import (
     UnknownOp,
     UnknownSkill,
 )
-from schemas.manifest import Kind, RSkillManifest, load_manifest
-from schemas.world import Action, WorldState
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
+from vram_arbiter.schemas.world import Action, WorldState
 
 Run = Callable[[Any], Any]
 RSKILL = "vram-arbiter/so101-navigate"
@@ -82,7 +82,9 @@ class Told(SkillBase):
         names = ("shoulder_pan", "wrist_roll")
         if self.steps % 2:
             return Hold("thinking")
-        return Act(Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), joint_names=names))
+        return Act(
+            Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), joint_names=names)
+        )
 
     async def _finish(self) -> None:
         self.story.append("finish")
@@ -141,7 +143,10 @@ def bench(
 
 
 def play(
-    run_async: Run, bench: Callable[..., Any], endpoint: str, body: Callable[[Bench, RunnerClient], Any]
+    run_async: Run,
+    bench: Callable[..., Any],
+    endpoint: str,
+    body: Callable[[Bench, RunnerClient], Any],
 ) -> None:
     async def scenario() -> None:
         async with bench() as b, RunnerClient(endpoint) as client:
@@ -150,7 +155,9 @@ def play(
     run_async(scenario())
 
 
-def test_a_goal_feeds_back_and_ends_with_one_result(bench: Any, endpoint: str, run_async: Run) -> None:
+def test_a_goal_feeds_back_and_ends_with_one_result(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
         goal = await client.send_goal(RSKILL, prompt="end")
         states = [feedback["state"] async for feedback in goal.feedback()]
@@ -165,7 +172,9 @@ def test_a_goal_feeds_back_and_ends_with_one_result(bench: Any, endpoint: str, r
     play(run_async, bench, endpoint, body)
 
 
-def test_the_next_goal_of_the_same_skill_reuses_it(bench: Any, endpoint: str, run_async: Run) -> None:
+def test_the_next_goal_of_the_same_skill_reuses_it(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
         for _ in range(3):
             assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
@@ -175,7 +184,9 @@ def test_the_next_goal_of_the_same_skill_reuses_it(bench: Any, endpoint: str, ru
     play(run_async, bench, endpoint, body)
 
 
-def test_a_second_goal_is_refused_and_the_first_goes_on(bench: Any, endpoint: str, run_async: Run) -> None:
+def test_a_second_goal_is_refused_and_the_first_goes_on(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
         first = await client.send_goal(RSKILL, prompt="forever", goal_id="one")
         with pytest.raises(GoalRejected, match="goal one"):
@@ -282,13 +293,17 @@ def test_cancel_takes_the_arm_back(bench: Any, endpoint: str, run_async: Run, pr
     play(run_async, bench, endpoint, body)
 
 
-def test_cancel_right_behind_the_goal_still_gives_a_result(bench: Any, endpoint: str, run_async: Run) -> None:
+def test_cancel_right_behind_the_goal_still_gives_a_result(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
         socket = zmq.asyncio.Context.instance().socket(zmq.DEALER)
         try:
             socket.connect(endpoint)
             await socket.send(
-                msgpack.packb({"op": "goal", "id": 1, "goal_id": "g", "rskill_id": RSKILL, "prompt": "hang"})
+                msgpack.packb(
+                    {"op": "goal", "id": 1, "goal_id": "g", "rskill_id": RSKILL, "prompt": "hang"}
+                )
             )
             await socket.send(msgpack.packb({"op": "cancel", "id": 2, "goal_id": "g"}))
             results = []
@@ -317,7 +332,9 @@ def test_a_deadline_is_no_success(bench: Any, endpoint: str, run_async: Run, pro
     ("prompt", "code"),
     [("evicted", "evicted"), ("unavailable", "sidecar_unavailable"), ("defect", "internal")],
 )
-def test_failures_are_typed(bench: Any, endpoint: str, run_async: Run, prompt: str, code: str) -> None:
+def test_failures_are_typed(
+    bench: Any, endpoint: str, run_async: Run, prompt: str, code: str
+) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
         result = await (await client.send_goal(RSKILL, prompt=prompt)).result(60)
         assert (result["status"], result["success"], result["code"]) == ("failed", False, code)
@@ -344,7 +361,9 @@ def test_a_client_that_vanished_finds_its_result(bench: Any, endpoint: str, run_
     play(run_async, bench, endpoint, body)
 
 
-def test_the_same_goal_sent_again_is_the_same_goal(bench: Any, endpoint: str, run_async: Run) -> None:
+def test_the_same_goal_sent_again_is_the_same_goal(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
         goal = await client.send_goal(RSKILL, prompt="forever", goal_id="same")
         async with RunnerClient(endpoint) as other:
@@ -401,10 +420,15 @@ def test_reads(bench: Any, endpoint: str, run_async: Run) -> None:
         (msgpack.packb({"id": 1}), "unknown_op"),
         (msgpack.packb({"op": "goal", "id": 1, "goal_id": "g"}), "bad_request"),
         (
-            msgpack.packb({"op": "goal", "id": 1, "goal_id": "g", "rskill_id": "x", "deadline_s": -1}),
+            msgpack.packb(
+                {"op": "goal", "id": 1, "goal_id": "g", "rskill_id": "x", "deadline_s": -1}
+            ),
             "bad_request",
         ),
-        (msgpack.packb({"op": "goal", "id": 1, "goal_id": "g", "rskill_id": "a/b"}), "unknown_skill"),
+        (
+            msgpack.packb({"op": "goal", "id": 1, "goal_id": "g", "rskill_id": "a/b"}),
+            "unknown_skill",
+        ),
         (msgpack.packb({"op": "ping", "id": 1, "extra": 1}), "bad_request"),
         (msgpack.packb({"op": "ping", "id": "one"}), "bad_request"),
         (msgpack.packb({"op": "cancel", "id": 1, "goal_id": "none"}), "bad_request"),
@@ -439,7 +463,9 @@ def test_shutdown_answers_cancels_and_ends(bench: Any, endpoint: str, run_async:
     play(run_async, bench, endpoint, body)
 
 
-def test_a_second_runner_on_the_same_socket_is_refused(bench: Any, endpoint: str, run_async: Run) -> None:
+def test_a_second_runner_on_the_same_socket_is_refused(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
     async def scenario() -> None:
         async with bench() as b, RunnerClient(endpoint) as client:
             control = b.server._control
@@ -462,7 +488,9 @@ def test_only_skills_that_move_something_can_be_executed(navigate_manifest: Path
         Catalogue([detector], {Kind.DETECTOR: Told}).find(RSKILL)
 
 
-def test_manifests_are_read_from_folders_and_checked(tmp_path: Path, navigate_manifest: Path) -> None:
+def test_manifests_are_read_from_folders_and_checked(
+    tmp_path: Path, navigate_manifest: Path
+) -> None:
     (tmp_path / "one").mkdir()
     (tmp_path / "one/rskill.yaml").write_text(navigate_manifest.read_text())
     assert [manifest.name for manifest in read_manifests([tmp_path])] == [RSKILL]
@@ -495,7 +523,9 @@ def test_the_emergency_stop_of_a_simulator_ends_its_goal_too(
     play(run_async, bench, endpoint, body)
 
 
-def test_a_goal_runs_when_it_has_the_arm_and_not_before(bench: Any, endpoint: str, run_async: Run) -> None:
+def test_a_goal_runs_when_it_has_the_arm_and_not_before(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
     """Regression: until the control thread took it up, a goal was fed back with the progress of the goal before: ended, all of it done."""
 
     async def body(b: Bench, client: RunnerClient) -> None:
@@ -527,7 +557,9 @@ def test_a_goal_runs_when_it_has_the_arm_and_not_before(bench: Any, endpoint: st
     play(run_async, bench, endpoint, body)
 
 
-def test_an_answer_does_not_repeat_a_mebibyte_of_mistakes(bench: Any, endpoint: str, run_async: Run) -> None:
+def test_an_answer_does_not_repeat_a_mebibyte_of_mistakes(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
         with pytest.raises(UnknownOp) as unknown:
             await client.call("x" * 1_000_000)

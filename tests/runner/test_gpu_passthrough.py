@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from grab_programs import ROOT
 
-from arbiter.testing.process import ArbiterProcess
-from clients.aio import ArbiterClient
-from clients.runner import RunnerClient
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.runner import RunnerClient
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(300)]
 
@@ -20,7 +20,9 @@ SKILL = "vram-arbiter/gpu-passthrough"
 
 
 @pytest.fixture
-def programs(arbiter_daemon: ArbiterProcess, tmp_path: Path) -> Iterator[list["subprocess.Popen[bytes]"]]:
+def programs(
+    arbiter_daemon: ArbiterProcess, tmp_path: Path
+) -> Iterator[list["subprocess.Popen[bytes]"]]:
     environ = arbiter_daemon.environ | {"OMP_NUM_THREADS": "1"}
     sidecar = [
         "sidecars", "--name", "passthrough", "--rskill", str(RSKILL), "--device", f"fake:{arbiter_daemon.card}"
@@ -29,7 +31,9 @@ def programs(arbiter_daemon: ArbiterProcess, tmp_path: Path) -> Iterator[list["s
     log = tmp_path / "programs.log"
     with log.open("ab") as sink:
         started = [
-            subprocess.Popen([sys.executable, "-m", *words], cwd=ROOT, env=environ, stdout=sink, stderr=sink)
+            subprocess.Popen(
+                [sys.executable, "-m", *words], cwd=ROOT, env=environ, stdout=sink, stderr=sink
+            )
             for words in (sidecar, runner)
         ]
     yield started

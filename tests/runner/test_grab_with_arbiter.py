@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 from grab_programs import GOAL_S, GRAB, SKILLS, GrabPrograms, need_checkpoint
 
-from arbiter.testing.process import ArbiterProcess
-from clients.aio import ArbiterClient
-from clients.runner import RunnerClient
-from schemas.wire import Footprint, LeaseSpec
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.schemas.wire import Footprint, LeaseSpec
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(340)]
 
@@ -32,7 +32,11 @@ def programs(arbiter_daemon: ArbiterProcess) -> Iterator[GrabPrograms]:
 
 
 def leases(status: dict[str, Any], consumer: str) -> list[tuple[str, int]]:
-    return [(lease["state"], lease["uses"]) for lease in status["leases"] if lease["consumer"] == consumer]
+    return [
+        (lease["state"], lease["uses"])
+        for lease in status["leases"]
+        if lease["consumer"] == consumer
+    ]
 
 
 async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
@@ -44,7 +48,9 @@ async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
         truth = await runner.ground_truth()
         target = truth["target"]
         x, y, z = truth["objects"][target]["xyz_base"]
-        drive = await runner.send_goal(NAVIGATE, goal_params={"target_point": {"x": x, "y": y, "z": z}})
+        drive = await runner.send_goal(
+            NAVIGATE, goal_params={"target_point": {"x": x, "y": y, "z": z}}
+        )
         assert (await drive.result(60))["success"]
         assert leases(await rival.status(), "grab") == []  # driving takes no lease
 
@@ -59,7 +65,9 @@ async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
         whole_card = LeaseSpec(
             consumer="rival",
             model_id="big",
-            footprint=Footprint(load_peak_bytes=6_000_000_000, steady_bytes=6_000_000_000, residue_bytes=0),
+            footprint=Footprint(
+                load_peak_bytes=6_000_000_000, steady_bytes=6_000_000_000, residue_bytes=0
+            ),
         )
         waiting = asyncio.create_task(rival.acquire(whole_card))
         result = await grab.result(60)

@@ -7,16 +7,16 @@ from typing import Any
 import pytest
 from small_robots import FedCamera, Nod, Twin
 
-from runner.clock import SystemClock
-from runner.hal.so101 import so101
-from runner.hardware import FIRST_DATA_SLICE_S, FIRST_STATE_TRIES, HardwareRunner
-from runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded
-from runner.safety.gate import RobotGate
-from runner.safety.ranges import JointRanges
-from runner.sensors import Feed
-from runner.skill_runner import WITHHELD_IN_A_ROW_MAX
-from runner.skills.base import SkillState
-from schemas.errors import (
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.hal.so101 import so101
+from vram_arbiter.runner.hardware import FIRST_DATA_SLICE_S, FIRST_STATE_TRIES, HardwareRunner
+from vram_arbiter.runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded
+from vram_arbiter.runner.safety.gate import RobotGate
+from vram_arbiter.runner.safety.ranges import JointRanges
+from vram_arbiter.runner.sensors import Feed
+from vram_arbiter.runner.skill_runner import WITHHELD_IN_A_ROW_MAX
+from vram_arbiter.runner.skills.base import SkillState
+from vram_arbiter.schemas.errors import (
     BadRequest,
     Cancelled,
     EstopRequested,
@@ -25,8 +25,8 @@ from schemas.errors import (
     RobotFault,
     StateStale,
 )
-from schemas.manifest import load_manifest
-from schemas.world import SensorFrame, WorldState
+from vram_arbiter.schemas.manifest import load_manifest
+from vram_arbiter.schemas.world import SensorFrame, WorldState
 
 PERIOD_S = 1 / 30
 MakeRunner = Callable[..., HardwareRunner]
@@ -124,9 +124,9 @@ def test_a_stale_camera_withholds_and_fails_the_goal_if_it_lasts(
     tick(runner, clock, 40)
     assert (skill.taken, len(twin.sent)) == (asked, sent)  # neither asked nor moved, not even once
     assert isinstance(ended[0].error, FrameStale)
-    assert {"hangs": "ms old", "ends": "end of file", "is not there": "no such camera"}[cause] in str(
-        ended[0].error
-    )
+    assert {"hangs": "ms old", "ends": "end of file", "is not there": "no such camera"}[
+        cause
+    ] in str(ended[0].error)
     assert len([text for text in runner.violations if "is stale" in text]) == 1
 
 
@@ -181,7 +181,9 @@ def test_a_lost_answer_of_the_bus_is_bridged_and_a_silent_bus_withholds(
     assert "joint_state" in runner.world.stale
 
 
-def test_what_cannot_be_sent_fails_the_goal(make: MakeRunner, twin: Twin, nod: Any, clock: Any) -> None:
+def test_what_cannot_be_sent_fails_the_goal(
+    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+) -> None:
     runner = make()
     runner.activate()
     ended = begin(runner, nod())
@@ -231,7 +233,9 @@ def test_the_emergency_stop_comes_before_anything_else(
     runner.activate()
     skill = nod(on_step=lambda world: runner.request_estop("a hand is in the way"))
     ended = begin(runner, skill)
-    assert not tick(runner, clock).action_applied  # the step that was under way is not sent any more
+    assert not tick(
+        runner, clock
+    ).action_applied  # the step that was under way is not sent any more
     assert not twin.sent
     assert twin.story == ["connect", "halt"]
     assert told == ["a hand is in the way"]
@@ -263,7 +267,9 @@ def test_a_stop_that_the_robot_latched_by_itself_is_the_runners_too(
     assert runner.estop is ended[0].error
 
 
-def test_a_late_action_is_withheld_under_drop(make: MakeRunner, twin: Twin, nod: Any, clock: Any) -> None:
+def test_a_late_action_is_withheld_under_drop(
+    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+) -> None:
     runner = make(deadline_policy=DeadlinePolicy.DROP)
     runner.activate()
     begin(runner, nod(on_step=lambda world: clock.advance(2 * PERIOD_S)))
@@ -307,10 +313,17 @@ def test_a_tick_says_where_its_time_went(
     result = runner.tick()
     assert result.inference_ms == pytest.approx(4.0)
     assert result.tick_ms == pytest.approx(4.0)
-    assert (result.sensors_ms, result.world_state_ms, result.safety_ms, result.hal_ms) == (0, 0, 0, 0)
+    assert (result.sensors_ms, result.world_state_ms, result.safety_ms, result.hal_ms) == (
+        0,
+        0,
+        0,
+        0,
+    )
 
 
-def test_a_goal_ends_after_as_many_ticks_as_it_may_take(make: MakeRunner, nod: Any, clock: Any) -> None:
+def test_a_goal_ends_after_as_many_ticks_as_it_may_take(
+    make: MakeRunner, nod: Any, clock: Any
+) -> None:
     runner = make()
     runner.activate()
     ended = begin(runner, nod(), max_ticks=5)
@@ -401,7 +414,9 @@ def test_it_does_not_start_on_a_robot_that_says_nothing(make: MakeRunner, twin: 
     assert twin.story == ["connect", "disconnect"]
 
 
-def test_a_robot_whose_first_answer_is_lost_starts(make: MakeRunner, twin: Twin, clock: Any) -> None:
+def test_a_robot_whose_first_answer_is_lost_starts(
+    make: MakeRunner, twin: Twin, clock: Any
+) -> None:
     twin.answers_lost = FIRST_STATE_TRIES - 1
     runner = make()
     runner.activate()

@@ -12,18 +12,24 @@ from typing import Any
 import pytest
 from small_robots import FedCamera, Nod, Twin
 
-from clients.runner import RunnerClient
-from runner.__main__ import main
-from runner.catalogue import Catalogue
-from runner.clock import SystemClock
-from runner.control import ControlThread
-from runner.goals import GoalServer
-from runner.hardware import HardwareRunner
-from runner.protocols import Goal
-from runner.safety.ranges import JointRanges
-from schemas.errors import EstopRequested, FrameStale, InternalError, LimitExceeded, RobotFault
-from schemas.manifest import Kind, RSkillManifest, load_manifest
-from schemas.world import WorldState
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.runner.__main__ import main
+from vram_arbiter.runner.catalogue import Catalogue
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.control import ControlThread
+from vram_arbiter.runner.goals import GoalServer
+from vram_arbiter.runner.hardware import HardwareRunner
+from vram_arbiter.runner.protocols import Goal
+from vram_arbiter.runner.safety.ranges import JointRanges
+from vram_arbiter.schemas.errors import (
+    EstopRequested,
+    FrameStale,
+    InternalError,
+    LimitExceeded,
+    RobotFault,
+)
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
+from vram_arbiter.schemas.world import WorldState
 
 Run = Callable[[Any], Any]
 RSKILL = "vram-arbiter/so101-navigate"
@@ -62,8 +68,14 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
     @asynccontextmanager
     async def serving(estop_s: float = 60.0) -> AsyncIterator[tuple[Bench, RunnerClient]]:
         clock = SystemClock()
-        twin, camera, skill = Twin(clock), FedCamera("front", clock), Told(load_manifest(navigate_manifest))
-        limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
+        twin, camera, skill = (
+            Twin(clock),
+            FedCamera("front", clock),
+            Told(load_manifest(navigate_manifest)),
+        )
+        limits = {
+            joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints
+        }
         runner = HardwareRunner(
             twin,
             [(camera, 100.0)],
@@ -74,7 +86,13 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
         catalogue = Catalogue([skill.manifest], {Kind.ROS_ACTION: lambda manifest: skill})
         async with ControlThread(runner) as control:
             server = GoalServer(
-                endpoint, control, runner, catalogue, clock, identity={"robot": "bench"}, estop_s=estop_s
+                endpoint,
+                control,
+                runner,
+                catalogue,
+                clock,
+                identity={"robot": "bench"},
+                estop_s=estop_s,
             )
             task = asyncio.create_task(server.serve())
             await server.bound.wait()
@@ -91,7 +109,10 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
 
 
 def play(
-    run_async: Run, bench: Callable[..., Any], body: Callable[[Bench, RunnerClient], Any], **options: Any
+    run_async: Run,
+    bench: Callable[..., Any],
+    body: Callable[[Bench, RunnerClient], Any],
+    **options: Any,
 ) -> None:
     async def scenario() -> None:
         async with bench(**options) as (b, client):
@@ -102,7 +123,10 @@ def play(
 
 async def diagnosed(client: RunnerClient, as_what: str) -> None:
     """Until the joints and the camera are called this. What is fresh is stale for some ticks wherever the machine stood still."""
-    while (await client.state())["world"]["diagnostics"] != {"front": as_what, "joint_state": as_what}:
+    while (await client.state())["world"]["diagnostics"] != {
+        "front": as_what,
+        "joint_state": as_what,
+    }:
         await asyncio.sleep(0.05)
 
 
@@ -113,7 +137,9 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("prompt", ["nod", "hang in the start"])
-def test_the_stop_fails_the_goal_and_refuses_new_ones(bench: Any, run_async: Run, prompt: str) -> None:
+def test_the_stop_fails_the_goal_and_refuses_new_ones(
+    bench: Any, run_async: Run, prompt: str
+) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
         goal = await client.send_goal(RSKILL, prompt=prompt)
         await b.skill.begun.wait()
@@ -122,7 +148,11 @@ def test_the_stop_fails_the_goal_and_refuses_new_ones(bench: Any, run_async: Run
         assert b.twin.story == ["connect", "halt"]
         sent = len(b.twin.sent)
         result = await goal.result(60)
-        assert (result["status"], result["success"], result["code"]) == ("failed", False, "estop_requested")
+        assert (result["status"], result["success"], result["code"]) == (
+            "failed",
+            False,
+            "estop_requested",
+        )
         with pytest.raises(EstopRequested, match="a hand is in the way"):
             await client.send_goal(RSKILL, prompt="nod")
         state = await client.state()
@@ -135,7 +165,9 @@ def test_the_stop_fails_the_goal_and_refuses_new_ones(bench: Any, run_async: Run
     play(run_async, bench, body)
 
 
-def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(bench: Any, run_async: Run) -> None:
+def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(
+    bench: Any, run_async: Run
+) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
         await client.send_goal(RSKILL, prompt="hang in the step")
         await b.skill.begun.wait()
@@ -177,7 +209,9 @@ def test_the_command_line_stops_the_robot(
 
 
 @pytest.mark.usefixtures("patient")
-@pytest.mark.parametrize("cause", [RobotFault("motor 2 does not answer"), TypeError("a driver's defect")])
+@pytest.mark.parametrize(
+    "cause", [RobotFault("motor 2 does not answer"), TypeError("a driver's defect")]
+)
 def test_a_stop_that_did_not_reach_the_motors_is_no_success_and_is_tried_again(
     bench: Any, run_async: Run, endpoint: str, capfd: pytest.CaptureFixture[str], cause: Exception
 ) -> None:
@@ -231,10 +265,17 @@ def test_a_stop_is_not_refused_for_its_words(bench: Any, run_async: Run, reason:
 
 
 def test_whoever_names_no_endpoint_stops_the_system_service_too(
-    bench: Any, run_async: Run, endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
+    bench: Any,
+    run_async: Run,
+    endpoint: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: Any,
 ) -> None:
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(tmp_path / "of-this-login"))
-    monkeypatch.setattr("runner.cli.estop.SYSTEM_RUNTIME", endpoint.removeprefix("ipc://").rpartition("/")[0])
+    monkeypatch.setattr(
+        "runner.cli.estop.SYSTEM_RUNTIME", endpoint.removeprefix("ipc://").rpartition("/")[0]
+    )
 
     async def body(b: Bench, client: RunnerClient) -> None:
         assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
@@ -255,7 +296,9 @@ def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_fr
     bench: Any, run_async: Run, endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", "not/absolute")
-    monkeypatch.setattr("runner.cli.estop.SYSTEM_RUNTIME", endpoint.removeprefix("ipc://").rpartition("/")[0])
+    monkeypatch.setattr(
+        "runner.cli.estop.SYSTEM_RUNTIME", endpoint.removeprefix("ipc://").rpartition("/")[0]
+    )
 
     async def body(b: Bench, client: RunnerClient) -> None:
         assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
@@ -268,14 +311,16 @@ def test_a_stop_does_not_wait_for_the_imports_of_other_commands(endpoint: str) -
     code = (
         "import sys; from runner.__main__ import main; "
         "code = main(['estop', '--endpoint', sys.argv[1]]); "
-        "print(code, sorted({'runner.cli.deploy', 'runner.cli.sim', 'pydantic', 'numpy', 'zmq', 'msgpack'} & set(sys.modules)))"
+        "print(code, sorted({'vram_arbiter.runner.cli.deploy', 'vram_arbiter.runner.cli.sim', 'pydantic', 'numpy', 'zmq', 'msgpack'} & set(sys.modules)))"
     )
     argv = [sys.executable, "-c", code, endpoint]
     done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == "1 []"
 
 
-def test_a_stop_that_nobody_hears_is_an_error(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stop_that_nobody_hears_is_an_error(
+    endpoint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["estop", "--endpoint", endpoint]) == 1
     assert "cut its power" in capsys.readouterr().err
 
@@ -301,14 +346,18 @@ def test_a_goal_is_limited_in_ticks(bench: Any, run_async: Run) -> None:
         goal = await client.send_goal(RSKILL, prompt="nod", max_ticks=4)
         result = await goal.result(60)
         assert (result["status"], result["code"]) == ("failed", "limit_exceeded")
-        assert result["data"]["ticks"] >= 4  # more where the machine stood still, and the skill was not asked
+        assert (
+            result["data"]["ticks"] >= 4
+        )  # more where the machine stood still, and the skill was not asked
         assert b.skill.taken <= 4
 
     play(run_async, bench, body)
 
 
 @pytest.mark.heavy
-def test_pictures_go_out_in_their_colours_and_a_dead_camera_gives_none(bench: Any, run_async: Run) -> None:
+def test_pictures_go_out_in_their_colours_and_a_dead_camera_gives_none(
+    bench: Any, run_async: Run
+) -> None:
     async def body(b: Bench, client: RunnerClient) -> None:
         import cv2
         import numpy as np

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from schemas import telemetry
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 pytestmark = pytest.mark.heavy  # the OpenTelemetry SDK
 
@@ -51,6 +51,18 @@ def test_a_share_of_a_goals_ticks_is_traced_from_its_first_tick_on(navigate_mani
     assert said["traces"] == [TRACE]
     of_the_goal = [tuple(text.split("-")[1:]) for text in said["ticks"][2:-1]]
     assert [span for _, span, flags in of_the_goal if flags == "01"] == said["tick_spans"]
-    assert [flags for _, _, flags in of_the_goal] == ["01", "00", "00", "00", "01", "00", "00", "00", "01"]
-    assert {(trace, span) for trace, span, flags in of_the_goal if flags == "00"} == {(TRACE, PARENT)}
+    assert [flags for _, _, flags in of_the_goal] == [
+        "01",
+        "00",
+        "00",
+        "00",
+        "01",
+        "00",
+        "00",
+        "00",
+        "01",
+    ]
+    assert {(trace, span) for trace, span, flags in of_the_goal if flags == "00"} == {
+        (TRACE, PARENT)
+    }
     assert said["send_parents"] == said["tick_spans"]

@@ -7,19 +7,23 @@ from typing import Any
 
 import pytest
 
-from runner.loop import Applied, Decision, RunnerBase
-from runner.protocols import DeadlineMissed, DeadlinePolicy, InferenceRunner
-from runner.timings import Timings, percentile
-from schemas.control import ControlMode
-from schemas.world import Action
+from vram_arbiter.runner.loop import Applied, Decision, RunnerBase
+from vram_arbiter.runner.protocols import DeadlineMissed, DeadlinePolicy, InferenceRunner
+from vram_arbiter.runner.timings import Timings, percentile
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.world import Action
 
-ACTION = Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=((0.0,),), joint_names=("a",))
+ACTION = Action(
+    control_mode=ControlMode.JOINT_POSITION, joint_targets=((0.0,),), joint_names=("a",)
+)
 
 
 class Scripted(RunnerBase):
     """Deciding takes what the script says, in seconds; what was applied is kept."""
 
-    def __init__(self, clock: Any, decide_s: list[float], apply_s: float = 0.0, **options: Any) -> None:
+    def __init__(
+        self, clock: Any, decide_s: list[float], apply_s: float = 0.0, **options: Any
+    ) -> None:
         super().__init__(clock=clock, **options)
         self.manual, self.decide_s, self.apply_s = clock, decide_s, apply_s
         self.applied: list[Action | None] = []
@@ -123,7 +127,12 @@ def test_a_second_run_counts_its_own_ticks(clock: Any) -> None:
 
 @pytest.mark.parametrize(
     ("values", "share", "expected"),
-    [([], 0.99, 0.0), ([7.0], 0.5, 7.0), ([1.0, 2.0], 0.5, 1.5), ([4.0, 1.0, 3.0, 2.0], 0.99, 3.97)],
+    [
+        ([], 0.99, 0.0),
+        ([7.0], 0.5, 7.0),
+        ([1.0, 2.0], 0.5, 1.5),
+        ([4.0, 1.0, 3.0, 2.0], 0.99, 3.97),
+    ],
 )
 def test_percentile_interpolates(values: list[float], share: float, expected: float) -> None:
     assert percentile(values, share) == pytest.approx(expected)

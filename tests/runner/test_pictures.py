@@ -4,9 +4,9 @@ from typing import Any
 
 import pytest
 
-from runner.pictures import as_rgb
-from schemas.errors import FrameStale, ModelError
-from schemas.world import FrameEncoding, SensorFrame
+from vram_arbiter.runner.pictures import as_rgb
+from vram_arbiter.schemas.errors import FrameStale, ModelError
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 pytestmark = pytest.mark.heavy
 

@@ -1,4 +1,4 @@
-"""`python -m runner sim` as a process: ready means ready, signals end it in order, mistakes are said."""
+"""`python -m vram_arbiter.runner sim` as a process: ready means ready, signals end it in order, mistakes are said."""
 
 import fcntl
 import os
@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from clients.runner import RunnerClient, RunnerUnreachable
-from runner.__main__ import main, parse
-from runner.catalogue import sidecar_endpoint
-from runner.cli.common import sidecars_given
-from schemas.errors import ConfigError
+from vram_arbiter.clients.runner import RunnerClient, RunnerUnreachable
+from vram_arbiter.runner.__main__ import main, parse
+from vram_arbiter.runner.catalogue import sidecar_endpoint
+from vram_arbiter.runner.cli.common import sidecars_given
+from vram_arbiter.schemas.errors import ConfigError
 
 Run = Callable[[Any], Any]
 ROOT = Path(__file__).parents[2]
@@ -30,7 +30,7 @@ def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
         argv = [
             sys.executable,
             "-m",
-            "runner",
+            "vram_arbiter.runner",
             "sim",
             "--skills",
             str(ROOT / "configs/rskills/so101-navigate"),
@@ -50,7 +50,10 @@ def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
 @pytest.mark.e2e
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it_in_order_and_the_video_is_whole(
-    start: Callable[..., subprocess.Popen[bytes]], tmp_path: Path, run_async: Run, how: signal.Signals
+    start: Callable[..., subprocess.Popen[bytes]],
+    tmp_path: Path,
+    run_async: Run,
+    how: signal.Signals,
 ) -> None:
     import imageio_ffmpeg
 
@@ -131,30 +134,46 @@ def test_wrong_flags_are_usage_errors(capsys: pytest.CaptureFixture[str]) -> Non
         (["--skills", "/nonexistent"], "cannot be read"),
     ],
 )
-def test_wrong_files_are_named(capsys: pytest.CaptureFixture[str], flags: list[str], said: str) -> None:
+def test_wrong_files_are_named(
+    capsys: pytest.CaptureFixture[str], flags: list[str], said: str
+) -> None:
     assert main(["sim", "--no-arbiter", *flags]) == 2
     assert said in capsys.readouterr().err
 
 
 @pytest.mark.heavy
-def test_a_second_runner_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_second_runner_records_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """It played, and left what it had played in the dataset, until it found out."""
     with open(tmp_path / "runner.sock.lock", "w") as first:
         fcntl.flock(first, fcntl.LOCK_EX)
         there = ["--endpoint", f"ipc://{tmp_path}/runner.sock", "--record", str(tmp_path / "set")]
-        assert main(["sim", *there, "--env", "gym:CartPole-v1", "--policy", "random", "--rate", "0"]) == 1
+        assert (
+            main(["sim", *there, "--env", "gym:CartPole-v1", "--policy", "random", "--rate", "0"])
+            == 1
+        )
     assert "already uses" in capsys.readouterr().err
     assert not (tmp_path / "set").exists()
 
 
 @pytest.mark.parametrize(
     "command",
-    [["sim"], ["deploy", "--config", "robot.yaml"], ["deploy", "--dry-run", "--config", "robot.yaml"]],
+    [
+        ["sim"],
+        ["deploy", "--config", "robot.yaml"],
+        ["deploy", "--dry-run", "--config", "robot.yaml"],
+    ],
 )
 def test_a_runner_serves_no_tcp_and_says_so_before_a_robot_has_power(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: list[str]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: list[str],
 ) -> None:
-    (tmp_path / "robot.yaml").write_text("robot_id: bench\nhal: {adapter: so101_mujoco}\nsensors: []\n")
+    (tmp_path / "robot.yaml").write_text(
+        "robot_id: bench\nhal: {adapter: so101_mujoco}\nsensors: []\n"
+    )
     monkeypatch.chdir(tmp_path)
     assert main([*command, "--no-arbiter", "--endpoint", "tcp://127.0.0.1:7777"]) == 2
     said = capsys.readouterr().err

@@ -9,9 +9,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from runner.clock import precise_sleep
-from runner.control import ControlThread
-from runner.promptness import NICE, SWITCH_S, Promptness, hasten, leaves_room, make_prompt
+from vram_arbiter.runner.clock import precise_sleep
+from vram_arbiter.runner.control import ControlThread
+from vram_arbiter.runner.realtime import (
+    NICE,
+    SWITCH_S,
+    Promptness,
+    hasten,
+    leaves_room,
+    make_prompt,
+)
 
 ROOT = Path(__file__).parents[2]
 
@@ -38,7 +45,9 @@ def test_programs_that_it_starts_are_ordinary_ones() -> None:
     def ask() -> str:
         hasten(realtime=True)
         code = "import os; print(os.sched_getscheduler(0))"
-        return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+        return subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
 
     assert in_thread(ask).split() == [str(os.SCHED_OTHER)]
 
@@ -46,7 +55,7 @@ def test_programs_that_it_starts_are_ordinary_ones() -> None:
 def test_where_nothing_is_allowed_it_goes_on_without() -> None:
     code = (
         "import os, resource\n"
-        "from runner.promptness import hasten\n"
+        "from runner.realtime import hasten\n"
         "resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))\n"
         "resource.setrlimit(resource.RLIMIT_NICE, (0, 0))\n"
         "if os.getuid() == 0: os.setuid(65534)\n"
@@ -54,13 +63,20 @@ def test_where_nothing_is_allowed_it_goes_on_without() -> None:
     )
     environ = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
-        [sys.executable, "-c", code], env=environ, cwd="/", capture_output=True, text=True, check=True
+        [sys.executable, "-c", code],
+        env=environ,
+        cwd="/",
+        capture_output=True,
+        text=True,
+        check=True,
     )
     nice = os.getpriority(os.PRIO_PROCESS, 0)
     assert done.stdout.split() == ["nice", str(nice), str(os.SCHED_OTHER)]
 
 
-def test_both_threads_are_asked_for_unless_the_loop_is_unpaced(make_runner: Callable[..., Any]) -> None:
+def test_both_threads_are_asked_for_unless_the_loop_is_unpaced(
+    make_runner: Callable[..., Any],
+) -> None:
     async def granted(first: bool) -> tuple[Promptness, int]:
         async with ControlThread(make_runner(rate_hz=100)) as control:
             await make_prompt(control, first=first)

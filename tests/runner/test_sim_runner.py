@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runner.protocols import (
+from vram_arbiter.runner.protocols import (
     Act,
     DeadlinePolicy,
     Done,
@@ -20,21 +20,29 @@ from runner.protocols import (
     SkillKey,
     StepOutcome,
 )
-from runner.sim.arm_env import ArmEnvironment
-from runner.sim.episodes import episodes_of
-from runner.sim.sim_runner import SimRunner
-from runner.skill_runner import WITHHELD_IN_A_ROW_MAX
-from schemas.control import ControlMode
-from schemas.errors import ConfigError, EnvironmentFailed, Evicted, InternalError, ModelError
-from schemas.manifest.contracts import SafetyEnvelope
-from schemas.world import Action, WorldState
+from vram_arbiter.runner.sim.arm_env import ArmEnvironment
+from vram_arbiter.runner.sim.episodes import episodes_of
+from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.runner.skill_runner import WITHHELD_IN_A_ROW_MAX
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import (
+    ConfigError,
+    EnvironmentFailed,
+    Evicted,
+    InternalError,
+    ModelError,
+)
+from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
+from vram_arbiter.schemas.world import Action, WorldState
 
 Make = Callable[..., Any]
 GOAL = Goal("g", "test/skill")
 
 
 def joints(*row: float) -> Action:
-    names = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")[: len(row)]
+    names = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")[
+        : len(row)
+    ]
     return Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), joint_names=names)
 
 
@@ -86,7 +94,12 @@ def test_the_first_tick_resets_and_every_other_one_steps(make_runner: Make, env:
     first = runner.tick()
     assert (env.resets, env.steps, first.step_idx, first.action_applied) == ([7], [], None, False)
     second = runner.tick()
-    assert (env.resets, len(env.steps), second.step_idx, second.action_applied) == ([7], 1, 0, False)
+    assert (env.resets, len(env.steps), second.step_idx, second.action_applied) == (
+        [7],
+        1,
+        0,
+        False,
+    )
 
 
 def test_n_episodes_are_n_resets_and_no_phantom_one(make_runner: Make, env: Any) -> None:
@@ -96,7 +109,10 @@ def test_n_episodes_are_n_resets_and_no_phantom_one(make_runner: Make, env: Any)
     assert env.resets == [3, 4]
     assert len(env.steps) == 8
     assert result.n_ticks == 10
-    assert [(e.index, e.steps, e.truncated) for e in runner.episodes] == [(0, 4, True), (1, 4, True)]
+    assert [(e.index, e.steps, e.truncated) for e in runner.episodes] == [
+        (0, 4, True),
+        (1, 4, True),
+    ]
     assert result.success is None  # nobody judged
 
 
@@ -120,7 +136,9 @@ def test_a_live_run_ends_when_asked(make_runner: Make, env: Any) -> None:
 
 
 def test_episodes_are_read_off_the_ticks(make_runner: Make, env: Any) -> None:
-    runner = make_runner(seed=3, rate_hz=0, episodes=3, max_steps=4, judge=lambda e: len(e.steps) == 6)
+    runner = make_runner(
+        seed=3, rate_hz=0, episodes=3, max_steps=4, judge=lambda e: len(e.steps) == 6
+    )
     runner.activate()
     ticks = []
     while not runner._finished():
@@ -128,7 +146,18 @@ def test_episodes_are_read_off_the_ticks(make_runner: Make, env: Any) -> None:
     assert episodes_of(ticks) == runner.episodes
     resets = [tick.tick_idx for tick in ticks if tick.step_idx is None]
     assert [episode.first_tick for episode in runner.episodes] == resets == [0, 5, 8]
-    assert [tick.step_idx for tick in ticks if tick.step_idx is not None] == [0, 1, 2, 3, 0, 1, 0, 1, 2, 3]
+    assert [tick.step_idx for tick in ticks if tick.step_idx is not None] == [
+        0,
+        1,
+        2,
+        3,
+        0,
+        1,
+        0,
+        1,
+        2,
+        3,
+    ]
     assert [(e.steps, e.success, e.truncated) for e in runner.episodes] == [
         (4, False, True),
         (2, True, False),
@@ -157,7 +186,11 @@ def test_stopping_within_an_episode_leaves_no_phantom(make_runner: Make, env: An
     stop_after=st.integers(0, 40),
 )
 def test_every_reset_is_an_episode_that_is_played(
-    make_env: Any, kinematic: RobotDescription, lengths: list[int], max_steps: int | None, stop_after: int
+    make_env: Any,
+    kinematic: RobotDescription,
+    lengths: list[int],
+    max_steps: int | None,
+    stop_after: int,
 ) -> None:
     """Whatever ends the episodes, and wherever the run is stopped and taken up again."""
     robot = make_env()
@@ -188,7 +221,9 @@ def test_every_reset_is_an_episode_that_is_played(
     assert first.n_ticks + result.n_ticks == len(robot.resets) + len(robot.steps)
 
 
-def test_a_run_that_is_over_resets_nothing_however_often_it_is_run(make_runner: Make, env: Any) -> None:
+def test_a_run_that_is_over_resets_nothing_however_often_it_is_run(
+    make_runner: Make, env: Any
+) -> None:
     runner = make_runner(rate_hz=0, episodes=1, max_steps=2)
     runner.activate()
     assert [runner.run().n_ticks for _ in range(3)] == [3, 0, 0]
@@ -248,8 +283,12 @@ def test_a_world_that_fails_ends_the_goal_and_is_reset(make_runner: Make, env: A
 
 
 # -- the skill at the arm -------------------------------------------------------------------------------------------
-def test_actions_reach_the_robot_in_order_and_done_ends_the_skill(make_runner: Make, env: Any) -> None:
-    twist = Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.3, 0.0, 0.0, 0.0, 0.0, 0.1),))
+def test_actions_reach_the_robot_in_order_and_done_ends_the_skill(
+    make_runner: Make, env: Any
+) -> None:
+    twist = Action(
+        control_mode=ControlMode.BODY_TWIST, body_twist=((0.3, 0.0, 0.0, 0.0, 0.0, 0.1),)
+    )
     script = [Act(joints(0.1), chunk_index=4), Hold("thinking"), Act(twist)]
     ticks, ended = play(make_runner(rate_hz=0), script, 5)
     first = dict(zip(env.joints, (0.1, -1.20, 1.05, 1.35, 0.0, 0.60), strict=True))
@@ -265,7 +304,9 @@ def test_actions_reach_the_robot_in_order_and_done_ends_the_skill(make_runner: M
     assert [(e.data["played"], e.data["ticks"], e.error) for e in ended] == [(True, 3, None)]
 
 
-def test_joints_that_an_action_leaves_out_keep_their_last_target(make_runner: Make, env: Any) -> None:
+def test_joints_that_an_action_leaves_out_keep_their_last_target(
+    make_runner: Make, env: Any
+) -> None:
     closed = joints(0.0, -1.0, 1.0, 1.0, 0.0, -0.1)
     play(make_runner(rate_hz=0), [Act(closed), Hold("gripped"), Act(joints(0.3, -1.1))], 4)
     assert list(env.steps[2][0].values()) == [0.3, -1.1, 1.0, 1.0, 0.0, -0.1]
@@ -289,7 +330,9 @@ def test_a_defect_of_a_skill_does_not_take_the_loop_with_it(make_runner: Make, e
     assert len(env.steps) == 3
 
 
-def test_an_action_outside_the_envelope_is_withheld_and_recorded(make_runner: Make, env: Any) -> None:
+def test_an_action_outside_the_envelope_is_withheld_and_recorded(
+    make_runner: Make, env: Any
+) -> None:
     runner = make_runner(rate_hz=0)
     ticks, ended = play(runner, [Act(joints(3.0)), Act(joints(0.6))], 3)
     assert env.steps[0] == (None, None)
@@ -302,7 +345,9 @@ def test_an_action_outside_the_envelope_is_withheld_and_recorded(make_runner: Ma
 
 def test_the_gate_is_a_robots_and_each_skill_tightens_it(make_runner: Make, env: Any) -> None:
     class Careful(Scripted):
-        manifest = SimpleNamespace(name="test/careful", envelope=SafetyEnvelope(max_joint_speed_factor=0.1))
+        manifest = SimpleNamespace(
+            name="test/careful", envelope=SafetyEnvelope(max_joint_speed_factor=0.1)
+        )
 
     runner = make_runner(rate_hz=0)
     play(runner, [Act(joints(0.2))], 2)
@@ -318,7 +363,9 @@ def test_the_gate_is_a_robots_and_each_skill_tightens_it(make_runner: Make, env:
     assert (ended[0].data["clamped"], ended[0].data["withheld"]) == (1, 1)
 
 
-def test_an_envelope_that_cannot_be_kept_is_refused_before_anything_moves(make_runner: Make) -> None:
+def test_an_envelope_that_cannot_be_kept_is_refused_before_anything_moves(
+    make_runner: Make,
+) -> None:
     class Boxed(Scripted):
         manifest = SimpleNamespace(
             name="test/boxed", envelope=SafetyEnvelope(workspace_box_max_xyz=(0.3, 0.3, 0.3))
@@ -343,7 +390,9 @@ def test_speeds_are_judged_by_simulated_time(make_runner: Make, env: Any, clock:
     ended: list[SkillEnded] = []
     runner.activate()
     runner.tick()
-    runner.begin_skill(Slow(Act(joints(0.3)), Act(joints(-0.4)), Act(joints(-0.4))), GOAL, ended.append)
+    runner.begin_skill(
+        Slow(Act(joints(0.3)), Act(joints(-0.4)), Act(joints(-0.4))), GOAL, ended.append
+    )
     ticks = [runner.tick() for _ in range(3)]
     assert [tick.action_applied for tick in ticks] == [True, True, True]
     assert env.joints["shoulder_pan"] == -0.4
@@ -429,7 +478,11 @@ def test_goals_and_runs_say_what_became_of_chunks_and_actions(make_runner: Make)
     metadata = runner.result().metadata
     assert metadata.items() >= {**counts, "robot": "arm", "scene": "table", "seed": 3}.items()
     assert metadata["goals_by_skill"] == {"test/skill": 1}
-    assert (metadata["rate_hz"], metadata["deadline_policy"], metadata["deadline_misses"]) == (0, "warn", 0)
+    assert (metadata["rate_hz"], metadata["deadline_policy"], metadata["deadline_misses"]) == (
+        0,
+        "warn",
+        0,
+    )
 
 
 def test_a_skill_without_chunks_says_nothing_of_them(make_runner: Make) -> None:
@@ -496,11 +549,11 @@ def test_navigating_the_real_simulator_and_filming_it(
 ) -> None:
     import imageio_ffmpeg
 
-    from runner.recorder import Recorder
-    from runner.sim.sim_runner import SimRunner
-    from runner.sim.worlds import so101_world
-    from runner.skills.navigate import Navigate
-    from schemas.manifest import load_manifest
+    from vram_arbiter.runner.recorder import Recorder
+    from vram_arbiter.runner.sim.sim_runner import SimRunner
+    from vram_arbiter.runner.sim.worlds import so101_world
+    from vram_arbiter.runner.skills.navigate import Navigate
+    from vram_arbiter.schemas.manifest import load_manifest
 
     world = so101_world(None)
     env, scene = world.arm, world.scene
@@ -514,7 +567,9 @@ def test_navigating_the_real_simulator_and_filming_it(
         runner.activate()
         runner.tick()
         x, y, z = env.ground_truth().objects[env.target].position_base
-        run_async(skill.start(Goal("g", "navigate", params={"target_point": {"x": x, "y": y, "z": z}})))
+        run_async(
+            skill.start(Goal("g", "navigate", params={"target_point": {"x": x, "y": y, "z": z}}))
+        )
         runner.begin_skill(skill, GOAL, ended.append)
         while not ended:
             runner.tick()
@@ -537,7 +592,9 @@ def test_navigating_the_real_simulator_and_filming_it(
     assert seconds == pytest.approx(frames / 10, abs=0.2)
 
 
-def test_a_scene_that_takes_long_to_build_misses_no_deadline(make_runner: Make, env: Any, clock: Any) -> None:
+def test_a_scene_that_takes_long_to_build_misses_no_deadline(
+    make_runner: Make, env: Any, clock: Any
+) -> None:
     """There is no action that could come too late: `raise` would end every run before its first step."""
     build = env.reset
 

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from clients.runner import RunnerClient
-from clients.serve import Message, Peer, RouterServer
-from clients.sidecar import npy
-from runner.__main__ import main
-from runner.dataset.reader import read_frame
-from schemas.errors import UnknownSkill
+from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.sidecar import npy
+from vram_arbiter.runner.__main__ import main
+from vram_arbiter.runner.dataset.reader import read_frame
+from vram_arbiter.schemas.errors import UnknownSkill
 
 pytestmark = pytest.mark.heavy
 
@@ -69,7 +69,9 @@ def test_a_scripted_policy_balances_gymnasiums_pole(
     code, result, _ = sim(tmp_path, capsys, "--env", "gym:CartPole-v1", "--policy", script, *flags)
     assert (code, result["success"], result["n_ticks"]) == (0, True, 2 * 121)
     assert result["metadata"]["episodes"] == 2
-    code, result, _ = sim(tmp_path, capsys, "--env", "gym:CartPole-v1", "--policy", "random", *flags)
+    code, result, _ = sim(
+        tmp_path, capsys, "--env", "gym:CartPole-v1", "--policy", "random", *flags
+    )
     assert (code, result["success"]) == (0, False)
 
 
@@ -84,7 +86,9 @@ def test_the_video_of_gymnasiums_pole(tmp_path: Path, capsys: pytest.CaptureFixt
     assert imageio_ffmpeg.count_frames_and_secs(str(video))[0] == result["n_ticks"] - 1
 
 
-def test_random_actions_in_our_own_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_random_actions_in_our_own_scene(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     code, result, _ = sim(tmp_path, capsys, "--policy", "random", "--max-steps", "5")
     assert (code, result["n_ticks"], result["success"]) == (0, 6, None)
     assert result["metadata"]["withheld"] == 0
@@ -93,7 +97,16 @@ def test_random_actions_in_our_own_scene(tmp_path: Path, capsys: pytest.CaptureF
 def test_a_policy_with_a_defect_ends_the_run_and_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flags = ("--env", POINT, "--policy", f"scripted:{HERE}/seek.py", "--seed", "12", "--episodes", "5")
+    flags = (
+        "--env",
+        POINT,
+        "--policy",
+        f"scripted:{HERE}/seek.py",
+        "--seed",
+        "12",
+        "--episodes",
+        "5",
+    )
     code, result, said = sim(tmp_path, capsys, *flags)
     assert (code, result["metadata"]["episodes"]) == (1, 2)  # the second is the one that failed
     assert said.splitlines()[-1].endswith("seek.py: IndexError: beyond the mark")
@@ -157,7 +170,9 @@ class Sidecar:
         self.calls: list[str] = []
 
     async def serve(self, endpoint: str) -> None:
-        async with RouterServer(endpoint, lambda error: {"ok": False, "error": str(error)}) as self.server:
+        async with RouterServer(
+            endpoint, lambda error: {"ok": False, "error": str(error)}
+        ) as self.server:
             await self.server.serve(self.answer)
 
     async def answer(self, peer: Peer, message: Message) -> None:
@@ -169,7 +184,10 @@ class Sidecar:
             reply |= {"lease_id": None, "token": None, "loaded": True}
         elif message["endpoint"] == "get_action":
             self.observations.append(npy.unpack(message["data"]["observation"]))
-            reply = {"action": npy.pack(np.array([self.aim] * 3, dtype=np.float32)), "re": message.get("id")}
+            reply = {
+                "action": npy.pack(np.array([self.aim] * 3, dtype=np.float32)),
+                "re": message.get("id"),
+            }
         await self.server.send(peer, reply)
 
 
@@ -181,7 +199,7 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
         *(
             sys.executable,
             "-m",
-            "runner",
+            "vram_arbiter.runner",
             "sim",
             "--env",
             POINT,
@@ -189,7 +207,12 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
             str(tmp_path / "world.yaml"),
         ),
         *("--skills", str(tmp_path / "rskill.yaml"), "--no-arbiter", "--rate", "0"),
-        *("--sidecar", f"test/point-seek=ipc://{tmp_path}/policy.sock", "--record", str(tmp_path / "set")),
+        *(
+            "--sidecar",
+            f"test/point-seek=ipc://{tmp_path}/policy.sock",
+            "--record",
+            str(tmp_path / "set"),
+        ),
     ]
     environ = os.environ | {
         "VRAM_ARBITER_RUNTIME": str(tmp_path),
@@ -220,7 +243,11 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
             sidecar.aim = (0.9, 0.9)
             result = await (await client.send_goal("test/point-seek", prompt="go there")).result(60)
             assert (result["status"], result["code"]) == ("failed", "limit_exceeded")
-            assert (result["data"]["success"], result["data"]["steps"], result["data"]["episode"]) == (
+            assert (
+                result["data"]["success"],
+                result["data"]["steps"],
+                result["data"]["episode"],
+            ) == (
                 False,
                 20,
                 1,
@@ -238,7 +265,11 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
         assert process.returncode == 0
         assert (result["success"], result["metadata"]["episodes"]) == (False, 2)
         told = result["metadata"]["recorded"]
-        assert (told["episodes"], told["frames"], told["skipped"]) == (1, 20, 1)  # one step is no episode
+        assert (told["episodes"], told["frames"], told["skipped"]) == (
+            1,
+            20,
+            1,
+        )  # one step is no episode
         second = read_frame(tmp_path / "set", 1)
         assert (second.goal["code"], second.task) == ("limit_exceeded", "go there")
         assert second.state == second.action == pytest.approx({"a": 0.9, "b": 0.9})
@@ -250,11 +281,13 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
 
 
 # -- benchmarks of a served policy ----------------------------------------------------------------------------------------
-def test_a_served_policy_is_started_anew_for_every_seed_and_released(tmp_path: Path, run_async: Any) -> None:
-    from runner.sim.benchmark import Benchmark, SkillContestant
-    from runner.sim.sim_runner import SimRunner
-    from runner.sim.worlds import makers_of, world_of
-    from schemas.manifest import Kind, parse_manifest
+def test_a_served_policy_is_started_anew_for_every_seed_and_released(
+    tmp_path: Path, run_async: Any
+) -> None:
+    from vram_arbiter.runner.sim.benchmark import Benchmark, SkillContestant
+    from vram_arbiter.runner.sim.sim_runner import SimRunner
+    from vram_arbiter.runner.sim.worlds import makers_of, world_of
+    from vram_arbiter.schemas.manifest import Kind, parse_manifest
 
     (tmp_path / "world.yaml").write_text(WORLD, encoding="utf-8")
     endpoint = f"ipc://{tmp_path}/policy.sock"
@@ -274,9 +307,11 @@ def test_a_served_policy_is_started_anew_for_every_seed_and_released(tmp_path: P
             (seed, True, 1, "") for seed in range(3)
         ]
         assert cell.summary()["revision"] == "1.0.0"
-        assert [call for call in sidecar.calls if call != "ping"] == ["load", "reset", "get_action"] * 3 + [
-            "unload"
-        ]
+        assert [call for call in sidecar.calls if call != "ping"] == [
+            "load",
+            "reset",
+            "get_action",
+        ] * 3 + ["unload"]
 
     run_async(scenario())
 

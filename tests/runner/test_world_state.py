@@ -4,14 +4,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.world_state import (
+from vram_arbiter.runner.world_state import (
     FUTURE_TOLERANCE_MS,
     JOINT_STATE,
     RECOVERY_UPDATES,
     WorldStateAggregator,
 )
-from schemas.errors import StateStale
-from schemas.world import FrameEncoding, JointState, SensorFrame
+from vram_arbiter.schemas.errors import StateStale
+from vram_arbiter.schemas.world import FrameEncoding, JointState, SensorFrame
 
 MS = 1_000_000
 START_NS = 10_000 * MS
@@ -99,7 +99,9 @@ def test_a_gap_during_recovery_begins_it_anew(world: WorldStateAggregator) -> No
     assert world.snapshot(now).diagnostics["front"] == "ok"
 
 
-def test_a_bus_that_repeats_its_last_answer_does_not_look_alive(world: WorldStateAggregator) -> None:
+def test_a_bus_that_repeats_its_last_answer_does_not_look_alive(
+    world: WorldStateAggregator,
+) -> None:
     for passed_ms in range(0, 120, 20):
         world.update_joint_state(joints(START_NS), START_NS + passed_ms * MS)
     world.note(JOINT_STATE, "no answer from motor 3")
@@ -133,7 +135,9 @@ def test_a_camera_of_unknown_age_is_refused(world: WorldStateAggregator) -> None
 
 
 @pytest.mark.parametrize(("loop_hz", "reads"), [(200.0, 60), (50.0, 60), (30.0, 60), (10.0, 20)])
-def test_cameras_are_read_at_its_own_cadence(world: WorldStateAggregator, loop_hz: float, reads: int) -> None:
+def test_cameras_are_read_at_its_own_cadence(
+    world: WorldStateAggregator, loop_hz: float, reads: int
+) -> None:
     period_ns = 1e9 / loop_hz
     times = [START_NS + round(tick * period_ns) for tick in range(round(2 * loop_hz))]
     assert sum(world.due(now) for now in times) == pytest.approx(reads, abs=1)

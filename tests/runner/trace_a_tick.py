@@ -11,11 +11,11 @@ from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from small_robots import FedCamera, Nod, Twin
 
-from runner.hardware import HardwareRunner
-from runner.protocols import Goal
-from runner.safety.ranges import JointRanges
-from runner.skills.base import SkillState
-from schemas.manifest import load_manifest
+from vram_arbiter.runner.hardware import HardwareRunner
+from vram_arbiter.runner.protocols import Goal
+from vram_arbiter.runner.safety.ranges import JointRanges
+from vram_arbiter.runner.skills.base import SkillState
+from vram_arbiter.schemas.manifest import load_manifest
 
 
 def main() -> None:
@@ -25,7 +25,9 @@ def main() -> None:
     clock = ManualClock()
     twin, camera = Twin(clock), FedCamera("front", clock)
     limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
-    runner = HardwareRunner(twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock)
+    runner = HardwareRunner(
+        twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock
+    )
     runner.activate()
     skill = Nod(load_manifest(Path(sys.argv[1])), cameras=("front",))
     skill.state = SkillState.ACTIVE
@@ -44,7 +46,9 @@ def main() -> None:
         }
         for span in exporter.get_finished_spans()
     ]
-    print(json.dumps({"spans": spans, "tick": result.trace_context, "run": runner.result().trace_id}))
+    print(
+        json.dumps({"spans": spans, "tick": result.trace_context, "run": runner.result().trace_id})
+    )
 
 
 if __name__ == "__main__":

@@ -11,12 +11,12 @@ from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from small_robots import FedCamera, Nod, Twin
 
-from runner.hardware import HardwareRunner
-from runner.protocols import Goal
-from runner.safety.ranges import JointRanges
-from runner.skills.base import SkillState
-from schemas import telemetry
-from schemas.manifest import load_manifest
+from vram_arbiter.runner.hardware import HardwareRunner
+from vram_arbiter.runner.protocols import Goal
+from vram_arbiter.runner.safety.ranges import JointRanges
+from vram_arbiter.runner.skills.base import SkillState
+from vram_arbiter.schemas.manifest import load_manifest
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 
 def main() -> None:
@@ -26,7 +26,9 @@ def main() -> None:
     clock = ManualClock()
     twin, camera = Twin(clock), FedCamera("front", clock)
     limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
-    runner = HardwareRunner(twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock)
+    runner = HardwareRunner(
+        twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock
+    )
     runner.trace_ticks = 0.25
     runner.activate()
     skill = Nod(load_manifest(Path(sys.argv[1])), cameras=("front",))
@@ -34,7 +36,9 @@ def main() -> None:
     ticks = [runner.tick(), runner.tick()]  # nobody has the arm
     idle_spans = len(exporter.get_finished_spans())
     goal = Goal("g", "a/nod", traceparent=sys.argv[2])
-    runner.mailbox.post(lambda: runner.begin_skill(skill, goal, lambda ended: None), lambda *_: None)
+    runner.mailbox.post(
+        lambda: runner.begin_skill(skill, goal, lambda ended: None), lambda *_: None
+    )
     ticks += [runner.tick() for _ in range(9)]
     runner.mailbox.post(runner.end_skill, lambda *_: None)
     ticks.append(runner.tick())
@@ -45,7 +49,9 @@ def main() -> None:
         "idle_spans": idle_spans,
         "tick_spans": [f"{span.context.span_id:016x}" for span in spans],
         "send_parents": [f"{span.parent.span_id:016x}" for span in sent if span.parent],
-        "traces": sorted({f"{span.context.trace_id:032x}" for span in exporter.get_finished_spans()}),
+        "traces": sorted(
+            {f"{span.context.trace_id:032x}" for span in exporter.get_finished_spans()}
+        ),
         "ticks": [tick.trace_context and tick.trace_context["traceparent"] for tick in ticks],
     }
     print(json.dumps(facts))

@@ -11,10 +11,10 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from schemas.config import load_config
-from schemas.errors import ConfigError
-from schemas.manifest import ManifestError, parse_manifest
-from schemas.robot import load_robot
+from vram_arbiter.schemas.config.arbiter import load_config
+from vram_arbiter.schemas.config.robot import load_robot
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.manifest import ManifestError, parse_manifest
 
 ROOT = Path(__file__).parents[2]
 VALUES = [
@@ -39,11 +39,20 @@ def warned(text: str) -> object:
 READERS: dict[str, tuple[Reader, list[str]]] = {
     "manifest": (
         warned,
-        [path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("configs/rskills/*/rskill.yaml"))],
+        [
+            path.read_text(encoding="utf-8")
+            for path in sorted(ROOT.glob("configs/rskills/*/rskill.yaml"))
+        ],
     ),
     "robot": (
         lambda text: load_robot(text, "robot.yaml"),
-        [ROBOT, *(path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("configs/robots/*.yaml")))],
+        [
+            ROBOT,
+            *(
+                path.read_text(encoding="utf-8")
+                for path in sorted(ROOT.glob("configs/robots/*.yaml"))
+            ),
+        ],
     ),
     "daemon": (
         lambda text: load_config(text, "arbiter.yaml"),
@@ -54,7 +63,13 @@ READERS: dict[str, tuple[Reader, list[str]]] = {
 
 def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     yield at
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    items = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     for key, inner in items:
         yield from places(inner, (*at, key))
 
@@ -70,7 +85,11 @@ def written(value: Any, place: tuple[Any, ...], raw: str, at: tuple[Any, ...] = 
         )
         return "{" + ", ".join(pairs) + "}"
     if isinstance(value, list):
-        return "[" + ", ".join(written(inner, place, raw, (*at, i)) for i, inner in enumerate(value)) + "]"
+        return (
+            "["
+            + ", ".join(written(inner, place, raw, (*at, i)) for i, inner in enumerate(value))
+            + "]"
+        )
     return json.dumps(value)
 
 
@@ -109,7 +128,9 @@ def test_a_family_of_a_wrong_type_is_a_finding(raw: str) -> None:
 @pytest.mark.parametrize("place", [("embodiment_tags", 0), ("actions", 0), ("sensors_required", 0)])
 def test_one_wrong_entry_is_one_finding(place: tuple[Any, ...]) -> None:
     """Regression: a list of one wrong entry was "must have at least 1 entry" as well."""
-    document = yaml.safe_load((ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8"))
+    document = yaml.safe_load(
+        (ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
+    )
     document[place[0]] = document[place[0]][:1]
     with pytest.raises(ManifestError) as caught:
         parse_manifest(written(document, place, "[]"))
@@ -121,14 +142,20 @@ def test_one_wrong_entry_is_one_finding(place: tuple[Any, ...]) -> None:
 
 
 def test_one_wrong_range_is_one_finding() -> None:
-    document = yaml.safe_load((ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8"))
+    document = yaml.safe_load(
+        (ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
+    )
     document["action_contract"] = {
         "dim": 3,
-        "slots": [{"range": [2, 0], "control_mode": "joint_position", "joint_names": ["a", "b", "c"]}],
+        "slots": [
+            {"range": [2, 0], "control_mode": "joint_position", "joint_names": ["a", "b", "c"]}
+        ],
     }
     with pytest.raises(ManifestError) as caught:
         parse_manifest(json.dumps(document))
     found = [
-        problem for problem in caught.value.problems if problem.field.startswith("action_contract.slots[0]")
+        problem
+        for problem in caught.value.problems
+        if problem.field.startswith("action_contract.slots[0]")
     ]
     assert len(found) == 1

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from schemas.body import NOBODY, Body, read_body
-from schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.body import NOBODY, Body, read_body
+from vram_arbiter.schemas.manifest import RSkillManifest
 
 BASE: dict[str, Any] = {
     "name": "lab/x", "version": "1.0.0", "kind": "vlm", "weights_uri": "local://models/x", "chunk_size": 1,
@@ -21,7 +21,9 @@ ARM = Body(
 
 
 def skill(tags: list[str], **needs: Any) -> RSkillManifest:
-    return RSkillManifest.model_validate({**BASE, "embodiment_tags": tags, "capabilities_required": needs})
+    return RSkillManifest.model_validate(
+        {**BASE, "embodiment_tags": tags, "capabilities_required": needs}
+    )
 
 
 def test_tags() -> None:
@@ -60,7 +62,10 @@ def test_a_robot_is_one_robot(vague: str) -> None:
         ({"fingers": True}, "it needs fingers, which this robot has as 2"),
         ({"has_gripper": 1}, "it needs has_gripper of at least 1; this robot has True"),
         ({"has_gripper": "True"}, "it needs has_gripper 'True'; this robot has True"),
-        ({"can_lift_kg": float("nan")}, "it needs can_lift_kg of at least nan; this robot has 0.25"),
+        (
+            {"can_lift_kg": float("nan")},
+            "it needs can_lift_kg of at least nan; this robot has 0.25",
+        ),
     ],
 )
 def test_capabilities_count_by_value(needs: dict[str, Any], said: str) -> None:
@@ -93,5 +98,12 @@ def test_a_robot_that_says_less_never_fits_more(wanted: Any, have: Any) -> None:
 
 def test_a_body_from_a_stranger() -> None:
     assert read_body(ARM.model_dump(mode="json")) == ARM
-    for broken in (None, 7, [], {"embodiment_tags": ["any"]}, {"tags": []}, {"capabilities": {"x": []}}):
+    for broken in (
+        None,
+        7,
+        [],
+        {"embodiment_tags": ["any"]},
+        {"tags": []},
+        {"capabilities": {"x": []}},
+    ):
         assert read_body(broken) == NOBODY

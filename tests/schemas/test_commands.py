@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.collector import Collector
-from schemas import telemetry
+from tests.support.collector import Collector
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 pytestmark = pytest.mark.heavy  # the OpenTelemetry SDK
 
@@ -21,7 +21,7 @@ WAIT_S = 60.0
 def program(lines: str, collector: Collector | None, **environ: str) -> "subprocess.Popen[str]":
     """A program of these lines inside `command("tool", "do")`; `serves` and `sys` are at hand."""
     body = "\n".join(f"    {line}" for line in lines.splitlines())
-    code = f"import signal, sys\nfrom schemas.commands import command\nwith command('tool', 'do') as running:\n{body}\n"
+    code = f"import signal, sys\nfrom schemas.runtime.telemetry.commands import command\nwith command('tool', 'do') as running:\n{body}\n"
     given = {
         "PYTHONPATH": str(ROOT),
         "PATH": "/usr/bin",
@@ -29,7 +29,11 @@ def program(lines: str, collector: Collector | None, **environ: str) -> "subproc
         **environ,
     }
     return subprocess.Popen(
-        [sys.executable, "-c", code], env=given, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", code],
+        env=given,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
 
 
@@ -50,7 +54,9 @@ def test_the_end_of_a_command_is_recorded(lines: str, code: int) -> None:
         (span,) = collector.spans(telemetry.SPAN_COMMAND)
     assert span.attributes[telemetry.ATTR_EXIT_CODE] == code
     assert span.attributes[telemetry.ATTR_COMMAND] == "do"
-    assert (span.service, span.trace_id, span.parent_id) == ("tool", TRACE, PARENT), "it joins who started it"
+    assert (span.service, span.trace_id, span.parent_id) == ("tool", TRACE, PARENT), (
+        "it joins who started it"
+    )
     assert [event.name for event in span.events] == (["exception"] if "raise" in lines else [])
 
 
@@ -102,7 +108,7 @@ def test_an_emergency_stop_is_not_refused_for_the_telemetrys_sake(tmp_path: Path
             },
         ):
             done = subprocess.run(
-                [sys.executable, "-m", "runner", "estop", "--endpoint", f"ipc://{tmp_path}/runner.sock"],
+                [sys.executable, "-m", "vram_arbiter.runner", "estop", "--endpoint", f"ipc://{tmp_path}/runner.sock"],
                 env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin", **said},
                 capture_output=True, text=True, timeout=WAIT_S,
             )  # fmt: skip

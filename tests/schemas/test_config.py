@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from schemas import defaults
-from schemas.config import ArbiterConfig, load_config
-from schemas.errors import ConfigError
-from schemas.yamltext import parse_yaml
+from vram_arbiter.schemas import defaults
+from vram_arbiter.schemas.config.arbiter import ArbiterConfig, load_config
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.yamltext import parse_yaml
 
 EXAMPLE = Path(__file__).parents[2] / "configs" / "arbiter.yaml"
 
@@ -21,7 +21,8 @@ def test_the_example_equals_the_defaults() -> None:
 def test_the_example_states_every_key() -> None:
     stated = yaml.safe_load(EXAMPLE.read_text())
     wanted = {
-        name: set(type(getattr(ArbiterConfig(), name)).model_fields) for name in ArbiterConfig.model_fields
+        name: set(type(getattr(ArbiterConfig(), name)).model_fields)
+        for name in ArbiterConfig.model_fields
     }
     assert {name: set(section) for name, section in stated.items()} == wanted
 
@@ -80,7 +81,10 @@ def test_a_mistyped_key_is_named_with_line_and_suggestion() -> None:
 
 
 def test_a_mistyped_section_is_named() -> None:
-    assert problem("verfiy:\n  timeout_s: 1\n") == "arbiter.yaml:1: verfiy: unknown key; did you mean verify?"
+    assert (
+        problem("verfiy:\n  timeout_s: 1\n")
+        == "arbiter.yaml:1: verfiy: unknown key; did you mean verify?"
+    )
 
 
 def test_a_key_that_resembles_nothing_lists_the_known_ones() -> None:
@@ -90,14 +94,20 @@ def test_a_key_that_resembles_nothing_lists_the_known_ones() -> None:
 def test_every_mistake_of_a_file_is_reported() -> None:
     text = "limits:\n  sessions_max: 0\nverify:\n  timeout_s: soon\n  tolerance_bytes: 12 parsecs\n"
     lines = problem(text).splitlines()
-    assert [line.split(": ")[0] for line in lines] == ["arbiter.yaml:2", "arbiter.yaml:4", "arbiter.yaml:5"]
+    assert [line.split(": ")[0] for line in lines] == [
+        "arbiter.yaml:2",
+        "arbiter.yaml:4",
+        "arbiter.yaml:5",
+    ]
     assert "not a size: '12 parsecs'" in lines[2]
 
 
 @pytest.mark.parametrize("ends", ["[2]", "[2, 5, 9]", "[5, 2]"])
 def test_the_pauses_of_a_verification_and_their_ends_belong_together(ends: str) -> None:
     assert "poll_until_s needs 2 rising times" in problem(f"verify:\n  poll_until_s: {ends}\n")
-    assert load_config("verify:\n  poll_s: [0.1]\n  poll_until_s: []\n", "x").verify.poll_until_s == ()
+    assert (
+        load_config("verify:\n  poll_s: [0.1]\n  poll_until_s: []\n", "x").verify.poll_until_s == ()
+    )
 
 
 def test_a_wrong_list_item_is_named_by_its_place() -> None:
@@ -139,6 +149,7 @@ def test_bad_text_is_a_config_error_with_a_line(text: str, line: int, words: str
 def test_aliases_that_multiply_end_in_an_error() -> None:
     text = "a: &a [x, x, x, x, x, x, x, x, x, x]\n"
     text += "".join(
-        f"{n}: &{n} [{', '.join([f'*{p}'] * 10)}]\n" for p, n in zip("abcdef", "bcdefg", strict=True)
+        f"{n}: &{n} [{', '.join([f'*{p}'] * 10)}]\n"
+        for p, n in zip("abcdef", "bcdefg", strict=True)
     )
     assert "more than" in problem(text)

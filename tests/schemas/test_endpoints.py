@@ -5,8 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from schemas.endpoints import arbiter_endpoint, check_endpoint, program_endpoint, runtime_dir, socket_path
-from schemas.errors import ConfigError
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.endpoints import (
+    arbiter_endpoint,
+    check_endpoint,
+    program_endpoint,
+    runtime_dir,
+    socket_path,
+)
 
 UID = 54_321
 

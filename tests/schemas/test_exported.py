@@ -5,8 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.collector import Collector
-from schemas.exported import LABEL_MAX_CHARS, TEXT_MAX_CHARS, attribute, labels, text
+from tests.support.collector import Collector
+from vram_arbiter.schemas.runtime.telemetry.exported import (
+    LABEL_MAX_CHARS,
+    TEXT_MAX_CHARS,
+    attribute,
+    labels,
+    text,
+)
 
 from .test_otel import needs_sdk, run
 
@@ -45,12 +51,15 @@ def test_there_is_an_end_to_everything() -> None:
     nested.append(nested)
     assert attribute(nested) != nested
     assert len(str(attribute(["x" * 1000] * 100_000))) < 200_000
-    assert labels({"a": "x" * 10_000, "b": "ok"}) == {"a": "x" * (LABEL_MAX_CHARS - 1) + "…", "b": "ok"}
+    assert labels({"a": "x" * 10_000, "b": "ok"}) == {
+        "a": "x" * (LABEL_MAX_CHARS - 1) + "…",
+        "b": "ok",
+    }
 
 
 PROGRAM = """
 import urllib.request
-import schemas.otel as o
+import schemas.runtime.telemetry.setup as o
 from schemas import meters, tracing
 t = o.set_up('robot', prometheus_port=0, attributes={'robot': 'a\\ud800'})
 half = 'half a pair: \\ud800'

@@ -7,13 +7,15 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from arbiter.testing.fakegpu_check import check_log
-from schemas import fakegpu
-from schemas.errors import CODES, ConfigError, OutOfMemory
-from schemas.ids import ProcessKey
+from tests.support.fakegpu_check import check_log
+from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.errors import CODES, ConfigError, OutOfMemory
+from vram_arbiter.schemas.ids import ProcessKey
 
 GB = 10**9
-CONFIG = fakegpu.CardConfig(uuid="GPU-fake-1", capacity_bytes=8 * GB, release_lag_s=0.5, boot_id="boot")
+CONFIG = fakegpu.CardConfig(
+    uuid="GPU-fake-1", capacity_bytes=8 * GB, release_lag_s=0.5, boot_id="boot"
+)
 A, B = ProcessKey(100, 1), ProcessKey(200, 2)
 
 
@@ -90,7 +92,9 @@ def test_a_freed_block_stays_in_the_cache_until_it_is_emptied_and_then_comes_bac
     folder = Folder()
     allocate(folder, A, 5 * GB)
     folder.do(fakegpu.free, A, "weights", 5 * GB)
-    assert allocate(folder, B, 4 * GB).error is not None, "the cache belongs to the process that freed"
+    assert allocate(folder, B, 4 * GB).error is not None, (
+        "the cache belongs to the process that freed"
+    )
     assert allocate(folder, A, 6 * GB).error is None, "which gets it without asking the card again"
     folder.do(fakegpu.free, A, "weights", 6 * GB)
     folder.do(fakegpu.empty_cache, A)
@@ -186,15 +190,21 @@ def test_a_card_survives_the_daemon_but_not_the_boot():
     existing = fakegpu.dump_config(CONFIG)
     same = CONFIG.model_copy(update={"uuid": "other"})
     assert fakegpu.plan_folder(same, existing, ["100-1.json"]) == fakegpu.FolderPlan()
-    rebooted = fakegpu.plan_folder(same.model_copy(update={"boot_id": "next"}), existing, ["100-1.json"])
+    rebooted = fakegpu.plan_folder(
+        same.model_copy(update={"boot_id": "next"}), existing, ["100-1.json"]
+    )
     assert rebooted.remove == ("100-1.json",)
     assert rebooted.fresh_log
-    assert fakegpu.parse_config(rebooted.write["gpu.json"]).uuid == CONFIG.uuid, "a card keeps its name"
+    assert fakegpu.parse_config(rebooted.write["gpu.json"]).uuid == CONFIG.uuid, (
+        "a card keeps its name"
+    )
     larger = CONFIG.model_copy(update={"capacity_bytes": 16 * GB})
     with pytest.raises(ConfigError, match="is in use here"):
         fakegpu.plan_folder(larger, existing, ["100-1.json"])
     assert (
-        fakegpu.parse_config(fakegpu.plan_folder(larger, existing, []).write["gpu.json"]).capacity_bytes
+        fakegpu.parse_config(
+            fakegpu.plan_folder(larger, existing, []).write["gpu.json"]
+        ).capacity_bytes
         == 16 * GB
     )
 
@@ -232,7 +242,9 @@ def test_the_checker_finds_what_is_wrong():
     lines = [json.loads(line) for line in folder.log.splitlines()]
 
     def problems(**wrong):
-        return check_log("".join(json.dumps(line) + "\n" for line in [lines[0], lines[1] | wrong])).problems
+        return check_log(
+            "".join(json.dumps(line) + "\n" for line in [lines[0], lines[1] | wrong])
+        ).problems
 
     assert problems() == []
     for wrong in (

@@ -4,11 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from schemas.errors import ManifestInvalid
-from schemas.manifest import Kind, ManifestError, Role, load_manifest, parse_manifest
+from vram_arbiter.schemas.errors import ManifestInvalid
+from vram_arbiter.schemas.manifest import Kind, ManifestError, Role, load_manifest, parse_manifest
 
 SAMPLES = sorted((Path(__file__).parent / "manifests").glob("*.yaml"))
-FIELD_FILES = sorted((Path(__file__).parents[3] / "shared" / "reference" / "manifests").glob("*.yaml"))
+FIELD_FILES = sorted(
+    (Path(__file__).parents[3] / "shared" / "reference" / "manifests").glob("*.yaml")
+)
 
 
 def sample(name: str) -> str:
@@ -38,7 +40,9 @@ def test_samples_cover_every_kind() -> None:
     assert {path.stem.split("-")[0] for path in SAMPLES} == set(Kind)
 
 
-@pytest.mark.skipif(not FIELD_FILES, reason="the field's own manifests do not lie beside this repository")
+@pytest.mark.skipif(
+    not FIELD_FILES, reason="the field's own manifests do not lie beside this repository"
+)
 @pytest.mark.parametrize("path", FIELD_FILES, ids=lambda path: path.stem)
 def test_files_of_the_field_load_unchanged(path: Path) -> None:
     assert load_manifest(path).name.startswith("OpenRAL/")
@@ -69,7 +73,11 @@ def test_vlm_with_role_s1_is_a_warning_not_an_error() -> None:
 
 
 def test_warnings_about_what_is_missing() -> None:
-    text = sample("vla").replace("int4: 4.3", "fp32: 4.3").replace("n_action_steps: 25", "n_action_steps: 99")
+    text = (
+        sample("vla")
+        .replace("int4: 4.3", "fp32: 4.3")
+        .replace("n_action_steps: 25", "n_action_steps: 99")
+    )
     text = text.replace("starting_pose: [0, ", "starting_pose: [").replace(
         'layout: "rc365"', 'layout: "home_made"'
     )
@@ -83,7 +91,9 @@ def test_warnings_about_what_is_missing() -> None:
 
 def test_undeclared_joint_units_are_a_warning() -> None:
     text = changed("vla-act-custom", ', joint_units: "degrees"', "")
-    assert [warning.field for warning in parse_manifest(text).warnings()] == ["action_contract.joint_units"]
+    assert [warning.field for warning in parse_manifest(text).warnings()] == [
+        "action_contract.joint_units"
+    ]
 
 
 @pytest.mark.parametrize(
@@ -161,10 +171,16 @@ def test_family_without_processors() -> None:
 
 
 def test_all_findings_come_at_once_in_the_order_of_lines() -> None:
-    text = changed("vla", 'dtype: "int4"', 'dtype: "int3"').replace("chunk_size: 50", "chunk_size: -1")
+    text = changed("vla", 'dtype: "int4"', 'dtype: "int3"').replace(
+        "chunk_size: 50", "chunk_size: -1"
+    )
     text += "detector: {labels: [x]}\n"
     lines = findings(text)
-    assert [line.split(" ")[1] for line in lines] == ["quantization.dtype:", "chunk_size:", "detector:"]
+    assert [line.split(" ")[1] for line in lines] == [
+        "quantization.dtype:",
+        "chunk_size:",
+        "detector:",
+    ]
     numbers = [int(line.split(":")[1]) for line in lines]
     assert numbers == sorted(numbers)
     assert text.splitlines()[numbers[0] - 1].strip().startswith("dtype:")

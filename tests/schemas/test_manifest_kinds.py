@@ -10,25 +10,33 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from schemas.manifest import Kind, RSkillManifest
-from schemas.manifest.kinds import KINDS, RULES, check_kind
-from schemas.manifest.problems import from_validation_error
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest
+from vram_arbiter.schemas.manifest.kinds import KINDS, RULES, check_kind
+from vram_arbiter.schemas.manifest.problems import from_validation_error
 
 FOLDER = Path(__file__).parent / "manifests"
 SAMPLES: dict[Kind, dict[str, Any]] = {
-    kind: yaml.safe_load((FOLDER / f"{kind.value}.yaml").read_text(encoding="utf-8")) for kind in KINDS
+    kind: yaml.safe_load((FOLDER / f"{kind.value}.yaml").read_text(encoding="utf-8"))
+    for kind in KINDS
 }
 
 VALUES: dict[str, Any] = {
     **{
-        field: value for data in SAMPLES.values() for field, value in data.items() if field in RULES and value
+        field: value
+        for data in SAMPLES.values()
+        for field, value in data.items()
+        if field in RULES and value
     },
     "model_family": "act",  # pi05 would ask for processors
 }
 """A valid value for every field of the table."""
 
-FORBIDDEN = [(kind, field) for field, row in RULES.items() for kind, rule in row.items() if rule == "F"]
-REQUIRED = [(kind, field) for field, row in RULES.items() for kind, rule in row.items() if rule == "R"]
+FORBIDDEN = [
+    (kind, field) for field, row in RULES.items() for kind, rule in row.items() if rule == "F"
+]
+REQUIRED = [
+    (kind, field) for field, row in RULES.items() for kind, rule in row.items() if rule == "R"
+]
 FREE = [(kind, field) for field, row in RULES.items() for kind, rule in row.items() if rule == "-"]
 
 
@@ -71,7 +79,11 @@ def test_missing_required_field_is_refused(cell: tuple[Kind, str], how: str) -> 
 def test_free_field_is_accepted_and_may_be_left_out(cell: tuple[Kind, str]) -> None:
     kind, field = cell
     assert problems(sample(kind) | {field: VALUES[field]}) == set()
-    if field not in ("chunk_size", "actions", "processors"):  # required of every kind, or by the family
+    if field not in (
+        "chunk_size",
+        "actions",
+        "processors",
+    ):  # required of every kind, or by the family
         data = sample(kind)
         data.pop(field, None)
         assert problems(data) == set()
@@ -79,7 +91,9 @@ def test_free_field_is_accepted_and_may_be_left_out(cell: tuple[Kind, str]) -> N
 
 @given(st.sampled_from(KINDS), st.integers(2, 1000))
 def test_chunks_of_one_where_rows_are_checked_one_by_one(kind: Kind, chunk_size: int) -> None:
-    expected = {"chunk_size"} if kind in (Kind.ROS_ACTION, Kind.ROS_SERVICE, Kind.PLAYBOOK) else set()
+    expected = (
+        {"chunk_size"} if kind in (Kind.ROS_ACTION, Kind.ROS_SERVICE, Kind.PLAYBOOK) else set()
+    )
     assert problems(sample(kind) | {"chunk_size": chunk_size}) == expected
 
 
@@ -92,7 +106,8 @@ def test_only_playbooks_are_bound_to_a_role(kind: Kind, role: str | None) -> Non
 
 
 @given(
-    st.sampled_from(KINDS), st.sets(st.sampled_from(sorted(set(VALUES) - {"chunk_size", "role", "actions"})))
+    st.sampled_from(KINDS),
+    st.sets(st.sampled_from(sorted(set(VALUES) - {"chunk_size", "role", "actions"}))),
 )
 def test_any_set_of_extra_fields_is_judged_field_by_field(kind: Kind, extra: set[str]) -> None:
     data = sample(kind) | {field: VALUES[field] for field in extra}

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.collector import Collector
-from schemas.errors import ConfigError
-from schemas.otel import OTLP_DEFAULT, Plan, Telemetry, plan, set_up
+from tests.support.collector import Collector
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.telemetry.setup import OTLP_DEFAULT, Plan, Telemetry, plan, set_up
 
 needs_sdk = pytest.mark.skipif(
     not all(importlib.util.find_spec(name) for name in ("opentelemetry.sdk", "prometheus_client")),
@@ -89,20 +89,32 @@ def run(code: str, environ: Mapping[str, str]) -> subprocess.CompletedProcess[st
                 "OTEL_EXPORTER_OTLP_TIMEOUT": "7",
                 "OTEL_EXPORTER_OTLP_TRACES_TIMEOUT": " 0.5 ",
             },
-            Plan(BASE + "/v1/traces", BASE + "/v1/metrics", traces_timeout_s=0.5, metrics_timeout_s=7.0),
+            Plan(
+                BASE + "/v1/traces",
+                BASE + "/v1/metrics",
+                traces_timeout_s=0.5,
+                metrics_timeout_s=7.0,
+            ),
         ),
         (
             {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_OTLP_TIMEOUT": "soon"},
-            Plan(prometheus=("127.0.0.1", 9464)),  # nothing is exported by OTLP: the variable is not read
+            Plan(
+                prometheus=("127.0.0.1", 9464)
+            ),  # nothing is exported by OTLP: the variable is not read
         ),
     ],
 )
-def test_the_standard_variables_mean_what_they_say(environ: Mapping[str, str], wanted: Plan) -> None:
+def test_the_standard_variables_mean_what_they_say(
+    environ: Mapping[str, str], wanted: Plan
+) -> None:
     assert plan(environ) == wanted
 
 
 def test_a_configuration_wins_over_the_environment() -> None:
-    environ = {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://other:4318", "OTEL_TRACES_SAMPLER": "always_off"}
+    environ = {
+        "OTEL_EXPORTER_OTLP_ENDPOINT": "http://other:4318",
+        "OTEL_TRACES_SAMPLER": "always_off",
+    }
     got = plan(environ, endpoint=BASE, prometheus_port=0, sample_ratio=0.5)
     assert got == Plan(
         BASE + "/v1/traces",
@@ -126,13 +138,31 @@ def test_a_configuration_wins_over_the_environment() -> None:
             {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_HOST": "0.0.0.0"},
             "no loopback address",
         ),
-        ({"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_HOST": "robot"}, "no loopback"),
-        ({"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_PORT": "70000"}, "no port"),
-        ({"OTEL_TRACES_EXPORTER": "otlp", "OTEL_TRACES_SAMPLER": "sometimes"}, "parentbased_traceidratio"),
-        ({"OTEL_TRACES_EXPORTER": "otlp", "OTEL_TRACES_SAMPLER_ARG": "2"}, "0 (no trace) to 1 (all)"),
-        ({"OTEL_TRACES_EXPORTER": "otlp", "OTEL_TRACES_SAMPLER_ARG": "nan"}, "OTEL_TRACES_SAMPLER_ARG"),
+        (
+            {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_HOST": "robot"},
+            "no loopback",
+        ),
+        (
+            {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_PORT": "70000"},
+            "no port",
+        ),
+        (
+            {"OTEL_TRACES_EXPORTER": "otlp", "OTEL_TRACES_SAMPLER": "sometimes"},
+            "parentbased_traceidratio",
+        ),
+        (
+            {"OTEL_TRACES_EXPORTER": "otlp", "OTEL_TRACES_SAMPLER_ARG": "2"},
+            "0 (no trace) to 1 (all)",
+        ),
+        (
+            {"OTEL_TRACES_EXPORTER": "otlp", "OTEL_TRACES_SAMPLER_ARG": "nan"},
+            "OTEL_TRACES_SAMPLER_ARG",
+        ),
         *(
-            ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, name: odd}, f"{name}: {odd!r} is no number of seconds")
+            (
+                {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, name: odd},
+                f"{name}: {odd!r} is no number of seconds",
+            )
             for name in (
                 "OTEL_EXPORTER_OTLP_TIMEOUT",
                 "OTEL_EXPORTER_OTLP_TRACES_TIMEOUT",
@@ -150,7 +180,7 @@ def test_what_makes_no_sense_is_named(environ: Mapping[str, str], words: str) ->
 # -- off ----------------------------------------------------------------------------------------------------------------
 def test_off_imports_nothing_of_opentelemetry_and_starts_nothing() -> None:
     result = run(
-        "import sys, threading, schemas.otel as o\n"
+        "import sys, threading, schemas.runtime.telemetry.setup as o\n"
         "t = o.set_up('robot')\n"
         "t()\n"
         "assert not t.on\n"
@@ -169,7 +199,7 @@ def test_packages_that_are_missing_are_asked_for() -> None:
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name.startswith('{}'): raise ModuleNotFoundError('No module named ' + repr(name))\n"
         "sys.meta_path.insert(0, Hidden())\n"
-        "import threading, schemas.otel as o\n"
+        "import threading, schemas.runtime.telemetry.setup as o\n"
         "try: o.set_up('robot')\n"
         "except Exception as e: print(type(e).__name__, e, threading.active_count())\n"
     )
@@ -187,7 +217,7 @@ def test_packages_that_are_missing_are_asked_for() -> None:
 
 # -- on -----------------------------------------------------------------------------------------------------------------
 PROGRAM = """
-import sys, schemas.otel as o
+import sys, schemas.runtime.telemetry.setup as o
 from schemas import telemetry, tracing
 from opentelemetry import metrics
 made_before = metrics.get_meter(telemetry.TRACER).create_counter(telemetry.METRIC_GOALS)
@@ -233,19 +263,24 @@ def test_spans_and_metrics_reach_the_collector_at_the_programs_end() -> None:
 def test_a_trace_that_began_elsewhere_is_kept_if_it_was_kept_there(flag: str, kept: int) -> None:
     parent = f"00-{'a' * 32}-{'b' * 16}-{flag}"
     with Collector() as collector:
-        environ = {"OTEL_EXPORTER_OTLP_ENDPOINT": collector.endpoint, "OTEL_TRACES_SAMPLER_ARG": "0"}
+        environ = {
+            "OTEL_EXPORTER_OTLP_ENDPOINT": collector.endpoint,
+            "OTEL_TRACES_SAMPLER_ARG": "0",
+        }
         result = run(f"import sys; sys.argv[1:] = [{parent!r}]\n{PROGRAM}", environ)
         assert (result.returncode, result.stderr) == (0, "")
         assert len(collector.spans()) == kept
         assert {span.trace_id for span in collector.spans()} <= {"a" * 32}
         assert result.stdout.startswith(f"00-{'a' * 32}-"), "the chain is passed on, kept or not"
-        collector.wait(lambda: bool(collector.points("vram.goals")), "metrics, which are never sampled")
+        collector.wait(
+            lambda: bool(collector.points("vram.goals")), "metrics, which are never sampled"
+        )
 
 
 @needs_sdk
 def test_prometheus_is_read_on_loopback_and_not_after_the_end() -> None:
     result = run(
-        "import http.client, schemas.otel as o\n"
+        "import http.client, schemas.runtime.telemetry.setup as o\n"
         "from schemas import telemetry as n\n"
         "t = o.set_up('vram-arbiter', prometheus_port=0)\n"
         "from opentelemetry import metrics\n"
@@ -287,7 +322,7 @@ def test_a_collector_that_is_away_is_complained_of_once_and_holds_up_no_end() ->
         deaf.listen()
         result = run(
             "import logging; logging.basicConfig(format='%(message)s')\n"
-            "import time, schemas.otel as o\n"
+            "import time, schemas.runtime.telemetry.setup as o\n"
             "from schemas import tracing\n"
             "t = o.set_up('robot')\n"
             "from opentelemetry import trace\n"
@@ -302,7 +337,9 @@ def test_a_collector_that_is_away_is_complained_of_once_and_holds_up_no_end() ->
             },
         )
     assert result.returncode == 0
-    assert result.stdout.strip() == "['MainThread']", "nothing is left that an interpreter would wait for"
+    assert result.stdout.strip() == "['MainThread']", (
+        "nothing is left that an interpreter would wait for"
+    )
     assert result.stderr.count("Failed to export") == 1, result.stderr
 
 
@@ -328,9 +365,11 @@ def test_ending_waits_for_nobody_longer_than_it_was_told() -> None:
         {"OTEL_SPAN_ATTRIBUTE_COUNT_LIMIT": "many"},
     ],
 )
-def test_what_the_sdk_refuses_is_the_operators_error_and_leaves_no_half(wrong: dict[str, str]) -> None:
+def test_what_the_sdk_refuses_is_the_operators_error_and_leaves_no_half(
+    wrong: dict[str, str],
+) -> None:
     result = run(
-        "import schemas.otel as o\n"
+        "import schemas.runtime.telemetry.setup as o\n"
         "from schemas.errors import ConfigError\n"
         "try:\n    o.set_up('robot', prometheus_port=0)\n"
         "except ConfigError as error:\n    print(error)\n"
@@ -349,7 +388,7 @@ def test_an_operators_time_limits_win_over_ours() -> None:
     """Regression: a limit for one signal was overridden by our 3 s."""
     result = run(
         "import gc\n"
-        "import schemas.otel as o\n"
+        "import schemas.runtime.telemetry.setup as o\n"
         "t = o.set_up('robot')\n"
         "from opentelemetry.exporter.otlp.common.http import _OTLPHTTPClient as C\n"
         "print({c._kind: c._timeout for c in gc.get_objects() if isinstance(c, C)})\n"
@@ -363,8 +402,8 @@ def test_an_operators_time_limits_win_over_ours() -> None:
 def test_no_secret_stands_in_a_message() -> None:
     result = run(
         "import logging; logging.basicConfig()\n"
-        "import schemas.otel as o\n"
-        "from schemas.config import ArbiterConfig\n"
+        "import schemas.runtime.telemetry.setup as o\n"
+        "from schemas.config.arbiter import ArbiterConfig\n"
         "from schemas.errors import ConfigError\n"
         "t = o.set_up('robot')\n"
         "for url in ('htps://me:geheim@host', 'htps://host/?key=geheim'):\n"
@@ -385,7 +424,7 @@ def test_no_secret_stands_in_a_message() -> None:
 def test_a_full_queue_of_spans_is_complained_of_as_seldom_as_its_collector() -> None:
     result = run(
         "import logging; logging.basicConfig(format='%(message)s')\n"
-        "import schemas.otel as o\n"
+        "import schemas.runtime.telemetry.setup as o\n"
         "o.set_up('robot')\n"
         "sdk = logging.getLogger('opentelemetry.sdk._shared_internal')\n"
         "for n in range(3):\n"

@@ -1,11 +1,11 @@
-"""`schemas.robot`: the deployment file, its defaults, and mistakes named by line and field."""
+"""`schemas.config.robot`: the deployment file, its defaults, and mistakes named by line and field."""
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.errors import ConfigError
-from schemas.robot import RobotEnvironment, SensorBackend, load_robot
+from vram_arbiter.schemas.config.robot import RobotEnvironment, SensorBackend, load_robot
+from vram_arbiter.schemas.errors import ConfigError
 
 SMALL = """\
 robot_id: so101
@@ -45,7 +45,11 @@ def fields(text: str) -> list[tuple[int, str]]:
 
 def test_three_lines_are_a_robot() -> None:
     robot = load_robot(SMALL, "robot.yaml")
-    assert (robot.rate_hz, robot.thumbnail_hz, robot.deadline_overrun_policy) == (30.0, 25.0, "warn")
+    assert (robot.rate_hz, robot.thumbnail_hz, robot.deadline_overrun_policy) == (
+        30.0,
+        25.0,
+        "warn",
+    )
     assert (robot.sensors, robot.task, robot.vla, robot.save_dir) == ((), None, None, None)
 
 

@@ -4,9 +4,16 @@ from pathlib import Path
 
 import pytest
 
-from schemas.errors import ConfigError
-from schemas.scenario import Arrivals, Scenario, ScenarioCard, ScenarioConsumer, Stowaway, load_scenario
-from schemas.sizes import parse_bytes
+from vram_arbiter.schemas.config.scenario import (
+    Arrivals,
+    Scenario,
+    ScenarioCard,
+    ScenarioConsumer,
+    Stowaway,
+    load_scenario,
+)
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.sizes import parse_bytes
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "scenarios").glob("*.yaml"))
 SMALL = """\
@@ -32,7 +39,11 @@ def test_every_shipped_scenario_is_valid_and_says_what_it_is(path: Path) -> None
 def test_the_defaults_of_a_small_one() -> None:
     scenario = load_scenario(SMALL, "s.yaml")
     consumer = scenario.consumers["a"]
-    assert (consumer.load_peak, consumer.use_s, consumer.evictable) == (parse_bytes("2GiB"), (1.0, 1.0), True)
+    assert (consumer.load_peak, consumer.use_s, consumer.evictable) == (
+        parse_bytes("2GiB"),
+        (1.0, 1.0),
+        True,
+    )
     assert scenario.cards[0].release_lag_s == 0.5
 
 
@@ -64,7 +75,11 @@ def test_every_key_that_is_not_plain_says_what_it_is(model: type[Scenario]) -> N
         ),
         ("every_s: 5", "after: b", "consumers.a.arrivals.after: there is no consumer 'b'"),
         ("use_s: 1", "use_s: 1\n    gpu: '3'", "consumers.a.gpu: '3' is no card"),
-        ("use_s: 1", "use_s: 1\n    steady: 3GiB", "consumers.a.steady is larger than its load_peak"),
+        (
+            "use_s: 1",
+            "use_s: 1\n    steady: 3GiB",
+            "consumers.a.steady is larger than its load_peak",
+        ),
         ("seconds: 10", "seconds: -1", "s.yaml:2: seconds: "),
         ("about: one", "about: one\nstowaways: [{name: x, bytes: 1, card: 1}]", "x is on card 1"),
         ("about: one\n", "", "about: Field required"),

@@ -1,4 +1,4 @@
-"""`python -m schemas` as people run it, and the exported JSON Schemas that must not drift from the models."""
+"""`python -m vram_arbiter.schemas` as people run it, and the exported JSON Schemas that must not drift from the models."""
 
 import json
 import subprocess
@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-import schemas
-from schemas.__main__ import main
-from schemas.export import documents, modules, public_models
+from vram_arbiter import schemas
+from vram_arbiter.schemas.__main__ import main
+from vram_arbiter.schemas.export import documents, modules, public_models
 
 SAMPLES = sorted((Path(__file__).parent / "manifests").glob("*.yaml"))
 EXPORTED = Path(schemas.__file__).parent / "json"
@@ -17,7 +17,7 @@ EXPORTED = Path(schemas.__file__).parent / "json"
 
 def test_check_says_ok_for_good_files() -> None:
     result = subprocess.run(
-        [sys.executable, "-m", "schemas", "check", *map(str, SAMPLES)],
+        [sys.executable, "-m", "vram_arbiter.schemas", "check", *map(str, SAMPLES)],
         capture_output=True,
         text=True,
         timeout=60,
@@ -31,11 +31,16 @@ def test_check_names_every_wrong_field_and_goes_on(
 ) -> None:
     wrong = tmp_path / "rskill.yaml"
     text = SAMPLES[0].read_text(encoding="utf-8")
-    wrong.write_text(text.replace("chunk_size: 1", "chunk_size: 0") + "colour: red\n", encoding="utf-8")
+    wrong.write_text(
+        text.replace("chunk_size: 1", "chunk_size: 0") + "colour: red\n", encoding="utf-8"
+    )
     assert main(["check", str(tmp_path), str(SAMPLES[1])]) == 1
     out, err = capsys.readouterr()
     lines = out.splitlines()
-    assert [line.partition(": ")[2].partition(":")[0] for line in lines[:2]] == ["chunk_size", "colour"]
+    assert [line.partition(": ")[2].partition(":")[0] for line in lines[:2]] == [
+        "chunk_size",
+        "colour",
+    ]
     assert lines[0].startswith(f"{wrong}:")
     assert lines[2] == f"{SAMPLES[1]}: ok"
     assert err == "1 of 2 files are invalid\n"
@@ -43,12 +48,17 @@ def test_check_names_every_wrong_field_and_goes_on(
 
 def test_check_of_a_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(tmp_path / "none.yaml")]) == 1
-    assert capsys.readouterr().out == f"{tmp_path / 'none.yaml'}: cannot be read: No such file or directory\n"
+    assert (
+        capsys.readouterr().out
+        == f"{tmp_path / 'none.yaml'}: cannot be read: No such file or directory\n"
+    )
 
 
 def test_warnings_go_beside_the_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = next(path for path in SAMPLES if path.stem == "vlm").read_text(encoding="utf-8")
-    (tmp_path / "rskill.yaml").write_text(text.replace('role: "s2"', 'role: "s1"'), encoding="utf-8")
+    (tmp_path / "rskill.yaml").write_text(
+        text.replace('role: "s2"', 'role: "s1"'), encoding="utf-8"
+    )
     assert main(["check", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
     assert out == f"{tmp_path / 'rskill.yaml'}: ok\n"
@@ -73,7 +83,9 @@ def test_export_writes_valid_json(tmp_path: Path, capsys: pytest.CaptureFixture[
     ]  # fmt: skip
 
 
-def test_export_into_a_file_fails_clearly(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_into_a_file_fails_clearly(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "file").touch()
     assert main(["export", str(tmp_path / "file")]) == 1
     assert capsys.readouterr().err.startswith(f"cannot write to {tmp_path / 'file'}: ")
@@ -82,14 +94,22 @@ def test_export_into_a_file_fails_clearly(tmp_path: Path, capsys: pytest.Capture
 def test_committed_schemas_are_those_of_the_models() -> None:
     committed = {path.name: path.read_text(encoding="utf-8") for path in EXPORTED.glob("*.json")}
     stale = sorted(
-        name for name in committed.keys() | documents().keys() if committed.get(name) != documents().get(name)
+        name
+        for name in committed.keys() | documents().keys()
+        if committed.get(name) != documents().get(name)
     )
-    assert not stale, f"run `python -m schemas export schemas/json`; drifted: {', '.join(stale)}"
+    assert not stale, (
+        f"run `python -m vram_arbiter.schemas export schemas/json`; drifted: {', '.join(stale)}"
+    )
 
 
 @pytest.mark.parametrize("name", modules())
 def test_every_public_model_is_exported(name: str) -> None:
-    module = sys.modules.get(f"schemas.{name}") or __import__(f"schemas.{name}", fromlist=[name])
+    module = sys.modules.get(f"vram_arbiter.schemas.{name}") or __import__(
+        f"vram_arbiter.schemas.{name}", fromlist=[name]
+    )
     models = public_models(module)
     if models:
-        assert {model.__name__ for model in models} <= set(json.loads(documents()[f"{name}.json"])["$defs"])
+        assert {model.__name__ for model in models} <= set(
+            json.loads(documents()[f"{name}.json"])["$defs"]
+        )

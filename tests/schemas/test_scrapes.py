@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from schemas import scrapes
-from schemas.scrapes import (
+from vram_arbiter.schemas.runtime.telemetry import scrapes
+from vram_arbiter.schemas.runtime.telemetry.scrapes import (
     CONNECTIONS_MAX,
     CONNECTIONS_PER_USER,
     REQUEST_MAX_BYTES,
@@ -28,9 +28,13 @@ def serve() -> Iterator[Callable[..., ScrapeServer]]:
     made: list[ScrapeServer] = []
 
     def make(
-        owners: Callable[[], Owners] = KernelTable, scrape_s: float = PATIENCE_S, host: str = "127.0.0.1"
+        owners: Callable[[], Owners] = KernelTable,
+        scrape_s: float = PATIENCE_S,
+        host: str = "127.0.0.1",
     ) -> ScrapeServer:
-        made.append(ScrapeServer(host, 0, lambda accept: (b"up 1\n", "text/plain"), owners, scrape_s))
+        made.append(
+            ScrapeServer(host, 0, lambda accept: (b"up 1\n", "text/plain"), owners, scrape_s)
+        )
         made[-1].start()
         return made[-1]
 
@@ -66,7 +70,12 @@ class Users:
 def test_a_page_is_answered_and_nothing_else_is(serve: Callable[..., ScrapeServer]) -> None:
     port = serve().port
     seen = []
-    for method, target in (("GET", "/metrics"), ("HEAD", "/metrics"), ("GET", "/etc"), ("POST", "/metrics")):
+    for method, target in (
+        ("GET", "/metrics"),
+        ("HEAD", "/metrics"),
+        ("GET", "/etc"),
+        ("POST", "/metrics"),
+    ):
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
         connection.request(method, target)
         response = connection.getresponse()
@@ -92,7 +101,9 @@ def test_one_user_with_many_silent_connections_does_not_keep_the_scraper_out(
         one.close()
 
 
-def test_a_reader_that_sends_a_byte_at_a_time_is_given_up(serve: Callable[..., ScrapeServer]) -> None:
+def test_a_reader_that_sends_a_byte_at_a_time_is_given_up(
+    serve: Callable[..., ScrapeServer],
+) -> None:
     """Every byte began the 5 s anew: eight connections with a byte every 4 s held all places for ever."""
     port = serve(scrape_s=0.3).port
     with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as slow:
@@ -125,7 +136,10 @@ def test_a_reader_that_does_not_read_is_given_up() -> None:
 
 def test_a_request_without_an_end_is_hung_up_on(serve: Callable[..., ScrapeServer]) -> None:
     port = serve().port
-    with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as endless, pytest.raises(OSError):  # noqa: PT012
+    with (  # noqa: PT012
+        socket.create_connection(("127.0.0.1", port), PATIENCE_S) as endless,
+        pytest.raises(OSError),
+    ):
         for _ in range(64):
             endless.sendall(b"GET /" + b"a" * REQUEST_MAX_BYTES)
         if not endless.recv(1):
@@ -133,7 +147,9 @@ def test_a_request_without_an_end_is_hung_up_on(serve: Callable[..., ScrapeServe
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
-def test_the_kernel_names_the_user_of_a_connection(host: str, serve: Callable[..., ScrapeServer]) -> None:
+def test_the_kernel_names_the_user_of_a_connection(
+    host: str, serve: Callable[..., ScrapeServer]
+) -> None:
     named: list[int | None] = []
     seen = threading.Event()
 

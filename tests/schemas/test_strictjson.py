@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas import strictjson
+from vram_arbiter.schemas import strictjson
 
 JSON = st.recursive(
     st.none()
@@ -16,7 +16,9 @@ JSON = st.recursive(
     | st.floats()
     | st.integers(-(1 << 70), 1 << 70)
     | st.text(st.characters(), max_size=4),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner, max_size=3)
+    ),
     max_leaves=10,
 )
 
@@ -34,7 +36,8 @@ def test_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["null", "[]", '{"a": [1, 2.5, "\\ud83d\\ude00"]}', "[" * 64 + "]" * 64, "9223372036854775807"]
+    "text",
+    ["null", "[]", '{"a": [1, 2.5, "\\ud83d\\ude00"]}', "[" * 64 + "]" * 64, "9223372036854775807"],
 )
 def test_read_as_usual(text: str) -> None:
     assert strictjson.loads(text) == json.loads(text)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from schemas import terminal
-from schemas.units import parse_bytes
+from vram_arbiter.schemas.runtime import terminal
+from vram_arbiter.schemas.units import parse_bytes
 
 ROOT = Path(__file__).parents[2]
 MANIFEST = ROOT / "tests/schemas/manifests"
@@ -23,10 +23,21 @@ BUFFERED = {key: value for key, value in os.environ.items() if key != "PYTHONUNB
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["-m", "schemas", "check", str(MANIFEST)],
-        ["-m", "arbiter.replay", "simulate", str(ROOT / "configs/scenarios/find-navigate-grab.yaml")],
-        ["-m", "arbiter.replay", "simulate", "--json", str(ROOT / "configs/scenarios/two-thrashing.yaml")],
-        ["-m", "clients", "simulate", "find-navigate-grab"],
+        ["-m", "vram_arbiter.schemas", "check", str(MANIFEST)],
+        [
+            "-m",
+            "vram_arbiter.arbiter.lab",
+            "simulate",
+            str(ROOT / "configs/scenarios/find-navigate-grab.yaml"),
+        ],
+        [
+            "-m",
+            "vram_arbiter.arbiter.lab",
+            "simulate",
+            "--json",
+            str(ROOT / "configs/scenarios/two-thrashing.yaml"),
+        ],
+        ["-m", "vram_arbiter.clients", "simulate", "find-navigate-grab"],
     ],
 )
 def test_a_reader_that_left_is_no_defect(arguments: list[str]) -> None:
@@ -59,7 +70,11 @@ def test_ctrl_c_is_no_defect() -> None:
         "sys.exit(main())\n"
     )
     process = subprocess.Popen(
-        [sys.executable, "-c", program], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", program],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     try:
         assert process.stdout is not None
@@ -138,7 +153,10 @@ def test_another_error_of_the_system_keeps_its_traceback() -> None:
     ("arguments", "extra"),
     [
         (["clients", "demo"], "all"),
-        (["sidecars", "--name", "x", "--rskill", str(GRAB), "--device", "none", "--no-arbiter"], "sidecars"),
+        (
+            ["sidecars", "--name", "x", "--rskill", str(GRAB), "--device", "none", "--no-arbiter"],
+            "sidecars",
+        ),
         (["runner", "sim", "--no-arbiter"], "runner"),
     ],
 )

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.errors import BadRequest, UnknownOp
-from schemas.tools import (
+from vram_arbiter.schemas.errors import BadRequest, UnknownOp
+from vram_arbiter.schemas.tools import (
     TOOL_CALL,
     TOOL_NAME_MAX_CHARS,
     TOOLS,
@@ -44,7 +44,10 @@ def test_call_from_json_from_a_mapping_and_back(name: str) -> None:
 
 @pytest.mark.parametrize("key", ["rationale", "rational"])
 def test_both_spellings_of_the_reason(key: str) -> None:
-    assert parse_tool_call("query_scene", {"question": "?", key: "to be sure"}).rationale == "to be sure"
+    assert (
+        parse_tool_call("query_scene", {"question": "?", key: "to be sure"}).rationale
+        == "to be sure"
+    )
 
 
 def test_goal_params_are_a_json_object() -> None:
@@ -60,13 +63,21 @@ def test_goal_params_are_a_json_object() -> None:
         ("execute_rskill", "{", "the arguments are not JSON"),
         ("execute_rskill", "[]", "the arguments are not a JSON object"),
         ("execute_rskill", "", "rskill_id: Field required"),
-        ("execute_rskill", {"rskill_id": "a", "deadline_s": -1}, "deadline_s: Input should be greater"),
+        (
+            "execute_rskill",
+            {"rskill_id": "a", "deadline_s": -1},
+            "deadline_s: Input should be greater",
+        ),
         (
             "execute_rskill",
             {"rskill_id": "a", "goal_params_json": "[1]"},
             "goal_params_json: .*a JSON object",
         ),
-        ("execute_rskill", {"rskill_id": "a", "goal_params_json": "x"}, "goal_params_json: .*a JSON object"),
+        (
+            "execute_rskill",
+            {"rskill_id": "a", "goal_params_json": "x"},
+            "goal_params_json: .*a JSON object",
+        ),
         ("execute_rskill", {"rskill_id": "a", "patience_s": 0}, "patience_s: "),
         ("locate_in_view", {"query": ""}, "query: "),
         ("locate_in_view", {"query": "x", "zoom": 2}, "zoom: Extra"),
@@ -74,7 +85,9 @@ def test_goal_params_are_a_json_object() -> None:
         ("emit_prompt", {"target_topic": "operator", "text": "x"}, "target_topic: "),
     ],
 )
-def test_wrong_arguments_are_named(name: str, arguments: str | dict[str, Any], message: str) -> None:
+def test_wrong_arguments_are_named(
+    name: str, arguments: str | dict[str, Any], message: str
+) -> None:
     with pytest.raises(BadRequest, match=message):
         parse_tool_call(name, arguments)
 
@@ -103,7 +116,9 @@ def test_function_schema_offers_what_the_class_accepts(name: str) -> None:
 
 
 def test_function_schemas_of_some_or_all() -> None:
-    assert [schema["function"]["name"] for schema in function_schemas(["query_scene"])] == ["query_scene"]
+    assert [schema["function"]["name"] for schema in function_schemas(["query_scene"])] == [
+        "query_scene"
+    ]
     assert len(function_schemas()) == len(TOOLS)
 
 
@@ -114,7 +129,9 @@ NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,40}/[A-Za-z0-9._-]{1,60}", f
 def test_each_skill_has_a_function_name_of_its_own(names: list[str]) -> None:
     made = [skill_tool_name(name) for name in names]
     assert len(set(made)) == len(made)
-    assert all(re.fullmatch(r"[A-Za-z0-9_-]+", name) and len(name) <= TOOL_NAME_MAX_CHARS for name in made)
+    assert all(
+        re.fullmatch(r"[A-Za-z0-9_-]+", name) and len(name) <= TOOL_NAME_MAX_CHARS for name in made
+    )
 
 
 def test_function_names_that_need_a_suffix() -> None:

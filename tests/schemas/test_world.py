@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from schemas.control import ControlMode
-from schemas.world import (
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.world import (
     PAYLOAD_OF_MODE,
     Action,
     CameraModel,
@@ -122,7 +122,9 @@ PAYLOADS: dict[str, Any] = {
 
 
 @given(st.sampled_from(list(ControlMode)), st.sets(st.sampled_from(sorted(PAYLOADS))))
-def test_action_carries_exactly_the_payload_of_its_mode(mode: ControlMode, given_fields: set[str]) -> None:
+def test_action_carries_exactly_the_payload_of_its_mode(
+    mode: ControlMode, given_fields: set[str]
+) -> None:
     fields = {"control_mode": mode, **{name: PAYLOADS[name] for name in given_fields}}
     if given_fields == {PAYLOAD_OF_MODE[mode]}:
         action = Action.model_validate(fields)
@@ -145,7 +147,9 @@ def test_action_carries_exactly_the_payload_of_its_mode(mode: ControlMode, given
 )
 def test_wrong_action_is_refused(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
-        Action.model_validate({"control_mode": "joint_position", "joint_targets": [[0, 1]]} | fields)
+        Action.model_validate(
+            {"control_mode": "joint_position", "joint_targets": [[0, 1]]} | fields
+        )
 
 
 def test_wire_numbers_of_control_modes() -> None:
@@ -191,13 +195,17 @@ def test_objects_are_read_as_the_field_writes_them() -> None:
     box = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
     ours = DetectedObject(label="cube", confidence=0.9, box_3d=box, track_id="a")
     assert ours.box_3d == box
-    field = DetectedObject.model_validate({"label": "cube", "confidence": 0.9, "bbox_3d": box, "track_id": 7})
+    field = DetectedObject.model_validate(
+        {"label": "cube", "confidence": 0.9, "bbox_3d": box, "track_id": 7}
+    )
     assert (field.box_3d, field.track_id) == (box, 7)
     assert DetectedObject.model_validate(field.model_dump()) == field
     assert DetectedObject.model_validate_json(field.model_dump_json()) == field
     for track_id in (-1, 1.5, True):
         with pytest.raises(ValidationError):
-            DetectedObject.model_validate({"label": "cube", "confidence": 0.9, "track_id": track_id})
+            DetectedObject.model_validate(
+                {"label": "cube", "confidence": 0.9, "track_id": track_id}
+            )
 
 
 @pytest.mark.parametrize("name", ["tick_idx", "chunk_index", "step_idx", "episode_idx"])

@@ -8,12 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.config import load_config
-from schemas.errors import ConfigError
-from schemas.manifest import ManifestError, parse_manifest
-from schemas.robot import load_robot
-from schemas.scenario import load_scenario
-from schemas.yamltext import DEPTH_MAX, NODES_MAX, TEXT_MAX_BYTES, parse_yaml, read_yaml
+from vram_arbiter.schemas.config.arbiter import load_config
+from vram_arbiter.schemas.config.robot import load_robot
+from vram_arbiter.schemas.config.scenario import load_scenario
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.manifest import ManifestError, parse_manifest
+from vram_arbiter.schemas.yamltext import (
+    DEPTH_MAX,
+    NODES_MAX,
+    TEXT_MAX_BYTES,
+    parse_yaml,
+    read_yaml,
+)
 
 ROOT = Path(__file__).parents[2]
 DEEP_BY_ALIASES = "a: &a " + "[" * 40 + "]" * 40 + "\nb: " + "[" * 40 + "*a" + "]" * 40
@@ -81,7 +87,9 @@ def test_the_limits_leave_room_for_what_people_write() -> None:
     assert found.line(("here", "rate")) == 2
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "configs").rglob("*.yaml")), ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "configs").rglob("*.yaml")), ids=lambda path: path.name
+)
 def test_every_shipped_file_is_read(path: Path) -> None:
     assert read_yaml(path).data
 
@@ -103,7 +111,9 @@ def test_no_other_module_reads_yaml() -> None:
         str(path.relative_to(ROOT))
         for package in ("arbiter", "clients", "reasoner", "runner", "schemas", "sidecars")
         for path in (ROOT / package).rglob("*.py")
-        if re.search(r"^\s*(import|from) (yaml|ruamel)\b", path.read_text(encoding="utf-8"), re.MULTILINE)
+        if re.search(
+            r"^\s*(import|from) (yaml|ruamel)\b", path.read_text(encoding="utf-8"), re.MULTILINE
+        )
     }
     assert users == {"schemas/yamltext.py"}
 

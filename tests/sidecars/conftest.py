@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.host.gpu.fake import FakeProbe, make_card
-from arbiter.testing.fakegpu_check import check_log
-from arbiter.testing.wire import WireClient
+from tests.support.fakegpu_check import check_log
+from tests.support.wire import WireClient
+from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
 
 PNG = b"\x89PNG\r\n\x1a\n"  # the echo does not look at it
 PATIENCE_S = 60.0
@@ -120,7 +120,9 @@ class Box:
                 sidecar.process.kill()
                 sidecar.process.wait(PATIENCE_S)
         report = (
-            check_log((self.card / "log.jsonl").read_text()) if (self.card / "log.jsonl").exists() else None
+            check_log((self.card / "log.jsonl").read_text())
+            if (self.card / "log.jsonl").exists()
+            else None
         )
         assert report is None or report.problems == [], report
 
@@ -140,7 +142,9 @@ def lone_box():
     make_card(runtime / "fakegpu", 8 * 2**30, release_lag_s=0.1)
     root = str(Path(__file__).parents[2])
     box = Box(
-        runtime, runtime / "fakegpu", {**os.environ, "VRAM_ARBITER_RUNTIME": str(runtime), "PYTHONPATH": root}
+        runtime,
+        runtime / "fakegpu",
+        {**os.environ, "VRAM_ARBITER_RUNTIME": str(runtime), "PYTHONPATH": root},
     )
     yield box
     try:

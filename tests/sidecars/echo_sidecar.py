@@ -9,9 +9,9 @@ import sys
 import threading
 from pathlib import Path
 
-from schemas.errors import BadRequest
-from schemas.sidecar import QueryOp
-from sidecars.__main__ import main
+from vram_arbiter.schemas.errors import BadRequest
+from vram_arbiter.schemas.sidecar import QueryOp
+from vram_arbiter.sidecars.__main__ import main
 
 
 class EchoAdapter:

@@ -5,11 +5,11 @@ import time
 
 import pytest
 
-from clients.runner import RunnerClient
-from clients.serve import Message, Peer, RouterServer
-from clients.sidecar.perception import SceneVlmClient
-from reasoner.tools import LOOKED_AT_MAX_S, Tools
-from schemas.tools import QueryScene
+from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.sidecar.perception import SceneVlmClient
+from vram_arbiter.reasoner.tools import LOOKED_AT_MAX_S, Tools
+from vram_arbiter.schemas.tools import QueryScene
 
 from .conftest import PNG, until
 
@@ -48,7 +48,9 @@ def test_an_answer_is_not_about_a_picture_from_before_a_long_load(box) -> None:
             RunnerClient(f"ipc://{box.runtime}/runner.sock") as runner,
             SceneVlmClient(f"ipc://{box.runtime}/vlm.sock") as vlm,
         ):
-            asking = asyncio.create_task(Tools(runner, None, vlm)(QueryScene(question="which picture?")))
+            asking = asyncio.create_task(
+                Tools(runner, None, vlm)(QueryScene(question="which picture?"))
+            )
             await asyncio.to_thread(until, lambda: sidecar.state() == "loading")
             since_s = time.monotonic()
             await asyncio.to_thread(until, lambda: time.monotonic() > since_s + LOOKED_AT_MAX_S)

@@ -10,7 +10,7 @@ from time import monotonic
 
 import pytest
 
-from arbiter.testing.wire import WireClient
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 
@@ -95,7 +95,9 @@ def test_a_token_is_checked_before_every_op(box):
     assert sidecar.state() == "unloaded", "a stale token loads nothing"
 
 
-def test_ping_is_answered_and_a_revoke_acknowledged_while_an_op_runs_which_is_not_cut_short(box, arbiter):
+def test_ping_is_answered_and_a_revoke_acknowledged_while_an_op_runs_which_is_not_cut_short(
+    box, arbiter
+):
     detector = box.start("detector", "--min-residency-s", "0", footprint="5GB,5GB,100MB")
     grab = box.start("grab", footprint="5GB,5GB,100MB")
     running = detector.hold()
@@ -263,7 +265,9 @@ def test_the_arbiter_may_be_killed_between_two_requests(box, arbiter_daemon, arb
     token = sidecar.ask("load")["token"]
     arbiter_daemon.kill()
     assert sidecar.state() == "resident"
-    assert sidecar.detect(token=token)["ok"], "a goal does not stall because the daemon is restarted"
+    assert sidecar.detect(token=token)["ok"], (
+        "a goal does not stall because the daemon is restarted"
+    )
     assert sidecar.detect()["ok"]
     arbiter_daemon.start()
     assert sidecar.detect(token=token)["ok"], "what it had it keeps"
@@ -300,7 +304,9 @@ def test_an_attacked_sidecar_serves_others_and_lives(lone_box, mode):
     sidecar = lone_box.start("detector", "--no-arbiter", device="none")
     assert sidecar.detect()["ok"]
     path = sidecar.endpoint.removeprefix("ipc://")
-    with subprocess.Popen([sys.executable, ATTACKER, mode, path], stdout=subprocess.PIPE) as attacker:
+    with subprocess.Popen(
+        [sys.executable, ATTACKER, mode, path], stdout=subprocess.PIPE
+    ) as attacker:
         try:
             assert attacker.stdout.readline() == b"under way\n"
             for _ in range(20):

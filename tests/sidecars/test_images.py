@@ -10,13 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.errors import BadRequest
-from sidecars import images
+from vram_arbiter.schemas.errors import BadRequest
+from vram_arbiter.sidecars import images
 
 pytestmark = pytest.mark.heavy
 
 
-def encoded(form: str, size: tuple[int, int] = (64, 48), mode: str = "RGB", **options: Any) -> bytes:
+def encoded(
+    form: str, size: tuple[int, int] = (64, 48), mode: str = "RGB", **options: Any
+) -> bytes:
     from PIL import Image
 
     stream = io.BytesIO()
@@ -25,7 +27,12 @@ def encoded(form: str, size: tuple[int, int] = (64, 48), mode: str = "RGB", **op
 
 
 def chunk(kind: bytes, content: bytes = b"") -> bytes:
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+    return (
+        struct.pack(">I", len(content))
+        + kind
+        + content
+        + struct.pack(">I", zlib.crc32(kind + content))
+    )
 
 
 def png(width: int, height: int, depth: int = 8, color: int = 2, *more: bytes) -> bytes:
@@ -102,7 +109,9 @@ def test_a_frame_header_that_is_not_the_decoders_is_refused() -> None:
     cuts=st.lists(st.tuples(st.integers(0, 3000), st.binary(max_size=6)), min_size=1, max_size=6),
     end=st.integers(0, 4000),
 )
-def test_damaged_pictures_are_decoded_or_refused(form: str, cuts: list[tuple[int, bytes]], end: int) -> None:
+def test_damaged_pictures_are_decoded_or_refused(
+    form: str, cuts: list[tuple[int, bytes]], end: int
+) -> None:
     data = encoded("JPEG", progressive=True) if form == "progressive" else encoded(form)
     for at, inserted in cuts:
         at %= len(data)

@@ -5,15 +5,15 @@ import threading
 
 import pytest
 
-from clients.aio import ArbiterClient
-from schemas.errors import NotResident
-from schemas.manifest import parse_manifest
-from schemas.wire import Footprint
-from sidecars.device.fake import FakeMemory
-from sidecars.residency import Residency
-from sidecars.settings import Settings
-from sidecars.weights import Weights
-from sidecars.worker import Worker
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.schemas.errors import NotResident
+from vram_arbiter.schemas.manifest import parse_manifest
+from vram_arbiter.schemas.wire import Footprint
+from vram_arbiter.sidecars.device.fake import FakeMemory
+from vram_arbiter.sidecars.residency import Residency
+from vram_arbiter.sidecars.settings import Settings
+from vram_arbiter.sidecars.weights import Weights
+from vram_arbiter.sidecars.worker import Worker
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 

@@ -4,17 +4,24 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.host.gpu.fake import FakeProbe, make_card
-from schemas.errors import ConfigError
-from schemas.manifest import parse_manifest
-from sidecars.__main__ import _parser, main, settings_from
-from sidecars.adapters.choose import make_adapter
-from sidecars.settings import FootprintEntry, footprint_for, parse_footprint, read_footprints
-from sidecars.weights import Weights
+from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.manifest import parse_manifest
+from vram_arbiter.sidecars.__main__ import _parser, main, settings_from
+from vram_arbiter.sidecars.adapters.choose import make_adapter
+from vram_arbiter.sidecars.settings import (
+    FootprintEntry,
+    footprint_for,
+    parse_footprint,
+    read_footprints,
+)
+from vram_arbiter.sidecars.weights import Weights
 
 MIB = 2**20
 HEAD = "name: test/model\nversion: 1.2.3\nembodiment_tags: [any]\nchunk_size: 1\ndescription: d\nlatency_budget: {per_chunk_ms: 1}\n"
-DETECTOR = HEAD + "kind: detector\nweights_uri: hf://a/b@rev\nactions: [detect]\ndetector: {labels: [x]}\n"
+DETECTOR = (
+    HEAD + "kind: detector\nweights_uri: hf://a/b@rev\nactions: [detect]\ndetector: {labels: [x]}\n"
+)
 SHIPPED = Path(__file__).parents[2] / "configs/models/footprints.yaml"
 
 
@@ -51,7 +58,10 @@ def test_a_footprint_that_makes_no_sense(text):
 def test_the_shipped_footprints_are_the_measured_ones():
     entries = read_footprints(SHIPPED)
     peaks = {name: (entry.load_peak, entry.stands_for) for name, entry in entries.items()}
-    assert peaks["vram-arbiter/so101-detector"] == (5_300_000_000, "OpenRAL/rskill-locateanything-3b-nf4")
+    assert peaks["vram-arbiter/so101-detector"] == (
+        5_300_000_000,
+        "OpenRAL/rskill-locateanything-3b-nf4",
+    )
     assert peaks["vram-arbiter/so101-scene-vlm"][0] == 3_300_000_000
     assert peaks["vram-arbiter/so101-grab"][0] == 4_300_000_000
     assert all(entry.source and entry.residue == 450 * MIB for entry in entries.values())
@@ -88,9 +98,20 @@ def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", "/run/x")
     monkeypatch.setenv("VRAM_FAKE_GPU", str(tmp_path / "card"))
     found = settings(
-        "--name", "detector", "--rskill", rskill, "--footprint", "2GB", "--priority", "70", "--pinned"
+        "--name",
+        "detector",
+        "--rskill",
+        rskill,
+        "--footprint",
+        "2GB",
+        "--priority",
+        "70",
+        "--pinned",
     )
-    assert (found.endpoint, found.arbiter) == ("ipc:///run/x/detector.sock", "ipc:///run/x/arbiter.sock")
+    assert (found.endpoint, found.arbiter) == (
+        "ipc:///run/x/detector.sock",
+        "ipc:///run/x/arbiter.sock",
+    )
     assert found.device == f"fake:{tmp_path / 'card'}"
     assert found.weights == Weights("a/b", "rev")
     spec = found.lease_spec()
@@ -100,19 +121,46 @@ def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
         "the card that is charged is the card that is leased"
     )
     alone = settings(
-        "--name", "d", "--rskill", rskill, "--footprint", "2GB", "--no-arbiter", "--device", "cuda:1"
+        "--name",
+        "d",
+        "--rskill",
+        rskill,
+        "--footprint",
+        "2GB",
+        "--no-arbiter",
+        "--device",
+        "cuda:1",
     )
-    assert (alone.arbiter, alone.device, alone.gpu) == (None, "cuda:1", "1"), "not any: it loads on that one"
+    assert (alone.arbiter, alone.device, alone.gpu) == (None, "cuda:1", "1"), (
+        "not any: it loads on that one"
+    )
     with pytest.raises(ConfigError, match="--device gpu"):
         settings("--name", "d", "--rskill", rskill, "--footprint", "2GB", "--device", "gpu")
     with pytest.raises(ConfigError, match="any user of the machine"):
         settings(
-            "--name", "d", "--rskill", rskill, "--footprint", "2GB", "--endpoint", "tcp://127.0.0.1:5757"
+            "--name",
+            "d",
+            "--rskill",
+            rskill,
+            "--footprint",
+            "2GB",
+            "--endpoint",
+            "tcp://127.0.0.1:5757",
         )
 
 
 def test_check_says_ok_or_what_is_wrong(rskill, tmp_path, capsys):
-    flags = ["--name", "d", "--rskill", str(rskill), "--footprint", "2GB", "--device", "none", "--check"]
+    flags = [
+        "--name",
+        "d",
+        "--rskill",
+        str(rskill),
+        "--footprint",
+        "2GB",
+        "--device",
+        "none",
+        "--check",
+    ]
     assert main(flags) == 0
     assert "ok: test/model from a/b as detector; weights not compared" in capsys.readouterr().out
     rskill.write_text(DETECTOR.replace("labels", "lables"))
@@ -153,24 +201,53 @@ def test_what_no_sidecar_serves_is_said(text, told):
 )
 def test_a_kind_without_weights_is_no_sidecars_business(rskill, capsys, text):
     rskill.write_text(HEAD + text)
-    flags = ["--name", "d", "--rskill", str(rskill), "--footprint", "2GB", "--device", "none", "--check"]
+    flags = [
+        "--name",
+        "d",
+        "--rskill",
+        str(rskill),
+        "--footprint",
+        "2GB",
+        "--device",
+        "none",
+        "--check",
+    ]
     assert main(flags) == 2
-    assert "has no weights (sidecars serve detector, vlm, vla and reward skills)" in capsys.readouterr().err
+    assert (
+        "has no weights (sidecars serve detector, vlm, vla and reward skills)"
+        in capsys.readouterr().err
+    )
 
 
-def test_what_only_a_person_can_mend_is_not_started_again_and_what_may_come_is(rskill, tmp_path, capsys):
+def test_what_only_a_person_can_mend_is_not_started_again_and_what_may_come_is(
+    rskill, tmp_path, capsys
+):
     """systemd starts a sidecar again unless it ended with 2."""
     flags = ["--name", "d", "--rskill", str(rskill), "--footprint", "2GB", "--check"]
     assert main([*flags, "--device", "none", "--standby", "--idle-release-s", "5"]) == 2
     assert main([*flags, "--device", "gpu"]) == 2
     assert main([*flags, "--device", "none", "--rskill", str(tmp_path / "none.yaml")]) == 2
-    assert main([*flags, "--device", f"fake:{tmp_path}"]) == 1, "the arbiter makes the card when it starts"
+    assert main([*flags, "--device", f"fake:{tmp_path}"]) == 1, (
+        "the arbiter makes the card when it starts"
+    )
     assert "start the arbiter with --gpu fake:8GiB" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["", "../x", "a\nb", "x" * 1000])
 def test_a_name_that_nobody_could_use_is_refused_at_once(rskill, capsys, name):
     with pytest.raises(SystemExit) as caught:
-        main(["--name", name, "--rskill", str(rskill), "--footprint", "2GB", "--device", "none", "--check"])
+        main(
+            [
+                "--name",
+                name,
+                "--rskill",
+                str(rskill),
+                "--footprint",
+                "2GB",
+                "--device",
+                "none",
+                "--check",
+            ]
+        )
     assert caught.value.code == 2
     assert "argument --name: must be" in capsys.readouterr().err

@@ -2,8 +2,8 @@
 
 import pytest
 
-from arbiter.testing.collector import Collector
-from schemas import telemetry
+from tests.support.collector import Collector
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e]  # the OpenTelemetry SDK; real processes
 
@@ -29,16 +29,28 @@ def test_requests_are_spans_of_the_callers_trace_with_their_outcome(lone_box, co
 
     asked = sorted(collector.spans(telemetry.SPAN_SIDECAR_REQUEST), key=lambda span: span.start_ns)
     outcomes = [
-        (span.attributes[telemetry.ATTR_OPERATION], span.attributes[telemetry.ATTR_OUTCOME]) for span in asked
+        (span.attributes[telemetry.ATTR_OPERATION], span.attributes[telemetry.ATTR_OUTCOME])
+        for span in asked
     ]
-    assert outcomes == [("detect", "ok"), ("detect", "model_error"), ("detect", "ok"), ("unload", "ok")]
+    assert outcomes == [
+        ("detect", "ok"),
+        ("detect", "model_error"),
+        ("detect", "ok"),
+        ("unload", "ok"),
+    ]
     assert [(span.trace_id, span.parent_id) for span in asked[:2]] == [(TRACE, PARENT)] * 2
     assert [span.failed for span in asked] == [False, True, False, False]
-    assert all(span.trace_id != TRACE and span.parent_id == "" for span in asked[2:]), "a trace of its own"
+    assert all(span.trace_id != TRACE and span.parent_id == "" for span in asked[2:]), (
+        "a trace of its own"
+    )
     (unload,) = collector.spans(telemetry.SPAN_SIDECAR_UNLOAD)
     assert unload.parent_id == asked[3].span_id
     counted = {
-        (point.attributes[telemetry.ATTR_OPERATION], point.attributes[telemetry.ATTR_OUTCOME], point.count)
+        (
+            point.attributes[telemetry.ATTR_OPERATION],
+            point.attributes[telemetry.ATTR_OUTCOME],
+            point.count,
+        )
         for point in collector.points(telemetry.METRIC_SIDECAR_REQUEST)
     }
     assert {("detect", "ok", 2), ("detect", "model_error", 1), ("unload", "ok", 1)} <= counted

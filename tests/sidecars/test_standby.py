@@ -7,7 +7,7 @@ from time import monotonic
 
 import pytest
 
-from arbiter.testing.wire import WireClient
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 
@@ -24,7 +24,12 @@ def arbiter(arbiter_daemon):
 
 def state(arbiter, consumer):
     return next(
-        (lease["state"] for lease in arbiter.ask("status")["leases"] if lease["consumer"] == consumer), None
+        (
+            lease["state"]
+            for lease in arbiter.ask("status")["leases"]
+            if lease["consumer"] == consumer
+        ),
+        None,
     )
 
 
@@ -77,7 +82,9 @@ def test_a_request_whose_time_ends_does_not_end_the_standby(box, arbiter):
     assert (late["ok"], late["code"]) == (False, "wait_timeout")
     assert "vramctl why detector" in late["hint"]
     assert detector.ask("ping")["wanted"], "it was wanted, and is on its way"
-    assert state(arbiter, "policy") in ("held", "revoking"), "nobody is made to leave in the middle of a step"
+    assert state(arbiter, "policy") in ("held", "revoking"), (
+        "nobody is made to leave in the middle of a step"
+    )
     policy.let_go()
     assert policy.client.reply(running, PATIENCE_S)["ok"]
     until(lambda: detector.state() == "resident")
@@ -112,7 +119,9 @@ def test_the_arbiter_may_be_killed_while_it_is_away(box, arbiter_daemon, arbiter
         until(lambda: detector.state() == "resident")
 
 
-def test_it_comes_back_by_itself_although_the_arbiter_was_away_when_it_left(box, arbiter_daemon, arbiter):
+def test_it_comes_back_by_itself_although_the_arbiter_was_away_when_it_left(
+    box, arbiter_daemon, arbiter
+):
     """Regression: its release was said for 5 s; after a longer absence the lease was over here, and kept its room there for its ttl."""
     detector = box.start("detector", *DETECTOR, footprint=BOTH)
     policy = box.start("policy", "--min-residency-s", "0", footprint=BOTH)
@@ -176,7 +185,11 @@ def test_told_to_unload_while_it_is_called_back_it_is_called_back_no_longer(box,
     until(lambda: state(arbiter, "detector") == "queued")
     with WireClient(f"ipc://{box.runtime}/detector.sock") as other:
         identity = other.reply(other.send("ping"), PATIENCE_S)
-        assert (identity["state"], identity["standby"], identity["wanted"]) == ("unloaded", True, True)
+        assert (identity["state"], identity["standby"], identity["wanted"]) == (
+            "unloaded",
+            True,
+            True,
+        )
         assert other.reply(other.send("unload"), PATIENCE_S)["ok"]
     refused = detector.client.reply(waiting, PATIENCE_S)
     assert (refused["ok"], refused["code"]) == (False, "not_resident")

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from clients.configs import configs_folder
-from schemas.errors import ConfigError, ModelError
-from sidecars.weights import Weights, from_pretrained, resolve
+from vram_arbiter.clients.configs import configs_folder
+from vram_arbiter.schemas.errors import ConfigError, ModelError
+from vram_arbiter.sidecars.weights import Weights, from_pretrained, resolve
 
 
 def test_a_hub_id_keeps_its_revision(tmp_path):
@@ -45,6 +45,11 @@ def test_hub_and_folder_take_the_same_call(tmp_path):
 
     from_pretrained(Model, Weights("owner/repo", "abc"), dtype=1)
     from_pretrained(Model, Weights(str(Path("/x")), local=True))
-    assert calls == [("owner/repo", {"dtype": 1, "revision": "abc"}), ("/x", {"local_files_only": True})]
-    with pytest.raises(ModelError, match=r"Model cannot load broken: OSError: no file named config\.json"):
+    assert calls == [
+        ("owner/repo", {"dtype": 1, "revision": "abc"}),
+        ("/x", {"local_files_only": True}),
+    ]
+    with pytest.raises(
+        ModelError, match=r"Model cannot load broken: OSError: no file named config\.json"
+    ):
         from_pretrained(Model, Weights("broken"))

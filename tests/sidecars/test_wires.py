@@ -7,11 +7,11 @@ import msgpack
 import pytest
 import zmq
 
-from clients.serve import Peer
-from schemas.errors import CODES, BadRequest, ModelError, OutOfMemory, UnknownOp
-from schemas.sidecar import PICTURES_MAX, DetectOp, EndpointCall, ScoreOp
-from sidecars.images import decode, within
-from sidecars.wires import PENDING_MAX, Wire, error_reply, parse
+from vram_arbiter.clients.net.server import Peer
+from vram_arbiter.schemas.errors import CODES, BadRequest, ModelError, OutOfMemory, UnknownOp
+from vram_arbiter.schemas.sidecar import PICTURES_MAX, DetectOp, EndpointCall, ScoreOp
+from vram_arbiter.sidecars.images import decode, within
+from vram_arbiter.sidecars.wires import PENDING_MAX, Wire, error_reply, parse
 
 PNG = b"\x89PNG\r\n\x1a\n"
 OPS = frozenset({"detect", "get_action", "reset"})
@@ -103,7 +103,11 @@ def test_both_families_reach_the_host():
         ({"op": "detect"}, "bad_request", "image"),
         ({"op": "detect", "image": "text", "query": "x", "colour": 1}, "bad_request", "colour"),
         ({"op": "detect", "image": PNG, "query": ""}, "bad_request", "query"),
-        ({"op": "detect", "image": PNG, "query": "x", "max_side": 10**9}, "bad_request", "max_side"),
+        (
+            {"op": "detect", "image": PNG, "query": "x", "max_side": 10**9},
+            "bad_request",
+            "max_side",
+        ),
         ({"op": "detect", "image": PNG, "query": "x", "token": [1]}, "bad_request", "token"),
         (
             {"op": "detect", "image": PNG, "query": "x", "score_threshold": float("nan")},
@@ -156,10 +160,8 @@ def test_arrays_go_both_ways_and_objects_never():
     assert (host.calls[0][1].data["observation"]["state"] == np.arange(3.0)).all()
     assert reply["action"]["__ndarray_class__"] is True
     assert msgpack.packb(reply), "nothing but plain values goes to the codec"
-    bomb = (
-        b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(
-            128, b" "
-        )
+    bomb = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(
+        128, b" "
     )
     for bad in (
         npy(np.array([{"a": 1}], dtype=object), allow_pickle=True),
@@ -185,7 +187,9 @@ def test_errors_of_the_model_keep_their_type(error):
 
 
 def test_a_defect_of_ours_is_an_answer_too():
-    (reply,), _ = talk({"op": "detect", "image": PNG, "query": "x"}, answer=ZeroDivisionError("oops"))
+    (reply,), _ = talk(
+        {"op": "detect", "image": PNG, "query": "x"}, answer=ZeroDivisionError("oops")
+    )
     assert (reply["code"], reply["error"]) == ("internal", "InternalError: ZeroDivisionError: oops")
 
 
@@ -272,7 +276,9 @@ def test_a_real_sidecar_survives_what_strangers_send(lone_box):
         assert reply is not None, payload
         assert reply["ok"] is False, payload
     sidecar.client.send_frames([b"one", b"two", b"three"])
-    sidecar.client.send_raw(msgpack.packb({"op": "detect", "image": bytes(17 * 2**20), "query": "x"}))
+    sidecar.client.send_raw(
+        msgpack.packb({"op": "detect", "image": bytes(17 * 2**20), "query": "x"})
+    )
     codes = set()
     while "message_too_large" not in codes:
         reply = sidecar.client.receive()
@@ -336,7 +342,13 @@ def test_pictures_to_judge_come_as_the_field_sends_them_or_as_pngs():
         {**RAW, "width": None},
         {**RAW, "frames": b"x"},
         {**RAW, "n": 0, "frames": b""},
-        {**RAW, "n": PICTURES_MAX + 1, "width": 1, "height": 1, "frames": bytes(3 * (PICTURES_MAX + 1))},
+        {
+            **RAW,
+            "n": PICTURES_MAX + 1,
+            "width": 1,
+            "height": 1,
+            "frames": bytes(3 * (PICTURES_MAX + 1)),
+        },
         {"op": "score", "images": [PNG] * (PICTURES_MAX + 1)},
         {"op": "score", "images": [b"x"]},
         {"op": "score", "images": PNG},

@@ -6,8 +6,8 @@ import weakref
 
 import pytest
 
-from schemas.errors import ModelError, VramError, WaitTimeout
-from sidecars.worker import Worker
+from vram_arbiter.schemas.errors import ModelError, VramError, WaitTimeout
+from vram_arbiter.sidecars.worker import Worker
 
 
 class Weights:
@@ -62,7 +62,9 @@ def test_work_that_could_not_begin_in_time_never_does_and_stuck_work_is_told() -
             await begun.wait()
             with pytest.raises(WaitTimeout, match="busy"):
                 await worker.run_for(lambda: done.append("late"), begin_s=0.05, end_s=60)
-            canceled = asyncio.create_task(worker.run_for(lambda: done.append("x"), begin_s=60, end_s=60))
+            canceled = asyncio.create_task(
+                worker.run_for(lambda: done.append("x"), begin_s=60, end_s=60)
+            )
             await asyncio.sleep(0)
             canceled.cancel()
             with pytest.raises(asyncio.CancelledError):

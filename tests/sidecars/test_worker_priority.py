@@ -3,7 +3,7 @@
 import asyncio
 import os
 
-from sidecars.worker import Worker
+from vram_arbiter.sidecars.worker import Worker
 
 
 def test_only_the_models_thread_stands_back() -> None:

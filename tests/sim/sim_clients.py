@@ -1,4 +1,4 @@
-"""Simulated programs on the real client library: `clients.aio`, `clients.lease` and `clients.protocol` under simulated time.
+"""Simulated programs on the real client library: `clients.client`, `clients.lease` and `clients._protocol.protocol` under simulated time.
 
 A `Consumer` is a process with models: it waits, loads in steps, works in uses, leaves when asked or by itself, and misbehaves as
 its `Character` says. A `Runner` marks uses on other processes' leases. An `Observer` asks questions, an `Operator` acts by hand. Every
@@ -11,17 +11,17 @@ from collections.abc import Awaitable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from arbiter.testing.simulation.card import SimOutOfMemory
-from arbiter.testing.simulation.clock import ProcessLoop
-from arbiter.testing.simulation.world import Entitlement, SimProcess, World
-from clients.aio import ArbiterClient
-from clients.lease import Lease
-from clients.protocol import ClientProtocol
-from clients.transport import Transport
-from schemas import defaults as d
-from schemas.errors import ArbiterUnreachable, VramError
-from schemas.ids import GpuId
-from schemas.wire import Footprint, LeaseSpec
+from tests.support.simulation.card import SimOutOfMemory
+from tests.support.simulation.clock import ProcessLoop
+from tests.support.simulation.world import Entitlement, SimProcess, World
+from vram_arbiter.clients._protocol.protocol import ClientProtocol
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.lease import Lease
+from vram_arbiter.clients.net.dealer import Transport
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.errors import ArbiterUnreachable, VramError
+from vram_arbiter.schemas.ids import GpuId
+from vram_arbiter.schemas.wire import Footprint, LeaseSpec
 
 SIZES = (600 * d.MIB, d.GIB, 2 * d.GIB, 3_300_000_000, 4_300_000_000, 5_300_000_000, 7 * d.GIB)
 RESIDUES = (0, 200 * d.MIB, 450 * d.MIB)
@@ -36,10 +36,10 @@ class SimClient(ArbiterClient):
     def __init__(self, world: World, process: SimProcess, role: str = "client") -> None:
         super().__init__("ipc://simulated", name=process.name, role=role)
         self._world, self._process = world, process
-        self.protocol = ClientProtocol(name=process.name, instance=world.clock.new_id("i"), role=role)
-        self.reserves = (
-            False  # its leases are for others to carve theirs out of: by itself it puts nothing on a card
+        self.protocol = ClientProtocol(
+            name=process.name, instance=world.clock.new_id("i"), role=role
         )
+        self.reserves = False  # its leases are for others to carve theirs out of: by itself it puts nothing on a card
         process.on_kill.append(self._killed)
 
     @property
@@ -131,7 +131,9 @@ class Cast:
     ooms: int = 0
     refusals: dict[str, int] = field(default_factory=dict)
     clients: list[SimClient] = field(default_factory=list)
-    offers: dict[str, Lease] = field(default_factory=dict)  # leases out of which others may carve theirs
+    offers: dict[str, Lease] = field(
+        default_factory=dict
+    )  # leases out of which others may carve theirs
 
     def entitlements(self) -> Iterator[Entitlement]:
         """Leases that living clients believe in, and would not have fenced by their own clock."""
@@ -172,7 +174,10 @@ class Cast:
         return [
             holding
             for holding in self.holdings.values()
-            if holding.loaded and not holding.over and holding.lease.state == "held" and holding.process.alive
+            if holding.loaded
+            and not holding.over
+            and holding.lease.state == "held"
+            and holding.process.alive
         ]
 
 
@@ -253,7 +258,9 @@ class Consumer(Program):
                 "consumer": self.process.name,
                 "model_id": f"{self.process.name}-{slot}",
                 "gpu": choice(gpus),
-                "mode": "exclusive" if parent is None and chance(self.character.exclusive) else "shared",
+                "mode": "exclusive"
+                if parent is None and chance(self.character.exclusive)
+                else "shared",
                 "footprint": Footprint(
                     load_peak_bytes=max(peak, self.residue_bytes),
                     steady_bytes=steady,
@@ -383,7 +390,11 @@ class Consumer(Program):
                 return False
             if fails and step:
                 return False
-            part = weights // LOAD_STEPS if step < LOAD_STEPS - 1 else weights - 2 * (weights // LOAD_STEPS)
+            part = (
+                weights // LOAD_STEPS
+                if step < LOAD_STEPS - 1
+                else weights - 2 * (weights // LOAD_STEPS)
+            )
             reused = min(part, card.held.get((key, "leak"), 0))  # its allocator has these already
             missing = self.residue_bytes - card.held.get((key, "context"), 0)
             try:
@@ -402,8 +413,12 @@ class Consumer(Program):
         card = self.world.cards[holding.gpu]
         strange = [block for block in card.blocks() if block.tag in ("stranger", "excess")]
         if not strange and not self.world.distrusted:
-            self.world.fail(f"{self.process.name} was granted {holding.lease.lease_id} and met: {error}")
-        await holding.lease.oom(wanted, card.held.get((self.process.key, holding.lease.lease_id), 0))
+            self.world.fail(
+                f"{self.process.name} was granted {holding.lease.lease_id} and met: {error}"
+            )
+        await holding.lease.oom(
+            wanted, card.held.get((self.process.key, holding.lease.lease_id), 0)
+        )
 
     async def _settle(self, holding: Holding) -> int | None:
         """Drop the temporary peak; perhaps take more than was declared. Returns what is to be reported."""
@@ -439,7 +454,9 @@ class Consumer(Program):
     async def _unload(self, holding: Holding) -> None:
         """Called by the library at the safe point, or after a loss."""
         used = self.cast.used_by_others(holding)
-        alone = holding.lease.given_up and not self.client.connected  # nobody is there who could refuse
+        alone = (
+            holding.lease.given_up and not self.client.connected
+        )  # nobody is there who could refuse
         if used and holding.lease.state != "gone" and not alone:
             self.world.fail(f"{holding.lease.lease_id} unloads while {used} use it")
         card, key = self.world.cards[holding.gpu], self.process.key
@@ -555,7 +572,9 @@ class Operator(Program):
                 continue
             while continue_with and not await self._do(continue_with, target):
                 await self.pause(1.0)
-        while not await self._do("resume"):  # an operator before this one may have died with the card drained
+        while not await self._do(
+            "resume"
+        ):  # an operator before this one may have died with the card drained
             await self.pause(1.0)
 
     async def _do(self, action: str, target: str = "") -> bool:

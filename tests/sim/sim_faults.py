@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 from sim_clients import Cast, Program
 
-from arbiter.testing.simulation.card import ProbeFaults, SimOutOfMemory
-from arbiter.testing.simulation.wire import QUEUE_MAX, WireFaults
-from arbiter.testing.simulation.world import World
-from schemas import defaults as d
-from schemas.ids import ProcessKey
+from tests.support.simulation.card import ProbeFaults, SimOutOfMemory
+from tests.support.simulation.wire import QUEUE_MAX, WireFaults
+from tests.support.simulation.world import World
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import ProcessKey
 
 FAULT_PAUSE_S = 1.4  # on average
 DAEMON_AWAY_S = (0.05, 0.3, 1.5, 4.0, 15.0)
@@ -65,9 +65,9 @@ class Nemesis:
     def _strike(self) -> None:
         if self.stopped:
             return
-        fault = self.random.choices([fault for _, fault in self.table], [weight for weight, _ in self.table])[
-            0
-        ]
+        fault = self.random.choices(
+            [fault for _, fault in self.table], [weight for weight, _ in self.table]
+        )[0]
         self._count(fault.__name__)
         fault()
         self._plan()
@@ -134,7 +134,8 @@ class Nemesis:
             return
         loop.freeze()
         self.clock.after(
-            self.random.choice(FROZEN_S), lambda: loop.thaw() if loop.frozen and not loop.dead else None
+            self.random.choice(FROZEN_S),
+            lambda: loop.thaw() if loop.frozen and not loop.dead else None,
         )
 
     # -- the wire ------------------------------------------------------------------------------------------------------
@@ -235,7 +236,9 @@ class Nemesis:
         self.world.reboot()
         self.clock.after(2.0, self._restart)
         for index in range(len(self.slots)):
-            self.clock.after(self.random.uniform(2.0, 5.0), lambda index=index: self._respawn(index, None))
+            self.clock.after(
+                self.random.uniform(2.0, 5.0), lambda index=index: self._respawn(index, None)
+            )
 
     # -- cards and probes ----------------------------------------------------------------------------------------------
     def _spoil(self, spoil: Callable[[ProbeFaults], None]) -> None:
@@ -300,7 +303,9 @@ class Nemesis:
             card.free(STRANGER, "stranger")
             return
         try:
-            card.allocate(STRANGER, "stranger", self.random.choice((100 * d.MIB, 700 * d.MIB, 3 * d.GIB)))
+            card.allocate(
+                STRANGER, "stranger", self.random.choice((100 * d.MIB, 700 * d.MIB, 3 * d.GIB))
+            )
         except SimOutOfMemory:
             self.clock.say("no room for a stowaway")
 

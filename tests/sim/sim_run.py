@@ -25,8 +25,8 @@ if __name__ == "__main__":  # run as a file: the tree is found from here
 from sim_clients import Cast, Character, Consumer, Lender, Observer, Operator, Runner
 from sim_faults import Nemesis, Slot
 
-from arbiter.testing.simulation.clock import TRACE_LINES
-from arbiter.testing.simulation.world import SimFailure, World, state_folder
+from tests.support.simulation.clock import TRACE_LINES
+from tests.support.simulation.world import SimFailure, World, state_folder
 
 TROUBLE_S = 80.0
 SETTLE_S = 150.0  # simulated: every wait, ageing, ladder and verification of the end fits in
@@ -66,7 +66,9 @@ def run_seed(seed: int, lines_max: int | None = TRACE_LINES) -> Report:
     sys.unraisablehook = lambda _: None
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # killed processes leave coroutines behind
+            warnings.simplefilter(
+                "ignore", RuntimeWarning
+            )  # killed processes leave coroutines behind
             gc.collect()
     finally:
         sys.unraisablehook = hook
@@ -104,7 +106,9 @@ def _run(seed: int, lines_max: int | None) -> Report:
             seconds=time.perf_counter() - began,
             faults=dict(world.faults),
             notes=dict(Counter(note.kind for note in history)),
-            verdicts=dict(Counter(str(note.data["verdict"]) for note in history if note.kind == "verified")),
+            verdicts=dict(
+                Counter(str(note.data["verdict"]) for note in history if note.kind == "verified")
+            ),
             refusals=cast.refusals,
             outcomes=dict(Counter(ask.outcome for ask in cast.asks)),
         )
@@ -149,7 +153,9 @@ def _settle(world: World, cast: Cast, nemesis: Nemesis) -> None:
             continue
         waiting = [str(ask) for ask in cast.asks if not ask.outcome and ask.process.alive]
         still = [p.process.name for p in nemesis.running if not p.done and p.process.alive]
-        world.fail(f"not over after {SETTLE_S} s: {still}, waiting {waiting}; status {_status(world)}")
+        world.fail(
+            f"not over after {SETTLE_S} s: {still}, waiting {waiting}; status {_status(world)}"
+        )
         world.raise_failure()
     for process in list(world.processes.values()):
         world.kill(process)
@@ -182,7 +188,9 @@ def _let_a_residue_go(world: World, cast: Cast) -> None:
         others = 0
         for card in world.cards.values():
             keeps = [
-                b for b in card.blocks() if b.tag in ("context", "leak") and b.process != ask.process.key
+                b
+                for b in card.blocks()
+                if b.tag in ("context", "leak") and b.process != ask.process.key
             ]
             others = max(others, sum(block.count for block in keeps))
         room = min(gpu.capacity_bytes - gpu.reserve_bytes for gpu in world.gpus) - others
@@ -217,8 +225,21 @@ def _quiet() -> None:
 
 def summary(reports: Sequence[Report]) -> dict[str, object]:
     """Sums over runs."""
-    total: dict[str, object] = {"seeds": len(reports), "failed": [r.seed for r in reports if r.failure]}
-    for name in ("steps", "granted", "evicted", "ooms", "epochs", "lost", "duplicates", "delays", "dropped"):
+    total: dict[str, object] = {
+        "seeds": len(reports),
+        "failed": [r.seed for r in reports if r.failure],
+    }
+    for name in (
+        "steps",
+        "granted",
+        "evicted",
+        "ooms",
+        "epochs",
+        "lost",
+        "duplicates",
+        "delays",
+        "dropped",
+    ):
         total[name] = sum(getattr(report, name) for report in reports)
     for name in ("faults", "notes", "verdicts", "refusals", "outcomes"):
         counted: Counter[str] = Counter()
@@ -231,7 +252,9 @@ def summary(reports: Sequence[Report]) -> dict[str, object]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, help="one seed, with the end of its story")
-    parser.add_argument("--grep", help="with --seed: its whole story, lines that match this expression")
+    parser.add_argument(
+        "--grep", help="with --seed: its whole story, lines that match this expression"
+    )
     parser.add_argument("--seeds", type=int, default=100, help="this many seeds, from --first on")
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)

@@ -8,14 +8,14 @@ import pytest
 from sim_clients import SimClient
 from sim_run import run_seed, summary
 
-from arbiter.testing.simulation.card import Device, SimOutOfMemory
-from arbiter.testing.simulation.clock import Clock, ProcessLoop
-from arbiter.testing.simulation.daemon import Happening
-from arbiter.testing.simulation.world import Entitlement, SimFailure, World
-from clients.lease import Lease
-from schemas.defaults import GIB
-from schemas.ids import GpuId, ProcessKey
-from schemas.wire import Footprint, LeaseSpec
+from tests.support.simulation.card import Device, SimOutOfMemory
+from tests.support.simulation.clock import Clock, ProcessLoop
+from tests.support.simulation.daemon import Happening
+from tests.support.simulation.world import Entitlement, SimFailure, World
+from vram_arbiter.clients.lease import Lease
+from vram_arbiter.schemas.defaults import GIB
+from vram_arbiter.schemas.ids import GpuId, ProcessKey
+from vram_arbiter.schemas.wire import Footprint, LeaseSpec
 
 A, B, GPU = ProcessKey(1, 1), ProcessKey(2, 2), GpuId("GPU-0")
 
@@ -150,7 +150,9 @@ async def parked_slowly(client: SimClient, size: int, parked: list[str], **field
     return lease
 
 
-def run_client(made: World, life: Callable[[SimClient], Awaitable[None]], seconds: float = 60.0) -> bool:
+def run_client(
+    made: World, life: Callable[[SimClient], Awaitable[None]], seconds: float = 60.0
+) -> bool:
     """Connect a client and run its life. Did it come to its end within so much simulated time?"""
     process = made.spawn("client")
     client = SimClient(made, process)

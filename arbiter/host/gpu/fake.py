@@ -12,12 +12,12 @@ import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from arbiter.core.events import ProcessUse
-from arbiter.host.gpu.probe import Card, Reading
-from schemas import fakegpu
-from schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
-from schemas.ids import GpuId, ProcessKey
-from schemas.units import parse_bytes
+from vram_arbiter.arbiter.core.events import ProcessUse
+from vram_arbiter.arbiter.host.gpu.probe import Card, Reading
+from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
+from vram_arbiter.schemas.ids import GpuId, ProcessKey
+from vram_arbiter.schemas.units import parse_bytes
 
 _HANG_POLL_S = 0.05  # how soon a simulated hang notices that it was switched off
 
@@ -73,9 +73,13 @@ class FakeProbe:
 
     def _suffer(self, folder: Path) -> None:
         """Fail or hang as the card's faults say; a hang ends with the fault or with `close`."""
-        while (fault := fakegpu.parse_config((folder / fakegpu.CARD_FILE).read_text()).faults.probe) != "ok":
+        while (
+            fault := fakegpu.parse_config((folder / fakegpu.CARD_FILE).read_text()).faults.probe
+        ) != "ok":
             if fault == "fail":
-                raise ProbeFailed("the probe fails because gpu.json says so", hint='set faults.probe to "ok"')
+                raise ProbeFailed(
+                    "the probe fails because gpu.json says so", hint='set faults.probe to "ok"'
+                )
             if self._closed.wait(_HANG_POLL_S):
                 raise ProbeFailed("the probe was closed while it hung")
 
@@ -112,7 +116,11 @@ def open_cards(text: str, runtime: Path) -> FakeProbe:
 
 
 def make_card(
-    folder: Path, capacity_bytes: int, *, index: int = 0, release_lag_s: float = fakegpu.RELEASE_LAG_S
+    folder: Path,
+    capacity_bytes: int,
+    *,
+    index: int = 0,
+    release_lag_s: float = fakegpu.RELEASE_LAG_S,
 ) -> None:
     """Make a card in `folder`, or keep the one there. Raises ConfigError if that one is in use with another capacity."""
     boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
@@ -154,7 +162,9 @@ def locked(folder: Path) -> Iterator[None]:
 def _settled(folder: Path) -> fakegpu.Card:
     """The card now; the lock is held. Deaths and returns since the last reading are written down."""
     names = [
-        name for name in os.listdir(folder) if name == fakegpu.CARD_FILE or fakegpu.is_process_file(name)
+        name
+        for name in os.listdir(folder)
+        if name == fakegpu.CARD_FILE or fakegpu.is_process_file(name)
     ]
     texts = {name: (folder / name).read_text() for name in names}
     change = fakegpu.read_card(texts, _tail(folder / fakegpu.LOG_FILE))
@@ -170,7 +180,9 @@ def _perform(folder: Path, step: fakegpu.Step) -> None:
     elif step.text is not None:
         _replace(folder / step.name, step.text)
     if step.line:
-        log = os.open(folder / fakegpu.LOG_FILE, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o660)
+        log = os.open(
+            folder / fakegpu.LOG_FILE, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o660
+        )
         try:
             os.write(log, step.line.encode())
         finally:

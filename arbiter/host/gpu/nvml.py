@@ -6,11 +6,11 @@ NVML only reads: it creates no CUDA context, which alone would cost 120-550 MB o
 import threading
 from typing import Any
 
-from arbiter.core.events import ProcessUse
-from arbiter.host.gpu.pids import PidMap
-from arbiter.host.gpu.probe import Card, Reading
-from schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
-from schemas.ids import GpuId
+from vram_arbiter.arbiter.core.events import ProcessUse
+from vram_arbiter.arbiter.host.gpu.pids import PidMap
+from vram_arbiter.arbiter.host.gpu.probe import Card, Reading
+from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
+from vram_arbiter.schemas.ids import GpuId
 
 _HINT = "install the NVIDIA driver, or start with --gpu fake:8GiB to simulate a card"
 
@@ -83,7 +83,9 @@ class NvmlProbe:
             except (NoGpu, ConfigError) as error:
                 raise ProbeFailed(error.message, hint=error.hint) from error
             if lost := sorted(self._handles.keys() - found.keys()):
-                raise ProbeFailed(f"the NVIDIA driver no longer lists {', '.join(lost)}", hint="see dmesg")
+                raise ProbeFailed(
+                    f"the NVIDIA driver no longer lists {', '.join(lost)}", hint="see dmesg"
+                )
             self._handles = found
             self._failing.clear()
 
@@ -131,7 +133,9 @@ class NvmlProbe:
         try:
             return gpu, _text(self._nvml.nvmlDeviceGetName(handle))
         except self._nvml.NVMLError as error:
-            raise ProbeFailed(f"{gpu} does not answer: {error}", hint="see nvidia-smi and dmesg") from error
+            raise ProbeFailed(
+                f"{gpu} does not answer: {error}", hint="see nvidia-smi and dmesg"
+            ) from error
 
     def processes(self, gpu: GpuId) -> tuple[ProcessUse, ...] | None:
         """Who is on a card; None where the driver does not say."""
@@ -165,7 +169,10 @@ class NvmlProbe:
         if not self._pids.knows:
             return None
         used: dict[int, int | None] = {}
-        for read in (nvml.nvmlDeviceGetComputeRunningProcesses, nvml.nvmlDeviceGetGraphicsRunningProcesses):
+        for read in (
+            nvml.nvmlDeviceGetComputeRunningProcesses,
+            nvml.nvmlDeviceGetGraphicsRunningProcesses,
+        ):
             try:
                 listed = read(handle)
             except nvml.NVMLError:

@@ -10,8 +10,8 @@ import os
 from pathlib import Path
 from typing import Literal
 
-from schemas.fakegpu import parse_stat
-from schemas.ids import ProcessKey
+from vram_arbiter.schemas.fakegpu import parse_stat
+from vram_arbiter.schemas.ids import ProcessKey
 
 log = logging.getLogger(__name__)
 
@@ -61,7 +61,9 @@ class PidMap:
         if pid not in self._told:
             self._told.add(pid)
             log.warning(
-                "pid_unmapped: host pid %d (%s) is no process of this namespace", pid, name or "unseen"
+                "pid_unmapped: host pid %d (%s) is no process of this namespace",
+                pid,
+                name or "unseen",
             )
         return ProcessKey(-pid, 0), f"host pid {pid} {name}".strip()
 
@@ -75,7 +77,7 @@ def process_key(proc: Path, pid: int) -> ProcessKey:
 
 
 def process_name(proc: Path, pid: int) -> str:
-    """Program and, for an interpreter, what it runs: `python -m sidecars` says more than `python`."""
+    """Program and, for an interpreter, what it runs: `python -m vram_arbiter.sidecars` says more than `python`."""
     try:
         words = (proc / str(pid) / "cmdline").read_bytes().decode(errors="replace").split("\0")
     except OSError:

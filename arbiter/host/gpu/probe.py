@@ -7,8 +7,8 @@ anything, and none of them creates a CUDA context.
 from dataclasses import dataclass
 from typing import Protocol
 
-from arbiter.core.events import ProcessUse
-from schemas.ids import GpuId
+from vram_arbiter.arbiter.core.events import ProcessUse
+from vram_arbiter.schemas.ids import GpuId
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from arbiter.core.events import ProcessUse
-from arbiter.host.gpu.nvml import NvmlProbe
-from arbiter.host.gpu.pids import PidMap, process_key, process_name
-from arbiter.host.gpu.probe import Card, GpuProbe, Reading
-from schemas.defaults import GIB, KIB, MIB
-from schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
-from schemas.ids import GpuId
+from vram_arbiter.arbiter.core.events import ProcessUse
+from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
+from vram_arbiter.arbiter.host.gpu.pids import PidMap, process_key, process_name
+from vram_arbiter.arbiter.host.gpu.probe import Card, GpuProbe, Reading
+from vram_arbiter.schemas.defaults import GIB, KIB, MIB
+from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
+from vram_arbiter.schemas.ids import GpuId
 
 MARGIN_SHARE = 0.15
 """Of the machine's memory that is never leased: kernel, desktop, cameras and their growth. A discrete card needs 300 MiB."""
@@ -44,7 +44,9 @@ class UnifiedProbe:
     def cards(self) -> tuple[Card, ...]:
         total, _ = read_meminfo(self._root)
         margin = max(MARGIN_MIN_BYTES, int(total * MARGIN_SHARE))
-        return (Card(self._gpu, 0, self._name, total, margin_bytes=margin, noise_bytes=NOISE_BYTES),)
+        return (
+            Card(self._gpu, 0, self._name, total, margin_bytes=margin, noise_bytes=NOISE_BYTES),
+        )
 
     def sample(self, gpu: GpuId) -> Reading:
         if gpu != self._gpu:
@@ -82,7 +84,12 @@ def nvmap_clients(root: Path) -> tuple[ProcessUse, ...] | None:
     used: dict[int, int] = {}
     for line in lines:
         words = line.split()
-        if len(words) == 4 and words[0] == "user" and words[2].isdecimal() and words[3][:-1].isdecimal():
+        if (
+            len(words) == 4
+            and words[0] == "user"
+            and words[2].isdecimal()
+            and words[3][:-1].isdecimal()
+        ):
             used[int(words[2])] = used.get(int(words[2]), 0) + int(words[3][:-1]) * _UNITS.get(
                 words[3][-1], 1
             )
@@ -90,7 +97,8 @@ def nvmap_clients(root: Path) -> tuple[ProcessUse, ...] | None:
         return None
     proc = root / "proc"
     return tuple(
-        ProcessUse(process_key(proc, pid), process_name(proc, pid), used[pid]) for pid in sorted(used)
+        ProcessUse(process_key(proc, pid), process_name(proc, pid), used[pid])
+        for pid in sorted(used)
     )
 
 
@@ -99,7 +107,10 @@ _UNITS = {"K": KIB, "M": MIB, "B": 1}
 
 # -- which backend -------------------------------------------------------------------------------------------------------
 def choose(
-    source: Literal["auto", "nvml", "unified"], pids: PidMap, root: Path = Path("/"), nvml: Any = None
+    source: Literal["auto", "nvml", "unified"],
+    pids: PidMap,
+    root: Path = Path("/"),
+    nvml: Any = None,
 ) -> tuple[GpuProbe, str]:
     """(backend, `nvml` or `unified`) for a source. A machine with a card of its own is never read by its main memory.
 

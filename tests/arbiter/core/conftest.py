@@ -2,7 +2,7 @@
 
 import pytest
 
-from arbiter.testing.scenes import Tree
+from tests.support.scenes import Tree
 
 
 @pytest.fixture

@@ -7,12 +7,20 @@ from typing import Any
 
 import pytest
 
-from arbiter.core import events as ev
-from arbiter.core.arbiter import Arbiter
-from arbiter.core.effects import Effect, Reply
-from arbiter.core.settings import GpuInfo, Settings
-from schemas import defaults as d
-from schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, RequestId, Token
+from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.arbiter.core.arbiter import Arbiter
+from vram_arbiter.arbiter.core.effects import Effect, Reply
+from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import (
+    ClientId,
+    GpuId,
+    LeaseId,
+    ModelKey,
+    ProcessKey,
+    RequestId,
+    Token,
+)
 
 CARD = GpuId("GPU-0")
 FEW, MANY = 5, 500
@@ -91,7 +99,9 @@ class Counted:
         one = (lease.id, lease.token)
         found["ready"] = self.counted(ev.ReadyReported(client, self.request(), *one, None))
         found["renew"] = self.counted(ev.Renewed(client, self.request(), (one,)))
-        found["release"] = self.counted(ev.ReleaseReported(client, self.request(), *one, exiting=False))
+        found["release"] = self.counted(
+            ev.ReleaseReported(client, self.request(), *one, exiting=False)
+        )
         found["tick"] = self.counted(ev.Tick())
         found["first reading"] = self.counted(self.reading())
         self.tell(ev.Tick())
@@ -102,12 +112,16 @@ class Counted:
 
 
 @pytest.mark.parametrize("listed", [True, False])
-def test_no_event_costs_more_beside_a_hundred_times_as_many_leases_and_connections(listed: bool) -> None:
+def test_no_event_costs_more_beside_a_hundred_times_as_many_leases_and_connections(
+    listed: bool,
+) -> None:
     few, many = Counted(FEW, listed=listed), Counted(MANY, listed=listed)
     few.cycle()
     many.cycle()
     before, after = few.cycle(), many.cycle()
-    grown = {name: (before[name], after[name]) for name in before if after[name] > 1.1 * before[name]}
+    grown = {
+        name: (before[name], after[name]) for name in before if after[name] > 1.1 * before[name]
+    }
     assert not grown, f"instructions with {FEW} and with {MANY}"
 
 

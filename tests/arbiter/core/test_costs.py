@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from arbiter.core import costs
-from arbiter.testing.core_driver import Consumer, CoreDriver
-from arbiter.testing.scenes import held
-from schemas import defaults as d
-from schemas.ids import LeaseId
+from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.scenes import held
+from vram_arbiter.arbiter.core.learning import costs
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId
 
 GIB = d.GIB
 
@@ -19,7 +19,9 @@ def asked(driver: CoreDriver, leases: dict[str, LeaseId]) -> list[str]:
 
 # -- victims ---------------------------------------------------------------------------------------------------------
 def test_of_two_alike_the_one_that_reloads_faster_goes() -> None:
-    driver = CoreDriver(8 * GIB, settings={"learnt": {"slow": {"load_s": 40.0}, "fast": {"load_s": 2.0}}})
+    driver = CoreDriver(
+        8 * GIB, settings={"learnt": {"slow": {"load_s": 40.0}, "fast": {"load_s": 2.0}}}
+    )
     _, slow = held(driver, "slow", 3)
     _, fast = held(driver, "fast", 3)
     driver.consumer("w").acquire(4 * GIB)
@@ -46,7 +48,9 @@ def test_who_could_park_but_finds_no_room_is_like_the_others() -> None:
 
 
 def test_a_lower_priority_goes_whatever_it_costs() -> None:
-    driver = CoreDriver(8 * GIB, settings={"learnt": {"cheap": {"load_s": 0.1}, "dear": {"load_s": 99.0}}})
+    driver = CoreDriver(
+        8 * GIB, settings={"learnt": {"cheap": {"load_s": 0.1}, "dear": {"load_s": 99.0}}}
+    )
     _, cheap = held(driver, "cheap", 3, priority=60)
     _, dear = held(driver, "dear", 3, priority=40)
     driver.consumer("w").acquire(4 * GIB, priority=70)
@@ -89,7 +93,9 @@ def test_who_never_comes_back_is_cheaper_to_send_away() -> None:
 
 def test_many_candidates_are_searched_with_parking_in_mind_too() -> None:
     driver = CoreDriver(17 * GIB, settings={"host_ram_budget_bytes": 64 * GIB})
-    leases = {f"n{n}": held(driver, f"n{n}", 1, park_bytes=GIB if n == 9 else 0)[1] for n in range(16)}
+    leases = {
+        f"n{n}": held(driver, f"n{n}", 1, park_bytes=GIB if n == 9 else 0)[1] for n in range(16)
+    }
     driver.consumer("w").acquire(int(1.2 * GIB))
     assert asked(driver, leases) == ["n9"]
 

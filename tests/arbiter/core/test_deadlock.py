@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from arbiter.core import deadlock
-from arbiter.core.effects import Effect, Refuse
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
-from schemas import defaults as d
-from schemas.ids import LeaseId
+from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from vram_arbiter.arbiter.core.effects import Effect, Refuse
+from vram_arbiter.arbiter.core.scheduling import deadlock
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId
 
 GIB = d.GIB
 
@@ -57,7 +57,10 @@ def test_who_uses_what_is_in_his_way_is_told_at_once(driver: CoreDriver) -> None
     refused = refusal(effects)
     assert refused.code == "would_deadlock"
     assert links(refused) == [("job", ["job"], ["job"])]
-    assert f"job (pid {job.process.pid}) uses job ({lease}) and waits for job ({lease})" in refused.message
+    assert (
+        f"job (pid {job.process.pid}) uses job ({lease}) and waits for job ({lease})"
+        in refused.message
+    )
     assert "`yield`" in refused.hint
     assert not asked(effects), "nobody is asked to leave in vain"
     assert driver.state(lease) == "held"
@@ -192,7 +195,7 @@ def test_a_pinned_holder_is_a_wait_and_no_circle(driver: CoreDriver) -> None:
 
 
 def test_what_waits_for_a_residue_or_a_stowaway_is_left_alone(driver: CoreDriver) -> None:
-    from schemas.ids import ProcessKey
+    from vram_arbiter.schemas.ids import ProcessKey
 
     driver.card.set(ProcessKey(9, 9), 4 * GIB, driver.now)
     driver.advance(2.0)
@@ -217,7 +220,9 @@ def test_a_process_that_can_be_served_elsewhere_is_in_no_circle() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     job, _ = using(driver, "job", 5, gpu="0")
     using(driver, "other", 5, gpu="1")
-    assert driver.state(job.acquire(5 * GIB)) == "queued", "the other card's holder will end its use"
+    assert driver.state(job.acquire(5 * GIB)) == "queued", (
+        "the other card's holder will end its use"
+    )
 
 
 def test_a_debt_is_on_its_way_back(driver: CoreDriver) -> None:
@@ -259,7 +264,11 @@ def test_who_only_waits_for_a_circle_is_not_the_one_to_be_refused() -> None:
     newest = c.acquire(5 * GIB, gpu="0")
     assert [driver.state(lease) for lease in (first, second, newest)] == ["queued"] * 3
     b.use_begin(theirs)
-    assert [driver.state(lease) for lease in (first, second, newest)] == ["queued", "over", "queued"]
+    assert [driver.state(lease) for lease in (first, second, newest)] == [
+        "queued",
+        "over",
+        "queued",
+    ]
     (denied,) = driver.pushes("denied", second)
     assert sorted(link["consumer"] for link in denied["error"]["details"]["cycle"]) == ["a", "b"]
 
@@ -271,9 +280,13 @@ def test_a_process_that_waits_for_very_many_is_not_looked_at() -> None:
     first, _ = using(driver, "other", 1)
     for _ in range(deadlock.WAITS_MAX):
         job.acquire(5 * GIB, independent=True)
-    assert refusal(job.try_acquire(5 * GIB)).code == "would_deadlock", "independent waits do not count"
+    assert refusal(job.try_acquire(5 * GIB)).code == "would_deadlock", (
+        "independent waits do not count"
+    )
     job.use_yield(lease)
     crowd = [job.acquire(int(5.5 * GIB)) for _ in range(deadlock.WAITS_MAX + 1)]
     job.use_begin(lease)
     assert {driver.state(one) for one in crowd} == {"queued"}
-    assert driver.state(first.acquire(GIB // 2)) == "loading", "and nobody else is denied because of it"
+    assert driver.state(first.acquire(GIB // 2)) == "loading", (
+        "and nobody else is denied because of it"
+    )

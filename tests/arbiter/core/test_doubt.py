@@ -1,9 +1,9 @@
 """A restart with a journal in doubt: it may have lost records, so holders know more than it does."""
 
-from arbiter.core.events import DOUBT_KEY
-from arbiter.testing.core_driver import CoreDriver, answer
-from arbiter.testing.scenes import held, sent_away
-from schemas import defaults as d
+from tests.support.core_driver import CoreDriver, answer
+from tests.support.scenes import held, sent_away
+from vram_arbiter.arbiter.core.events import DOUBT_KEY
+from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
 WAIT_S = d.LEASE_TTL_S + d.FENCE_GRACE_S
@@ -91,4 +91,6 @@ def test_a_lease_that_was_away_is_what_its_holder_says() -> None:
     policy.connect()
     answer(policy.reattach(wanted, policy_token))
     (kept,) = answer(det.reattach(lease, old, spec=spec, away=True))["leases"]
-    assert (kept["kept"], kept["lease"]["state"]) == (True, "standby"), "adopted as its holder tells"
+    assert (kept["kept"], kept["lease"]["state"]) == (True, "standby"), (
+        "adopted as its holder tells"
+    )

@@ -2,15 +2,17 @@
 
 import pytest
 
-from arbiter.core.effects import Sample
-from arbiter.testing.core_driver import CoreDriver, refusal
-from schemas import defaults as d
-from schemas.ids import GpuId, LeaseId
+from tests.support.core_driver import CoreDriver, refusal
+from vram_arbiter.arbiter.core.effects import Sample
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import GpuId, LeaseId
 
 GIB, MIB = d.GIB, d.MIB
 
 
-def lived(driver: CoreDriver, name: str, *, peak: float, steady: float, residue: float = 0.0) -> None:
+def lived(
+    driver: CoreDriver, name: str, *, peak: float, steady: float, residue: float = 0.0
+) -> None:
     """One life: loads with a peak, serves, unloads, ends. It declared 2 GiB (and 450 MiB of residue)."""
     person = driver.consumer(name)
     lease = person.acquire(2 * GIB, residue_bytes=450 * MIB)
@@ -71,7 +73,11 @@ def test_the_holders_own_word_counts_where_the_driver_lists_nobody() -> None:
     lease = det.acquire(2 * GIB)
     det.load(lease, measured_bytes=3 * GIB)
     (note,) = [note for note in driver.notes("drift") if note["part"] == "steady"]
-    assert (note["declared_bytes"], note["measured_bytes"], note["drift_bytes"]) == (2 * GIB, 3 * GIB, GIB)
+    assert (note["declared_bytes"], note["measured_bytes"], note["drift_bytes"]) == (
+        2 * GIB,
+        3 * GIB,
+        GIB,
+    )
     assert "above" in note["reason"]
     view = driver.view(lease)
     assert view is not None
@@ -132,7 +138,9 @@ def test_while_somebody_loads_the_card_is_read_twenty_times_a_second() -> None:
     driver.advance(0.1)
     before = len(driver.effects)
     driver.advance(1.0)
-    assert sum(isinstance(effect, Sample) for effect in driver.effects[before:]) == pytest.approx(20, abs=1)
+    assert sum(isinstance(effect, Sample) for effect in driver.effects[before:]) == pytest.approx(
+        20, abs=1
+    )
 
 
 def test_a_load_that_is_cut_off_teaches_only_that_it_was_too_much() -> None:
@@ -172,7 +180,9 @@ def test_a_process_with_two_leases_teaches_nothing() -> None:
 
 
 def test_what_was_learnt_never_asks_for_more_than_a_whole_card() -> None:
-    driver = CoreDriver(8 * GIB, settings={"footprints": {"det det-model": {"load_peak": [9 * GIB]}}})
+    driver = CoreDriver(
+        8 * GIB, settings={"footprints": {"det det-model": {"load_peak": [9 * GIB]}}}
+    )
     lease = driver.consumer("det").acquire(2 * GIB)
     assert driver.state(lease) == "loading"
     assert charge(driver, lease) == (8 * GIB - d.RESERVE_BYTES) / GIB
@@ -185,7 +195,10 @@ def test_a_refusal_says_that_the_figure_was_learnt() -> None:
     driver.restart(keep_journal=False)
     refused = refusal(driver.consumer("det").try_acquire(2 * GIB, gpu="1"))
     assert "declared, more was measured" in refused.message
-    assert (refused.details["needed_bytes"], refused.details["declared_bytes"]) == (6 * GIB, 2 * GIB)
+    assert (refused.details["needed_bytes"], refused.details["declared_bytes"]) == (
+        6 * GIB,
+        2 * GIB,
+    )
 
 
 def test_why_says_that_a_waiter_needs_more_than_it_declared() -> None:
@@ -195,7 +208,10 @@ def test_why_says_that_a_waiter_needs_more_than_it_declared() -> None:
     det.load(lease)
     det.use_begin(lease)
     driver.consumer("w").acquire(2 * GIB)
-    assert "(2.00 GiB declared, 5.00 GiB learnt)" in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
+    assert (
+        "(2.00 GiB declared, 5.00 GiB learnt)"
+        in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
+    )
 
 
 def test_a_lease_that_comes_back_after_a_restart_is_measured_on() -> None:

@@ -1,9 +1,9 @@
 """The ladder: ask, ask again until heard, remind, deadline. Exact times, no sleep."""
 
-from arbiter.core.events import ClientConnected
-from arbiter.testing.core_driver import Consumer, CoreDriver
-from schemas import defaults as d
-from schemas.ids import ClientId, LeaseId
+from tests.support.core_driver import Consumer, CoreDriver
+from vram_arbiter.arbiter.core.events import ClientConnected
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import ClientId, LeaseId
 
 GIB = d.GIB
 
@@ -163,7 +163,9 @@ def test_a_holder_that_comes_back_is_asked_again_and_keeps_the_uses_of_others() 
     driver.advance(1.0)
     assert len(driver.pushes("revoke")) == 1
     old, det.client = det.client, ClientId("c-new")
-    driver.post(ClientConnected(det.client, det.process, 1000, "det", f"det-{old}"))  # the same instance
+    driver.post(
+        ClientConnected(det.client, det.process, 1000, "det", f"det-{old}")
+    )  # the same instance
     det.reattach(lease, det.token(lease))
     assert driver.pushes("revoke")[-1]["uses"] == 1
     driver.advance(0.3)

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 
-from arbiter.core.effects import Note
-from arbiter.core.events import AcquireRequested
-from arbiter.core.explain import NOTE_KINDS
-from arbiter.testing.core_driver import CoreDriver
-from arbiter.testing.scenes import held, why
-from schemas import defaults as d
-from schemas.ids import GpuId, ProcessKey
+from tests.support.core_driver import CoreDriver
+from tests.support.scenes import held, why
+from vram_arbiter.arbiter.core.effects import Note
+from vram_arbiter.arbiter.core.events import AcquireRequested
+from vram_arbiter.arbiter.core.report.explain import NOTE_KINDS
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import GpuId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -222,7 +222,9 @@ def test_the_eta_is_learnt_and_honest_about_not_knowing() -> None:
         0.5 + learnt["det"]["verify_s"] + learnt["vlm"]["load_s"]
     )
     det.release(lease)
-    assert why(again, "vlm")["eta_s"] == pytest.approx(learnt["det"]["verify_s"] + learnt["vlm"]["load_s"])
+    assert why(again, "vlm")["eta_s"] == pytest.approx(
+        learnt["det"]["verify_s"] + learnt["vlm"]["load_s"]
+    )
 
 
 def test_a_load_without_eviction_is_a_record_too() -> None:
@@ -243,7 +245,10 @@ def test_a_lease_may_be_asked_about_by_its_id() -> None:
     driver = CoreDriver(8 * GIB)
     _, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
-    assert driver.arbiter.why(waiter, driver.now)["leases"] == driver.arbiter.why("vlm", driver.now)["leases"]
+    assert (
+        driver.arbiter.why(waiter, driver.now)["leases"]
+        == driver.arbiter.why("vlm", driver.now)["leases"]
+    )
     assert [told["lease_id"] for told in driver.arbiter.why(lease, driver.now)["leases"]] == [lease]
 
 

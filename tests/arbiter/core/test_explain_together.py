@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer
-from arbiter.testing.scenes import held, why
-from schemas import defaults as d
-from schemas.ids import LeaseId, ProcessKey
+from tests.support.core_driver import Consumer, CoreDriver, answer
+from tests.support.scenes import held, why
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -43,7 +43,9 @@ def test_every_member_that_waits_says_what_the_gang_needs_and_who_is_in_its_way(
     for member in ("policy", "reward"):
         told = why(driver, member)
         assert told["condition"] == "gang waiting"
-        assert told["needed_bytes"] == 3 * GIB + 2 * GIB + 1 * GIB, "all their steady bytes and one headroom"
+        assert told["needed_bytes"] == 3 * GIB + 2 * GIB + 1 * GIB, (
+            "all their steady bytes and one headroom"
+        )
         assert told["deficit_bytes"] == 6 * GIB - told["free_bytes"]
         assert "nobody who could make room for the whole gang may be asked now" in told["next"]
         assert blockers(driver, member) == [
@@ -77,13 +79,18 @@ def test_one_that_waits_for_its_turn_names_who_loads() -> None:
     policy, first, _, second = gang(driver)
     driver.advance(0.5)
     told = why(driver, "reward")
-    assert (told["condition"], told["needed_bytes"], told["deficit_bytes"]) == ("gang loading", 3 * GIB, 0)
+    assert (told["condition"], told["needed_bytes"], told["deficit_bytes"]) == (
+        "gang loading",
+        3 * GIB,
+        0,
+    )
     assert "free or kept for it" in told["text"]
     assert blockers(driver, "reward") == [("policy", first, 4.0, "loading", "is loading")]
     assert plan(driver, "reward") == [("loaded", "policy", 1.5)]
     assert told["eta_s"] == pytest.approx(5.0), "its own load comes after the other's"
     assert (
-        f"gang g is complete once all are held: reward ({second}) is queued" in why(driver, "policy")["text"]
+        f"gang g is complete once all are held: reward ({second}) is queued"
+        in why(driver, "policy")["text"]
     )
     policy.load(first)
     driver.advance(0.01)
@@ -114,7 +121,10 @@ def test_whoever_waits_beside_a_gang_sees_what_is_kept_for_it() -> None:
         ("policy", first, 4.0, "loading", "is loading"),
         ("reward", second, 2.0, "queued", "has its bytes kept for its turn in gang g"),
     ]
-    assert sum(count for _, _, count, *_ in blockers(driver, "w")) * GIB == driver.gpu()["charged_bytes"]
+    assert (
+        sum(count for _, _, count, *_ in blockers(driver, "w")) * GIB
+        == driver.gpu()["charged_bytes"]
+    )
 
 
 def test_a_holder_of_an_unfinished_gang_says_so_to_its_waiter() -> None:
@@ -156,7 +166,10 @@ def test_a_gang_over_two_cards_tells_each_member_its_own_card() -> None:
     b.acquire(6 * GIB, gang=("g", 2), gpu="1")
     assert [(name, count) for name, _, count, *_ in blockers(driver, "a")] == [("left", 5.0)]
     assert [(name, count) for name, _, count, *_ in blockers(driver, "b")] == [("right", 5.0)]
-    assert (why(driver, "a")["needed_bytes"], why(driver, "b")["needed_bytes"]) == (4 * GIB, 6 * GIB)
+    assert (why(driver, "a")["needed_bytes"], why(driver, "b")["needed_bytes"]) == (
+        4 * GIB,
+        6 * GIB,
+    )
 
 
 def test_a_gang_of_which_not_all_are_back_says_so() -> None:
@@ -181,7 +194,9 @@ def test_a_member_that_waits_for_the_rest_after_a_restart_knows_until_when() -> 
         person.connect()
     answer(people[0].reattach(leases[0], token, held=False))
     people[1].acquire(GIB, gang=("g", 3))
-    assert plan(driver, "b") == [("break", "", pytest.approx(d.LEASE_TTL_S + d.FENCE_GRACE_S, abs=0.1))]
+    assert plan(driver, "b") == [
+        ("break", "", pytest.approx(d.LEASE_TTL_S + d.FENCE_GRACE_S, abs=0.1))
+    ]
     assert why(driver, "b")["eta_s"] is None
 
 
@@ -224,7 +239,13 @@ def test_a_tree_that_was_asked_goes_in_order() -> None:
     driver.consumer("w").acquire(5 * GIB)
     driver.advance(0.1)
     assert blockers(driver, "w") == [
-        ("runner", root, 2.0, "revoking", f"was asked to leave 0.1 s ago, goes after policy ({leaf})"),
+        (
+            "runner",
+            root,
+            2.0,
+            "revoking",
+            f"was asked to leave 0.1 s ago, goes after policy ({leaf})",
+        ),
         ("policy", leaf, 4.0, "revoking", "was asked to leave 0.1 s ago, idle"),
     ]
     assert why(driver, "w")["next"] == (
@@ -234,7 +255,8 @@ def test_a_tree_that_was_asked_goes_in_order() -> None:
     assert plan(driver, "w") == [("deadline", "policy", 29.9), ("wait", "runner", None)]
     assert f"it lends 4.00 GiB to policy ({leaf}), who leave first" in why(driver, "runner")["text"]
     assert (
-        f"asked to leave for w, idle; it was carved out of runner ({root})" in why(driver, "policy")["text"]
+        f"asked to leave for w, idle; it was carved out of runner ({root})"
+        in why(driver, "policy")["text"]
     )
     policy.unloading(leaf)
     assert why(driver, "w")["next"].startswith("policy unloads, then 4.00 GiB are verified")

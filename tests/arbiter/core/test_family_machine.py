@@ -6,11 +6,11 @@ from typing import Any
 import hypothesis.strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, multiple, rule
 
-from arbiter.core.effects import Effect, Refuse, Reply
-from arbiter.testing.core_driver import Consumer, CoreDriver
-from arbiter.testing.machines import walk
-from schemas import defaults as d
-from schemas.ids import LeaseId, ProcessKey
+from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.machines import walk
+from vram_arbiter.arbiter.core.effects import Effect, Refuse, Reply
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 CAPACITY = 8 * d.GIB
 MOMENT_S = 0.0001
@@ -38,7 +38,14 @@ class Families(RuleBasedStateMachine):
 
     # -- asking ----------------------------------------------------------------------------------------------------
     def ask(self, who: Consumer, size: int, steady: int, spec: dict[str, Any]) -> Any:
-        if sum(self.driver.state(lease) != "over" for lease, owner in self.mine.items() if owner is who) > 2:
+        if (
+            sum(
+                self.driver.state(lease) != "over"
+                for lease, owner in self.mine.items()
+                if owner is who
+            )
+            > 2
+        ):
             return None
         spec = dict(spec)
         wait_timeout_s = spec.pop("wait_timeout_s", None)
@@ -89,7 +96,10 @@ class Families(RuleBasedStateMachine):
     def carve(self, parent: LeaseId, who: int, size: int, residue: int, lends: bool) -> Any:
         if self.driver.state(parent) not in ("loading", "held") or parent not in self.lends:
             return multiple()
-        spec = {"residue_bytes": 0 if lends else residue, "parent": (parent, self.mine[parent].token(parent))}
+        spec = {
+            "residue_bytes": 0 if lends else residue,
+            "parent": (parent, self.mine[parent].token(parent)),
+        }
         before = self.driver.gpu()["charged_bytes"]
         lease = self.ask(self.people[who], size, size, spec)
         assert self.driver.gpu()["charged_bytes"] <= before, "the total never grows by it"
@@ -110,7 +120,9 @@ class Families(RuleBasedStateMachine):
         name = (f"g{self.gangs}", len(sizes))
         asked = sizes[:-1] if missing else sizes
         made = [
-            self.ask(self.people[n], size, max(size // 2, 1), {"gang": name, "wait_timeout_s": 40.0})
+            self.ask(
+                self.people[n], size, max(size // 2, 1), {"gang": name, "wait_timeout_s": 40.0}
+            )
             for n, size in enumerate(asked)
         ]
         return multiple(*(lease for lease in made if lease is not None))
@@ -225,16 +237,22 @@ class Families(RuleBasedStateMachine):
         }
         total = self.driver.gpu()["charged_bytes"]
         self.driver.restart(epoch=self.driver.settings.epoch + 1)
-        for person in self.dead:  # a daemon that starts looks for the processes of its journal first
+        for (
+            person
+        ) in self.dead:  # a daemon that starts looks for the processes of its journal first
             person.die()
         for person in self.people:
             person.connect()
         for lease, (state, token) in held.items():
             effects: list[Effect] = self.mine[lease].reattach(lease, token, held=state != "loading")
             if any(
-                effect.body["leases"][0]["kept"] is False for effect in effects if isinstance(effect, Reply)
+                effect.body["leases"][0]["kept"] is False
+                for effect in effects
+                if isinstance(effect, Reply)
             ):
-                self.loaded.get(self.mine[lease].process, {}).pop(lease, None)  # it was told so, and unloads
+                self.loaded.get(self.mine[lease].process, {}).pop(
+                    lease, None
+                )  # it was told so, and unloads
                 self.show(self.mine[lease].process)
         assert self.driver.gpu()["charged_bytes"] <= total, "nothing is granted twice"
 
@@ -243,7 +261,9 @@ class Families(RuleBasedStateMachine):
         if not hasattr(self, "driver"):
             return
         self.fits()
-        views = {view["lease_id"]: view for view in self.driver.arbiter.status(self.driver.now)["leases"]}
+        views = {
+            view["lease_id"]: view for view in self.driver.arbiter.status(self.driver.now)["leases"]
+        }
         for lease, view in views.items():
             for child in view.get("children", ()):
                 assert views[child]["parent"] == lease
@@ -254,7 +274,9 @@ class Families(RuleBasedStateMachine):
             return
         waiting: set[LeaseId] = set()
         for turn in range(300):
-            if turn in range(100, 150, 10):  # contexts of live processes may be all that is in the way
+            if turn in range(
+                100, 150, 10
+            ):  # contexts of live processes may be all that is in the way
                 self.die((turn - 100) // 10)
             for lease in self.mine:
                 self.load(lease)

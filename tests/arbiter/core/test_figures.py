@@ -1,11 +1,11 @@
 """The present in numbers, and the traces that facts and pushes name."""
 
-from arbiter.core.events import OperatorAsked
-from arbiter.core.figures import RESIDUES, STOWAWAYS, UNATTRIBUTED
-from arbiter.testing.core_driver import CoreDriver
-from arbiter.testing.scenes import held, sent_away
-from schemas import defaults as d
-from schemas.ids import ProcessKey
+from tests.support.core_driver import CoreDriver
+from tests.support.scenes import held, sent_away
+from vram_arbiter.arbiter.core.events import OperatorAsked
+from vram_arbiter.arbiter.core.report.figures import RESIDUES, STOWAWAYS, UNATTRIBUTED
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 HERS = f"00-{'a' * 32}-{'1' * 16}-01"
@@ -78,7 +78,9 @@ def test_pressure_a_drain_and_the_time_of_the_reading() -> None:
     figures = driver.arbiter.figures()
     assert (figures["drained"], figures["gpus"][0]["pressure_bytes"]) == (False, 0)
     person, _ = held(driver, "det", 2)
-    event = OperatorAsked(person.client, driver.next_request(), "drain", "", "operator", "maintenance")
+    event = OperatorAsked(
+        person.client, driver.next_request(), "drain", "", "operator", "maintenance"
+    )
     driver.post(event)
     driver.card.set(person.process, 8 * GIB, driver.now)
     driver.advance(1.1)

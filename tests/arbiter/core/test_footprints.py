@@ -1,6 +1,11 @@
 """What was measured of a model, and what of it counts for the next request."""
 
-from arbiter.core.footprints import HISTORY_MAX, MODELS_MAX, OOM_LOADS, Footprints
+from vram_arbiter.arbiter.core.learning.footprints import (
+    HISTORY_MAX,
+    MODELS_MAX,
+    OOM_LOADS,
+    Footprints,
+)
 
 
 def test_few_measurements_count_by_their_maximum_and_many_by_their_95th_percentile() -> None:
@@ -25,7 +30,9 @@ def test_only_the_last_measurements_count() -> None:
     assert prints.p95_bytes("det m", "residue") == 4
 
 
-def test_an_out_of_memory_counts_whatever_many_loads_measured_before_and_is_forgotten_in_the_end() -> None:
+def test_an_out_of_memory_counts_whatever_many_loads_measured_before_and_is_forgotten_in_the_end() -> (
+    None
+):
     prints = Footprints()
     for _ in range(HISTORY_MAX):
         prints.measured("det m", "load_peak", 5)
@@ -58,7 +65,10 @@ def test_what_is_kept_says_the_same_after_a_restart() -> None:
 def test_what_is_not_understood_is_left_out() -> None:
     prints = Footprints()
     prints.restore(
-        {"a": {"load_peak": 5, "steady": ["x", -1, 3], "oom": [1], "more": [1]}, "b": {"oom": [5, 999]}}
+        {
+            "a": {"load_peak": 5, "steady": ["x", -1, 3], "oom": [1], "more": [1]},
+            "b": {"oom": [5, 999]},
+        }
     )
     assert prints.kept() == {"a": {"steady": [3]}, "b": {"oom": [5, OOM_LOADS]}}
 

@@ -3,19 +3,21 @@
 from collections.abc import Sized
 from typing import Any
 
-from arbiter.core import state
-from arbiter.core.lease import NONCES_MAX
-from arbiter.core.state import CONSUMERS_REMEMBERED, ENDED_REMEMBERED
-from arbiter.testing.core_driver import CoreDriver
-from arbiter.testing.scenes import held
-from schemas import defaults as d
+from tests.support.core_driver import CoreDriver
+from tests.support.scenes import held
+from vram_arbiter.arbiter.core.model import state
+from vram_arbiter.arbiter.core.model.lease import NONCES_MAX
+from vram_arbiter.arbiter.core.model.state import CONSUMERS_REMEMBERED, ENDED_REMEMBERED
+from vram_arbiter.schemas import defaults as d
 
 GIB, MIB = d.GIB, d.MIB
 
 
 def sizes(owner: object) -> dict[str, int]:
     """Every table of the engine's state by name, with the number of its entries."""
-    tables: dict[str, Any] = {name: table for name, table in vars(owner).items() if isinstance(table, Sized)}
+    tables: dict[str, Any] = {
+        name: table for name, table in vars(owner).items() if isinstance(table, Sized)
+    }
     return {name: len(table) for name, table in tables.items() if not isinstance(table, str)}
 
 
@@ -73,6 +75,8 @@ def test_a_lease_that_is_taken_over_again_and_again_is_known_by_its_last_nonces(
         driver.advance(1.0)
     core = driver.arbiter._core
     mine = [
-        nonce for (process, nonce), known in core.nonces.items() if known == lease and process == det.process
+        nonce
+        for (process, nonce), known in core.nonces.items()
+        if known == lease and process == det.process
     ]
     assert len(mine) == NONCES_MAX + 1

@@ -2,11 +2,11 @@
 
 import pytest
 
-from arbiter.core.effects import Sample
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer
-from arbiter.testing.scenes import held, hidden_card
-from schemas import defaults as d
-from schemas.ids import LeaseId, ProcessKey
+from tests.support.core_driver import Consumer, CoreDriver, answer
+from tests.support.scenes import held, hidden_card
+from vram_arbiter.arbiter.core.effects import Sample
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 GIB = d.GIB
 MIB = d.MIB
@@ -57,7 +57,11 @@ def test_while_a_member_waits_for_its_memory_the_card_is_not_read_without_pause(
     driver.effects.clear()
     driver.advance(1.0)
     assert driver.state(second) == "queued"
-    assert 10 < sum(isinstance(effect, Sample) for effect in driver.effects) <= 1.0 / d.LOAD_PROBE_S + 2
+    assert (
+        10
+        < sum(isinstance(effect, Sample) for effect in driver.effects)
+        <= 1.0 / d.LOAD_PROBE_S + 2
+    )
 
 
 def test_memory_that_does_not_come_back_breaks_the_gang_in_time() -> None:
@@ -187,7 +191,9 @@ def test_bytes_kept_for_the_next_member_hide_no_context_of_the_one_before() -> N
     driver.until(lambda: driver.state(one) == "loading")
     first.ready(one)
     driver.until(lambda: driver.state(two) == "loading")
-    assert driver.now - began >= 0.8, "with the peak of the other one it would be more than the budget"
+    assert driver.now - began >= 0.8, (
+        "with the peak of the other one it would be more than the budget"
+    )
 
 
 def test_who_came_and_died_since_the_reading_may_still_be_on_the_card() -> None:

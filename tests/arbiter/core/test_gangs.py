@@ -4,12 +4,12 @@ from typing import Any
 
 import pytest
 
-from arbiter.core import gangs
-from arbiter.core.effects import Effect, Refuse
-from arbiter.testing.core_driver import CoreDriver, answer, refusal
-from arbiter.testing.scenes import held
-from schemas import defaults as d
-from schemas.ids import LeaseId, ProcessKey
+from tests.support.core_driver import CoreDriver, answer, refusal
+from tests.support.scenes import held
+from vram_arbiter.arbiter.core.effects import Effect, Refuse
+from vram_arbiter.arbiter.core.features import gangs
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 GIB = d.GIB
 MIB = d.MIB
@@ -74,7 +74,9 @@ def test_they_load_one_after_the_other_and_nobody_comes_between(driver: CoreDriv
     small = driver.consumer("small").acquire(GIB)
     driver.advance(5.0)
     assert states(a, b) == ["loading", "queued"]
-    assert "its bytes are kept for it" in driver.arbiter.why("reward", driver.now)["leases"][0]["text"]
+    assert (
+        "its bytes are kept for it" in driver.arbiter.why("reward", driver.now)["leases"][0]["text"]
+    )
     a.load()
     assert b.state == "loading", "in the same breath"
     driver.advance(1.0)
@@ -110,7 +112,9 @@ def test_one_too_many_and_another_size_are_refused(driver: CoreDriver) -> None:
 
 def test_a_sub_lease_is_in_no_gang(driver: CoreDriver) -> None:
     runner, root = held(driver, "runner", 4)
-    refused = refusal(driver.consumer("x").try_acquire(1, parent=(root, runner.token(root)), gang=("g", 2)))
+    refused = refusal(
+        driver.consumer("x").try_acquire(1, parent=(root, runner.token(root)), gang=("g", 2))
+    )
     assert refused.code == "bad_request"
 
 
@@ -125,9 +129,15 @@ def test_what_can_never_fit_together_is_said_to_all_at_once(driver: CoreDriver) 
 
 def test_a_member_that_can_never_fit_alone_breaks_the_gang(driver: CoreDriver) -> None:
     a = Member(driver, "a", 5)
-    assert refusal(driver.consumer("b").try_acquire(9 * GIB, gang=("g", 2))).code == "vram_insufficient"
+    assert (
+        refusal(driver.consumer("b").try_acquire(9 * GIB, gang=("g", 2))).code
+        == "vram_insufficient"
+    )
     assert codes(driver, a) == ["gang_broken"]
-    assert refusal(driver.consumer("b").try_acquire(9 * GIB, gang=("h", 2))).code == "vram_insufficient"
+    assert (
+        refusal(driver.consumer("b").try_acquire(9 * GIB, gang=("h", 2))).code
+        == "vram_insufficient"
+    )
 
 
 def test_serial_loading_counts_only_the_largest_headroom(driver: CoreDriver) -> None:
@@ -168,7 +178,10 @@ def test_victims_are_asked_only_if_the_whole_gang_then_fits(driver: CoreDriver) 
     a, b = Member(driver, "a", 2), Member(driver, "b", 2)
     assert driver.state(first) == "revoking"
     assert states(a, b) == ["queued", "queued"]
-    assert "room is being made for the whole gang" in driver.arbiter.why("a", driver.now)["leases"][0]["text"]
+    assert (
+        "room is being made for the whole gang"
+        in driver.arbiter.why("a", driver.now)["leases"][0]["text"]
+    )
     idle.unload(first)
     driver.until(lambda: a.state == "loading")
     assert driver.notes("granted")[-1]["evicted"] == ["idle"]
@@ -212,7 +225,8 @@ def test_nobody_of_a_gang_is_backfilled_alone(driver: CoreDriver) -> None:
     driver.advance(2.0)
     assert states(a, b) == ["queued", "queued"]
     assert (
-        "as one of gang g behind big as number 2" in driver.arbiter.why("b", driver.now)["leases"][0]["text"]
+        "as one of gang g behind big as number 2"
+        in driver.arbiter.why("b", driver.now)["leases"][0]["text"]
     )
 
 
@@ -233,7 +247,9 @@ def test_a_model_over_two_cards_is_a_gang_of_two_leases() -> None:
     who = driver.consumer("p")
     first = who.acquire(6 * GIB, gang=("g", 2), gpu="0")
     second = who.acquire(6 * GIB, gang=("g", 2), gpu="1")
-    assert (driver.state(first), driver.state(second)) == ("loading", "loading"), "serial per card only"
+    assert (driver.state(first), driver.state(second)) == ("loading", "loading"), (
+        "serial per card only"
+    )
     who.load(first)
     who.load(second)
     assert [n["phase"] for n in driver.notes("gang")] == ["loading", "complete"]
@@ -272,14 +288,20 @@ def test_an_exclusive_member_wants_a_card_of_its_own() -> None:
     assert driver.view(a.lease)["gpu"] != driver.view(b.lease)["gpu"]  # type: ignore[index]
     single = CoreDriver(8 * GIB)
     Member(single, "a", 2, exclusive=True)
-    assert refusal(single.consumer("b").try_acquire(2 * GIB, gang=("g", 2))).code == "vram_insufficient"
+    assert (
+        refusal(single.consumer("b").try_acquire(2 * GIB, gang=("g", 2))).code
+        == "vram_insufficient"
+    )
 
 
 def test_a_search_without_end_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gangs, "SEARCH_MAX", 1)
     driver = CoreDriver(8 * GIB, cards=2)
     Member(driver, "a", 6)
-    assert refusal(driver.consumer("b").try_acquire(6 * GIB, gang=("g", 2))).code == "vram_insufficient"
+    assert (
+        refusal(driver.consumer("b").try_acquire(6 * GIB, gang=("g", 2))).code
+        == "vram_insufficient"
+    )
 
 
 # -- breaking ----------------------------------------------------------------------------------------------------------
@@ -305,7 +327,9 @@ def test_who_holds_keeps_its_lease_when_the_gang_breaks(driver: CoreDriver) -> N
     assert a.state == "revoking", "ordinary from now on"
 
 
-def test_a_member_that_waits_for_its_turn_and_gives_up_gives_its_bytes_back(driver: CoreDriver) -> None:
+def test_a_member_that_waits_for_its_turn_and_gives_up_gives_its_bytes_back(
+    driver: CoreDriver,
+) -> None:
     a, b = pair(driver)
     b.who.cancel(b.lease)
     assert states(a, b) == ["loading", "over"]
@@ -334,7 +358,9 @@ def test_a_member_that_takes_more_than_it_said_breaks_what_no_longer_fits() -> N
     assert a.state == "held"
 
 
-def test_somebody_who_grew_meanwhile_is_asked_to_leave_or_the_gang_breaks(driver: CoreDriver) -> None:
+def test_somebody_who_grew_meanwhile_is_asked_to_leave_or_the_gang_breaks(
+    driver: CoreDriver,
+) -> None:
     for evictable in (True, False):
         driver = CoreDriver(8 * GIB)
         other, lease = held(driver, "other", 1, evictable=evictable)

@@ -2,12 +2,12 @@
 
 import pytest
 
-from arbiter.core.effects import Sample
-from arbiter.core.events import MemorySampled
-from arbiter.testing.core_driver import CoreDriver, answer
-from arbiter.testing.scenes import held
-from schemas import defaults as d
-from schemas.ids import GpuId, LeaseId, ProcessKey
+from tests.support.core_driver import CoreDriver, answer
+from tests.support.scenes import held
+from vram_arbiter.arbiter.core.effects import Sample
+from vram_arbiter.arbiter.core.events import MemorySampled
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 STRANGER = ProcessKey(9, 9)
@@ -38,7 +38,9 @@ def test_a_small_one_passes_the_head_if_it_cannot_delay_it() -> None:
     assert driver.state(fits_beside) == "loading", "5 + 2 fit once the holder is gone"
     small.load(fits_beside)
     too_big = driver.consumer("big").acquire(1 * GIB)
-    assert driver.state(too_big) == "queued", "there is room now, but the head would not fit beside it"
+    assert driver.state(too_big) == "queued", (
+        "there is room now, but the head would not fit beside it"
+    )
     busy.use_end(busy_lease)
     busy.unload(busy_lease)
     driver.until(lambda: driver.state(head) == "loading")
@@ -56,7 +58,9 @@ def test_nobody_passes_an_exclusive_head_or_when_its_room_is_about_to_come() -> 
     alone.cancel(head)
     head = alone.acquire(5 * GIB)
     driver.advance(0.01)
-    assert driver.state(small) == "loading", "the newcomer came later, so the small one is the head now"
+    assert driver.state(small) == "loading", (
+        "the newcomer came later, so the small one is the head now"
+    )
 
 
 def test_while_the_head_s_victim_unloads_nobody_starts_a_load_in_between() -> None:
@@ -80,7 +84,11 @@ def test_an_exclusive_waiter_never_passes() -> None:
     alone = driver.consumer("alone").acquire(1 * GIB, exclusive=True)
     third = driver.consumer("third").acquire(2 * GIB)
     driver.advance(0.1)
-    assert [driver.state(lease) for lease in (head, alone, third)] == ["queued", "queued", "loading"]
+    assert [driver.state(lease) for lease in (head, alone, third)] == [
+        "queued",
+        "queued",
+        "loading",
+    ]
 
 
 # -- exclusive -------------------------------------------------------------------------------------------------------------
@@ -122,7 +130,10 @@ def test_an_old_reading_carries_no_grant_a_fresh_one_is_asked_for() -> None:
     again = driver.consumer("vlm").try_acquire(1 * GIB)
     assert not [e for e in again if isinstance(e, Sample)], "one is under way"
     driver.advance(0.01)
-    assert [view["state"] for view in driver.arbiter.status(driver.now)["leases"]] == ["loading", "queued"]
+    assert [view["state"] for view in driver.arbiter.status(driver.now)["leases"]] == [
+        "loading",
+        "queued",
+    ]
 
 
 def test_the_card_may_say_no_where_the_ledger_says_yes() -> None:
@@ -256,7 +267,10 @@ def test_any_takes_the_first_card_where_it_fits_without_asking() -> None:
     a, b = driver.consumer("a"), driver.consumer("b")
     first = a.acquire(5 * GIB)
     second = b.acquire(5 * GIB)
-    assert [view["gpu"] for view in (driver.view(first), driver.view(second)) if view] == ["GPU-0", "GPU-1"]
+    assert [view["gpu"] for view in (driver.view(first), driver.view(second)) if view] == [
+        "GPU-0",
+        "GPU-1",
+    ]
 
 
 def test_any_empties_the_cheaper_card_only() -> None:

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.events import MemorySampled, ProcessUse
-from arbiter.testing.core_driver import CoreDriver
-from schemas import defaults as d
-from schemas.ids import ProcessKey
+from tests.support.core_driver import CoreDriver
+from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import ProcessKey
 
 GIB = d.GIB
 LIES: list[dict[str, Any]] = [
@@ -22,12 +22,19 @@ LIES: list[dict[str, Any]] = [
     {"total_bytes": 4 * GIB},
     {"total_bytes": 16 * GIB},
     {"processes": (ProcessUse(ProcessKey(9, 9), "odd", 1 << 60),)},
-    {"processes": (ProcessUse(ProcessKey(9, 9), "odd", None), ProcessUse(ProcessKey(8, 8), "odd", -5))},
+    {
+        "processes": (
+            ProcessUse(ProcessKey(9, 9), "odd", None),
+            ProcessUse(ProcessKey(8, 8), "odd", -5),
+        )
+    },
 ]
 
 
 @pytest.mark.parametrize("lie", LIES)
-def test_nothing_is_granted_on_an_impossible_reading_until_a_plausible_one(lie: dict[str, Any]) -> None:
+def test_nothing_is_granted_on_an_impossible_reading_until_a_plausible_one(
+    lie: dict[str, Any],
+) -> None:
     driver = CoreDriver(8 * GIB)
     driver.card.lies = lie
     driver.advance(3.0)
@@ -37,7 +44,9 @@ def test_nothing_is_granted_on_an_impossible_reading_until_a_plausible_one(lie: 
     gpu = driver.gpu()
     assert gpu["measured_used_bytes"] is None
     assert "impossible reading" in gpu["blocked"]
-    assert [note["reason"] in gpu["blocked"] for note in driver.notes("probe_failed")] == [True], "once"
+    assert [note["reason"] in gpu["blocked"] for note in driver.notes("probe_failed")] == [True], (
+        "once"
+    )
     driver.card.lies = {}
     driver.until(lambda: driver.state(waiter) == "loading")
     assert len(driver.notes("probe_ok")) == 1

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import pytest
 
-from arbiter.core import invariants
-from arbiter.core.events import ProcessDied
-from arbiter.core.invariants import InvariantViolation
-from arbiter.core.lease import Lease, LeaseState, Order, Use
-from arbiter.core.state import Core, Gpu
-from arbiter.testing.core_driver import CoreDriver
-from schemas import defaults as d
-from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, Token, UseId
+from tests.support.core_driver import CoreDriver
+from vram_arbiter.arbiter.core import invariants
+from vram_arbiter.arbiter.core.events import ProcessDied
+from vram_arbiter.arbiter.core.invariants import InvariantViolation
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState, Order, Use
+from vram_arbiter.arbiter.core.model.state import Core, Gpu
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, Token, UseId
 
 GIB = d.GIB
 X = ProcessKey(5, 5)

@@ -2,8 +2,8 @@
 
 import pytest
 
-from arbiter.core.events import Spec
-from arbiter.core.lease import (
+from vram_arbiter.arbiter.core.events import Spec
+from vram_arbiter.arbiter.core.model.lease import (
     AWAY,
     STORY_MAX,
     TRANSITIONS,
@@ -11,11 +11,13 @@ from arbiter.core.lease import (
     Lease,
     LeaseState,
 )
-from schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey
+from vram_arbiter.schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey
 
 
 def lease(priority: int = 50, residue_bytes: int = 7) -> Lease:
-    spec = Spec("det", ModelKey("m"), "any", False, 10, 10, residue_bytes, priority, True, 10.0, 2.0, False)
+    spec = Spec(
+        "det", ModelKey("m"), "any", False, 10, 10, residue_bytes, priority, True, 10.0, 2.0, False
+    )
     return Lease(LeaseId("L1-1"), "n", spec, ProcessKey(1, 1), ClientId("c"), 100.0, 1, 10, 10, ())
 
 
@@ -57,7 +59,9 @@ def test_a_legal_life_is_told() -> None:
 @pytest.mark.parametrize("to", sorted(set(LeaseState) - TRANSITIONS[LeaseState.QUEUED]))
 def test_an_illegal_move_changes_nothing_and_carries_the_story(to: LeaseState) -> None:
     one = lease()
-    with pytest.raises(IllegalTransition, match=rf"L1-1: queued → {to} is not legal; story: new") as caught:
+    with pytest.raises(
+        IllegalTransition, match=rf"L1-1: queued → {to} is not legal; story: new"
+    ) as caught:
         one.move(to, 101.0, "no")
     assert caught.value.lease_id == one.id
     assert (one.state, one.since, one.story) == (LeaseState.QUEUED, 0.0, [])
@@ -65,7 +69,13 @@ def test_an_illegal_move_changes_nothing_and_carries_the_story(to: LeaseState) -
 
 def test_priority_grows_by_a_point_for_every_five_seconds_waited() -> None:
     one = lease(priority=50)
-    assert [one.priority_at(at, 5.0) for at in (99.0, 100.0, 104.9, 105.0, 120.0)] == [50, 50, 50, 51, 54]
+    assert [one.priority_at(at, 5.0) for at in (99.0, 100.0, 104.9, 105.0, 120.0)] == [
+        50,
+        50,
+        50,
+        51,
+        54,
+    ]
 
 
 def test_a_process_that_exits_keeps_nothing() -> None:

@@ -1,9 +1,9 @@
 """Bytes of one card: folding of residues, debts, evidence, stowaways."""
 
-from arbiter.core.events import MemorySampled, ProcessUse
-from arbiter.core.ledger import GpuLedger, process_bytes
-from arbiter.core.settings import GpuInfo
-from schemas.ids import GpuId, LeaseId, ProcessKey
+from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
+from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger, process_bytes
+from vram_arbiter.arbiter.core.settings import GpuInfo
+from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 
 A, B, C = ProcessKey(1, 1), ProcessKey(2, 2), ProcessKey(3, 3)
 LA, LA2, LB = LeaseId("La"), LeaseId("La2"), LeaseId("Lb")
@@ -11,7 +11,9 @@ GPU = GpuId("GPU-0")
 
 
 def ledger() -> GpuLedger:
-    return GpuLedger(GpuInfo(GPU, 0, "card", capacity_bytes=1000, reserve_bytes=100), tolerance_bytes=10)
+    return GpuLedger(
+        GpuInfo(GPU, 0, "card", capacity_bytes=1000, reserve_bytes=100), tolerance_bytes=10
+    )
 
 
 def sample(at: float, used: int, *processes: tuple[ProcessKey, int | None]) -> MemorySampled:

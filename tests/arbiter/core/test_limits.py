@@ -3,10 +3,10 @@ holder too, which then could not use what it held."""
 
 from typing import Any
 
-from arbiter.core.effects import Refuse
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
-from schemas import defaults as d
-from schemas.ids import LeaseId
+from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from vram_arbiter.arbiter.core.effects import Refuse
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId
 
 GIB = d.GIB
 LIMITS: dict[str, Any] = {
@@ -56,7 +56,11 @@ def test_the_last_places_are_for_requests_above_the_default_priority() -> None:
             waiting(driver.consumer(f"crowd{number}", uid=uid))
     late = driver.consumer("late", uid=9)
     assert waiting(late) == {"limit": "waiters_max", "value": 28, "share": "of all users"}
-    assert waiting(late, priority=51) == {"limit": "waiters_max", "value": 32, "share": "of all users"}
+    assert waiting(late, priority=51) == {
+        "limit": "waiters_max",
+        "value": 32,
+        "share": "of all users",
+    }
 
 
 def test_a_place_is_free_again_when_its_waiter_is_gone() -> None:
@@ -86,7 +90,11 @@ def test_strangers_never_take_the_uses_of_the_holder() -> None:
         raise AssertionError("nothing was refused")
 
     runner = driver.consumer("runner", uid=7)
-    assert use_all(runner) == {"limit": "uses_per_lease_max", "value": 4, "share": "of this process"}
+    assert use_all(runner) == {
+        "limit": "uses_per_lease_max",
+        "value": 4,
+        "share": "of this process",
+    }
     again = driver.consumer("again", uid=7)
     assert use_all(again)["share"] == "of this process"
     third = driver.consumer("third", uid=7)
@@ -94,7 +102,11 @@ def test_strangers_never_take_the_uses_of_the_holder() -> None:
     for uid in (8, 9):
         for number in range(2):
             last = use_all(driver.consumer(f"more{number}", uid=uid))
-    assert last == {"limit": "uses_per_lease_max", "value": 16, "share": "of others than its holder"}
+    assert last == {
+        "limit": "uses_per_lease_max",
+        "value": 16,
+        "share": "of others than its holder",
+    }
     assert use_all(holder) == {"limit": "uses_per_lease_max", "value": 16, "share": "of its holder"}
     answer(runner.use_begin(lease, "u0", token))
     runner.use_end(lease, "u0", token)

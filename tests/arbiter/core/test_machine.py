@@ -13,13 +13,13 @@ from typing import Any
 import hypothesis.strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-from arbiter.core import policy
-from arbiter.core.effects import Push, Reply
-from arbiter.core.lease import Lease, LeaseState
-from arbiter.testing.core_driver import Consumer, CoreDriver
-from arbiter.testing.machines import walk
-from schemas import defaults as d
-from schemas.ids import LeaseId, ProcessKey
+from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.machines import walk
+from vram_arbiter.arbiter.core.effects import Push, Reply
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
+from vram_arbiter.arbiter.core.scheduling import policy
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 CAPACITY = 8 * d.GIB
 SIZES = [450 * d.MIB, 1 * d.GIB, 2 * d.GIB, 3_300_000_000, 4_300_000_000, 5_300_000_000, 7 * d.GIB]
@@ -39,7 +39,9 @@ QUEUED, LOADING, HELD, REVOKING = (
 AWAY = (LeaseState.STANDBY, LeaseState.PARKED)
 
 TURN_S = 0.5
-EXITS = range(100, 100 + 10 * PEOPLE, 10)  # turns in which a process exits: its context may be in the way
+EXITS = range(
+    100, 100 + 10 * PEOPLE, 10
+)  # turns in which a process exits: its context may be in the way
 AGEING_S = (max(PRIORITIES) - min(PRIORITIES)) * d.AGEING_S_PER_POINT
 WAIT_MAX_S = AGEING_S + 100.0
 """Who waits has aged past every newcomer after `AGEING_S`; the rest serves those ahead of him, one after the other."""
@@ -86,7 +88,9 @@ class Leases(RuleBasedStateMachine):
         self.crowd = crowd  # newcomers keep arriving while the last waiters are served
         self.people = [self.driver.consumer(f"p{n}") for n in range(PEOPLE)]
         self.mine: dict[LeaseId, Consumer] = {}
-        self.loaded: dict[ProcessKey, dict[LeaseId, int]] = {}  # what each process holds for which lease
+        self.loaded: dict[
+            ProcessKey, dict[LeaseId, int]
+        ] = {}  # what each process holds for which lease
         self.context: dict[ProcessKey, int] = {}  # what it keeps once it has loaded anything
         self.taking_over: dict[
             LeaseId, int
@@ -135,7 +139,9 @@ class Leases(RuleBasedStateMachine):
     def ask(
         self, person: Consumer, size: int, steady: int, bound: float | None, spec: dict[str, Any]
     ) -> LeaseId | None:
-        self.taking_over = {lease: size for lease in self.having(*AWAY) if self.mine[lease] is person}
+        self.taking_over = {
+            lease: size for lease in self.having(*AWAY) if self.mine[lease] is person
+        }
         effects = person.try_acquire(size, steady, wait_timeout_s=bound, **spec)
         self.taking_over = {}
         reply = next((effect for effect in effects if isinstance(effect, Reply)), None)
@@ -290,9 +296,12 @@ class Leases(RuleBasedStateMachine):
         """kill -9 of the daemon: the journal survives, holders come back with their tokens, waiters have to ask again."""
         self.breaks("restart")
         resident = self.having(LOADING, HELD, REVOKING, LeaseState.UNLOADING)
-        held = {lease: (self.lease(lease).state, self.mine[lease].token(lease)) for lease in resident}
+        held = {
+            lease: (self.lease(lease).state, self.mine[lease].token(lease)) for lease in resident
+        }
         away = {
-            lease: (self.lease(lease).state, self.mine[lease].token(lease)) for lease in self.having(*AWAY)
+            lease: (self.lease(lease).state, self.mine[lease].token(lease))
+            for lease in self.having(*AWAY)
         }
         self.driver.restart(epoch=self.driver.settings.epoch + 1)
         for person in self.people:
@@ -326,7 +335,9 @@ class Leases(RuleBasedStateMachine):
         """The ledger of the core never has less for a process than the process holds. Where the card lists nobody, what one holds is
         known as exactly only as what an empty card may show."""
         (gpu,) = self.driver.arbiter._core.gpus.values()
-        unsure = 0 if self.driver.card.lists_processes else d.RESERVE_BYTES + d.VERIFY_TOLERANCE_BYTES
+        unsure = (
+            0 if self.driver.card.lists_processes else d.RESERVE_BYTES + d.VERIFY_TOLERANCE_BYTES
+        )
         for process, leases in self.loaded.items():
             held = max(sum(leases.values()), self.context[process])
             account = gpu.ledger.accounts.get(process)
@@ -335,7 +346,10 @@ class Leases(RuleBasedStateMachine):
 
     def tokens_grow(self) -> None:
         for effect in self.driver.effects[self.seen :]:
-            if isinstance(effect, Reply | Push) and effect.body.get("lease", {}).get("state") == "loading":
+            if (
+                isinstance(effect, Reply | Push)
+                and effect.body.get("lease", {}).get("state") == "loading"
+            ):
                 token = effect.body["lease"]["token"]
                 assert not self.tokens or tuple(token) > tuple(self.tokens[-1])
                 self.tokens.append(token)
@@ -350,7 +364,9 @@ class Leases(RuleBasedStateMachine):
             return
         room = policy.measured_room_bytes(core, gpu)
         assert not (
-            policy.fits(gpu, head) and room is not None and room >= policy.measured_need_bytes(gpu, head)
+            policy.fits(gpu, head)
+            and room is not None
+            and room >= policy.measured_need_bytes(gpu, head)
         )
 
     def waits_end_in_time(self) -> None:
@@ -395,7 +411,9 @@ class Leases(RuleBasedStateMachine):
 
     def newcomers(self, turn: int) -> None:
         """They are more urgent than anybody, leave only when asked, and exit then; another one comes."""
-        people = {person.name: person for person in self.mine.values() if person.name.startswith("new")}
+        people = {
+            person.name: person for person in self.mine.values() if person.name.startswith("new")
+        }
         here = [
             person
             for person in people.values()

@@ -4,18 +4,20 @@ import random
 
 import pytest
 
-from arbiter.core.events import ProcessDied
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
-from arbiter.testing.scenes import held, place
-from schemas import defaults as d
-from schemas.ids import GpuId, LeaseId
+from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.scenes import held, place
+from vram_arbiter.arbiter.core.events import ProcessDied
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import GpuId, LeaseId
 
 GIB = d.GIB
 ZERO, ONE = GpuId("GPU-0"), GpuId("GPU-1")
 
 
 # -- selector and placement ------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(("selector", "wanted"), [("1", ONE), ("GPU-1", ONE), ("0", ZERO), ("any", ZERO)])
+@pytest.mark.parametrize(
+    ("selector", "wanted"), [("1", ONE), ("GPU-1", ONE), ("0", ZERO), ("any", ZERO)]
+)
 def test_a_selector_is_an_uuid_an_index_or_any(selector: str, wanted: GpuId) -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     _, lease = held(driver, "a", 5, gpu=selector)
@@ -44,7 +46,9 @@ def test_a_lease_is_never_split() -> None:
 def test_a_model_over_two_cards_is_two_leases_of_one_process() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     big = driver.consumer("big")
-    halves = [big.acquire(6 * GIB, gpu=str(n), key=f"half {n}", residue_bytes=GIB // 2) for n in (0, 1)]
+    halves = [
+        big.acquire(6 * GIB, gpu=str(n), key=f"half {n}", residue_bytes=GIB // 2) for n in (0, 1)
+    ]
     assert [driver.state(half) for half in halves] == ["loading", "loading"], (
         "one load a card, not one in all"
     )
@@ -53,9 +57,13 @@ def test_a_model_over_two_cards_is_two_leases_of_one_process() -> None:
     driver.advance(0.01)
     big.unload(halves[0])
     driver.until(lambda: driver.state(halves[0]) == "over")
-    assert [driver.gpu(n)["charged_bytes"] for n in (0, 1)] == [GIB // 2, 6 * GIB], "a context a card"
+    assert [driver.gpu(n)["charged_bytes"] for n in (0, 1)] == [GIB // 2, 6 * GIB], (
+        "a context a card"
+    )
     big.die()
-    driver.until(lambda: driver.gpu(0)["charged_bytes"] + driver.gpu(1)["charged_bytes"] == 0, limit_s=2.0)
+    driver.until(
+        lambda: driver.gpu(0)["charged_bytes"] + driver.gpu(1)["charged_bytes"] == 0, limit_s=2.0
+    )
 
 
 def test_pins_are_in_the_way_on_their_own_card_only() -> None:
@@ -263,7 +271,11 @@ def test_whoever_came_first_is_first_on_every_card() -> None:
         person.unload(lease)
     driver.until(lambda: "loading" in {driver.state(first), driver.state(second)}, limit_s=1.0)
     driver.until(lambda: driver.state(higher) == "loading", limit_s=1.0)
-    assert (place(driver, first), place(driver, higher), driver.state(second)) == (ZERO, ONE, "queued")
+    assert (place(driver, first), place(driver, higher), driver.state(second)) == (
+        ZERO,
+        ONE,
+        "queued",
+    )
 
 
 def test_a_waiter_for_any_card_ages_on_all_of_them() -> None:
@@ -285,7 +297,9 @@ def test_a_waiter_for_any_card_ages_on_all_of_them() -> None:
     assert driver.state(waiter) == "queued"
 
 
-def test_a_newcomer_of_higher_priority_overtakes_on_its_card_only_until_the_other_has_aged() -> None:
+def test_a_newcomer_of_higher_priority_overtakes_on_its_card_only_until_the_other_has_aged() -> (
+    None
+):
     driver = CoreDriver(8 * GIB, cards=2)
     busy, lease = held(driver, "busy", 6, gpu="1", priority=99)
     busy.use_begin(lease)
@@ -309,7 +323,8 @@ def test_a_gang_behind_a_head_that_is_placed_elsewhere_is_served() -> None:
     head = driver.consumer("head").acquire(6 * GIB, gpu="any")
     assert (driver.state(head), driver.state(lease)) == ("queued", "revoking")
     members = [
-        driver.consumer(f"m{n}").acquire(2 * GIB, gpu="1", gang=("pair", 2), priority=40) for n in (0, 1)
+        driver.consumer(f"m{n}").acquire(2 * GIB, gpu="1", gang=("pair", 2), priority=40)
+        for n in (0, 1)
     ]
     driver.until(lambda: driver.state(members[0]) == "loading", limit_s=1.0)
     assert [place(driver, member) for member in members] == [ONE, ONE]
@@ -319,7 +334,9 @@ def test_a_gang_over_two_cards_waits_for_both_of_which_one_cannot_be_read() -> N
     driver = CoreDriver(8 * GIB, cards=2)
     driver.cards[ONE].failing = "NVML_ERROR_GPU_IS_LOST"
     driver.advance(1.5)
-    members = [driver.consumer(f"m{n}").acquire(6 * GIB, gpu=str(n), gang=("pair", 2)) for n in (0, 1)]
+    members = [
+        driver.consumer(f"m{n}").acquire(6 * GIB, gpu=str(n), gang=("pair", 2)) for n in (0, 1)
+    ]
     driver.advance(10.0)
     assert [driver.state(member) for member in members] == ["queued", "queued"]
     assert driver.gpu(0)["charged_bytes"] == 0, "nothing is kept for half a gang"
@@ -347,7 +364,9 @@ def on_standby(driver: CoreDriver, selector: str) -> tuple[Consumer, LeaseId]:
 
 
 @pytest.mark.parametrize(("selector", "wanted"), [("any", ONE), ("0", None), ("GPU-0", None)])
-def test_standby_returns_to_the_cards_that_its_selector_names(selector: str, wanted: GpuId | None) -> None:
+def test_standby_returns_to_the_cards_that_its_selector_names(
+    selector: str, wanted: GpuId | None
+) -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     det, lease = on_standby(driver, selector)
     driver.advance(10.0)
@@ -411,7 +430,11 @@ def test_a_card_whose_reading_hangs_blocks_itself_only() -> None:
     there = driver.consumer("there").acquire(5 * GIB, gpu="1")
     here = driver.consumer("here").acquire(5 * GIB)
     driver.advance(5.0)
-    assert (driver.state(there), driver.state(here), place(driver, here)) == ("queued", "loading", ZERO)
+    assert (driver.state(there), driver.state(here), place(driver, here)) == (
+        "queued",
+        "loading",
+        ZERO,
+    )
 
 
 def test_a_card_that_is_lost_keeps_its_leases_and_the_others_go_on() -> None:
@@ -498,7 +521,11 @@ def test_whatever_happens_no_card_overflows_and_everybody_is_served(seed: int) -
     mine: dict[LeaseId, Consumer] = {}
     for _ in range(60):
         person = draw.choice(people)
-        live = [lease for lease, owner in mine.items() if owner is person and driver.state(lease) != "over"]
+        live = [
+            lease
+            for lease, owner in mine.items()
+            if owner is person and driver.state(lease) != "over"
+        ]
         if not live:
             size = draw.choice([1, 2, 3, 5, 7]) * GIB
             spec = {
@@ -523,7 +550,12 @@ def test_whatever_happens_no_card_overflows_and_everybody_is_served(seed: int) -
 
 
 def step(
-    driver: CoreDriver, draw: random.Random, person: Consumer, lease: LeaseId, *, willing: bool = False
+    driver: CoreDriver,
+    draw: random.Random,
+    person: Consumer,
+    lease: LeaseId,
+    *,
+    willing: bool = False,
 ) -> None:
     """What its holder does next with a lease."""
     view = driver.view(lease)

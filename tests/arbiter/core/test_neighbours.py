@@ -1,8 +1,8 @@
 """What users of other arbiters and model servers complain about, as tests. Numbers are those of the list of complaints."""
 
-from arbiter.testing.core_driver import CoreDriver, answer, refusal
-from arbiter.testing.scenes import held
-from schemas import defaults as d
+from tests.support.core_driver import CoreDriver, answer, refusal
+from tests.support.scenes import held
+from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
 

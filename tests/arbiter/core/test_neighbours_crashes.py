@@ -2,11 +2,11 @@
 
 from typing import Any
 
-from arbiter.core.crashes import FORGOTTEN_S, NAMES_MAX, PAUSE_MAX_S
-from arbiter.core.effects import Effect, Refuse
-from arbiter.testing.core_driver import Consumer, CoreDriver, refusal
-from arbiter.testing.scenes import held
-from schemas import defaults as d
+from tests.support.core_driver import Consumer, CoreDriver, refusal
+from tests.support.scenes import held
+from vram_arbiter.arbiter.core.effects import Effect, Refuse
+from vram_arbiter.arbiter.core.learning.crashes import FORGOTTEN_S, NAMES_MAX, PAUSE_MAX_S
+from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
 
@@ -78,8 +78,12 @@ def test_17_others_and_what_an_exclusive_one_or_a_queue_would_cost() -> None:
     crashed(driver, 3)
     small, _ = held(driver, "small", 1)
     exclusive: dict[str, Any] = {"exclusive": True}
-    assert refusal(driver.consumer("policy").try_acquire(1 * GIB, **exclusive)).code == "load_failing"
-    assert not refused(driver.consumer("other").try_acquire(7 * GIB)), "another consumer is not meant"
+    assert (
+        refusal(driver.consumer("policy").try_acquire(1 * GIB, **exclusive)).code == "load_failing"
+    )
+    assert not refused(driver.consumer("other").try_acquire(7 * GIB)), (
+        "another consumer is not meant"
+    )
     assert refusal(driver.consumer("policy").try_acquire(1 * GIB)).code == "load_failing", (
         "it would stand behind others"
     )

@@ -2,11 +2,11 @@
 
 import pytest
 
-from arbiter.core.effects import Signal
-from arbiter.testing.core_driver import CoreDriver, answer, refusal
-from arbiter.testing.scenes import charge, held
-from schemas import defaults as d
-from schemas.ids import LeaseId
+from tests.support.core_driver import CoreDriver, answer, refusal
+from tests.support.scenes import charge, held
+from vram_arbiter.arbiter.core.effects import Signal
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -41,7 +41,9 @@ def test_4_two_models_that_are_wanted_alike_do_not_load_all_the_time() -> None:
 @pytest.mark.parametrize("priority", [0, 50])
 def test_4_an_idle_holder_does_not_keep_a_card_for_minutes(priority: int) -> None:
     """aprender#3986: a lock held for 25 minutes at 97 % idle, six waiters. Whatever was learnt, the wait has a bound."""
-    learnt = {name: {"load_s": 1000.0, "unload_s": 1000.0, "verify_s": 1000.0} for name in ("idle", "w")}
+    learnt = {
+        name: {"load_s": 1000.0, "unload_s": 1000.0, "verify_s": 1000.0} for name in ("idle", "w")
+    }
     driver = CoreDriver(8 * GIB, settings={"learnt": learnt})
     person, lease = held(driver, "idle", 5)
     core = driver.arbiter._core
@@ -143,7 +145,9 @@ def test_16_parked_is_charged_as_parked_and_resumed_as_resumed() -> None:
     driver.until(lambda: driver.state(lease) == "parked")
     assert driver.gpu()["charged_bytes"] == 450 * MIB
     _, other = held(driver, "det", 4)
-    assert answer(vlm.reacquire(lease))["state"] == "loading", "3 fit beside 4: there is nothing to drain"
+    assert answer(vlm.reacquire(lease))["state"] == "loading", (
+        "3 fit beside 4: there is nothing to drain"
+    )
     assert (charge(driver, lease), driver.gpu()["charged_bytes"]) == (3 * GIB, 7 * GIB)
     assert driver.state(other) == "held"
 

@@ -1,7 +1,7 @@
 """What users of other arbiters and model servers complain about, where one job needs several models. Numbers are those of the list."""
 
-from arbiter.testing.core_driver import CoreDriver, refusal
-from schemas import defaults as d
+from tests.support.core_driver import CoreDriver, refusal
+from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
 
@@ -19,7 +19,11 @@ def test_3_a_hung_part_of_a_tree_is_not_stopping_for_ever() -> None:
     driver.advance(9.0)
     assert "policy" in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
     driver.advance(20.0)
-    assert (driver.state(leaf), driver.state(root), driver.state(waiter)) == ("over", "over", "queued")
+    assert (driver.state(leaf), driver.state(root), driver.state(waiter)) == (
+        "over",
+        "over",
+        "queued",
+    )
     policy.die()
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)
 
@@ -71,7 +75,9 @@ def test_15_or_the_job_yields_and_is_loaded_again_afterwards() -> None:
     driver.advance(0.01)
     called = llm.acquire(5 * GIB)
     driver.advance(40.0)
-    assert driver.state(called) == "queued", "without a word nobody is evicted in the middle of a job"
+    assert driver.state(called) == "queued", (
+        "without a word nobody is evicted in the middle of a job"
+    )
     comfy.use_yield(job, "render")
     comfy.unload(job)
     driver.until(lambda: driver.state(called) == "loading")

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.events import MemorySampled, ProbeFailed
-from arbiter.core.verify import DYING_S
-from arbiter.testing.core_driver import READING_S, Consumer, CoreDriver
-from schemas import defaults as d
-from schemas.ids import LeaseId, ProcessKey
+from tests.support.core_driver import READING_S, Consumer, CoreDriver
+from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed
+from vram_arbiter.arbiter.core.verification.verify import DYING_S
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 BROWSER = ProcessKey(9, 9)
@@ -61,7 +61,9 @@ def test_1_waiting_for_the_driver_costs_no_more_than_the_driver_takes(lag_s: flo
 def test_1_a_dying_process_leaves_the_list_before_its_bytes_leave_the_card() -> None:
     """And a reading may come in between, before anybody says that it died: those bytes are its own still, and no stowaway's."""
     driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 4, min_residency_s=60.0)  # so that it is not asked to leave meanwhile
+    det, lease = held(
+        driver, "det", 4, min_residency_s=60.0
+    )  # so that it is not asked to leave meanwhile
     waiter = driver.consumer("vlm").acquire(1 * GIB, exclusive=True)
     driver.card.unlisted.add(det.process)
     driver.post(driver.card.read(driver.now))
@@ -172,7 +174,9 @@ def test_2_stranded_bytes_have_an_owner() -> None:
     driver.advance(1.5)
     driver.consumer("vlm").acquire(4 * GIB)
     (told,) = driver.arbiter.why("vlm", driver.now)["leases"]
-    assert ("ollama runner", int(5.4 * GIB)) in {(b["consumer"], b["bytes"]) for b in told["blockers"]}
+    assert ("ollama runner", int(5.4 * GIB)) in {
+        (b["consumer"], b["bytes"]) for b in told["blockers"]
+    }
 
 
 # -- 7: estimates are wrong ----------------------------------------------------------------------------------------------
@@ -330,7 +334,9 @@ def test_20_what_the_machine_itself_takes_is_not_leased() -> None:
     assert (driver.state(fits), driver.state(waits)) == ("loading", "queued")
 
 
-def test_a_stowaway_that_goes_while_lists_are_hidden_is_not_taken_for_the_bytes_of_a_lease() -> None:
+def test_a_stowaway_that_goes_while_lists_are_hidden_is_not_taken_for_the_bytes_of_a_lease() -> (
+    None
+):
     """A storm of faults found it: the card fell by as much as was waited for, because a stowaway had died unseen, and an exclusive lease
     was granted beside bytes that were still there."""
     driver = CoreDriver(8 * GIB)

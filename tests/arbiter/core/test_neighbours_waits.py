@@ -2,9 +2,9 @@
 
 import pytest
 
-from arbiter.testing.core_driver import CoreDriver, answer, refusal
-from arbiter.testing.scenes import held
-from schemas import defaults as d
+from tests.support.core_driver import CoreDriver, answer, refusal
+from tests.support.scenes import held
+from vram_arbiter.schemas import defaults as d
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -26,7 +26,11 @@ def test_3_an_unload_that_hangs_holds_up_nobody_who_can_be_served_without_it(ask
     tiny = driver.consumer("small")
     small = tiny.acquire(512 * MIB)
     driver.advance(28.0)
-    assert (driver.state(waiter), driver.state(small), driver.state(idle)) == ("queued", "queued", "held")
+    assert (driver.state(waiter), driver.state(small), driver.state(idle)) == (
+        "queued",
+        "queued",
+        "held",
+    )
     assert not driver.notes("deadline_passed"), "a whole deadline is its own"
     driver.advance(2.0)
     (note,) = driver.notes("deadline_passed")
@@ -34,15 +38,21 @@ def test_3_an_unload_that_hangs_holds_up_nobody_who_can_be_served_without_it(ask
     assert driver.state(small) == "loading", "its bytes are not waited for any more"
     told = driver.arbiter.why("w", driver.now)["leases"][0]
     assert "'is unloading for 31 s and may hang: end its process (pid" in str(told["blockers"])
-    assert "waits for stuck to let go, its unloading may hang" in [step["text"] for step in told["plan"]]
+    assert "waits for stuck to let go, its unloading may hang" in [
+        step["text"] for step in told["plan"]
+    ]
     assert driver.gpu()["charged_bytes"] >= 7 * GIB, "but they are charged until they are gone"
     tiny.load(small)
     stuck.hold(0)
     stuck.die()
-    driver.until(lambda: driver.state(waiter) == "loading" or driver.state(idle) == "revoking", limit_s=5.0)
+    driver.until(
+        lambda: driver.state(waiter) == "loading" or driver.state(idle) == "revoking", limit_s=5.0
+    )
 
 
-def test_3_a_waiter_that_wants_an_answer_gets_one_although_the_holder_says_that_it_unloads() -> None:
+def test_3_a_waiter_that_wants_an_answer_gets_one_although_the_holder_says_that_it_unloads() -> (
+    None
+):
     """ollama#10831. `on_deadline: deny` is a typed error after the deadline, whatever the holder says that it is doing."""
     driver = CoreDriver(8 * GIB)
     stuck, lease = held(driver, "stuck", 5, ttl_s=3600.0)
@@ -89,7 +99,8 @@ def test_4_whoever_waits_long_enough_is_next() -> None:
     driver = CoreDriver(8 * GIB)
     people = {name: driver.consumer(name) for name in ("a", "b")}
     leases = {
-        name: person.acquire(5 * GIB, priority=60, min_residency_s=0.0) for name, person in people.items()
+        name: person.acquire(5 * GIB, priority=60, min_residency_s=0.0)
+        for name, person in people.items()
     }
     low, began = driver.consumer("low").acquire(5 * GIB, priority=50), driver.now
     while driver.state(low) == "queued" and driver.now - began < 200.0:
@@ -142,7 +153,12 @@ def test_6_what_fits_together_stays_together_without_groups() -> None:
     _, small = held(driver, "small", 2)
     assert [driver.state(lease) for lease in (*leases, small)] == ["held"] * 4
     driver.consumer("large").acquire(6 * GIB)
-    assert [driver.state(lease) for lease in (*leases, small)] == ["held", "revoking", "held", "held"]
+    assert [driver.state(lease) for lease in (*leases, small)] == [
+        "held",
+        "revoking",
+        "held",
+        "held",
+    ]
 
 
 def test_6_of_equals_the_least_recently_used_leaves() -> None:
@@ -250,7 +266,9 @@ def test_22_a_load_may_take_as_long_as_it_takes() -> None:
     assert [note["consumer"] for note in driver.notes("ready")] == ["vlm"]
 
 
-def test_22_and_whoever_is_not_heard_of_is_given_up_within_its_ttl_however_short_its_load_was() -> None:
+def test_22_and_whoever_is_not_heard_of_is_given_up_within_its_ttl_however_short_its_load_was() -> (
+    None
+):
     """Silence is what is measured, not the length of the load."""
     driver = CoreDriver(8 * GIB)
     hung = driver.consumer("hung")

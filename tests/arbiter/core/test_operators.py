@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.effects import Effect, Note, Refuse
-from arbiter.core.events import OperatorAsked
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
-from schemas import defaults as d
-from schemas.ids import LeaseId
+from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from vram_arbiter.arbiter.core.effects import Effect, Note, Refuse
+from vram_arbiter.arbiter.core.events import OperatorAsked
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId
 
 GIB, MIB = d.GIB, d.MIB
 BY = "ops (uid 0, pid 7)"
@@ -48,9 +48,12 @@ def test_an_evicted_holder_in_use_finishes_first(driver: CoreDriver, ops: Consum
     det.use_begin(lease)
     effects = ask(ops, "evict", "det", "maintenance")
     assert answer(effects)["state"] == "revoking"
-    assert noted(effects) | {"action": "evict", "by": BY, "reason": "maintenance", "uses": 1} == noted(
-        effects
-    )
+    assert noted(effects) | {
+        "action": "evict",
+        "by": BY,
+        "reason": "maintenance",
+        "uses": 1,
+    } == noted(effects)
     (revoke,) = driver.pushes("revoke", lease)
     assert "maintenance" in revoke["reason"]
     assert BY in revoke["reason"]
@@ -66,7 +69,9 @@ def test_an_evicted_holder_in_use_finishes_first(driver: CoreDriver, ops: Consum
     det.unload(lease)
     driver.until(lambda: driver.state(lease) == "over")
     late = refusal(other.use_begin(lease, token=token))
-    assert late.message == f"{lease} is released: evicted by {BY}: maintenance", "not a bare `is released`"
+    assert late.message == f"{lease} is released: evicted by {BY}: maintenance", (
+        "not a bare `is released`"
+    )
     assert driver.notes("verified")[-1]["verdict"] == "verified"
 
 
@@ -78,7 +83,9 @@ def test_evicting_twice_asks_once(driver: CoreDriver, ops: Consumer) -> None:
     assert len(driver.notes("revoke_asked")) == 1
 
 
-def test_a_holder_that_leaves_for_a_waiter_hears_of_the_operator(driver: CoreDriver, ops: Consumer) -> None:
+def test_a_holder_that_leaves_for_a_waiter_hears_of_the_operator(
+    driver: CoreDriver, ops: Consumer
+) -> None:
     """`vramctl run` lets a waiter of its own priority wait, and ends its program for an operator."""
     det, lease = held(driver, "det", 5 * GIB)
     det.use_begin(lease)
@@ -110,14 +117,18 @@ def test_only_what_is_resident_can_be_evicted(driver: CoreDriver, ops: Consumer)
 
 
 # -- who is meant --------------------------------------------------------------------------------------------------------
-def test_a_consumer_with_several_leases_has_to_be_named_by_lease(driver: CoreDriver, ops: Consumer) -> None:
+def test_a_consumer_with_several_leases_has_to_be_named_by_lease(
+    driver: CoreDriver, ops: Consumer
+) -> None:
     det, first = held(driver, "det", 1 * GIB)
     second = det.acquire(1 * GIB)
     refused = refusal(ask(ops, "evict", "det"))
     assert (refused.code, refused.details["leases"]) == ("bad_request", [first, second])
 
 
-def test_of_a_resident_and_a_waiting_lease_the_resident_is_meant(driver: CoreDriver, ops: Consumer) -> None:
+def test_of_a_resident_and_a_waiting_lease_the_resident_is_meant(
+    driver: CoreDriver, ops: Consumer
+) -> None:
     det, first = held(driver, "det", 5 * GIB, min_residency_s=100.0)
     det.acquire(5 * GIB)
     assert answer(ask(ops, "pin", "det"))["lease"]["lease_id"] == first
@@ -154,7 +165,9 @@ def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consum
     vlm = driver.consumer("vlm")
     waiting = vlm.acquire(3 * GIB)
     assert driver.state(lease) == "revoking"
-    assert refusal(ask(ops, "pin", lease)).code == "bad_state", "it was asked to leave before the pin"
+    assert refusal(ask(ops, "pin", lease)).code == "bad_state", (
+        "it was asked to leave before the pin"
+    )
     vlm.cancel(waiting)
 
     other = CoreDriver(8 * GIB)
@@ -176,7 +189,9 @@ def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consum
     assert other.notes("operator")[-1]["action"] == "unpin"
 
 
-def test_a_request_that_a_pin_is_in_the_way_of_waits_for_the_unpin(driver: CoreDriver, ops: Consumer) -> None:
+def test_a_request_that_a_pin_is_in_the_way_of_waits_for_the_unpin(
+    driver: CoreDriver, ops: Consumer
+) -> None:
     _, lease = held(driver, "det", 5 * GIB)
     ask(ops, "pin", lease)
     waiter = driver.consumer("policy").acquire(4 * GIB)
@@ -216,7 +231,9 @@ def test_a_pin_outlives_the_daemon(driver: CoreDriver, ops: Consumer) -> None:
 
 
 # -- drain -------------------------------------------------------------------------------------------------------------
-def test_a_drained_arbiter_grants_nothing_and_keeps_what_is_held(driver: CoreDriver, ops: Consumer) -> None:
+def test_a_drained_arbiter_grants_nothing_and_keeps_what_is_held(
+    driver: CoreDriver, ops: Consumer
+) -> None:
     _, lease = held(driver, "det", 3 * GIB)
     assert answer(ask(ops, "drain", reason="new driver"))["drained"] == f"{BY}: new driver"
     waiting = driver.consumer("vlm").acquire(1 * GIB)
@@ -298,7 +315,9 @@ def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
 
 
 @pytest.mark.parametrize("restarts", [1, 2])
-def test_who_is_given_up_and_keeps_its_bytes_has_its_lease_until_it_fences_itself(restarts: int) -> None:
+def test_who_is_given_up_and_keeps_its_bytes_has_its_lease_until_it_fences_itself(
+    restarts: int,
+) -> None:
     """A frozen process wakes up and goes on for as long as it believes in its lease; what it keeps until then is no mere residue."""
     driver = CoreDriver(8 * GIB)
     ops = driver.consumer("ops")
@@ -311,7 +330,9 @@ def test_who_is_given_up_and_keeps_its_bytes_has_its_lease_until_it_fences_itsel
     waiter = driver.consumer("policy").acquire(1 * GIB, exclusive=True)
     other = driver.consumer("vlm").acquire(1 * GIB)
     driver.until(lambda: bool(driver.notes("verified")), limit_s=16.0)
-    assert [(note["verdict"], note["resolved"]) for note in driver.notes("verified")] == [("residue", False)]
+    assert [(note["verdict"], note["resolved"]) for note in driver.notes("verified")] == [
+        ("residue", False)
+    ]
     (blocker,) = driver.arbiter.why("policy", driver.now)["leases"][0]["blockers"]
     assert (
         blocker["condition"]

@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.core_driver import CoreDriver
-from arbiter.testing.scenes import held
-from schemas import defaults as d
-from schemas.ids import ProcessKey
+from tests.support.core_driver import CoreDriver
+from tests.support.scenes import held
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import ProcessKey
 
 GIB = d.GIB
 
@@ -55,7 +55,10 @@ def test_several_are_asked_together_when_the_last_of_them_may_be() -> None:
     held(driver, "second", 3.5, min_residency_s=3.0)
     driver.consumer("w").acquire(7 * GIB)
     steps = plan(driver)
-    assert [(step["action"], step["consumer"]) for step in steps] == [("ask", "first"), ("ask", "second")]
+    assert [(step["action"], step["consumer"]) for step in steps] == [
+        ("ask", "first"),
+        ("ask", "second"),
+    ]
     assert steps[0]["in_s"] == steps[1]["in_s"]
     assert steps[0]["text"].endswith("when enough may be asked together")
     assert steps[1]["text"].endswith("when its minimum residency ends")
@@ -68,8 +71,16 @@ def test_nobody_is_asked_where_nobody_could_make_room() -> None:
     driver.advance(1.5)
     driver.consumer("w").acquire(4 * GIB)
     step = only(driver)
-    assert (step["action"], step["consumer"], step["lease_id"], step["in_s"]) == ("wait", "", None, None)
-    assert step["text"] == "asks nobody, those who could make room are pinned or in use above its priority"
+    assert (step["action"], step["consumer"], step["lease_id"], step["in_s"]) == (
+        "wait",
+        "",
+        None,
+        None,
+    )
+    assert (
+        step["text"]
+        == "asks nobody, those who could make room are pinned or in use above its priority"
+    )
 
 
 def test_whoever_may_be_asked_already_waits_for_a_measurement_first() -> None:

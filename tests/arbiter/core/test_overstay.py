@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.effects import Signal
-from arbiter.testing.core_driver import Consumer, CoreDriver
-from schemas import defaults as d
-from schemas.ids import LeaseId
+from tests.support.core_driver import Consumer, CoreDriver
+from vram_arbiter.arbiter.core.effects import Signal
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId
 
 GIB = d.GIB
 

@@ -2,12 +2,12 @@
 
 from typing import Any
 
-from arbiter.core.arbiter import DUE_MAX
-from arbiter.core.blockers import BLOCKERS_MAX
-from arbiter.core.events import Tick
-from arbiter.core.explain import EXPLAINED_MAX
-from arbiter.testing.core_driver import CoreDriver
-from schemas import defaults as d
+from tests.support.core_driver import CoreDriver
+from vram_arbiter.arbiter.core.arbiter import DUE_MAX
+from vram_arbiter.arbiter.core.events import Tick
+from vram_arbiter.arbiter.core.report.blockers import BLOCKERS_MAX
+from vram_arbiter.arbiter.core.report.explain import EXPLAINED_MAX
+from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
 
@@ -55,7 +55,9 @@ def test_pages_hold_every_lease_once_whatever_their_size() -> None:
 
 def test_waiters_are_listed_in_the_order_in_which_they_are_served() -> None:
     driver = crowd()
-    waiting = [view for view in driver.arbiter.status(driver.now)["leases"] if view["state"] == "queued"]
+    waiting = [
+        view for view in driver.arbiter.status(driver.now)["leases"] if view["state"] == "queued"
+    ]
     for index in ("0", "1"):
         places = [
             view["position"]

@@ -5,14 +5,14 @@ from typing import Any
 
 import pytest
 
-from arbiter.core import invariants
-from arbiter.core.events import OperatorAsked
-from arbiter.core.invariants import InvariantViolation
-from arbiter.core.parking import HostRam
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
-from arbiter.testing.scenes import held
-from schemas import defaults as d
-from schemas.ids import LeaseId
+from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.scenes import held
+from vram_arbiter.arbiter.core import invariants
+from vram_arbiter.arbiter.core.events import OperatorAsked
+from vram_arbiter.arbiter.core.features.parking import HostRam
+from vram_arbiter.arbiter.core.invariants import InvariantViolation
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId
 
 GIB, MIB = d.GIB, d.MIB
 RESIDUE = 450 * MIB
@@ -26,7 +26,9 @@ def asked(
     driver: CoreDriver, park_gib: float = 5, **spec: Any
 ) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
     """A VLM that was asked to leave, and who asked for its room."""
-    vlm, lease = held(driver, "vlm", 5, park_bytes=int(park_gib * GIB), residue_bytes=RESIDUE, **spec)
+    vlm, lease = held(
+        driver, "vlm", 5, park_bytes=int(park_gib * GIB), residue_bytes=RESIDUE, **spec
+    )
     policy = driver.consumer("policy")
     wanted = policy.acquire(5 * GIB)
     driver.until(lambda: driver.state(lease) == "revoking")
@@ -77,7 +79,11 @@ def test_room_is_kept_from_the_revoke_until_it_lets_go() -> None:
     other.unloading(second)
     short = refusal(other.release(second, parked=True))
     assert short.code == "host_ram_insufficient"
-    assert short.details == {"needed_bytes": 4 * GIB, "budget_bytes": 8 * GIB, "booked_bytes": 5 * GIB}
+    assert short.details == {
+        "needed_bytes": 4 * GIB,
+        "budget_bytes": 8 * GIB,
+        "booked_bytes": 5 * GIB,
+    }
     assert driver.state(second) == "unloading", "nothing has changed"
     vlm.unload(lease)
     assert ram(driver) == 0, "it did not park after all"
@@ -126,7 +132,9 @@ def test_parked_it_is_charged_its_residue_on_the_card_and_its_weights_in_ram() -
     (why,) = driver.arbiter.why("vlm", driver.now)["leases"]
     assert why["text"] == "vlm: parked in host RAM until its holder asks for it"
     assert answer(vlm.reacquire(lease))["state"] == "loading"
-    assert driver.gpu()["charged_bytes"] == 5 * GIB, "the load peak with the residue folded, as ever"
+    assert driver.gpu()["charged_bytes"] == 5 * GIB, (
+        "the load peak with the residue folded, as ever"
+    )
     assert ram(driver) == 5 * GIB, "the copy is there until the weights are on the card"
     vlm.load(lease)
     assert ram(driver) == 0

@@ -5,11 +5,11 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.events import OperatorAsked
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer
-from arbiter.testing.scenes import held, place
-from schemas import defaults as d
-from schemas.ids import GpuId, LeaseId
+from tests.support.core_driver import Consumer, CoreDriver, answer
+from tests.support.scenes import held, place
+from vram_arbiter.arbiter.core.events import OperatorAsked
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import GpuId, LeaseId
 
 GIB = d.GIB
 ZERO, ONE = GpuId("GPU-0"), GpuId("GPU-1")
@@ -59,7 +59,9 @@ def order(driver: CoreDriver, action: str, lease: LeaseId) -> None:
     driver.post(OperatorAsked(ops.client, driver.next_request(), action, lease, "ops", "test"))
 
 
-def test_whoever_names_another_card_or_is_too_large_waits_only_where_it_may_be(driver: CoreDriver) -> None:
+def test_whoever_names_another_card_or_is_too_large_waits_only_where_it_may_be(
+    driver: CoreDriver,
+) -> None:
     busy_and_pinned(driver)
     named = driver.consumer("named").acquire(5 * GIB, gpu="0")
     any_card = driver.consumer("any").acquire(7 * GIB)
@@ -143,7 +145,9 @@ def test_a_lease_that_is_away_from_a_card_that_is_gone_ends(driver: CoreDriver) 
     assert place(driver, other) == ONE, "the daemon grants"
 
 
-def test_one_that_is_too_large_for_a_card_keeps_nobody_from_returning_to_it(driver: CoreDriver) -> None:
+def test_one_that_is_too_large_for_a_card_keeps_nobody_from_returning_to_it(
+    driver: CoreDriver,
+) -> None:
     """Regression: it counted as the one before them there, for whom room had to be kept."""
     large, first = held(driver, "large", 7, gpu="any", standby=True)
     small, second = held(driver, "small", 5, gpu="any", standby=True)

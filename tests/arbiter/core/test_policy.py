@@ -4,12 +4,12 @@ from typing import Any
 
 import pytest
 
-from arbiter.core import policy
-from arbiter.core.lease import Lease
-from arbiter.core.state import Gpu
-from arbiter.testing.core_driver import Consumer, CoreDriver
-from schemas import defaults as d
-from schemas.ids import LeaseId
+from tests.support.core_driver import Consumer, CoreDriver
+from vram_arbiter.arbiter.core.model.lease import Lease
+from vram_arbiter.arbiter.core.model.state import Gpu
+from vram_arbiter.arbiter.core.scheduling import policy
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -239,7 +239,9 @@ def test_the_measured_need_is_less_by_what_the_process_holds() -> None:
     assert policy.measured_need_bytes(card.gpu, inner) == 3 * GIB - 450 * MIB
     card.driver.card.lists_processes = False
     card.driver.advance(2.0)
-    assert policy.measured_need_bytes(card.gpu, inner) == 3 * GIB - 450 * MIB, "by the books, without a list"
+    assert policy.measured_need_bytes(card.gpu, inner) == 3 * GIB - 450 * MIB, (
+        "by the books, without a list"
+    )
     card.people["b"] = card.driver.consumer("b")
     other = card.people["b"].acquire(1 * GIB)
     assert card.driver.state(other) == "loading"

@@ -1,15 +1,24 @@
 """Order of waiters: priority, arrival, and ageing that never reorders equals."""
 
-from arbiter.core.events import Spec
-from arbiter.core.lease import Lease
-from arbiter.core.queue import WaitQueue
-from schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey
+from vram_arbiter.arbiter.core.events import Spec
+from vram_arbiter.arbiter.core.model.lease import Lease
+from vram_arbiter.arbiter.core.scheduling.queue import WaitQueue
+from vram_arbiter.schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey
 
 
 def waiter(arrival: int, at: float, priority: int = 50, need: int = 10) -> Lease:
     spec = Spec("c", ModelKey("m"), "any", False, need, need, 0, priority, True, 10.0, 0.0, False)
     return Lease(
-        LeaseId(f"L1-{arrival}"), "n", spec, ProcessKey(1, 1), ClientId("c"), at, arrival, need, need, ()
+        LeaseId(f"L1-{arrival}"),
+        "n",
+        spec,
+        ProcessKey(1, 1),
+        ClientId("c"),
+        at,
+        arrival,
+        need,
+        need,
+        (),
     )
 
 
@@ -19,7 +28,12 @@ def order(queue: WaitQueue) -> list[int]:
 
 def test_priority_then_arrival() -> None:
     queue = WaitQueue(5.0)
-    for lease in (waiter(1, 0.0), waiter(2, 0.0), waiter(3, 0.1, priority=60), waiter(4, 0.2, priority=40)):
+    for lease in (
+        waiter(1, 0.0),
+        waiter(2, 0.0),
+        waiter(3, 0.1, priority=60),
+        waiter(4, 0.2, priority=40),
+    ):
         queue.add(lease)
     assert order(queue) == [3, 1, 2, 4]
     assert [lease.arrival for lease in queue.behind_head()] == [1, 2, 4]

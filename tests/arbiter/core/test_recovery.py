@@ -2,11 +2,17 @@
 
 from typing import Any
 
-from arbiter.core.effects import Note
-from arbiter.core.events import ClientConnected, ClientLeft, MemorySampled, Recovered, UseBegan
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
-from schemas import defaults as d
-from schemas.ids import ClientId, GpuId, LeaseId, Token, UseId
+from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from vram_arbiter.arbiter.core.effects import Note
+from vram_arbiter.arbiter.core.events import (
+    ClientConnected,
+    ClientLeft,
+    MemorySampled,
+    Recovered,
+    UseBegan,
+)
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, Token, UseId
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -34,7 +40,11 @@ def test_a_kept_lease_keeps_its_token_its_uses_and_its_charge() -> None:
     det.connect()
     (kept,) = answer(det.reattach(lease, token, uses=["goal"]))["leases"]
     assert kept["kept"] is True
-    assert (kept["lease"]["state"], kept["lease"]["uses"], kept["lease"]["token"]) == ("held", 1, [1, 2])
+    assert (kept["lease"]["state"], kept["lease"]["uses"], kept["lease"]["token"]) == (
+        "held",
+        1,
+        [1, 2],
+    )
     driver.until(lambda: driver.state(waiter) == "loading")
     assert driver.arbiter.status(driver.now)["phase"] == "serving"
     assert vlm.token(waiter) > token, "tokens grow across restarts"
@@ -47,12 +57,16 @@ def test_re_attaching_to_a_daemon_that_did_not_restart_only_moves_the_connection
     det, lease, token = held(driver, "det", 5)
     det.use_begin(lease, "over")
     det.use_begin(lease, "runs")
-    det.client = ClientId("c-new")  # the same instance: the server never says that its old connection is gone
+    det.client = ClientId(
+        "c-new"
+    )  # the same instance: the server never says that its old connection is gone
     driver.post(ClientConnected(det.client, det.process, 1000, det.name, "det-c101"))
     assert answer(det.reattach(lease, token, uses=["runs"]))["leases"][0]["lease"]["uses"] == 1
     det.use_end(lease, "runs")
     det.unloading(lease)
-    assert answer(det.reattach(lease, token, uses=["late"]))["leases"][0]["lease"]["uses"] == 0, "it unloads"
+    assert answer(det.reattach(lease, token, uses=["late"]))["leases"][0]["lease"]["uses"] == 0, (
+        "it unloads"
+    )
     det.unload(lease)
     driver.until(lambda: driver.state(lease) == "over")
     (gone,) = answer(det.reattach(lease, token))["leases"]
@@ -72,7 +86,9 @@ def test_a_re_attachment_keeps_the_uses_that_others_began_again_before_it() -> N
     runner.use_begin(lease, "goal", token)
     det.connect()
     assert answer(det.reattach(lease, token, uses=["own"]))["leases"][0]["lease"]["uses"] == 3
-    assert answer(det.reattach(lease, token))["leases"][0]["lease"]["uses"] == 2, "its own it may take back"
+    assert answer(det.reattach(lease, token))["leases"][0]["lease"]["uses"] == 2, (
+        "its own it may take back"
+    )
     vlm = driver.consumer("vlm").acquire(5 * GIB)
     driver.until(lambda: driver.state(lease) == "revoking")
     assert refusal(det.unloading(lease)).code == "bad_state", "not at a safe point: others use it"
@@ -87,7 +103,10 @@ def test_wrong_tokens_and_wrong_processes_are_not_kept() -> None:
     det, lease, token = held(driver, "det", 5)
     thief = driver.consumer("thief")
     spec = det.specs[lease]
-    assert answer(thief.reattach(lease, token, spec=spec))["leases"][0]["error"]["code"] == "not_permitted"
+    assert (
+        answer(thief.reattach(lease, token, spec=spec))["leases"][0]["error"]["code"]
+        == "not_permitted"
+    )
     assert answer(det.reattach(lease, Token(1, 99)))["leases"][0]["error"]["code"] == "stale_token"
     unknown = answer(det.reattach(LeaseId("L0-5"), Token(0, 5), spec=spec))["leases"][0]
     assert unknown["error"]["code"] == "lease_lost", "only while recovering is anybody believed"
@@ -132,7 +151,9 @@ def test_whoever_has_not_come_back_is_named() -> None:
     driver = CoreDriver(8 * GIB)
     driver.card.set(driver.consumer("x").process, 1 * GIB, driver.now)
     driver.post(Recovered({}))
-    assert "holders that the journal may not name must come back first" in str(driver.gpu()["blocked"])
+    assert "holders that the journal may not name must come back first" in str(
+        driver.gpu()["blocked"]
+    )
 
 
 def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> None:
@@ -217,7 +238,9 @@ def test_verifications_and_debts_go_on_after_the_restart() -> None:
     driver.restart()
     assert driver.gpu()["charged_bytes"] == 6 * GIB
     assert driver.state(lease) == "verifying"
-    assert driver.arbiter.status(driver.now)["phase"] == "serving", "nobody has to come back for these"
+    assert driver.arbiter.status(driver.now)["phase"] == "serving", (
+        "nobody has to come back for these"
+    )
     (gone,) = answer(vlm.connect() + vlm.reattach(other, Token(1, 4)))["leases"]
     assert gone["error"]["code"] == "lease_lost"
     driver.until(lambda: driver.gpu()["charged_bytes"] == 450 * MIB, limit_s=5.0)
@@ -254,7 +277,8 @@ def test_a_lost_journal_believes_holders_for_a_while() -> None:
     loader.connect()
     assert answer(det.reattach(lease, token, measured_bytes=5 * GIB))["leases"][0]["kept"] is True
     assert (
-        answer(loader.reattach(loading, load_token, held=False))["leases"][0]["lease"]["state"] == "loading"
+        answer(loader.reattach(loading, load_token, held=False))["leases"][0]["lease"]["state"]
+        == "loading"
     )
     spec = det.spec(1 * GIB, gpu="7")
     lost = answer(det.reattach(LeaseId("L1-77"), Token(1, 77), spec=spec))["leases"][0]
@@ -349,7 +373,9 @@ def test_the_first_verdict_after_a_restart_needs_no_reading_from_before() -> Non
     again.post(Recovered(records))
     again.advance(11.0)
     (note,) = again.notes("verified")
-    assert (note["verdict"], note["before_bytes"]) == ("verified", None), "the stowaway explains the card"
+    assert (note["verdict"], note["before_bytes"]) == ("verified", None), (
+        "the stowaway explains the card"
+    )
 
 
 def test_records_that_a_full_disk_kept_may_say_more_than_the_card_has() -> None:
@@ -360,10 +386,19 @@ def test_records_that_a_full_disk_kept_may_say_more_than_the_card_has() -> None:
     other = driver.consumer("other")
     stale = {"gpu": "GPU-0", "pid": other.process.pid, "start_ticks": other.process.start_ticks}
     records[f"residue:{other.process}:GPU-0"] = {**stale, "residue_bytes": 4 * GIB}
-    records["lease:L1-9"] = {**records[f"lease:{lease}"], "lease_id": "L1-9", "token": [1, 10], "nonce": "n9"}
+    records["lease:L1-9"] = {
+        **records[f"lease:{lease}"],
+        "lease_id": "L1-9",
+        "token": [1, 10],
+        "nonce": "n9",
+    }
     again = CoreDriver(8 * GIB, start=False)
     again.journal = dict(records)
     again.post(Recovered(records))
-    assert not [key for key in again.journal if key.startswith("residue:")], "nobody would ever take it out"
-    assert {lease, "L1-9"} <= {view["lease_id"] for view in again.arbiter.status(again.now)["leases"]}
+    assert not [key for key in again.journal if key.startswith("residue:")], (
+        "nobody would ever take it out"
+    )
+    assert {lease, "L1-9"} <= {
+        view["lease_id"] for view in again.arbiter.status(again.now)["leases"]
+    }
     assert again.gpu()["pressure_bytes"] > 0, "what was never approved is pressure"

@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.refusals import AT_ONCE, PROCESSES_REMEMBERED
-from arbiter.testing.core_driver import Consumer, CoreDriver, refusal
-from arbiter.testing.scenes import held
-from schemas import defaults as d
+from tests.support.core_driver import Consumer, CoreDriver, refusal
+from tests.support.scenes import held
+from vram_arbiter.arbiter.core.requests.refusals import AT_ONCE, PROCESSES_REMEMBERED
+from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
 
@@ -62,7 +62,11 @@ def test_what_is_refused_at_once_is_noted_with_its_reason(
     (note,) = driver.notes("refused")
     refused = refusal([effect for effect in driver.effects if hasattr(effect, "code")])
     assert (note["code"], note["reason"]) == (code, refused.message)
-    assert (note["consumer"], note["pid"], "lease_id" in note) == ("big", person.process.pid, leased)
+    assert (note["consumer"], note["pid"], "lease_id" in note) == (
+        "big",
+        person.process.pid,
+        leased,
+    )
 
 
 def test_timeouts_and_cancels_are_noted_too(driver: CoreDriver) -> None:
@@ -86,7 +90,9 @@ def test_a_flood_of_refusals_is_counted_instead(driver: CoreDriver) -> None:
     for _ in range(10 * AT_ONCE):
         too_large(flooder)
     too_large(other)
-    assert [note["consumer"] for note in driver.notes("refused")] == ["flooder"] * AT_ONCE + ["other"]
+    assert [note["consumer"] for note in driver.notes("refused")] == ["flooder"] * AT_ONCE + [
+        "other"
+    ]
     driver.advance(1.5)
     too_large(flooder)
     too_large(flooder)

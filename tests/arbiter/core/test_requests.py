@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.effects import JournalPut, Note, Push, Reply, Sample
-from arbiter.core.events import AcquireRequested
-from arbiter.testing.core_driver import CoreDriver, answer, refusal
-from schemas import defaults as d
-from schemas.ids import ClientId, LeaseId, RequestId, Token
+from tests.support.core_driver import CoreDriver, answer, refusal
+from vram_arbiter.arbiter.core.effects import JournalPut, Note, Push, Reply, Sample
+from vram_arbiter.arbiter.core.events import AcquireRequested
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import ClientId, LeaseId, RequestId, Token
 
 GIB = d.GIB
 
@@ -19,7 +19,9 @@ def driver() -> CoreDriver:
 
 
 def kinds(effects: list[Any]) -> list[str]:
-    return [f"{type(e).__name__}:{e.kind}" if isinstance(e, Note) else type(e).__name__ for e in effects]
+    return [
+        f"{type(e).__name__}:{e.kind}" if isinstance(e, Note) else type(e).__name__ for e in effects
+    ]
 
 
 # -- acquire -----------------------------------------------------------------------------------------------------------
@@ -239,7 +241,9 @@ def test_renewing_keeps_alive_and_never_resurrects(driver: CoreDriver) -> None:
     queued = det.acquire(5 * GIB)
     token = det.token(lease)
     driver.advance(9.0)
-    renewed = answer(det.renew((lease, token), (queued, Token(0, 0)), (LeaseId("L8-8"), Token(8, 8))))
+    renewed = answer(
+        det.renew((lease, token), (queued, Token(0, 0)), (LeaseId("L8-8"), Token(8, 8)))
+    )
     assert renewed["alive"] == [lease, queued]
     assert [(gone["lease_id"], gone["error"]["code"]) for gone in renewed["gone"]] == [
         ("L8-8", "unknown_lease")
@@ -311,7 +315,10 @@ def test_an_out_of_memory_raises_the_learnt_peak_of_its_model(driver: CoreDriver
     view = driver.view(again)
     assert view is not None
     assert view["charge_bytes"] == 3 * GIB
-    assert answer(det.oom(again, 100 * GIB, 1 * GIB))["learnt_load_peak_bytes"] == 8 * GIB - d.RESERVE_BYTES
+    assert (
+        answer(det.oom(again, 100 * GIB, 1 * GIB))["learnt_load_peak_bytes"]
+        == 8 * GIB - d.RESERVE_BYTES
+    )
     assert isinstance(det.oom(again, 1, 1)[0], Reply), "a reading is under way already"
 
 

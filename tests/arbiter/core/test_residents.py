@@ -2,11 +2,11 @@
 
 import pytest
 
-from arbiter.core.lease import Lease, LeaseState, Order
-from arbiter.core.residents import Residents
-from arbiter.testing.core_driver import CoreDriver
-from schemas import defaults as d
-from schemas.ids import GpuId, LeaseId
+from tests.support.core_driver import CoreDriver
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState, Order
+from vram_arbiter.arbiter.core.model.residents import Residents
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import GpuId, LeaseId
 
 
 def crowd(count: int) -> tuple[Residents, list[Lease]]:

@@ -4,13 +4,13 @@ from typing import Any
 
 import pytest
 
-from arbiter.core import invariants
-from arbiter.core.events import MemorySampled
-from arbiter.core.invariants import InvariantViolation
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
-from arbiter.testing.scenes import charge, shown
-from schemas import defaults as d
-from schemas.ids import GpuId, LeaseId
+from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.scenes import charge, shown
+from vram_arbiter.arbiter.core import invariants
+from vram_arbiter.arbiter.core.events import MemorySampled
+from vram_arbiter.arbiter.core.invariants import InvariantViolation
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import GpuId, LeaseId
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -46,7 +46,9 @@ def test_a_shrink_is_believed_when_the_card_agrees(lists: bool) -> None:
     view = driver.view(lease)
     assert view is not None
     assert (view["state"], view["uses"]) == ("held", 1)
-    driver.until(lambda: driver.state(driver.consumer("d").acquire(3 * GIB)) == "loading", limit_s=1.0)
+    driver.until(
+        lambda: driver.state(driver.consumer("d").acquire(3 * GIB)) == "loading", limit_s=1.0
+    )
 
 
 @pytest.mark.parametrize("lists", [True, False])

@@ -3,17 +3,19 @@
 from collections.abc import Mapping
 from typing import Any
 
-from arbiter.core.effects import Note, Sample
-from arbiter.core.events import MemorySampled, ProcessDied, Resumed
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer
-from schemas import defaults as d
-from schemas.ids import LeaseId
+from tests.support.core_driver import Consumer, CoreDriver, answer
+from vram_arbiter.arbiter.core.effects import Note, Sample
+from vram_arbiter.arbiter.core.events import MemorySampled, ProcessDied, Resumed
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId
 
 GIB = d.GIB
 NIGHT_S = 8 * 3600.0
 
 
-def held(driver: CoreDriver, name: str, gib: float, ttl_s: float = 10.0) -> tuple[Consumer, LeaseId]:
+def held(
+    driver: CoreDriver, name: str, gib: float, ttl_s: float = 10.0
+) -> tuple[Consumer, LeaseId]:
     person = driver.consumer(name)
     lease = person.acquire(int(gib * GIB), ttl_s=ttl_s)
     driver.until(lambda: driver.state(lease) == "loading")
@@ -126,7 +128,9 @@ def test_waiters_and_leases_on_their_way_out_keep_their_place() -> None:
     waiter = driver.consumer("b").acquire(5 * GIB, wait_timeout_s=20.0)
     driver.until(lambda: driver.state(lease) == "revoking")
     effects = driver.post(Resumed(NIGHT_S))
-    assert not [e for e in effects if isinstance(e, Note) and e.kind in ("denied", "expired", "cancelled")]
+    assert not [
+        e for e in effects if isinstance(e, Note) and e.kind in ("denied", "expired", "cancelled")
+    ]
     assert (driver.state(lease), driver.state(waiter)) == ("revoking", "queued")
     holder.use_end(lease)
     holder.unload(lease)
@@ -150,4 +154,6 @@ def test_what_was_there_before_the_night_has_to_come_back_before_a_dead_holder_i
     driver.post(ProcessDied(person.process))
     waiter = driver.consumer("b").acquire(GIB, exclusive=True)
     assert driver.until(lambda: driver.state(waiter) == "loading") > 2.9
-    assert [note["verdict"] for note in driver.notes("verified") if note["lease_id"] == lease] == ["verified"]
+    assert [note["verdict"] for note in driver.notes("verified") if note["lease_id"] == lease] == [
+        "verified"
+    ]

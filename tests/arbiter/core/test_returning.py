@@ -2,14 +2,14 @@
 
 import pytest
 
-from arbiter.core.events import MemorySampled, ProcessUse
-from arbiter.core.ledger import GpuLedger
-from arbiter.core.returning import Returning
-from arbiter.core.settings import GpuInfo
-from arbiter.testing.core_driver import Consumer, CoreDriver
-from arbiter.testing.scenes import held, hidden_card
-from schemas import defaults as d
-from schemas.ids import GpuId, LeaseId, ProcessKey
+from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.scenes import held, hidden_card
+from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
+from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger
+from vram_arbiter.arbiter.core.ledger.returning import Returning
+from vram_arbiter.arbiter.core.settings import GpuInfo
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 GPU = GpuId("GPU-0")
@@ -72,7 +72,9 @@ def test_a_rest_that_may_be_going_is_believed_as_far_as_it_was_there_before(list
         books.observe(sample, quiet=True, returning_bytes=returning_bytes)
         return books.unnamed_bytes, books.overhead_bytes
 
-    assert observe(1.0, 400, 400) == (0, None), "all of it may be going, and the driver's own was never seen"
+    assert observe(1.0, 400, 400) == (0, None), (
+        "all of it may be going, and the driver's own was never seen"
+    )
     assert observe(2.0, 400, 250) == (50, 100), "150 stay"
     assert observe(3.0, 400, 400) == (50, 100)
     assert observe(4.0, 120, 400) == (20, 100), "more than there is cannot be anybody's"
@@ -151,7 +153,9 @@ def test_the_doubt_ends_with_the_time_for_a_verdict() -> None:
     driver.card.lag_s = 60.0
     small.unload(lease)
     driver.card.set(STRANGER, 0, driver.now - 59.9)
-    assert driver.until(lambda: driver.state(lease) == "over") == pytest.approx(d.VERIFY_TIMEOUT_S, abs=0.6)
+    assert driver.until(lambda: driver.state(lease) == "over") == pytest.approx(
+        d.VERIFY_TIMEOUT_S, abs=0.6
+    )
 
 
 def test_when_all_that_nobody_named_is_gone_there_is_no_doubt() -> None:

@@ -4,11 +4,11 @@ from typing import get_args
 
 import pytest
 
-from arbiter.core.scheduling import SCHEDULING
-from arbiter.testing.core_driver import CoreDriver
-from schemas import defaults as d
-from schemas.config import SchedulingConfig
-from schemas.ids import LeaseId
+from tests.support.core_driver import CoreDriver
+from vram_arbiter.arbiter.core.scheduling.policies import SCHEDULING
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.config.arbiter import SchedulingConfig
+from vram_arbiter.schemas.ids import LeaseId
 
 GIB = d.GIB
 

@@ -1,10 +1,16 @@
 """Connections that come and go, deaths, and a journal that fails."""
 
-from arbiter.core.effects import Note, Push, Refuse
-from arbiter.core.events import ClientConnected, ClientLeft, JournalFailed, OperatorAsked, ProcessDied
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
-from schemas import defaults as d
-from schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
+from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from vram_arbiter.arbiter.core.effects import Note, Push, Refuse
+from vram_arbiter.arbiter.core.events import (
+    ClientConnected,
+    ClientLeft,
+    JournalFailed,
+    OperatorAsked,
+    ProcessDied,
+)
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
 
 GIB = d.GIB
 
@@ -102,7 +108,9 @@ def test_a_death_ends_leases_waits_and_uses_and_its_bytes_are_measured_away() ->
     runner.use_begin(vlm_lease, "goal", vlm.token(vlm_lease))
     runner.die()
     assert driver.notes("use_ended")[-1]["reason"] == "its process died"
-    assert refusal(det.connect() + det.release(held, token=vlm.token(vlm_lease))).code == "lease_lost"
+    assert (
+        refusal(det.connect() + det.release(held, token=vlm.token(vlm_lease))).code == "lease_lost"
+    )
 
 
 def test_a_death_during_verification_needs_no_residue_any_more() -> None:
@@ -231,7 +239,10 @@ def test_who_owns_bytes_of_a_card_and_who_is_connected() -> None:
     assert driver.arbiter.clients() == {det.process, watcher.process}
     lease = det.acquire(2 * GIB, gpu=first)
     det.load(lease)
-    assert (driver.arbiter.owners(first), driver.arbiter.owners(second)) == ({det.process}, frozenset())
+    assert (driver.arbiter.owners(first), driver.arbiter.owners(second)) == (
+        {det.process},
+        frozenset(),
+    )
     assert driver.arbiter.owners(GpuId("GPU-none")) == frozenset()
     det.die()
     assert driver.arbiter.clients() == {watcher.process}
@@ -262,7 +273,9 @@ def test_an_instance_that_reconnects_is_one_client_with_everything_that_was_its_
     det.leave("silent")
     assert (driver.state(queued), driver.state(theirs)) == ("over", "queued")
     views = (driver.view(held), driver.view(lent))
-    assert [view and view["uses"] for view in views] == [0, 1], "its uses end with its newest connection"
+    assert [view and view["uses"] for view in views] == [0, 1], (
+        "its uses end with its newest connection"
+    )
 
 
 def test_a_connection_that_says_hello_as_another_instance_is_only_that() -> None:

@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.events import ProcessDied
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
-from arbiter.testing.scenes import held, sent_away
-from schemas import defaults as d
-from schemas.ids import LeaseId, ProcessKey
+from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.scenes import held, sent_away
+from vram_arbiter.arbiter.core.events import ProcessDied
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 GIB = d.GIB
 MIB = d.MIB
@@ -32,7 +32,9 @@ def test_the_detector_returns_by_itself_after_the_grab() -> None:
     view = driver.view(lease)
     assert view is not None
     assert (view["state"], view["standby"], view["charge_bytes"]) == ("held", True, 5 * GIB)
-    assert driver.notes("granted")[-1]["reason"] == "back from standby: there is room and nobody waits"
+    assert (
+        driver.notes("granted")[-1]["reason"] == "back from standby: there is room and nobody waits"
+    )
     assert driver.notes("switch")[-1]["switched"] is False
 
 
@@ -87,7 +89,9 @@ def test_it_asks_nobody_to_leave() -> None:
     driver.until(lambda: driver.state(vlm_lease) == "loading")
     vlm.load(vlm_lease)
     driver.advance(600.0)
-    assert (driver.state(lease), driver.state(vlm_lease)) == ("standby", "held"), "5 + 4 do not fit on 8"
+    assert (driver.state(lease), driver.state(vlm_lease)) == ("standby", "held"), (
+        "5 + 4 do not fit on 8"
+    )
     (why,) = driver.arbiter.why("det", driver.now)["leases"]
     assert why["text"] == "det: on standby until there is room; it asks nobody to leave"
 
@@ -387,7 +391,11 @@ def test_a_new_acquire_of_the_same_model_takes_the_lease_over() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease, policy, wanted = sent_away(driver)
     told = answer(det.try_acquire(4 * GIB, nonce="again", standby=True, priority=70))
-    assert (told["state"], told["lease"]["lease_id"], told["lease"]["priority"]) == ("queued", lease, 70)
+    assert (told["state"], told["lease"]["lease_id"], told["lease"]["priority"]) == (
+        "queued",
+        lease,
+        70,
+    )
     assert answer(det.try_acquire(4 * GIB, nonce="again"))["lease"]["lease_id"] == lease, "a repeat"
     policy.unload(wanted)
     driver.until(lambda: driver.state(lease) == "loading")

@@ -4,12 +4,12 @@ from collections.abc import Callable
 
 import pytest
 
-from arbiter.core import invariants
-from arbiter.core.invariants import InvariantViolation
-from arbiter.core.lease import LeaseState
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
-from arbiter.testing.scenes import held, order, sent_away
-from schemas import defaults as d
+from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.scenes import held, order, sent_away
+from vram_arbiter.arbiter.core import invariants
+from vram_arbiter.arbiter.core.invariants import InvariantViolation
+from vram_arbiter.arbiter.core.model.lease import LeaseState
+from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
 
@@ -51,7 +51,9 @@ def test_it_ends_with_its_connection(reason: str) -> None:
 
 
 @pytest.mark.parametrize("end", [Consumer.leave, Consumer.die], ids=["connection", "process"])
-def test_who_ends_during_the_measurement_does_not_want_it_back(end: Callable[[Consumer], object]) -> None:
+def test_who_ends_during_the_measurement_does_not_want_it_back(
+    end: Callable[[Consumer], object],
+) -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, standby=True)
     policy = driver.consumer("policy")

@@ -1,11 +1,11 @@
 """A restart of the daemon loses no lease on standby, at whichever step of its way it comes."""
 
-from arbiter.core.effects import Push
-from arbiter.core.events import ClientConnected, Recovered
-from arbiter.testing.core_driver import CoreDriver, answer, refusal
-from arbiter.testing.scenes import held, sent_away
-from schemas import defaults as d
-from schemas.ids import ClientId, Token
+from tests.support.core_driver import CoreDriver, answer, refusal
+from tests.support.scenes import held, sent_away
+from vram_arbiter.arbiter.core.effects import Push
+from vram_arbiter.arbiter.core.events import ClientConnected, Recovered
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import ClientId, Token
 
 GIB = d.GIB
 
@@ -88,7 +88,9 @@ def test_a_restart_in_the_middle_of_the_way_out_does_not_make_it_a_wish() -> Non
     driver.until(lambda: driver.state(lease) == "revoking")
     token = det.token(lease)
     driver.restart()
-    assert driver.state(lease) == "held", "not asked by this daemon: uses of others may be on their way back"
+    assert driver.state(lease) == "held", (
+        "not asked by this daemon: uses of others may be on their way back"
+    )
     det.connect()
     det.reattach(lease, token)
     wanted = policy.acquire(5 * GIB) if policy.connect() is not None else None
@@ -229,5 +231,7 @@ def test_a_return_that_cannot_be_journalled_is_not_made() -> None:
     driver.advance(1.0)
     assert driver.state(lease) == "over"
     assert driver.pushes("denied", lease)[-1]["error"]["code"] == "journal_unavailable"
-    assert not any(isinstance(e, Push) and e.body["push"] == "granted" for e in driver.effects[-20:])
+    assert not any(
+        isinstance(e, Push) and e.body["push"] == "granted" for e in driver.effects[-20:]
+    )
     assert driver.gpu()["charged_bytes"] == 0

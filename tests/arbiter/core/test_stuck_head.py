@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.core_driver import Consumer, CoreDriver
-from schemas import defaults as d
-from schemas.ids import LeaseId, ProcessKey
+from tests.support.core_driver import Consumer, CoreDriver
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 STRANGER = ProcessKey(9, 9)
@@ -149,7 +149,9 @@ def test_the_ageing_bound_holds_against_those_who_passed() -> None:
     late.use_begin(lease)
     stowaway(driver, 2)
     assert driver.state(lease) == "held"
-    driver.until(lambda: driver.state(lease) == "revoking", limit_s=2 * driver.settings.ageing_s_per_point)
+    driver.until(
+        lambda: driver.state(lease) == "revoking", limit_s=2 * driver.settings.ageing_s_per_point
+    )
     assert driver.now == pytest.approx(asked_at, abs=0.1)
     late.use_end(lease)
     late.unload(lease)
@@ -180,7 +182,9 @@ def test_whoever_passed_is_in_nobodys_way_when_the_stowaway_is_gone(seed: int) -
                 owner.use_begin(lease)
     asked = len(driver.notes("revoke_asked"))
     stowaway(driver, 0)
-    driver.until(lambda: driver.state(head) != "queued" or driver.state(kept) == "revoking", limit_s=2.0)
+    driver.until(
+        lambda: driver.state(head) != "queued" or driver.state(kept) == "revoking", limit_s=2.0
+    )
     if driver.state(kept) == "revoking":
         keeper.unload(kept)
         asked += 1
@@ -317,7 +321,11 @@ def test_one_that_was_there_before_the_head_did_not_pass_it() -> None:
     driver.advance(0.1)
     head = driver.consumer("head").acquire(6 * GIB)
     _, small = held(driver, "small", 1.5)
-    assert (driver.state(low), driver.state(head), driver.state(small)) == ("held", "queued", "held")
+    assert (driver.state(low), driver.state(head), driver.state(small)) == (
+        "held",
+        "queued",
+        "held",
+    )
 
 
 def test_a_sub_lease_of_one_that_was_there_did_not_pass() -> None:

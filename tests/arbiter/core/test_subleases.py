@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.effects import Reply
-from arbiter.testing.core_driver import CoreDriver, answer, refusal
-from arbiter.testing.scenes import Tree, revokes
-from schemas import defaults as d
-from schemas.ids import LeaseId, Token
+from tests.support.core_driver import CoreDriver, answer, refusal
+from tests.support.scenes import Tree, revokes
+from vram_arbiter.arbiter.core.effects import Reply
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, Token
 
 GIB = d.GIB
 MIB = d.MIB
@@ -44,7 +44,9 @@ def test_asked_again_by_its_nonce_it_is_the_same_sub_lease(tree: Tree) -> None:
 
 
 def test_more_than_is_left_is_refused_with_both_figures(tree: Tree) -> None:
-    refused = refusal(tree.driver.consumer("x").try_acquire(2 * GIB, parent=(tree.root, tree.token)))
+    refused = refusal(
+        tree.driver.consumer("x").try_acquire(2 * GIB, parent=(tree.root, tree.token))
+    )
     assert refused.code == "parent_too_small"
     assert refused.details == {"needed_bytes": 2 * GIB, "left_bytes": 1 * GIB}
     assert tree.total() == 5 * GIB
@@ -54,7 +56,9 @@ def test_what_the_parents_own_process_holds_is_not_left(tree: Tree) -> None:
     tree.held()
     tree.runner.hold(700 * MIB)
     tree.driver.advance(1.5)
-    refused = refusal(tree.driver.consumer("x").try_acquire(512 * MIB, parent=(tree.root, tree.token)))
+    refused = refusal(
+        tree.driver.consumer("x").try_acquire(512 * MIB, parent=(tree.root, tree.token))
+    )
     assert refused.details["left_bytes"] == 1 * GIB - 700 * MIB
 
 
@@ -64,7 +68,9 @@ def test_a_parent_that_says_what_it_holds_has_that_much_less() -> None:
     runner = driver.consumer("runner")
     root = runner.acquire(5 * GIB)
     runner.load(root, 4 * GIB)
-    refused = refusal(driver.consumer("x").try_acquire(512 * MIB, parent=(root, runner.token(root))))
+    refused = refusal(
+        driver.consumer("x").try_acquire(512 * MIB, parent=(root, runner.token(root)))
+    )
     assert refused.details["left_bytes"] == 0
 
 
@@ -146,7 +152,9 @@ def test_a_load_under_a_held_parent_keeps_others_out_while_it_lasts(tree: Tree) 
     assert (tree.state(second), tree.state(waiter)) == ("loading", "queued")
 
 
-def test_a_sub_lease_that_holds_more_than_it_said_takes_it_from_its_parent_first(tree: Tree) -> None:
+def test_a_sub_lease_that_holds_more_than_it_said_takes_it_from_its_parent_first(
+    tree: Tree,
+) -> None:
     tree.policy.load(tree.leaf, 4 * GIB + 512 * MIB)
     assert tree.charges() == [512 * MIB, 4 * GIB + 512 * MIB]
     tree.driver.advance(0.5)
@@ -169,7 +177,9 @@ def test_more_than_the_whole_tree_is_pressure_and_is_not_kept_when_it_goes() -> 
     assert tree.charges(tree.root) == [5 * GIB]
 
 
-def test_a_parent_that_says_ready_itself_keeps_what_it_holds_beside_its_sub_leases(tree: Tree) -> None:
+def test_a_parent_that_says_ready_itself_keeps_what_it_holds_beside_its_sub_leases(
+    tree: Tree,
+) -> None:
     tree.runner.ready(tree.root, 512 * MIB)
     assert tree.charges() == [1 * GIB, 4 * GIB], "its steady bytes cover both"
     assert tree.state(tree.leaf) == "loading"
@@ -200,7 +210,9 @@ def test_a_tree_is_in_use_while_any_of_it_is(tree: Tree, on: str) -> None:
     )
     assert "1 use" in tree.driver.arbiter.why("w", tree.driver.now)["leases"][0]["text"]
     effects = tree.runner.use_end(lease, "goal", owner.token(lease))
-    assert revokes(effects) == [(tree.leaf, 0, 0), (tree.root, 0, 1)], "the leaf first, both may leave now"
+    assert revokes(effects) == [(tree.leaf, 0, 0), (tree.root, 0, 1)], (
+        "the leaf first, both may leave now"
+    )
 
 
 def test_a_waiter_of_lower_priority_does_not_ask_a_tree_in_use(tree: Tree) -> None:
@@ -210,7 +222,9 @@ def test_a_waiter_of_lower_priority_does_not_ask_a_tree_in_use(tree: Tree) -> No
     assert (tree.state(tree.root), tree.state(tree.leaf)) == ("held", "held")
 
 
-def test_an_idle_sub_lease_may_not_unload_under_a_goal_but_beside_a_busy_sibling_it_may(tree: Tree) -> None:
+def test_an_idle_sub_lease_may_not_unload_under_a_goal_but_beside_a_busy_sibling_it_may(
+    tree: Tree,
+) -> None:
     tree.held()
     other = tree.driver.consumer("other")
     second = tree.carve(other, 512 * MIB)
@@ -223,7 +237,9 @@ def test_an_idle_sub_lease_may_not_unload_under_a_goal_but_beside_a_busy_sibling
 
 
 # -- lines of three ----------------------------------------------------------------------------------------------------
-def test_a_grandchild_takes_from_its_parent_and_its_grandparent_knows_nothing_of_it(tree: Tree) -> None:
+def test_a_grandchild_takes_from_its_parent_and_its_grandparent_knows_nothing_of_it(
+    tree: Tree,
+) -> None:
     worker = tree.driver.consumer("worker")
     grandchild = worker.acquire(3 * GIB, parent=(tree.leaf, tree.policy.token(tree.leaf)))
     assert tree.charges(tree.root, tree.leaf, grandchild) == [1 * GIB, 1 * GIB, 3 * GIB]

@@ -1,10 +1,10 @@
 """How a tree of leases comes to its end: evictions, releases, and what becomes of it when somebody dies."""
 
-from arbiter.core.events import OperatorAsked
-from arbiter.testing.core_driver import CoreDriver, answer, refusal
-from arbiter.testing.scenes import Tree, revokes
-from schemas import defaults as d
-from schemas.ids import LeaseId
+from tests.support.core_driver import CoreDriver, answer, refusal
+from tests.support.scenes import Tree, revokes
+from vram_arbiter.arbiter.core.events import OperatorAsked
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId
 
 GIB = d.GIB
 MIB = d.MIB
@@ -176,7 +176,9 @@ def test_a_sub_lease_that_becomes_ready_in_a_tree_that_an_operator_evicts_is_ask
     other = tree.driver.consumer("second")
     second = tree.carve(other, 512 * MIB)
     ops = tree.driver.consumer("ops")
-    tree.driver.post(OperatorAsked(ops.client, tree.driver.next_request(), "evict", tree.root, "ops", "test"))
+    tree.driver.post(
+        OperatorAsked(ops.client, tree.driver.next_request(), "evict", tree.root, "ops", "test")
+    )
     assert (tree.state(second), tree.state(tree.leaf)) == ("loading", "revoking")
     assert revokes(other.ready(second)) == [(second, 0, 0)]
     push = tree.driver.pushes("revoke", second)[-1]
@@ -285,13 +287,17 @@ def test_a_hung_child_that_expires_in_an_eviction_does_not_hold_its_parent_for_e
     driver.advance(0.01)
     waiter = driver.consumer("w").acquire(5 * GIB)
     driver.advance(2.0)
-    assert (driver.state(leaf), driver.state(waiter)) == ("over", "queued"), "its bytes are still there"
+    assert (driver.state(leaf), driver.state(waiter)) == ("over", "queued"), (
+        "its bytes are still there"
+    )
     driver.until(lambda: driver.state(root) == "over")
     policy.die()
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=10.0)
 
 
-def test_a_parent_in_use_is_not_given_up_when_its_last_child_dies_in_an_eviction(tree: Tree) -> None:
+def test_a_parent_in_use_is_not_given_up_when_its_last_child_dies_in_an_eviction(
+    tree: Tree,
+) -> None:
     tree.held()
     tree.runner.use_begin(tree.root, "goal")
     tree.driver.consumer("w").acquire(5 * GIB)
@@ -317,7 +323,9 @@ def test_a_sub_lease_that_fails_to_load_gives_everything_back(tree: Tree) -> Non
     assert tree.state(tree.root) == "loading"
 
 
-def test_a_sub_lease_whose_record_cannot_be_written_is_refused_and_its_parent_stays(tree: Tree) -> None:
+def test_a_sub_lease_whose_record_cannot_be_written_is_refused_and_its_parent_stays(
+    tree: Tree,
+) -> None:
     tree.driver.journal_failing = "disk full"
     tree.driver.consumer("x").try_acquire(512 * MIB, parent=(tree.root, tree.token))
     tree.driver.journal_failing = ""

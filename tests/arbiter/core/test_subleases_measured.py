@@ -3,16 +3,18 @@ loads beside its sub-leases is no mere reservation."""
 
 import pytest
 
-from arbiter.testing.core_driver import answer, refusal
-from arbiter.testing.scenes import hidden_card
-from schemas import defaults as d
+from tests.support.core_driver import answer, refusal
+from tests.support.scenes import hidden_card
+from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
 MIB = d.MIB
 
 
 @pytest.mark.parametrize("of_its_own", [True, False])
-def test_without_process_lists_bytes_are_lent_again_only_once_they_are_gone(of_its_own: bool) -> None:
+def test_without_process_lists_bytes_are_lent_again_only_once_they_are_gone(
+    of_its_own: bool,
+) -> None:
     """No reading was taken while the sub-lease was ready: the ledger bound is all there is, and the reservation must not hide it."""
     driver = hidden_card(lists=False, lag_s=0.8)
     runner, policy = driver.consumer("runner"), driver.consumer("policy")
@@ -46,7 +48,9 @@ def test_without_process_lists_a_parent_that_is_ready_without_a_figure_lends_not
 
 @pytest.mark.parametrize("lists", [True, False])
 @pytest.mark.parametrize("asked", [False, True])
-def test_a_parent_that_is_ready_after_its_sub_lease_is_no_mere_reservation(lists: bool, asked: bool) -> None:
+def test_a_parent_that_is_ready_after_its_sub_lease_is_no_mere_reservation(
+    lists: bool, asked: bool
+) -> None:
     driver = hidden_card(lists=lists)
     runner, policy = driver.consumer("runner"), driver.consumer("policy")
     root = runner.acquire(5 * GIB)

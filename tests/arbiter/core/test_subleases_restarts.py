@@ -2,9 +2,9 @@
 
 import pytest
 
-from arbiter.testing.core_driver import CoreDriver, answer
-from arbiter.testing.scenes import Tree
-from schemas import defaults as d
+from tests.support.core_driver import CoreDriver, answer
+from tests.support.scenes import Tree
+from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
 MIB = d.MIB
@@ -142,7 +142,9 @@ def test_a_parent_on_standby_comes_back_as_a_reservation() -> None:
 
 
 @pytest.mark.parametrize("parent_first", [True, False])
-def test_a_tree_is_adopted_from_its_holders_when_the_journal_is_lost(tree: Tree, parent_first: bool) -> None:
+def test_a_tree_is_adopted_from_its_holders_when_the_journal_is_lost(
+    tree: Tree, parent_first: bool
+) -> None:
     tree.held()
     leaf = tree.policy.token(tree.leaf)
     tree.driver.restart(keep_journal=False)

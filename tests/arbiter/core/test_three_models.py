@@ -1,8 +1,8 @@
 """The loop that the product exists for: detector, VLM and policy on one card of 8 GiB."""
 
-from arbiter.testing.core_driver import Consumer, CoreDriver
-from schemas import defaults as d
-from schemas.ids import LeaseId
+from tests.support.core_driver import Consumer, CoreDriver
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId
 
 RESIDUE = 450 * d.MIB
 DETECTOR, VLM, POLICY = 5_300_000_000, 3_300_000_000, 4_300_000_000
@@ -94,7 +94,9 @@ def test_find_navigate_grab_and_find_again() -> None:
     )
 
     robot.runner.use_end(policy, "goal-1", robot.policy.token(policy))
-    assert driver.pushes("revoke", policy)[-1]["uses"] == 0, "told at once that it is at its safe point"
+    assert driver.pushes("revoke", policy)[-1]["uses"] == 0, (
+        "told at once that it is at its safe point"
+    )
     robot.policy.unload(policy)
     driver.until(lambda: driver.state(detector) == "loading")
     robot.detector.load(detector)

@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.events import MemorySampled, ProcessDied, ProcessUse, Resumed
-from arbiter.testing.core_driver import Consumer, CoreDriver
-from arbiter.testing.scenes import charge, held, why
-from schemas import defaults as d
-from schemas.ids import LeaseId, ProcessKey
+from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.scenes import charge, held, why
+from vram_arbiter.arbiter.core.events import MemorySampled, ProcessDied, ProcessUse, Resumed
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 TOLERANCE = d.VERIFY_TOLERANCE_BYTES
@@ -35,7 +35,9 @@ def leftover(driver: CoreDriver, count: int, residue_bytes: int = 0) -> Consumer
     return person
 
 
-@pytest.mark.parametrize(("less", "after"), [(TOLERANCE, 2 * GIB), (TOLERANCE + 1, 2 * GIB - TOLERANCE - 1)])
+@pytest.mark.parametrize(
+    ("less", "after"), [(TOLERANCE, 2 * GIB), (TOLERANCE + 1, 2 * GIB - TOLERANCE - 1)]
+)
 def test_a_leftover_falls_by_more_than_the_tolerance_or_not_at_all(less: int, after: int) -> None:
     driver = CoreDriver(8 * GIB)
     person = leftover(driver, 2 * GIB)
@@ -46,7 +48,9 @@ def test_a_leftover_falls_by_more_than_the_tolerance_or_not_at_all(less: int, af
 
 
 @pytest.mark.parametrize(("shown", "after"), [(0, 0), (1, 450 * MIB), (100 * MIB, 450 * MIB)])
-def test_only_who_is_neither_connected_nor_on_the_card_has_no_context(shown: int, after: int) -> None:
+def test_only_who_is_neither_connected_nor_on_the_card_has_no_context(
+    shown: int, after: int
+) -> None:
     driver = CoreDriver(8 * GIB)
     person = leftover(driver, 450 * MIB, 450 * MIB)
     person.hold(shown)
@@ -112,7 +116,9 @@ def stranger(driver: CoreDriver, pid: int, count: int) -> None:
 
 def culprits(driver: CoreDriver) -> list[tuple[int, str, int]]:
     """Of the last verdict."""
-    return [(one["pid"], one["name"], one["bytes"]) for one in driver.notes("verified")[-1]["culprits"]]
+    return [
+        (one["pid"], one["name"], one["bytes"]) for one in driver.notes("verified")[-1]["culprits"]
+    ]
 
 
 def test_who_grew_by_a_byte_is_named_and_who_did_not_is_not_the_largest_first() -> None:
@@ -131,7 +137,9 @@ def test_who_grew_by_a_byte_is_named_and_who_did_not_is_not_the_largest_first() 
     assert culprits(driver) == [(pid, f"p{9 - pid}", grew[pid]) for pid in (5, 2, 4, 1)]
 
 
-def test_without_a_reading_from_before_only_strangers_are_named_and_with_all_that_they_hold() -> None:
+def test_without_a_reading_from_before_only_strangers_are_named_and_with_all_that_they_hold() -> (
+    None
+):
     driver = CoreDriver(8 * GIB)
     det, _ = held(driver, "det", 3)
     held(driver, "other", 1)
@@ -153,7 +161,10 @@ def test_a_process_without_a_figure_has_not_grown() -> None:
     driver.advance(0.5)
     driver.card.silent = True
     det.release(lease)
-    uses = (ProcessUse(ProcessKey(8, 8), "silent", None), ProcessUse(ProcessKey(9, 9), "browser", GIB))
+    uses = (
+        ProcessUse(ProcessKey(8, 8), "silent", None),
+        ProcessUse(ProcessKey(9, 9), "browser", GIB),
+    )
     for _ in range(25):
         driver.advance(0.5)
         driver.post(MemorySampled(driver.card.gpu, driver.now, GIB, 8 * GIB, uses))
@@ -175,7 +186,10 @@ def test_what_a_process_kept_of_a_sub_lease_is_its_own_once_it_has_a_lease_of_it
     driver.until(lambda: driver.state(own) == "loading")
     assert charge(driver, root) == 5 * GIB - 450 * MIB
     estate = driver.journal[f"lease:{root}"]["estate"]
-    assert (estate["booked_bytes"], estate["approved_bytes"]) == (5 * GIB - 450 * MIB, 5 * GIB - 450 * MIB)
+    assert (estate["booked_bytes"], estate["approved_bytes"]) == (
+        5 * GIB - 450 * MIB,
+        5 * GIB - 450 * MIB,
+    )
     assert estate["borne"] == []
     assert driver.gpu()["charged_bytes"] == 6 * GIB - 450 * MIB
 
@@ -201,7 +215,9 @@ def test_a_load_elsewhere_is_waited_for_as_long_as_a_holder_that_was_asked() -> 
     assert driver.state(idle) == "revoking"
 
 
-@pytest.mark.parametrize("trouble", ["it cannot be read", "pressure", "it has not been read since a suspend"])
+@pytest.mark.parametrize(
+    "trouble", ["it cannot be read", "pressure", "it has not been read since a suspend"]
+)
 def test_a_load_on_a_card_in_trouble_is_not_waited_for(trouble: str) -> None:
     driver, idle, _, _ = two_cards()
     card = list(driver.cards.values())[1]
@@ -237,7 +253,9 @@ def test_up_to_three_who_have_not_come_back_are_named(count: int) -> None:
     driver.restart()
     named = ", ".join(f"m{n} (pid {who.process.pid})" for n, who in enumerate(people[:3]))
     more = " and 1 more" if count == 4 else ""
-    assert driver.gpu()["blocked"] == f"recovering after a restart: {named}{more} must come back first"
+    assert (
+        driver.gpu()["blocked"] == f"recovering after a restart: {named}{more} must come back first"
+    )
 
 
 # -- gangs that load -----------------------------------------------------------------------------------------------------
@@ -247,7 +265,9 @@ def gang_of(driver: CoreDriver, *sizes: tuple[int, int]) -> list[tuple[Consumer,
     for n, (peak, steady) in enumerate(sizes):
         who = driver.consumer(f"member{n}")
         found.append((who, who.acquire(peak, steady, gang=("g", len(sizes)))))
-    assert [driver.state(lease) for _, lease in found] == ["loading"] + ["queued"] * (len(sizes) - 1)
+    assert [driver.state(lease) for _, lease in found] == ["loading"] + ["queued"] * (
+        len(sizes) - 1
+    )
     return found
 
 
@@ -261,13 +281,17 @@ def ready_with(member: tuple[Consumer, LeaseId], count: int, says: int | None = 
 
 
 @pytest.mark.parametrize(("beyond", "after"), [(0, "loading"), (1, "over")])
-def test_a_member_may_hold_more_than_it_declared_as_long_as_the_rest_fits(beyond: int, after: str) -> None:
+def test_a_member_may_hold_more_than_it_declared_as_long_as_the_rest_fits(
+    beyond: int, after: str
+) -> None:
     driver = CoreDriver(8 * GIB)
     one, (_, second) = gang_of(driver, (4608 * MIB, 4 * GIB), (3500 * MIB, 3 * GIB))
     ready_with(one, BUDGET - 3500 * MIB + beyond)
     assert driver.state(second) == after
     if beyond:
-        assert "holds more than it declared" in driver.pushes("denied", second)[0]["error"]["message"]
+        assert (
+            "holds more than it declared" in driver.pushes("denied", second)[0]["error"]["message"]
+        )
 
 
 @pytest.mark.parametrize("says", [3200 * MIB, 3250 * MIB])
@@ -323,14 +347,20 @@ def test_what_a_process_shows_of_its_peak_may_be_what_is_kept_for_its_next_membe
     driver.until(lambda: driver.state(second) == "loading", limit_s=2.0)
 
 
-def test_the_headroom_goes_to_the_member_that_loads_and_what_it_does_not_need_stays_for_the_next() -> None:
+def test_the_headroom_goes_to_the_member_that_loads_and_what_it_does_not_need_stays_for_the_next() -> (
+    None
+):
     driver = CoreDriver(8 * GIB)
     sizes = [(2100 * MIB, 2000 * MIB), (2500 * MIB, 2000 * MIB), (2300 * MIB, 2000 * MIB)]
     members = gang_of(driver, *sizes)
     assert driver.gpu()["charged_bytes"] == 6500 * MIB
     driver.consumer("w").acquire(3 * GIB)
     blockers = {one["consumer"]: one for one in why(driver, "w")["blockers"]}
-    assert [blockers[f"member{n}"]["bytes"] for n in range(3)] == [2100 * MIB, 2400 * MIB, 2000 * MIB]
+    assert [blockers[f"member{n}"]["bytes"] for n in range(3)] == [
+        2100 * MIB,
+        2400 * MIB,
+        2000 * MIB,
+    ]
     assert blockers["member1"] == {
         "lease_id": members[1][1],
         "consumer": "member1",
@@ -343,7 +373,11 @@ def test_the_headroom_goes_to_the_member_that_loads_and_what_it_does_not_need_st
     assert driver.state(members[1][1]) == "loading"
     assert driver.gpu()["charged_bytes"] == 6500 * MIB
     blockers = {one["consumer"]: one for one in why(driver, "w")["blockers"]}
-    assert [blockers[f"member{n}"]["bytes"] for n in range(3)] == [2000 * MIB, 2500 * MIB, 2000 * MIB]
+    assert [blockers[f"member{n}"]["bytes"] for n in range(3)] == [
+        2000 * MIB,
+        2500 * MIB,
+        2000 * MIB,
+    ]
 
 
 def test_a_gang_over_two_cards_keeps_no_bytes_for_a_member_elsewhere() -> None:
@@ -364,7 +398,9 @@ def test_a_gang_that_may_be_given_up_says_when_and_why() -> None:
     step = why(driver, "member1")["plan"][-1]
     gives_up_at = driver.now + step["in_s"]
     assert step["action"] == "break"
-    assert step["text"] == f"gives gang g up in {step['in_s']:.1f} s, if its memory is not free then"
+    assert (
+        step["text"] == f"gives gang g up in {step['in_s']:.1f} s, if its memory is not free then"
+    )
     assert "lease_id" not in step or step["lease_id"] is None
     driver.advance(gives_up_at - 0.2 - driver.now)
     assert driver.state(second) == "queued"
@@ -385,7 +421,9 @@ def restarted_with(driver: CoreDriver, person: Consumer, **changes: Any) -> None
     ("floor", "after"),
     [(100 * MIB, 100 * MIB), (450 * MIB, 450 * MIB), (900 * MIB, 450 * MIB), (None, 450 * MIB)],
 )
-def test_a_residue_falls_after_a_restart_to_what_was_declared_of_it(floor: int | None, after: int) -> None:
+def test_a_residue_falls_after_a_restart_to_what_was_declared_of_it(
+    floor: int | None, after: int
+) -> None:
     """A record of an older daemon does not say: then all of it was."""
     driver = CoreDriver(8 * GIB)
     person = leftover(driver, 450 * MIB, 450 * MIB)
@@ -418,7 +456,10 @@ def test_what_a_restart_found_is_told_and_what_is_of_a_card_that_is_gone_is_take
     _, lost = held(driver, "b", 1)
     gone = {"gpu": "GPU-9"}
     driver.journal[f"lease:{lost}"] = {**driver.journal[f"lease:{lost}"], **gone}
-    driver.journal["residue:elsewhere"] = {**driver.journal[f"residue:{person.process}:GPU-0"], **gone}
+    driver.journal["residue:elsewhere"] = {
+        **driver.journal[f"residue:{person.process}:GPU-0"],
+        **gone,
+    }
     driver.restart()
     assert driver.notes("recovered")[-1] == {"leases": [lease], "records": 4}
     assert driver.journal.keys() == {f"lease:{lease}", f"residue:{person.process}:GPU-0"}

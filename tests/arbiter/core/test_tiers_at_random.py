@@ -5,11 +5,11 @@ import random
 
 import pytest
 
-from arbiter.core.effects import Note, Refuse
-from arbiter.core.events import OperatorAsked
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
-from schemas import defaults as d
-from schemas.ids import LeaseId, ProcessKey
+from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from vram_arbiter.arbiter.core.effects import Note, Refuse
+from vram_arbiter.arbiter.core.events import OperatorAsked
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 CAPACITY = 8 * GIB
@@ -30,7 +30,11 @@ class Crowd:
         self.leases: dict[LeaseId, Consumer] = {}
 
     def mine(self, person: Consumer) -> LeaseId | None:
-        found = [x for x, owner in self.leases.items() if owner is person and self.driver.state(x) != "over"]
+        found = [
+            x
+            for x, owner in self.leases.items()
+            if owner is person and self.driver.state(x) != "over"
+        ]
         return found[0] if found else None
 
     def acquire(self, person: Consumer) -> None:
@@ -60,7 +64,9 @@ class Crowd:
         assert view is not None
         chance = self.draw.random()
         match view["state"]:
-            case "loading" if chance < 0.2:  # killed or asked here, it has a part of its bytes already
+            case "loading" if (
+                chance < 0.2
+            ):  # killed or asked here, it has a part of its bytes already
                 person.hold(person.specs[lease].steady_bytes // 2, gpu=view["gpu"])
             case "loading":
                 person.load(lease)
@@ -166,7 +172,9 @@ class Crowd:
             shown = card.shown(self.driver.now)
             assert sum(count for process, count in shown.items() if process != STRANGER) <= BUDGET
         status = self.driver.arbiter.status(self.driver.now)
-        assert status["host_ram"]["parked_bytes"] == sum(v.get("parked_bytes", 0) for v in status["leases"])
+        assert status["host_ram"]["parked_bytes"] == sum(
+            v.get("parked_bytes", 0) for v in status["leases"]
+        )
 
 
 def live(seed: int, steps: int) -> tuple[Crowd, collections.Counter[str]]:
@@ -189,11 +197,13 @@ def live(seed: int, steps: int) -> tuple[Crowd, collections.Counter[str]]:
         for person in crowd.people:
             lease = crowd.mine(person)
             state = None if lease is None else crowd.driver.state(lease)
-            if state in ("loading", "revoking") or (state == "held" and crowd.driver.view(lease)["uses"]):  # type: ignore[arg-type,index]
+            if state in ("loading", "revoking") or (
+                state == "held" and crowd.driver.view(lease)["uses"]
+            ):  # type: ignore[arg-type,index]
                 crowd.step(person)
         crowd.driver.advance(0.3)
-    assert not [x for x in crowd.leases if crowd.driver.state(x) == "queued"], crowd.driver.arbiter.status(
-        crowd.driver.now
+    assert not [x for x in crowd.leases if crowd.driver.state(x) == "queued"], (
+        crowd.driver.arbiter.status(crowd.driver.now)
     )
     kinds = collections.Counter(e.kind for e in crowd.driver.effects if isinstance(e, Note))
     return crowd, kinds
@@ -204,4 +214,6 @@ def test_nothing_is_lost_or_granted_twice(block: int) -> None:
     seen: collections.Counter[str] = collections.Counter()
     for seed in range(block * 3, block * 3 + 3):
         seen += live(seed, 120)[1]
-    assert all(seen[kind] for kind in ("standby", "parked", "resized", "granted", "revoke_asked")), seen
+    assert all(
+        seen[kind] for kind in ("standby", "parked", "resized", "granted", "revoke_asked")
+    ), seen

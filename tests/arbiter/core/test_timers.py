@@ -1,6 +1,6 @@
 """Deadlines by name."""
 
-from arbiter.core.timers import SLACK, Timers
+from vram_arbiter.arbiter.core.timers import SLACK, Timers
 
 
 def test_timers_come_in_their_order_and_once() -> None:

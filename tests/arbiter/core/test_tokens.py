@@ -4,10 +4,10 @@ could read it in `status`, or guess it, could keep a holder on its GPU for ever.
 from itertools import pairwise
 from typing import Any
 
-from arbiter.core.effects import Note, Push, Refuse, Reply
-from arbiter.testing.core_driver import CoreDriver, answer, refusal
-from schemas import defaults as d
-from schemas.ids import Token
+from tests.support.core_driver import CoreDriver, answer, refusal
+from vram_arbiter.arbiter.core.effects import Note, Push, Refuse, Reply
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import Token
 
 GIB = d.GIB
 SECRET = "5e" * 16
@@ -27,7 +27,9 @@ def test_a_token_is_shown_to_its_holder_and_to_an_operator_only() -> None:
     assert Token(*shown()["token"]) == Token(*shown(det.process)["token"]) == token
     assert "token" not in shown(stranger.process)
     refused = refusal(stranger.use_begin(lease, token=Token(1, 99)))
-    assert (refused.code, refused.details) == ("stale_token", {}), "the right token is not given away"
+    assert (refused.code, refused.details) == ("stale_token", {}), (
+        "the right token is not given away"
+    )
 
 
 def test_nothing_that_is_said_to_others_holds_a_token() -> None:
@@ -85,6 +87,8 @@ def test_a_token_cannot_be_guessed_from_the_lease_id_or_from_another_token() -> 
     gaps = [second - first for first, second in pairwise(grown)]
     assert min(gaps) > 1000
     assert len(set(gaps)) == len(gaps)
-    assert grown == tokens(SECRET), "the same settings give the same tokens: a replay finds them again"
+    assert grown == tokens(SECRET), (
+        "the same settings give the same tokens: a replay finds them again"
+    )
     assert not set(grown) & set(tokens("17" * 16))
     assert max(grown) + 2**32 < 2**63

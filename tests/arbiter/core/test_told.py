@@ -5,13 +5,13 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.events import OperatorAsked, ProbeFailed
-from arbiter.core.lease import Lease
-from arbiter.core.recovery import spec_from_record
-from arbiter.testing.core_driver import START_S, CoreDriver, answer, refusal
-from arbiter.testing.scenes import Tree, held, order, sent_away
-from schemas import defaults as d
-from schemas.ids import LeaseId, ProcessKey, Token
+from tests.support.core_driver import START_S, CoreDriver, answer, refusal
+from tests.support.scenes import Tree, held, order, sent_away
+from vram_arbiter.arbiter.core.events import OperatorAsked, ProbeFailed
+from vram_arbiter.arbiter.core.model.lease import Lease
+from vram_arbiter.arbiter.core.requests.recovery import spec_from_record
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey, Token
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -32,7 +32,9 @@ def test_a_lease_as_it_is_shown(exclusive: bool, mode: str) -> None:
     person, lease = held(driver, "det", 2, exclusive=exclusive)
     view = driver.view(lease)
     assert view is not None
-    assert {key: view[key] for key in ("mode", "consumer", "model", "priority", "evictable", "uses")} == {
+    assert {
+        key: view[key] for key in ("mode", "consumer", "model", "priority", "evictable", "uses")
+    } == {
         "mode": mode,
         "consumer": "det",
         "model": "det-model",
@@ -62,7 +64,11 @@ def test_a_card_as_it_is_shown() -> None:
         "pressure_bytes": 0,
         "blocked": "",
     }
-    assert (process["name"], process["used_bytes"], process["charged_bytes"]) == ("det", 2 * GIB, 2 * GIB)
+    assert (process["name"], process["used_bytes"], process["charged_bytes"]) == (
+        "det",
+        2 * GIB,
+        2 * GIB,
+    )
 
 
 def test_why_of_a_resident_lease_asks_for_nothing() -> None:
@@ -133,7 +139,9 @@ def test_refusals_of_operators_say_why() -> None:
 
     def told(action: Any, target: LeaseId) -> str:
         return refusal(
-            driver.post(OperatorAsked(ops.client, driver.next_request(), action, target, "ops", "test"))
+            driver.post(
+                OperatorAsked(ops.client, driver.next_request(), action, target, "ops", "test")
+            )
         ).message
 
     assert told("release_dead", waiting) == f"{waiting} is queued: nobody holds it"
@@ -164,9 +172,14 @@ def test_a_line_of_sub_leases_that_is_too_long_says_which_number_it_would_be() -
     lease, token = None, None
     for n in range(d.SUBLEASE_DEPTH_MAX + 1):
         person = driver.consumer(f"p{n}")
-        effects = person.try_acquire((7 - n) * GIB, parent=None if lease is None else (lease, token))
+        effects = person.try_acquire(
+            (7 - n) * GIB, parent=None if lease is None else (lease, token)
+        )
         if n == d.SUBLEASE_DEPTH_MAX:
-            assert refusal(effects).message == f"a sub-lease of {lease} would be number {n + 1} of its line"
+            assert (
+                refusal(effects).message
+                == f"a sub-lease of {lease} would be number {n + 1} of its line"
+            )
             return
         lease = LeaseId(answer(effects)["lease"]["lease_id"])
         token = Token(*answer(effects)["lease"]["token"])
@@ -177,7 +190,9 @@ def test_a_parent_that_was_asked_to_leave_says_its_state() -> None:
     tree.policy.use_begin(tree.leaf)
     tree.driver.consumer("other").acquire(6 * GIB)
     tree.driver.until(lambda: tree.state(tree.root) == "revoking")
-    refused = refusal(tree.driver.consumer("late").try_acquire(GIB // 2, parent=(tree.root, tree.token)))
+    refused = refusal(
+        tree.driver.consumer("late").try_acquire(GIB // 2, parent=(tree.root, tree.token))
+    )
     assert (refused.code, refused.details["state"]) == ("lease_revoking", "revoking")
 
 
@@ -318,8 +333,12 @@ def test_a_record_holds_all_that_was_asked_for() -> None:
         "independent": True,
     }
     spec = det.spec(3 * GIB, 2 * GIB, **wishes)
-    same = sum(a == b for a, b in zip(astuple(spec), astuple(det.spec(1 * GIB, GIB // 2)), strict=True))
-    assert same == 3, "all differ from what they are by default but the consumer's name, parent and gang"
+    same = sum(
+        a == b for a, b in zip(astuple(spec), astuple(det.spec(1 * GIB, GIB // 2)), strict=True)
+    )
+    assert same == 3, (
+        "all differ from what they are by default but the consumer's name, parent and gang"
+    )
     lease = det.acquire(3 * GIB, 2 * GIB, **wishes)
     det.load(lease)
     record = driver.journal[f"lease:{lease}"]
@@ -369,7 +388,11 @@ def test_a_debt_keeps_the_context_of_a_living_process_over_a_restart() -> None:
     det.hold(450 * MIB)
     driver.advance(20.0)
     note = driver.notes("verified")[-1]
-    assert (note["lease_id"], note["verdict"], note["residue_bytes"]) == (lease, "verified", 450 * MIB)
+    assert (note["lease_id"], note["verdict"], note["residue_bytes"]) == (
+        lease,
+        "verified",
+        450 * MIB,
+    )
     assert driver.gpu()["charged_bytes"] == 450 * MIB
 
 

@@ -2,10 +2,10 @@
 
 import pytest
 
-from arbiter.core.effects import Push
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
-from schemas import defaults as d
-from schemas.ids import LeaseId
+from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from vram_arbiter.arbiter.core.effects import Push
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId
 
 GIB = d.GIB
 
@@ -32,7 +32,9 @@ def test_a_yielded_use_lets_the_holder_leave_before_the_job_has_ended(driver: Co
     effects = job.use_yield(lease)
     assert answer(effects)["uses"] == 0
     pushed = [e.body for e in effects if isinstance(e, Push)]
-    assert [(p["push"], p["uses"]) for p in pushed] == [("revoke", 0)], "it is told that it may unload"
+    assert [(p["push"], p["uses"]) for p in pushed] == [("revoke", 0)], (
+        "it is told that it may unload"
+    )
     assert driver.view(lease)["yielded"] == 1  # type: ignore[index]
     job.unload(lease)
     driver.until(lambda: driver.state(waiter) == "loading")
@@ -57,7 +59,9 @@ def test_beginning_a_yielded_use_again_resumes_it(driver: CoreDriver) -> None:
     assert refusal(job.unloading(lease)).code == "bad_state"
 
 
-def test_a_use_that_yielded_is_not_resumed_on_a_holder_that_was_asked_to_leave(driver: CoreDriver) -> None:
+def test_a_use_that_yielded_is_not_resumed_on_a_holder_that_was_asked_to_leave(
+    driver: CoreDriver,
+) -> None:
     job, lease = in_use(driver)
     job.use_yield(lease)
     driver.consumer("w").acquire(5 * GIB)
@@ -69,7 +73,9 @@ def test_a_use_that_yielded_is_not_resumed_on_a_holder_that_was_asked_to_leave(d
 def test_yielding_again_is_fine_and_yielding_what_is_not_there_is_not(driver: CoreDriver) -> None:
     job, lease = in_use(driver)
     stranger = driver.consumer("stranger")
-    assert refusal(stranger.use_yield(lease, "u1", job.token(lease))).code == "bad_state", "not its use"
+    assert refusal(stranger.use_yield(lease, "u1", job.token(lease))).code == "bad_state", (
+        "not its use"
+    )
     job.use_yield(lease)
     before = len(driver.notes("use_yielded"))
     assert answer(job.use_yield(lease))["uses"] == 0
@@ -79,7 +85,9 @@ def test_yielding_again_is_fine_and_yielding_what_is_not_there_is_not(driver: Co
     assert refusal(job.use_yield(lease)).code == "bad_state"
 
 
-def test_one_use_that_yields_beside_a_busy_one_changes_nothing_for_the_holder(driver: CoreDriver) -> None:
+def test_one_use_that_yields_beside_a_busy_one_changes_nothing_for_the_holder(
+    driver: CoreDriver,
+) -> None:
     job, lease = in_use(driver)
     job.use_begin(lease, "u2")
     driver.consumer("w").acquire(5 * GIB)

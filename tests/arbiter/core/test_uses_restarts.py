@@ -5,12 +5,12 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.effects import Effect, JournalPut, Reply
-from arbiter.core.events import ProcessDied, Resumed
-from arbiter.testing.core_driver import Consumer, CoreDriver, answer, refusal
-from arbiter.testing.scenes import Tree, held, shown
-from schemas import defaults as d
-from schemas.ids import LeaseId, Token
+from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.scenes import Tree, held, shown
+from vram_arbiter.arbiter.core.effects import Effect, JournalPut, Reply
+from vram_arbiter.arbiter.core.events import ProcessDied, Resumed
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, Token
 
 GIB, MIB = d.GIB, d.MIB
 PATIENCE_S = d.LEASE_TTL_S + d.FENCE_GRACE_S
@@ -27,14 +27,18 @@ def used(
     return sidecar, lease, sidecar.token(lease), runner
 
 
-def restarted(driver: CoreDriver, sidecar: Consumer, lease: LeaseId, token: Token, epoch: int = 2) -> None:
+def restarted(
+    driver: CoreDriver, sidecar: Consumer, lease: LeaseId, token: Token, epoch: int = 2
+) -> None:
     """The daemon is killed and started again. The holder comes back at once."""
     driver.restart(epoch=epoch)
     sidecar.connect()
     sidecar.reattach(lease, token)
 
 
-def live(driver: CoreDriver, sidecar: Consumer, lease: LeaseId, token: Token, seconds: float) -> None:
+def live(
+    driver: CoreDriver, sidecar: Consumer, lease: LeaseId, token: Token, seconds: float
+) -> None:
     """Time passes, and the holder renews its lease."""
     until = driver.now + seconds
     while driver.now < until:
@@ -54,7 +58,9 @@ def test_a_user_that_is_stopped_across_a_restart_keeps_its_holder() -> None:
     driver = CoreDriver(8 * GIB)
     sidecar, lease, token, runner = used(driver)
     restarted(driver, sidecar, lease, token)
-    assert driver.arbiter.status(driver.now)["phase"] == "serving", "nobody waits for the user to come back"
+    assert driver.arbiter.status(driver.now)["phase"] == "serving", (
+        "nobody waits for the user to come back"
+    )
     assert shown(driver, lease)["uses"] == 1
     vlm = driver.consumer("vlm").acquire(5 * GIB, priority=90)
     live(driver, sidecar, lease, token, PATIENCE_S - 1.0)
@@ -151,7 +157,9 @@ def test_a_holder_that_was_asked_and_is_used_is_not_taken_for_gone() -> None:
     restarted(driver, sidecar, lease, token)
     assert refusal(sidecar.unloading(lease)).details["uses"] == 1
     driver.consumer("watcher").use_begin(lease, "watch", token)
-    assert driver.journal[f"lease:{lease}"]["state"] == "revoking", "the next daemon has to know it too"
+    assert driver.journal[f"lease:{lease}"]["state"] == "revoking", (
+        "the next daemon has to know it too"
+    )
     restarted(driver, sidecar, lease, token, epoch=3)
     assert shown(driver, lease)["uses"] == 2
     driver.post(ProcessDied(runner.process))
@@ -170,7 +178,9 @@ def test_a_tree_is_in_use_while_a_stopped_user_has_one_of_it() -> None:
     driver.consumer("vlm").acquire(5 * GIB, priority=90)
     driver.advance(1.0)
     assert refusal(tree.policy.unloading(tree.leaf)).details["uses"] == 1
-    assert tree.state(tree.root) != "held" or tree.state(tree.leaf) == "held", "asked together or not at all"
+    assert tree.state(tree.root) != "held" or tree.state(tree.leaf) == "held", (
+        "asked together or not at all"
+    )
 
 
 def test_a_use_that_yields_after_a_restart_is_its_clients_own() -> None:
@@ -221,7 +231,9 @@ def test_one_use_of_each_other_process_is_written_before_it_is_answered() -> Non
     assert writes(runner.use_end(lease, "u2", token)) == []
     watcher = driver.consumer("watcher")
     assert writes(watcher.use_begin(lease, "w1", token)) == [["u1", "w1"]]
-    assert writes(runner.use_end(lease, "u1", token)) == [["u3", "w1"]], "another of its uses runs on"
+    assert writes(runner.use_end(lease, "u1", token)) == [["u3", "w1"]], (
+        "another of its uses runs on"
+    )
     assert writes(watcher.use_yield(lease, "w1", token)) == [["u3"]]
     assert writes(watcher.use_begin(lease, "w1", token)) == [["u3", "w1"]]
     assert writes(watcher.leave("dropped")) == [["u3"]]

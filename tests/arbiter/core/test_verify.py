@@ -4,12 +4,12 @@ import itertools
 
 import pytest
 
-from arbiter.core.effects import Sample
-from arbiter.core.events import MemorySampled, ProbeFailed, Tick
-from arbiter.testing.core_driver import READING_S, CoreDriver
-from arbiter.testing.scenes import held
-from schemas import defaults as d
-from schemas.ids import GpuId, ProcessKey
+from tests.support.core_driver import READING_S, CoreDriver
+from tests.support.scenes import held
+from vram_arbiter.arbiter.core.effects import Sample
+from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed, Tick
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import GpuId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 STRANGER = ProcessKey(9, 9)
@@ -35,7 +35,11 @@ def test_two_equal_readings_after_the_release_are_enough() -> None:
         "readings begin 2 ms apart, and the second one takes 1 ms"
     )
     (note,) = driver.notes("verified")
-    assert (note["verdict"], note["before_bytes"], note["after_bytes"]) == ("verified", 5 * GIB, 450 * MIB)
+    assert (note["verdict"], note["before_bytes"], note["after_bytes"]) == (
+        "verified",
+        5 * GIB,
+        450 * MIB,
+    )
     assert note["ms"] == pytest.approx(5.0, abs=0.001), "from the release on"
     assert driver.gpu()["charged_bytes"] == 450 * MIB
 
@@ -43,7 +47,9 @@ def test_two_equal_readings_after_the_release_are_enough() -> None:
 def pauses(driver: CoreDriver, began: float) -> list[float]:
     """Milliseconds between the readings that were asked for by a timer since then."""
     ticks = [at for at, event in driver.events if isinstance(event, Tick) and at >= began]
-    return [round(1e3 * (later - sooner), 3) for sooner, later in itertools.pairwise([began, *ticks])]
+    return [
+        round(1e3 * (later - sooner), 3) for sooner, later in itertools.pairwise([began, *ticks])
+    ]
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.001, 0.25, 0.7, 1.5, 1.99])
@@ -73,7 +79,9 @@ def test_readings_are_dense_while_memory_usually_comes_back_and_rarer_later() ->
 
 
 def test_a_consumer_that_is_known_to_take_longer_is_looked_at_densely_for_longer() -> None:
-    driver = CoreDriver(8 * GIB, settings={"learnt": {"det": {"verify_s": 4.0}}, "probe_period_s": 1000.0})
+    driver = CoreDriver(
+        8 * GIB, settings={"learnt": {"det": {"verify_s": 4.0}}, "probe_period_s": 1000.0}
+    )
     driver.card.lag_s = 4.2
     det, lease = held(driver, "det", 5)
     driver.advance(0.1)
@@ -182,7 +190,9 @@ def test_totals_alone_verify_by_what_the_lease_was_charged() -> None:
     driver.advance(1.0)
     b.unloading(second)
     c = driver.consumer("c")
-    third = c.acquire(1 * GIB)  # loads while b is measured: what it may take is allowed for once it has it
+    third = c.acquire(
+        1 * GIB
+    )  # loads while b is measured: what it may take is allowed for once it has it
     assert driver.state(third) == "loading"
     c.hold(1 * GIB)
     b.hold(0)
@@ -205,7 +215,9 @@ def test_what_a_load_has_not_taken_yet_hides_nobodys_bytes() -> None:
     driver.until(lambda: driver.state(second) == "loading")
     driver.card.lag_s = 3.0
     a.die()
-    assert driver.until(lambda: bool(driver.notes("verified")), step_s=0.001) == pytest.approx(3.0, abs=0.05)
+    assert driver.until(lambda: bool(driver.notes("verified")), step_s=0.001) == pytest.approx(
+        3.0, abs=0.05
+    )
     assert (driver.state(second), verdicts(driver)) == ("loading", [("verified", True)])
 
 
@@ -291,10 +303,15 @@ def test_others_that_grew_are_named_and_charged_as_stowaways() -> None:
     det.release(lease)
     driver.advance(11.0)
     assert verdicts(driver) == [("contested", True)]
-    assert driver.notes("verified")[0]["culprits"] == [{"pid": 9, "name": "browser", "bytes": 1 * GIB}]
+    assert driver.notes("verified")[0]["culprits"] == [
+        {"pid": 9, "name": "browser", "bytes": 1 * GIB}
+    ]
     assert driver.state(waiter) == "queued"
     assert driver.gpu()["stowaway_bytes"] == 1 * GIB
-    assert "browser (holds bytes without a lease)" in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
+    assert (
+        "browser (holds bytes without a lease)"
+        in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
+    )
     driver.card.set(STRANGER, 0, driver.now)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
 
@@ -339,7 +356,9 @@ def test_totals_alone_and_a_dead_process_end_contested_if_the_ledger_explains_th
     a.hold(2 * GIB)
     b.die()
     driver.advance(11.0)
-    assert verdicts(driver) == [("contested", True)], "a took what it is charged for; b cannot hold anything"
+    assert verdicts(driver) == [("contested", True)], (
+        "a took what it is charged for; b cannot hold anything"
+    )
     assert driver.gpu()["charged_bytes"] == 2 * GIB
     assert driver.state(first) == "held"
 
@@ -392,14 +411,18 @@ def test_a_failed_reading_of_an_unknown_card_is_ignored() -> None:
 
 
 # -- expiry ------------------------------------------------------------------------------------------------------------------
-def test_expired_bytes_stay_charged_until_measured_gone_and_not_before_the_holder_fences_itself() -> None:
+def test_expired_bytes_stay_charged_until_measured_gone_and_not_before_the_holder_fences_itself() -> (
+    None
+):
     driver = CoreDriver(8 * GIB)
     hung, lease = held(driver, "hung", 5, ttl_s=10.0, residue_bytes=450 * MIB)
     waiter = driver.consumer("w").acquire(5 * GIB)
     driver.advance(10.1)
     assert driver.state(lease) == "over"
     assert driver.notes("expired")[0]["consumer"] == "hung"
-    assert driver.pushes("lost", lease)[0]["error"]["message"] == f"{lease} was not renewed for 10 s"
+    assert (
+        driver.pushes("lost", lease)[0]["error"]["message"] == f"{lease} was not renewed for 10 s"
+    )
     hung.hold(450 * MIB)
     driver.advance(4.5)
     assert driver.state(waiter) == "queued", "it may still be loading until it fences itself"
@@ -437,7 +460,9 @@ def test_the_residue_of_a_process_that_left_unseen_is_forgotten() -> None:
     assert driver.gpu()["charged_bytes"] == 0
 
 
-def test_a_residue_of_a_process_that_is_listed_without_its_bytes_stays_until_the_card_shows_it_gone() -> None:
+def test_a_residue_of_a_process_that_is_listed_without_its_bytes_stays_until_the_card_shows_it_gone() -> (
+    None
+):
     """Regression: WSL2 lists processes without their bytes, and the next reading after the verdict took that for none."""
     driver = CoreDriver(8 * GIB)
     driver.card.knows_bytes = False
@@ -449,7 +474,9 @@ def test_a_residue_of_a_process_that_is_listed_without_its_bytes_stays_until_the
     assert verdicts(driver) == [("residue", True)]
     driver.advance(10.0)
     gpu = driver.gpu()
-    assert (gpu["charged_bytes"], gpu["stowaway_bytes"]) == (2 * GIB, 0), "charged once, to who let go"
+    assert (gpu["charged_bytes"], gpu["stowaway_bytes"]) == (2 * GIB, 0), (
+        "charged once, to who let go"
+    )
     det.hold(GIB)
     driver.advance(2.0)
     assert driver.gpu()["charged_bytes"] == GIB, "what came back later is free"

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 
-from arbiter.core.events import MemorySampled, ProcessUse
-from arbiter.testing.core_driver import Consumer, CoreDriver
-from arbiter.testing.scenes import held, hidden_card
-from schemas import defaults as d
-from schemas.ids import LeaseId, ProcessKey
+from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.scenes import held, hidden_card
+from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 BROWSER = ProcessKey(9, 9)
@@ -20,7 +20,9 @@ def verdicts(driver: CoreDriver) -> list[tuple[str, bool]]:
 
 
 @pytest.mark.parametrize("since", ["always", "late"])
-def test_a_living_holder_that_nobody_lists_is_charged_for_what_it_did_not_give_back(since: str) -> None:
+def test_a_living_holder_that_nobody_lists_is_charged_for_what_it_did_not_give_back(
+    since: str,
+) -> None:
     driver = CoreDriver(8 * GIB)
     if since == "always":
         driver.card.unlisted.add(ProcessKey(101, 707))
@@ -41,7 +43,9 @@ def test_a_living_holder_that_nobody_lists_is_charged_for_what_it_did_not_give_b
     )
     det.hold(450 * MIB)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
-    assert driver.gpu()["charged_bytes"] == 6 * GIB + 450 * MIB, "the total showed that it came back"
+    assert driver.gpu()["charged_bytes"] == 6 * GIB + 450 * MIB, (
+        "the total showed that it came back"
+    )
 
 
 def test_its_death_frees_what_it_kept() -> None:
@@ -112,7 +116,9 @@ def test_where_the_list_has_no_bytes_all_of_it_stays_charged() -> None:
     assert verdicts(driver) == [("residue", True)]
     assert driver.gpu()["charged_bytes"] == 5 * GIB
     driver.advance(30.0)
-    assert driver.gpu()["charged_bytes"] == 5 * GIB, "nor does it shrink by readings that cannot say"
+    assert driver.gpu()["charged_bytes"] == 5 * GIB, (
+        "nor does it shrink by readings that cannot say"
+    )
 
 
 def change_places(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
@@ -170,7 +176,9 @@ def test_what_another_holder_grew_by_right_hides_no_dead_one() -> None:
     det.die()
     other.hold(4 * GIB)
     driver.advance(14.0)
-    assert verdicts(driver) == [("contested", False)], "up to its charge it may grow: that was allowed for"
+    assert verdicts(driver) == [("contested", False)], (
+        "up to its charge it may grow: that was allowed for"
+    )
     driver.advance(2.0)
     assert verdicts(driver)[-1] == ("verified", True)
 
@@ -179,12 +187,17 @@ def test_a_process_that_is_known_by_its_pid_alone_is_no_stranger() -> None:
     driver = CoreDriver(8 * GIB)
     det, _ = held(driver, "det", 3)
     ledger = driver.arbiter._core.gpus[driver.card.gpu].ledger
-    assert ledger.booked_by(ProcessKey(det.process.pid, 0)) == ledger.booked_by(det.process) == 3 * GIB
+    assert (
+        ledger.booked_by(ProcessKey(det.process.pid, 0)) == ledger.booked_by(det.process) == 3 * GIB
+    )
     assert ledger.booked_by(BROWSER) == 0
     reading = driver.card.read(driver.now)
     assert isinstance(reading, MemorySampled)
     assert ledger.hidden_bytes(reading) == 0
-    assert ledger.hidden_bytes(replace(reading, processes=(ProcessUse(det.process, "det", None),))) is None
+    assert (
+        ledger.hidden_bytes(replace(reading, processes=(ProcessUse(det.process, "det", None),)))
+        is None
+    )
 
 
 # -- what the rule machines found by night -----------------------------------------------------------------------------------

@@ -3,11 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from arbiter.core import effects as fx
-from arbiter.core import events as ev
-from arbiter.host.executor import Executor
-from schemas.errors import JournalUnavailable
-from schemas.ids import ClientId, GpuId, ProcessKey, RequestId
+from vram_arbiter.arbiter.core import effects as fx
+from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.arbiter.host.executor import Executor
+from vram_arbiter.schemas.errors import JournalUnavailable
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
 
 A, ONE, GPU = ClientId("aa"), RequestId(1), GpuId("GPU-1")
 LEASE = {"lease_id": "L1-1", "state": "loading"}
@@ -19,7 +19,9 @@ class Recorder:
     def __init__(self) -> None:
         self.done: list[tuple[Any, ...]] = []
         self.disk_full = False
-        self.executor = Executor(self, self, self, self.sample, self.post, self.log_event, self.signal)
+        self.executor = Executor(
+            self, self, self, self.sample, self.post, self.log_event, self.signal
+        )
 
     def reply(self, client: ClientId, request: RequestId, body: Mapping[str, Any]) -> None:
         self.done.append(("reply", client, request, body))
@@ -160,7 +162,9 @@ def test_a_record_that_a_full_disk_could_not_delete_goes_with_the_next_write() -
     """Regression: it stayed for ever, and every restart recovered a lease that nobody had."""
     recorder = Recorder()
     recorder.disk_full = True
-    recorder.executor.perform([fx.JournalDelete("lease:L1-1"), fx.JournalDelete("residue:1@1:GPU-1")])
+    recorder.executor.perform(
+        [fx.JournalDelete("lease:L1-1"), fx.JournalDelete("residue:1@1:GPU-1")]
+    )
     recorder.disk_full = False
     recorder.executor.perform([fx.JournalPut("residue:1@1:GPU-1", {"a": 1})])
     recorder.executor.perform([fx.JournalDelete("lease:L1-2")])

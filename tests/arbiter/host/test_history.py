@@ -11,8 +11,8 @@ from typing import Any, cast
 
 import pytest
 
-from arbiter.host import history as module
-from arbiter.host.history import (
+from vram_arbiter.arbiter.host import history as module
+from vram_arbiter.arbiter.host.history import (
     BUFFER_MAX,
     CLEAN_END,
     QUESTIONS_MAX,
@@ -25,7 +25,10 @@ PATIENCE_S = 60.0
 
 
 def with_history(
-    folder: Path, test: Callable[[History], Awaitable[None]], max_events: int = 100_000, days: float = 7.0
+    folder: Path,
+    test: Callable[[History], Awaitable[None]],
+    max_events: int = 100_000,
+    days: float = 7.0,
 ) -> None:
     async def run() -> None:
         history = History.open(folder, max_events, days)
@@ -74,9 +77,15 @@ def test_numbering_goes_on_after_an_orderly_stop(tmp_path: Path) -> None:
     async def second(history: History) -> None:
         assert history.append("ready", {})["seq"] == 3
         events = (await read(history))["events"]
-        assert [(e["seq"], e["kind"]) for e in events] == [(1, "granted"), (2, CLEAN_END), (3, "ready")]
+        assert [(e["seq"], e["kind"]) for e in events] == [
+            (1, "granted"),
+            (2, CLEAN_END),
+            (3, "ready"),
+        ]
         assert events[0]["lease_id"] == "L1-1"
-        assert [e["seq"] for e in (await read(history, kinds=("granted", "nonsense")))["events"]] == [1]
+        assert [
+            e["seq"] for e in (await read(history, kinds=("granted", "nonsense")))["events"]
+        ] == [1]
 
     with_history(tmp_path, first)
     with_history(tmp_path, second)
@@ -99,7 +108,10 @@ def test_what_memory_no_longer_holds_is_found_on_disk(tmp_path: Path) -> None:
             history.append("odd" if number % 2 else "even", {"number": number})
         old = (await read(history, after=10, limit=3))["events"]
         assert [e["seq"] for e in old] == [11, 12, 13]
-        assert [e["number"] for e in (await read(history, kinds=("odd",), limit=2))["events"]] == [1, 3]
+        assert [e["number"] for e in (await read(history, kinds=("odd",), limit=2))["events"]] == [
+            1,
+            3,
+        ]
         assert len((await read(history, limit=5000))["events"]) == RING_EVENTS + 50
 
     with_history(tmp_path, test)
@@ -147,7 +159,9 @@ def test_a_wild_wall_clock_only_dates_events(tmp_path: Path) -> None:
     store.close()
 
 
-def test_a_clock_that_is_set_by_decades_does_not_empty_the_history_of_this_run(tmp_path: Path) -> None:
+def test_a_clock_that_is_set_by_decades_does_not_empty_the_history_of_this_run(
+    tmp_path: Path,
+) -> None:
     """Regression: a robot boots in 1970 and hears the time from the network; its morning was pruned as older than a week."""
     store = module._Store(tmp_path / "history.sqlite", 100_000, 7.0, time.time)
     assert store.last_seq() == 0
@@ -242,7 +256,9 @@ def test_who_asks_a_disk_that_hangs_hears_so_beyond_the_bound() -> None:
         assert await asyncio.to_thread(disk.hangs.wait, PATIENCE_S)
         for _ in range(QUESTIONS_MAX + 1):
             history.read(0, 1, (), answers.append)
-        assert [answer["problem"] for answer in answers] == ["the disk of the history does not answer"]
+        assert [answer["problem"] for answer in answers] == [
+            "the disk of the history does not answer"
+        ]
         disk.goes_on.set()
         async with asyncio.timeout(PATIENCE_S):
             while len(answers) <= QUESTIONS_MAX:
@@ -274,7 +290,9 @@ EVENT = "INSERT INTO events VALUES (?, 9e9, 'x', ?)"  # young enough to be kept
     "text",
     ["{", "[" * 100_000, "7", '{"seq": 1e999}', '{"n": ' + "9" * 5000 + "}", '{"n": ' + "9" * 30 + "}", b"\xff{}", '"\\ud800"'],
 )  # fmt: skip
-def test_an_event_that_cannot_be_read_does_not_hide_the_others(tmp_path: Path, text: str | bytes) -> None:
+def test_an_event_that_cannot_be_read_does_not_hide_the_others(
+    tmp_path: Path, text: str | bytes
+) -> None:
     """Regression: one of them ended the thread that reads and writes the history, and no question was answered again."""
     spoiled(tmp_path, EVENT, 3, text)
 

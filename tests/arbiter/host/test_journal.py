@@ -9,11 +9,14 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.events import DOUBT_KEY
-from arbiter.host.journal import AT_ONCE_MAX, Journal, Opened
-from schemas.errors import ConfigError, JournalUnavailable
+from vram_arbiter.arbiter.core.events import DOUBT_KEY
+from vram_arbiter.arbiter.host.journal import AT_ONCE_MAX, Journal, Opened
+from vram_arbiter.schemas.errors import ConfigError, JournalUnavailable
 
-RECORDS = {"lease:L1-1": {"token": [1, 2], "state": "held"}, "residue:7@9:GPU-1": {"residue_bytes": 5}}
+RECORDS = {
+    "lease:L1-1": {"token": [1, 2], "state": "held"},
+    "residue:7@9:GPU-1": {"residue_bytes": 5},
+}
 
 
 def filled(folder: Path, boot_id: str = "boot-1") -> int:
@@ -67,7 +70,9 @@ def test_a_commit_survives_kill_9(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["garbage", "torn", "schema", "table"])
-def test_a_corrupt_journal_is_put_aside_and_the_epoch_still_grows(tmp_path: Path, damage: str) -> None:
+def test_a_corrupt_journal_is_put_aside_and_the_epoch_still_grows(
+    tmp_path: Path, damage: str
+) -> None:
     epoch = filled(tmp_path)
     path = tmp_path / "journal.sqlite"
     match damage:
@@ -120,7 +125,11 @@ def test_records_that_nobody_understands_are_put_aside_in_the_same_epoch(tmp_pat
     journal.apply([("lease:L2-1", {})])
     journal.close()
     again = opened(tmp_path, at_least=0)
-    assert (set(again.records), again.doubt, again.epoch) == ({DOUBT_KEY, "lease:L2-1"}, "", epoch + 1)
+    assert (set(again.records), again.doubt, again.epoch) == (
+        {DOUBT_KEY, "lease:L2-1"},
+        "",
+        epoch + 1,
+    )
     assert "KeyError" in again.records[DOUBT_KEY]["why"], (
         "the doubt outlives a restart until the core deletes it"
     )
@@ -133,7 +142,10 @@ def test_what_was_learnt_survives_a_boot_and_nonsense_is_nothing(tmp_path: Path)
     journal.close()
     assert Journal.open(tmp_path, "boot-2").opened.learnt == {"detector": {"load_s": 2.5}}
     for nonsense in ("[1]", "{", '{"a": {"b": "c"}}', '{"a": 1}'):
-        edit(tmp_path / "journal.sqlite", f"UPDATE meta SET value = '{nonsense}' WHERE name = 'learnt'")
+        edit(
+            tmp_path / "journal.sqlite",
+            f"UPDATE meta SET value = '{nonsense}' WHERE name = 'learnt'",
+        )
         found = opened(tmp_path, "boot-2")
         assert (found.learnt, found.put_aside) == ({}, None)
 
@@ -150,7 +162,10 @@ def test_footprints_survive_a_boot_and_a_journal_that_is_put_aside(tmp_path: Pat
     assert journal.opened.footprints == kept, "for this run; it will be kept again"
     journal.close()
     for nonsense in ("[1]", "{", '{"a": {"b": "c"}}', '{"a": {"b": 1}}', '{"a": 1}'):
-        edit(tmp_path / "journal.sqlite", f"INSERT OR REPLACE INTO meta VALUES ('footprints', '{nonsense}')")
+        edit(
+            tmp_path / "journal.sqlite",
+            f"INSERT OR REPLACE INTO meta VALUES ('footprints', '{nonsense}')",
+        )
         found = opened(tmp_path, "boot-2")
         assert (found.footprints, found.put_aside) == ({}, None)
 

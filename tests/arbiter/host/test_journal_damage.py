@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from arbiter.core.events import DOUBT_KEY
-from arbiter.host.journal import Journal, Opened
-from arbiter.host.seal import EPOCH_MAX, Seal, fresh_epoch
-from schemas.errors import JournalUnavailable
+from vram_arbiter.arbiter.core.events import DOUBT_KEY
+from vram_arbiter.arbiter.host.journal import Journal, Opened
+from vram_arbiter.arbiter.host.seal import EPOCH_MAX, Seal, fresh_epoch
+from vram_arbiter.schemas.errors import JournalUnavailable
 
 DATABASE = "journal.sqlite"
 FRAME = 24 + 4096
@@ -150,14 +150,20 @@ def test_a_power_cut_is_not_doubted(tmp_path: Path, cut: str) -> None:
 
 def test_a_database_of_an_earlier_version_is_taken_over(tmp_path: Path) -> None:
     with contextlib.closing(sqlite3.connect(tmp_path / DATABASE)) as connection, connection:
-        connection.execute("CREATE TABLE meta (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID")
-        connection.execute("CREATE TABLE records (key TEXT PRIMARY KEY, json TEXT NOT NULL) WITHOUT ROWID")
+        connection.execute(
+            "CREATE TABLE meta (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID"
+        )
+        connection.execute(
+            "CREATE TABLE records (key TEXT PRIMARY KEY, json TEXT NOT NULL) WITHOUT ROWID"
+        )
         rows = [("schema", "1"), ("boot_id", "boot-1"), ("epoch", "7")]
         connection.executemany("INSERT INTO meta VALUES (?, ?)", rows)
         connection.execute("INSERT INTO records VALUES ('a', '{\"n\": 1}')")
     found = opened(tmp_path, at_least=0)
     assert (found.epoch, found.records["a"], found.put_aside) == (8, {"n": 1}, None)
-    assert found.doubt == "its seal is missing", "so the first start after an upgrade waits for its holders"
+    assert found.doubt == "its seal is missing", (
+        "so the first start after an upgrade waits for its holders"
+    )
     assert opened(tmp_path).records == found.records
 
 
@@ -192,7 +198,9 @@ BATCHES = st.lists(st.tuples(KEYS, st.none() | st.integers(0, 3)), min_size=1, m
 
 @settings(max_examples=8)
 @given(st.lists(BATCHES, min_size=1, max_size=4))
-def test_a_kill_at_any_instant_is_not_taken_for_damage(batches: list[list[tuple[str, int | None]]]) -> None:
+def test_a_kill_at_any_instant_is_not_taken_for_damage(
+    batches: list[list[tuple[str, int | None]]],
+) -> None:
     with watched() as folder:
         states: list[Records] = [{}]
         journal = Journal.open(folder, "boot-1", seals=Watched)
@@ -205,7 +213,9 @@ def test_a_kill_at_any_instant_is_not_taken_for_damage(batches: list[list[tuple[
                 if record is not None:
                     after[key] = record
             states.append(after)
-        started, *copies = Watched.copies[1:]  # before and after the start's own write, then four a commit
+        started, *copies = Watched.copies[
+            1:
+        ]  # before and after the start's own write, then four a commit
         assert opened(started).doubt == ""
         for index, copy in enumerate(copies):
             found = opened(copy)
@@ -248,7 +258,9 @@ class Failing(Seal):
 
 
 @settings(max_examples=15)
-@given(st.lists(BATCHES, min_size=1, max_size=6), st.sets(st.integers(2, 14), min_size=1, max_size=4))
+@given(
+    st.lists(BATCHES, min_size=1, max_size=6), st.sets(st.integers(2, 14), min_size=1, max_size=4)
+)
 def test_a_seal_that_cannot_be_written_stops_grants_and_nothing_else(
     batches: list[list[tuple[str, int | None]]], refused: set[int]
 ) -> None:
@@ -267,7 +279,9 @@ def test_a_seal_that_cannot_be_written_stops_grants_and_nothing_else(
                 assert before + 1 in refused
                 assert journal.problem
                 continue
-            assert bool(journal.problem) == (before + 2 in refused) or all(n is None for _, n in batch)
+            assert bool(journal.problem) == (before + 2 in refused) or all(
+                n is None for _, n in batch
+            )
             for key, record in changes:
                 made.pop(key, None)
                 if record is not None:
@@ -284,7 +298,9 @@ def test_a_seal_that_cannot_be_written_stops_grants_and_nothing_else(
 
 @pytest.mark.parametrize("doubted", [False, True])
 @pytest.mark.parametrize("boot_id", ["boot-1", "boot-2"])
-def test_a_kill_in_the_middle_of_a_start_changes_nothing(tmp_path: Path, boot_id: str, doubted: bool) -> None:
+def test_a_kill_in_the_middle_of_a_start_changes_nothing(
+    tmp_path: Path, boot_id: str, doubted: bool
+) -> None:
     """The second start is killed between its three writes; the third finds what the first left, and its doubt."""
     before = tmp_path / "before"
     killed(before, [{"a": {"n": 1}}])
@@ -327,7 +343,19 @@ def test_epochs_grow_while_the_clock_goes_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["9" * 5000, str(EPOCH_MAX + 1), "9" * 19, "-1", "", "12x", "١٢", "1e3", "\0", "7\n" + "x" * 300]
+    "text",
+    [
+        "9" * 5000,
+        str(EPOCH_MAX + 1),
+        "9" * 19,
+        "-1",
+        "",
+        "12x",
+        "١٢",
+        "1e3",
+        "\0",
+        "7\n" + "x" * 300,
+    ],
 )
 def test_an_epoch_that_cannot_be_is_put_aside(tmp_path: Path, text: str) -> None:
     """Regression: 5,000 digits ended every start in a traceback."""
@@ -357,7 +385,9 @@ def test_a_folder_that_forgot_the_last_start_is_doubted(tmp_path: Path) -> None:
         third = opened(copy, witness=second.witness, at_least=0)
         assert "older than the last start" in third.doubt
         assert third.epoch == second.epoch + 1
-    assert opened(tmp_path / "new", witness="x" * 300).doubt == "", "what says nothing is no witness"
+    assert opened(tmp_path / "new", witness="x" * 300).doubt == "", (
+        "what says nothing is no witness"
+    )
 
 
 FILES = ("journal.sqlite", "journal.sqlite-wal", "journal.seal", "epoch")
@@ -393,4 +423,6 @@ def test_damage_anywhere_in_a_file_is_doubted_or_harmless(
             path.unlink()
         found = opened(folder)
         assert found.doubt or found.records == records
-        assert all(records.get(key) == record for key, record in found.records.items() if key != DOUBT_KEY)
+        assert all(
+            records.get(key) == record for key, record in found.records.items() if key != DOUBT_KEY
+        )

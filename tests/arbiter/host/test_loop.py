@@ -6,8 +6,8 @@ import time
 
 import pytest
 
-from arbiter.host import loop as fine
-from arbiter.host.loop import FineSelector, new_loop
+from vram_arbiter.arbiter.host import loop as fine
+from vram_arbiter.arbiter.host.loop import FineSelector, new_loop
 
 WAIT_S = 0.0021
 TRIES = 200
@@ -44,7 +44,9 @@ def test_what_is_ready_ends_the_wait() -> None:
     os.close(writer)
 
 
-def test_a_descriptor_that_select_does_not_take_waits_as_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_descriptor_that_select_does_not_take_waits_as_ever(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(fine, "SELECT_FD_MAX", -1)
     with FineSelector() as selector:
         assert selector.select(0.001) == []

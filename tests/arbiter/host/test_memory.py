@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from arbiter.host.memory import available_bytes, park_budget_bytes
-from schemas.defaults import KIB
+from vram_arbiter.arbiter.host.memory import available_bytes, park_budget_bytes
+from vram_arbiter.schemas.defaults import KIB
 
 
 def test_half_of_what_is_available(tmp_path: Path) -> None:

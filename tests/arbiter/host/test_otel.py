@@ -14,16 +14,17 @@ from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from opentelemetry.sdk.trace.sampling import ALWAYS_OFF, ParentBased
 
-from arbiter.core.arbiter import Arbiter
-from arbiter.core.effects import Effect, Note, Push
-from arbiter.host import otel, otel_metrics
-from arbiter.host.otel import LeaseTelemetry
-from arbiter.host.otel_metrics import OTHERS, LeaseMetrics
-from arbiter.host.traced import Harmless
-from arbiter.testing.core_driver import START_S, CoreDriver
-from arbiter.testing.scenes import held, sent_away
-from schemas import defaults as d
-from schemas.ids import ProcessKey
+from tests.support.core_driver import START_S, CoreDriver
+from tests.support.scenes import held, sent_away
+from vram_arbiter.arbiter.core.arbiter import Arbiter
+from vram_arbiter.arbiter.core.effects import Effect, Note, Push
+from vram_arbiter.arbiter.host.telemetry import metrics as otel_metrics
+from vram_arbiter.arbiter.host.telemetry import spans as otel
+from vram_arbiter.arbiter.host.telemetry.metrics import OTHERS, LeaseMetrics
+from vram_arbiter.arbiter.host.telemetry.spans import LeaseTelemetry
+from vram_arbiter.arbiter.host.telemetry.traced import Harmless
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 WALL_S = 1.8e9
@@ -78,7 +79,9 @@ class Listener:
         data = self.reader.get_metrics_data()
         found: dict[tuple[str, ...], float] = {}
         for group in [] if data is None else data.resource_metrics:
-            for one in (m for scope in group.scope_metrics for m in scope.metrics if m.name == metric):
+            for one in (
+                m for scope in group.scope_metrics for m in scope.metrics if m.name == metric
+            ):
                 for point in one.data.data_points:
                     value = point.sum if hasattr(point, "sum") else point.value
                     found[tuple(str(v) for v in point.attributes.values())] = value
@@ -147,7 +150,11 @@ def test_a_handover_is_one_trace_with_every_part_of_it(driver: CoreDriver, heard
     policy.load(wanted)
 
     acquire, queue = heard.span("lease.acquire"), heard.span("lease.queue")
-    evict, verify, load = heard.span("lease.evict"), heard.span("lease.verify"), heard.span("lease.load")
+    evict, verify, load = (
+        heard.span("lease.evict"),
+        heard.span("lease.verify"),
+        heard.span("lease.load"),
+    )
     assert len(heard.spans()) == 5
     assert {span.context.trace_id for span in heard.spans()} == {int(TRACE, 16)}
     assert {parent_of(span) for span in (queue, evict, load)} == {acquire.context.span_id}
@@ -183,7 +190,10 @@ def test_every_victim_has_a_span_of_its_own(driver: CoreDriver, heard: Listener)
         driver.until(lambda lease=lease: driver.state(lease) == "revoking")
         person.unload(lease)
     driver.until(lambda: driver.state(wanted) == "loading")
-    assert {span.attributes["vram.consumer"] for span in heard.spans("lease.evict")} == {"one", "two"}
+    assert {span.attributes["vram.consumer"] for span in heard.spans("lease.evict")} == {
+        "one",
+        "two",
+    }
     assert len({parent_of(span) for span in heard.spans("lease.evict")}) == 1
 
 
@@ -206,7 +216,9 @@ def test_a_wait_that_ends_without_a_grant_ends_its_spans(
     assert [queue.name, acquire.name] == ["lease.queue", "lease.acquire"]
     word = "wait_timeout" if how == "timeout" else "cancelled"
     assert str(failed(acquire)).startswith(word)
-    assert heard.numbers("vram.lease.denials") == ({("wait_timeout",): 1} if how == "timeout" else {})
+    assert heard.numbers("vram.lease.denials") == (
+        {("wait_timeout",): 1} if how == "timeout" else {}
+    )
     assert seconds(acquire) == pytest.approx(2.0 if how == "timeout" else 1.0, abs=0.01)
     det.use_end(lease)
     det.unload(lease)  # who was asked leaves all the same
@@ -234,7 +246,9 @@ def test_what_is_refused_and_told_counts_once(driver: CoreDriver, heard: Listene
     assert {str(failed(span)).partition(":")[0] for span in heard.spans()} == {"vram_insufficient"}
 
 
-def test_a_holder_that_dies_while_it_loads_fails_its_spans(driver: CoreDriver, heard: Listener) -> None:
+def test_a_holder_that_dies_while_it_loads_fails_its_spans(
+    driver: CoreDriver, heard: Listener
+) -> None:
     det = driver.consumer("det")
     lease = det.acquire(2 * GIB)
     det.die()
@@ -259,7 +273,9 @@ def test_a_victim_that_is_lost_fails_its_eviction(driver: CoreDriver, heard: Lis
     assert evict.attributes["vram.verdict"] == "verified"
 
 
-def test_a_lease_that_leaves_by_itself_points_to_its_acquirer(driver: CoreDriver, heard: Listener) -> None:
+def test_a_lease_that_leaves_by_itself_points_to_its_acquirer(
+    driver: CoreDriver, heard: Listener
+) -> None:
     det = driver.consumer("det")
     det.traceparent = HERS
     lease = det.acquire(2 * GIB)
@@ -294,7 +310,9 @@ def test_a_return_from_standby_is_a_trace_of_its_own(driver: CoreDriver, heard: 
     assert len(heard_before.spans("lease.queue")) == 1, "the policy's"
 
 
-def test_a_lease_that_is_lost_while_away_leaves_nothing_open(driver: CoreDriver, heard: Listener) -> None:
+def test_a_lease_that_is_lost_while_away_leaves_nothing_open(
+    driver: CoreDriver, heard: Listener
+) -> None:
     det, lease, _, _ = sent_away(driver)
     count = len(heard.spans())
     det.die()
@@ -303,7 +321,9 @@ def test_a_lease_that_is_lost_while_away_leaves_nothing_open(driver: CoreDriver,
     assert len(heard.spans()) == count
 
 
-def test_a_growth_is_an_acquire_until_the_lease_has_its_new_size(driver: CoreDriver, heard: Listener) -> None:
+def test_a_growth_is_an_acquire_until_the_lease_has_its_new_size(
+    driver: CoreDriver, heard: Listener
+) -> None:
     det, lease = held(driver, "det", 2)
     vlm, other = held(driver, "vlm", 5)
     heard.exporter.clear()
@@ -322,8 +342,12 @@ def test_a_growth_is_an_acquire_until_the_lease_has_its_new_size(driver: CoreDri
     }
 
 
-def test_an_unresolved_verdict_is_an_event_of_its_verification(driver: CoreDriver, heard: Listener) -> None:
-    driver.card.lag_s = 15.0  # the driver lists a dead process for longer than a verification takes its time
+def test_an_unresolved_verdict_is_an_event_of_its_verification(
+    driver: CoreDriver, heard: Listener
+) -> None:
+    driver.card.lag_s = (
+        15.0  # the driver lists a dead process for longer than a verification takes its time
+    )
     det, _ = held(driver, "det", 5)
     wanted = driver.consumer("policy").acquire(5 * GIB)
     det.die()
@@ -363,14 +387,18 @@ def test_the_daemons_end_ends_every_span(driver: CoreDriver, heard: Listener) ->
     assert len(heard.spans()) == 5
 
 
-def test_open_spans_are_bounded(driver: CoreDriver, heard: Listener, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open_spans_are_bounded(
+    driver: CoreDriver, heard: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(otel, "OPEN_MAX", 3)
     held(driver, "det", 6)
     heard.exporter.clear()
     for number in range(8):
         driver.consumer(f"w{number}").acquire(6 * GIB)
     gone = heard.spans("lease.acquire")
-    assert [span.attributes["vram.consumer"] for span in gone] == [f"w{number}" for number in range(5)]
+    assert [span.attributes["vram.consumer"] for span in gone] == [
+        f"w{number}" for number in range(5)
+    ]
     assert {failed(span) for span in gone} == {"too many spans are open"}
 
 
@@ -403,7 +431,9 @@ def test_a_malformed_traceparent_begins_a_trace(driver: CoreDriver, heard: Liste
     assert heard.span("lease.verify").links == ()
 
 
-def test_lines_of_the_log_name_the_span_that_they_belong_to(driver: CoreDriver, heard: Listener) -> None:
+def test_lines_of_the_log_name_the_span_that_they_belong_to(
+    driver: CoreDriver, heard: Listener
+) -> None:
     det = driver.consumer("det")
     det.traceparent = HERS
     lease = det.acquire(5 * GIB)
@@ -443,7 +473,9 @@ def test_whatever_happens_spans_end_and_nest(busy: CoreDriver) -> None:
     states = {view["lease_id"]: view["state"] for view in engine.status(busy.now)["leases"]}
     measured = {v.lease for gpu in engine._core.gpus.values() for v in gpu.verifications.values()}
     assert {states.get(lease) for lease in heard.telemetry._acquires} <= {"queued", "loading"}
-    on_its_way = {lease for lease, state in states.items() if state in ("revoking", "unloading", "verifying")}
+    on_its_way = {
+        lease for lease, state in states.items() if state in ("revoking", "unloading", "verifying")
+    }
     assert set(heard.telemetry._leaving) <= on_its_way | measured
     heard.telemetry.close()
     spans = heard.spans()
@@ -552,10 +584,16 @@ def test_the_sum_over_consumers_is_what_the_gpu_holds(
     heard.metrics.watch(ticks, lambda: figures_of(driver))  # type: ignore[arg-type]
     by_consumer = heard.numbers("vram.gpu.measured")
     assert ("GPU-0", "") not in by_consumer
-    assert sum(by_consumer.values()) == heard.numbers("vram.gpu.used")[("GPU-0",)] == 2 * GIB + 300 * MIB
+    assert (
+        sum(by_consumer.values())
+        == heard.numbers("vram.gpu.used")[("GPU-0",)]
+        == 2 * GIB + 300 * MIB
+    )
 
 
-def test_the_health_of_the_daemon_in_numbers(driver: CoreDriver, heard: Listener, ticks: Ticks) -> None:
+def test_the_health_of_the_daemon_in_numbers(
+    driver: CoreDriver, heard: Listener, ticks: Ticks
+) -> None:
     heard.metrics.watch(ticks, lambda: figures_of(driver))  # type: ignore[arg-type]
     heard.telemetry.wrote(0.002, failed=False)
     heard.telemetry.wrote(0.1, failed=True)
@@ -569,7 +607,9 @@ def test_the_health_of_the_daemon_in_numbers(driver: CoreDriver, heard: Listener
     assert heard.numbers("vram.gpu.reading_age")[("GPU-0",)] == pytest.approx(3.0, abs=0.1)
 
 
-def test_names_that_clients_invent_do_not_grow_the_metrics(heard: Listener, driver: CoreDriver) -> None:
+def test_names_that_clients_invent_do_not_grow_the_metrics(
+    heard: Listener, driver: CoreDriver
+) -> None:
     for number in range(otel_metrics.CONSUMERS_MAX + 5):
         person = driver.consumer(f"c{number}")
         lease = person.acquire(MIB)
@@ -581,7 +621,9 @@ def test_names_that_clients_invent_do_not_grow_the_metrics(heard: Listener, driv
     assert grants[(OTHERS,)] == 5
 
 
-def test_a_defect_in_telemetry_is_said_once_and_stops_nothing(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_defect_in_telemetry_is_said_once_and_stops_nothing(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     class Broken(LeaseTelemetry):
         def _fail(self, *_: Any) -> Any:
             raise KeyError("a fact that nobody thought of")

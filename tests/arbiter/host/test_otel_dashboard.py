@@ -16,13 +16,13 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-from arbiter.core.effects import Note, Push
-from arbiter.host.otel import LeaseTelemetry
-from arbiter.host.otel_metrics import LeaseMetrics
-from arbiter.testing.core_driver import CoreDriver
-from arbiter.testing.scenes import sent_away
-from schemas import defaults as d
-from schemas import telemetry as names
+from tests.support.core_driver import CoreDriver
+from tests.support.scenes import sent_away
+from vram_arbiter.arbiter.core.effects import Note, Push
+from vram_arbiter.arbiter.host.telemetry.metrics import LeaseMetrics
+from vram_arbiter.arbiter.host.telemetry.spans import LeaseTelemetry
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.runtime.telemetry import names as names
 
 GUIDE = Path(__file__).parents[3] / "docs" / "operating.md"
 DASHBOARD = Path(__file__).parents[3] / "configs" / "grafana" / "arbiter.json"
@@ -76,13 +76,19 @@ def test_every_curve_exists(expression: str, exported: dict[str, set[str]]) -> N
 
 def test_every_metric_has_a_panel(exported: dict[str, set[str]]) -> None:
     shown = " ".join(expressions())
-    own = {re.sub(r"_(bucket|count|sum|total)$", "", name) for name in exported if name.startswith("vram_")}
+    own = {
+        re.sub(r"_(bucket|count|sum|total)$", "", name)
+        for name in exported
+        if name.startswith("vram_")
+    }
     assert {name for name in own if name not in shown} == set()
 
 
 def test_the_operators_guide_names_the_metrics_that_there_are() -> None:
     """A metric that is only written down makes an alert that never fires."""
-    documented = re.search(r"^Metrics of the programs.*?(?=^\*\*Logs)", GUIDE.read_text(), re.M | re.S)
+    documented = re.search(
+        r"^Metrics of the programs.*?(?=^\*\*Logs)", GUIDE.read_text(), re.M | re.S
+    )
     assert documented
     named = set(re.findall(r"`(vram\.[a-z_.]+)`", documented[0]))
     assert named == {value for key, value in vars(names).items() if key.startswith("METRIC_")}

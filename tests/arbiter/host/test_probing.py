@@ -9,12 +9,12 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
-from arbiter.core import events as ev
-from arbiter.host.gpu.probe import Card, Reading
-from arbiter.host.probing import Prober, within
-from arbiter.host.tree import Known, read_kin
-from schemas.errors import NoGpu, ProbeFailed
-from schemas.ids import GpuId, ProcessKey
+from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.arbiter.host.gpu.probe import Card, Reading
+from vram_arbiter.arbiter.host.prober import Prober, within
+from vram_arbiter.arbiter.host.process_tree import Known, read_kin
+from vram_arbiter.schemas.errors import NoGpu, ProbeFailed
+from vram_arbiter.schemas.ids import GpuId, ProcessKey
 
 GPU = GpuId("GPU-1")
 PATIENCE_S = 60.0
@@ -56,7 +56,9 @@ def probing(
     async def run() -> None:
         probe = ScriptedProbe()
         posted: asyncio.Queue[ev.Event] = asyncio.Queue()
-        prober = Prober(probe, [GPU], deadline_s, asyncio.get_running_loop(), posted.put_nowait, known)
+        prober = Prober(
+            probe, [GPU], deadline_s, asyncio.get_running_loop(), posted.put_nowait, known
+        )
         async with asyncio.timeout(PATIENCE_S):
             await test(prober, probe, posted)
         prober.close()
@@ -80,7 +82,12 @@ def test_a_reading_is_stamped_with_the_time_before_it_began() -> None:
         event = await posted.get()
         assert isinstance(event, ev.MemorySampled)
         assert asked_at <= event.taken_at <= began_at
-        assert (event.gpu, event.used_bytes, event.total_bytes, event.processes) == (GPU, 40, 100, ())
+        assert (event.gpu, event.used_bytes, event.total_bytes, event.processes) == (
+            GPU,
+            40,
+            100,
+            (),
+        )
 
     probing(test)
 
@@ -109,9 +116,14 @@ def test_a_question_after_the_reading_began_gets_a_fresh_reading_and_many_share_
 
 @pytest.mark.parametrize(
     ("error", "reason"),
-    [(ProbeFailed("driver says no"), "driver says no"), (ZeroDivisionError("x"), "ZeroDivisionError: x")],
+    [
+        (ProbeFailed("driver says no"), "driver says no"),
+        (ZeroDivisionError("x"), "ZeroDivisionError: x"),
+    ],
 )
-def test_a_failing_reading_is_unknown_and_the_next_one_is_tried(error: Exception, reason: str) -> None:
+def test_a_failing_reading_is_unknown_and_the_next_one_is_tried(
+    error: Exception, reason: str
+) -> None:
     async def test(prober: Prober, probe: ScriptedProbe, posted: Posted) -> None:
         prober.sample(GPU)
         probe.answers.put(error)
@@ -139,7 +151,9 @@ def test_a_hanging_reading_is_unknown_until_a_fresh_one_answers() -> None:
         assert "hangs since" in event.reason
         assert probe.calls == 1, "no second call into a driver that hangs"
         for reader in prober._readers.values():
-            reader._deadline_s = PATIENCE_S  # from here on nothing hangs, however slow this machine is
+            reader._deadline_s = (
+                PATIENCE_S  # from here on nothing hangs, however slow this machine is
+            )
         probe.answers.put(Reading(1, 100, ()))  # the late answer
         await began(probe)
         assert posted.empty(), "it is as old as its question: not used"

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from arbiter.core.arbiter import Arbiter
-from arbiter.host import recorder as module
-from arbiter.host.recorder import Recorder, freezer
-from arbiter.replay import runner
-from arbiter.replay.logfile import FOLDER, LogError, header_line
-from arbiter.testing.core_driver import START_S, CoreDriver
-from schemas import defaults as d
+from tests.support.core_driver import START_S, CoreDriver
+from vram_arbiter.arbiter.core.arbiter import Arbiter
+from vram_arbiter.arbiter.eventlog import replay as runner
+from vram_arbiter.arbiter.eventlog import writer as module
+from vram_arbiter.arbiter.eventlog.logfile import FOLDER, LogError, header_line
+from vram_arbiter.arbiter.eventlog.writer import Recorder, freezer
+from vram_arbiter.schemas import defaults as d
 
 PATIENCE_S = 60.0
 KIB = d.KIB
@@ -157,7 +157,9 @@ def test_a_state_that_is_larger_than_a_file_does_not_begin_a_new_one_at_every_ev
         recorded.recorder.close()
         files = recorded.files()
         assert 2 < len(files) < count / 20
-        assert all(path.stat().st_size >= 200 * KIB for path in files[:-1]), "as much again as the state took"
+        assert all(path.stat().st_size >= 200 * KIB for path in files[:-1]), (
+            "as much again as the state took"
+        )
         assert max(sizes) <= 1024 * KIB
         assert recorded.replayed().identical
 

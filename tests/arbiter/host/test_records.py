@@ -16,19 +16,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from arbiter.core.arbiter import Arbiter
-from arbiter.core.effects import JournalPut
-from arbiter.core.events import DOUBT_KEY, MemorySampled, Recovered, Tick
-from arbiter.core.settings import Settings
-from arbiter.daemon import processes_of, try_records
-from arbiter.host.journal import Journal, Opened
-from arbiter.host.records import LeaseRecord, check_record
-from arbiter.host.seal import digest
-from arbiter.rpc import codec
-from arbiter.testing.busy import busy_driver
-from arbiter.testing.core_driver import CoreDriver
-from arbiter.testing.scenes import Tree, sent_away
-from schemas import defaults as d
+from tests.support.busy import busy_driver
+from tests.support.core_driver import CoreDriver
+from tests.support.scenes import Tree, sent_away
+from vram_arbiter.arbiter.core.arbiter import Arbiter
+from vram_arbiter.arbiter.core.effects import JournalPut
+from vram_arbiter.arbiter.core.events import DOUBT_KEY, MemorySampled, Recovered, Tick
+from vram_arbiter.arbiter.core.settings import Settings
+from vram_arbiter.arbiter.daemon import processes_of, try_records
+from vram_arbiter.arbiter.host.journal import Journal, Opened
+from vram_arbiter.arbiter.host.records import LeaseRecord, check_record
+from vram_arbiter.arbiter.host.seal import digest
+from vram_arbiter.arbiter.rpc import codec
+from vram_arbiter.schemas import defaults as d
 
 Records = dict[str, dict[str, Any]]
 STARTED_S = 1000.0
@@ -52,7 +52,10 @@ def start(settings: Settings, texts: dict[str, str]) -> Opened:
     """As the daemon does it, with an hour of work afterwards. Raises nothing, whatever the records say."""
     with tempfile.TemporaryDirectory(prefix="va", dir="/dev/shm") as root:
         Journal.open(Path(root), "boot").close()
-        with contextlib.closing(sqlite3.connect(Path(root) / "journal.sqlite")) as connection, connection:
+        with (
+            contextlib.closing(sqlite3.connect(Path(root) / "journal.sqlite")) as connection,
+            connection,
+        ):
             rows = [(key, text, digest(key, text)) for key, text in texts.items()]
             connection.executemany("INSERT INTO records VALUES (?, ?, ?)", rows)
         journal = Journal.open(Path(root), "boot", check=check_record)
@@ -79,7 +82,13 @@ def texts_of(records: Records) -> dict[str, str]:
 def paths(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """The way to each value in a record."""
     found = [path] if path else []
-    parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    parts = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     for key, part in parts:
         found += paths(part, (*path, key))
     return found
@@ -99,7 +108,9 @@ def test_what_the_core_writes_is_taken(index: int) -> None:
         if key.startswith("lease:"):
             assert set(record) <= set(LeaseRecord.model_fields), "a field that no model checks"
     opened = start(settings, texts_of(records))
-    assert set(opened.records) == {*records, DOUBT_KEY}, "planted behind the seal's back, so in doubt"
+    assert set(opened.records) == {*records, DOUBT_KEY}, (
+        "planted behind the seal's back, so in doubt"
+    )
     assert opened.put_aside is None
 
 
@@ -116,7 +127,9 @@ def test_a_record_with_a_value_that_cannot_be_is_put_aside_or_harmless(
     settings, records = written()[index]
     records = copy.deepcopy(records)
     changed = set()
-    for key in data.draw(st.lists(st.sampled_from(sorted(records)), min_size=1, max_size=3, unique=True)):
+    for key in data.draw(
+        st.lists(st.sampled_from(sorted(records)), min_size=1, max_size=3, unique=True)
+    ):
         *way, last = data.draw(st.sampled_from(paths(records[key])))
         place: Any = records[key]
         for part in way:
@@ -139,7 +152,10 @@ def test_a_record_with_a_value_that_cannot_be_is_put_aside_or_harmless(
         ("lease:L1-1", "null"),
         ("lease:L1-1", '{"pid": 1, "pid": 2}'),
         ("residue:1@1:GPU", '{"pid":1099511627776,"start_ticks":1,"gpu":"g","residue_bytes":1}'),
-        ("residue:1@1:GPU", '{"pid":1,"start_ticks":1,"gpu":"g","residue_bytes":1' + "0" * 30 + "}"),
+        (
+            "residue:1@1:GPU",
+            '{"pid":1,"start_ticks":1,"gpu":"g","residue_bytes":1' + "0" * 30 + "}",
+        ),
         ("drain", '{"by":1,"reason":[]}'),
         ("doubt", "{}"),
         ("", "{}"),

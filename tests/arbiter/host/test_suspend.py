@@ -1,6 +1,6 @@
 """A suspend is what CLOCK_BOOTTIME saw and CLOCK_MONOTONIC did not. The clocks are the test's."""
 
-from arbiter.host.suspend import NOTICED_S, SuspendWatch
+from vram_arbiter.arbiter.host.suspend import NOTICED_S, SuspendWatch
 
 
 class Clocks:
@@ -41,7 +41,9 @@ def test_naps_add_up() -> None:
         clocks.lead_s += NOTICED_S * 0.3
         told.append(watching.slept_s())
     assert 0.0 in told
-    assert abs(sum(told) - NOTICED_S * 2.4) < 1e-6, "what is below the threshold is kept, not forgotten"
+    assert abs(sum(told) - NOTICED_S * 2.4) < 1e-6, (
+        "what is below the threshold is kept, not forgotten"
+    )
 
 
 def test_a_process_that_was_held_up_did_not_sleep() -> None:

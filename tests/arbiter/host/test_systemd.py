@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.host.systemd import Notifier
+from vram_arbiter.arbiter.host.systemd import Notifier
 
 
 @pytest.fixture

@@ -6,9 +6,17 @@ import sys
 
 import pytest
 
-from arbiter.core.events import ProcessUse
-from arbiter.host.tree import DEPTH_MAX, NAME_MAX, Kin, Known, Lineages, on_owners, read_kin
-from schemas.ids import ProcessKey
+from vram_arbiter.arbiter.core.events import ProcessUse
+from vram_arbiter.arbiter.host.process_tree import (
+    DEPTH_MAX,
+    NAME_MAX,
+    Kin,
+    Known,
+    Lineages,
+    on_owners,
+    read_kin,
+)
+from vram_arbiter.schemas.ids import ProcessKey
 
 
 def key(pid: int) -> ProcessKey:
@@ -29,11 +37,18 @@ class Proc:
 
     def __init__(self) -> None:
         self.kin = {1: Kin(key(1), 0, "init")}
-        for pid, parent, name in ((20, 1, "bash"), (30, 20, "vramctl"), (40, 30, "sh"), (50, 40, "python")):
+        for pid, parent, name in (
+            (20, 1, "bash"),
+            (30, 20, "vramctl"),
+            (40, 30, "sh"),
+            (50, 40, "python"),
+        ):
             self.add(pid, parent, name)
 
     def add(self, pid: int, parent: int, name: str, start_ticks: int | None = None) -> None:
-        self.kin[pid] = Kin(ProcessKey(pid, 10 * pid if start_ticks is None else start_ticks), parent, name)
+        self.kin[pid] = Kin(
+            ProcessKey(pid, 10 * pid if start_ticks is None else start_ticks), parent, name
+        )
 
     def book(self, who: Known, *uses: ProcessUse) -> tuple[ProcessUse, ...]:
         return on_owners(uses, Lineages(self.kin.get).trace(uses), who)
@@ -64,7 +79,9 @@ def test_a_child_without_a_name_adds_none() -> None:
 
 
 def test_bytes_that_the_driver_does_not_say_make_the_sum_unknown() -> None:
-    assert Proc().book(known((30,)), use(40, 2), use(50, None)) == (use(30, None, "vramctl (python)"),)
+    assert Proc().book(known((30,)), use(40, 2), use(50, None)) == (
+        use(30, None, "vramctl (python)"),
+    )
 
 
 def test_a_child_with_a_lease_or_a_connection_of_its_own_keeps_its_bytes() -> None:
@@ -108,7 +125,9 @@ def test_an_orphan_is_a_stowaway() -> None:
 
 
 @pytest.mark.parametrize("listed", [key(40), ProcessKey(40, 0)])
-def test_who_dies_between_the_reading_and_the_tracing_belongs_where_it_did(listed: ProcessKey) -> None:
+def test_who_dies_between_the_reading_and_the_tracing_belongs_where_it_did(
+    listed: ProcessKey,
+) -> None:
     proc = Proc()
     lineages = Lineages(proc.kin.get)
     lineages.trace([use(40, 3)])
@@ -117,7 +136,9 @@ def test_who_dies_between_the_reading_and_the_tracing_belongs_where_it_did(liste
     for _ in range(2):
         assert on_owners([left], lineages.trace([left]), known((30,)))[0].process == key(30)
     lineages.trace([])
-    assert on_owners([left], lineages.trace([left]), known((30,))) == (left,), "remembered for one reading"
+    assert on_owners([left], lineages.trace([left]), known((30,))) == (left,), (
+        "remembered for one reading"
+    )
 
 
 def test_somebody_else_with_the_pid_of_the_dead_inherits_nothing() -> None:

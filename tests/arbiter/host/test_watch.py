@@ -10,9 +10,9 @@ from collections.abc import Awaitable, Callable, Iterator
 
 import pytest
 
-from arbiter.host.watch import ProcessWatch
-from schemas.ids import ProcessKey
-from schemas.runtime.peercred import start_ticks
+from vram_arbiter.arbiter.host.process_watch import ProcessWatch
+from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime.peercred import start_ticks
 
 PATIENCE_S = 60.0
 
@@ -24,7 +24,9 @@ def children() -> Iterator[Callable[[], "subprocess.Popen[bytes]"]]:
 
     def make() -> "subprocess.Popen[bytes]":
         made.append(
-            subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE)
+            subprocess.Popen(
+                [sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE
+            )
         )
         return made[-1]
 
@@ -84,7 +86,9 @@ def test_a_process_is_watched_by_the_descriptor_of_its_connection(
     watching(test)
 
 
-def test_a_process_that_is_dropped_is_not_reported(children: Callable[[], "subprocess.Popen[bytes]"]) -> None:
+def test_a_process_that_is_dropped_is_not_reported(
+    children: Callable[[], "subprocess.Popen[bytes]"],
+) -> None:
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
         dropped, other = children(), children()
         before = watched()
@@ -151,7 +155,9 @@ def test_a_reused_pid_is_the_death_of_the_one_that_was_meant(
     watching(test)
 
 
-def test_an_unknown_start_time_is_watched_by_pid(children: Callable[[], "subprocess.Popen[bytes]"]) -> None:
+def test_an_unknown_start_time_is_watched_by_pid(
+    children: Callable[[], "subprocess.Popen[bytes]"],
+) -> None:
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
         child = children()
         watch.add(ProcessKey(child.pid, 0))
@@ -215,7 +221,9 @@ def test_whoever_is_not_watched_or_not_surely_known_gets_no_signal(
     assert child.wait(PATIENCE_S) == -signal.SIGKILL
 
 
-def test_a_signal_that_comes_too_late_is_no_error(children: Callable[[], "subprocess.Popen[bytes]"]) -> None:
+def test_a_signal_that_comes_too_late_is_no_error(
+    children: Callable[[], "subprocess.Popen[bytes]"],
+) -> None:
     child = children()
 
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:

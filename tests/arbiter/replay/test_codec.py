@@ -7,12 +7,20 @@ from typing import Any, NewType, get_args, get_origin, get_type_hints
 
 import pytest
 
-from arbiter.core.effects import JournalDelete, Note, Push, Reply, Sample
-from arbiter.core.events import AcquireRequested, Event, Tick
-from arbiter.core.settings import GpuInfo, Settings
-from arbiter.replay.codec import CodecError, decode, decode_event, digest, event_types, summary, to_json
-from arbiter.testing.core_driver import CoreDriver
-from schemas.ids import ClientId, GpuId, RequestId
+from tests.support.core_driver import CoreDriver
+from vram_arbiter.arbiter.core.effects import JournalDelete, Note, Push, Reply, Sample
+from vram_arbiter.arbiter.core.events import AcquireRequested, Event, Tick
+from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
+from vram_arbiter.arbiter.eventlog.codec import (
+    CodecError,
+    decode,
+    decode_event,
+    digest,
+    event_types,
+    summary,
+    to_json,
+)
+from vram_arbiter.schemas.ids import ClientId, GpuId, RequestId
 
 
 def example(hint: Any) -> Any:
@@ -50,7 +58,9 @@ def test_what_a_run_posts_survives_a_log(busy: CoreDriver) -> None:
 
 
 def test_settings_survive_a_log() -> None:
-    settings = Settings(3, (GpuInfo(GpuId("g"), 0, "card", 8),), policy="lru", learnt={"a": {"load_s": 0.1}})
+    settings = Settings(
+        3, (GpuInfo(GpuId("g"), 0, "card", 8),), policy="lru", learnt={"a": {"load_s": 0.1}}
+    )
     assert decode(Settings, json.loads(to_json(settings))) == settings
 
 

@@ -5,15 +5,16 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.replay import compare, runner
-from arbiter.replay.__main__ import main
-from arbiter.replay.extract import extract
-from arbiter.replay.outcome import Outcome
-from arbiter.replay.scenarios import settings_of, workload_of
-from arbiter.testing.core_driver import CoreDriver
-from arbiter.testing.recording import record_workload, write_log
-from schemas import defaults as d
-from schemas.scenario import Scenario, load_scenario
+from tests.support.core_driver import CoreDriver
+from tests.support.recording import record_workload, write_log
+from vram_arbiter.arbiter.eventlog import replay as runner
+from vram_arbiter.arbiter.lab import compare
+from vram_arbiter.arbiter.lab.__main__ import main
+from vram_arbiter.arbiter.lab.extract import extract
+from vram_arbiter.arbiter.lab.outcome import Outcome
+from vram_arbiter.arbiter.lab.scenarios import settings_of, workload_of
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.config.scenario import Scenario, load_scenario
 
 SCENARIOS = Path(__file__).parents[3] / "configs" / "scenarios"
 GIB = d.GIB
@@ -103,7 +104,9 @@ def test_programs_that_only_hold_and_leave_by_themselves(tmp_path: Path) -> None
         job.die()
         driver.advance(1)
     found = extract(runner.load(write_log(driver, tmp_path)))
-    assert [plan.jobs[0].release_after_s for plan in found.workload.plans] == pytest.approx([10.0, 10.0])
+    assert [plan.jobs[0].release_after_s for plan in found.workload.plans] == pytest.approx(
+        [10.0, 10.0]
+    )
     again = compare.under(found.workload, found.settings, "default")
     assert (again.total.loads, again.total.unserved, again.switches) == (2, 0, 0)
 
@@ -128,7 +131,9 @@ def test_who_gave_up_gives_up_again_and_who_never_fits_is_denied_again(tmp_path:
 
 
 @pytest.mark.parametrize("policy", ["default", "lru"])
-def test_a_wild_log_is_taken_as_far_as_it_goes(busy: CoreDriver, policy: str, tmp_path: Path) -> None:
+def test_a_wild_log_is_taken_as_far_as_it_goes(
+    busy: CoreDriver, policy: str, tmp_path: Path
+) -> None:
     found = extract(runner.load(write_log(busy, tmp_path)))
     assert any("readings that failed" in line for line in found.workload.approximations)
     assert compare.under(found.workload, found.settings, policy).total.ooms == 0
@@ -152,8 +157,12 @@ def test_what_if_prints_the_log_beside_the_policies(
     assert shown["check"]["switches"] == shown["logged"]["switches"]
 
 
-def test_simulate_prints_decisions_and_tables(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    short = (SCENARIOS / "find-navigate-grab.yaml").read_text().replace("seconds: 600", "seconds: 60")
+def test_simulate_prints_decisions_and_tables(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    short = (
+        (SCENARIOS / "find-navigate-grab.yaml").read_text().replace("seconds: 600", "seconds: 60")
+    )
     scenario = tmp_path / "short.yaml"
     scenario.write_text(short)
     path = str(scenario)

@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.replay import runner, text
-from arbiter.replay.__main__ import main
-from arbiter.replay.logfile import LogError
-from arbiter.testing.core_driver import CoreDriver
-from arbiter.testing.recording import write_log
-from arbiter.testing.scenes import held
+from tests.support.core_driver import CoreDriver
+from tests.support.recording import write_log
+from tests.support.scenes import held
+from vram_arbiter.arbiter.eventlog import replay as runner
+from vram_arbiter.arbiter.eventlog.logfile import LogError
+from vram_arbiter.arbiter.lab import text
+from vram_arbiter.arbiter.lab.__main__ import main
 
 
 @pytest.fixture
@@ -60,7 +61,12 @@ def test_the_first_divergence_is_shown_with_its_surroundings(log: Path) -> None:
     found = runner.replay(runner.load(log))
     odd = found.divergence
     assert odd is not None
-    assert (odd.number, odd.entry.line, len(odd.before), found.events) == (40, 41, runner.CONTEXT, 40)
+    assert (odd.number, odd.entry.line, len(odd.before), found.events) == (
+        40,
+        41,
+        runner.CONTEXT,
+        40,
+    )
     lines = text.replay_lines(found)
     assert lines[0] == f"event 40 is decided otherwise ({log.name}:41)"
     assert any(line.startswith("  logged") and "0" * 16 in line for line in lines)
@@ -96,7 +102,13 @@ def test_a_torn_last_line_is_tolerated_and_said(busy: CoreDriver, log: Path) -> 
 def test_a_crash_of_the_engine_is_repeated_too(busy: CoreDriver, log: Path) -> None:
     """The last line of a daemon that stopped on a defect has no digest."""
     broken = {"t": 5000.0, "event": "MemorySampled", "effects": "", "digest": None}
-    data = {"gpu": "GPU-0", "taken_at": 5000.0, "used_bytes": None, "total_bytes": 8 << 30, "processes": None}
+    data = {
+        "gpu": "GPU-0",
+        "taken_at": 5000.0,
+        "used_bytes": None,
+        "total_bytes": 8 << 30,
+        "processes": None,
+    }
     with log.open("a") as file:
         file.write(json.dumps(broken | {"data": data}) + "\n")
     found = runner.replay(runner.load(log))
@@ -122,7 +134,9 @@ def test_a_defect_that_is_new_is_a_divergence(log: Path) -> None:
         ('"digest"', '"digits"', "not a line of an event log"),
     ],
 )
-def test_what_is_no_log_of_ours_is_told_with_its_file(log: Path, old: str, new: str, says: str) -> None:
+def test_what_is_no_log_of_ours_is_told_with_its_file(
+    log: Path, old: str, new: str, says: str
+) -> None:
     log.write_text(log.read_text().replace(old, new, 1))
     with pytest.raises(LogError, match=says) as caught:
         runner.load(log)

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.core.scheduling import SCHEDULING
-from arbiter.core.settings import Settings
-from arbiter.replay import compare
-from arbiter.replay.outcome import Outcome, as_plain
-from arbiter.replay.rules import RULES, OneCardOnly
-from arbiter.replay.scenarios import settings_of, workload_of
-from schemas.scenario import Scenario, load_scenario
+from vram_arbiter.arbiter.core.scheduling.policies import SCHEDULING
+from vram_arbiter.arbiter.core.settings import Settings
+from vram_arbiter.arbiter.lab import compare
+from vram_arbiter.arbiter.lab.outcome import Outcome, as_plain
+from vram_arbiter.arbiter.lab.rules import RULES, OneCardOnly
+from vram_arbiter.arbiter.lab.scenarios import settings_of, workload_of
+from vram_arbiter.schemas.config.scenario import Scenario, load_scenario
 
 SCENARIOS = Path(__file__).parents[3] / "configs" / "scenarios"
 

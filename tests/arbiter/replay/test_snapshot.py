@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import pytest
 
-from arbiter.core.arbiter import Arbiter
-from arbiter.replay.codec import CodecError, digest
-from arbiter.replay.snapshot import freeze, from_plain, thaw, to_plain
-from arbiter.testing.core_driver import START_S, CoreDriver
+from tests.support.core_driver import START_S, CoreDriver
+from vram_arbiter.arbiter.core.arbiter import Arbiter
+from vram_arbiter.arbiter.eventlog.codec import CodecError, digest
+from vram_arbiter.arbiter.eventlog.snapshot import freeze, from_plain, thaw, to_plain
 
 
 def through_json(engine: Arbiter) -> Arbiter:
@@ -57,10 +57,13 @@ def test_a_function_in_the_state_is_refused(busy: CoreDriver) -> None:
     ("entry", "says"),
     [
         (["object", "os:system", {}], "no class of the engine"),
-        (["object", "arbiter.core.arbiter:print", {}], "no class of the engine"),
-        (["object", "arbiter.core.state:Any", {}], "no class of the engine"),
+        (["object", "vram_arbiter.arbiter.core.arbiter:print", {}], "no class of the engine"),
+        (["object", "vram_arbiter.arbiter.core.model.state:Any", {}], "no class of the engine"),
         (["enum", "subprocess:Popen", ["id"]], "no class of the engine"),
-        (["object", "arbiter.core.settings:GpuInfo", {"id": "g"}], "GpuInfo has other fields"),
+        (
+            ["object", "vram_arbiter.arbiter.core.settings:GpuInfo", {"id": "g"}],
+            "GpuInfo has other fields",
+        ),
         (["list", []], "a list where the engine should be"),
         (["lambda", []], "no such thing"),
     ],

@@ -8,11 +8,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from arbiter.rpc import codec
-from schemas import defaults as d
-from schemas.defaults import VALUES_MAX
-from schemas.errors import BadFrame, BadRequest, MessageTooLarge, UnknownOp
-from schemas.wire import Acquire, Footprint, Gang, LeaseSpec, Ping, Reattach
+from vram_arbiter.arbiter.rpc import codec
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import VALUES_MAX
+from vram_arbiter.schemas.errors import BadFrame, BadRequest, MessageTooLarge, UnknownOp
+from vram_arbiter.schemas.wire import Acquire, Footprint, Gang, LeaseSpec, Ping, Reattach
 
 LIMIT = 1 << 20
 
@@ -33,7 +33,11 @@ def test_a_request_is_read() -> None:
 
 
 def test_a_nested_request_is_read() -> None:
-    spec = {"consumer": "c", "model_id": "m", "footprint": {"load_peak_bytes": 5, "steady_bytes": 4}}
+    spec = {
+        "consumer": "c",
+        "model_id": "m",
+        "footprint": {"load_peak_bytes": 5, "steady_bytes": 4},
+    }
     request = codec.decode(pack(op="acquire", id=1, nonce="n", spec=spec), LIMIT)
     assert isinstance(request, Acquire)
     assert request.spec.footprint.load_peak_bytes == 5
@@ -102,7 +106,10 @@ def test_many_wrong_fields_make_a_short_reply() -> None:
 def worst_leases(leases: int, **wrong: Any) -> list[dict[str, Any]]:
     """A reattachment in which each lease has as many unknown keys as a map may have."""
     junk = {f"k{number}": 0 for number in range(codec.KEYS_MAX - 4)}
-    return [{"lease_id": "L", "token": [1, 1], "state": "held", "spec": junk, **wrong} for _ in range(leases)]
+    return [
+        {"lease_id": "L", "token": [1, 1], "state": "held", "spec": junk, **wrong}
+        for _ in range(leases)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -139,7 +146,10 @@ def test_a_client_with_all_its_leases_and_many_uses_reattaches() -> None:
         consumer="c", model_id="m", footprint=Footprint(**size), gang=Gang(id="g", size=2)
     ).model_dump()
     lease = {"lease_id": "L", "token": [1, 1], "state": "held", "spec": spec, "measured_bytes": 4}
-    leases = [{**lease, "use_ids": [f"use-{n}" for n in range(16)]} for _ in range(d.LEASES_PER_CLIENT_MAX)]
+    leases = [
+        {**lease, "use_ids": [f"use-{n}" for n in range(16)]}
+        for _ in range(d.LEASES_PER_CLIENT_MAX)
+    ]
     request = codec.decode(pack(op="reattach", id=1, leases=leases), LIMIT)
     assert isinstance(request, Reattach)
     assert len(request.leases) == d.LEASES_PER_CLIENT_MAX
@@ -179,19 +189,27 @@ _VALUES = st.recursive(
     | st.floats()
     | st.text()
     | st.binary(),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4)
+    ),
     max_leaves=10,
 )
-_OPS = st.sampled_from(["hello", "acquire", "renew", "history", "release", "reattach", "oom", "use_begin"])
+_OPS = st.sampled_from(
+    ["hello", "acquire", "renew", "history", "release", "reattach", "oom", "use_begin"]
+)
 _FIELDS = st.dictionaries(
-    st.sampled_from(["spec", "nonce", "lease_id", "token", "leases", "use_id", "after", "version", "name"]),
+    st.sampled_from(
+        ["spec", "nonce", "lease_id", "token", "leases", "use_id", "after", "version", "name"]
+    ),
     _VALUES,
 )
 
 
 @settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(_OPS, st.integers(0, 100), _FIELDS)
-def test_any_fields_are_a_request_or_a_typed_error(op: str, request_id: int, fields: dict[str, Any]) -> None:
+def test_any_fields_are_a_request_or_a_typed_error(
+    op: str, request_id: int, fields: dict[str, Any]
+) -> None:
     bad = outcome(pack(**{**fields, "op": op, "id": request_id}))
     if bad is not None:
         assert bad.request_id == request_id
@@ -207,4 +225,8 @@ def test_replies_have_the_shape_of_the_wire() -> None:
         "ok": False,
         "error": error,
     }
-    assert msgpack.unpackb(codec.push(8, 2, {"push": "lost"})) == {"push": "lost", "seq": 8, "epoch": 2}
+    assert msgpack.unpackb(codec.push(8, 2, {"push": "lost"})) == {
+        "push": "lost",
+        "seq": 8,
+        "epoch": 2,
+    }

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from pydantic import ValidationError
 
-from arbiter.rpc import codec
-from arbiter.testing.costly import COSTLY
-from arbiter.testing.hostile import BOMBS, Forger, pack
-from schemas.defaults import MESSAGE_MAX_BYTES, MIB, VALUES_MAX
-from schemas.errors import MessageTooLarge
-from schemas.runtime.msgpack_codec import count_values
-from schemas.wire import OPS
+from tests.support.costly import COSTLY
+from tests.support.hostile import BOMBS, Forger, pack
+from vram_arbiter.arbiter.rpc import codec
+from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES, MIB, VALUES_MAX
+from vram_arbiter.schemas.errors import MessageTooLarge
+from vram_arbiter.schemas.runtime.msgpack_codec import count_values
+from vram_arbiter.schemas.wire import OPS
 
 ANSWER_MAX_BYTES = 16_384
 RANDOM = st.randoms(use_true_random=False)
@@ -68,7 +68,9 @@ def test_a_mutated_request_keeps_its_id_in_the_answer(draw: random.Random, op: s
 @pytest.mark.parametrize("name", BOMBS)
 def test_a_bomb_is_defused_in_little_memory(name: str) -> None:
     frame = BOMBS[name]
-    codec.decode(pack({"op": "ping", "id": 1}), MESSAGE_MAX_BYTES)  # whatever is made once is made now
+    codec.decode(
+        pack({"op": "ping", "id": 1}), MESSAGE_MAX_BYTES
+    )  # whatever is made once is made now
     tracemalloc.start()
     try:
         found = outcome(frame)
@@ -92,7 +94,9 @@ def test_the_costliest_messages_are_little_work(name: str) -> None:
     except codec.Undecodable as bad:
         refused = bad
     if refused is not None:
-        assert len(codec.refusal(refused.request_id, 1, refused.error.to_wire())) <= ANSWER_MAX_BYTES
+        assert (
+            len(codec.refusal(refused.request_id, 1, refused.error.to_wire())) <= ANSWER_MAX_BYTES
+        )
         if isinstance(refused.__cause__, ValidationError):
             assert refused.__cause__.error_count() <= 5 * codec.KEYS_MAX
         if isinstance(refused.error, MessageTooLarge):

@@ -13,18 +13,18 @@ import msgpack
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from arbiter.core import effects as fx
-from arbiter.core import events as ev
-from arbiter.core.arbiter import Arbiter
-from arbiter.core.settings import GpuInfo, Settings
-from arbiter.host.executor import Executor
-from arbiter.rpc.session import SessionSettings, SessionTable
-from arbiter.testing.connections import KeptConnection, peer_of
-from arbiter.testing.core_driver import SimCard
-from arbiter.testing.hostile import Forger, pack
-from schemas import defaults as d
-from schemas.ids import ClientId, GpuId, ProcessKey
-from schemas.runtime.peercred import Peer
+from tests.support.connections import KeptConnection, peer_of
+from tests.support.core_driver import SimCard
+from tests.support.hostile import Forger, pack
+from vram_arbiter.arbiter.core import effects as fx
+from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.arbiter.core.arbiter import Arbiter
+from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
+from vram_arbiter.arbiter.host.executor import Executor
+from vram_arbiter.arbiter.rpc.session import SessionSettings, SessionTable
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
+from vram_arbiter.schemas.runtime.peercred import Peer
 
 GPU = GpuId("GPU-0")
 STRANGER_UID = 54_321
@@ -171,7 +171,11 @@ class Plant:
         self.table.broadcast(event)
 
     def _read(
-        self, after: int, limit: int, kinds: tuple[str, ...], done: Callable[[Mapping[str, Any]], None]
+        self,
+        after: int,
+        limit: int,
+        kinds: tuple[str, ...],
+        done: Callable[[Mapping[str, Any]], None],
     ) -> None:
         done({"events": [], "last_seq": 0})
 
@@ -296,7 +300,11 @@ def test_the_core_answers_every_frame_once_and_leaves_others_alone(seed: int) ->
     assert set(counts) <= {1}, f"every frame is answered exactly once: {counts}"
     core.advance(draw.choice([0.0, 1.0, 40.0]))
     (mine,) = (view for view in core.status()["leases"] if view["consumer"] == "victim")
-    assert (mine["state"], mine["token"], mine["lease_id"]) == ("held", lease["token"], lease["lease_id"])
+    assert (mine["state"], mine["token"], mine["lease_id"]) == (
+        "held",
+        lease["token"],
+        lease["lease_id"],
+    )
     assert plant.ask(b"victim", VICTIM, "renew", leases=[on])["alive"] == [lease["lease_id"]]
     plant.everybody_dies()
     core.advance(60.0)
@@ -307,7 +315,9 @@ def test_the_core_answers_every_frame_once_and_leaves_others_alone(seed: int) ->
 
 
 @pytest.mark.parametrize("sessions_max", [1, 4])
-def test_at_the_limit_of_sessions_hellos_are_refused_and_remembered_by_nobody(sessions_max: int) -> None:
+def test_at_the_limit_of_sessions_hellos_are_refused_and_remembered_by_nobody(
+    sessions_max: int,
+) -> None:
     plant = Plant(real=True, sessions_max=sessions_max)
     answers = [plant.hello(b"h%d" % number, ATTACKERS[0]) for number in range(2000)]
     assert sum(answer["ok"] for answer in answers) == sessions_max
@@ -341,7 +351,10 @@ def test_acquire_and_cancel_for_ever_keeps_nothing() -> None:
     assert first["state"] == "loading"
     for number in range(3000):
         waiting = plant.ask(b"c", ATTACKERS[0], "acquire", nonce=f"n{number}", spec=big)["lease"]
-        assert plant.ask(b"c", ATTACKERS[0], "cancel", lease_id=waiting["lease_id"])["state"] == "cancelled"
+        assert (
+            plant.ask(b"c", ATTACKERS[0], "cancel", lease_id=waiting["lease_id"])["state"]
+            == "cancelled"
+        )
     inside = core.arbiter._core
     assert len(inside.leases) == 1
     assert not inside.waiting

@@ -4,10 +4,10 @@ import os
 
 import pytest
 
-from arbiter.rpc.peer import check_visible, group_id, is_operator
-from schemas.errors import NotPermitted
-from schemas.ids import ProcessKey
-from schemas.runtime.peercred import Peer
+from vram_arbiter.arbiter.rpc.peer import check_visible, group_id, is_operator
+from vram_arbiter.schemas.errors import NotPermitted
+from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime.peercred import Peer
 
 
 def peer(uid: int, gid: int, pid: int = 1) -> Peer:

@@ -8,13 +8,21 @@ from typing import Any
 import msgpack
 import pytest
 
-from arbiter.core import events as ev
-from arbiter.rpc.session import SessionSettings, SessionTable
-from arbiter.testing.connections import KeptConnection, peer_of
-from schemas import wire
-from schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey, RequestId, Token, UseId
-from schemas.runtime.peercred import Peer
-from schemas.runtime.zmtp import Oversize
+from tests.support.connections import KeptConnection, peer_of
+from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.arbiter.rpc.session import SessionSettings, SessionTable
+from vram_arbiter.schemas import wire
+from vram_arbiter.schemas.ids import (
+    ClientId,
+    LeaseId,
+    ModelKey,
+    ProcessKey,
+    RequestId,
+    Token,
+    UseId,
+)
+from vram_arbiter.schemas.runtime.peercred import Peer
+from vram_arbiter.schemas.runtime.zmtp import Oversize
 
 ME = peer_of(os.getpid())
 PARENT = peer_of(os.getppid())
@@ -54,7 +62,11 @@ class Bench:
         return {"consumer": consumer, "leases": []}
 
     def history(
-        self, after: int, limit: int, kinds: tuple[str, ...], done: Callable[[Mapping[str, Any]], None]
+        self,
+        after: int,
+        limit: int,
+        kinds: tuple[str, ...],
+        done: Callable[[Mapping[str, Any]], None],
     ) -> None:
         self.questions.append((after, limit, kinds))
         done({"events": [], "last_seq": 0})
@@ -144,7 +156,9 @@ def test_hello_is_welcomed_and_the_core_hears_the_kernels_word(bench: Bench) -> 
         "re": 1, "epoch": 3, "ok": True, "version": 1, "boot_id": "boot", "server": "test", "role": "client",
         "heartbeat_s": 2.0, "grace_s": 5.0,
     }  # fmt: skip
-    assert bench.events == [ev.ClientConnected(bench.client(), ME.process, os.getuid(), "n", "i-61")]
+    assert bench.events == [
+        ev.ClientConnected(bench.client(), ME.process, os.getuid(), "n", "i-61")
+    ]
     assert bench.watched == [ME.process]
     assert bench.connections[b"a"].admitted, "the time limit for hellos ends"
 
@@ -218,7 +232,9 @@ def test_every_request_on_leases_becomes_its_event(bench: Bench) -> None:
     me, token, on = bench.client(), Token(3, 7), {"lease_id": "L3-1", "token": [3, 7]}
     wanted = {"consumer": "detector", "model_id": "m", "revision": "r", "footprint": FOOTPRINT, "mode": "exclusive",
               "priority": 60, "evictable": False, "on_deadline": "deny"}  # fmt: skip
-    spec = ev.Spec("detector", ModelKey("m", "r"), "any", True, 10, 8, 2, 60, False, 10.0, 2.0, True)
+    spec = ev.Spec(
+        "detector", ModelKey("m", "r"), "any", True, 10, 8, 2, 60, False, 10.0, 2.0, True
+    )
     trace = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
     bench.ask("acquire", nonce="n1", spec=wanted, wait_timeout_s=4.0, traceparent=trace)
     bench.ask("ready", **on, measured_bytes=5)
@@ -269,8 +285,12 @@ def test_only_an_operator_acts_by_hand_and_is_named_by_the_kernel(bench: Bench) 
         ev.OperatorAsked(me, RequestId(last - 1), "evict", "det", by, "r"),
         ev.OperatorAsked(me, RequestId(last), "drain", "", by, "new driver"),
     ]
-    assert code(bench.ask("evict", b"o", target="det")) == "bad_request", "an action without a reason"
-    assert code(bench.ask("drain", b"o", reason="a\nb")) == "bad_request", "a reason is one line of history"
+    assert code(bench.ask("evict", b"o", target="det")) == "bad_request", (
+        "an action without a reason"
+    )
+    assert code(bench.ask("drain", b"o", reason="a\nb")) == "bad_request", (
+        "a reason is one line of history"
+    )
 
 
 def test_every_op_of_the_wire_is_dispatched(bench: Bench) -> None:
@@ -394,7 +414,9 @@ def test_an_instance_on_a_new_connection_replaces_its_old_one(bench: Bench) -> N
     assert bench.left() == [], "nothing is lost by reconnecting"
     for via in (b"b", b"c"):
         bench.table.push(bench.client(via), {"push": "granted"})
-        assert bench.connections[b"c"].sent[-1]["push"] == "granted", "it reaches the new connection"
+        assert bench.connections[b"c"].sent[-1]["push"] == "granted", (
+            "it reaches the new connection"
+        )
     assert len(bench.connections[b"c"].sent) == 3
     assert bench.connections[b"a"].closed, "the old connection has no use any more"
     for via in (b"a", b"b"):
@@ -512,7 +534,11 @@ def test_processes_that_held_something_and_left_have_a_share() -> None:
         via, peer = b"%d" % number, Peer(ProcessKey(1000 + number, 7), uid, uid, -1)
         reply = bench.hello(via, peer=peer, role=role)
         bench.ask(
-            "acquire", via, peer, nonce="n", spec={"consumer": "c", "model_id": "m", "footprint": FOOTPRINT}
+            "acquire",
+            via,
+            peer,
+            nonce="n",
+            spec={"consumer": "c", "model_id": "m", "footprint": FOOTPRINT},
         )
         bench.hang_up(via)
         return reply
@@ -611,13 +637,17 @@ def test_bad_frames_change_nothing(bench: Bench) -> None:
     assert bench.ask("ping")["ok"]
 
 
-def test_every_refusal_is_in_the_log_with_its_reason(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+def test_every_refusal_is_in_the_log_with_its_reason(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
     """A request that was refused at once was nowhere but in its own program's error message."""
     caplog.set_level("INFO")
     bench.ask("status")
     bench.hello()
     bench.ask("evict", target="L3-1", reason="by hand")
-    bench.table.refuse(bench.client(), RequestId(9), {"code": "vram_insufficient", "message": "9 GiB of 8"})
+    bench.table.refuse(
+        bench.client(), RequestId(9), {"code": "vram_insufficient", "message": "9 GiB of 8"}
+    )
     said = [record.getMessage() for record in caplog.records if record.name == "arbiter.refusals"]
     whose = f"pid {ME.process.pid}, uid {ME.uid}"
     assert said == [

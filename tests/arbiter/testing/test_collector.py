@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from arbiter.testing.collector import Collector
+from tests.support.collector import Collector
 
 pytest.importorskip("opentelemetry.proto", reason="the extra `telemetry`")
 
@@ -28,7 +28,9 @@ def test_what_an_exporter_sent_before_it_ended_is_there() -> None:
     """Regression: on a slow machine a program had ended before the test's own thread had read its last spans."""
     with Collector() as collector:
         body = batch("last")
-        head = f"POST /v1/traces HTTP/1.1\r\nHost: x\r\nContent-Length: {len(body)}\r\n\r\n".encode()
+        head = (
+            f"POST /v1/traces HTTP/1.1\r\nHost: x\r\nContent-Length: {len(body)}\r\n\r\n".encode()
+        )
         for _ in range(50):
             with connected(collector) as exporter:
                 exporter.sendall(head + body)  # and it ends without having heard the answer
@@ -43,7 +45,9 @@ def test_who_is_still_sending_is_waited_for_and_who_comes_later_is_not() -> None
         slow.putheader("Content-Length", str(len(body)))
         slow.endheaders()
         seen: list[str] = []
-        asked = threading.Thread(target=lambda: seen.extend(span.name for span in collector.spans()))
+        asked = threading.Thread(
+            target=lambda: seen.extend(span.name for span in collector.spans())
+        )
         asked.start()
         slow.send(body)
         asked.join(60)
@@ -52,4 +56,6 @@ def test_who_is_still_sending_is_waited_for_and_who_comes_later_is_not() -> None
         slow.close()
         with pytest.raises(AssertionError, match="no nothing within"):
             collector.wait(lambda: False, "nothing", timeout_s=0.0)
-    assert [span.name for span in collector.spans()] == ["slow"], "it is kept when the collector has ended"
+    assert [span.name for span in collector.spans()] == ["slow"], (
+        "it is kept when the collector has ended"
+    )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.forkserver import Child, ForkServer
+from tests.support.forkserver import Child, ForkServer
 
 PROGRAM = """
 import json, os, sys
@@ -38,7 +38,9 @@ def child(forks: ForkServer) -> Iterator[Child]:
     child.close()
 
 
-def test_a_child_has_its_arguments_its_environment_and_its_own_pipes(forks: ForkServer, child: Child) -> None:
+def test_a_child_has_its_arguments_its_environment_and_its_own_pipes(
+    forks: ForkServer, child: Child
+) -> None:
     born = child.until("born")
     assert (born["arguments"], born["word"], born["parent"]) == (["one", "two"], "hello", forks.pid)
     other = forks.spawn("other")

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.lease_check import NOISE_BYTES, Hindrance, Story, check_leases
+from tests.support.lease_check import NOISE_BYTES, Hindrance, Story, check_leases
 
 GIB = 1 << 30
 A, B, IDLE, STRANGER = 11, 12, 13, 99
@@ -43,7 +43,14 @@ class Scene:
         self.t += 1.0
         size, change = int(gib * GIB), int((gib if delta is None else delta) * GIB)
         self.held[pid] = self.held.get(pid, 0) + change
-        line = {"t": self.t, "pid": pid, "name": f"p{pid}", "op": op, "bytes": size, "delta": change}
+        line = {
+            "t": self.t,
+            "pid": pid,
+            "name": f"p{pid}",
+            "op": op,
+            "bytes": size,
+            "delta": change,
+        }
         self.card.append({**line, "process_bytes": self.held[pid]})
 
     def grant(self, pid: int, gib: float, *, exclusive: bool = False) -> str:
@@ -272,7 +279,9 @@ def beside_what_is_on_its_way(
         case "exited":
             scene.trace(IDLE, "done")
         case "measured gone":
-            scene.event("verified", lease_id=None, consumer=f"{IDLE}@5", resolved=True, residue_bytes=0)
+            scene.event(
+                "verified", lease_id=None, consumer=f"{IDLE}@5", resolved=True, residue_bytes=0
+            )
     scene.grant(B, 1, exclusive=True)
     return [finding.rule for finding in scene.judge().findings]
 
@@ -293,16 +302,24 @@ def test_what_no_reading_can_tell_may_be_beside_an_exclusive_lease_and_no_byte_m
 
 @pytest.mark.parametrize("ended", ["killed", "exited", "measured gone"])
 def test_a_process_that_has_ended_hides_nothing(ended: str) -> None:
-    assert beside_what_is_on_its_way(MOST_GIB + 1 / GIB, charged_gib=0.25, ended=ended) == ["exclusive"]
+    assert beside_what_is_on_its_way(MOST_GIB + 1 / GIB, charged_gib=0.25, ended=ended) == [
+        "exclusive"
+    ]
 
 
 def test_what_the_arbiter_found_beyond_a_context_hides_nothing() -> None:
     assert beside_what_is_on_its_way(MOST_GIB + 0.25 + 1 / GIB, charged_gib=2) == ["exclusive"]
-    assert beside_what_is_on_its_way(MOST_GIB + 1 / GIB, charged_gib=2, declared_gib=0) == ["exclusive"]
+    assert beside_what_is_on_its_way(MOST_GIB + 1 / GIB, charged_gib=2, declared_gib=0) == [
+        "exclusive"
+    ]
 
 
-@pytest.mark.parametrize(("outages", "stuck"), [([], True), ([(0.0, 30.0)], True), ([(0.0, 50.0)], False)])
-def test_time_without_an_arbiter_is_no_wait(outages: list[tuple[float, float]], stuck: bool) -> None:
+@pytest.mark.parametrize(
+    ("outages", "stuck"), [([], True), ([(0.0, 30.0)], True), ([(0.0, 50.0)], False)]
+)
+def test_time_without_an_arbiter_is_no_wait(
+    outages: list[tuple[float, float]], stuck: bool
+) -> None:
     """Regression (storm, seed 7): killed and stopped again and again, the daemon had answered for 29 s of 70."""
     scene = sound()
     scene.trace(A, "asked", bytes=1, exclusive=False)

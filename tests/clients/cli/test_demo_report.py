@@ -6,8 +6,15 @@ from typing import Any
 
 import pytest
 
-from clients.cli.demo_display import describe
-from clients.cli.demo_report import CardStory, Point, draw_timeline, read_log, read_samples, summarise
+from vram_arbiter.clients.cli.demo_display import describe
+from vram_arbiter.clients.cli.demo_report import (
+    CardStory,
+    Point,
+    draw_timeline,
+    read_log,
+    read_samples,
+    summarise,
+)
 
 GIB = 1 << 30
 SWITCH = {
@@ -21,7 +28,10 @@ HELD = {"held_above_table": {"red cube": True, "blue ball": False}}
 
 
 def line(pid: int, t: float, op: str, process: int, used: int) -> str:
-    return json.dumps({"pid": pid, "t": t, "op": op, "process_bytes": process, "used_after": used}) + "\n"
+    return (
+        json.dumps({"pid": pid, "t": t, "op": op, "process_bytes": process, "used_after": used})
+        + "\n"
+    )
 
 
 def summary(**changes: Any) -> dict[str, Any]:
@@ -34,7 +44,12 @@ def summary(**changes: Any) -> dict[str, Any]:
 
 
 def test_the_log_gives_bytes_by_program_peak_and_refusals() -> None:
-    text = line(7, 1.0, "alloc", 5, 5) + line(8, 2.0, "oom", 0, 5) + line(8, 3.0, "alloc", 4, 9) + '{"torn'
+    text = (
+        line(7, 1.0, "alloc", 5, 5)
+        + line(8, 2.0, "oom", 0, 5)
+        + line(8, 3.0, "alloc", 4, 9)
+        + '{"torn'
+    )
     story = read_log(text, {7: "detector"})
     assert story == CardStory(
         (Point(1.0, "detector", 5), Point(2.0, "pid 8", 0), Point(3.0, "pid 8", 4)), 9, (2.0,)
@@ -46,7 +61,9 @@ def test_samples_of_a_real_card_give_the_same_story() -> None:
         "measured_used_bytes": 6,
         "processes": [{"pid": 7, "used_bytes": 5}, {"pid": 9, "used_bytes": None}],
     }
-    story = read_samples([(1.0, gpu)], {7: "grab"}, [{"kind": "oom", "at_wall_s": 12.0}], wall_offset_s=10.0)
+    story = read_samples(
+        [(1.0, gpu)], {7: "grab"}, [{"kind": "oom", "at_wall_s": 12.0}], wall_offset_s=10.0
+    )
     assert story == CardStory((Point(1.0, "grab", 5), Point(1.0, "pid 9", 0)), 6, (2.0,))
 
 
@@ -72,14 +89,18 @@ def test_switches_are_counted_apart_from_loads_beside_others() -> None:
 def test_events_read_as_sentences() -> None:
     assert describe(SWITCH) == "grab took over from detector in 15 ms"
     assert describe(LOAD) == "grab loaded beside the others in 5 ms, nobody evicted"
-    assert describe({"kind": "denied", "consumer": "x", "reason": "too big"}) == "x: denied (too big)"
+    assert (
+        describe({"kind": "denied", "consumer": "x", "reason": "too big"}) == "x: denied (too big)"
+    )
 
 
 @pytest.mark.heavy
 def test_a_timeline_is_drawn_even_of_nothing(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="needs the runner extra")
     story = CardStory(
-        (Point(1.0, "detector", GIB), Point(2.0, "detector", 0), Point(2.5, "grab", 2 * GIB)), 2 * GIB, (2.2,)
+        (Point(1.0, "detector", GIB), Point(2.0, "detector", 0), Point(2.5, "grab", 2 * GIB)),
+        2 * GIB,
+        (2.2,),
     )
     events = [{"kind": "revoke_asked", "at_wall_s": 101.9, "consumer": "detector"}]
     for number, told in enumerate((story, CardStory((), 0, ()))):

@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from clients.cli import history
-from clients.cli.history import Wanted, collect, parse_since
-from clients.sync import SyncArbiterClient
-from schemas.wire import LeaseSpec
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.cli import history
+from vram_arbiter.clients.cli.history import Wanted, collect, parse_since
+from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.schemas.wire import LeaseSpec
 
 PATIENCE_S = 60.0
 NOON = datetime.datetime(2026, 11, 21, 12, 0).timestamp()
@@ -120,7 +120,7 @@ def test_after_a_number_come_the_first_that_are_wanted(archive: Archive) -> None
 
 def vramctl(arbiter: ArbiterProcess, *arguments: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
-        [sys.executable, "-m", "clients", *arguments],
+        [sys.executable, "-m", "vram_arbiter.clients", *arguments],
         env=arbiter.environ,
         capture_output=True,
         text=True,
@@ -137,13 +137,24 @@ def test_following_shows_the_past_and_then_the_present(
         client.acquire(spec("early", 1)).ready()
         shown = vramctl(arbiter_daemon, "history", "--since", "1h", "-c", "early", "--json")
         kinds = [event["kind"] for event in json.loads(shown.stdout)["events"]]
-        kinds = [kind for kind in kinds if kind != "queued"]  # where the first reading was still under way
+        kinds = [
+            kind for kind in kinds if kind != "queued"
+        ]  # where the first reading was still under way
         assert kinds == ["granted", "ready", "switch"]
         assert vramctl(arbiter_daemon, "history", "-c", "nobody").stdout.strip() == ""
         assert vramctl(arbiter_daemon, "history", "--since", "soon").returncode == 2
 
         process = subprocess.Popen(
-            [sys.executable, "-m", "clients", "history", "--follow", "--kind", "granted", "--json"],
+            [
+                sys.executable,
+                "-m",
+                "vram_arbiter.clients",
+                "history",
+                "--follow",
+                "--kind",
+                "granted",
+                "--json",
+            ],
             env=arbiter_daemon.environ,
             stdout=subprocess.PIPE,
             text=True,
@@ -152,7 +163,9 @@ def test_following_shows_the_past_and_then_the_present(
             lines: queue.Queue[str] = queue.Queue()
             output = process.stdout
             assert output is not None
-            threading.Thread(target=lambda: [lines.put(line) for line in output], daemon=True).start()
+            threading.Thread(
+                target=lambda: [lines.put(line) for line in output], daemon=True
+            ).start()
             assert json.loads(lines.get(timeout=PATIENCE_S))["consumer"] == "early"
             client.acquire(spec("late", 1)).ready()
             assert json.loads(lines.get(timeout=PATIENCE_S))["consumer"] == "late"
@@ -172,7 +185,16 @@ def test_following_goes_on_after_a_restart_with_a_new_history(
     for _ in range(3):
         assert vramctl(arbiter, "drain", "-r", "x").returncode == 0
     process = subprocess.Popen(
-        [sys.executable, "-m", "clients", "history", "--follow", "--kind", "operator", "--json"],
+        [
+            sys.executable,
+            "-m",
+            "vram_arbiter.clients",
+            "history",
+            "--follow",
+            "--kind",
+            "operator",
+            "--json",
+        ],
         env=arbiter.environ,
         stdout=subprocess.PIPE,
         text=True,

@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from rich.console import Console
 from rich.text import Text
 
-from arbiter import telemetry
-from arbiter.replay import text as replay_text
-from clients import logs
-from clients.cli import demo_display, doctor, quick, text
-from schemas import terminal
-from schemas.errors import BadState
+from vram_arbiter.arbiter import log as telemetry
+from vram_arbiter.arbiter.lab import text as replay_text
+from vram_arbiter.clients import logs
+from vram_arbiter.clients.cli import demo_display, doctor, quick, text
+from vram_arbiter.schemas.errors import BadState
+from vram_arbiter.schemas.runtime import terminal
 
 GIB = 1 << 30
 HOSTILE = "x\x1b]0;owned\x07\x1b[2J\x9b31m\u202egnp\u2066\u200b\x00\r\n2026 forged [red]line[/red]\t\udcff"
@@ -30,7 +30,9 @@ HOSTILE = "x\x1b]0;owned\x07\x1b[2J\x9b31m\u202egnp\u2066\u200b\x00\r\n2026 forg
 
 def obeyed(shown: str) -> list[str]:
     """What a terminal would not simply show."""
-    return [c for c in shown if c != "\n" and unicodedata.category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp")]
+    return [
+        c for c in shown if c != "\n" and unicodedata.category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp")
+    ]
 
 
 def poisoned(value: Any, name: str, keys: frozenset[str] | None = None) -> Any:
@@ -98,7 +100,13 @@ WHY = {
             "free_bytes": GIB,
             "deficit_bytes": GIB,
             "blockers": [
-                {"lease_id": "L1-1", "consumer": "x", "bytes": GIB, "state": "held", "condition": "in use"}
+                {
+                    "lease_id": "L1-1",
+                    "consumer": "x",
+                    "bytes": GIB,
+                    "state": "held",
+                    "condition": "in use",
+                }
             ],
             "next": "it unloads",
             "plan": [{"text": "x leaves"}],
@@ -124,7 +132,9 @@ SAID: dict[str, Callable[[str], list[str]]] = {
             "drained": name,
             "problems": [name],
             "gpus": poisoned([GPU], name),
-            "leases": poisoned(STATUS["leases"], name, frozenset({"consumer", "model", "lease_id", "gpu"})),
+            "leases": poisoned(
+                STATUS["leases"], name, frozenset({"consumer", "model", "lease_id", "gpu"})
+            ),
         }
     ),
     "status, every text": lambda name: text.status_lines(poisoned(STATUS, name)),
@@ -171,7 +181,9 @@ def test_columns_stay_columns_beside_an_escaped_name() -> None:
 
 
 # -- the demo's display --------------------------------------------------------------------------------------------
-def test_the_demos_display_obeys_neither_escapes_nor_markup(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demos_display_obeys_neither_escapes_nor_markup(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     out = io.StringIO()
     monkeypatch.setattr("sys.stdout", out)
     monkeypatch.setenv("COLUMNS", "400")

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from clients.reach import obstacle
-from clients.sync import SyncArbiterClient
-from schemas.errors import CODES
-from schemas.wire import LeaseSpec
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.net.diagnose import obstacle
+from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.schemas.errors import CODES
+from vram_arbiter.schemas.wire import LeaseSpec
 
 pytestmark = pytest.mark.e2e
 Spec = Callable[..., LeaseSpec]
@@ -30,14 +30,16 @@ EVERY_ACTION = (
 )  # fmt: skip
 STRANGER = """
 import os, sys
-import clients.aio, clients.cli.app, clients.cli.history, clients.cli.main, msgpack, zmq
+import clients.client, clients.cli.app, clients.cli.history, clients.cli.main, msgpack, zmq
 os.setgroups([]); os.setresgid(65534, 65534, 65534); os.setresuid(65534, 65534, 65534)
 clients.cli.main.main()
 """
 
 
 def vramctl(
-    environ: dict[str, str], *arguments: str, program: tuple[str, ...] = ("-m", "clients")
+    environ: dict[str, str],
+    *arguments: str,
+    program: tuple[str, ...] = ("-m", "vram_arbiter.clients"),
 ) -> Finished:
     return subprocess.run(
         [sys.executable, *program, *arguments],
@@ -79,7 +81,9 @@ def client(arbiter_daemon: ArbiterProcess) -> Iterator[SyncArbiterClient]:
         ("simulate", "desktop", "--timeline", "-3"),
     ],
 )  # fmt: skip
-def test_2_what_is_mistyped_is_told_before_anybody_is_asked(command: tuple[str, ...], tmp_path: Path) -> None:
+def test_2_what_is_mistyped_is_told_before_anybody_is_asked(
+    command: tuple[str, ...], tmp_path: Path
+) -> None:
     """There is no daemon: who asked one would end with 3."""
     environ = {k: v for k, v in os.environ.items() if not k.startswith("VRAM_ARBITER_")}
     done = vramctl({**environ, "VRAM_ARBITER_RUNTIME": str(tmp_path)}, *command)
@@ -141,7 +145,10 @@ def test_who_is_no_operator_may_look_and_is_told_who_may_act(
     for action in EVERY_ACTION:
         refused = vramctl(environ, *action, program=stranger)
         assert (refused.returncode, "operators_group" in one_line(refused)) == (1, True), action
-    assert typed(vramctl(environ, "evict", "det", "-r", "why", "--json", program=stranger)) == "not_permitted"
+    assert (
+        typed(vramctl(environ, "evict", "det", "-r", "why", "--json", program=stranger))
+        == "not_permitted"
+    )
     assert vramctl(environ, "why", "det", program=stranger).returncode == 0
     assert lease.state == "held"
     sock.chmod(0o660)
@@ -153,9 +160,10 @@ def test_who_is_no_operator_may_look_and_is_told_who_may_act(
         ("run", "--vram", "1GiB", "true"),
     ):
         shut_out = vramctl(environ, *command, program=stranger)
-        assert (shut_out.returncode, "may not be used by uid 65534" in one_line(shut_out)) == (3, True), (
-            command
-        )
+        assert (shut_out.returncode, "may not be used by uid 65534" in one_line(shut_out)) == (
+            3,
+            True,
+        ), command
     assert "join the group root" in shut_out.stderr
     arbiter_daemon.runtime.chmod(0o700)
     assert "its folder is closed to you" in one_line(vramctl(environ, "status", program=stranger))
@@ -176,17 +184,22 @@ def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) 
     arbiter_daemon.kill()
     for action in (*EVERY_ACTION, ("history",), ("why", "x"), ("watch",), ("history", "-f")):
         dead = vramctl(environ, *action)
-        assert (dead.returncode, "it was killed, its socket is left over" in one_line(dead)) == (3, True), (
-            action
-        )
+        assert (dead.returncode, "it was killed, its socket is left over" in one_line(dead)) == (
+            3,
+            True,
+        ), action
     for action in (("resume", "--json"), ("history", "-f", "--json")):
         assert typed(vramctl(environ, *action)) == "arbiter_unreachable"
     (arbiter_daemon.runtime / "arbiter.sock").unlink()
     assert "there is no such socket" in one_line(vramctl(environ, "resume"))
     (arbiter_daemon.runtime / "arbiter.sock").write_text("")
     assert "is no socket" in one_line(vramctl(environ, "resume"))
-    assert "Linux allows 107" in one_line(vramctl(environ, "resume", "--endpoint", f"ipc:///{'x' * 200}"))
-    assert "'garbage' is not an endpoint" in one_line(vramctl(environ, "resume", "--endpoint", "garbage"))
+    assert "Linux allows 107" in one_line(
+        vramctl(environ, "resume", "--endpoint", f"ipc:///{'x' * 200}")
+    )
+    assert "'garbage' is not an endpoint" in one_line(
+        vramctl(environ, "resume", "--endpoint", "garbage")
+    )
 
 
 def test_a_look_at_the_socket_disturbs_nobody(
@@ -221,4 +234,6 @@ def test_an_empty_and_a_cut_log(arbiter_daemon: ArbiterProcess, tmp_path: Path) 
         assert says in (done.stdout if code == 0 else one_line(done))
     assert "no event log here" in one_line(vramctl(environ, "replay", str(tmp_path / "nothing")))
     assert "one that is shipped: desktop" in one_line(vramctl(environ, "simulate", "nothing"))
-    assert json.loads(vramctl(environ, "replay", str(tmp_path / "nothing"), "--json").stdout)["error"]["hint"]
+    assert json.loads(vramctl(environ, "replay", str(tmp_path / "nothing"), "--json").stdout)[
+        "error"
+    ]["hint"]

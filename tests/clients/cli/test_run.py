@@ -17,13 +17,13 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.process import ArbiterProcess
-from clients import cuda
-from clients.aio import ArbiterClient
-from clients.cli.run import RunSpec, _Run, lease_spec
-from clients.lease import Lease
-from clients.sync import SyncArbiterClient
-from schemas.wire import LeaseSpec
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients import cuda
+from vram_arbiter.clients.cli.run import RunSpec, _Run, lease_spec
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.lease import Lease
+from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.schemas.wire import LeaseSpec
 
 Spec = Callable[..., LeaseSpec]
 Finished = subprocess.CompletedProcess[str]
@@ -43,13 +43,23 @@ DEAF = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); prin
 
 
 def command(*options: str, program: str = PROGRAM) -> list[str]:
-    run = [sys.executable, "-m", "clients", "run", "--vram", "5GiB", "--name", "job", *options]
+    run = [
+        sys.executable,
+        "-m",
+        "vram_arbiter.clients",
+        "run",
+        "--vram",
+        "5GiB",
+        "--name",
+        "job",
+        *options,
+    ]
     return [*run, "--", sys.executable, "-c", program]
 
 
 def vramctl(*arguments: str | bytes, environ: dict[str, str]) -> Finished:
     return subprocess.run(
-        [sys.executable, "-m", "clients", *arguments],
+        [sys.executable, "-m", "vram_arbiter.clients", *arguments],
         env=environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
     )  # fmt: skip
 
@@ -101,7 +111,9 @@ def test_run_leases_for_a_program(arbiter_daemon: ArbiterProcess) -> None:
     assert re.fullmatch(r"L(\d+)-1 \1\.\d+ 3\n", done.stdout)
     assert "peak not measured" in done.stderr
     history = json.loads(vramctl("history", "--json", environ=environ).stdout)["events"]
-    story = [(event["kind"], event.get("exiting")) for event in history if event.get("consumer") == "job"]
+    story = [
+        (event["kind"], event.get("exiting")) for event in history if event.get("consumer") == "job"
+    ]
     assert ("granted", None) in story
     assert ("released", True) in story
 
@@ -116,7 +128,9 @@ def test_run_leases_for_a_program(arbiter_daemon: ArbiterProcess) -> None:
         ("UNIFIED-0", {}, {}),
     ],
 )
-def test_cuda_sees_the_granted_gpu(gpu: str, environ: dict[str, str], variables: dict[str, str]) -> None:
+def test_cuda_sees_the_granted_gpu(
+    gpu: str, environ: dict[str, str], variables: dict[str, str]
+) -> None:
     """A program on a machine with two GPUs took the first, whichever was granted."""
     assert cuda.visible(gpu, environ) == variables
 
@@ -134,7 +148,9 @@ def test_cuda_sees_the_granted_gpu(gpu: str, environ: dict[str, str], variables:
         (["--name", "x\n", "true"], 2, "--name: "),
     ],
 )
-def test_codes_of_what_is_never_started(command: list[str], code: int, said: str, tmp_path: Path) -> None:
+def test_codes_of_what_is_never_started(
+    command: list[str], code: int, said: str, tmp_path: Path
+) -> None:
     """Known before any arbiter is asked; 126 and 127 are as shells have them."""
     environ = {**os.environ, "VRAM_ARBITER_RUNTIME": str(tmp_path)}
     done = vramctl("run", "--vram", "1GiB", *command, environ=environ)
@@ -173,7 +189,9 @@ def test_a_program_may_have_any_name(arbiter_daemon: ArbiterProcess, tmp_path: P
 # -- signals ---------------------------------------------------------------------------------------------------------------
 @pytest.mark.e2e
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 5), (signal.SIGQUIT, 9)])
-def test_run_passes_signals_on(number: signal.Signals, code: int, arbiter_daemon: ArbiterProcess) -> None:
+def test_run_passes_signals_on(
+    number: signal.Signals, code: int, arbiter_daemon: ArbiterProcess
+) -> None:
     with running(arbiter_daemon.environ) as process:
         process.send_signal(number)
         assert process.wait(PATIENCE_S) == code
@@ -241,7 +259,9 @@ def test_two_programs_that_do_not_fit_together_run_one_after_the_other(
 def test_a_program_waits_for_as_long_as_it_was_told(arbiter_daemon: ArbiterProcess) -> None:
     """`--wait` did not count beside a pinned program: the answer was no at once."""
     with running(arbiter_daemon.environ, "--pin"):
-        done = vramctl("run", "--vram", "5GiB", "--wait", "0.2", "true", environ=arbiter_daemon.environ)
+        done = vramctl(
+            "run", "--vram", "5GiB", "--wait", "0.2", "true", environ=arbiter_daemon.environ
+        )
     assert done.returncode == 1
     assert "0.2 s" in done.stderr, done.stderr
 
@@ -252,7 +272,9 @@ def test_a_higher_priority_behind_an_equal_one_ends_the_program(
 ) -> None:
     """The revoke was for the first of them, and no second one comes."""
     with running(arbiter_daemon.environ) as process:
-        equal = subprocess.Popen(command("--name", "next", program="pass"), env=arbiter_daemon.environ)
+        equal = subprocess.Popen(
+            command("--name", "next", program="pass"), env=arbiter_daemon.environ
+        )
         assert "next waits" in said(process)
         lease = client.acquire(spec("b", 5), PATIENCE_S)
         assert process.wait(PATIENCE_S) == 5
@@ -310,7 +332,10 @@ async def test_the_peak_is_what_the_arbiter_measured_of_the_program(
         "memory = FakeMemory(Path(sys.argv[1]), 'job', 0); memory.allocate('x', 2 << 30); sys.stdin.read()"
     )
     spec = RunSpec(["job"], None, 1 << 30, "any", 40, None, False, "priority", None)
-    async with asyncio.timeout(PATIENCE_S), ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with (
+        asyncio.timeout(PATIENCE_S),
+        ArbiterClient(arbiter_daemon.endpoint, name="t") as client,
+    ):
         run = _Run(spec, client)
         lease: Lease = await client.acquire(lease_spec(spec))
         child = await asyncio.create_subprocess_exec(

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from clients.serve import Message, Peer, RouterServer
-from schemas.errors import LeaseLost, VramError
+from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.schemas.errors import LeaseLost, VramError
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
@@ -47,7 +47,9 @@ class GrantsAtOnce:
     @asynccontextmanager
     async def serving(self) -> AsyncIterator[str]:
         with tempfile.TemporaryDirectory(prefix="va") as folder:
-            server = RouterServer(f"ipc://{folder}/a.sock", lambda error: {"error": error.to_wire()})
+            server = RouterServer(
+                f"ipc://{folder}/a.sock", lambda error: {"error": error.to_wire()}
+            )
 
             async def handle(peer: Peer, message: Message) -> None:
                 reply = self.reply(message)
@@ -77,7 +79,7 @@ class GrantsAtOnce:
 async def vramctl_run(endpoint: str) -> AsyncIterator[asyncio.subprocess.Process]:
     """A program that ends with 5 on SIGTERM, once it is up."""
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "clients", "run", "--vram", "1GiB", "--name", "job", "--", sys.executable, "-c", PROGRAM,
+        sys.executable, "-m", "vram_arbiter.clients", "run", "--vram", "1GiB", "--name", "job", "--", sys.executable, "-c", PROGRAM,
         env={**os.environ, "VRAM_ARBITER_ENDPOINT": endpoint}, stdout=subprocess.PIPE,
     )  # fmt: skip
     assert process.stdout is not None
@@ -93,10 +95,16 @@ async def vramctl_run(endpoint: str) -> AsyncIterator[asyncio.subprocess.Process
             await process.wait()
 
 
-async def test_a_signal_reaches_the_program_although_the_arbiter_has_not_heard_that_it_runs() -> None:
+async def test_a_signal_reaches_the_program_although_the_arbiter_has_not_heard_that_it_runs() -> (
+    None
+):
     """Regression: until `ready` was answered nobody listened for signals. vramctl ended, its program stayed without a lease."""
     arbiter = GrantsAtOnce(ready=None)
-    async with asyncio.timeout(WAIT_S), arbiter.serving() as endpoint, vramctl_run(endpoint) as process:
+    async with (
+        asyncio.timeout(WAIT_S),
+        arbiter.serving() as endpoint,
+        vramctl_run(endpoint) as process,
+    ):
         process.send_signal(signal.SIGTERM)
         assert await process.wait() == 5
     assert arbiter.heard[-2:] == ["release", "bye"]
@@ -105,7 +113,11 @@ async def test_a_signal_reaches_the_program_although_the_arbiter_has_not_heard_t
 async def test_a_program_whose_lease_is_gone_when_it_has_started_is_waited_for() -> None:
     """Regression: vramctl ended with the error, and its program went on with nobody to pass signals to it."""
     arbiter = GrantsAtOnce(ready=LeaseLost("L1-1 expired"))
-    async with asyncio.timeout(WAIT_S), arbiter.serving() as endpoint, vramctl_run(endpoint) as process:
+    async with (
+        asyncio.timeout(WAIT_S),
+        arbiter.serving() as endpoint,
+        vramctl_run(endpoint) as process,
+    ):
         await arbiter.refused.wait()
         process.send_signal(signal.SIGTERM)
         assert await process.wait() == 5

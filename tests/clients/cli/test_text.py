@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from clients.cli import text
-from schemas.defaults import GIB, MIB
+from vram_arbiter.clients.cli import text
+from vram_arbiter.schemas.defaults import GIB, MIB
 
 GPU = {
     "gpu": "GPU-1",
@@ -37,11 +37,24 @@ LEASE = {
     "pid": 7,
     "since_s": 61.0,
 }
-STATUS = {"epoch": 3, "phase": "serving", "uptime_s": 720.0, "gpus": [GPU], "leases": [LEASE], "clients": 1}
+STATUS = {
+    "epoch": 3,
+    "phase": "serving",
+    "uptime_s": 720.0,
+    "gpus": [GPU],
+    "leases": [LEASE],
+    "clients": 1,
+}
 
 
 def test_status() -> None:
-    queued = LEASE | {"lease_id": "L1-12", "consumer": "grab", "state": "queued", "uses": 0, "position": 1}
+    queued = LEASE | {
+        "lease_id": "L1-12",
+        "consumer": "grab",
+        "state": "queued",
+        "uses": 0,
+        "position": 1,
+    }
     pinned = LEASE | {
         "lease_id": "L1-3",
         "consumer": "job",
@@ -64,14 +77,22 @@ def test_status() -> None:
 
 
 def test_status_says_what_is_wrong_with_the_daemons_own_files() -> None:
-    problems = ["the journal cannot be written (disk full): what is held stays, nothing new is granted"]
+    problems = [
+        "the journal cannot be written (disk full): what is held stays, nothing new is granted"
+    ]
     assert text.status_lines(STATUS | {"problems": problems})[1] == f"  {problems[0]}"
 
 
 def test_status_of_a_card_in_trouble() -> None:
     processes = [
         {"pid": 8, "name": "Xorg", "used_bytes": 200 * MIB, "residue_bytes": 0, "stowaway": True},
-        {"pid": 7, "name": "python", "used_bytes": None, "residue_bytes": 450 * MIB, "stowaway": False},
+        {
+            "pid": 7,
+            "name": "python",
+            "used_bytes": None,
+            "residue_bytes": 450 * MIB,
+            "stowaway": False,
+        },
         {"pid": 9, "name": "python", "used_bytes": 1, "residue_bytes": 0, "stowaway": False},
     ]
     gpu = GPU | {
@@ -82,7 +103,9 @@ def test_status_of_a_card_in_trouble() -> None:
         "blocked": "the probe failed",
         "processes": processes,
     }
-    assert text.status_lines(STATUS | {"phase": "recovering", "gpus": [gpu], "leases": [], "clients": 2}) == [
+    assert text.status_lines(
+        STATUS | {"phase": "recovering", "gpus": [gpu], "leases": [], "clients": 2}
+    ) == [
         "arbiter recovering · epoch 3 · up 12 min · 2 clients",
         "  after a restart nothing is granted until every lease is accounted for",
         "",
@@ -128,7 +151,9 @@ def test_why_somebody_waits() -> None:
         "  next      it unloads",
         "  expected  in 1.2 s (learnt)",
     ]
-    unknown = text.why_lines({"consumer": "grab", "leases": [entry | {"eta_s": None, "eta_source": "none"}]})
+    unknown = text.why_lines(
+        {"consumer": "grab", "leases": [entry | {"eta_s": None, "eta_source": "none"}]}
+    )
     assert unknown[-1] == "  expected  unknown, never seen before"
 
 
@@ -144,7 +169,13 @@ def test_drift_is_a_column_only_where_somebody_drifts() -> None:
 
 
 def test_why_tells_what_is_planned() -> None:
-    plan = [{"action": "ask", "in_s": 1.2, "text": "asks detector in 1.2 s, when its minimum residency ends"}]
+    plan = [
+        {
+            "action": "ask",
+            "in_s": 1.2,
+            "text": "asks detector in 1.2 s, when its minimum residency ends",
+        }
+    ]
     entry = {
         "lease_id": "L1-2",
         "state": "queued",
@@ -168,10 +199,14 @@ def test_why_tells_what_was_measured_before() -> None:
     entry = {"lease_id": "L1-1", "state": "held", "text": "detector: it is resident, idle"}
 
     def lines(footprint: dict[str, Any]) -> list[str]:
-        return text.why_lines({"consumer": "detector", "leases": [entry | {"footprint": footprint}]})
+        return text.why_lines(
+            {"consumer": "detector", "leases": [entry | {"footprint": footprint}]}
+        )
 
     assert len(lines(never)) == 2
-    assert lines(never | {"learnt_bytes": {"load_peak": 2 * GIB, "steady": GIB, "residue": 0}})[-1] == (
+    assert lines(never | {"learnt_bytes": {"load_peak": 2 * GIB, "steady": GIB, "residue": 0}})[
+        -1
+    ] == (
         "  footprint load peak 1 GiB (measured 2 GiB), steady 1 GiB (measured 1 GiB), residue 1 GiB"
     )
 
@@ -205,7 +240,9 @@ def test_an_event() -> None:
     }
     line = text.event_line(event)
     day = time.strftime("%Y-%m-%d", time.localtime(0))
-    assert line.startswith(day + " "), "the history is days long: without a date two nights look like one"
+    assert line.startswith(day + " "), (
+        "the history is days long: without a date two nights look like one"
+    )
     assert line.partition(":")[2].partition(":")[2] == (
         "00.062  granted         a L1-1  fits  charge=1GiB waited=12.3ms share=0.123"
     )
@@ -230,7 +267,13 @@ def test_fields_of_an_event_have_units(field: dict[str, Any], said: str) -> None
 def test_since_counts_from_the_grant() -> None:
     """It counted from the last change of state: a lease that was held for a day showed 2 s once it was asked to leave."""
     revoked = LEASE | {"state": "revoking", "since_s": 2.0, "granted_s": 90_000.0}
-    away = LEASE | {"lease_id": "L1-2", "state": "standby", "gpu": None, "since_s": 3.0, "granted_s": 900.0}
+    away = LEASE | {
+        "lease_id": "L1-2",
+        "state": "standby",
+        "gpu": None,
+        "since_s": 3.0,
+        "granted_s": 900.0,
+    }
     lines = text.status_lines(STATUS | {"leases": [revoked, away]})
     assert [line.split("  ")[-1].strip() for line in lines[-2:]] == ["25 h", "3.0 s"]
 
@@ -248,7 +291,14 @@ def test_the_gpu_of_a_lease_is_a_column_where_there_are_several() -> None:
 
 @pytest.mark.parametrize(
     ("seconds", "said"),
-    [(0.04, "0.0 s"), (9.96, "10.0 s"), (12, "12 s"), (180, "3 min"), (10_800, "3 h"), (200_000, "2 d")],
+    [
+        (0.04, "0.0 s"),
+        (9.96, "10.0 s"),
+        (12, "12 s"),
+        (180, "3 min"),
+        (10_800, "3 h"),
+        (200_000, "2 d"),
+    ],
 )
 def test_durations(seconds: float, said: str) -> None:
     assert text.duration(seconds) == said

@@ -1,4 +1,4 @@
-"""A sidecar of the tests, in a process of its own: the op family on `clients.serve`, without any model. Not a test module.
+"""A sidecar of the tests, in a process of its own: the op family on `clients.net.server`, without any model. Not a test module.
 
 Usage: server_process.py ENDPOINT [crash | silent | slow]. `crash` prints and exits with 3, `silent` never serves.
 """
@@ -9,8 +9,8 @@ import sys
 import time
 from typing import Any
 
-from clients.serve import Peer, RouterServer
-from schemas.errors import CODES, VramError
+from vram_arbiter.clients.net.server import Peer, RouterServer
+from vram_arbiter.schemas.errors import CODES, VramError
 
 DYING_S = 1.5
 """A process that held gigabytes of a card hangs up long before the kernel says that it has ended."""
@@ -47,7 +47,9 @@ async def main(endpoint: str, mode: str) -> None:
                 case "detect" if message["query"] == "die":
                     os._exit(9)
                 case "detect" if message["query"] == "die slowly":
-                    os.closerange(3, 1024)  # as the kernel does, before it says that a process has ended
+                    os.closerange(
+                        3, 1024
+                    )  # as the kernel does, before it says that a process has ended
                     time.sleep(DYING_S)
                     os._exit(9)
                 case "detect" if message["query"] == "hang":
@@ -58,7 +60,9 @@ async def main(endpoint: str, mode: str) -> None:
                     reply |= {"detections": [{"label": "x"}]}
                 case "detect":
                     boxes = [("a", 0.2, [0, 0, 2, 4]), ("b", 0.9, [1, 1, 3, 3])]
-                    reply |= {"detections": [{"label": a, "score": s, "box": b} for a, s, b in boxes]}
+                    reply |= {
+                        "detections": [{"label": a, "score": s, "box": b} for a, s, b in boxes]
+                    }
                 case "query":
                     reply |= {"answer": f"{message['question']} {message.get('token')}"}
                 case "load":
@@ -66,7 +70,12 @@ async def main(endpoint: str, mode: str) -> None:
                 case "reset":
                     reply |= {"seed": message["data"].get("seed")}
                 case "get_action":
-                    reply = {"result": [{"action": message["data"]["observation"]["state"]}, {"steps": 1}]}
+                    reply = {
+                        "result": [
+                            {"action": message["data"]["observation"]["state"]},
+                            {"steps": 1},
+                        ]
+                    }
                 case "shutdown":
                     stopped.set()
             await server.send(peer, reply | {"re": message.get("id")})

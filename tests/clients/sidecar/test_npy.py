@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clients.sidecar import npy
-from schemas.errors import BadRequest
+from vram_arbiter.clients.sidecar import npy
+from vram_arbiter.schemas.errors import BadRequest
 
 
 def test_plain_values_pass_and_numpy_is_not_imported_for_them() -> None:
@@ -121,7 +121,9 @@ def test_a_message_has_a_bounded_number_of_arrays() -> None:
     fortran=st.booleans(),
     seed=st.integers(0, 9),
 )
-def test_every_array_of_numbers_comes_back(dtype: str, shape: list[int], fortran: bool, seed: int) -> None:
+def test_every_array_of_numbers_comes_back(
+    dtype: str, shape: list[int], fortran: bool, seed: int
+) -> None:
     import numpy
 
     numbers = numpy.random.default_rng(seed).integers(0, 100, shape).astype(dtype)

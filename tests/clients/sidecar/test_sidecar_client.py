@@ -11,12 +11,19 @@ from pathlib import Path
 
 import pytest
 
-from clients.sidecar import base
-from clients.sidecar.base import SidecarClient
-from clients.sidecar.perception import Detection, DetectorClient, SceneVlmClient
-from clients.sidecar.policy import PolicyClient
-from clients.sidecar.spawn import SpawnSpec
-from schemas.errors import Evicted, Loading, ModelError, NotResident, OutOfMemory, SidecarUnavailable
+from vram_arbiter.clients.sidecar import base
+from vram_arbiter.clients.sidecar.base import SidecarClient
+from vram_arbiter.clients.sidecar.perception import Detection, DetectorClient, SceneVlmClient
+from vram_arbiter.clients.sidecar.policy import PolicyClient
+from vram_arbiter.clients.sidecar.spawn import SpawnSpec
+from vram_arbiter.schemas.errors import (
+    Evicted,
+    Loading,
+    ModelError,
+    NotResident,
+    OutOfMemory,
+    SidecarUnavailable,
+)
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
@@ -51,7 +58,9 @@ def foreign(endpoint: str) -> Iterator[Callable[[], subprocess.Popen[bytes]]]:
 
 @pytest.fixture
 async def detector(endpoint: str) -> AsyncIterator[DetectorClient]:
-    async with DetectorClient(endpoint, spawn=SpawnSpec(command(endpoint)), timeout_s=60.0) as client:
+    async with DetectorClient(
+        endpoint, spawn=SpawnSpec(command(endpoint)), timeout_s=60.0
+    ) as client:
         yield client
 
 
@@ -114,7 +123,9 @@ async def test_a_killed_child_is_replaced(detector: DetectorClient) -> None:
     assert await detector.detect(PNG, "x")
 
 
-async def test_a_child_that_takes_its_time_to_die_is_replaced_all_the_same(detector: DetectorClient) -> None:
+async def test_a_child_that_takes_its_time_to_die_is_replaced_all_the_same(
+    detector: DetectorClient,
+) -> None:
     """Regression: it was waited for as for one that boots, and its old end was the next call's error."""
     await detector.detect(PNG, "x")
     first = detector.child
@@ -136,7 +147,9 @@ async def test_a_boot_that_fails_says_why(endpoint: str) -> None:
 
 
 async def test_a_boot_that_takes_too_long(endpoint: str, tmp_path: Path) -> None:
-    spec = SpawnSpec(command(endpoint, "silent"), boot_timeout_s=0.5, log=tmp_path / "logs" / "s.log")
+    spec = SpawnSpec(
+        command(endpoint, "silent"), boot_timeout_s=0.5, log=tmp_path / "logs" / "s.log"
+    )
     async with DetectorClient(endpoint, spawn=spec) as client:
         with pytest.raises(SidecarUnavailable, match=r"within 0\.5 s"):
             await client.detect(PNG, "x")
@@ -155,7 +168,10 @@ async def test_a_command_that_does_not_exist(endpoint: str) -> None:
 
 async def test_two_clients_starting_one_sidecar_end_up_with_one(endpoint: str) -> None:
     spec = SpawnSpec(command(endpoint))
-    async with DetectorClient(endpoint, spawn=spec) as one, DetectorClient(endpoint, spawn=spec) as two:
+    async with (
+        DetectorClient(endpoint, spawn=spec) as one,
+        DetectorClient(endpoint, spawn=spec) as two,
+    ):
         await asyncio.gather(one.detect(PNG, "x"), two.detect(PNG, "x"))
         assert one.identity is not None
         assert two.identity is not None

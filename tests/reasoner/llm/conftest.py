@@ -25,9 +25,13 @@ class StandIn:
 
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
-                stand_in.asked.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+                stand_in.asked.append(
+                    json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+                )
                 stand_in.paths.append(self.path)
-                stand_in.headers.append({name.lower(): value for name, value in self.headers.items()})
+                stand_in.headers.append(
+                    {name.lower(): value for name, value in self.headers.items()}
+                )
                 stand_in.begun.set()
                 stand_in.answers.pop(0)(self)
 

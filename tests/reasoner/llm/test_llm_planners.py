@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from reasoner.llm.anthropic import AnthropicPlanner
-from reasoner.llm.base import LlmConfig, LlmPlanner
-from reasoner.llm.openai import OpenAiPlanner
-from reasoner.palette import Palette, Skill
-from reasoner.planner import Episode, Finish, Note, Outcome, Step
-from schemas.errors import ConfigError, LlmError
-from schemas.tools import ExecuteRskill, LocateInView, QueryScene, StopGoal, Wait
+from vram_arbiter.reasoner.llm.anthropic import AnthropicPlanner
+from vram_arbiter.reasoner.llm.base import LlmConfig, LlmPlanner
+from vram_arbiter.reasoner.llm.openai import OpenAiPlanner
+from vram_arbiter.reasoner.palette import Palette, Skill
+from vram_arbiter.reasoner.planner import Episode, Finish, Note, Outcome, Step
+from vram_arbiter.schemas.errors import ConfigError, LlmError
+from vram_arbiter.schemas.tools import ExecuteRskill, LocateInView, QueryScene, StopGoal, Wait
 
 pytest.importorskip("httpx", reason="needs the reasoner extra")
 
@@ -48,7 +48,13 @@ class OpenAi:
         ]
         return {
             "choices": [
-                {"message": {"role": "assistant", "content": text or None, "tool_calls": made or None}}
+                {
+                    "message": {
+                        "role": "assistant",
+                        "content": text or None,
+                        "tool_calls": made or None,
+                    }
+                }
             ]
         }
 
@@ -84,7 +90,12 @@ class Anthropic:
             except ValueError:
                 value = arguments
             content.append({"type": "tool_use", "id": f"toolu_{n}", "name": name, "input": value})
-        return {"type": "message", "role": "assistant", "content": content, "stop_reason": "tool_use"}
+        return {
+            "type": "message",
+            "role": "assistant",
+            "content": content,
+            "stop_reason": "tool_use",
+        }
 
     @staticmethod
     def offered(body: dict[str, Any]) -> dict[str, Any]:
@@ -99,7 +110,9 @@ class Anthropic:
                     case "text":
                         found.append(block["text"])
                     case "tool_use":
-                        found.append(f"{block['name']} {json.dumps(block['input'], separators=(',', ':'))}")
+                        found.append(
+                            f"{block['name']} {json.dumps(block['input'], separators=(',', ':'))}"
+                        )
                     case "tool_result":
                         found.append(block["content"])
         return found
@@ -112,7 +125,9 @@ def api(request: pytest.FixtureRequest) -> Any:
 
 @pytest.fixture
 def decide(api: Any, stand_in: Any) -> Callable[..., Any]:
-    def run(episode: Episode | None = None, *, timeout_s: float = 20.0, palette: Palette = PALETTE) -> Any:
+    def run(
+        episode: Episode | None = None, *, timeout_s: float = 20.0, palette: Palette = PALETTE
+    ) -> Any:
         config = LlmConfig(stand_in.url + api.base, "m", KEY, timeout_s)
 
         async def once() -> Any:
@@ -124,7 +139,9 @@ def decide(api: Any, stand_in: Any) -> Callable[..., Any]:
     return run
 
 
-def test_a_call_is_decoded_and_only_what_may_be_used_is_offered(api: Any, stand_in: Any, decide: Any) -> None:
+def test_a_call_is_decoded_and_only_what_may_be_used_is_offered(
+    api: Any, stand_in: Any, decide: Any
+) -> None:
     stand_in.json(api.says(("locate_in_view", '{"query": "red cube", "rationale": "look first"}')))
     assert decide() == LocateInView(query="red cube", rationale="look first")
     assert stand_in.paths == [api.path]
@@ -141,16 +158,22 @@ def test_a_call_is_decoded_and_only_what_may_be_used_is_offered(api: Any, stand_
 
 def test_a_skill_is_called_by_its_own_function(api: Any, stand_in: Any, decide: Any) -> None:
     stand_in.json(
-        api.says(("execute_rskill__lab__navigate", '{"goal_params": {"turn_rad": 0.5}, "deadline_s": 9}'))
+        api.says(
+            ("execute_rskill__lab__navigate", '{"goal_params": {"turn_rad": 0.5}, "deadline_s": 9}')
+        )
     )
     assert decide() == ExecuteRskill(
         rskill_id="lab/navigate", goal_params_json='{"turn_rad":0.5}', deadline_s=9
     )
 
 
-def test_parameters_that_do_not_fit_the_skill_are_told_back(api: Any, stand_in: Any, decide: Any) -> None:
+def test_parameters_that_do_not_fit_the_skill_are_told_back(
+    api: Any, stand_in: Any, decide: Any
+) -> None:
     stand_in.json(api.says(("execute_rskill__lab__navigate", '{"goal_params": {"turn_rad": 90}}')))
-    stand_in.json(api.says(("execute_rskill__lab__navigate", '{"goal_params": {"turn_rad": 1.57}}')))
+    stand_in.json(
+        api.says(("execute_rskill__lab__navigate", '{"goal_params": {"turn_rad": 1.57}}'))
+    )
     assert decide().goal_params == {"turn_rad": 1.57}
     assert "goal_params.turn_rad: must be at most 3.2" in api.told(stand_in.asked[1])[-1]
 
@@ -173,11 +196,16 @@ def test_the_episode_is_told_as_a_conversation(api: Any, stand_in: Any, decide: 
     assert "nothing was looked at" in json.loads(seen)["meaning"]
 
 
-def test_words_without_a_call_get_one_nudge_and_no_second(api: Any, stand_in: Any, decide: Any) -> None:
+def test_words_without_a_call_get_one_nudge_and_no_second(
+    api: Any, stand_in: Any, decide: Any
+) -> None:
     stand_in.json(api.says(text="I would look."))
     stand_in.json(api.says(("query_scene", '{"question": "what is there?"}')))
     assert decide() == QueryScene(question="what is there?")
-    assert api.told(stand_in.asked[1])[-2:] == ["I would look.", "Answer with exactly one tool call."]
+    assert api.told(stand_in.asked[1])[-2:] == [
+        "I would look.",
+        "Answer with exactly one tool call.",
+    ]
     stand_in.json(api.says(text="I would look."))
     stand_in.json(api.says(text=""))
     with pytest.raises(LlmError, match="no tool call"):
@@ -197,7 +225,10 @@ def test_words_without_a_call_get_one_nudge_and_no_second(api: Any, stand_in: An
         ([("locate_in_view", "not json")], "not JSON"),
         ([("execute_rskill__lab__grab", '{"rskill_id": "lab/vlm"}')], "rskill_id"),
         ([("execute_rskill__lab__navigate", '{"goal_params": {"turn_rad": NaN}}')], "NaN"),
-        ([("execute_rskill__lab__navigate", '{"goal_params": {"turn_rad": 1e999}}')], "goal_params"),
+        (
+            [("execute_rskill__lab__navigate", '{"goal_params": {"turn_rad": 1e999}}')],
+            "goal_params",
+        ),
         ([("finish", '{"success": "yes", "reason": "x"}')], "success"),
     ],
 )
@@ -208,14 +239,20 @@ def test_it_gives_up_after_three_unusable_answers(
         stand_in.json(api.says(*calls))
     with pytest.raises(LlmError):
         decide()
-    if len(stand_in.asked) > 1:  # a body that is no strict JSON is refused before its calls are read
+    if (
+        len(stand_in.asked) > 1
+    ):  # a body that is no strict JSON is refused before its calls are read
         assert len(stand_in.asked) == 3
         assert problem in " ".join(api.told(stand_in.asked[2]))
 
 
-def test_while_a_goal_runs_only_its_going_on_is_decided(api: Any, stand_in: Any, decide: Any) -> None:
+def test_while_a_goal_runs_only_its_going_on_is_decided(
+    api: Any, stand_in: Any, decide: Any
+) -> None:
     running = Episode(
-        "grab it", notes=[Note("operator", "careful", 0)], running=ExecuteRskill(rskill_id="lab/grab")
+        "grab it",
+        notes=[Note("operator", "careful", 0)],
+        running=ExecuteRskill(rskill_id="lab/grab"),
     )
     stand_in.json(api.says(("execute_rskill__lab__navigate", "{}")))
     stand_in.json(api.says(("stop_goal", "{}")))
@@ -229,9 +266,13 @@ def test_while_a_goal_runs_only_its_going_on_is_decided(api: Any, stand_in: Any,
     assert decide(running) == Wait()
 
 
-def test_a_skill_that_cannot_be_started_is_no_longer_offered(api: Any, stand_in: Any, decide: Any) -> None:
+def test_a_skill_that_cannot_be_started_is_no_longer_offered(
+    api: Any, stand_in: Any, decide: Any
+) -> None:
     """The defect of the field: a policy whose sidecar does not start was selected for ever."""
-    failed = Step(ExecuteRskill(rskill_id="lab/grab"), Outcome("failed", "no process", "sidecar_unavailable"))
+    failed = Step(
+        ExecuteRskill(rskill_id="lab/grab"), Outcome("failed", "no process", "sidecar_unavailable")
+    )
     stand_in.json(api.says(("finish", '{"success": false, "reason": "x"}')))
     decide(Episode("x", [failed, failed, failed]))
     assert "execute_rskill__lab__grab" not in api.offered(stand_in.asked[0])
@@ -250,7 +291,9 @@ def test_a_perception_model_called_as_a_skill_goes_to_the_loop_to_be_refused(
 
 # -- servers that misbehave ----------------------------------------------------------------------------------------
 @pytest.mark.parametrize("how", ["hangs", "drips"])
-def test_a_server_that_never_ends_its_answer_is_given_up(stand_in: Any, decide: Any, how: str) -> None:
+def test_a_server_that_never_ends_its_answer_is_given_up(
+    stand_in: Any, decide: Any, how: str
+) -> None:
     getattr(stand_in, how)()
     with pytest.raises(LlmError, match=r"within 0\.3 s"):
         decide(timeout_s=0.3)
@@ -309,7 +352,9 @@ def test_garbage_is_a_typed_error(stand_in: Any, decide: Any, body: bytes) -> No
 
 def test_nobody_there_is_a_typed_error(api: Any) -> None:
     async def ask() -> None:
-        async with api.planner(LlmConfig("http://127.0.0.1:1", "m"), PALETTE, retry_pause_s=0.0) as planner:
+        async with api.planner(
+            LlmConfig("http://127.0.0.1:1", "m"), PALETTE, retry_pause_s=0.0
+        ) as planner:
             await planner.decide(Episode("x"))
 
     with pytest.raises(LlmError, match="3 times"):
@@ -347,7 +392,12 @@ def test_the_environment_is_checked() -> None:
         LlmConfig.from_environ({})
     complete = {"VRAM_REASONER_LLM_BASE_URL": "http://x/v1/", "VRAM_REASONER_LLM_MODEL": "m"}
     assert LlmConfig.from_environ(complete).base_url == "http://x/v1"
-    for name, text in (("TIMEOUT_S", "soon"), ("TIMEOUT_S", "-1"), ("TIMEOUT_S", "nan"), ("MAX_TOKENS", "0")):
+    for name, text in (
+        ("TIMEOUT_S", "soon"),
+        ("TIMEOUT_S", "-1"),
+        ("TIMEOUT_S", "nan"),
+        ("MAX_TOKENS", "0"),
+    ):
         with pytest.raises(ConfigError, match="no number"):
             LlmConfig.from_environ(complete | {f"VRAM_REASONER_LLM_{name}": text})
     with pytest.raises(ConfigError, match="no http"):

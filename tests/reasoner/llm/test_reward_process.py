@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.fakegpu_check import check_log
-from arbiter.testing.wire import WireClient
-from clients.runner import RunnerClient
-from clients.sidecar.perception import RewardClient
-from schemas.errors import Evicted
+from tests.support.fakegpu_check import check_log
+from tests.support.wire import WireClient
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.sidecar.perception import RewardClient
+from vram_arbiter.schemas.errors import Evicted
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(400)]
 
@@ -25,7 +25,11 @@ GB = 10**9
 
 
 def openai(name: str, **arguments: Any) -> Any:
-    call = {"id": "c", "type": "function", "function": {"name": name, "arguments": json.dumps(arguments)}}
+    call = {
+        "id": "c",
+        "type": "function",
+        "function": {"name": name, "arguments": json.dumps(arguments)},
+    }
     return {"choices": [{"message": {"role": "assistant", "content": None, "tool_calls": [call]}}]}
 
 
@@ -97,10 +101,14 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
                     3.33 * GB,
                 )
                 token = identity["token"]  # of the sidecar: `status` shows tokens to holders only
-                assert (await reward.score([picture], "grab the red cube", token=token)).progress[0] < 0.5
+                assert (await reward.score([picture], "grab the red cube", token=token)).progress[
+                    0
+                ] < 0.5
 
                 # somebody needs the card: it leaves, and says *evicted* to whoever still speaks of the old lease
-                granted = await asyncio.to_thread(arbiter.acquire, "vla", 6 * GB, wait_timeout_s=60.0)
+                granted = await asyncio.to_thread(
+                    arbiter.acquire, "vla", 6 * GB, wait_timeout_s=60.0
+                )
                 assert granted["ok"], granted
                 push = await asyncio.to_thread(arbiter.push, "granted", 60.0)
                 assert (await reward.ping(timeout_s=60.0))["state"] == "unloaded"
@@ -125,7 +133,9 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
     offered = {tool["function"]["name"] for tool in stand_in.asked[0]["tools"]}
     assert "query_task_progress" in offered
     assert not any("progress" in name for name in offered - {"query_task_progress"})
-    told = next(json.loads(m["content"]) for m in stand_in.asked[1]["messages"] if m["role"] == "tool")
+    told = next(
+        json.loads(m["content"]) for m in stand_in.asked[1]["messages"] if m["role"] == "tool"
+    )
     assert told["source"] == "reward_model"
     assert told["data"]["progress"][-1] < 0.5, "nothing has been grabbed"
     assert told["data"]["success"][-1] < 0.5

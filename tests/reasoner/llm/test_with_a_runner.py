@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from clients.runner import RunnerClient
-from reasoner.server import send
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.reasoner.server import send
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
 
@@ -22,7 +22,11 @@ TURN = "execute_rskill__vram-arbiter__so101-navigate"
 
 
 def openai(name: str, **arguments: Any) -> Any:
-    call = {"id": "c", "type": "function", "function": {"name": name, "arguments": json.dumps(arguments)}}
+    call = {
+        "id": "c",
+        "type": "function",
+        "function": {"name": name, "arguments": json.dumps(arguments)},
+    }
     return {"choices": [{"message": {"role": "assistant", "content": None, "tool_calls": [call]}}]}
 
 
@@ -45,7 +49,12 @@ class Programs:
     @asynccontextmanager
     async def run(self, *argv: str) -> AsyncIterator[asyncio.subprocess.Process]:
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", *argv, cwd=ROOT, env=self.environ, stderr=asyncio.subprocess.DEVNULL
+            sys.executable,
+            "-m",
+            *argv,
+            cwd=ROOT,
+            env=self.environ,
+            stderr=asyncio.subprocess.DEVNULL,
         )
         try:
             yield process
@@ -80,7 +89,9 @@ async def until(condition: Callable[[], Any]) -> Any:
         await asyncio.sleep(0.02)
 
 
-def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(tmp_path: Path, stand_in: Any) -> None:
+def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(
+    tmp_path: Path, stand_in: Any
+) -> None:
     pytest.importorskip("mujoco", reason="needs the full install")
     programs = Programs(tmp_path, stand_in.url)
 
@@ -99,7 +110,11 @@ def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(tmp_path:
             stand_in.json(openai("finish", success=True, reason="turned"))
             async with programs.reasoner("openai") as reasoner:
                 await until(goal)
-                await send(f"ipc://{tmp_path}/reasoner.sock", {"op": "say", "text": "slowly"}, timeout_s=60.0)
+                await send(
+                    f"ipc://{tmp_path}/reasoner.sock",
+                    {"op": "say", "text": "slowly"},
+                    timeout_s=60.0,
+                )
                 assert await reasoner.wait() == 0
             result = programs.result()
             assert [step["status"] for step in result["steps"]] == ["succeeded"]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from runner.dataset import commit
-from schemas.errors import AlreadyRunning, ConfigError
+from vram_arbiter.runner.dataset import commit
+from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError
 
 
 def write(root: Path, name: str, text: str) -> None:
@@ -108,7 +108,9 @@ def test_a_damaged_episode_is_said_and_nothing_is_touched(dataset: Path, harm: s
     commit.begin(dataset)
     write(dataset, "data/chunk-000/file-002.parquet", "half")
     before = tree(dataset)
-    with pytest.raises(ConfigError, match=r"file-000\.parquet is missing or not as it was recorded"):
+    with pytest.raises(
+        ConfigError, match=r"file-000\.parquet is missing or not as it was recorded"
+    ):
         commit.repair(dataset)
     assert tree(dataset) == before
 
@@ -150,7 +152,10 @@ def test_one_dataset_has_one_writer(tmp_path: Path) -> None:
     assert other.stdout is not None
     with other:
         assert other.stdout.readline() == b"held\n"
-        with pytest.raises(AlreadyRunning, match="another process records"), commit.locked(tmp_path, 0.0):
+        with (
+            pytest.raises(AlreadyRunning, match="another process records"),
+            commit.locked(tmp_path, 0.0),
+        ):
             pass
         other.stdin.close()
         with commit.locked(tmp_path, 60.0):  # as soon as the other one is done

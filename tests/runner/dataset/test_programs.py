@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from clients.runner import RunnerClient
-from runner.dataset import commit
-from runner.dataset.reader import read_frame
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.runner.dataset import commit
+from vram_arbiter.runner.dataset.reader import read_frame
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(600)]
 
@@ -32,11 +32,17 @@ def start(tmp_path: Path) -> Iterator[Start]:
     started: list[subprocess.Popen[str]] = []
 
     def begin(*argv: str, **environ: str) -> subprocess.Popen[str]:
-        given = os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path), "OMP_NUM_THREADS": "1"} | environ
+        given = (
+            os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path), "OMP_NUM_THREADS": "1"} | environ
+        )
         skills = ("--skills", str(ROOT / "configs/rskills/so101-navigate"), "--no-arbiter")
         started.append(
             subprocess.Popen(
-                [sys.executable, *argv, *skills], cwd=tmp_path, env=given, stdout=subprocess.PIPE, text=True
+                [sys.executable, *argv, *skills],
+                cwd=tmp_path,
+                env=given,
+                stdout=subprocess.PIPE,
+                text=True,
             )
         )
         return started[-1]
@@ -48,9 +54,13 @@ def start(tmp_path: Path) -> Iterator[Start]:
         process.communicate()
 
 
-def test_the_episode_of_a_killed_simulator_is_finished_by_its_writer(start: Start, tmp_path: Path) -> None:
+def test_the_episode_of_a_killed_simulator_is_finished_by_its_writer(
+    start: Start, tmp_path: Path
+) -> None:
     root = tmp_path / "set"
-    process = start("-m", "runner", "sim", "--record", str(root), "--rate", "0", **DEAF)
+    process = start(
+        "-m", "vram_arbiter.runner", "sim", "--record", str(root), "--rate", "0", **DEAF
+    )
 
     async def use() -> None:
         async with (
@@ -79,7 +89,11 @@ def test_the_episode_of_a_killed_simulator_is_finished_by_its_writer(start: Star
     last = read_frame(root, note["frames"] - 1)
     assert last.tick["done"]
     assert last.tick["success"] is None  # no world judged
-    assert (last.trace_id, last.robot, sorted(last.pictures)) == (TRACE, "so101-mobile", ["front", "wrist"])
+    assert (last.trace_id, last.robot, sorted(last.pictures)) == (
+        TRACE,
+        "so101-mobile",
+        ["front", "wrist"],
+    )
     looked_at = min(note["frames"], 10)
     spans = {read_frame(root, index).span_id for index in range(looked_at)}
     assert len(spans) == looked_at  # each tick its own, none the caller's
@@ -101,12 +115,23 @@ def test_a_deployment_records_into_its_save_dir(start: Start, tmp_path: Path) ->
     assert process.returncode == 0
     result = json.loads(out.splitlines()[-1])
     (note,) = commit.notes(root)
-    said = {"episodes": 1, "frames": note["frames"], "skipped": 0, "dropped": 0, "left_out": 0, "error": None}
+    said = {
+        "episodes": 1,
+        "frames": note["frames"],
+        "skipped": 0,
+        "dropped": 0,
+        "left_out": 0,
+        "error": None,
+    }
     assert (result["save_dir"], result["metadata"]["recorded"]) == (str(root), said)
     assert (note["status"], note["goal_id"], note["task"]) == ("succeeded", "task", "nod twice")
     assert note["frames"] >= 12
     first, second = read_frame(root, 0), read_frame(root, 1)
     assert first.tick["action_applied"]
-    assert second.tick["index"] > first.tick["index"]  # next to each other, unless the machine stood still
+    assert (
+        second.tick["index"] > first.tick["index"]
+    )  # next to each other, unless the machine stood still
     assert first.action["wrist_flex"] == pytest.approx(first.state["wrist_flex"] + 0.01, abs=1e-4)
-    assert read_frame(root, note["frames"] - 1).tick["success"] is None  # the skill's word is in the note
+    assert (
+        read_frame(root, note["frames"] - 1).tick["success"] is None
+    )  # the skill's word is in the note

@@ -16,16 +16,22 @@ from typing import Any
 
 import pytest
 
-from runner import __main__ as program
-from runner.cli.replay import as_text
-from runner.dataset import commit, wire
-from runner.dataset.lerobot_files import LerobotFiles, features_of, frame_of
-from runner.dataset.reader import read_frame
-from runner.dataset.recorder import QUEUE_TICKS, DatasetRecorder, whole_rate
-from runner.dataset.rows import row_of
-from runner.dataset.writer import EpisodeWriter
-from runner.protocols import Transition
-from schemas.errors import AlreadyRunning, BadRequest, ConfigError, InternalError, VramError
+from vram_arbiter.runner import __main__ as program
+from vram_arbiter.runner.cli.replay import as_text
+from vram_arbiter.runner.dataset import commit, wire
+from vram_arbiter.runner.dataset.lerobot_files import LerobotFiles, features_of, frame_of
+from vram_arbiter.runner.dataset.reader import read_frame
+from vram_arbiter.runner.dataset.recorder import QUEUE_TICKS, DatasetRecorder, whole_rate
+from vram_arbiter.runner.dataset.rows import row_of
+from vram_arbiter.runner.dataset.writer import EpisodeWriter
+from vram_arbiter.runner.protocols import Transition
+from vram_arbiter.schemas.errors import (
+    AlreadyRunning,
+    BadRequest,
+    ConfigError,
+    InternalError,
+    VramError,
+)
 
 sys.path.insert(0, str(Path(__file__).parent))  # for the helper beside it
 
@@ -98,7 +104,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 
     said = io.StringIO()
     handler = logging.StreamHandler(said)
-    logging.getLogger("runner.dataset").addHandler(handler)
+    logging.getLogger("vram_arbiter.runner.dataset").addHandler(handler)
     small = {"front": picture("front", 1, width=16, height=16, data=bytes(16 * 16 * 3))}
     torn = {"front": picture("front", 1, encoding="jpeg", data=b"no jpeg")}
     second = recorder(root)
@@ -119,7 +125,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
         play(second, goal("torn"), DONE, 2)
     finally:
         second.close()
-        logging.getLogger("runner.dataset").removeHandler(handler)
+        logging.getLogger("vram_arbiter.runner.dataset").removeHandler(handler)
     return Recorded(root, first, second, cut_off, said.getvalue(), blocked)
 
 
@@ -138,12 +144,18 @@ def test_lerobots_own_reader_finds_every_tick(
     for row, index in zip(rows, [*range(6), *range(4), *range(3), *range(2)], strict=True):
         assert row["observation.state"].tolist() == pytest.approx([0.1 * index, 0.5])
         assert row["action"].tolist() == pytest.approx([0.1 * index + 0.05, 0.4])
-        assert (row["trace_id"], row["span_id"], bool(row["trace_sampled"])) == (TRACE, span_of(index), True)
+        assert (row["trace_id"], row["span_id"], bool(row["trace_sampled"])) == (
+            TRACE,
+            span_of(index),
+            True,
+        )
         assert int(row["tick.index"]) == 100 + index
         assert float(row["timestamp"]) == pytest.approx(index / 30)
         seen = row["observation.images.front"]
         assert tuple(seen.shape) == (3, HEIGHT, WIDTH)
-        assert float(seen.mean()) * 255 == pytest.approx(10 * index, abs=3)  # the picture of this very tick
+        assert float(seen.mean()) * 255 == pytest.approx(
+            10 * index, abs=3
+        )  # the picture of this very tick
     assert [index for index, row in enumerate(rows) if row["next.done"]] == [5, 9, 12, 14]
     assert "next.success" not in dataset.meta.features, "no world judged"
 
@@ -154,7 +166,11 @@ def test_a_run_says_what_it_recorded_and_what_not(recorded: Recorded) -> None:
     assert dict(first.incomplete) == {"joint grip has no target yet": 1}
     assert "1 ticks left out: joint grip has no target yet" in first.summary()
     assert (second.episodes, second.frames) == (2, 5)
-    assert (first.facts()["left_out"], first.facts()["skipped"], second.facts()["skipped"]) == (1, 0, 1)
+    assert (first.facts()["left_out"], first.facts()["skipped"], second.facts()["skipped"]) == (
+        1,
+        0,
+        1,
+    )
     assert second.facts()["error"] == second.error.message
     notes = commit.notes(recorded.root)
     kept = [(note["goal_id"], note["status"], note["code"], note["incomplete"]) for note in notes]
@@ -171,13 +187,18 @@ def test_a_killed_writer_is_said_and_the_next_recording_mends(recorded: Recorded
     assert isinstance(recorded.first.error, InternalError)
     assert "NOT ALL WAS RECORDED" in recorded.first.summary()
     assert recorded.cut_off
-    assert "an earlier recording was cut off: an episode was being written; it is lost" in recorded.said
+    assert (
+        "an earlier recording was cut off: an episode was being written; it is lost"
+        in recorded.said
+    )
 
 
 def test_a_disk_that_takes_nothing_costs_the_goal_and_no_more(recorded: Recorded) -> None:
     assert isinstance(recorded.blocked, InternalError)
     assert "file-002.parquet" in recorded.blocked.message
-    assert read_frame(recorded.root, 10).goal["goal_id"] == "g3"  # its files have the name that was taken
+    assert (
+        read_frame(recorded.root, 10).goal["goal_id"] == "g3"
+    )  # its files have the name that was taken
 
 
 def test_a_goal_with_other_columns_is_said_and_costs_only_itself(recorded: Recorded) -> None:
@@ -221,7 +242,9 @@ def record_verdicts(root: Path, *verdicts: bool | None) -> list[wire.Header]:
         for said in verdicts:
             try:
                 for index in range(2):
-                    writer.row(*row_of(tick(index, of=goal(str(said)), frames={}, success=said), ()))
+                    writer.row(
+                        *row_of(tick(index, of=goal(str(said)), frames={}, success=said), ())
+                    )
                 writer.ended({"goal_id": str(said), "status": "succeeded"})
             except ConfigError as error:
                 writer.failed(str(said), error)
@@ -241,8 +264,12 @@ def test_success_is_what_the_world_says_and_no_skill(tmp_path: Path) -> None:
     assert [note["judged"] for note in commit.notes(tmp_path / "judged")] == [False, True]
 
     record_verdicts(tmp_path / "live", None, True)
-    assert [read_frame(tmp_path / "live", 1, episode).tick["success"] for episode in range(2)] == [None] * 2
-    assert "next.success" not in json.loads((tmp_path / "live/meta/info.json").read_text())["features"]
+    assert [read_frame(tmp_path / "live", 1, episode).tick["success"] for episode in range(2)] == [
+        None
+    ] * 2
+    assert (
+        "next.success" not in json.loads((tmp_path / "live/meta/info.json").read_text())["features"]
+    )
     assert [note["judged"] for note in commit.notes(tmp_path / "live")] == [None, True]
 
 
@@ -259,7 +286,9 @@ def test_a_state_or_an_action_of_one_number_is_replayed(tmp_path: Path) -> None:
     """lerobot makes a column of plain numbers of it, not of lists."""
     files = LerobotFiles(tmp_path, fps=30, robot="bench")
     rows = [
-        row_of(replace(tick(index), transition=Transition({"gap": 0.5 * index}, {"push": -1.0})), ())[0]
+        row_of(
+            replace(tick(index), transition=Transition({"gap": 0.5 * index}, {"push": -1.0})), ()
+        )[0]
         for index in range(2)
     ]
     features = features_of(rows[0])
@@ -268,7 +297,11 @@ def test_a_state_or_an_action_of_one_number_is_replayed(tmp_path: Path) -> None:
         files.add(frame_of(row, (), features))
     files.finish({"units": rows[0]["units"]})
     found = read_frame(tmp_path, 1)
-    assert (found.units, dict(found.state), dict(found.action)) == ("own", {"gap": 0.5}, {"push": -1.0})
+    assert (found.units, dict(found.state), dict(found.action)) == (
+        "own",
+        {"gap": 0.5},
+        {"push": -1.0},
+    )
     assert "shown    gap: +0.5\nsent     push: -1" in as_text(found, None)
 
 
@@ -300,14 +333,18 @@ def test_the_command_prints_the_frame_and_opens_its_trace(
     assert "last of its episode" in out
     assert program.main(["replay", "--dataset", root, "--frame", "99"]) == 1
     assert program.main(["replay", "--dataset", str(tmp_path), "--frame", "0"]) == 2
-    assert program.main(["replay", "--dataset", root, "--frame", "0", "--trace-url", "http://x"]) == 2
+    assert (
+        program.main(["replay", "--dataset", root, "--frame", "0", "--trace-url", "http://x"]) == 2
+    )
     assert "is no dataset that this program recorded" in capsys.readouterr().err
 
 
 def test_two_cameras_of_one_column_are_refused() -> None:
     """A column has no `/`: the pictures of the one would have been the other's."""
     frames = {name: picture(name, 10) for name in ("arm/top", "arm_top")}
-    with pytest.raises(ConfigError, match=r"two cameras would have the column observation\.images\.arm_top"):
+    with pytest.raises(
+        ConfigError, match=r"two cameras would have the column observation\.images\.arm_top"
+    ):
         features_of(row_of(tick(0, frames=frames), tuple(frames))[0])
 
 

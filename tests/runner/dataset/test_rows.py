@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from runner.dataset import wire
-from runner.dataset.rows import NO_CHUNK, NUMBERS_MAX, Incomplete, row_of, trace_of
-from runner.protocols import GoalTick, Transition
-from schemas.world import FrameEncoding
+from vram_arbiter.runner.dataset import wire
+from vram_arbiter.runner.dataset.rows import NO_CHUNK, NUMBERS_MAX, Incomplete, row_of, trace_of
+from vram_arbiter.runner.protocols import GoalTick, Transition
+from vram_arbiter.schemas.world import FrameEncoding
 
 sys.path.insert(0, str(Path(__file__).parent))  # for the helper beside it
 
@@ -19,7 +19,9 @@ from ticks import TRACE, goal, picture, span_of, tick
 
 
 def test_a_row_says_what_was_measured_and_what_was_told() -> None:
-    row, pictures = row_of(tick(3, safety_violations=("too fast",), deadline_missed=True), ("front",))
+    row, pictures = row_of(
+        tick(3, safety_violations=("too fast",), deadline_missed=True), ("front",)
+    )
     assert (row["units"], row["state_names"], row["action_names"]) == (
         "rad",
         ["pan", "grip"],
@@ -53,7 +55,10 @@ def test_a_goal_without_a_prompt_is_called_by_its_skill() -> None:
             tick(0, frames={"front": picture("front", 0, encoding=FrameEncoding.RAW)}),
             r"camera front \(raw\) have no colours",
         ),
-        (tick(0, frames={"front": picture("front", 0, data=None, topic="/front")}), "have no colours"),
+        (
+            tick(0, frames={"front": picture("front", 0, data=None, topic="/front")}),
+            "have no colours",
+        ),
     ],
 )
 def test_what_lacks_a_part_is_no_row(made: object, reason: str) -> None:
@@ -75,7 +80,11 @@ def test_a_world_that_is_no_robot_has_its_own_numbers() -> None:
     ("shown", "sent", "reason"),
     [
         ({"gap": 0.5}, {}, "nothing was sent: the world stood still"),
-        ({"gap": 0.5, "speed": float("nan")}, {"push": 1.0}, "speed is nan, which no column can hold"),
+        (
+            {"gap": 0.5, "speed": float("nan")},
+            {"push": 1.0},
+            "speed is nan, which no column can hold",
+        ),
         ({"gap": 0.5}, {"push": 1e39}, r"push is 1e\+39, which no column can hold"),
         ({str(n): 0.0 for n in range(NUMBERS_MAX + 1)}, {"push": 1.0}, "at most 4096 are recorded"),
     ],
@@ -87,7 +96,9 @@ def test_a_step_that_lacks_a_part_is_no_row(
         row_of(stepped(shown, sent), ())
 
 
-@pytest.mark.parametrize("text", [None, "", "00-abc-def-01", f"00-{TRACE}-{'0' * 15}1-zz", "nonsense"])
+@pytest.mark.parametrize(
+    "text", [None, "", "00-abc-def-01", f"00-{TRACE}-{'0' * 15}1-zz", "nonsense"]
+)
 def test_without_a_trace_there_are_no_ids(text: str | None) -> None:
     assert trace_of(text) == ("", "", False)
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from runner import __main__ as program
-from runner.dataset import commit
+from vram_arbiter.runner import __main__ as program
+from vram_arbiter.runner.dataset import commit
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(600)]
 
@@ -25,12 +25,33 @@ ACTIONS = ["arm.0", "arm.1", "gripper", "lamps.0", "lamps.1", "walk.0.0", "walk.
 SHOWN = ["arm.0", "arm.1", "gripper", "views.1.0", "views.1.1"]
 
 
-def record(root: Path, runtime: Path, *flags: str, **environ: str) -> subprocess.CompletedProcess[str]:
+def record(
+    root: Path, runtime: Path, *flags: str, **environ: str
+) -> subprocess.CompletedProcess[str]:
     """One run of a policy, as fast as it can."""
-    given = {"VRAM_ARBITER_RUNTIME": str(runtime), "OMP_NUM_THREADS": "1", "PYTHONPATH": f"{ROOT}:{HERE}"}
-    argv = [sys.executable, "-m", "runner", "sim", "--record", str(root), "--rate", "0", *flags]
+    given = {
+        "VRAM_ARBITER_RUNTIME": str(runtime),
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": f"{ROOT}:{HERE}",
+    }
+    argv = [
+        sys.executable,
+        "-m",
+        "vram_arbiter.runner",
+        "sim",
+        "--record",
+        str(root),
+        "--rate",
+        "0",
+        *flags,
+    ]
     return subprocess.run(
-        argv, cwd=ROOT, env=os.environ | given | environ, capture_output=True, text=True, timeout=WAIT_S
+        argv,
+        cwd=ROOT,
+        env=os.environ | given | environ,
+        capture_output=True,
+        text=True,
+        timeout=WAIT_S,
     )
 
 
@@ -46,7 +67,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
 
 def played(seed: int) -> list[tuple[dict[str, float], dict[str, float], float]]:
     """The same episode once more: what was shown, what was sent, what it was worth."""
-    from runner.sim.gym_env import GymEnv
+    from vram_arbiter.runner.sim.gym_env import GymEnv
 
     env = GymEnv(HAND, render=False)
     env.reset(seed)
@@ -70,7 +91,11 @@ def test_lerobot_reads_what_the_world_showed_and_was_sent(
     dataset = LeRobotDataset("local/recording", root=root, video_backend="pyav")
     episodes = [played(SEED + index) for index in range(3)]
     frames = sum(map(len, episodes))
-    assert (dataset.num_episodes, len(dataset), dataset.meta.robot_type) == (3, frames, f"gym:{HAND}")
+    assert (dataset.num_episodes, len(dataset), dataset.meta.robot_type) == (
+        3,
+        frames,
+        f"gym:{HAND}",
+    )
     features = dataset.meta.features
     assert (features["observation.state"]["names"], features["action"]["names"]) == (SHOWN, ACTIONS)
     assert {name: tuple(features[name]["shape"]) for name in dataset.meta.camera_keys} == {
@@ -85,8 +110,12 @@ def test_lerobot_reads_what_the_world_showed_and_was_sent(
         assert row["observation.state"].tolist() == pytest.approx([shown[name] for name in SHOWN])
         assert row["action"].tolist() == pytest.approx([sent[name] for name in ACTIONS])
         assert float(row["next.reward"]) == pytest.approx(reward)
-        assert float(row["observation.images.views.0"].mean()) * 255 == pytest.approx(20 * (index + 1), abs=4)
-        assert float(row["observation.images.render"].mean()) * 255 == pytest.approx(10 * (index + 1), abs=4)
+        assert float(row["observation.images.views.0"].mean()) * 255 == pytest.approx(
+            20 * (index + 1), abs=4
+        )
+        assert float(row["observation.images.render"].mean()) * 255 == pytest.approx(
+            10 * (index + 1), abs=4
+        )
         assert row["task"] == "random"
         spans.add((row["trace_id"], row["span_id"]))
     assert len(spans) == frames
@@ -98,7 +127,14 @@ def test_lerobot_reads_what_the_world_showed_and_was_sent(
     assert [(note["goal_id"], note["frames"], note["units"]) for note in commit.notes(root)] == [
         (f"seed-{SEED + index}", len(episode), "own") for index, episode in enumerate(episodes)
     ]
-    told = {"episodes": 3, "frames": frames, "skipped": 0, "dropped": 0, "left_out": 0, "error": None}
+    told = {
+        "episodes": 3,
+        "frames": frames,
+        "skipped": 0,
+        "dropped": 0,
+        "left_out": 0,
+        "error": None,
+    }
     assert (result["save_dir"], result["metadata"]["recorded"]) == (str(root), told)
 
 
@@ -127,7 +163,11 @@ def test_a_frame_of_a_world_leads_back_to_its_tick(
 
 def test_a_run_for_a_recording_that_is_impossible_fails(tmp_path: Path) -> None:
     root = tmp_path / "set"
-    ran = record(root, tmp_path, "--env", f"gym:{POINT}", "--policy", "random")  # its pictures are 33 × 24
+    ran = record(
+        root, tmp_path, "--env", f"gym:{POINT}", "--policy", "random"
+    )  # its pictures are 33 × 24
     assert ran.returncode == 2
-    assert "camera top gives 33 × 24 pixels; a video needs even numbers" in ran.stderr.splitlines()[-1]
+    assert (
+        "camera top gives 33 × 24 pixels; a video needs even numbers" in ran.stderr.splitlines()[-1]
+    )
     assert commit.notes(root) == []

@@ -3,9 +3,16 @@
 from collections.abc import Mapping
 from typing import Any
 
-from runner.protocols import Goal, GoalTick, SkillEnded
-from schemas.errors import ModelError
-from schemas.world import FrameEncoding, JointState, Pose, SensorFrame, TickResult, WorldState
+from vram_arbiter.runner.protocols import Goal, GoalTick, SkillEnded
+from vram_arbiter.schemas.errors import ModelError
+from vram_arbiter.schemas.world import (
+    FrameEncoding,
+    JointState,
+    Pose,
+    SensorFrame,
+    TickResult,
+    WorldState,
+)
 
 JOINTS = ("pan", "grip")
 TRACE = "0af7651916cd43dd8448eb211c80319c"
@@ -48,7 +55,9 @@ def tick(
         stamp_ns=1_002_000_000,
         joint_state=JointState(name=JOINTS, position=(0.1 * index, 0.5), stamp_ns=1_002_000_000),
         base_pose=Pose(xyz=(1.0, 2.0, 0.0), quat_xyzw=(0.0, 0.0, 1.0, 0.0), frame_id="map"),
-        image_frames=dict(frames) if frames is not None else {"front": picture("front", 10 * (index % 20))},
+        image_frames=dict(frames)
+        if frames is not None
+        else {"front": picture("front", 10 * (index % 20))},
     )
     given: dict[str, Any] = {
         "stamp_ns": 5_000 + index,

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from runner.hal.factory import make_hal
-from runner.protocols import RobotDescription
-from runner.safety.gate import RobotGate
-from schemas.robot import load_robot
+from vram_arbiter.runner.hal.factory import make_hal
+from vram_arbiter.runner.protocols import RobotDescription
+from vram_arbiter.runner.safety.gate import RobotGate
+from vram_arbiter.schemas.config.robot import load_robot
 
 FOLDER = Path(__file__).parents[3] / "configs" / "robots"
 FILES = sorted(path.name for path in FOLDER.glob("*.yaml"))
@@ -27,11 +27,13 @@ def test_it_loads(name: str) -> None:
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", FILES)
 def test_its_envelope_can_be_kept(name: str) -> None:
-    from runner.hal.so101 import so101
-    from runner.hal.so101_kinematics import kinematics_for
+    from vram_arbiter.runner.hal.so101 import so101
+    from vram_arbiter.runner.hal.so101_kinematics import kinematics_for
 
     robot = load_robot((FOLDER / name).read_text(encoding="utf-8"), name)
-    known = "so101" in robot.hal.adapter  # drivers are not installed everywhere: the description will do
+    known = (
+        "so101" in robot.hal.adapter
+    )  # drivers are not installed everywhere: the description will do
     description = so101(simulated=False) if known else RobotDescription(robot.hal.adapter, (), {})
     gate = RobotGate(
         description,
@@ -39,12 +41,14 @@ def test_its_envelope_can_be_kept(name: str) -> None:
         kinematics=kinematics_for(description),
         envelopes={"safety": robot.safety},
     )
-    assert gate.unkept == (() if known else ("safety.max_ee_speed_m_s (no kinematics of this robot)",))
+    assert gate.unkept == (
+        () if known else ("safety.max_ee_speed_m_s (no kinematics of this robot)",)
+    )
 
 
 @pytest.mark.heavy
 def test_the_twin_of_the_shipped_file_starts_inside_its_workspace() -> None:
-    from runner.hal.so101_kinematics import So101Kinematics
+    from vram_arbiter.runner.hal.so101_kinematics import So101Kinematics
 
     robot = load_robot((FOLDER / "so101-twin.yaml").read_text(encoding="utf-8"), "so101-twin.yaml")
     assert robot.safety is not None

@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from runner.hal.factory import make_hal
-from runner.hal.kinematic import KinematicTwin
-from runner.hal.units import JointScale, JointUnit
-from schemas.errors import ConfigError
-from schemas.robot import HalConfig
+from vram_arbiter.runner.hal.factory import make_hal
+from vram_arbiter.runner.hal.kinematic import KinematicTwin
+from vram_arbiter.runner.hal.units import JointScale, JointUnit
+from vram_arbiter.schemas.config.robot import HalConfig
+from vram_arbiter.schemas.errors import ConfigError
 
 
 def fields(adapter: str, **sections: dict[str, Any]) -> list[tuple[str, str]]:
@@ -23,7 +23,12 @@ def fields(adapter: str, **sections: dict[str, Any]) -> list[tuple[str, str]]:
     [
         ("so101_mujocu", {}, "hal.adapter", "did you mean so101_mujoco"),
         ("lerobot", {}, "hal.adapter", "unknown adapter"),
-        ("so101_kinematic", {"transport": {"port": "/dev/ttyACM0"}}, "hal.transport.port", "no transport"),
+        (
+            "so101_kinematic",
+            {"transport": {"port": "/dev/ttyACM0"}},
+            "hal.transport.port",
+            "no transport",
+        ),
         (
             "so101_kinematic",
             {"params": {"start_pose": {}}},
@@ -77,7 +82,10 @@ def test_each_mistake_names_its_field(adapter: str, sections: Any, field: str, s
 
 def test_all_mistakes_are_told_at_once() -> None:
     found = fields("so101_kinematic", params={"start_pose_rad": {"a": 1.0, "b": 2.0}})
-    assert [field for field, _ in found] == ["hal.params.start_pose_rad.a", "hal.params.start_pose_rad.b"]
+    assert [field for field, _ in found] == [
+        "hal.params.start_pose_rad.a",
+        "hal.params.start_pose_rad.b",
+    ]
 
 
 def test_the_kinematic_twin_is_made_without_moving() -> None:
@@ -107,7 +115,11 @@ def test_units_come_back_as_they_went(unit: JointUnit, sign: int, angle_rad: flo
         (JointScale(JointUnit.PERCENT, -0.5, 1.5, -1), 100.0, -0.5),
         (JointScale(JointUnit.SIGNED_PERCENT, -1.0, 3.0), 0.0, 1.0),
         (JointScale(JointUnit.SIGNED_PERCENT, -1.0, 3.0), 100.0, 3.0),
-        (JointScale(JointUnit.PERCENT, 0.0, 1.0), 110.0, 1.1),  # beyond its range is told, not hidden
+        (
+            JointScale(JointUnit.PERCENT, 0.0, 1.0),
+            110.0,
+            1.1,
+        ),  # beyond its range is told, not hidden
     ],
 )
 def test_units_mean_what_they_say(scale: JointScale, value: float, angle_rad: float) -> None:

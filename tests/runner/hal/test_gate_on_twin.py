@@ -5,15 +5,15 @@ from typing import Any
 
 import pytest
 
-from runner.hal.factory import make_hal
-from runner.hal.so101_kinematics import So101Kinematics, kinematics_for
-from runner.protocols import Hal, RobotDescription
-from runner.safety.gate import RobotGate
-from runner.sim.config import SceneConfig
-from schemas.control import ControlMode
-from schemas.manifest.contracts import SafetyEnvelope
-from schemas.robot import HalConfig
-from schemas.world import Action, WorldState
+from vram_arbiter.runner.hal.factory import make_hal
+from vram_arbiter.runner.hal.so101_kinematics import So101Kinematics, kinematics_for
+from vram_arbiter.runner.protocols import Hal, RobotDescription
+from vram_arbiter.runner.safety.gate import RobotGate
+from vram_arbiter.runner.sim.config import SceneConfig
+from vram_arbiter.schemas.config.robot import HalConfig
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
+from vram_arbiter.schemas.world import Action, WorldState
 
 pytestmark = pytest.mark.heavy
 
@@ -28,7 +28,9 @@ def hal(clock: Any) -> Hal:
 def gate_of(hal: Hal, **envelope: Any) -> RobotGate:
     safety = SafetyEnvelope(**envelope)
     kinematics = kinematics_for(hal.description)
-    return RobotGate(hal.description, rate_hz=30.0, kinematics=kinematics, envelopes={"safety": safety})
+    return RobotGate(
+        hal.description, rate_hz=30.0, kinematics=kinematics, envelopes={"safety": safety}
+    )
 
 
 def drive(
@@ -46,7 +48,9 @@ def drive(
         action = Action(
             control_mode=ControlMode.JOINT_POSITION, joint_targets=(tuple(step[n] for n in names),), joint_names=names
         )  # fmt: skip
-        allowed, problems = gate.check(action, WorldState(stamp_ns=clock.now_ns(), joint_state=state))
+        allowed, problems = gate.check(
+            action, WorldState(stamp_ns=clock.now_ns(), joint_state=state)
+        )
         said.append(problems)
         if allowed is not None:
             hal.send_action(allowed)
@@ -55,7 +59,7 @@ def drive(
 
 
 def test_kinematics_agree_with_the_simulators() -> None:
-    from runner.sim.kinematics import ArmKinematics
+    from vram_arbiter.runner.sim.kinematics import ArmKinematics
 
     scene = SceneConfig()
     pose = {
@@ -86,9 +90,13 @@ def test_an_allowed_motion_is_followed(hal: Hal, clock: Any) -> None:
 
 def test_the_tool_never_leaves_the_workspace(hal: Hal, clock: Any) -> None:
     arm = So101Kinematics()
-    start = arm.points(dict(zip(*(hal.read_state().name, hal.read_state().position), strict=True)))["tool"]
+    start = arm.points(dict(zip(*(hal.read_state().name, hal.read_state().position), strict=True)))[
+        "tool"
+    ]
     wall_y = start[1] + 0.08
-    gate = gate_of(hal, workspace_box_max_xyz=(9.0, wall_y, 9.0), workspace_box_min_xyz=(-9.0, -9.0, -9.0))
+    gate = gate_of(
+        hal, workspace_box_max_xyz=(9.0, wall_y, 9.0), workspace_box_min_xyz=(-9.0, -9.0, -9.0)
+    )
     side = 1.2 if arm.points({"shoulder_pan": 0.5})["tool"][1] > start[1] else -1.2
     said, states = drive(hal, gate, clock, 60, {"shoulder_pan": side})
     assert any("outside the workspace" in problems[0] for problems in said if problems)

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from runner.hal.factory import make_hal
-from runner.hal.lerobot_robot import LerobotHal
-from schemas.control import ControlMode
-from schemas.errors import ConfigError, EstopRequested, RobotFault
-from schemas.robot import HalConfig
-from schemas.world import Action
+from vram_arbiter.runner.hal.factory import make_hal
+from vram_arbiter.runner.hal.lerobot_robot import LerobotHal
+from vram_arbiter.schemas.config.robot import HalConfig
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import ConfigError, EstopRequested, RobotFault
+from vram_arbiter.schemas.world import Action
 
 pytestmark = pytest.mark.heavy
 
@@ -64,7 +64,10 @@ def test_it_reads_in_rad_what_lerobot_says_in_its_units(make: Make, clock: Any) 
     state = hal.read_state()
     assert state.name == hal.description.joint_names == ("motor_1", "motor_2", "motor_3")
     assert state.position == pytest.approx((math.pi / 2, -0.5, -0.5))
-    assert (state.velocity, state.effort) == ((), ())  # lerobot does not say them: nothing is made up
+    assert (state.velocity, state.effort) == (
+        (),
+        (),
+    )  # lerobot does not say them: nothing is made up
     assert state.stamp_ns == clock.now_ns()
 
 
@@ -72,7 +75,9 @@ def test_it_sends_in_lerobots_units_what_is_said_in_rad(make: Make) -> None:
     hal = make()
     hal.connect()
     hal.send_action(to(motor_1=-math.pi / 4, motor_2=1.0, motor_3=1.0))
-    assert robot_of(hal).sent[-1] == pytest.approx({"motor_1": -45.0, "motor_2": 100.0, "motor_3": 100.0})
+    assert robot_of(hal).sent[-1] == pytest.approx(
+        {"motor_1": -45.0, "motor_2": 100.0, "motor_3": 100.0}
+    )
     assert hal.read_state().position == pytest.approx((-math.pi / 4, 1.0, 1.0))
 
 
@@ -97,7 +102,10 @@ def test_a_shortened_step_is_remembered_as_it_was_made(make: Make) -> None:
 
 
 def test_the_files_word_goes_before_lerobots(make: Make) -> None:
-    joints = {**JOINTS, "motor_1": {**JOINTS["motor_1"], "unit": "rad", "sign": -1, "offset_rad": 0.5}}
+    joints = {
+        **JOINTS,
+        "motor_1": {**JOINTS["motor_1"], "unit": "rad", "sign": -1, "offset_rad": 0.5},
+    }
     hal = make({"joints": joints}, values=[0.25, 0.0, 0.0])
     hal.connect()
     assert hal.read_state().position[0] == pytest.approx(0.25)
@@ -124,7 +132,9 @@ def test_the_files_word_goes_before_lerobots(make: Make) -> None:
         ({}, {"joints": JOINTS, "rest_pose_rad": {"elbow": 0}}, "hal.params.rest_pose_rad.elbow", "no such"),
     ],
 )  # fmt: skip
-def test_each_mistake_names_its_field(make: Make, transport: Any, params: Any, field: str, said: str) -> None:
+def test_each_mistake_names_its_field(
+    make: Make, transport: Any, params: Any, field: str, said: str
+) -> None:
     with pytest.raises(ConfigError) as caught:
         make(params, **transport)
     found = caught.value.details["fields"][0]
@@ -156,7 +166,8 @@ def test_an_uncalibrated_robot_asks_nobody_on_the_terminal(make: Make) -> None:
 
 
 @pytest.mark.parametrize(
-    "fault", [ConnectionError("no status packet"), RuntimeError("motor 3 is missing"), OSError(5, "I/O")]
+    "fault",
+    [ConnectionError("no status packet"), RuntimeError("motor 3 is missing"), OSError(5, "I/O")],
 )
 def test_faults_of_the_bus_are_typed(make: Make, fault: Exception) -> None:
     hal = make()
@@ -192,7 +203,9 @@ def test_a_joint_that_is_not_reported_is_not_zero(make: Make) -> None:
 
 
 @pytest.mark.parametrize(("how", "torque"), [("hold", True), ("torque_off", False)])
-def test_an_emergency_stop_holds_or_lets_go_as_the_file_says(make: Make, how: str, torque: bool) -> None:
+def test_an_emergency_stop_holds_or_lets_go_as_the_file_says(
+    make: Make, how: str, torque: bool
+) -> None:
     hal = make({"joints": JOINTS, "estop": how}, values=[10.0, 0.0, 50.0])
     hal.connect()
     hal.send_action(to(motor_1=1.0))
@@ -201,7 +214,9 @@ def test_an_emergency_stop_holds_or_lets_go_as_the_file_says(make: Make, how: st
         hal.estop("test")
     assert robot_of(hal).bus.torque is torque
     if torque:
-        assert robot_of(hal).sent[-1]["motor_1"] == pytest.approx(40.0)  # here, not where it was going
+        assert robot_of(hal).sent[-1]["motor_1"] == pytest.approx(
+            40.0
+        )  # here, not where it was going
     with pytest.raises(EstopRequested):
         hal.send_action(to(motor_1=0.0))
 
@@ -228,7 +243,9 @@ def test_a_stop_that_does_not_reach_the_motors_says_so(make: Make) -> None:
 def test_a_cable_that_is_pulled_is_a_fault_whatever_the_serial_port_makes_of_it(make: Make) -> None:
     hal = make()
     hal.connect()
-    robot_of(hal).fault = termios.error(5, "Input/output error")  # no OSError, and no error of lerobot's
+    robot_of(hal).fault = termios.error(
+        5, "Input/output error"
+    )  # no OSError, and no error of lerobot's
     with pytest.raises(RobotFault, match="Input/output error"):
         hal.read_state()
     with pytest.raises(RobotFault):

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from runner.hal.factory import make_hal
-from runner.hal.so101 import RANGES_RAD
-from runner.protocols import Hal
-from schemas.control import ControlMode
-from schemas.errors import EstopRequested, RobotFault
-from schemas.robot import HalConfig
-from schemas.world import Action
+from vram_arbiter.runner.hal.factory import make_hal
+from vram_arbiter.runner.hal.so101 import RANGES_RAD
+from vram_arbiter.runner.protocols import Hal
+from vram_arbiter.schemas.config.robot import HalConfig
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import EstopRequested, RobotFault
+from vram_arbiter.schemas.world import Action
 
 from .servo_bus import PRESENT, ServoBus
 
@@ -36,7 +36,9 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[ServoBus]:
             port.packet_start_time = port.getCurrentTime()
             port.packet_timeout = 1.0 if servos.silent else 60_000.0  # ms
 
-        monkeypatch.setattr("lerobot.motors.feetech.feetech.patch_setPacketTimeout", wait_as_long_as_it_lives)
+        monkeypatch.setattr(
+            "lerobot.motors.feetech.feetech.patch_setPacketTimeout", wait_as_long_as_it_lives
+        )
         yield servos
 
 
@@ -59,7 +61,12 @@ def calibrated(tmp_path: Path) -> Path:
 
 
 def config(bus: ServoBus, folder: Path, **params: Any) -> HalConfig:
-    transport = {"port": bus.path, "id": "arm", "calibration_dir": str(folder), "num_read_retries": 20}
+    transport = {
+        "port": bus.path,
+        "id": "arm",
+        "calibration_dir": str(folder),
+        "num_read_retries": 20,
+    }
     return HalConfig(adapter="lerobot:so101_follower", transport=transport, params=params)
 
 

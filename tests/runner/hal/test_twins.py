@@ -6,15 +6,17 @@ from typing import Any
 
 import pytest
 
-from runner.hal.base import HalBase
-from runner.hal.factory import make_hal
-from schemas.control import ControlMode
-from schemas.errors import BadState, EstopRequested, InternalError
-from schemas.robot import HalConfig
-from schemas.world import Action
+from vram_arbiter.runner.hal.base import HalBase
+from vram_arbiter.runner.hal.factory import make_hal
+from vram_arbiter.schemas.config.robot import HalConfig
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import BadState, EstopRequested, InternalError
+from vram_arbiter.schemas.world import Action
 
 HEAVY = pytest.mark.heavy
-BOTH = pytest.mark.parametrize("adapter", ["so101_kinematic", pytest.param("so101_mujoco", marks=HEAVY)])
+BOTH = pytest.mark.parametrize(
+    "adapter", ["so101_kinematic", pytest.param("so101_mujoco", marks=HEAVY)]
+)
 MakeHal = Callable[..., HalBase]
 
 
@@ -57,7 +59,9 @@ def test_nothing_is_read_or_sent_without_a_connection(adapter: str, clock: Any) 
 
 
 @BOTH
-def test_it_starts_in_the_rest_pose_and_stays_there(adapter: str, make: MakeHal, clock: Any) -> None:
+def test_it_starts_in_the_rest_pose_and_stays_there(
+    adapter: str, make: MakeHal, clock: Any
+) -> None:
     hal = make(adapter)
     clock.advance(0.4)
     rest = hal.description.rest_pose_rad
@@ -168,7 +172,7 @@ def test_the_description_needs_no_simulator() -> None:
 
 @HEAVY
 def test_the_description_is_that_of_the_published_model() -> None:
-    from runner.sim.scene import arm_mjcf_path, load_mujoco
+    from vram_arbiter.runner.sim.scene import arm_mjcf_path, load_mujoco
 
     model = load_mujoco().MjModel.from_xml_path(str(arm_mjcf_path()))
     joints = make_hal(HalConfig(adapter="so101_mujoco")).description.joints
@@ -203,7 +207,7 @@ def test_a_long_pause_is_not_simulated_second_by_second(make: MakeHal, clock: An
 def test_without_mujoco_the_file_is_told_what_to_install() -> None:
     if importlib.util.find_spec("mujoco") is not None:
         pytest.skip("MuJoCo is installed here; `make test-core` runs this one")
-    from schemas.errors import ConfigError
+    from vram_arbiter.schemas.errors import ConfigError
 
     with pytest.raises(ConfigError, match="pip install"):
         make_hal(HalConfig(adapter="so101_mujoco"))

@@ -4,15 +4,17 @@ from pathlib import Path
 
 import pytest
 
-from runner.safety.estop_mark import EstopMark
-from schemas.errors import EstopRequested
+from vram_arbiter.runner.safety.estop_mark import EstopMark
+from vram_arbiter.schemas.errors import EstopRequested
 
 
 def test_the_first_reason_is_the_one_that_is_read_later(tmp_path: Path) -> None:
     mark = EstopMark(tmp_path / "robot-arm.estop")
     mark.leave("hand in the way")
     mark.leave("on request")  # whoever presses again only wants to be sure
-    with pytest.raises(EstopRequested, match="because somebody ended it: hand in the way") as refused:
+    with pytest.raises(
+        EstopRequested, match="because somebody ended it: hand in the way"
+    ) as refused:
         EstopMark(tmp_path / "robot-arm.estop").refuse_if_left()
     assert refused.value.details == {"reason": "hand in the way"}
     mark.remove()

@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.protocols import Joint, MobileBase, RobotDescription
-from runner.safety.gate import LATE_MAX, MAX_FOLLOWING_ERROR_RAD, RobotGate
-from runner.safety.limits import Vector3
-from runner.safety.ranges import CLAMP_TOLERANCE_RAD
-from runner.skill_runner import WITHHELD_IN_A_ROW_MAX
-from schemas.control import ControlMode
-from schemas.errors import ConfigError
-from schemas.manifest.contracts import SafetyEnvelope
-from schemas.world import Action, JointState, WorldState
+from vram_arbiter.runner.protocols import Joint, MobileBase, RobotDescription
+from vram_arbiter.runner.safety.gate import LATE_MAX, MAX_FOLLOWING_ERROR_RAD, RobotGate
+from vram_arbiter.runner.safety.limits import Vector3
+from vram_arbiter.runner.safety.ranges import CLAMP_TOLERANCE_RAD
+from vram_arbiter.runner.skill_runner import WITHHELD_IN_A_ROW_MAX
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
+from vram_arbiter.schemas.world import Action, JointState, WorldState
 
 ROBOT = RobotDescription(
     "planar",
@@ -45,7 +45,9 @@ class Planar:
 
 
 def gate(needs: frozenset[str] | None = None, kinematic: bool = True, **envelope: Any) -> RobotGate:
-    wide = {"max_ee_speed_m_s": 1e9, "max_joint_speed_factor": 1.0} if kinematic and envelope else {}
+    wide = (
+        {"max_ee_speed_m_s": 1e9, "max_joint_speed_factor": 1.0} if kinematic and envelope else {}
+    )
     return RobotGate(
         ROBOT,
         rate_hz=30.0,
@@ -58,7 +60,9 @@ def gate(needs: frozenset[str] | None = None, kinematic: bool = True, **envelope
 def at(*position: float, ms: float = 1000.0, age_ms: float = 0.0, **more: Any) -> WorldState:
     state = {key: more.pop(key) for key in ("velocity", "effort") if key in more}
     stamp_ns = int(ms * 1e6)
-    joints = JointState(name=NAMES, position=position, stamp_ns=stamp_ns - int(age_ms * 1e6), **state)
+    joints = JointState(
+        name=NAMES, position=position, stamp_ns=stamp_ns - int(age_ms * 1e6), **state
+    )
     return WorldState(stamp_ns=stamp_ns, joint_state=joints, **more)
 
 
@@ -84,7 +88,9 @@ def test_what_is_inside_passes_unchanged(names: tuple[str, ...] | None) -> None:
 
 
 def test_ranges_are_still_checked() -> None:
-    assert row_of(gate().check(to(1.95 + 0.1, joint_names=("reach",)), at(0.0, 1.95, 0.5))) == (2.0,)
+    assert row_of(gate().check(to(1.95 + 0.1, joint_names=("reach",)), at(0.0, 1.95, 0.5))) == (
+        2.0,
+    )
     assert gate().check(to(2.5, joint_names=("reach",)), at(0.0, 1.95, 0.5))[0] is None
 
 
@@ -117,8 +123,12 @@ def test_a_state_or_target_that_is_no_number_cannot_be_built(value: float) -> No
 
 @pytest.mark.parametrize("kinematic", [True, False])
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_a_target_that_is_no_number_is_withheld_however_it_was_built(value: float, kinematic: bool) -> None:
-    action = to(0.0, 1.0, 0.5).model_copy(update={"joint_targets": ((value, 1.0, 0.5),)})  # not validated
+def test_a_target_that_is_no_number_is_withheld_however_it_was_built(
+    value: float, kinematic: bool
+) -> None:
+    action = to(0.0, 1.0, 0.5).model_copy(
+        update={"joint_targets": ((value, 1.0, 0.5),)}
+    )  # not validated
     allowed, problems = gate(kinematic=kinematic).check(action, at(*HERE))
     assert allowed is None
     assert "is no number" in problems[0]
@@ -136,7 +146,9 @@ def test_a_target_that_is_no_number_is_withheld_however_it_was_built(value: floa
         ("front", frozenset({"wrist"}), False),
     ],
 )
-def test_a_stale_world_stops(state: Any, component: str, needs: frozenset[str] | None, stops: bool) -> None:
+def test_a_stale_world_stops(
+    state: Any, component: str, needs: frozenset[str] | None, stops: bool
+) -> None:
     world = at(*HERE, diagnostics={component: state})
     allowed, problems = gate(needs).check(to(*HERE), world)
     assert (allowed is None) is stops
@@ -151,7 +163,9 @@ def test_an_old_joint_state_stops_even_when_nobody_says_so() -> None:
 
 
 def test_a_joint_that_is_not_measured_stops() -> None:
-    partial = WorldState(stamp_ns=1, joint_state=JointState(name=NAMES[:2], position=(0.0, 1.0), stamp_ns=1))
+    partial = WorldState(
+        stamp_ns=1, joint_state=JointState(name=NAMES[:2], position=(0.0, 1.0), stamp_ns=1)
+    )
     allowed, problems = gate().check(to(0.0, joint_names=("turn",)), partial)
     assert allowed is None
     assert "grip" in problems[0]
@@ -166,13 +180,17 @@ def test_a_step_a_little_too_long_is_shortened_and_said() -> None:
 
 @pytest.mark.parametrize("direction", [1, -1])
 def test_a_step_far_too_long_is_withheld(direction: int) -> None:
-    allowed, problems = gate().check(to(direction * (STEP + 1.1 * CLAMP_TOLERANCE_RAD), 1.0, 0.5), at(*HERE))
+    allowed, problems = gate().check(
+        to(direction * (STEP + 1.1 * CLAMP_TOLERANCE_RAD), 1.0, 0.5), at(*HERE)
+    )
     assert allowed is None
     assert "turn" in problems[0]
 
 
 def test_a_gripper_that_jumps_closes_at_its_own_speed() -> None:
-    assert row_of(gate().check(to(0.0, 1.0, 0.0), at(0.0, 1.0, 0.9))) == pytest.approx((0.0, 1.0, 0.7))
+    assert row_of(gate().check(to(0.0, 1.0, 0.0), at(0.0, 1.0, 0.9))) == pytest.approx(
+        (0.0, 1.0, 0.7)
+    )
 
 
 def test_steps_are_measured_from_the_last_target_while_it_is_young() -> None:
@@ -181,7 +199,9 @@ def test_steps_are_measured_from_the_last_target_while_it_is_young() -> None:
     # the servo lags at 0.02; the next target is a step from the last one, not from there
     assert row_of(checked.check(to(0.2, 1.0, 0.5), at(0.02, 1.0, 0.5, ms=1033))) == (0.2, 1.0, 0.5)
     # after a late tick the way may be half as long again, and no more however late it is
-    assert row_of(checked.check(to(0.4, 1.0, 0.5), at(0.1, 1.0, 0.5, ms=1150)))[0] == pytest.approx(0.35)
+    assert row_of(checked.check(to(0.4, 1.0, 0.5), at(0.1, 1.0, 0.5, ms=1150)))[0] == pytest.approx(
+        0.35
+    )
     # much later only where it is counts
     allowed = row_of(checked.check(to(0.4, 1.0, 0.5), at(0.2, 1.0, 0.5, ms=5000)))
     assert allowed == pytest.approx((0.3, 1.0, 0.5))
@@ -197,7 +217,9 @@ def test_ticks_that_come_late_and_then_early_make_no_joint_faster(early: float) 
         share = 1 + early if tick % 2 else 1 - early
         ms += share * 1000 / 30
         wanted = motors["turn"] + min(max(share, 1.0), LATE_MAX) * STEP
-        allowed, _ = checked.check(to(wanted, joint_names=("turn",)), at(motors["turn"], 1.0, 0.5, ms=ms))
+        allowed, _ = checked.check(
+            to(wanted, joint_names=("turn",)), at(motors["turn"], 1.0, 0.5, ms=ms)
+        )
         motors["turn"] = row_of((allowed, ()))[0]
         if motors["turn"] > 2.5:  # the way back
             motors["turn"], begun = -2.9, begun - 5.4
@@ -225,7 +247,9 @@ def test_steps_that_were_dropped_for_being_late_do_not_add_up() -> None:
     motors["turn"] = 0.05
     later = RobotGate(ROBOT, rate_hz=30.0, sent=lambda: motors)
     row_of(later.check(to(0.1, joint_names=("turn",)), at(*HERE, ms=1000)))
-    shortened = later.tightened("skill", None).check(to(0.2, joint_names=("turn",)), at(*HERE, ms=1033))
+    shortened = later.tightened("skill", None).check(
+        to(0.2, joint_names=("turn",)), at(*HERE, ms=1033)
+    )
     assert row_of(shortened) == pytest.approx((0.15,))
 
 
@@ -364,7 +388,9 @@ def test_envelopes_only_tighten() -> None:
     assert tighter.box == base.limits.box
     assert tighter.speeds_rad_s == {"turn": 3.0, "reach": 3.0, "grip": 6.0}
     assert (tighter.ee_speed_m_s, tighter.force_n) == (0.4, 5.0)
-    slow = base.tightened("skill", SafetyEnvelope(max_joint_speed_factor=0.5, max_force_n=3.0)).limits
+    slow = base.tightened(
+        "skill", SafetyEnvelope(max_joint_speed_factor=0.5, max_force_n=3.0)
+    ).limits
     assert slow.speeds_rad_s == {"turn": 1.5, "reach": 1.5, "grip": 3.0}
     assert slow.force_n == 3.0
     assert base.limits.speeds_rad_s["turn"] == 3.0  # the base gate is as it was
@@ -408,14 +434,20 @@ def test_an_envelope_that_limits_nothing_is_refused(envelope: Any, field: str, s
 
 
 def test_two_workspaces_without_a_common_place_are_refused() -> None:
-    elsewhere = SafetyEnvelope(workspace_box_min_xyz=(2.0, 0.0, 0.0), workspace_box_max_xyz=(3.0, 1.0, 1.0))
+    elsewhere = SafetyEnvelope(
+        workspace_box_min_xyz=(2.0, 0.0, 0.0), workspace_box_max_xyz=(3.0, 1.0, 1.0)
+    )
     with pytest.raises(ConfigError, match=r"skill\.workspace_box_min_xyz: the workspace is empty"):
         gate(**BOX).tightened("skill", elsewhere)
 
 
 @pytest.mark.parametrize(
     "envelope",
-    [{"max_ee_speed_m_s": 0.1}, {"workspace_box_min_xyz": (0, 0, 0)}, {"max_cartesian_step_m": 0.1}],
+    [
+        {"max_ee_speed_m_s": 0.1},
+        {"workspace_box_min_xyz": (0, 0, 0)},
+        {"max_cartesian_step_m": 0.1},
+    ],
 )
 def test_what_needs_kinematics_is_refused_without(envelope: Any) -> None:
     with pytest.raises(ConfigError, match="cannot be kept: there are no kinematics"):
@@ -453,7 +485,11 @@ def test_a_limit_of_force_is_told_as_not_kept_where_no_effort_is_measured() -> N
 
 
 def test_an_action_cannot_switch_a_check_off() -> None:
-    overrides = {"max_joint_speed_factor": 100.0, "workspace_box_max_xyz": (9, 9, 9), "disable": True}
+    overrides = {
+        "max_joint_speed_factor": 100.0,
+        "workspace_box_max_xyz": (9, 9, 9),
+        "disable": True,
+    }
     allowed, _ = gate(**BOX).check(to(0.0, 1.07, 0.5, safety_overrides=overrides), at(*HERE))
     assert allowed is None
 
@@ -470,7 +506,9 @@ def test_a_latched_stop_holds_for_every_gate_of_the_robot() -> None:
 
 
 Angles = st.tuples(
-    st.floats(-3.5, 3.5, allow_nan=False), st.floats(-0.5, 2.5, allow_nan=False), st.floats(-0.5, 1.5)
+    st.floats(-3.5, 3.5, allow_nan=False),
+    st.floats(-0.5, 2.5, allow_nan=False),
+    st.floats(-0.5, 1.5),
 )
 Inside = st.tuples(st.floats(-3.0, 3.0), st.floats(0.0, 2.0), st.floats(0.0, 1.0))
 
@@ -534,10 +572,15 @@ def test_an_envelope_slows_the_base_and_never_speeds_it_up() -> None:
     assert slow.check(twist(0.2, 0.0, 1.2), at(*HERE))[0] is not None
 
 
-def test_a_base_stands_on_a_stale_state_after_the_emergency_stop_and_for_what_is_no_number() -> None:
+def test_a_base_stands_on_a_stale_state_after_the_emergency_stop_and_for_what_is_no_number() -> (
+    None
+):
     gate = driving()
     assert gate.check(twist(0.1, 0.0, 0.0), at(*HERE, age_ms=500.0))[0] is None
     row = (math.nan, 0.0, 0.0, 0.0, 0.0, 0.0)
-    assert gate.check(twist(0.1, 0.0, 0.0).model_copy(update={"body_twist": (row,)}), at(*HERE))[0] is None
+    assert (
+        gate.check(twist(0.1, 0.0, 0.0).model_copy(update={"body_twist": (row,)}), at(*HERE))[0]
+        is None
+    )
     gate.trip("hand in the way")
     assert gate.check(twist(0.1, 0.0, 0.0), at(*HERE))[0] is None

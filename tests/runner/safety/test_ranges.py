@@ -4,12 +4,14 @@ from typing import Any
 
 import pytest
 
-from runner.safety.ranges import CLAMP_TOLERANCE_RAD, JointRanges
-from schemas.control import ControlMode
-from schemas.world import Action, JointState, WorldState
+from vram_arbiter.runner.safety.ranges import CLAMP_TOLERANCE_RAD, JointRanges
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.world import Action, JointState, WorldState
 
 LIMITS = {"a": (-1.0, 1.0), "b": (0.0, 2.0)}
-WORLD = WorldState(stamp_ns=1, joint_state=JointState(name=("a", "b"), position=(0.0, 0.0), stamp_ns=1))
+WORLD = WorldState(
+    stamp_ns=1, joint_state=JointState(name=("a", "b"), position=(0.0, 0.0), stamp_ns=1)
+)
 
 
 def joints(*row: float, names: tuple[str, ...] | None = ("a", "b")) -> Action:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from runner.sensors import SlotReader
+from vram_arbiter.runner.sensors import SlotReader
 
 PACKET = 188  # bytes of one packet of an MPEG transport stream
 
@@ -19,7 +19,9 @@ PACKET = 188  # bytes of one packet of an MPEG transport stream
 def make_video(tmp_path: Path) -> Callable[..., Path]:
     """`make_video(greys, fps=25.0, name="v.avi", fourcc="MJPG")`: a video of 64 × 48 whose pictures are plain grey."""
 
-    def make(greys: list[int], fps: float = 25.0, name: str = "video.avi", fourcc: str = "MJPG") -> Path:
+    def make(
+        greys: list[int], fps: float = 25.0, name: str = "video.avi", fourcc: str = "MJPG"
+    ) -> Path:
         import cv2
         import numpy as np
 

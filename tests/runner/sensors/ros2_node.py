@@ -88,10 +88,17 @@ def subscribe(participant: DomainParticipant, topic: Topic, qos: Qos) -> None:
     threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
     while not ended.is_set():
         for sample in reader.take_iter(timeout=duration(milliseconds=100)):
-            fields = {k: v for k, v in vars(sample).items() if k not in ("header", "data", "sample_info")}
+            fields = {
+                k: v for k, v in vars(sample).items() if k not in ("header", "data", "sample_info")
+            }
             stamp = sample.header.stamp
             data = base64.b64encode(bytes(sample.data)).decode()
-            say(stamp=[stamp.sec, stamp.nanosec], frame_id=sample.header.frame_id, data=data, **fields)
+            say(
+                stamp=[stamp.sec, stamp.nanosec],
+                frame_id=sample.header.frame_id,
+                data=data,
+                **fields,
+            )
 
 
 def main() -> None:

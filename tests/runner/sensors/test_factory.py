@@ -2,17 +2,18 @@
 
 import pytest
 
-from runner.clock import SystemClock
-from runner.protocols import SensorReader
-from runner.sensors.factory import BACKENDS, make_reader
-from schemas.errors import ConfigError
-from schemas.robot import SensorBackend, SensorReaderConfig
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.protocols import SensorReader
+from vram_arbiter.runner.sensors.factory import BACKENDS, make_reader
+from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig
+from vram_arbiter.schemas.errors import ConfigError
 
 
 def test_a_reserved_backend_is_refused_with_the_ones_there_are() -> None:
     config = SensorReaderConfig(sensor_id="front", backend=SensorBackend.HOLOSCAN)
     with pytest.raises(
-        ConfigError, match=r"sensor front: backend: holoscan is reserved; choose from .*opencv_thread"
+        ConfigError,
+        match=r"sensor front: backend: holoscan is reserved; choose from .*opencv_thread",
     ):
         make_reader(config, SystemClock())
 

@@ -12,17 +12,19 @@ from typing import Any
 
 import pytest
 
-from runner.clock import SystemClock
-from runner.sensors.gstreamer import _Run, load, make, without_credentials
-from runner.sensors.pipelines import GStreamerParams, build
-from runner.sensors.platform import probe_platform
-from runner.sensors.slot import SlotReader
-from schemas.errors import ConfigError, FrameStale
-from schemas.robot import SensorBackend, SensorReaderConfig
-from schemas.world import SensorFrame
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.sensors.gstreamer import _Run, load, make, without_credentials
+from vram_arbiter.runner.sensors.pipelines import GStreamerParams, build
+from vram_arbiter.runner.sensors.platform import probe_platform
+from vram_arbiter.runner.sensors.slot import SlotReader
+from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig
+from vram_arbiter.schemas.errors import ConfigError, FrameStale
+from vram_arbiter.schemas.world import SensorFrame
 
 pytestmark = pytest.mark.heavy
-pytest.importorskip("gi", reason="GStreamer's binding is not installed; .ci/setup says what to install")
+pytest.importorskip(
+    "gi", reason="GStreamer's binding is not installed; .ci/setup says what to install"
+)
 
 CLOCK = SystemClock()
 WAIT_S = 60.0
@@ -34,7 +36,10 @@ SIZE = (96, 64)
 
 def camera(max_age_ms: float = 60_000.0, **params: Any) -> SensorReaderConfig:
     return SensorReaderConfig(
-        sensor_id="wrist", backend=SensorBackend.GSTREAMER, backend_params=params, max_age_ms=max_age_ms
+        sensor_id="wrist",
+        backend=SensorBackend.GSTREAMER,
+        backend_params=params,
+        max_age_ms=max_age_ms,
     )
 
 
@@ -105,7 +110,9 @@ class Recorder:
     [("bgr8", b"\x00\x00\xff"), ("rgb8", b"\xff\x00\x00")],
 )
 @pytest.mark.parametrize("width", [64, 101, 102, 103])
-def test_colours_and_rows(reader: Callable[..., SlotReader], encoding: str, pixel: bytes, width: int) -> None:
+def test_colours_and_rows(
+    reader: Callable[..., SlotReader], encoding: str, pixel: bytes, width: int
+) -> None:
     """GStreamer pads rows to four bytes; a width of 101 came out slanted wherever that was forgotten."""
     frame = frame_of(reader(source="test", pattern="red", width=width, height=7, encoding=encoding))
     assert (frame.width, frame.height, frame.channels, frame.encoding) == (width, 7, 3, encoding)
@@ -115,13 +122,17 @@ def test_colours_and_rows(reader: Callable[..., SlotReader], encoding: str, pixe
 def test_grey(reader: Callable[..., SlotReader]) -> None:
     frame = frame_of(reader(source="test", pattern="white", width=33, height=5, encoding="mono8"))
     assert (frame.channels, len(frame.data or b"")) == (1, 33 * 5)
-    assert min(frame.data or b"") >= 235  # white, in the narrower range of video levels at the least
+    assert (
+        min(frame.data or b"") >= 235
+    )  # white, in the narrower range of video levels at the least
 
 
 def test_depth_has_two_bytes(reader: Callable[..., SlotReader]) -> None:
     frame = frame_of(reader(source="test", pattern="white", width=33, height=5, encoding="depth16"))
     assert (frame.channels, frame.encoding, len(frame.data or b"")) == (1, "depth16", 2 * 33 * 5)
-    assert set(memoryview(frame.data or b"").cast("H")) == {memoryview(frame.data or b"").cast("H")[0]}
+    assert set(memoryview(frame.data or b"").cast("H")) == {
+        memoryview(frame.data or b"").cast("H")[0]
+    }
 
 
 def test_jpeg(reader: Callable[..., SlotReader]) -> None:
@@ -167,7 +178,10 @@ def test_stamps_are_of_the_monotonic_clock(reader: Callable[..., SlotReader]) ->
     first = source.read_synced(soon())
     assert called_ns < first.stamp_monotonic_ns <= CLOCK.now_ns()
     assert (
-        abs((first.stamp_wall_ns - first.stamp_monotonic_ns) - (time.time_ns() - time.monotonic_ns()))
+        abs(
+            (first.stamp_wall_ns - first.stamp_monotonic_ns)
+            - (time.time_ns() - time.monotonic_ns())
+        )
         < 60 * 10**9
     )
     assert source.read_synced(soon()).stamp_monotonic_ns > first.stamp_monotonic_ns
@@ -201,7 +215,9 @@ def test_a_thread_that_is_stopped_makes_no_picture_younger() -> None:
         while frame is None:
             clock.asked_ns.clear()
             frame = run.next_frame()
-        assert frame.stamp_monotonic_ns <= clock.asked_ns[0], "by then it had been taken out of the pipeline"
+        assert frame.stamp_monotonic_ns <= clock.asked_ns[0], (
+            "by then it had been taken out of the pipeline"
+        )
     finally:
         run.close()
 
@@ -211,9 +227,13 @@ def brightness(frame: SensorFrame) -> int:
     return (frame.data or b"\0")[len(frame.data or b"\0") // 2]
 
 
-def test_an_h264_file_plays_at_its_rate_and_ends(reader: Callable[..., SlotReader], h264_file: Path) -> None:
+def test_an_h264_file_plays_at_its_rate_and_ends(
+    reader: Callable[..., SlotReader], h264_file: Path
+) -> None:
     tee = Recorder()  # sees every picture that the sink kept, however slow this test is
-    source = reader(source="file", path=str(h264_file), platform="cpu_only", encoding="rgb8", tee=tee)
+    source = reader(
+        source="file", path=str(h264_file), platform="cpu_only", encoding="rgb8", tee=tee
+    )
     assert end_of(source) == "the stream is over"
     assert {(frame.width, frame.height) for frame in tee.frames} == {SIZE}
     levels = [brightness(frame) for frame in tee.frames]
@@ -231,10 +251,15 @@ def test_a_file_begins_again(reader: Callable[..., SlotReader], h264_file: Path)
     begun_s: list[float] = []  # when each round began, by the pictures' stamps and what they show
     while len(begun_s) < 3:
         frame = frame_of(source)
-        at_s = frame.stamp_monotonic_ns / 1e9 - round(brightness(frame) / 255 * (FILE_FRAMES - 1)) / FILE_FPS
+        at_s = (
+            frame.stamp_monotonic_ns / 1e9
+            - round(brightness(frame) / 255 * (FILE_FRAMES - 1)) / FILE_FPS
+        )
         if not begun_s or at_s > begun_s[-1] + FILE_FRAMES / FILE_FPS / 2:
             begun_s.append(at_s)
-        assert at_s == pytest.approx(begun_s[-1], abs=3 / FILE_FPS), "in order between two beginnings"
+        assert at_s == pytest.approx(begun_s[-1], abs=3 / FILE_FPS), (
+            "in order between two beginnings"
+        )
 
 
 def test_a_file_is_scaled(reader: Callable[..., SlotReader], h264_file: Path) -> None:
@@ -264,7 +289,9 @@ def test_an_error_on_the_bus_ends_the_reader(reader: Callable[..., SlotReader]) 
 
 def test_formats_that_do_not_meet_end_it_with_a_reason(reader: Callable[..., SlotReader]) -> None:
     """An own appsink gets the encoding that was asked for, never silently another one."""
-    own = "videotestsrc is-live=true ! video/x-raw,format=I420,width=16,height=16 ! appsink name=sink"
+    own = (
+        "videotestsrc is-live=true ! video/x-raw,format=I420,width=16,height=16 ! appsink name=sink"
+    )
     source = make(camera(pipeline=own), CLOCK, None)
     with contextlib.suppress(FrameStale):  # said at once, or a moment later
         source.start()
@@ -273,13 +300,19 @@ def test_formats_that_do_not_meet_end_it_with_a_reason(reader: Callable[..., Slo
 
 
 def test_a_camera_that_is_not_there(reader: Callable[..., SlotReader]) -> None:
-    with pytest.raises(FrameStale, match=r"wrist cannot be opened: v4l2src\d+: .*/dev/video99") as caught:
+    with pytest.raises(
+        FrameStale, match=r"wrist cannot be opened: v4l2src\d+: .*/dev/video99"
+    ) as caught:
         reader(source="v4l2", device="/dev/video99")
     assert caught.value.details["ended"]
 
 
-def test_stop_wakes_waiters_ends_the_thread_and_start_begins_anew(reader: Callable[..., SlotReader]) -> None:
-    source = reader(pipeline="videotestsrc is-live=true pattern=red ! video/x-raw,width=16,height=16")
+def test_stop_wakes_waiters_ends_the_thread_and_start_begins_anew(
+    reader: Callable[..., SlotReader],
+) -> None:
+    source = reader(
+        pipeline="videotestsrc is-live=true pattern=red ! video/x-raw,width=16,height=16"
+    )
     frame_of(source)
     (thread,) = [thread for thread in threading.enumerate() if thread.name == "camera-wrist"]
     source.stop()
@@ -296,13 +329,22 @@ def test_stop_wakes_waiters_ends_the_thread_and_start_begins_anew(reader: Callab
 @pytest.mark.parametrize(
     ("params", "problem"),
     [
-        ({"pipeline": "videotestsrc ! nosuchthing"}, 'backend_params.pipeline: no element "nosuchthing"'),
+        (
+            {"pipeline": "videotestsrc ! nosuchthing"},
+            'backend_params.pipeline: no element "nosuchthing"',
+        ),
         ({"pipeline": "videotestsrc patern=ball"}, 'no property "patern"'),
         ({"pipeline": "videotestsrc ! appsink name=mine"}, "has no appsink named sink"),
         ({"pipeline": "appsink name=sink"}, "has no appsink named sink"),
         ({"source": "test", "pattern": "plaid"}, "pattern"),
-        ({"source": "test", "patern": "ball"}, "backend_params.patern: unknown key; did you mean pattern?"),
-        ({"source": "file", "path": "/no/such.mp4"}, "backend_params.path: there is no file /no/such.mp4"),
+        (
+            {"source": "test", "patern": "ball"},
+            "backend_params.patern: unknown key; did you mean pattern?",
+        ),
+        (
+            {"source": "file", "path": "/no/such.mp4"},
+            "backend_params.path: there is no file /no/such.mp4",
+        ),
         (
             {"source": "v4l2", "device": "/dev/video0", "codec": "h264", "platform": "tegra"},
             "or say platform: cpu_only to decode on the CPU",
@@ -318,14 +360,17 @@ def test_mistakes_are_named(params: dict[str, Any], problem: str) -> None:
 
 def test_no_password_in_messages() -> None:
     text = "rtspsrc0: Could not open rtsp://robot:secret@10.0.0.7:554/main (Unauthorized)"
-    assert without_credentials(text) == "rtspsrc0: Could not open rtsp://10.0.0.7:554/main (Unauthorized)"
+    assert (
+        without_credentials(text)
+        == "rtspsrc0: Could not open rtsp://10.0.0.7:554/main (Unauthorized)"
+    )
 
 
 # -- beside the other heavy packages ----------------------------------------------------------------------------------
 TAKE_ONE = """
 from runner.clock import SystemClock
 from runner.sensors.gstreamer import make
-from schemas.robot import SensorReaderConfig
+from schemas.config.robot import SensorReaderConfig
 params = {"source": "test", "pattern": "red", "width": 16, "height": 16}
 clock = SystemClock()
 camera = make(SensorReaderConfig(sensor_id="wrist", backend="gstreamer", backend_params=params), clock, None)
@@ -337,7 +382,9 @@ camera.stop()
 
 def fresh(code: str) -> str:
     """What a program of its own prints. It has to end well."""
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=240)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=240
+    )
     assert result.returncode == 0, result.stderr
     return result.stdout
 

@@ -9,7 +9,7 @@ sys.modules["gi"] = None  # what an import finds where it is not installed
 from runner.clock import SystemClock
 from runner.sensors.gstreamer import make
 from schemas.errors import ConfigError
-from schemas.robot import SensorReaderConfig
+from schemas.config.robot import SensorReaderConfig
 try:
     make(SensorReaderConfig(sensor_id="wrist", backend="gstreamer", backend_params={"source": "test"}), SystemClock(), None)
 except ConfigError as error:
@@ -18,7 +18,9 @@ except ConfigError as error:
 
 
 def test_it_says_what_to_install() -> None:
-    result = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, timeout=120)
+    result = subprocess.run(
+        [sys.executable, "-c", CODE], capture_output=True, text=True, timeout=120
+    )
     assert result.returncode == 0, result.stderr
     assert "sensor wrist" in result.stdout
     assert "GStreamer cannot be used here" in result.stdout

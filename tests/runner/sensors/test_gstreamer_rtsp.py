@@ -8,15 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from runner.clock import SystemClock
-from runner.sensors.factory import make_reader
-from runner.sensors.slot import SlotReader
-from schemas.errors import FrameStale
-from schemas.robot import SensorBackend, SensorReaderConfig
-from schemas.world import SensorFrame
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.sensors.factory import make_reader
+from vram_arbiter.runner.sensors.slot import SlotReader
+from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig
+from vram_arbiter.schemas.errors import FrameStale
+from vram_arbiter.schemas.world import SensorFrame
 
 pytestmark = pytest.mark.heavy
-pytest.importorskip("gi", reason="GStreamer's binding is not installed; .ci/setup says what to install")
+pytest.importorskip(
+    "gi", reason="GStreamer's binding is not installed; .ci/setup says what to install"
+)
 
 CLOCK = SystemClock()
 WAIT_S = 60.0
@@ -91,7 +93,7 @@ class NetworkCamera:
         }.get(method, "Session: 1\r\n\r\n")
 
     def _play(self, connection: socket.socket) -> None:
-        from runner.sensors.gstreamer import load
+        from vram_arbiter.runner.sensors.gstreamer import load
 
         gst = load().gst
         pipeline = gst.parse_launch(f"{self.source} ! appsink name=out")
@@ -132,7 +134,11 @@ def watching() -> Iterator[Callable[..., SlotReader]]:
         config = SensorReaderConfig(
             sensor_id="overview",
             backend=SensorBackend.GSTREAMER,
-            backend_params={"source": "rtsp", "url": f"rtsp://{credentials}127.0.0.1:{port}/main", **params},
+            backend_params={
+                "source": "rtsp",
+                "url": f"rtsp://{credentials}127.0.0.1:{port}/main",
+                **params,
+            },
         )
         made.append(make_reader(config, CLOCK))
         made[-1].start()
@@ -169,7 +175,9 @@ def end_of(reader: SlotReader) -> str:
 
 
 def test_an_h264_stream_and_its_end(
-    network_camera: Callable[..., NetworkCamera], watching: Callable[..., SlotReader], h264_packets: str
+    network_camera: Callable[..., NetworkCamera],
+    watching: Callable[..., SlotReader],
+    h264_packets: str,
 ) -> None:
     camera = network_camera("h264", h264_packets)
     reader = watching(camera.port, platform="cpu_only")

@@ -4,12 +4,14 @@ import uuid
 
 import pytest
 
-from runner.clock import SystemClock
-from runner.sensors.factory import make_reader
-from schemas.robot import SensorBackend, SensorReaderConfig
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.sensors.factory import make_reader
+from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig
 
 pytestmark = pytest.mark.heavy
-pytest.importorskip("gi", reason="GStreamer's binding is not installed; .ci/setup says what to install")
+pytest.importorskip(
+    "gi", reason="GStreamer's binding is not installed; .ci/setup says what to install"
+)
 pytest.importorskip("cyclonedds")
 
 CLOCK = SystemClock()

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.sensors.lag import WINDOW_S, LagMeter
+from vram_arbiter.runner.sensors.lag import WINDOW_S, LagMeter
 
 S = 10**9
 MS = 10**6

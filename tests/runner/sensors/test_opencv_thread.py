@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from runner.clock import SystemClock
-from runner.sensors import SlotReader
-from runner.sensors.factory import make_reader
-from runner.sensors.opencv_thread import OpenCvReader, as_encoding, without_credentials
-from schemas.errors import ConfigError, FrameStale
-from schemas.robot import SensorReaderConfig
-from schemas.world import SensorFrame
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.sensors import SlotReader
+from vram_arbiter.runner.sensors.factory import make_reader
+from vram_arbiter.runner.sensors.opencv_thread import OpenCvReader, as_encoding, without_credentials
+from vram_arbiter.schemas.config.robot import SensorReaderConfig
+from vram_arbiter.schemas.errors import ConfigError, FrameStale
+from vram_arbiter.schemas.world import SensorFrame
 
 pytestmark = pytest.mark.heavy  # OpenCV
 
@@ -74,11 +74,17 @@ def test_a_file_is_played_in_order_at_its_rate_and_then_ends(
         "front", "bgr8", 64, 48, 3,
     )  # fmt: skip
     for index, frame in enumerate(shelf.frames):
-        assert frame.stamp_monotonic_ns - begun_ns >= index * 20_000_000  # each at its time, never before
+        assert (
+            frame.stamp_monotonic_ns - begun_ns >= index * 20_000_000
+        )  # each at its time, never before
 
 
-def test_the_rate_can_be_given_and_is_kept(make_video: Callable[..., Path], reading: Reading) -> None:
-    slow = make_video([10, 20, 30], fps=0.02)  # two and a half minutes, longer than the wait for the end
+def test_the_rate_can_be_given_and_is_kept(
+    make_video: Callable[..., Path], reading: Reading
+) -> None:
+    slow = make_video(
+        [10, 20, 30], fps=0.02
+    )  # two and a half minutes, longer than the wait for the end
     assert "over after 3 pictures" in wait_for_end(reading(reader_of(path=str(slow), fps=500.0)))
 
 
@@ -89,7 +95,9 @@ def test_a_file_that_loops_begins_again(make_video: Callable[..., Path], reading
     while len(shelf.frames) < 5:
         reader.read_synced(deadline_ns)
     assert reader.slot.ended is None
-    assert [grey(frame) for frame in shelf.frames[:5]] == pytest.approx([50, 150, 50, 150, 50], abs=3)
+    assert [grey(frame) for frame in shelf.frames[:5]] == pytest.approx(
+        [50, 150, 50, 150, 50], abs=3
+    )
 
 
 def test_a_file_that_is_no_video_ends_with_the_reason(tmp_path: Path, reading: Reading) -> None:
@@ -101,9 +109,13 @@ def test_a_file_that_is_no_video_ends_with_the_reason(tmp_path: Path, reading: R
 
 
 @pytest.mark.parametrize(("encoding", "channels"), [("rgb8", 3), ("mono8", 1)])
-def test_encodings(make_video: Callable[..., Path], reading: Reading, encoding: str, channels: int) -> None:
+def test_encodings(
+    make_video: Callable[..., Path], reading: Reading, encoding: str, channels: int
+) -> None:
     shelf = Shelf()
-    wait_for_end(reading(reader_of(shelf, path=str(make_video([90], fps=100.0)), encoding=encoding)))
+    wait_for_end(
+        reading(reader_of(shelf, path=str(make_video([90], fps=100.0)), encoding=encoding))
+    )
     frame = shelf.frames[0]
     assert (frame.encoding, frame.channels, len(frame.data or b"")) == (
         encoding,
@@ -162,7 +174,9 @@ def test_a_stream_that_breaks_off_is_opened_again_and_given_up_in_the_end(
         reader.read_synced(deadline_ns)  # waits through the interruption
     server.close()
     said = wait_for_end(reader)
-    assert f"rtsp://127.0.0.1:{server.port}/front cannot be opened, given up after 2 new tries" in said
+    assert (
+        f"rtsp://127.0.0.1:{server.port}/front cannot be opened, given up after 2 new tries" in said
+    )
     assert "secret" not in said
     assert "hidden" not in said
 
@@ -199,13 +213,17 @@ def test_pictures_that_waited_in_the_network_are_as_old_as_they_are(
     if stamp == "arrival":
         assert late.stamp_monotonic_ns >= begun_ns + 100 * 10**9
     else:
-        assert 90 < age_s < 170  # a hundred, less the four that the stream lasts, and what this test took
+        assert (
+            90 < age_s < 170
+        )  # a hundred, less the four that the stream lasts, and what this test took
         assert late.stamp_wall_ns <= clock.wall_ns() - 90 * 10**9
 
 
 def test_a_device_that_is_not_there_is_tried_and_given_up(reading: Reading) -> None:
     reader = reading(reader_of(device=NO_DEVICE, reconnect_tries=1, reconnect_s=0.01))
-    assert f"device {NO_DEVICE} cannot be opened, given up after 1 new tries" in wait_for_end(reader)
+    assert f"device {NO_DEVICE} cannot be opened, given up after 1 new tries" in wait_for_end(
+        reader
+    )
 
 
 def test_stopping_does_not_wait_for_the_next_try(reading: Reading) -> None:
@@ -236,7 +254,9 @@ def test_stopping_does_not_wait_for_the_next_try(reading: Reading) -> None:
         ({"path": "not-there.avi"}, "there is no file not-there.avi"),
     ],
 )
-def test_wrong_parameters_are_refused_before_anything_starts(params: dict[str, Any], problem: str) -> None:
+def test_wrong_parameters_are_refused_before_anything_starts(
+    params: dict[str, Any], problem: str
+) -> None:
     with pytest.raises(ConfigError) as refused:
         make_reader(camera(**params), SystemClock())
     assert problem in str(refused.value)

@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from runner.sensors.pipelines import GStreamerParams, build, framerate
-from runner.sensors.platform import Platform
+from vram_arbiter.runner.sensors.pipelines import GStreamerParams, build, framerate
+from vram_arbiter.runner.sensors.platform import Platform
 
 
 def text(on: Platform = Platform.CPU_ONLY, **params: Any) -> str:
@@ -40,13 +40,22 @@ H264_FILE = {"source": "file", "path": "/data/run.mp4"}
     ],
 )
 def test_an_h264_file(platform: Platform, expected: str) -> None:
-    assert text(platform, **H264_FILE) == f'filesrc location="/data/run.mp4" ! {expected} ! appsink name=sink'
+    assert (
+        text(platform, **H264_FILE)
+        == f'filesrc location="/data/run.mp4" ! {expected} ! appsink name=sink'
+    )
 
 
 ALL_SOURCES: list[dict[str, Any]] = [
     {"source": "v4l2", "device": "/dev/video0"},
-    *({"source": "v4l2", "device": "/dev/video0", "codec": codec} for codec in ("mjpeg", "h264", "h265")),
-    *({"source": "rtsp", "url": "rtsp://cam/1", "codec": codec} for codec in ("mjpeg", "h264", "h265")),
+    *(
+        {"source": "v4l2", "device": "/dev/video0", "codec": codec}
+        for codec in ("mjpeg", "h264", "h265")
+    ),
+    *(
+        {"source": "rtsp", "url": "rtsp://cam/1", "codec": codec}
+        for codec in ("mjpeg", "h264", "h265")
+    ),
     *({"source": "file", "path": "a.mkv", "codec": codec} for codec in ("mjpeg", "h264", "h265")),
     {"source": "file", "path": "a.mp4", "width": 320, "height": 240},
     {"source": "test"},
@@ -94,7 +103,9 @@ def test_a_file_is_scaled_by_what_the_platform_has() -> None:
 
 def test_jpeg_is_handed_on_as_it_is() -> None:
     made = text(source="v4l2", device="/dev/video0", codec="mjpeg", encoding="jpeg", fps=29.97)
-    assert made == 'v4l2src device="/dev/video0" ! image/jpeg,framerate=30000/1001 ! appsink name=sink'
+    assert (
+        made == 'v4l2src device="/dev/video0" ! image/jpeg,framerate=30000/1001 ! appsink name=sink'
+    )
 
 
 def test_depth_is_never_made_out_of_grey() -> None:
@@ -123,14 +134,20 @@ def test_an_operators_pipeline_keeps_its_own_sink() -> None:
         ({"source": "test", "pipeline": "videotestsrc"}, "give either pipeline or source"),
         ({"source": "v4l2"}, "source v4l2 needs device"),
         ({"source": "v4l2", "device": "/dev/video0", "loop": True}, "not for v4l2: loop"),
-        ({"source": "rtsp", "url": "rtsp://c", "fps": 30.0, "path": "x"}, "not for rtsp: fps, path"),
+        (
+            {"source": "rtsp", "url": "rtsp://c", "fps": 30.0, "path": "x"},
+            "not for rtsp: fps, path",
+        ),
         ({"pipeline": "videotestsrc", "width": 3}, "not for pipeline: width"),
         ({"source": "test", "width": 64}, "width and height go together"),
         ({"source": "rtsp", "url": "http://cam"}, "url begins with rtsp://"),
         ({"source": "file", "path": "a.h264"}, "path must end in one of .mp4"),
         ({"source": "file", "path": "a.avi"}, "put it into .mp4"),
         ({"source": "file", "path": "a.mp4", "codec": "raw"}, "carries mjpeg, h264 or h265"),
-        ({"source": "v4l2", "device": "/dev/video0", "encoding": "jpeg"}, "it goes with codec mjpeg"),
+        (
+            {"source": "v4l2", "device": "/dev/video0", "encoding": "jpeg"},
+            "it goes with codec mjpeg",
+        ),
         ({"source": "v4l2", "device": "/dev/video\n0"}, "device: "),
         ({"source": "usb"}, "source: "),
         ({"source": "test", "fps": float("nan")}, "fps: "),

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from runner.sensors.platform import Platform, probe_platform
+from vram_arbiter.runner.sensors.platform import Platform, probe_platform
 
 
 @pytest.mark.parametrize(
@@ -13,17 +13,27 @@ from runner.sensors.platform import Platform, probe_platform
         ({}, Platform.CPU_ONLY, "no NVIDIA device"),
         ({"proc/driver/nvidia/version": b"NVRM"}, Platform.CPU_ONLY, "no card is visible"),
         ({"dev/nvidiactl": b""}, Platform.CPU_ONLY, "no NVIDIA device"),
-        ({"dev/nvidia0": b"", "dev/nvidiactl": b""}, Platform.NVIDIA_DESKTOP, "/dev/nvidia0 exists"),
+        (
+            {"dev/nvidia0": b"", "dev/nvidiactl": b""},
+            Platform.NVIDIA_DESKTOP,
+            "/dev/nvidia0 exists",
+        ),
         ({"etc/nv_tegra_release": b"# R36"}, Platform.TEGRA, "nv_tegra_release"),
         (
             {"proc/device-tree/compatible": b"nvidia,p3971\0nvidia,tegra264\0", "dev/nvidia0": b""},
             Platform.TEGRA,
             "nvidia,tegra264",
         ),
-        ({"proc/device-tree/compatible": b"raspberrypi,5-model-b\0brcm,bcm2712\0"}, Platform.CPU_ONLY, ""),
+        (
+            {"proc/device-tree/compatible": b"raspberrypi,5-model-b\0brcm,bcm2712\0"},
+            Platform.CPU_ONLY,
+            "",
+        ),
     ],
 )
-def test_machines(tmp_path: Path, files: dict[str, bytes], platform: Platform, evidence: str) -> None:
+def test_machines(
+    tmp_path: Path, files: dict[str, bytes], platform: Platform, evidence: str
+) -> None:
     for name, content in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(content)

@@ -13,14 +13,14 @@ from typing import Any
 
 import pytest
 
-from runner.clock import SystemClock
-from runner.sensors import SlotReader
-from runner.sensors.factory import make_reader
-from runner.sensors.ros2_dds import dds_topic, dds_type, domain_of, full_topic, qos_of
-from runner.sensors.ros2_image import RosImagePublisher, RosImageReader
-from schemas.errors import ConfigError, FrameStale
-from schemas.robot import SensorBackend, SensorReaderConfig
-from schemas.world import FrameEncoding, SensorFrame
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.sensors import SlotReader
+from vram_arbiter.runner.sensors.factory import make_reader
+from vram_arbiter.runner.sensors.ros2_dds import dds_topic, dds_type, domain_of, full_topic, qos_of
+from vram_arbiter.runner.sensors.ros2_image import RosImagePublisher, RosImageReader
+from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig
+from vram_arbiter.schemas.errors import ConfigError, FrameStale
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 pytestmark = pytest.mark.heavy  # Cyclone DDS
 
@@ -37,7 +37,9 @@ Reading = Callable[[SlotReader], SlotReader]
 class Node:
     """The other process. `tell` sends it a line, `told` waits for one of its."""
 
-    def __init__(self, what: str, topic: str, message: str, reliability: str, network: str = NETWORK) -> None:
+    def __init__(
+        self, what: str, topic: str, message: str, reliability: str, network: str = NETWORK
+    ) -> None:
         script = Path(__file__).with_name("ros2_node.py")
         self.process = subprocess.Popen(
             [sys.executable, str(script), what, topic, message, reliability],
@@ -126,7 +128,9 @@ def picture_now(reader: SlotReader, publisher: Node, data: bytes, **fields: Any)
     for _ in range(300):
         publisher.publish(data, **fields)
         with slot._changed:
-            if slot._changed.wait_for(lambda: slot._frame is not None and slot._frame.data == data, 0.2):
+            if slot._changed.wait_for(
+                lambda: slot._frame is not None and slot._frame.data == data, 0.2
+            ):
                 return reader.read_latest()
     raise AssertionError(f"no picture within a minute: {slot._reason}")
 
@@ -179,10 +183,14 @@ def test_jpeg_pictures(topic: str, node: Callable[..., Node], reading: Reading) 
     assert frame.data == data
 
 
-def test_age_counts_from_the_header(topic: str, node: Callable[..., Node], reading: Reading) -> None:
+def test_age_counts_from_the_header(
+    topic: str, node: Callable[..., Node], reading: Reading
+) -> None:
     reader = reading(reader_of(topic, max_age_ms=1_000.0, reliability="reliable"))
     publisher = node("publish", topic, "image", "reliable")
-    old_ns = SystemClock().wall_ns() - 30 * 10**9  # a machine that has just been started has no longer past
+    old_ns = (
+        SystemClock().wall_ns() - 30 * 10**9
+    )  # a machine that has just been started has no longer past
     slot = reader.slot
     for _ in range(300):  # whoever has matched a reader may not yet have been matched by it
         publisher.publish(bytes(12), old_ns, **image(2, 2))
@@ -196,7 +204,9 @@ def test_age_counts_from_the_header(topic: str, node: Callable[..., Node], readi
     assert "in the future; set the machines' clocks" in why_stale(reader, "future")
 
 
-def test_age_can_count_from_the_arrival(topic: str, node: Callable[..., Node], reading: Reading) -> None:
+def test_age_can_count_from_the_arrival(
+    topic: str, node: Callable[..., Node], reading: Reading
+) -> None:
     reader = reading(reader_of(topic, stamp="arrival"))
     publisher = node("publish", topic)
     frame = picture_now(
@@ -271,7 +281,9 @@ def test_the_last_picture_of_a_publisher_that_left_is_not_shown_after_it(topic: 
     assert slot._frame is None
 
 
-def test_a_killed_publisher_is_noticed_too(topic: str, node: Callable[..., Node], reading: Reading) -> None:
+def test_a_killed_publisher_is_noticed_too(
+    topic: str, node: Callable[..., Node], reading: Reading
+) -> None:
     reader = reading(reader_of(topic))
     brief = NETWORK.replace("<Discovery>", "<Discovery><LeaseDuration>1s</LeaseDuration>")
     publisher = node("publish", topic, network=brief)
@@ -289,7 +301,9 @@ def test_a_publisher_with_another_quality_of_service_is_named(
     assert "say reliability: best_effort" in why_stale(reader, "best_effort")
 
 
-def test_stopping_ends_the_thread_and_starting_begins_anew(topic: str, node: Callable[..., Node]) -> None:
+def test_stopping_ends_the_thread_and_starting_begins_anew(
+    topic: str, node: Callable[..., Node]
+) -> None:
     reader = reader_of(topic)
     publisher = node("publish", topic)
     for _ in range(2):
@@ -323,7 +337,9 @@ def test_the_frames_of_any_reader_can_be_published(
     assert sum(data) / len(data) == pytest.approx(200, abs=3)
 
 
-def plain(stamp_ns: int, encoding: FrameEncoding = FrameEncoding.MONO8, **where: Any) -> SensorFrame:
+def plain(
+    stamp_ns: int, encoding: FrameEncoding = FrameEncoding.MONO8, **where: Any
+) -> SensorFrame:
     return SensorFrame(
         sensor_id="front", stamp_monotonic_ns=stamp_ns, stamp_wall_ns=stamp_ns, encoding=encoding, width=1, height=1,
         channels=1, **(where or {"data": b"x"}),
@@ -346,13 +362,17 @@ def test_the_publisher_keeps_to_its_rate_and_counts_what_it_cannot_send(topic: s
 
 
 @pytest.mark.parametrize("encoding", [FrameEncoding.DEPTH16, FrameEncoding.JPEG])
-def test_what_is_published_is_read_as_it_was(topic: str, reading: Reading, encoding: FrameEncoding) -> None:
+def test_what_is_published_is_read_as_it_was(
+    topic: str, reading: Reading, encoding: FrameEncoding
+) -> None:
     import cv2
     import numpy as np
 
     depth = np.arange(12, dtype="<u2").reshape(3, 4) * 5000
     data = (
-        depth.tobytes() if encoding is FrameEncoding.DEPTH16 else bytes(cv2.imencode(".jpg", depth >> 8)[1])
+        depth.tobytes()
+        if encoding is FrameEncoding.DEPTH16
+        else bytes(cv2.imencode(".jpg", depth >> 8)[1])
     )
     message = "image" if encoding is FrameEncoding.DEPTH16 else "compressed"
     reader = reading(reader_of(topic, message=message, reliability="reliable"))
@@ -369,7 +389,13 @@ def test_what_is_published_is_read_as_it_was(topic: str, reading: Reading, encod
                 break
     got = reader.read_latest()
     publisher.close()
-    assert (got.encoding, got.width, got.height, got.channels, got.data) == (encoding, 4, 3, 1, data)
+    assert (got.encoding, got.width, got.height, got.channels, got.data) == (
+        encoding,
+        4,
+        3,
+        1,
+        data,
+    )
 
 
 def test_a_network_that_is_not_there_is_said_at_the_start(
@@ -380,7 +406,7 @@ def test_a_network_that_is_not_there_is_said_at_the_start(
     code = (
         "from runner.clock import SystemClock\n"
         "from runner.sensors.factory import make_reader\n"
-        "from schemas.robot import SensorReaderConfig\n"
+        "from schemas.config.robot import SensorReaderConfig\n"
         f"reader = make_reader(SensorReaderConfig(sensor_id='a', backend='ros2_image', backend_params={{'topic': {topic!r}}}), SystemClock())\n"
         "try:\n    reader.start()\nexcept Exception as error:\n    print(type(error).__name__, error)\n"
     )
@@ -402,7 +428,9 @@ def test_a_network_that_is_not_there_is_said_at_the_start(
     ],
 )
 def test_wrong_parameters_are_refused(params: dict[str, Any], problem: str) -> None:
-    camera = SensorReaderConfig(sensor_id="front", backend=SensorBackend.ROS2_IMAGE, backend_params=params)
+    camera = SensorReaderConfig(
+        sensor_id="front", backend=SensorBackend.ROS2_IMAGE, backend_params=params
+    )
     with pytest.raises(ConfigError) as refused:
         make_reader(camera, SystemClock())
     assert problem in str(refused.value)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.sensors.ros2_messages import (
+from vram_arbiter.runner.sensors.ros2_messages import (
     Picture,
     RosCompressedImage,
     RosImage,
@@ -18,7 +18,7 @@ from runner.sensors.ros2_messages import (
     read_image,
     write_cdr,
 )
-from schemas.world import FrameEncoding
+from vram_arbiter.schemas.world import FrameEncoding
 
 stamps = st.integers(0, (2**31 - 1) * 10**9)
 names = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\0"), max_size=20)
@@ -52,7 +52,9 @@ def test_an_image_survives_the_wire(
 
 
 @given(stamps, names, names, st.binary(max_size=40))
-def test_a_compressed_image_survives_the_wire(stamp_ns: int, frame_id: str, form: str, data: bytes) -> None:
+def test_a_compressed_image_survives_the_wire(
+    stamp_ns: int, frame_id: str, form: str, data: bytes
+) -> None:
     message = RosCompressedImage(stamp_ns, frame_id, form, data)
     assert read_compressed(write_cdr(message)) == message
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from runner.clock import Clock, SystemClock
-from runner.protocols import SensorReader
-from runner.sensors import Feed, LatestSlot, SlotReader
-from schemas.errors import FrameStale
-from schemas.world import FrameEncoding, SensorFrame
+from vram_arbiter.runner.clock import Clock, SystemClock
+from vram_arbiter.runner.protocols import SensorReader
+from vram_arbiter.runner.sensors import Feed, LatestSlot, SlotReader
+from vram_arbiter.schemas.errors import FrameStale
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 
 def frame(stamp_ns: int, value: int = 0, sensor_id: str = "front") -> SensorFrame:
@@ -210,7 +210,9 @@ def test_a_reader_conforms_starts_again_and_tells_its_tee(clock: Any) -> None:
     assert [kept.data for kept in shelf.frames] == [b"\x01", b"\x03"]
 
 
-def test_a_source_that_cannot_be_opened_leaves_a_reader_that_can_be_started_again(clock: Any) -> None:
+def test_a_source_that_cannot_be_opened_leaves_a_reader_that_can_be_started_again(
+    clock: Any,
+) -> None:
     reader = Pushed(clock)
     reader.broken = OSError("no such device")
     with pytest.raises(OSError, match="no such device"):

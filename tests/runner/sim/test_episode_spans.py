@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.collector import Collector
-from schemas import telemetry
+from tests.support.collector import Collector
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
 
@@ -18,13 +18,18 @@ ROOT = Path(__file__).parents[3]
 def test_each_episode_is_a_trace_with_its_ticks(tmp_path: Path) -> None:
     pytest.importorskip("gymnasium", reason="needs the runner extra")
     argv = [
-        "-m", "runner", "sim", "--env", "gym:Pendulum-v1", "--policy", "random", "--episodes", "2", "--max-steps", "4",
+        "-m", "vram_arbiter.runner", "sim", "--env", "gym:Pendulum-v1", "--policy", "random", "--episodes", "2", "--max-steps", "4",
         "--rate", "0", "--no-arbiter", "--no-realtime",
     ]  # fmt: skip
     with Collector() as collector:
         environ = os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path)} | collector.environ()
         done = subprocess.run(
-            [sys.executable, *argv], cwd=ROOT, env=environ, capture_output=True, text=True, timeout=120
+            [sys.executable, *argv],
+            cwd=ROOT,
+            env=environ,
+            capture_output=True,
+            text=True,
+            timeout=120,
         )
     assert done.returncode == 0, done.stderr[-3000:]
     episodes = collector.spans(telemetry.SPAN_EPISODE)

@@ -13,12 +13,12 @@ pytestmark = pytest.mark.heavy
 np = pytest.importorskip("numpy")
 gymnasium = pytest.importorskip("gymnasium")
 
-from runner.sim.benchmark import Benchmark, Cell, PolicyContestant  # noqa: E402
-from runner.sim.gym_config import GymConfig  # noqa: E402
-from runner.sim.gym_env import GymEnv  # noqa: E402
-from runner.sim.policies import Policy, PolicyPlayer  # noqa: E402
-from runner.sim.sim_runner import SimRunner  # noqa: E402
-from schemas.errors import ConfigError, EnvironmentFailed  # noqa: E402
+from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, PolicyContestant  # noqa: E402
+from vram_arbiter.runner.sim.gym_config import GymConfig  # noqa: E402
+from vram_arbiter.runner.sim.gym_env import GymEnv  # noqa: E402
+from vram_arbiter.runner.sim.policies import Policy, PolicyPlayer  # noqa: E402
+from vram_arbiter.runner.sim.sim_runner import SimRunner  # noqa: E402
+from vram_arbiter.schemas.errors import ConfigError, EnvironmentFailed  # noqa: E402
 
 Run = Callable[[Any], Any]
 ROOT = Path(__file__).parents[3]
@@ -61,7 +61,9 @@ JOINTS = {"state": "v", "joints": ["a", "b"], "hold": [0.0]}
 
 
 def world(steps: dict[int, Any], **config: Any) -> GymEnv:
-    return GymEnv(ID, GymConfig.model_validate({"kwargs": {"steps": steps}, **config}), render=False)
+    return GymEnv(
+        ID, GymConfig.model_validate({"kwargs": {"steps": steps}, **config}), render=False
+    )
 
 
 class Looks(PolicyPlayer):
@@ -105,8 +107,14 @@ def test_an_episode_whose_last_step_fails_is_not_the_one_before(run_async: Run) 
     """The policy is done in the tick in which the world raises: there is no episode, and the last one must not count again."""
     env = world({1: GOOD, 3: ZeroDivisionError("the physics blew up")}, hold=[0.0])
     cell = play(run_async, env, 1, 1, 1)
-    assert [(e.success, e.error) for e in cell.episodes][:2] == [(True, ""), (None, "environment_failed")]
-    assert (cell.episodes[2].success, cell.episodes[2].error) == (False, "")  # the world said nothing of it
+    assert [(e.success, e.error) for e in cell.episodes][:2] == [
+        (True, ""),
+        (None, "environment_failed"),
+    ]
+    assert (cell.episodes[2].success, cell.episodes[2].error) == (
+        False,
+        "",
+    )  # the world said nothing of it
     assert (cell.judged, cell.successes, cell.errors) == (2, 1, 1)
 
 
@@ -147,7 +155,9 @@ def test_what_was_not_promised_is_the_worlds_failure_and_the_next_episode_is_pla
     assert not any(e.error for e in cell.episodes[1:])
 
 
-@pytest.mark.parametrize("said", [True, np.True_, 1, 1.0, np.float32(1), np.array(1), np.array([True])])
+@pytest.mark.parametrize(
+    "said", [True, np.True_, 1, 1.0, np.float32(1), np.array(1), np.array([True])]
+)
 def test_every_plain_yes_is_one(said: Any) -> None:
     env = world({1: (SEEN, 0.0, True, False, {"success": said})})
     env.reset(0)
@@ -184,7 +194,7 @@ def test_a_policy_that_is_done_as_its_world_fails_does_not_play_for_ever() -> No
 
 
 def test_pictures_that_change_their_size_do_not_garble_a_video(tmp_path: Path) -> None:
-    from runner.recorder import Recorder
+    from vram_arbiter.runner.recorder import Recorder
 
     recorder = Recorder(tmp_path / "v.mp4", fps=30, wait=True)
     for size in (64, 64, 96, 64):
@@ -212,7 +222,11 @@ for room in (20_000, 1 << 20):
     print(recorder.written, bool(recorder.error))
 """
     ran = subprocess.run(
-        [sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True, check=True, cwd=ROOT
+        [sys.executable, "-c", script, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
     )
     assert ran.stdout.split() == ["12", "True", "12", "False"]
 
@@ -227,7 +241,9 @@ class Sketch(gymnasium.Env[Any, Any]):
         self.film = np.zeros((8, 8, 3), np.uint8) if film is None else film
         self.eye = np.zeros((8, 8, 3), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(2)
-        self.observation_space = gymnasium.spaces.Dict(eye=gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8))
+        self.observation_space = gymnasium.spaces.Dict(
+            eye=gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+        )
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)

@@ -7,18 +7,18 @@ import pytest
 
 pytestmark = pytest.mark.heavy
 
-gym_env = pytest.importorskip("runner.sim.gym_env")
+gym_env = pytest.importorskip("vram_arbiter.runner.sim.gym_env")
 np = pytest.importorskip("numpy")
 pytest.importorskip("gymnasium")
 
-from runner.protocols import Act, Goal, Hold, SkillEnded, SkillKey  # noqa: E402
-from runner.sim.gym_config import GymConfig  # noqa: E402
-from runner.sim.gym_env import GymEnv  # noqa: E402
-from runner.sim.policies import policy_of  # noqa: E402
-from runner.sim.sim_runner import SimRunner  # noqa: E402
-from schemas.control import ControlMode  # noqa: E402
-from schemas.errors import ConfigError, EnvironmentFailed, ModelError  # noqa: E402
-from schemas.world import Action, JointState, WorldState  # noqa: E402
+from vram_arbiter.runner.protocols import Act, Goal, Hold, SkillEnded, SkillKey  # noqa: E402
+from vram_arbiter.runner.sim.gym_config import GymConfig  # noqa: E402
+from vram_arbiter.runner.sim.gym_env import GymEnv  # noqa: E402
+from vram_arbiter.runner.sim.policies import policy_of  # noqa: E402
+from vram_arbiter.runner.sim.sim_runner import SimRunner  # noqa: E402
+from vram_arbiter.schemas.control import ControlMode  # noqa: E402
+from vram_arbiter.schemas.errors import ConfigError, EnvironmentFailed, ModelError  # noqa: E402
+from vram_arbiter.schemas.world import Action, JointState, WorldState  # noqa: E402
 
 POINT = "gym_worlds:test/Point-v0"
 NAMED = GymConfig(state="agent_pos", joints={"a": 0, "b": 1}, actions=("a", "b"))
@@ -54,7 +54,8 @@ def test_joints_are_only_those_that_the_file_names() -> None:
     env.reset(3)
     assert env.observe(5, None).joint_state.name == ()
     env = GymEnv(
-        POINT, GymConfig(state="agent_pos", joints={"b": 1, "mark": 3}, velocities={"b": 0, "mark": 2})
+        POINT,
+        GymConfig(state="agent_pos", joints={"b": 1, "mark": 3}, velocities={"b": 0, "mark": 2}),
     )
     env.reset(3)
     state = env.observe(5, None).joint_state
@@ -122,9 +123,14 @@ def test_named_columns_are_sorted_into_the_environments_order() -> None:
         (targets(0.1), "1 numbers for an action of 2"),
         (targets(0.1, 0.2, names=("a", "x")), "named a, x"),
         (targets(1.2, 0.0), "outside"),
-        (Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.0,) * 6,)), "takes joint_position"),
         (
-            Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=((0.0, 0.0),) * 2, horizon=2),
+            Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.0,) * 6,)),
+            "takes joint_position",
+        ),
+        (
+            Action(
+                control_mode=ControlMode.JOINT_POSITION, joint_targets=((0.0, 0.0),) * 2, horizon=2
+            ),
             "one step",
         ),
     ],
@@ -149,7 +155,11 @@ def test_one_step_per_tick_and_the_world_waits_without_an_action() -> None:
     script: list[Any] = [Hold("thinking"), Act(targets(0.95, 0.95)), Hold("thinking")]
 
     def act(world: WorldState) -> Any:
-        return script.pop(0) if script else Act(targets(*env.observation["agent_pos"][2:], names=("a", "b")))
+        return (
+            script.pop(0)
+            if script
+            else Act(targets(*env.observation["agent_pos"][2:], names=("a", "b")))
+        )
 
     runner.activate()
     assert runner.tick().step_idx is None
@@ -238,7 +248,9 @@ def test_a_mujoco_environment_of_gymnasium_is_driven_and_seen() -> None:
     runner.activate()
     runner.tick()
     assert runner.camera_names() == ("render",)
-    runner.begin_skill(Policy(lambda world: Act(env.action_of([3.0]))), Goal("g", "r"), lambda _: None)
+    runner.begin_skill(
+        Policy(lambda world: Act(env.action_of([3.0]))), Goal("g", "r"), lambda _: None
+    )
     result = runner.run(max_ticks=200)
     assert runner.world is not None
     assert runner.world.joint_state.name == ("cart", "pole")
@@ -283,7 +295,9 @@ def test_gymnasiums_own_environments_of_all_kinds_can_be_played(env_id: str) -> 
         ("Blackjack-v1", {"hold": 7}, "`hold`"),
     ],
 )
-def test_what_does_not_fit_is_refused_at_once(env_id: str, config: dict[str, Any], said: str) -> None:
+def test_what_does_not_fit_is_refused_at_once(
+    env_id: str, config: dict[str, Any], said: str
+) -> None:
     with pytest.raises(ConfigError, match=said):
         GymEnv(env_id, GymConfig(**config))
 

@@ -12,15 +12,15 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium import spaces  # noqa: E402
 
-from runner.protocols import Act, Goal, SkillEnded, SkillKey  # noqa: E402
-from runner.sim.benchmark import Benchmark, Cell, PolicyContestant  # noqa: E402
-from runner.sim.gym_config import GymConfig  # noqa: E402
-from runner.sim.gym_env import GymEnv  # noqa: E402
-from runner.sim.policies import Policy, PolicyPlayer, policy_of  # noqa: E402
-from runner.sim.sim_runner import SimRunner  # noqa: E402
-from schemas.control import ControlMode  # noqa: E402
-from schemas.errors import ConfigError, EnvironmentFailed, ModelError  # noqa: E402
-from schemas.world import Action, JointState, WorldState  # noqa: E402
+from vram_arbiter.runner.protocols import Act, Goal, SkillEnded, SkillKey  # noqa: E402
+from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, PolicyContestant  # noqa: E402
+from vram_arbiter.runner.sim.gym_config import GymConfig  # noqa: E402
+from vram_arbiter.runner.sim.gym_env import GymEnv  # noqa: E402
+from vram_arbiter.runner.sim.policies import Policy, PolicyPlayer, policy_of  # noqa: E402
+from vram_arbiter.runner.sim.sim_runner import SimRunner  # noqa: E402
+from vram_arbiter.schemas.control import ControlMode  # noqa: E402
+from vram_arbiter.schemas.errors import ConfigError, EnvironmentFailed, ModelError  # noqa: E402
+from vram_arbiter.schemas.world import Action, JointState, WorldState  # noqa: E402
 
 HAND = "gym_worlds:test/Hand-v0"
 NAMES = ("arm.0", "arm.1", "gripper", "lamps.0", "lamps.1", "walk.0.0", "walk.0.1", "walk.1")
@@ -56,7 +56,9 @@ if "test/Plain-v0" not in gymnasium.registry:
 
 def plain(action: Any, observation: Any = None, seen: Any = None, **config: Any) -> GymEnv:
     kwargs = {"action": action, "observation": observation, "seen": seen}
-    return GymEnv("test/Plain-v0", GymConfig.model_validate({"kwargs": kwargs, **config}), render=False)
+    return GymEnv(
+        "test/Plain-v0", GymConfig.model_validate({"kwargs": kwargs, **config}), render=False
+    )
 
 
 def gate_of(env: GymEnv) -> Any:
@@ -133,10 +135,14 @@ def test_the_action_that_waits_may_have_parts() -> None:
     ],
     ids=str,
 )
-def test_random_actions_of_every_kind_are_the_spaces_own_and_follow_from_the_seed(space: Any) -> None:
+def test_random_actions_of_every_kind_are_the_spaces_own_and_follow_from_the_seed(
+    space: Any,
+) -> None:
     def play() -> list[Any]:
         env = plain(space)
-        runner = SimRunner(lambda: env, rate_hz=0, episodes=2, max_steps=5, policy=policy_of("random").play)
+        runner = SimRunner(
+            lambda: env, rate_hz=0, episodes=2, max_steps=5, policy=policy_of("random").play
+        )
         runner.activate()
         runner.run()
         assert (runner.policy_error, list(runner.violations)) == (None, [])
@@ -152,13 +158,21 @@ def test_random_actions_of_every_kind_are_the_spaces_own_and_follow_from_the_see
     ("space", "said"),
     [
         (spaces.Text(3), "it is Text.*: a text is no number"),
-        (spaces.Dict(say=spaces.Text(3), go=spaces.Discrete(2)), "say is Text.*: a text is no number"),
+        (
+            spaces.Dict(say=spaces.Text(3), go=spaces.Discrete(2)),
+            "say is Text.*: a text is no number",
+        ),
         (spaces.Tuple((spaces.Sequence(spaces.Discrete(2)),)), "0 is Sequence.*longer one time"),
-        (spaces.OneOf((spaces.Discrete(2), spaces.Discrete(3))), "it is OneOf.*which of its alternatives"),
+        (
+            spaces.OneOf((spaces.Discrete(2), spaces.Discrete(3))),
+            "it is OneOf.*which of its alternatives",
+        ),
         (spaces.Graph(spaces.Box(0, 1, (1,)), None), "it is Graph.*more nodes"),
     ],
 )
-def test_actions_that_are_no_row_of_numbers_are_refused_with_the_reason(space: Any, said: str) -> None:
+def test_actions_that_are_no_row_of_numbers_are_refused_with_the_reason(
+    space: Any, said: str
+) -> None:
     with pytest.raises(ConfigError, match=f"no row of numbers: {said}") as error:
         plain(space)
     assert "Dict and Tuple" in (error.value.hint or "")
@@ -307,7 +321,9 @@ def test_a_benchmark_of_such_a_world_is_the_same_for_the_same_seeds(
 ) -> None:
     def play(policy: Policy) -> Cell:
         runner = SimRunner(lambda: GymEnv(HAND, render=False), rate_hz=0, ends_with_skill=True)
-        cell: Cell = run_async(Benchmark(runner, world=HAND).run(PolicyContestant(policy), range(5, 15)))
+        cell: Cell = run_async(
+            Benchmark(runner, world=HAND).run(PolicyContestant(policy), range(5, 15))
+        )
         return cell
 
     cell = play(seeker())

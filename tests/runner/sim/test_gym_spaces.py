@@ -12,7 +12,7 @@ spaces = pytest.importorskip("gymnasium.spaces")
 from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
-from runner.sim.gym_spaces import CHOICES_MAX, ActionRow, NoNumbers, leaves  # noqa: E402
+from vram_arbiter.runner.sim.gym_spaces import CHOICES_MAX, ActionRow, NoNumbers, leaves  # noqa: E402
 
 FLOATS = ("float16", "float32", "float64")
 INTEGERS = ("int8", "uint8", "int32", "int64")
@@ -52,7 +52,11 @@ def multi_discretes(draw: Any) -> Any:
 PARTS = st.one_of(
     boxes(),
     multi_discretes(),
-    st.builds(lambda n, start: spaces.Discrete(n, start=start), st.integers(1, 10**9), st.integers(-99, 99)),
+    st.builds(
+        lambda n, start: spaces.Discrete(n, start=start),
+        st.integers(1, 10**9),
+        st.integers(-99, 99),
+    ),
     st.one_of(st.integers(1, 4), AXES).map(spaces.MultiBinary),
 )
 KEYS = st.text("abc", min_size=1, max_size=3)
@@ -72,8 +76,12 @@ def same(one: Any, other: Any) -> bool:
         return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
     if isinstance(one, tuple):
         return len(one) == len(other) and all(map(same, one, other))
-    if isinstance(other, np.ndarray):  # of a Box without axes gymnasium samples a plain number of its dtype
-        return bool(one.dtype == other.dtype and np.shape(one) == other.shape and (one == other).all())
+    if isinstance(
+        other, np.ndarray
+    ):  # of a Box without axes gymnasium samples a plain number of its dtype
+        return bool(
+            one.dtype == other.dtype and np.shape(one) == other.shape and (one == other).all()
+        )
     return int(one) == other and isinstance(other, int)  # of a Discrete
 
 
@@ -85,7 +93,9 @@ def test_every_action_of_a_space_goes_there_and_back(space: Any, seed: int) -> N
     element = space.sample()
     numbers = row.row_of(element)
     assert len(numbers) == len(row.names) == len(set(row.names)) == len(row.low) == len(row.high)
-    assert all(low <= number <= high for low, number, high in zip(row.low, numbers, row.high, strict=True))
+    assert all(
+        low <= number <= high for low, number, high in zip(row.low, numbers, row.high, strict=True)
+    )
     assert same(element, row.element(numbers))
 
 
@@ -123,7 +133,11 @@ def test_numbers_are_called_by_the_paths_of_their_parts() -> None:
 def test_choices_are_equal_parts_and_bits_are_set_from_the_half_on() -> None:
     row = ActionRow(
         spaces.Tuple(
-            (spaces.Discrete(4, start=10), spaces.MultiDiscrete([2, 3], start=[0, 5]), spaces.MultiBinary(2))
+            (
+                spaces.Discrete(4, start=10),
+                spaces.MultiDiscrete([2, 3], start=[0, 5]),
+                spaces.MultiBinary(2),
+            )
         )
     )
     for numbers, chosen, axes, bits in (
@@ -198,7 +212,13 @@ def test_an_observations_numbers_are_its_own() -> None:
     discrete, bits, text = leaves(space)
     seen = {"a": (np.int64(7), np.array([1, 0], np.int8)), "b": "xyz"}
     assert (discrete.numbers(seen), bits.numbers(seen)) == ([7.0], [1.0, 0.0])
-    for wrong in ({"a": (7,)}, {"b": "x"}, {"a": (7, np.array([1], np.int8))}, {"a": (7, ["x", "y"])}, None):
+    for wrong in (
+        {"a": (7,)},
+        {"b": "x"},
+        {"a": (7, np.array([1], np.int8))},
+        {"a": (7, ["x", "y"])},
+        None,
+    ):
         with pytest.raises(NoNumbers):
             bits.numbers(wrong)
     with pytest.raises(NoNumbers):

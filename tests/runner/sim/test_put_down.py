@@ -8,14 +8,14 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from runner.protocols import Act, Done, Goal
-from runner.sim.config import ARM_JOINTS, REST_POSE
-from runner.sim.dataset import stand_before
-from runner.sim.expert import GrabExpert
-from runner.sim.kinematics import ArmKinematics
-from runner.sim.worlds import so101_world
-from runner.skills.trajectory import FollowJointTrajectory
-from schemas.manifest import load_manifest
+from vram_arbiter.runner.protocols import Act, Done, Goal
+from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE
+from vram_arbiter.runner.sim.dataset import stand_before
+from vram_arbiter.runner.sim.expert import GrabExpert
+from vram_arbiter.runner.sim.kinematics import ArmKinematics
+from vram_arbiter.runner.sim.worlds import so101_world
+from vram_arbiter.runner.skills.trajectory import FollowJointTrajectory
+from vram_arbiter.schemas.manifest import load_manifest
 
 pytestmark = pytest.mark.heavy
 
@@ -53,7 +53,9 @@ def test_what_was_grasped_stands_again_where_the_arm_takes_things_from(shape: st
             allowed, problems = gate.check(outcome.action, seen)
             assert allowed is not None, problems
             # the gate counts a first step from where a joint is: the grip is back within a tenth of a second
-            assert not problems or (tick < 4 and all(one.startswith("gripper") for one in problems)), problems
+            assert not problems or (
+                tick < 4 and all(one.startswith("gripper") for one in problems)
+            ), problems
             environment.step(allowed)
             if tick < 30:
                 carried_m.append(env.ground_truth().objects[env.target].lift_m)

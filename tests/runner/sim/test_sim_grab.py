@@ -12,13 +12,13 @@ pytest.importorskip("mujoco")
 import cv2
 import numpy as np
 
-from runner.sim.config import REST_POSE, SceneConfig
-from runner.sim.dataset import VIEWS, main, stand_before, write_grab
-from runner.sim.env import SimEnv
-from runner.sim.evaluate import attempt
-from runner.sim.expert import CLOSED_RAD, GrabExpert, RestController, run_expert
-from runner.sim.kinematics import ArmKinematics
-from runner.sim.learned import LoadedPolicy
+from vram_arbiter.runner.sim.config import REST_POSE, SceneConfig
+from vram_arbiter.runner.sim.dataset import VIEWS, main, stand_before, write_grab
+from vram_arbiter.runner.sim.env import SimEnv
+from vram_arbiter.runner.sim.evaluate import attempt
+from vram_arbiter.runner.sim.expert import CLOSED_RAD, GrabExpert, RestController, run_expert
+from vram_arbiter.runner.sim.kinematics import ArmKinematics
+from vram_arbiter.runner.sim.learned import LoadedPolicy
 
 pytestmark = pytest.mark.heavy
 
@@ -37,7 +37,9 @@ def kinematics() -> ArmKinematics:
 
 
 @pytest.mark.parametrize("shape", ["cube", "ball", "cylinder"])
-def test_expert_grabs_after_imperfect_navigation(env: SimEnv, kinematics: ArmKinematics, shape: str) -> None:
+def test_expert_grabs_after_imperfect_navigation(
+    env: SimEnv, kinematics: ArmKinematics, shape: str
+) -> None:
     for seed in range(8):
         env.reset(seed, names=(f"red {shape}", "blue ball", "green cube"))
         stand_before(env, f"red {shape}", random.Random(seed))
@@ -66,7 +68,9 @@ def test_a_miss_holds_nothing(env: SimEnv, kinematics: ArmKinematics) -> None:
     assert env.held_object() is None
 
 
-def test_opening_the_gripper_lets_go_and_rest_is_reached(env: SimEnv, kinematics: ArmKinematics) -> None:
+def test_opening_the_gripper_lets_go_and_rest_is_reached(
+    env: SimEnv, kinematics: ArmKinematics
+) -> None:
     env.reset(1)
     stand_before(env, env.target, random.Random(1))
     run_expert(env, GrabExpert(env, kinematics, env.target))
@@ -85,7 +89,9 @@ def test_inverse_kinematics_reaches_the_grasp_zone(kinematics: ArmKinematics) ->
             point = (spot[0] + dx, spot[1] + dy, 0.215)
             joints, error = kinematics.solve(point, REST_POSE)
             assert error < 0.002
-            assert math.dist(kinematics.grasp_point(joints), point) == pytest.approx(error, abs=1e-4)
+            assert math.dist(kinematics.grasp_point(joints), point) == pytest.approx(
+                error, abs=1e-4
+            )
 
 
 def test_scene_data_set_labels_what_the_pictures_show(

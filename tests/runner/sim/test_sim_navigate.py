@@ -7,9 +7,15 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from runner.sim.config import SceneConfig
-from runner.sim.env import SimEnv
-from runner.sim.navigate import PlanarController, Pose2D, front_reach_m, standoff_pose, to_map
+from vram_arbiter.runner.sim.config import SceneConfig
+from vram_arbiter.runner.sim.env import SimEnv
+from vram_arbiter.runner.sim.navigate import (
+    PlanarController,
+    Pose2D,
+    front_reach_m,
+    standoff_pose,
+    to_map,
+)
 
 pytestmark = pytest.mark.heavy
 

@@ -9,14 +9,21 @@ import pytest
 pytest.importorskip("mujoco")
 import numpy as np
 
-from runner.hal.so101 import so101
-from runner.sim.arm_env import ArmEnvironment
-from runner.sim.config import ARM_JOINTS, COLOURS, REST_POSE, SHAPES, SceneConfig, vocabulary
-from runner.sim.env import SimEnv
-from runner.sim.layout import make_layout
-from runner.sim.navigate import standoff_pose
-from runner.sim.worlds import so101_world
-from schemas.errors import ConfigError, EnvironmentFailed
+from vram_arbiter.runner.hal.so101 import so101
+from vram_arbiter.runner.sim.arm_env import ArmEnvironment
+from vram_arbiter.runner.sim.config import (
+    ARM_JOINTS,
+    COLOURS,
+    REST_POSE,
+    SHAPES,
+    SceneConfig,
+    vocabulary,
+)
+from vram_arbiter.runner.sim.env import SimEnv
+from vram_arbiter.runner.sim.layout import make_layout
+from vram_arbiter.runner.sim.navigate import standoff_pose
+from vram_arbiter.runner.sim.worlds import so101_world
+from vram_arbiter.schemas.errors import ConfigError, EnvironmentFailed
 
 pytestmark = pytest.mark.heavy
 

@@ -9,8 +9,8 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runner.skills.chunks import ChunkPlayer, Played
-from schemas.errors import Evicted
+from vram_arbiter.runner.skills.chunks import ChunkPlayer, Played
+from vram_arbiter.schemas.errors import Evicted
 
 Row = tuple[float, ...]
 ROWS_MAX = 60
@@ -81,7 +81,9 @@ def test_any_sizes_any_prefetch_any_lateness(
             row = player.next_row(step)
         except Evicted:
             failures += 1
-            stood_still = len(played) == len(answers.answered)  # else the failed one was not yet due
+            stood_still = len(played) == len(
+                answers.answered
+            )  # else the failed one was not yet due
         else:
             if row is not None:
                 played.append(row)
@@ -113,4 +115,6 @@ def test_answers_of_another_thread_that_are_waited_for(size: int, prefetch_at: i
 
         player = ChunkPlayer(fetch, prefetch_at=prefetch_at, wait_s=60.0)
         rows = [player.next_row("o") for _ in range(40)]
-    assert [row.row for row in rows if row is not None] == [(n // size, n % size) for n in range(40)]
+    assert [row.row for row in rows if row is not None] == [
+        (n // size, n % size) for n in range(40)
+    ]

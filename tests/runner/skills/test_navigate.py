@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from runner.protocols import Act, Done, Goal, StepOutcome
-from runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
-from runner.skills.navigate import Navigate, NavigateParams
-from runner.skills.ros_goals import parse_goal
-from schemas.control import ControlMode
-from schemas.errors import BadRequest, GoalRejected, ModelError
-from schemas.manifest import load_manifest
-from schemas.world import JointState, Pose, WorldState
+from vram_arbiter.runner.protocols import Act, Done, Goal, StepOutcome
+from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
+from vram_arbiter.runner.skills.navigate import Navigate, NavigateParams
+from vram_arbiter.runner.skills.ros_goals import parse_goal
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import BadRequest, GoalRejected, ModelError
+from vram_arbiter.schemas.manifest import load_manifest
+from vram_arbiter.schemas.world import JointState, Pose, WorldState
 
 Run = Callable[[Any], Any]
 CONFIG = SceneConfig()
@@ -29,9 +29,13 @@ def world(env: Any) -> WorldState:
     x, y, yaw = env.base_pose()
     return WorldState(
         stamp_ns=1,
-        joint_state=JointState(name=tuple(env.joints), position=tuple(env.joints.values()), stamp_ns=1),
+        joint_state=JointState(
+            name=tuple(env.joints), position=tuple(env.joints.values()), stamp_ns=1
+        ),
         base_pose=Pose(
-            xyz=(x, y, 0.0), quat_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)), frame_id="map"
+            xyz=(x, y, 0.0),
+            quat_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)),
+            frame_id="map",
         ),
     )
 
@@ -56,7 +60,9 @@ def started(skill: Navigate, run_async: Run, **params: Any) -> None:
     run_async(skill.start(Goal("g", "navigate", params=params)))
 
 
-def test_stands_so_that_a_point_lies_on_the_grasp_spot(skill: Navigate, env: Any, run_async: Run) -> None:
+def test_stands_so_that_a_point_lies_on_the_grasp_spot(
+    skill: Navigate, env: Any, run_async: Run
+) -> None:
     env.reset(0)
     started(skill, run_async, target_point={"x": 0.70, "y": 0.20, "z": 0.22})
     done, modes = drive(skill, env)
@@ -104,7 +110,9 @@ def test_without_parameters_nothing_drives(skill: Navigate, env: Any, run_async:
     assert env.base_pose() == (0.0, 0.0, 0.0)
 
 
-def test_folds_the_arm_first_and_keeps_the_gripper(skill: Navigate, env: Any, run_async: Run) -> None:
+def test_folds_the_arm_first_and_keeps_the_gripper(
+    skill: Navigate, env: Any, run_async: Run
+) -> None:
     env.reset(0)
     env.joints.update(shoulder_lift=0.3, gripper=0.1)
     started(skill, run_async, turn_rad=0.3)
@@ -159,6 +167,8 @@ def test_no_joint_state_no_motion(skill: Navigate, env: Any, run_async: Run) -> 
         ({"pose": {"pose": {"orientation": {"w": 0}}}}, "zero"),
     ],
 )
-def test_wrong_parameters_are_named(navigate_manifest: Path, params: dict[str, Any], path: str) -> None:
+def test_wrong_parameters_are_named(
+    navigate_manifest: Path, params: dict[str, Any], path: str
+) -> None:
     with pytest.raises(BadRequest, match=path.replace(".", r"\.")):
         parse_goal(NavigateParams, load_manifest(navigate_manifest), params)

@@ -7,20 +7,22 @@ from typing import Any
 
 import pytest
 
-from runner.protocols import Done, Goal, SkillKey, StepOutcome
-from runner.skills import residency as residency_module
-from runner.skills.base import SkillBase
-from runner.skills.residency import Residency
-from schemas.errors import BadState, ManifestInvalid, SidecarUnavailable
-from schemas.manifest import RSkillManifest, load_manifest
-from schemas.world import WorldState
+from vram_arbiter.runner.protocols import Done, Goal, SkillKey, StepOutcome
+from vram_arbiter.runner.skills import residency as residency_module
+from vram_arbiter.runner.skills.base import SkillBase
+from vram_arbiter.runner.skills.residency import Residency
+from vram_arbiter.schemas.errors import BadState, ManifestInvalid, SidecarUnavailable
+from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
+from vram_arbiter.schemas.world import WorldState
 
 Run = Callable[[Any], Any]
 GOAL = Goal("g", "r", prompt="now")
 
 
 class Recording(SkillBase):
-    def __init__(self, manifest: RSkillManifest, revision: str, holds_gpu: bool, fails: str = "") -> None:
+    def __init__(
+        self, manifest: RSkillManifest, revision: str, holds_gpu: bool, fails: str = ""
+    ) -> None:
         super().__init__(manifest, revision=revision)
         self.holds_gpu = holds_gpu
         self.fails = fails
@@ -59,7 +61,9 @@ def skill(navigate_manifest: Path) -> Callable[..., Recording]:
     return make
 
 
-def test_the_same_key_is_reused_whatever_the_prompt(skill: Callable[..., Recording], run_async: Run) -> None:
+def test_the_same_key_is_reused_whatever_the_prompt(
+    skill: Callable[..., Recording], run_async: Run
+) -> None:
     async def scenario() -> None:
         residency, made = Residency(), skill()
         for prompt in ("red", "blue"):
@@ -88,7 +92,9 @@ def test_another_key_makes_the_old_one_leave_first(
     run_async(scenario())
 
 
-def test_a_gpu_free_skill_makes_nobody_leave(skill: Callable[..., Recording], run_async: Run) -> None:
+def test_a_gpu_free_skill_makes_nobody_leave(
+    skill: Callable[..., Recording], run_async: Run
+) -> None:
     async def scenario() -> None:
         residency, policy, drive = Residency(), skill("1"), skill("drive", holds_gpu=False)
         await residency.acquire(policy.key, lambda: policy)
@@ -228,7 +234,11 @@ def test_a_failing_gpu_free_skill_leaves_the_resident_one_alone(
     skill: Callable[..., Recording], run_async: Run
 ) -> None:
     async def scenario() -> None:
-        residency, policy, drive = Residency(), skill("1"), skill("drive", holds_gpu=False, fails="start")
+        residency, policy, drive = (
+            Residency(),
+            skill("1"),
+            skill("drive", holds_gpu=False, fails="start"),
+        )
         await residency.acquire(policy.key, lambda: policy)
         await residency.acquire(drive.key, lambda: drive)
         with pytest.raises(SidecarUnavailable):

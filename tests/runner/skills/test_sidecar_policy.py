@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from clients.serve import Message, Peer, RouterServer
-from clients.sidecar import npy
-from clients.sidecar.policy import PolicyClient
-from runner.protocols import Act, Done, Goal, Hold, StepOutcome
-from runner.skills.sidecar_policy import STEP_SHARE, SidecarPolicy, Wiring, wire_up
-from schemas.errors import (
+from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.clients.sidecar import npy
+from vram_arbiter.clients.sidecar.policy import PolicyClient
+from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
+from vram_arbiter.runner.skills.sidecar_policy import STEP_SHARE, SidecarPolicy, Wiring, wire_up
+from vram_arbiter.schemas.errors import (
     BadState,
     Evicted,
     FrameStale,
@@ -24,8 +24,8 @@ from schemas.errors import (
     VramError,
     WaitTimeout,
 )
-from schemas.manifest import RSkillManifest, parse_manifest
-from schemas.world import FrameEncoding, JointState, SensorFrame, WorldState
+from vram_arbiter.schemas.manifest import RSkillManifest, parse_manifest
+from vram_arbiter.schemas.world import FrameEncoding, JointState, SensorFrame, WorldState
 
 pytestmark = pytest.mark.heavy  # arrays: numpy
 
@@ -80,7 +80,9 @@ class Sidecar:
 
     @asynccontextmanager
     async def served(self, endpoint: str) -> AsyncIterator[None]:
-        async with RouterServer(endpoint, lambda error: {"ok": False, "error": str(error)}) as server:
+        async with RouterServer(
+            endpoint, lambda error: {"ok": False, "error": str(error)}
+        ) as server:
             self.server = server
             task = asyncio.create_task(server.serve(self.handle))
             try:
@@ -168,7 +170,9 @@ class Bench:
         self.client = PolicyClient(endpoint, timeout_s=60.0)
         options.setdefault("wait_s", 60.0)
         wiring: Wiring = wire_up(manifest, JOINTS, REST)
-        self.skill = SidecarPolicy(manifest, wiring, self.client, arbiter, period_s=1 / 30, **options)
+        self.skill = SidecarPolicy(
+            manifest, wiring, self.client, arbiter, period_s=1 / 30, **options
+        )
         self.position = dict(REST)
 
     def world(self, frames: bool = True, **changes: Any) -> WorldState:
@@ -227,7 +231,9 @@ def scenario(run_async: Run, bench: Bench, play: Callable[[Bench], Any]) -> None
 GOAL = Goal("g1", "test/arm-grab", prompt="grab the red cube", deadline_s=20.0)
 
 
-def test_a_goal_is_one_use_and_its_chunks_play_in_order(bench: Callable[..., Bench], run_async: Run) -> None:
+def test_a_goal_is_one_use_and_its_chunks_play_in_order(
+    bench: Callable[..., Bench], run_async: Run
+) -> None:
     async def play(b: Bench) -> None:
         await b.skill.start(GOAL)
         rows, done = await b.play()
@@ -314,7 +320,8 @@ def test_without_an_arbiter_no_use_is_marked(bench: Callable[..., Bench], run_as
 
 
 @pytest.mark.parametrize(
-    "action", [[[float("nan"), 0.0]], [[0.0, float("inf")]], [[0.0, 0.0, 0.0]], [0.0, 0.0], [], "left"]
+    "action",
+    [[[float("nan"), 0.0]], [[0.0, float("inf")]], [[0.0, 0.0, 0.0]], [0.0, 0.0], [], "left"],
 )
 def test_actions_that_are_none_never_reach_the_arm(
     bench: Callable[..., Bench], run_async: Run, action: Any
@@ -405,7 +412,10 @@ def test_a_manifest_for_another_arm_is_refused(manifest: RSkillManifest) -> None
 def test_views_are_cropped_and_averaged_as_trained(
     manifest: RSkillManifest, tmp_path: Path, run_async: Run
 ) -> None:
-    extras = {"rollout_steps": 3, "views": {"front": {"crop": [0.5, 0.0, 1.0, 1.0], "size_px": [1, 1]}}}
+    extras = {
+        "rollout_steps": 3,
+        "views": {"front": {"crop": [0.5, 0.0, 1.0, 1.0], "size_px": [1, 1]}},
+    }
 
     async def play(b: Bench) -> None:
         await b.skill.start(GOAL)
@@ -426,7 +436,8 @@ def test_a_policy_whose_targets_lead_goes_there_as_fast_as_the_robot_may(
         await b.skill.start(GOAL)
         rows, _ = await b.play()
         assert rows == [
-            pytest.approx((n * 3.0 * STEP_SHARE / 30, 0.5 - n * 1.5 * STEP_SHARE / 30)) for n in range(1, 8)
+            pytest.approx((n * 3.0 * STEP_SHARE / 30, 0.5 - n * 1.5 * STEP_SHARE / 30))
+            for n in range(1, 8)
         ]
 
     scenario(run_async, bench(Arbiter(), speeds_rad_s={"a": 3.0, "b": 1.5}), play)
@@ -457,7 +468,11 @@ def test_a_chunk_that_is_asked_for_too_late_loads_nothing(
 
     async def play(b: Bench) -> None:
         b.skill = SidecarPolicy(
-            b.skill.manifest, wire_up(b.skill.manifest, JOINTS, REST), b.client, b.arbiter, period_s=1 / 30
+            b.skill.manifest,
+            wire_up(b.skill.manifest, JOINTS, REST),
+            b.client,
+            b.arbiter,
+            period_s=1 / 30,
         )
         await b.skill.start(GOAL)
         assert isinstance(b.skill.step(b.world()), Hold), "at the start pose"
@@ -475,7 +490,11 @@ def test_a_chunk_that_is_asked_for_too_late_loads_nothing(
 @pytest.mark.parametrize("wanted", [True, False])
 @pytest.mark.parametrize("state", ["unloaded", "waiting", "resident"])
 def test_a_goal_that_is_over_before_its_policy_is_there_takes_the_load_back(
-    bench: Callable[..., Bench], run_async: Run, state: str, wanted: bool, monkeypatch: pytest.MonkeyPatch
+    bench: Callable[..., Bench],
+    run_async: Run,
+    state: str,
+    wanted: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Regressions: the sidecar went on and made others leave the card for a goal that had been canceled; also one that was called back
     from standby, or left in that moment, and said neither `waiting` nor `loading`."""
@@ -527,7 +546,9 @@ def test_a_policy_that_does_not_come_in_time_is_not_wanted_any_more(
     scenario(run_async, bench(Arbiter()), play)
 
 
-def test_the_next_goal_of_the_same_skill_begins_anew(bench: Callable[..., Bench], run_async: Run) -> None:
+def test_the_next_goal_of_the_same_skill_begins_anew(
+    bench: Callable[..., Bench], run_async: Run
+) -> None:
     """Nothing of the goal before is played: reset, its own use, its own chunks, its own words."""
 
     async def play(b: Bench) -> None:
@@ -536,12 +557,18 @@ def test_the_next_goal_of_the_same_skill_begins_anew(bench: Callable[..., Bench]
             await b.step()
         await b.skill.finish()
         seen = len(b.sidecar.observations)
-        await b.skill.start(Goal("g2", "test/arm-grab", prompt="grab the blue ball", deadline_s=20.0))
+        await b.skill.start(
+            Goal("g2", "test/arm-grab", prompt="grab the blue ball", deadline_s=20.0)
+        )
         rows, done = await b.play()
         assert b.sidecar.calls.count("reset") == 2
         assert done.data["steps"] == 7
-        assert rows[-7][1] == 0.0, "behind the way to the start pose, the first row of a fresh chunk"
-        assert {str(seen["task"]) for seen in b.sidecar.observations[seen:]} == {"grab the blue ball"}
+        assert rows[-7][1] == 0.0, (
+            "behind the way to the start pose, the first row of a fresh chunk"
+        )
+        assert {str(seen["task"]) for seen in b.sidecar.observations[seen:]} == {
+            "grab the blue ball"
+        }
         assert b.arbiter is not None
         assert [use.ended for use in b.arbiter.uses] == [1, 0]
 

@@ -11,25 +11,36 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runner.hal.so101 import so101
-from runner.protocols import Act, Done, Goal, StepOutcome
-from runner.safety.limits import Limits, own_limits
-from runner.skills.ros_standins import NAVIGATE, TRAJECTORY, StandIn, StandIns, interface_of
-from runner.skills.trajectory import ARRIVE_S, FollowJointTrajectory
-from schemas.control import ControlMode
-from schemas.errors import BadRequest, GoalRejected, ModelError
-from schemas.manifest import RSkillManifest, load_manifest
-from schemas.world import JointState, WorldState
+from vram_arbiter.runner.hal.so101 import so101
+from vram_arbiter.runner.protocols import Act, Done, Goal, StepOutcome
+from vram_arbiter.runner.safety.limits import Limits, own_limits
+from vram_arbiter.runner.skills.ros_standins import (
+    NAVIGATE,
+    TRAJECTORY,
+    StandIn,
+    StandIns,
+    interface_of,
+)
+from vram_arbiter.runner.skills.trajectory import ARRIVE_S, FollowJointTrajectory
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import BadRequest, GoalRejected, ModelError
+from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
+from vram_arbiter.schemas.world import JointState, WorldState
 
 CONFIGS = Path(__file__).parents[3] / "configs/rskills"
-MOVE, DRIVE = (load_manifest(CONFIGS / f"so101-{name}/rskill.yaml") for name in ("move", "navigate"))
+MOVE, DRIVE = (
+    load_manifest(CONFIGS / f"so101-{name}/rskill.yaml") for name in ("move", "navigate")
+)
 ROBOT = so101(simulated=True)
 LIMITS = own_limits(ROBOT)
 PERIOD_S = 1 / 30
 
 
 def trajectory(
-    *points: tuple[float, ...], names: tuple[str, ...] = ("elbow_flex",), every_s: float = 1.0, **more: Any
+    *points: tuple[float, ...],
+    names: tuple[str, ...] = ("elbow_flex",),
+    every_s: float = 1.0,
+    **more: Any,
 ) -> dict[str, Any]:
     stamped = [
         {"positions": list(positions), "time_from_start": duration(every_s * (number + 1))}
@@ -104,7 +115,9 @@ def test_a_gripper_that_holds_something_is_not_let_go_when_a_trajectory_begins()
     start=st.floats(-1.6, 1.6),
     every_s=st.floats(0.01, 3.0),
 )
-def test_it_is_refused_or_played_within_the_limits(points: list[float], start: float, every_s: float) -> None:
+def test_it_is_refused_or_played_within_the_limits(
+    points: list[float], start: float, every_s: float
+) -> None:
     most = LIMITS.speeds_rad_s["elbow_flex"]
     fast = any(abs(b - a) / every_s > most * 1.01 for a, b in pairwise([start, *points]))
     try:
@@ -126,7 +139,10 @@ def test_it_is_refused_or_played_within_the_limits(points: list[float], start: f
         ({}, "an empty one moves nothing"),
         (trajectory(), "an empty one moves nothing"),
         (trajectory((0.1, 0.1), names=("elbow_flex", "elbow_flex")), "named twice"),
-        (trajectory((0.1,), names=("elbow",)), "there is no joint elbow; the robot has shoulder_pan"),
+        (
+            trajectory((0.1,), names=("elbow",)),
+            "there is no joint elbow; the robot has shoulder_pan",
+        ),
         (trajectory((0.1, 0.2)), r"points\[0\]: 2 positions for 1 joints"),
         (trajectory((2.0,)), r"points\[0\]: elbow_flex 2 rad is outside"),
         (
@@ -136,11 +152,16 @@ def test_it_is_refused_or_played_within_the_limits(points: list[float], start: f
         (trajectory((0.1,), (0.2,), every_s=0.0), "time_from_start must be above 0"),
         (trajectory((math.nan,)), "finite number"),
         (trajectory((0.1,), path_tolerance=[{"name": "elbow_flex"}]), "path_tolerance"),
-        (trajectory((0.1,), goal_tolerance=[{"name": "elbow", "position": 0.1}]), "there is no joint elbow"),
+        (
+            trajectory((0.1,), goal_tolerance=[{"name": "elbow", "position": 0.1}]),
+            "there is no joint elbow",
+        ),
         (trajectory((0.1,)) | {"speed": 3}, "speed"),
     ],
 )
-def test_what_cannot_be_done_is_refused_before_anything_moves(params: dict[str, Any], said: str) -> None:
+def test_what_cannot_be_done_is_refused_before_anything_moves(
+    params: dict[str, Any], said: str
+) -> None:
     with pytest.raises(BadRequest, match=said):
         started(params)
 
@@ -178,7 +199,9 @@ def test_an_arm_that_does_not_arrive_fails_the_goal() -> None:
     assert all(isinstance(outcome, Act) for outcome in outcomes)
     assert len(outcomes) == pytest.approx((1.0 + ARRIVE_S) / PERIOD_S, abs=2)
     tight = trajectory(
-        (0.5,), goal_tolerance=[{"name": "elbow_flex", "position": 0.01}], goal_time_tolerance=duration(0.1)
+        (0.5,),
+        goal_tolerance=[{"name": "elbow_flex", "position": 0.01}],
+        goal_time_tolerance=duration(0.1),
     )
     skill = started(tight)
     with pytest.raises(GoalRejected, match=r"0\.020 rad from"):
@@ -208,7 +231,9 @@ def stand_ins(*known: str) -> StandIns:
 
 
 def changed(manifest: RSkillManifest, **fields: Any) -> RSkillManifest:
-    return RSkillManifest.model_validate(json.loads(manifest.model_dump_json(exclude_unset=True)) | fields)
+    return RSkillManifest.model_validate(
+        json.loads(manifest.model_dump_json(exclude_unset=True)) | fields
+    )
 
 
 def test_a_ros_action_without_a_stand_in_is_refused_with_what_there_is() -> None:
@@ -227,7 +252,8 @@ def test_types_are_read_as_ros_writes_them_and_packages_count() -> None:
     assert ros is not None
     long = changed(
         MOVE,
-        ros_integration=ros.model_dump() | {"interface_type": "control_msgs/action/FollowJointTrajectory"},
+        ros_integration=ros.model_dump()
+        | {"interface_type": "control_msgs/action/FollowJointTrajectory"},
     )
     assert interface_of(long) == TRAJECTORY
     other = changed(MOVE, ros_integration=ros.model_dump() | {"package": "my_msgs"})
@@ -237,7 +263,9 @@ def test_types_are_read_as_ros_writes_them_and_packages_count() -> None:
 def test_what_it_drives_has_to_be_what_the_stand_in_drives() -> None:
     twist = [{"kind": "body_twist", "control_mode_semantics": {"mode": "absolute"}}]
     said = stand_ins(TRAJECTORY).refuses(changed(MOVE, actuators_required=twist))
-    assert said == f"it drives by body_twist; the stand-in for {TRAJECTORY} drives by joint_position"
+    assert (
+        said == f"it drives by body_twist; the stand-in for {TRAJECTORY} drives by joint_position"
+    )
     legs = [
         {
             "kind": "joint_position",

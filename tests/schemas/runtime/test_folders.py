@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from schemas.errors import AlreadyRunning, ConfigError
-from schemas.runtime.folders import LockFile, private_folder, socket_folder
+from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError
+from vram_arbiter.schemas.runtime.folders import LockFile, private_folder, socket_folder
 
 FOREIGN = 54_321
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can make files of another user")
@@ -71,7 +71,9 @@ def test_a_folder_that_others_may_write_is_refused(tmp_path: Path) -> None:
 
 
 @as_root
-def test_a_folder_of_another_user_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_of_another_user_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tmp_path / "x"
     folder.mkdir(mode=0o700)
     os.chown(folder, FOREIGN, -1)
@@ -93,7 +95,10 @@ def test_only_the_runtime_folder_is_made_for_a_socket(tmp_path: Path) -> None:
 
 # -- lock files --------------------------------------------------------------------------------------------------------
 def test_a_second_holder_is_told_who_the_first_is(tmp_path: Path) -> None:
-    first, second = LockFile(tmp_path / "lock", "the socket"), LockFile(tmp_path / "lock", "the socket")
+    first, second = (
+        LockFile(tmp_path / "lock", "the socket"),
+        LockFile(tmp_path / "lock", "the socket"),
+    )
     second.check_free()  # nothing there, nothing made
     assert not list(tmp_path.iterdir())
     first.acquire()
@@ -141,7 +146,10 @@ def test_a_lock_file_that_is_another_file_is_left_alone(tmp_path: Path, tie: obj
     (tmp_path / "precious").write_text("kept")
     assert callable(tie)
     tie(tmp_path / "lock", tmp_path / "precious")
-    for used in (LockFile(tmp_path / "lock", "x").acquire, LockFile(tmp_path / "lock", "x").check_free):
+    for used in (
+        LockFile(tmp_path / "lock", "x").acquire,
+        LockFile(tmp_path / "lock", "x").check_free,
+    ):
         with pytest.raises(ConfigError, match=r"is a link|2 names"):
             used()
     assert (tmp_path / "precious").read_text() == "kept"

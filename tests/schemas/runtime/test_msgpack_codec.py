@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.defaults import MIB
-from schemas.errors import BadFrame, MessageTooLarge
-from schemas.runtime.msgpack_codec import UnpackLimits, count_values, unpack_map
+from vram_arbiter.schemas.defaults import MIB
+from vram_arbiter.schemas.errors import BadFrame, MessageTooLarge
+from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, count_values, unpack_map
 
 LIMITS = UnpackLimits(message_max_bytes=MIB, values_max=100, keys_max=20, items_max=30)
 
@@ -76,7 +76,8 @@ def test_any_bytes_are_a_map_or_a_typed_error(payload: bytes) -> None:
         b"\xdd\x00\x0f\xff\xf0" + b"\x80" * (MIB - 16),  # one list of a million maps
         b"\x9f" * (MIB - 1),  # lists in lists
         b"\x91" * (MIB - 1),
-        (b"\xdc\x00\x1e" + b"\xc0" * 29) * 32_000,  # each list is short, and the last item of the one before
+        (b"\xdc\x00\x1e" + b"\xc0" * 29)
+        * 32_000,  # each list is short, and the last item of the one before
         b"\xde\xff\xff" + b"\xa1k\xc0" * 300_000,
     ],
 )

@@ -5,7 +5,7 @@ import unicodedata
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.runtime.printable import printable, printable_lines
+from vram_arbiter.schemas.runtime.printable import printable, printable_lines
 
 
 def test_plain_words_stay_as_they_are() -> None:
@@ -22,7 +22,9 @@ def test_controls_are_shown_instead_of_obeyed() -> None:
 def test_no_control_is_left_and_nothing_is_lost(text: str) -> None:
     shown = printable(text)
     assert shown.isprintable()
-    assert not any(unicodedata.category(letter) in ("Cc", "Cf", "Cs", "Zl", "Zp") for letter in shown)
+    assert not any(
+        unicodedata.category(letter) in ("Cc", "Cf", "Cs", "Zl", "Zp") for letter in shown
+    )
     assert printable(shown) == shown
     shown.encode()  # a lone surrogate would end a print with a traceback
 

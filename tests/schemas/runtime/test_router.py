@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 import zmq
 
-from schemas.errors import ConfigError
-from schemas.runtime.router import OUT_MESSAGES_MAX, Connection, Limits, Router
-from schemas.runtime.zmtp import FRAMES_MAX, GREETING, READY, Oversize, encode
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.router import OUT_MESSAGES_MAX, Connection, Limits, Router
+from vram_arbiter.schemas.runtime.zmtp import FRAMES_MAX, GREETING, READY, Oversize, encode
 
 GREETING_AND_READY = (
     bytes.fromhex("ff00000000000000017f03014e554c4c")
@@ -26,7 +26,9 @@ GREETING_AND_READY = (
     + (b"\x04)\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER\x08Identity\x00\x00\x00\x00")
 )
 WAIT_S = 60.0
-LIMITS = Limits(message_max_bytes=1 << 20, process_share=1.0, user_share=1.0, handshake_s=30, hello_s=30)
+LIMITS = Limits(
+    message_max_bytes=1 << 20, process_share=1.0, user_share=1.0, handshake_s=30, hello_s=30
+)
 
 
 @dataclass
@@ -167,7 +169,8 @@ def test_an_identity_of_a_peer_names_nobody(path: Path) -> None:
         handler = Echo()
         async with serving(path, handler):
             raws = [
-                await (await Raw.connect(path, GREETING_AND_READY[:64] + ready)).ready() for _ in range(3)
+                await (await Raw.connect(path, GREETING_AND_READY[:64] + ready)).ready()
+                for _ in range(3)
             ]
             assert [await raw.echo(b"%d" % n) for n, raw in enumerate(raws)] == [b"0", b"1", b"2"]
             assert await asyncio.to_thread(ask, path, zmq.DEALER, b"honest") == [b"honest"]
@@ -188,7 +191,9 @@ def test_an_identity_of_a_peer_names_nobody(path: Path) -> None:
     ],
     ids=["empty frames", "MORE for ever", "a huge frame", "no frames at all"],
 )
-def test_a_peer_that_breaks_the_protocol_is_cut_and_others_are_served(path: Path, attack: bytes) -> None:
+def test_a_peer_that_breaks_the_protocol_is_cut_and_others_are_served(
+    path: Path, attack: bytes
+) -> None:
     """A message of two million empty frames let others wait for 18 s; MORE for ever grew without bound."""
 
     async def scenario() -> None:
@@ -295,7 +300,9 @@ def test_the_newest_connection_finds_room_among_silent_ones(path: Path) -> None:
 
     async def scenario() -> None:
         handler = Echo()
-        limits = Limits(connections_max=8, process_share=1.0, user_share=1.0, handshake_s=30, hello_s=30)
+        limits = Limits(
+            connections_max=8, process_share=1.0, user_share=1.0, handshake_s=30, hello_s=30
+        )
         async with serving(path, handler, limits) as router:
             bare = [await Raw.connect(path, b"") for _ in range(20)]
             honest = await (await Raw.connect(path)).ready()
@@ -319,12 +326,16 @@ assert peer.recv() == b"x"
 def test_a_process_has_a_share_of_the_connections(path: Path) -> None:
     async def scenario() -> None:
         handler = Echo()
-        limits = Limits(connections_max=8, process_share=0.5, user_share=1.0, handshake_s=30, hello_s=30)
+        limits = Limits(
+            connections_max=8, process_share=0.5, user_share=1.0, handshake_s=30, hello_s=30
+        )
         async with serving(path, handler, limits):
             greedy = [await (await Raw.connect(path)).ready() for _ in range(4)]
             refused = await Raw.connect(path)
             await refused.ended()
-            other = await asyncio.create_subprocess_exec(sys.executable, "-c", _HONEST, f"ipc://{path}")
+            other = await asyncio.create_subprocess_exec(
+                sys.executable, "-c", _HONEST, f"ipc://{path}"
+            )
             assert await other.wait() == 0
             for raw in greedy:
                 raw.close()
@@ -341,7 +352,9 @@ def test_a_flood_of_one_connection_delays_another_by_a_few_messages(path: Path) 
             await until(lambda: len(handler.open) == 2)
             flooder, other = handler.open
             reading = asyncio.create_task(flood.reader.read(-1))
-            flood.writer.write(encode(b"", False) * 20_000)  # both lie in their sockets from here on
+            flood.writer.write(
+                encode(b"", False) * 20_000
+            )  # both lie in their sockets from here on
             assert await honest.echo(b"now") == b"now"
             assert handler.received_from.index(other) < 2_000  # a turn of the flood, or two
             await until(lambda: handler.received_from.count(flooder) == 20_000)

@@ -9,11 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from schemas.errors import ConfigError, UntrustedServer, from_wire
-from schemas.runtime.trust import SERVICE_USERS, check_server, check_uid, frame_uid, trusts
+from vram_arbiter.schemas.errors import ConfigError, UntrustedServer, from_wire
+from vram_arbiter.schemas.runtime.trust import (
+    SERVICE_USERS,
+    check_server,
+    check_uid,
+    frame_uid,
+    trusts,
+)
 
 FOREIGN = 54_321
-as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can start a server of another user")
+as_root = pytest.mark.skipif(
+    os.geteuid() != 0, reason="only root can start a server of another user"
+)
 FALSE_SERVER = Path(__file__).with_name("false_server.py")
 
 
@@ -59,7 +67,9 @@ def test_the_units_users_are_those_that_are_trusted() -> None:
     """Only for their own program: a sidecar, which reads foreign weights, is not believed as the arbiter."""
     units = Path(__file__).parents[3] / "configs/systemd/system"
     for program, user in SERVICE_USERS.items():
-        unit = units / ("vram-arbiter.service" if program == "arbiter" else f"vram-{program}@.service")
+        unit = units / (
+            "vram-arbiter.service" if program == "arbiter" else f"vram-{program}@.service"
+        )
         lines = unit.read_text().splitlines()
         assert f"User={user}" in lines
         assert "PrivateUsers=yes" not in lines  # every other user would be 65534 there

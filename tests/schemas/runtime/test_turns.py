@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.runtime.turns import Turns
+from vram_arbiter.schemas.runtime.turns import Turns
 
 
 def drained(turns: Turns[str]) -> list[str]:
@@ -48,7 +48,9 @@ def test_an_item_that_leaves_is_not_called() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3), st.integers(0, 3)), unique=True))
-def test_each_item_has_one_turn_and_users_differ_by_one_at_most(items: list[tuple[int, int, int]]) -> None:
+def test_each_item_has_one_turn_and_users_differ_by_one_at_most(
+    items: list[tuple[int, int, int]],
+) -> None:
     turns: Turns[tuple[int, int, int]] = Turns()
     for item in items:
         turns.add(item, item[:2])

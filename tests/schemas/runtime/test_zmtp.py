@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.runtime.zmtp import (
+from vram_arbiter.schemas.runtime.zmtp import (
     COMMAND_MAX_BYTES,
     FRAMES_MAX,
     GREETING,
@@ -54,7 +54,10 @@ def command(name: bytes, rest: bytes = b"") -> bytes:
 def ready(*properties: tuple[bytes, bytes]) -> bytes:
     return command(
         b"READY",
-        b"".join(bytes((len(name),)) + name + len(value).to_bytes(4) + value for name, value in properties),
+        b"".join(
+            bytes((len(name),)) + name + len(value).to_bytes(4) + value
+            for name, value in properties
+        ),
     )
 
 
@@ -69,7 +72,9 @@ def test_recorded_peers_are_understood_in_pieces_of_any_size(
 ) -> None:
     data = PEER_GREETING + recorded + PING
     connection = ServerConnection(LIMITS)
-    found = [e for at in range(0, len(data), piece) for e in events(connection, data[at : at + piece])]
+    found = [
+        e for at in range(0, len(data), piece) for e in events(connection, data[at : at + piece])
+    ]
     assert found == [Ready(), Message(b"hello", delimiter), Heartbeat()]
     assert connection.outgoing() == GREETING + READY + b"\x04\x05\x04PONG"
     assert connection.outgoing() == b""
@@ -96,7 +101,10 @@ def test_the_greeting_goes_out_first_and_ready_only_to_a_zmtp_peer() -> None:
         (PEER_GREETING + ready(), "neither a DEALER nor a REQ"),
         (PEER_GREETING + ready((b"Socket-Type", b"PUB")), "neither a DEALER nor a REQ"),
         (PEER_GREETING + command(b"READY", b"\x00"), "malformed property"),
-        (PEER_GREETING + command(b"READY", b"\x0bSocket-Type\x00\x00\xff\xffDEALER"), "malformed property"),
+        (
+            PEER_GREETING + command(b"READY", b"\x0bSocket-Type\x00\x00\xff\xffDEALER"),
+            "malformed property",
+        ),
         (PEER_GREETING + command(b"READY", b"\x0bSocket"), "malformed property"),
         (PEER_GREETING + b"\x04\x00", "without a name"),
         (PEER_GREETING + b"\x04\x01\x05", "without a name"),
@@ -137,12 +145,16 @@ def test_names_of_properties_are_case_insensitive_and_unknown_ones_are_allowed()
 def test_an_identity_of_the_peer_is_read_over() -> None:
     """libzmq's ROUTER aborted on an identity that equals its next automatic routing id."""
     connection = ServerConnection(LIMITS)
-    data = PEER_GREETING + ready((b"Socket-Type", b"DEALER"), (b"Identity", b"\x00\x00\x00\x00\x01"))
+    data = PEER_GREETING + ready(
+        (b"Socket-Type", b"DEALER"), (b"Identity", b"\x00\x00\x00\x00\x01")
+    )
     assert events(connection, data) == [Ready()]
 
 
 @pytest.mark.parametrize("delimiter", [False, True])
-def test_a_message_over_the_limit_is_skipped_unkept_and_the_next_one_is_read(delimiter: bool) -> None:
+def test_a_message_over_the_limit_is_skipped_unkept_and_the_next_one_is_read(
+    delimiter: bool,
+) -> None:
     connection = greeted()
     head = (b"\x01\x00" if delimiter else b"") + b"\x02" + (3000).to_bytes(8)
     assert events(connection, head) == []
@@ -184,7 +196,9 @@ def test_a_ping_is_answered_with_its_context_and_a_pong_is_not() -> None:
     delimiter=st.booleans(),
     pieces=st.lists(st.integers(1, 400), max_size=20),
 )
-def test_what_is_encoded_is_read_again(payloads: list[bytes], delimiter: bool, pieces: list[int]) -> None:
+def test_what_is_encoded_is_read_again(
+    payloads: list[bytes], delimiter: bool, pieces: list[int]
+) -> None:
     data = b"".join(encode(payload, delimiter) for payload in payloads)
     connection, found, at = greeted(), [], 0
     for piece in [*pieces, len(data)]:
@@ -197,7 +211,9 @@ def test_what_is_encoded_is_read_again(payloads: list[bytes], delimiter: bool, p
     data=st.lists(
         st.one_of(
             st.binary(max_size=80),
-            st.sampled_from([PEER_GREETING, DEALER_READY, REQ_READY, DEALER_HELLO, REQ_HELLO, PING]),
+            st.sampled_from(
+                [PEER_GREETING, DEALER_READY, REQ_READY, DEALER_HELLO, REQ_HELLO, PING]
+            ),
             st.builds(lambda size: b"\x02" + size.to_bytes(8), st.integers(0, 5000)),
             st.builds(bytes, st.integers(0, 3000)),
         ),

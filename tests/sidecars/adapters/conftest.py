@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from schemas.manifest import parse_manifest
-from sidecars.weights import resolve
+from vram_arbiter.schemas.manifest import parse_manifest
+from vram_arbiter.sidecars.weights import resolve
 
 CHAT = (
     "{%- for message in messages -%}<|im_start|>{{ message.role }}\n{%- for part in message.content -%}"
@@ -43,7 +43,12 @@ def save_owlvit(folder: Path) -> None:
         tokenizer=tokenizer,
     ).save_pretrained(folder)
     torch.manual_seed(0)
-    small = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 1, "num_attention_heads": 2}
+    small = {
+        "hidden_size": 32,
+        "intermediate_size": 64,
+        "num_hidden_layers": 1,
+        "num_attention_heads": 2,
+    }
     config = OwlViTConfig(
         text_config=small | {"vocab_size": len(tokens), "max_position_embeddings": 16, "pad_token_id": 0,
                              "bos_token_id": len(tokens) - 2, "eos_token_id": len(tokens) - 1},
@@ -78,7 +83,9 @@ def save_qwen(folder: Path) -> None:
         "<|video_pad|>",
     ]
     letters = bytes_alphabet()
-    raw = Tokenizer(models.BPE(vocab={token: index for index, token in enumerate(letters)}, merges=[]))
+    raw = Tokenizer(
+        models.BPE(vocab={token: index for index, token in enumerate(letters)}, merges=[])
+    )
     raw.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     raw.decoder = decoders.ByteLevel()
     raw.add_special_tokens(special)
@@ -88,7 +95,9 @@ def save_qwen(folder: Path) -> None:
     ids = tokenizer.convert_tokens_to_ids
     pixels = {"shortest_edge": 32 * 32, "longest_edge": 64 * 64}
     Qwen3VLProcessor(
-        image_processor=Qwen2VLImageProcessor(patch_size=8, temporal_patch_size=2, merge_size=2, size=pixels),
+        image_processor=Qwen2VLImageProcessor(
+            patch_size=8, temporal_patch_size=2, merge_size=2, size=pixels
+        ),
         tokenizer=tokenizer,
         video_processor=Qwen3VLVideoProcessor(patch_size=8, temporal_patch_size=2, merge_size=2),
         chat_template=CHAT,
@@ -132,7 +141,10 @@ def save_act(folder: Path) -> None:
     ones = torch.ones(6)
     stats = {
         "observation.state": {"mean": 0 * ones, "std": ones},
-        "action": {"mean": 100 * ones, "std": ones},  # shows in the answer that the postprocessor ran
+        "action": {
+            "mean": 100 * ones,
+            "std": ones,
+        },  # shows in the answer that the postprocessor ran
         "observation.images.front": {"mean": torch.zeros(3, 1, 1), "std": torch.ones(3, 1, 1)},
     }
     ACTPolicy(config).save_pretrained(folder)
@@ -174,7 +186,9 @@ def manifest():
 
 @pytest.fixture
 def png():
-    def png(width: int = 80, height: int = 60, colour: tuple[int, int, int] = (200, 30, 30)) -> bytes:
+    def png(
+        width: int = 80, height: int = 60, colour: tuple[int, int, int] = (200, 30, 30)
+    ) -> bytes:
         from PIL import Image
 
         stream = io.BytesIO()

@@ -4,9 +4,14 @@ import math
 
 import pytest
 
-from schemas.errors import BadRequest, ModelError
-from schemas.sidecar import DetectOp
-from sidecars.adapters.detector import DetectorAdapter, _detection, grounding_answer, split_query
+from vram_arbiter.schemas.errors import BadRequest, ModelError
+from vram_arbiter.schemas.sidecar import DetectOp
+from vram_arbiter.sidecars.adapters.detector import (
+    DetectorAdapter,
+    _detection,
+    grounding_answer,
+    split_query,
+)
 
 BLOCK = "actions: [detect]\ndetector: {labels: [cube], score_threshold: 0.0, max_side: 512}\n"
 
@@ -64,7 +69,9 @@ def test_it_detects_in_the_pixels_of_the_picture_sent(manifest, weights, png):
     x0, y0, x1, y1 = zip(*(one["box"] for one in reply["detections"]), strict=True)
     assert min(x0) >= 0
     assert min(y0) >= 0
-    assert 100 < max(x1) <= 800, "boxes are in the pixels of the sent picture, not of the shrunk one"
+    assert 100 < max(x1) <= 800, (
+        "boxes are in the pixels of the sent picture, not of the shrunk one"
+    )
     assert 100 < max(y1) <= 600
     assert reply["answer"].startswith("<ref>")
     assert reply["norm"] == 1000
@@ -91,9 +98,9 @@ def test_the_fields_default_query_finds_what_is_in_view():
 
     from PIL import Image
 
-    from runner.sim.env import SimEnv
-    from schemas.manifest import load_manifest
-    from sidecars.weights import resolve
+    from vram_arbiter.runner.sim.env import SimEnv
+    from vram_arbiter.schemas.manifest import load_manifest
+    from vram_arbiter.sidecars.weights import resolve
 
     configs = Path(__file__).parents[3] / "configs"
     manifest = load_manifest(configs / "rskills/so101-detector/rskill.yaml")

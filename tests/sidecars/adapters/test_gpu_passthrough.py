@@ -5,13 +5,13 @@ from typing import Any
 
 import pytest
 
-from schemas.errors import BadRequest, ConfigError
-from schemas.manifest import load_manifest
-from schemas.sidecar import EndpointCall
-from sidecars.__main__ import main
-from sidecars.adapters.choose import make_adapter
-from sidecars.adapters.gpu_passthrough import GpuPassthroughAdapter
-from sidecars.weights import resolve
+from vram_arbiter.schemas.errors import BadRequest, ConfigError
+from vram_arbiter.schemas.manifest import load_manifest
+from vram_arbiter.schemas.sidecar import EndpointCall
+from vram_arbiter.sidecars.__main__ import main
+from vram_arbiter.sidecars.adapters.choose import make_adapter
+from vram_arbiter.sidecars.adapters.gpu_passthrough import GpuPassthroughAdapter
+from vram_arbiter.sidecars.weights import resolve
 
 pytestmark = pytest.mark.heavy  # torch
 
@@ -21,7 +21,9 @@ FRONT = "observation.images.front"
 
 
 def call(endpoint: str, observation: Any = None) -> EndpointCall:
-    return EndpointCall(endpoint=endpoint, data=None if observation is None else {"observation": observation})
+    return EndpointCall(
+        endpoint=endpoint, data=None if observation is None else {"observation": observation}
+    )
 
 
 def observation(**changes: Any) -> dict[str, Any]:
@@ -29,7 +31,11 @@ def observation(**changes: Any) -> dict[str, Any]:
 
     picture = np.zeros((100, 200, 3), dtype=np.uint8)
     picture[:, 100:] = 255
-    return {"observation.state": np.array([0.1, -0.2, 0.3]), FRONT: picture, "task": "look"} | changes
+    return {
+        "observation.state": np.array([0.1, -0.2, 0.3]),
+        FRONT: picture,
+        "task": "look",
+    } | changes
 
 
 @pytest.fixture
@@ -84,7 +90,9 @@ def test_what_is_missing_or_misshapen_is_refused(
         adapter.run(call("get_action", observation(**changes)))
 
 
-def test_an_observation_that_is_none_and_a_state_that_is_missing(adapter: GpuPassthroughAdapter) -> None:
+def test_an_observation_that_is_none_and_a_state_that_is_missing(
+    adapter: GpuPassthroughAdapter,
+) -> None:
     with pytest.raises(BadRequest, match="a map"):
         adapter.run(call("get_action", "look"))
     with pytest.raises(BadRequest, match="lacks observation"):
@@ -103,7 +111,10 @@ def test_without_a_card_it_does_not_start(device: str, capsys: pytest.CaptureFix
 
     if device == "cuda" and torch.cuda.is_available():
         pytest.skip("this machine has a card")
-    assert main(["--name", "passthrough", "--rskill", str(RSKILL), "--device", device, "--no-arbiter"]) == 1
+    assert (
+        main(["--name", "passthrough", "--rskill", str(RSKILL), "--device", device, "--no-arbiter"])
+        == 1
+    )
     said = capsys.readouterr().err
     assert "card" in said or "GPU" in said
     assert "fake:FOLDER" in said

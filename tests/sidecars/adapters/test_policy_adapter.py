@@ -4,9 +4,9 @@ import io
 
 import pytest
 
-from schemas.errors import BadRequest, ModelError
-from schemas.sidecar import EndpointCall
-from sidecars.adapters.policy import PolicyAdapter
+from vram_arbiter.schemas.errors import BadRequest, ModelError
+from vram_arbiter.schemas.sidecar import EndpointCall
+from vram_arbiter.sidecars.adapters.policy import PolicyAdapter
 
 pytestmark = pytest.mark.heavy
 
@@ -19,7 +19,7 @@ ALIASES = "image_preprocessing: {aliases: {base_cam: front}}\n"
 
 @pytest.fixture(scope="module")
 def adapter(weights):
-    from schemas.manifest import parse_manifest
+    from vram_arbiter.schemas.manifest import parse_manifest
 
     head = (
         "name: test/model\nversion: 0.1.0\nkind: vla\nembodiment_tags: [any]\nchunk_size: 5\nweights_uri: local://models/x\n"
@@ -62,9 +62,12 @@ def test_pictures_may_come_as_png_and_with_a_leading_one(adapter, observation):
     expected = act(adapter, observation)
     stream = io.BytesIO()
     Image.fromarray(observation["observation.images.base_cam"]).save(stream, "PNG")
-    assert (act(adapter, observation | {"observation.images.base_cam": stream.getvalue()}) == expected).all()
+    assert (
+        act(adapter, observation | {"observation.images.base_cam": stream.getvalue()}) == expected
+    ).all()
     batched = {
-        name: value[None] if hasattr(value, "dtype") else [value] for name, value in observation.items()
+        name: value[None] if hasattr(value, "dtype") else [value]
+        for name, value in observation.items()
     }
     assert (act(adapter, batched) == expected).all()
 

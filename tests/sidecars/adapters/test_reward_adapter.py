@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from schemas.errors import BadRequest, ModelError
-from schemas.manifest import RSkillManifest, load_manifest
-from schemas.sidecar import ScoreOp
-from sidecars.adapters.choose import make_adapter
-from sidecars.adapters.reward import RewardAdapter
-from sidecars.weights import Weights, resolve
+from vram_arbiter.schemas.errors import BadRequest, ModelError
+from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
+from vram_arbiter.schemas.sidecar import ScoreOp
+from vram_arbiter.sidecars.adapters.choose import make_adapter
+from vram_arbiter.sidecars.adapters.reward import RewardAdapter
+from vram_arbiter.sidecars.weights import Weights, resolve
 
 pytestmark = pytest.mark.heavy
 
@@ -50,10 +50,10 @@ def test_a_grab_makes_progress_and_only_for_the_thing_it_grabs(shipped: RewardAd
     """A scene that the training never saw; the pictures are what the runner would serve."""
     import random
 
-    from runner.sim.dataset import stand_before
-    from runner.sim.env import SimEnv
-    from runner.sim.expert import GrabExpert, run_expert
-    from runner.sim.kinematics import ArmKinematics
+    from vram_arbiter.runner.sim.dataset import stand_before
+    from vram_arbiter.runner.sim.env import SimEnv
+    from vram_arbiter.runner.sim.expert import GrabExpert, run_expert
+    from vram_arbiter.runner.sim.kinematics import ArmKinematics
 
     with SimEnv() as env:
         env.reset(4711, names=("red cube", "blue ball", "green cylinder"))
@@ -75,7 +75,13 @@ def test_both_ways_to_send_pictures_are_judged_alike(shipped: RewardAdapter) -> 
 
     rgb = np.random.default_rng(0).integers(0, 255, (2, 72, 96, 3), dtype=np.uint8)
     raw = ScoreOp(
-        op="score", task=TASK, frames=rgb[..., ::-1].tobytes(), n=2, width=96, height=72, num_bins=10
+        op="score",
+        task=TASK,
+        frames=rgb[..., ::-1].tobytes(),
+        n=2,
+        width=96,
+        height=72,
+        num_bins=10,
     )
     assert shipped.run(raw) == score(shipped, *map(as_png, rgb))
     shipped.unload()
@@ -120,7 +126,9 @@ def mean_red() -> Any:
 
         def __post_init__(self) -> None:
             super().__post_init__()
-            self.input_features = {"observation.images.top": PolicyFeature(FeatureType.VISUAL, (3, 8, 8))}
+            self.input_features = {
+                "observation.images.top": PolicyFeature(FeatureType.VISUAL, (3, 8, 8))
+            }
 
     class MeanRedRewardModel(PreTrainedRewardModel):
         config_class, name = MeanRedConfig, "mean_red"
@@ -140,9 +148,9 @@ def mean_red() -> Any:
         sys.modules[name] = types.ModuleType(name)
         vars(sys.modules[name]).update(content)
     MeanRedConfig.__module__ = "configuration_mean_red"
-    yield lambda folder, gain: MeanRedRewardModel(MeanRedConfig(gain=gain, device="cpu")).save_pretrained(
-        folder
-    )
+    yield lambda folder, gain: MeanRedRewardModel(
+        MeanRedConfig(gain=gain, device="cpu")
+    ).save_pretrained(folder)
     for name in modules:
         del sys.modules[name]
 
@@ -159,7 +167,11 @@ def reward_manifest(**block: Any) -> RSkillManifest:
 
 @pytest.mark.parametrize(
     ("gain", "block", "said"),
-    [(1.0, {}, 200 / 255), (5.0, {}, 1.0), (2.0, {"progress_range": (-1, 3)}, (2 * 200 / 255 + 1) / 4)],
+    [
+        (1.0, {}, 200 / 255),
+        (5.0, {}, 1.0),
+        (2.0, {"progress_range": (-1, 3)}, (2 * 200 / 255 + 1) / 4),
+    ],
 )
 def test_any_reward_model_of_lerobots_is_asked_its_own_question(
     mean_red: Any, tmp_path: Path, png: Any, gain: float, block: dict[str, Any], said: float

@@ -2,9 +2,9 @@
 
 import pytest
 
-from schemas.errors import BadRequest
-from schemas.sidecar import QueryOp
-from sidecars.adapters.scene_vlm import SceneVlmAdapter, after_thinking
+from vram_arbiter.schemas.errors import BadRequest
+from vram_arbiter.schemas.sidecar import QueryOp
+from vram_arbiter.sidecars.adapters.scene_vlm import SceneVlmAdapter, after_thinking
 
 
 def test_only_what_follows_the_last_thought_is_the_answer():

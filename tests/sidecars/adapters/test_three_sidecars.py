@@ -7,9 +7,9 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from arbiter.testing.fakegpu_check import check_log
-from arbiter.testing.wire import WireClient
-from clients.sidecar import npy
+from tests.support.fakegpu_check import check_log
+from tests.support.wire import WireClient
+from vram_arbiter.clients.sidecar import npy
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(400)]
 
@@ -33,9 +33,11 @@ def sidecars(arbiter_daemon, configs, weights, tmp_path):
     for name, (skill, model, block) in SKILLS.items():
         weights(model)
         rskill = tmp_path / f"{name}.yaml"
-        rskill.write_text(f"name: vram-arbiter/{skill}\nweights_uri: local://models/{model}\n{COMMON}{block}")
+        rskill.write_text(
+            f"name: vram-arbiter/{skill}\nweights_uri: local://models/{model}\n{COMMON}{block}"
+        )
         command = [
-            sys.executable, "-m", "sidecars", "--name", name, "--rskill", str(rskill), "--configs", str(configs),
+            sys.executable, "-m", "vram_arbiter.sidecars", "--name", name, "--rskill", str(rskill), "--configs", str(configs),
             "--footprints", str(footprints), "--device", f"fake:{arbiter_daemon.card}",
         ]  # fmt: skip
         environ = {**arbiter_daemon.environ, "OMP_NUM_THREADS": "1"}
@@ -67,7 +69,10 @@ def test_the_budget_of_8_gib_is_shared_as_it_fits(sidecars, arbiter_daemon, png)
     }
     detect = {"op": "detect", "image": image, "query": "red cube"}
     query = {"op": "query", "image": image, "question": "is it held?", "max_new_tokens": 4}
-    act = {"endpoint": "get_action", "data": npy.pack({"observation": observation, "options": None})}
+    act = {
+        "endpoint": "get_action",
+        "data": npy.pack({"observation": observation, "options": None}),
+    }
 
     def states():
         return {name: ask(client, {"op": "ping"})["state"] for name, client in sidecars.items()}

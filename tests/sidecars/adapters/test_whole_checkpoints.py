@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from schemas.errors import ModelError
-from sidecars.checkpoints import load_lerobot, load_transformers
-from sidecars.weights import Weights
+from vram_arbiter.schemas.errors import ModelError
+from vram_arbiter.sidecars.checkpoints import load_lerobot, load_transformers
+from vram_arbiter.sidecars.weights import Weights
 
 pytestmark = pytest.mark.heavy
 
@@ -26,7 +26,12 @@ WHOLE = "model.safetensors"
 def save_owlv2(folder: Path) -> None:
     from transformers import Owlv2Config, Owlv2ForObjectDetection
 
-    small = {"hidden_size": 32, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
+    small = {
+        "hidden_size": 32,
+        "intermediate_size": 32,
+        "num_hidden_layers": 1,
+        "num_attention_heads": 2,
+    }
     config = Owlv2Config(
         text_config=small | {"vocab_size": 64, "max_position_embeddings": 16},
         vision_config=small | {"image_size": 64, "patch_size": 16},
@@ -36,7 +41,12 @@ def save_owlv2(folder: Path) -> None:
 
 
 def save_grounding_dino(folder: Path) -> None:
-    from transformers import BertConfig, GroundingDinoConfig, GroundingDinoForObjectDetection, SwinConfig
+    from transformers import (
+        BertConfig,
+        GroundingDinoConfig,
+        GroundingDinoForObjectDetection,
+        SwinConfig,
+    )
 
     config = GroundingDinoConfig(
         backbone_config=SwinConfig(
@@ -80,7 +90,12 @@ def save_smolvla(folder: Path) -> None:
     from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
     from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
     from tokenizers import Tokenizer, models
-    from transformers import Idefics3ImageProcessor, Idefics3Processor, PreTrainedTokenizerFast, SmolVLMConfig
+    from transformers import (
+        Idefics3ImageProcessor,
+        Idefics3Processor,
+        PreTrainedTokenizerFast,
+        SmolVLMConfig,
+    )
 
     words = Tokenizer(models.WordLevel({"<pad>": 0, "<unknown>": 1}, unk_token="<unknown>"))
     names = ("fake_image_token", "image_token", "global_image_token", "end_of_utterance_token")
@@ -100,7 +115,9 @@ def save_smolvla(folder: Path) -> None:
     vlm = folder / "vlm"
     SmolVLMConfig(text_config=text, vision_config=vision, scale_factor=2).save_pretrained(vlm)
     Idefics3Processor(Idefics3ImageProcessor(), tokenizer).save_pretrained(vlm)
-    config = SmolVLAConfig(**features(), vlm_model_name=str(vlm), load_vlm_weights=False, num_vlm_layers=2)
+    config = SmolVLAConfig(
+        **features(), vlm_model_name=str(vlm), load_vlm_weights=False, num_vlm_layers=2
+    )
     SmolVLAPolicy(config).save_pretrained(folder)
 
 
@@ -124,7 +141,7 @@ def load_policy(weights: Weights, device: str) -> Any:
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class
 
-    import sidecars.compact_act  # noqa: F401  registers itself
+    import vram_arbiter.sidecars.models.compact_act  # noqa: F401  registers itself
 
     config = PreTrainedConfig.from_pretrained(weights.source)
     config.device = device
@@ -135,7 +152,7 @@ def load_reward(weights: Weights, device: str) -> Any:
     from lerobot.configs.rewards import RewardModelConfig
     from lerobot.rewards.factory import get_reward_model_class
 
-    import sidecars.compact_progress  # noqa: F401  registers itself
+    import vram_arbiter.sidecars.models.compact_progress  # noqa: F401  registers itself
 
     config = RewardModelConfig.from_pretrained(weights.source)
     config.device = device
@@ -263,7 +280,11 @@ def test_a_quantized_checkpoint_is_compared_with_its_statistics(
     load_detector(Weights(str(tmp_path), local=True), device)
     tensors = load_file(tmp_path / WHOLE)
     weight = next(key for key in tensors if key.endswith(".absmax")).removesuffix(".absmax")
-    for dropped in ([weight], [f"{weight}.absmax"], [key for key in tensors if key.startswith(weight)]):
+    for dropped in (
+        [weight],
+        [f"{weight}.absmax"],
+        [key for key in tensors if key.startswith(weight)],
+    ):
         kept = {key: tensor for key, tensor in tensors.items() if key not in dropped}
         save_file(kept, tmp_path / WHOLE, metadata={"format": "pt"})
         refused(load_detector, tmp_path, device)
@@ -285,14 +306,16 @@ def test_a_loader_that_swallows_what_it_could_not_read_is_found_out(tmp_path: Pa
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("part", ["preprocessor_step_3_normalizer", "postprocessor_step_0_unnormalizer"])
+@pytest.mark.parametrize(
+    "part", ["preprocessor_step_3_normalizer", "postprocessor_step_0_unnormalizer"]
+)
 def test_a_policy_without_its_statistics_is_refused(tmp_path: Path, part: str, device: str) -> None:
     """lerobot's processors leave what they have no statistics of as it is: actions would be in the
     network's units, not in the robot's."""
     from safetensors.torch import load_file, save_file
 
-    from schemas.manifest import load_manifest
-    from sidecars.adapters.choose import make_adapter
+    from vram_arbiter.schemas.manifest import load_manifest
+    from vram_arbiter.sidecars.adapters.choose import make_adapter
 
     shipped("so101-grab")(tmp_path)
     file = tmp_path / f"policy_{part}_processor.safetensors"
@@ -300,7 +323,8 @@ def test_a_policy_without_its_statistics_is_refused(tmp_path: Path, part: str, d
     numbers = {key: tensor for key, tensor in load_file(file).items() if key.startswith(kept)}
     save_file(numbers, file)
     adapter = make_adapter(
-        load_manifest(CONFIGS / "rskills/so101-grab/rskill.yaml"), Weights(str(tmp_path), local=True)
+        load_manifest(CONFIGS / "rskills/so101-grab/rskill.yaml"),
+        Weights(str(tmp_path), local=True),
     )
     adapter.prepare()
     with pytest.raises(ModelError, match=r"no statistics of (action|observation\.state)"):
@@ -315,7 +339,7 @@ def test_check_compares_the_weights_and_ends_with_2(
 ) -> None:
     from safetensors.torch import load_file, save_file
 
-    from sidecars.__main__ import main
+    from vram_arbiter.sidecars.__main__ import main
 
     for name in ("so101-grab", "so101-detector"):
         shutil.copytree(CONFIGS / "models" / name, tmp_path / "models" / name)
@@ -330,6 +354,8 @@ def test_check_compares_the_weights_and_ends_with_2(
         file = tmp_path / "models" / name / WHOLE
         tensors = load_file(file)
         dropped = sorted(tensors)[:5]
-        save_file({key: tensors[key] for key in tensors if key not in dropped}, file, {"format": "pt"})
+        save_file(
+            {key: tensors[key] for key in tensors if key not in dropped}, file, {"format": "pt"}
+        )
         assert main(flags) == 2
         assert f"of the parameters 5 missing from it ({dropped[0]}" in capsys.readouterr().err

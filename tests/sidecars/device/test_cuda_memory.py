@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from schemas.errors import NoGpu, OutOfMemory
+from vram_arbiter.schemas.errors import NoGpu, OutOfMemory
 
 MIB = 2**20
 
@@ -14,7 +14,7 @@ MIB = 2**20
 @pytest.mark.heavy
 def test_without_a_card_it_says_what_to_do():
     torch = pytest.importorskip("torch")
-    from sidecars.device.cuda import CudaMemory
+    from vram_arbiter.sidecars.device.cuda import CudaMemory
 
     index = torch.cuda.device_count() if torch.cuda.is_available() else 0
     with pytest.raises(NoGpu, match="--device fake:FOLDER"):
@@ -27,8 +27,8 @@ def test_ballast_fills_up_and_goes():
     torch = pytest.importorskip("torch")
     if not torch.cuda.is_available():
         pytest.skip("needs an NVIDIA card")
-    from sidecars.device.cuda import CudaMemory
-    from sidecars.device.memory import fill
+    from vram_arbiter.sidecars.device.cuda import CudaMemory
+    from vram_arbiter.sidecars.device.memory import fill
 
     memory = CudaMemory()
     assert memory.used_bytes() == 0

@@ -9,12 +9,12 @@ import time
 
 import pytest
 
-from arbiter.host.gpu.fake import FakeProbe, make_card
-from arbiter.testing.fakegpu_check import check_log
-from schemas.errors import NoGpu, OutOfMemory
-from schemas.fakegpu import SimulatedOutOfMemory
-from sidecars.device.fake import FakeMemory
-from sidecars.device.memory import NoDevice, fill
+from tests.support.fakegpu_check import check_log
+from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
+from vram_arbiter.schemas.errors import NoGpu, OutOfMemory
+from vram_arbiter.schemas.fakegpu import SimulatedOutOfMemory
+from vram_arbiter.sidecars.device.fake import FakeMemory
+from vram_arbiter.sidecars.device.memory import NoDevice, fill
 
 MIB = 2**20
 GIB = 2**30
@@ -127,7 +127,9 @@ def test_the_life_of_one_model(folder):
     assert memory.used_bytes() == 4 * GIB + 450 * MIB
     memory.free(peak)
     memory.free(block)
-    assert memory.used_bytes() == 4 * GIB + 450 * MIB, "caching frameworks give nothing back by themselves"
+    assert memory.used_bytes() == 4 * GIB + 450 * MIB, (
+        "caching frameworks give nothing back by themselves"
+    )
     memory.empty_cache()
     assert memory.used_bytes() == 450 * MIB
     until(lambda: used(folder) == 450 * MIB)
@@ -145,7 +147,9 @@ def test_an_out_of_memory_while_filling_leaves_nothing_behind(folder):
 
 def test_filling_is_throttled_and_can_be_stopped():
     slept: list[float] = []
-    blocks = fill(NoDevice(), "w", 300 * MIB, bytes_per_s=100 * MIB, wait=lambda s: slept.append(s) or False)  # type: ignore[func-returns-value]
+    blocks = fill(
+        NoDevice(), "w", 300 * MIB, bytes_per_s=100 * MIB, wait=lambda s: slept.append(s) or False
+    )  # type: ignore[func-returns-value]
     assert sum(block.size_bytes for block in blocks) == 300 * MIB
     assert sum(slept) == pytest.approx(3.0)
     assert len(fill(NoDevice(), "w", 300 * MIB, bytes_per_s=1, wait=lambda seconds: True)) == 1
@@ -154,7 +158,8 @@ def test_filling_is_throttled_and_can_be_stopped():
 def test_threads_of_one_process_do_not_lose_each_others_bytes(folder):
     memory = FakeMemory(folder, "model", 0)
     threads = [
-        threading.Thread(target=lambda: [memory.allocate("w", MIB) for _ in range(20)]) for _ in range(4)
+        threading.Thread(target=lambda: [memory.allocate("w", MIB) for _ in range(20)])
+        for _ in range(4)
     ]
     for thread in threads:
         thread.start()

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from sidecars.training import common, detector, queries
-from sidecars.training.detector_report import Trial, choose_threshold, rates
+from vram_arbiter.sidecars.training import common, detector, queries
+from vram_arbiter.sidecars.training.detector_report import Trial, choose_threshold, rates
 
 SHIPPED = Path(__file__).parents[3] / "configs" / "models" / "so101-detector"
 RGB = {"red": (200, 20, 20), "green": (20, 150, 40), "blue": (20, 50, 200)}
@@ -71,7 +71,10 @@ def test_sampled_queries_cover_the_vocabulary_and_strangers() -> None:
 
 
 def test_scenes_are_never_parted_by_the_split() -> None:
-    frames = [common.Frame(Path(f"{n}.png"), "front", str(n // 3), "start", (), (), None) for n in range(30)]
+    frames = [
+        common.Frame(Path(f"{n}.png"), "front", str(n // 3), "start", (), (), None)
+        for n in range(30)
+    ]
     training, testing = common.split_by_scene(frames, 0.2, seed=3)
     assert len(training) + len(testing) == 30
     assert {f.scene for f in training}.isdisjoint({f.scene for f in testing})
@@ -156,20 +159,25 @@ def test_the_shipped_checkpoint_finds_the_target_and_turns_down_the_absent() -> 
     from PIL import Image
     from transformers import AutoModelForZeroShotObjectDetection, AutoProcessor
 
-    from runner.sim.config import vocabulary
-    from runner.sim.env import SimEnv
+    from vram_arbiter.runner.sim.config import vocabulary
+    from vram_arbiter.runner.sim.env import SimEnv
 
     manifest = SHIPPED.parents[1] / "rskills" / "so101-detector" / "rskill.yaml"
     threshold = yaml.safe_load(manifest.read_text(encoding="utf-8"))["detector"]["score_threshold"]
     processor = AutoProcessor.from_pretrained(SHIPPED, local_files_only=True)
-    model = AutoModelForZeroShotObjectDetection.from_pretrained(SHIPPED, local_files_only=True).eval()
+    model = AutoModelForZeroShotObjectDetection.from_pretrained(
+        SHIPPED, local_files_only=True
+    ).eval()
 
     def best(image: Any, query: str) -> list[float] | None:
         inputs = processor(images=image, text=[[query]], truncation=True, return_tensors="pt")
         with torch.inference_mode():
             outputs = model(**inputs)
         (found,) = processor.post_process_grounded_object_detection(
-            outputs, threshold=threshold, target_sizes=[(image.height, image.width)], text_labels=[[query]]
+            outputs,
+            threshold=threshold,
+            target_sizes=[(image.height, image.width)],
+            text_labels=[[query]],
         )
         if len(found["scores"]) == 0:
             return None
@@ -185,8 +193,13 @@ def test_the_shipped_checkpoint_finds_the_target_and_turns_down_the_absent() -> 
             box = best(image, f"the {env.target}")
             assert box is not None, f"seed {seed}: {env.target} not found"
             for axis in (0, 1):
-                middle, true_middle = (box[axis] + box[axis + 2]) / 2, (truth[axis] + truth[axis + 2]) / 2
+                middle, true_middle = (
+                    (box[axis] + box[axis + 2]) / 2,
+                    (truth[axis] + truth[axis + 2]) / 2,
+                )
                 assert abs(middle - true_middle) < 8
-            absent = [n for n in vocabulary() if n not in {item.name for item in env.layout.objects}]
+            absent = [
+                n for n in vocabulary() if n not in {item.name for item in env.layout.objects}
+            ]
             false_alarms += sum(best(image, name) is not None for name in absent[::5])
     assert false_alarms <= 5  # of 18; the model card tells how often

@@ -10,7 +10,13 @@ pytest.importorskip("lerobot")
 import numpy as np
 import torch
 
-from sidecars.training.policy import BadDemonstrations, load_demonstrations, load_stats, main, train
+from vram_arbiter.sidecars.training.policy import (
+    BadDemonstrations,
+    load_demonstrations,
+    load_stats,
+    main,
+    train,
+)
 
 pytestmark = pytest.mark.heavy
 
@@ -33,12 +39,18 @@ def write_demonstrations(folder: Path, episodes: int = 4, length: int = 25) -> N
             column = int((place[step] + 0.5) * (width - 12))
             images[step, 30:42, column : column + 12] = (220, 30, 30)
         np.save(folder / f"{camera}.npy", images)
-    point = np.stack([np.full(steps, 0.3), place / 10, np.full(steps, 0.21)], axis=1).astype(np.float32)
+    point = np.stack([np.full(steps, 0.3), place / 10, np.full(steps, 0.21)], axis=1).astype(
+        np.float32
+    )
     for key, values in (("state", state), ("action", action), ("point", point)):
         np.save(folder / f"{key}.npy", values)
     np.save(folder / "episode_length.npy", np.full(episodes, length))
     views = {
-        "front": {"crop": [0.45, 0.2, 0.85, 0.7333333333], "size_px": [96, 96], "camera_px": [480, 360]},
+        "front": {
+            "crop": [0.45, 0.2, 0.85, 0.7333333333],
+            "size_px": [96, 96],
+            "camera_px": [480, 360],
+        },
         "wrist": {"crop": [0.1, 0.0, 1.0, 1.0], "size_px": [96, 80], "camera_px": [320, 240]},
     }
     info = {
@@ -57,7 +69,7 @@ def act(folder: Path, chunk_of: int) -> np.ndarray:
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
-    import sidecars.compact_act  # noqa: F401  # registers the policy type
+    import vram_arbiter.sidecars.models.compact_act  # noqa: F401  # registers the policy type
 
     config = PreTrainedConfig.from_pretrained(folder)
     config.device = "cpu"
@@ -108,7 +120,9 @@ def test_the_loss_falls_and_the_seed_decides(tmp_path: Path) -> None:
 
 
 def test_going_on_from_a_checkpoint_keeps_its_normalisation(tmp_path: Path) -> None:
-    first, second, started, went_on = (tmp_path / name for name in ("first", "second", "started", "went_on"))
+    first, second, started, went_on = (
+        tmp_path / name for name in ("first", "second", "started", "went_on")
+    )
     for folder in (first, second):
         folder.mkdir()
         write_demonstrations(folder)

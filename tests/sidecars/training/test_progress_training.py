@@ -10,7 +10,7 @@ pytest.importorskip("torch")
 pytest.importorskip("lerobot")
 import numpy as np
 
-from sidecars.training.progress import BadProgressData, judge, load, main, split, train
+from vram_arbiter.sidecars.training.progress import BadProgressData, judge, load, main, split, train
 
 pytestmark = pytest.mark.heavy
 
@@ -56,13 +56,23 @@ def test_it_learns_what_the_pictures_show_and_lerobot_loads_it(tmp_path: Path) -
 def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_grabs(tmp_path / "data", episodes=4)
     assert (
-        main(["--data", str(tmp_path / "data"), "--out", str(tmp_path / "out"), "--smoke", "--threads", "1"])
+        main(
+            [
+                "--data",
+                str(tmp_path / "data"),
+                "--out",
+                str(tmp_path / "out"),
+                "--smoke",
+                "--threads",
+                "1",
+            ]
+        )
         == 0
     )
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["steps"] == 20
     assert "success said rightly" in (tmp_path / "out/README.md").read_text()
     assert main(["--data", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
-    assert "python -m runner.sim.progress" in capsys.readouterr().err
+    assert "python -m vram_arbiter.runner.sim.progress" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

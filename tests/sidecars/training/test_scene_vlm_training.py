@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from sidecars.training import common, questions, scene_vlm
-from sidecars.training.scene_vlm_report import Asker
+from vram_arbiter.sidecars.training import common, questions, scene_vlm
+from vram_arbiter.sidecars.training.scene_vlm_report import Asker
 
 SHIPPED = Path(__file__).parents[3] / "configs" / "models" / "so101-scene-vlm"
 NAMES = ["blue ball", "blue cube", "red ball", "red cube"]
@@ -59,10 +59,12 @@ def test_answers_are_true_and_begin_with_yes_or_no() -> None:
     rng = random.Random(1)
     template = "Has the robot gripper grasped the {}?"
     assert (
-        questions.grasped(rng, "red cube", "red cube", template)[1] == "Yes, the gripper holds the red cube."
+        questions.grasped(rng, "red cube", "red cube", template)[1]
+        == "Yes, the gripper holds the red cube."
     )
     assert (
-        questions.grasped(rng, "red cube", "red ball", template)[1] == "No, the gripper holds the red ball."
+        questions.grasped(rng, "red cube", "red ball", template)[1]
+        == "No, the gripper holds the red ball."
     )
     assert questions.grasped(rng, "red cube", None, template)[1] == "No, the gripper is empty."
     assert questions.listing(rng, ["orange ball", "red cube"])[1] == "An orange ball, a red cube."
@@ -89,13 +91,17 @@ def test_training_sees_the_patches_and_tokens_that_the_library_makes(tmp_path: P
     picture = np.random.default_rng(0).integers(0, 255, (height, width, 3), dtype=np.uint8)
     prompt = "<|vision_start|><|image_pad|><|vision_end|>"
     inputs = processor(text=[prompt], images=[Image.fromarray(picture)], return_tensors="pt")
-    mine = scene_vlm.to_patches(torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255, recipe)
+    mine = scene_vlm.to_patches(
+        torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255, recipe
+    )
     assert torch.allclose(mine, inputs["pixel_values"], atol=1e-5)
 
     torch.manual_seed(0)
     model = scene_vlm.build_model(recipe, processor).eval()
     with torch.inference_mode():
-        theirs = model.model.visual(mine, grid_thw=inputs["image_grid_thw"], return_dict=True).pooler_output
+        theirs = model.model.visual(
+            mine, grid_thw=inputs["image_grid_thw"], return_dict=True
+        ).pooler_output
         assert torch.allclose(scene_vlm.image_tokens(model, mine, recipe)[0], theirs, atol=1e-5)
 
     # a 4:3 frame of any camera comes out at exactly the trained grid
@@ -128,10 +134,10 @@ def test_a_folder_without_labels_ends_with_status_2(
 def test_the_shipped_checkpoint_tells_held_from_empty_and_from_another(tmp_path: Path) -> None:
     from PIL import Image
 
-    from runner.sim.dataset import stand_before
-    from runner.sim.env import SimEnv
-    from runner.sim.expert import GrabExpert
-    from runner.sim.kinematics import ArmKinematics
+    from vram_arbiter.runner.sim.dataset import stand_before
+    from vram_arbiter.runner.sim.env import SimEnv
+    from vram_arbiter.runner.sim.expert import GrabExpert
+    from vram_arbiter.runner.sim.kinematics import ArmKinematics
 
     asker = Asker(SHIPPED)
     image = tmp_path / "wrist.png"

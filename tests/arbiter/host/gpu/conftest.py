@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.testing.nvml_stub import NvmlStub
+from tests.support.nvml_stub import NvmlStub
 
 SOURCE = Path(__file__).with_name("nvml_stub.c")
 

@@ -6,10 +6,10 @@ import threading
 
 import pytest
 
-from arbiter.host.gpu.fake import FakeProbe, locked, make_card, open_cards
-from schemas import fakegpu
-from schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
-from schemas.ids import GpuId
+from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, locked, make_card, open_cards
+from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
+from vram_arbiter.schemas.ids import GpuId
 
 GIB = 2**30
 PATIENCE_S = 60.0
@@ -21,7 +21,9 @@ def edit(folder, **changes):
 
 
 def stowaway(folder, pid, size, name="browser"):
-    (folder / f"{name}.json").write_text(json.dumps({"pid": pid, "name": name, "allocated_bytes": size}))
+    (folder / f"{name}.json").write_text(
+        json.dumps({"pid": pid, "name": name, "allocated_bytes": size})
+    )
 
 
 @pytest.fixture
@@ -54,7 +56,9 @@ def test_a_process_is_listed_with_its_bytes_and_a_dead_one_is_not(probe, folder)
     assert (use.process.pid, use.name, use.used_bytes) == (os.getpid(), "browser", 2 * GIB)
 
 
-def test_a_name_that_is_cut_in_the_middle_of_a_letter_fails_no_reading(probe, folder, half_a_letter):
+def test_a_name_that_is_cut_in_the_middle_of_a_letter_fails_no_reading(
+    probe, folder, half_a_letter
+):
     stowaway(folder, half_a_letter, GIB)
     (use,) = probe.sample(probe.cards()[0].id).processes
     assert (use.process.pid, use.used_bytes) == (half_a_letter, GIB)
@@ -118,7 +122,10 @@ def test_unknown_cards(probe, tmp_path):
 
 def test_sizes_make_cards_in_the_runtime_folder_and_a_second_start_keeps_them(tmp_path):
     first = open_cards("8GiB,16GiB", tmp_path)
-    assert [(card.index, card.total_bytes) for card in first.cards()] == [(0, 8 * GIB), (1, 16 * GIB)]
+    assert [(card.index, card.total_bytes) for card in first.cards()] == [
+        (0, 8 * GIB),
+        (1, 16 * GIB),
+    ]
     stowaway(tmp_path / "fakegpu", os.getpid(), GIB)
     again = open_cards("8GiB,16GiB", tmp_path)
     assert again.cards() == first.cards()
@@ -160,7 +167,9 @@ def test_readings_wait_for_the_lock(probe, folder):
 def test_what_a_killed_process_left_half_written_is_mended(probe, folder):
     line = {"seq": 1, "t": 0.0, "pid": os.getpid(), "start": 0, "name": "", "op": "alloc", "label": "", "bytes": 5, "delta": 5,
             "process_bytes": 5, "used_after": 5, "capacity": 8 * GIB}  # fmt: skip
-    (folder / "half.json").write_text(json.dumps({"pid": os.getpid(), "allocated_bytes": 5, "last": line}))
+    (folder / "half.json").write_text(
+        json.dumps({"pid": os.getpid(), "allocated_bytes": 5, "last": line})
+    )
     (folder / fakegpu.LOG_FILE).write_text('{"seq": 1, "t"')
     probe.sample(probe.cards()[0].id)
     assert json.loads((folder / fakegpu.LOG_FILE).read_text().splitlines()[1]) == line

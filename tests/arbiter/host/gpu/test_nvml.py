@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from arbiter.host.gpu.nvml import NvmlProbe
-from arbiter.host.gpu.pids import PidMap
-from schemas.errors import NoGpu, ProbeFailed, UnknownGpu
-from schemas.ids import GpuId
+from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
+from vram_arbiter.arbiter.host.gpu.pids import PidMap
+from vram_arbiter.schemas.errors import NoGpu, ProbeFailed, UnknownGpu
+from vram_arbiter.schemas.ids import GpuId
 
 GIB = 2**30
 
@@ -91,7 +91,13 @@ class Driver:
 
 
 def card(**changes):
-    return {"uuid": "GPU-1", "index": 0, "total": 8 * GIB, "reserved": GIB // 4, "used": GIB} | changes
+    return {
+        "uuid": "GPU-1",
+        "index": 0,
+        "total": 8 * GIB,
+        "reserved": GIB // 4,
+        "used": GIB,
+    } | changes
 
 
 def test_the_drivers_reserve_is_neither_used_nor_there():
@@ -184,7 +190,9 @@ def test_closing_twice_is_harmless():
     probe = NvmlProbe(driver)
     probe.close()
     probe.close()
-    assert driver.shutdowns == 2, "the library says that it is shut down already, and that is no error"
+    assert driver.shutdowns == 2, (
+        "the library says that it is shut down already, and that is no error"
+    )
 
 
 def test_the_real_library_says_no_gpu_where_there_is_no_driver():

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.nvml_stub import GIB, MIB, NvmlStub
-from arbiter.testing.process import ArbiterProcess
-from arbiter.testing.wire import WireClient
+from tests.support.nvml_stub import GIB, MIB, NvmlStub
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 pytest.importorskip("pynvml")
@@ -69,19 +69,27 @@ def event(
     client: WireClient, kind: str, where: Callable[[dict[str, Any]], bool] = lambda _: True
 ) -> dict[str, Any]:
     """The next event of a kind, for who has subscribed."""
-    found = client.push("event", where=lambda push: push["event"]["kind"] == kind and where(push["event"]))
+    found = client.push(
+        "event", where=lambda push: push["event"]["kind"] == kind and where(push["event"])
+    )
     happened: dict[str, Any] = found["event"]
     return happened
 
 
-@pytest.mark.parametrize("daemon", [CONFIG.replace("timeout_s: 3.0", "timeout_s: 60.0")], indirect=True)
-def test_a_cycle_with_release_lag(client: WireClient, daemon: ArbiterProcess, nvml: NvmlStub) -> None:
+@pytest.mark.parametrize(
+    "daemon", [CONFIG.replace("timeout_s: 3.0", "timeout_s: 60.0")], indirect=True
+)
+def test_a_cycle_with_release_lag(
+    client: WireClient, daemon: ArbiterProcess, nvml: NvmlStub
+) -> None:
     (card,) = client.ask("status")["gpus"]
     assert (card["gpu"], card["name"]) == ("GPU-stub-0", "NVIDIA Stub")
     assert card["capacity_bytes"] == 8 * GIB - 256 * MIB, "less what the driver keeps"
     assert client.ask("subscribe")["ok"]
     on = held(client, nvml, 5 * GIB)
-    let_go(client, nvml, on, 5 * GIB, f"process 0 compute {ME} {5 * GIB}")  # the driver takes its time
+    let_go(
+        client, nvml, on, 5 * GIB, f"process 0 compute {ME} {5 * GIB}"
+    )  # the driver takes its time
     waiter = client.acquire("next", 5 * GIB, nonce="next")
     assert waiter["state"] == "queued", "released is not free"
     event(client, "queued", lambda told: told["lease_id"] == waiter["lease"]["lease_id"])
@@ -98,7 +106,9 @@ def test_a_cycle_with_release_lag(client: WireClient, daemon: ArbiterProcess, nv
 
 
 @pytest.mark.parametrize("daemon", [HANGS], indirect=True)
-def test_a_call_that_hangs_is_unknown_blocks_and_recovers(client: WireClient, nvml: NvmlStub) -> None:
+def test_a_call_that_hangs_is_unknown_blocks_and_recovers(
+    client: WireClient, nvml: NvmlStub
+) -> None:
     assert client.ask("subscribe")["ok"]
     on = held(client, nvml, 5 * GIB)
     let_go(client, nvml, on, 0, "hang memory")
@@ -182,7 +192,8 @@ def test_mig_mode_is_an_error_of_the_configuration(make_arbiter: Make, nvml: Nvm
 def test_the_daemon_makes_no_cuda_context(daemon: ArbiterProcess) -> None:
     """llama.cpp#20582: a manager that asks CUDA for free memory eats 120-550 MB of every card itself."""
     mapped = {
-        Path(line.split()[-1]).name for line in Path(f"/proc/{daemon.pid}/maps").read_text().splitlines()
+        Path(line.split()[-1]).name
+        for line in Path(f"/proc/{daemon.pid}/maps").read_text().splitlines()
     }
     assert "libnvidia-ml.so.1" in mapped
     assert not [name for name in mapped if name.startswith(("libcuda", "libcudart", "libtorch"))]

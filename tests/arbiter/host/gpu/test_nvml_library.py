@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from arbiter.testing.nvml_stub import GIB, MIB, NvmlStub
+from tests.support.nvml_stub import GIB, MIB, NvmlStub
 
 pytest.importorskip("pynvml")
 READ = """

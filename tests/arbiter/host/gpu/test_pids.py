@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from arbiter.host.gpu.pids import INITIAL_NAMESPACE, PidMap
-from schemas.ids import ProcessKey
-from schemas.runtime.peercred import start_ticks
+from vram_arbiter.arbiter.host.gpu.pids import INITIAL_NAMESPACE, PidMap
+from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime.peercred import start_ticks
 
 
 def process(proc: Path, pid: int, ticks: int, name: str, nspid: Sequence[int]) -> None:
@@ -18,7 +18,9 @@ def process(proc: Path, pid: int, ticks: int, name: str, nspid: Sequence[int]) -
     fields = ["S", "1", *["0"] * 17, str(ticks), "0"]
     (folder / "stat").write_text(f"{pid} ({name}) {' '.join(fields)}\n")
     (folder / "cmdline").write_bytes(f"/usr/bin/{name}\0-m\0serve\0".encode())
-    (folder / "status").write_text(f"Name:\t{name}\nNSpid:\t{chr(9).join(map(str, nspid))}\nThreads:\t1\n")
+    (folder / "status").write_text(
+        f"Name:\t{name}\nNSpid:\t{chr(9).join(map(str, nspid))}\nThreads:\t1\n"
+    )
 
 
 def namespace(proc: Path, link: str) -> Path:
@@ -54,7 +56,10 @@ def test_a_kernel_without_pid_namespaces_is_a_host(tmp_path: Path) -> None:
 
 def test_in_a_container_a_host_pid_leads_to_one_of_ours(container: tuple[Path, Path]) -> None:
     own, host = container
-    assert PidMap(host_proc=host, proc=own).translate(500) == (ProcessKey(7, 1111), "detector -m serve")
+    assert PidMap(host_proc=host, proc=own).translate(500) == (
+        ProcessKey(7, 1111),
+        "detector -m serve",
+    )
 
 
 def test_in_a_container_a_name_that_ends_in_half_a_letter_makes_no_stowaway(
@@ -73,10 +78,14 @@ def test_in_a_container_others_are_never_taken_for_one_of_ours(
     pids = PidMap(host_proc=host, proc=own)
     with caplog.at_level(logging.WARNING):
         assert pids.translate(7) == (ProcessKey(-7, 0), "host pid 7 Xorg -m serve")
-        assert pids.translate(600)[0] == ProcessKey(-600, 0), "7 in its own container, but another process"
+        assert pids.translate(600)[0] == ProcessKey(-600, 0), (
+            "7 in its own container, but another process"
+        )
         assert pids.translate(600)[0] == ProcessKey(-600, 0)
         assert pids.translate(999) == (ProcessKey(-999, 0), "host pid 999")
-    assert [record.message.split(":")[0] for record in caplog.records] == ["pid_unmapped"] * 3, "once each"
+    assert [record.message.split(":")[0] for record in caplog.records] == ["pid_unmapped"] * 3, (
+        "once each"
+    )
 
 
 def test_in_a_container_without_the_hosts_proc_lists_are_no_evidence(
@@ -90,7 +99,9 @@ def test_in_a_container_without_the_hosts_proc_lists_are_no_evidence(
 
 def test_an_operator_may_know_better(container: tuple[Path, Path]) -> None:
     own, host = container
-    assert PidMap("own", host, own).translate(7)[0] == ProcessKey(7, 1111), "the driver counts as we do"
+    assert PidMap("own", host, own).translate(7)[0] == ProcessKey(7, 1111), (
+        "the driver counts as we do"
+    )
     namespace(host, INITIAL_NAMESPACE)
     assert PidMap("host", host, host).translate(500)[0] == ProcessKey(-500, 0)
 
@@ -102,7 +113,9 @@ def test_this_very_process_is_found_with_the_real_proc() -> None:
     assert "py" in name
 
 
-def test_a_name_that_is_cut_in_the_middle_of_a_letter_hides_no_start_time(half_a_letter: int) -> None:
+def test_a_name_that_is_cut_in_the_middle_of_a_letter_hides_no_start_time(
+    half_a_letter: int,
+) -> None:
     key, _ = PidMap("own").translate(half_a_letter)
     assert key == ProcessKey(half_a_letter, start_ticks(half_a_letter) or 0)
     assert key.start_ticks > 0

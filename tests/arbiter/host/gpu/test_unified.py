@@ -11,14 +11,20 @@ from typing import Any
 
 import pytest
 
-from arbiter.daemon import budget, core_settings
-from arbiter.host.gpu.pids import PidMap
-from arbiter.host.gpu.probe import Card
-from arbiter.host.gpu.unified import NOISE_BYTES, choose, nvmap_clients, read_meminfo, tegra_name
-from arbiter.host.journal import Opened
-from schemas.config import load_config
-from schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
-from schemas.ids import GpuId
+from vram_arbiter.arbiter.daemon import budget, core_settings
+from vram_arbiter.arbiter.host.gpu.pids import PidMap
+from vram_arbiter.arbiter.host.gpu.probe import Card
+from vram_arbiter.arbiter.host.gpu.unified import (
+    NOISE_BYTES,
+    choose,
+    nvmap_clients,
+    read_meminfo,
+    tegra_name,
+)
+from vram_arbiter.arbiter.host.journal import Opened
+from vram_arbiter.schemas.config.arbiter import load_config
+from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
+from vram_arbiter.schemas.ids import GpuId
 
 MACHINES = Path(__file__).with_name("machines")
 KIB, GIB = 2**10, 2**30
@@ -36,11 +42,18 @@ class NotSupported(NVMLError):
 class Nvml:
     """`pynvml` with one card whose memory may be NOT_SUPPORTED."""
 
-    NVMLError, NVMLError_NotSupported, NVMLError_FunctionNotFound = NVMLError, NotSupported, NotSupported
+    NVMLError, NVMLError_NotSupported, NVMLError_FunctionNotFound = (
+        NVMLError,
+        NotSupported,
+        NotSupported,
+    )
     nvmlMemory_v2 = 2
 
     def __init__(
-        self, memory: Exception | None = None, driver: Exception | None = None, used: int | None = 7 * GIB
+        self,
+        memory: Exception | None = None,
+        driver: Exception | None = None,
+        used: int | None = 7 * GIB,
     ) -> None:
         self.memory, self.driver, self.used = memory, driver, used
 
@@ -92,7 +105,9 @@ def orin(tmp_path: Path) -> Path:
     tree = tmp_path / "proc" / "device-tree"
     tree.mkdir(parents=True)
     (tree / "model").write_bytes(b"NVIDIA Jetson Orin Nano Developer Kit\0")
-    (tree / "compatible").write_bytes(b"nvidia,p3768-0000+p3767-0005\0nvidia,p3767-0005\0nvidia,tegra234\0")
+    (tree / "compatible").write_bytes(
+        b"nvidia,p3768-0000+p3767-0005\0nvidia,p3767-0005\0nvidia,tegra234\0"
+    )
     (tree / "serial-number").write_bytes(b"1423223012345\0")
     shutil.copy(MACHINES / "orin-nano-8gb.meminfo", tmp_path / "proc" / "meminfo")
     clients = tmp_path / "sys" / "kernel" / "debug" / "nvmap" / "iovmm" / "clients"
@@ -116,11 +131,15 @@ def test_an_orin_is_read_by_what_is_available(orin: Path) -> None:
     probe, source = choose("auto", PIDS, orin, NO_DRIVER)
     assert source == "unified"
     (card,) = probe.cards()
-    assert (card.id, card.name) == ("UNIFIED-1423223012345", "NVIDIA Jetson Orin Nano Developer Kit")
-    reading = probe.sample(card.id)
-    assert (reading.total_bytes, reading.used_bytes) == (7802124 * KIB, (7802124 - 4688128) * KIB), (
-        "the page cache is not used memory: sglang#10075"
+    assert (card.id, card.name) == (
+        "UNIFIED-1423223012345",
+        "NVIDIA Jetson Orin Nano Developer Kit",
     )
+    reading = probe.sample(card.id)
+    assert (reading.total_bytes, reading.used_bytes) == (
+        7802124 * KIB,
+        (7802124 - 4688128) * KIB,
+    ), "the page cache is not used memory: sglang#10075"
     probe.close()
     with pytest.raises(UnknownGpu):
         probe.sample(GpuId("GPU-1"))
@@ -243,10 +262,13 @@ def test_the_machine_keeps_a_larger_margin_and_tolerance(orin: Path) -> None:
     assert gpu.reserve_bytes == max(GIB, int(card.total_bytes * 0.15))
     assert gpu.source == "unified"
     assert core_settings(config, (gpu,), Opened(1, {})).verify_tolerance_bytes == NOISE_BYTES
-    assert budget([card], load_config("gpu: {reserve_bytes: 3GiB}", "x"))[0].reserve_bytes == 3 * GIB
+    assert (
+        budget([card], load_config("gpu: {reserve_bytes: 3GiB}", "x"))[0].reserve_bytes == 3 * GIB
+    )
     (plain,) = budget([Card(GpuId("GPU-1"), 0, "card", 8 * GIB)], config, "nvml")
     assert (
-        core_settings(config, (plain,), Opened(1, {})).verify_tolerance_bytes == config.verify.tolerance_bytes
+        core_settings(config, (plain,), Opened(1, {})).verify_tolerance_bytes
+        == config.verify.tolerance_bytes
     )
     with pytest.raises(ConfigError, match="leaves nothing"):
         budget([card], load_config("gpu: {capacity_bytes: {'0': 1GiB}}", "x"))

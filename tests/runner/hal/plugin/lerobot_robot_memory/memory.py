@@ -13,7 +13,8 @@ from .config_memory import MemoryRobotConfig
 class MemoryBus:
     def __init__(self, modes: list[str]) -> None:
         self.motors = {
-            f"motor_{i}": Motor(i, "sts3215", MotorNormMode(mode)) for i, mode in enumerate(modes, 1)
+            f"motor_{i}": Motor(i, "sts3215", MotorNormMode(mode))
+            for i, mode in enumerate(modes, 1)
         }
         self.torque = True
 

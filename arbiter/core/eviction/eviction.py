@@ -1,0 +1,315 @@
+"""The ladder towards a holder: ask, ask again until heard, remind, deadline.
+
+A holder is only ever *asked*. It unloads by itself at its safe point; the core refuses its `unloading` before that. What comes after the
+deadline was agreed by the holder itself (`on_overstay` of its own lease), and is never done to a process that uses anything.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from vram_arbiter.arbiter.core.effects import Signal
+from vram_arbiter.arbiter.core.features import families
+from vram_arbiter.arbiter.core.model.lease import LEAVING, Cause, Eviction, Lease, LeaseState, Order
+from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
+from vram_arbiter.schemas.ids import LeaseId
+
+
+def ask(
+    core: Core,
+    gpu: Gpu,
+    holder: Lease,
+    waiter: Lease | None,
+    reason: str,
+    *,
+    cause: Cause | None = None,
+    order: Order | None = None,
+) -> None:
+    """Ask a holder to leave, and everything that was carved out of it: leaves first. A fresh reading is taken, so that there is
+    something to compare with. Without a waiter, an `order` of an operator or another `cause` it is for pressure."""
+    cause = cause or ("operator" if order else "waiter" if waiter else "pressure")
+    for member in reversed(list(holder.tree())):
+        if member.state is LeaseState.HELD:
+            member.move(LeaseState.REVOKING, core.now, reason)
+            _begin(core, gpu, member, waiter, reason, cause, order)
+    if holder.children:  # a restart must find the whole tree asked, or none of it
+        for member in holder.tree():
+            core.record_lease(member)
+    core.want_sample(gpu, core.now)
+    for member in reversed(list(holder.tree())):
+        if member.eviction is not None and member.eviction.asked_at == core.now:
+            _tell(core, member, member.eviction)
+
+
+def _begin(
+    core: Core,
+    gpu: Gpu,
+    holder: Lease,
+    waiter: Lease | None,
+    reason: str,
+    cause: Cause,
+    order: Order | None,
+) -> None:
+    holder.left_for = "" if waiter is None else waiter.spec.consumer
+    holder.eviction = Eviction(
+        lease=holder.id,
+        consumer=holder.spec.consumer,
+        charge_bytes=gpu.ledger.charge_bytes(holder.id),
+        wanted_by=None if waiter is None else waiter.id,
+        wanted_consumer=holder.left_for,
+        reason=reason,
+        cause=cause,
+        order=order,
+        asked_at=core.now,
+        next_push_at=core.now + core.settings.revoke_resend_s,
+        traceparent=None if waiter is None else waiter.traceparent,
+    )
+    gpu.evictions.append(holder.eviction)
+    parks = core.host.book(holder.id, holder.spec.park_bytes)
+    if holder.spec.standby or parks:
+        # a restart must not take a release that was asked for as one that was wished for
+        core.record_lease(holder)
+
+
+def _tell(core: Core, holder: Lease, eviction: Eviction) -> None:
+    """The first `revoke`, and the start of the ladder."""
+    _push_now(core, holder, eviction)
+    if holder.spec.on_overstay != "wait":
+        core.timers.set(("overstay", holder.id), _overstays_at(core, holder, eviction))
+    core.note(
+        "revoke_asked",
+        holder,
+        wanted_by=eviction.wanted_consumer,
+        wanted_by_lease=eviction.wanted_by,
+        uses=holder.busy_uses(),
+        cause=eviction.cause,
+        reason=eviction.reason,
+    )
+
+
+def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
+    """`uses` counts what still runs on the lease, also what others marked: at 0 the holder is at its safe point."""
+    assert holder.token is not None, f"{holder.id} is revoked without a token"
+    waiter, order = None, eviction.order
+    if eviction.wanted_by is not None and order is None:
+        waiter = core.waiting.get(eviction.wanted_by)
+    core.push(
+        holder,
+        {
+            "push": "revoke",
+            "lease_id": holder.id,
+            "token": [holder.token.epoch, holder.token.serial],
+            "reason": f"evicted by {order}" if order else eviction.reason,
+            "cause": "operator" if order else eviction.cause,
+            **({"order": {"by": order.by, "reason": order.reason}} if order else {}),
+            "wanted_by": eviction.wanted_consumer,
+            **({"priority": waiter.spec.priority} if waiter is not None else {}),
+            "deadline_in_s": max(
+                0.0, eviction.asked_at + core.settings.revoke_deadline_s - core.now
+            ),
+            "uses": holder.busy_uses(),
+            **({"children": len(holder.children)} if holder.children else {}),
+            "park": holder.id in core.host.booked,
+            **({"traceparent": eviction.traceparent} if eviction.traceparent else {}),
+        },
+    )
+
+
+def acknowledge(core: Core, holder: Lease, eta_s: float | None) -> None:
+    """The holder heard. Said once; a repeat only renews the estimate."""
+    eviction = holder.eviction
+    if eviction is None:
+        return
+    eviction.safe_point_eta_s = eta_s
+    if eviction.acked_at is None:
+        eviction.acked_at = core.now
+        core.note("revoke_acked", holder, safe_point_eta_s=eta_s, uses=holder.busy_uses())
+
+
+def reached_safe_point(core: Core, holder: Lease) -> None:
+    """The last use ended while the holder is asked to leave: tell it, it may not know of uses that others marked."""
+    for member in reversed(list(holder.root.tree())):
+        if (
+            member.eviction is not None
+            and member.state is LeaseState.REVOKING
+            and not member.busy_uses()
+        ):
+            _push_now(core, member, member.eviction)
+
+
+def _push_now(core: Core, holder: Lease, eviction: Eviction) -> None:
+    push_revoke(core, holder, eviction)
+    eviction.next_push_at = core.now + core.settings.revoke_resend_s
+    _set_timer(core, holder, eviction)
+
+
+def ask_again(core: Core, holder: Lease) -> None:
+    """The holder came back on another connection: what it heard on the old one does not count."""
+    if holder.eviction is not None and holder.state is LeaseState.REVOKING:
+        holder.eviction.acked_at = None
+        _push_now(core, holder, holder.eviction)
+
+
+def on_ladder_due(core: Core, lease_id: str) -> None:
+    """A step of the ladder. Who has begun to unload is asked nothing more, and has a whole deadline for it."""
+    holder = core.leases[LeaseId(lease_id)]
+    eviction = holder.eviction
+    if holder.state is LeaseState.UNLOADING:
+        _unload_hangs(core, holder)
+        return
+    if eviction is None or holder.state is not LeaseState.REVOKING:
+        return
+    settings = core.settings
+    if core.now >= eviction.next_push_at:
+        eviction.next_push_at = core.now + settings.revoke_resend_s
+        if eviction.acked_at is None or _may_unload(holder):
+            push_revoke(core, holder, eviction)
+    if not eviction.reminded and core.now >= eviction.asked_at + settings.revoke_remind_s:
+        eviction.reminded = True
+        core.note("reminded", holder, uses=holder.busy_uses(), acked=eviction.acked_at is not None)
+    if not eviction.overdue and core.now >= eviction.asked_at + settings.revoke_deadline_s:
+        eviction.overdue = True
+        _deadline(core, holder, eviction)
+    _set_timer(core, holder, eviction)
+
+
+def _unload_hangs(core: Core, holder: Lease) -> None:
+    """It unloads, and has not ended within a deadline. Others are asked in its place, and the card is not kept free for its bytes."""
+    holder.hangs = True
+    if holder.eviction is not None:
+        holder.eviction.overdue = True
+    _deadline(core, holder, holder.eviction)
+
+
+def _deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None:
+    """The holder outstayed. Its waiter is denied if that is its wish; the `revoke` stands in any case."""
+    wanted_by, consumer = (eviction.wanted_by, eviction.wanted_consumer) if eviction else (None, "")
+    core.note("deadline_passed", holder, uses=holder.busy_uses(), wanted_by=consumer)
+    core.wake(core.gpu_of(holder))
+    waiter = core.waiting.get(wanted_by) if wanted_by is not None else None
+    for gpu_id in () if waiter is None else waiter.gpus:
+        core.wake(core.gpus[gpu_id])  # it may be served on another card now
+    if waiter is None or not waiter.spec.deny_on_deadline:
+        return
+    message = f"{holder.spec.consumer} did not leave within {core.settings.revoke_deadline_s:g} s"
+    deny(
+        core,
+        waiter,
+        {
+            "code": "holder_busy",
+            "message": message,
+            "hint": "try again later, or wait: on_deadline=wait",
+            "details": {
+                "lease_id": holder.id,
+                "consumer": holder.spec.consumer,
+                "uses": holder.busy_uses(),
+            },
+        },
+    )
+
+
+def on_overstay_due(core: Core, lease_id: str) -> None:
+    """Has the holder outstayed, idle, for the whole deadline since its last use or step? Then its process is told to end, as it agreed.
+
+    Nothing is done to a process that uses any lease, its own or another's: that is looked at again later.
+    """
+    holder = core.leases[LeaseId(lease_id)]
+    eviction = holder.eviction
+    if eviction is None or holder.state not in (LeaseState.REVOKING, LeaseState.UNLOADING):
+        return
+    due_at = _overstays_at(core, holder, eviction)
+    if _process_in_use(core, holder):
+        due_at = core.now + core.settings.revoke_deadline_s
+    if due_at > core.now:
+        core.timers.set(("overstay", holder.id), due_at)
+        return
+    kind: Literal["term", "kill"] = "kill" if eviction.signalled else "term"
+    eviction.signalled = kind
+    core.out.append(Signal(holder.process, kind))
+    core.note(
+        "signalled",
+        holder,
+        signal=kind,
+        pid=holder.process.pid,
+        wanted_by=eviction.wanted_consumer,
+        reason=f"asked {core.now - eviction.asked_at:.1f} s ago, idle, and its lease says on_overstay={holder.spec.on_overstay}",
+    )
+    if kind == "term" and holder.spec.on_overstay == "kill":
+        core.timers.set(("overstay", holder.id), core.now + core.settings.terminate_grace_s)
+
+
+def _overstays_at(core: Core, holder: Lease, eviction: Eviction) -> float:
+    """A whole deadline after it was asked, after its last use and after its last step towards the exit."""
+    if eviction.signalled:
+        return core.now
+    return (
+        max(eviction.asked_at, holder.last_used_at, holder.since) + core.settings.revoke_deadline_s
+    )
+
+
+def _process_in_use(core: Core, holder: Lease) -> bool:
+    return holder.process in core.users or any(
+        lease.busy_uses() for lease in core.leases_of(holder.process)
+    )
+
+
+def deny(core: Core, waiter: Lease, error: Mapping[str, Any]) -> None:
+    """End a waiter's wait with a typed error."""
+    waiter.move(LeaseState.DENIED, core.now, str(error["message"]))
+    core.dequeue(waiter)
+    if waiter.answered or waiter.request is None:
+        core.push(waiter, {"push": "denied", "lease_id": waiter.grows or waiter.id, "error": error})
+    else:  # it has only just asked
+        refused = Refused(error["code"], error["message"], error["hint"], **error["details"])
+        core.refuse(waiter.client, waiter.request, refused)
+    if waiter.grows is not None:
+        core.leases[waiter.grows].growth = None
+    core.note("denied", waiter, code=error["code"], reason=error["message"])
+    core.end(waiter, error)
+
+
+def _may_unload(holder: Lease) -> bool:
+    return not holder.children and not holder.busy_uses()
+
+
+def _set_timer(core: Core, holder: Lease, eviction: Eviction) -> None:
+    times = [eviction.asked_at + core.settings.revoke_deadline_s] if not eviction.overdue else []
+    if not eviction.reminded:
+        times.append(eviction.asked_at + core.settings.revoke_remind_s)
+    if eviction.acked_at is None or _may_unload(holder):
+        times.append(eviction.next_push_at)
+    if times:
+        core.timers.set(("revoke", holder.id), min(times))
+
+
+# -- families --------------------------------------------------------------------------------------------------------
+def depart(core: Core, lease: Lease, *, exiting: bool) -> None:
+    """Its holder lets go while sub-leases are there: they are asked to leave first, then it is over."""
+    lease.departing, lease.exiting = True, exiting
+    core.timers.clear(("ttl", lease.id))  # its holder has said its last word on it
+    if lease.state is not LeaseState.REVOKING:
+        lease.move(LeaseState.REVOKING, core.now, "leaves after its sub-leases")
+    gpu = core.gpu_of(lease)
+    for child in list(lease.children):
+        ask(core, gpu, child, None, f"{lease.spec.consumer} ({lease.id}) leaves", cause="parent")
+
+
+def follow(core: Core, lease: Lease) -> None:
+    """A sub-lease finished loading while what it was carved out of was asked to leave: it is asked too."""
+    parent = lease.parent
+    if parent is None or parent.state not in LEAVING:
+        return
+    gpu = core.gpu_of(lease)
+    wanted = parent.eviction.wanted_by if parent.eviction is not None else None
+    waiter = None if wanted is None else core.waiting.get(wanted)
+    ask(core, gpu, lease, waiter, f"{parent.spec.consumer} ({parent.id}) leaves", cause="parent")
+
+
+def part(core: Core, gpu: Gpu, lease: Lease) -> None:
+    """A lease is over: what was carved out of it stands for itself from now on, and may have reached its safe point."""
+    heirs = list(lease.children)
+    families.close(gpu, lease)
+    for heir in heirs:
+        core.note(
+            "orphaned", heir, parent=lease.id, reason=f"{lease.spec.consumer} ({lease.id}) is over"
+        )
+        reached_safe_point(core, heir)

@@ -1,0 +1,1 @@
+"""Learned footprints, durations and crash backoff."""

@@ -1,0 +1,68 @@
+"""Models that die in their load, again and again, do not throw others out for every try.
+
+Whoever supervises a program starts it again at once, and each start would empty the card for a load that fails. After a few failures in a
+row an acquire for which somebody would have to leave is refused for a while, twice as long after each, with the cause of the last one.
+What fits as the card is costs nobody anything and is granted as ever. One load that succeeds forgets it all; so does a restart.
+"""
+
+from typing import Final
+
+from vram_arbiter.arbiter.core.events import Spec
+from vram_arbiter.arbiter.core.learning.drift import model_name
+from vram_arbiter.arbiter.core.model.lease import Failures, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
+from vram_arbiter.schemas.ids import GpuId
+
+FREE: Final = 2
+"""So many failures in a row cost nothing: the first may be an accident, the second the same one."""
+PAUSE_S: Final = 2.0
+PAUSE_MAX_S: Final = 60.0
+FORGOTTEN_S: Final = 600.0
+NAMES_MAX: Final = 256
+
+
+def failed(core: Core, lease: Lease, cause: str) -> None:
+    """A lease is over without its holder's word. Nothing, unless it was loading."""
+    if lease.state is not LeaseState.LOADING:
+        return
+    name = model_name(lease.spec)
+    before = core.crashes.pop(name, None)
+    if before is None or core.now - before.last_at > FORGOTTEN_S:
+        before = Failures(0, core.now, "")
+    core.crashes[name] = Failures(before.count + 1, core.now, cause)
+    if len(core.crashes) > NAMES_MAX:
+        del core.crashes[next(iter(core.crashes))]  # the one that failed longest ago
+
+
+def succeeded(core: Core, lease: Lease) -> None:
+    core.crashes.pop(model_name(lease.spec), None)
+
+
+def check(core: Core, spec: Spec, load_peak_bytes: int, gpus: tuple[GpuId, ...]) -> None:
+    """Refuses an acquire that would make somebody leave for one more try. Raises Refused."""
+    seen = core.crashes.get(model_name(spec))
+    if seen is None or (wait_s := seen.last_at + _pause_s(seen) - core.now) <= 0:
+        return
+    if any(_costs_nobody(core.gpus[gpu], spec, load_peak_bytes) for gpu in gpus):
+        return
+    raise Refused(
+        "load_failing",
+        f"{spec.consumer} failed {seen.count} times in a row to load {spec.key}: {seen.cause}",
+        f"nobody is made to leave for it for {wait_s:.0f} s more; look at its own log",
+        failures=seen.count,
+        cause=seen.cause,
+        retry_in_s=wait_s,
+    )
+
+
+def _pause_s(seen: Failures) -> float:
+    return min(PAUSE_MAX_S, PAUSE_S * 2.0 ** (seen.count - FREE - 1)) if seen.count > FREE else 0.0
+
+
+def _costs_nobody(gpu: Gpu, spec: Spec, load_peak_bytes: int) -> bool:
+    free = gpu.ledger.budget_bytes - gpu.ledger.total_bytes()
+    return (
+        gpu.queue.head() is None
+        and not (spec.exclusive and gpu.residents)
+        and load_peak_bytes <= free
+    )

@@ -1,0 +1,128 @@
+"""Who is resident on one card, and the few of them that a question is about, without looking at everybody.
+
+A card may have ten thousand small leases while one is loading and two are leaving. What follows from a lease's state is kept as it
+changes (`Lease.move` tells its `roster`), so that a decision and the invariants cost what has changed and not what is there.
+Knows nothing of bytes or order. Every change must come through `[id] = lease`, `del [id]` or `pop`; `disagreement` finds what did not.
+"""
+
+from collections.abc import Iterable, Iterator
+
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
+from vram_arbiter.schemas.ids import LeaseId
+
+_MISSING = object()
+
+
+class Residents(dict[LeaseId, Lease]):
+    """Leases of one card by id, oldest grant first, with sub-tables by state and by what they forbid."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._by_state: dict[LeaseState, dict[LeaseId, Lease]] = {state: {} for state in LeaseState}
+        self.exclusive: dict[LeaseId, Lease] = {}
+        self.pinned: dict[LeaseId, Lease] = {}
+        """Never asked to leave, by their own wish or an operator's."""
+        self.recent: dict[LeaseId, Lease] = {}
+        """All that were granted or became ready since the newest reading began, and perhaps some more."""
+        self.touched: set[LeaseId] = set()
+        """Came or went since the invariants were checked last."""
+
+    # -- changing --------------------------------------------------------------------------------------------------
+    def __setitem__(self, lease_id: LeaseId, lease: Lease) -> None:
+        self.pop(lease_id, None)
+        super().__setitem__(lease_id, lease)
+        lease.roster = self
+        self._by_state[lease.state][lease_id] = lease
+        self.recent[lease_id] = lease
+        self.touched.add(lease_id)
+        if lease.spec.exclusive:
+            self.exclusive[lease_id] = lease
+        self.refresh(lease)
+
+    def __delitem__(self, lease_id: LeaseId) -> None:
+        self.pop(lease_id)
+
+    def pop(self, lease_id: LeaseId, default: object = _MISSING) -> Lease | None:  # type: ignore[override]  # reason: one default
+        """Take a lease off the card. Raises KeyError without a default, as any dict."""
+        lease = self.get(lease_id)
+        if lease is None:
+            if default is _MISSING:
+                raise KeyError(lease_id)
+            return None
+        super().__delitem__(lease_id)
+        lease.roster = None
+        for table in (self._by_state[lease.state], self.exclusive, self.pinned, self.recent):
+            table.pop(lease_id, None)
+        self.touched.add(lease_id)
+        return lease
+
+    def moved(self, lease: Lease, before: LeaseState) -> None:
+        """A lease of this card went to another state."""
+        self._by_state[before].pop(lease.id, None)
+        self._by_state[lease.state][lease.id] = lease
+        if lease.state is LeaseState.HELD:
+            self.recent[lease.id] = lease
+
+    def refresh(self, lease: Lease) -> None:
+        """Whether it may be asked to leave has changed."""
+        if lease.evictable:
+            self.pinned.pop(lease.id, None)
+        else:
+            self.pinned[lease.id] = lease
+
+    def seen(self, taken_at: float) -> None:
+        """A reading that began then knows of everything that happened before."""
+        for lease in [lease for lease in self.recent.values() if not _after(lease, taken_at)]:
+            del self.recent[lease.id]
+
+    # -- reading ---------------------------------------------------------------------------------------------------
+    def in_state(self, *states: LeaseState) -> list[Lease]:
+        """Leases in these states, in the order in which they came to them."""
+        return [lease for state in states for lease in self._by_state[state].values()]
+
+    def any_in(self, states: Iterable[LeaseState]) -> bool:
+        by_state = self._by_state
+        for state in states:  # noqa: SIM110 - asked with every event, and a generator costs more than the answer
+            if by_state[state]:
+                return True
+        return False
+
+    def unseen(self, taken_at: float) -> list[Lease]:
+        """Granted or become ready after a reading began (the newest, or one after it): it cannot have seen them."""
+        return [lease for lease in self.recent.values() if _after(lease, taken_at)]
+
+    def filling(self, since: float) -> Iterator[Lease]:
+        """Who loads, or became ready after that moment. Leases are held in the order in which they became ready."""
+        for lease in reversed(self._by_state[LeaseState.HELD].values()):
+            if lease.ready_at <= since:
+                break
+            yield lease
+        yield from self._by_state[LeaseState.LOADING].values()
+        for lease in self.in_state(LeaseState.REVOKING, LeaseState.UNLOADING, LeaseState.VERIFYING):
+            if lease.ready_at > since:
+                yield lease
+
+    def ready_since(self, moment: float) -> Iterator[Lease]:
+        """Who has become ready no earlier than that, and has not begun to leave."""
+        for lease in reversed(self._by_state[LeaseState.HELD].values()):
+            if lease.ready_at < moment:
+                break
+            yield lease
+        for lease in self._by_state[LeaseState.REVOKING].values():
+            if lease.ready_at >= moment:
+                yield lease
+
+    def disagreement(self) -> str:
+        """Where the sub-tables and the leases disagree; "" if nowhere. Looks at everybody: for tests."""
+        for state, table in self._by_state.items():
+            if table.keys() != {lease.id for lease in self.values() if lease.state is state}:
+                return f"{sorted(table)} are listed as {state}"
+        if self.exclusive.keys() != {lease.id for lease in self.values() if lease.spec.exclusive}:
+            return f"{sorted(self.exclusive)} are listed as exclusive"
+        if self.pinned.keys() != {lease.id for lease in self.values() if not lease.evictable}:
+            return f"{sorted(self.pinned)} are listed as pinned"
+        return ""
+
+
+def _after(lease: Lease, taken_at: float) -> bool:
+    return max(lease.granted_at, lease.ready_at, lease.resized_at) > taken_at

@@ -1,0 +1,1 @@
+"""Status and explanations as typed data."""

@@ -1,0 +1,476 @@
+"""After a restart of the daemon alone: the journal says who held what, the holders come back or do not.
+
+Until every recovered lease is accounted for (re-attached, given up, its process dead, or the card is read at baseline) nothing is
+granted. Recovered bytes are charged from the first moment, until their holder says that they are gone, dies, or its time is over.
+A journal in doubt names some leases at best: its holders are believed, and grants wait as long as any holder may keep what it has.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from vram_arbiter.arbiter.core.events import (
+    DOUBT_KEY,
+    MemorySampled,
+    Reattached,
+    ReattachedLease,
+    Recovered,
+    Spec,
+)
+from vram_arbiter.arbiter.core.eviction import eviction
+from vram_arbiter.arbiter.core.features import families, gangs, standby
+from vram_arbiter.arbiter.core.learning import drift
+from vram_arbiter.arbiter.core.ledger.ledger import process_bytes
+from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState, Order, Use
+from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Gpu, Refused
+from vram_arbiter.arbiter.core.report import explain
+from vram_arbiter.arbiter.core.requests import operators, uses
+from vram_arbiter.arbiter.core.requests.requests import (
+    become_held,
+    client_of,
+    ended_error,
+    let_go,
+    touch,
+)
+from vram_arbiter.arbiter.core.scheduling import placement
+from vram_arbiter.arbiter.core.verification.measure import begin_for_lease
+from vram_arbiter.schemas import defaults
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, Token
+
+EMPTY_JOURNAL = LeaseId("journal")
+"""Stands for the holders that an empty, lost or doubted journal does not name; given up after a TTL and the fence grace."""
+
+
+def on_recovered(core: Core, event: Recovered) -> None:
+    """Charge everything that the journal names, then wait for the holders. Records of a card that is gone are dropped."""
+    core.recovering = set()
+    held = dict(sorted(event.records.items()))
+    doubt = held.pop(DOUBT_KEY, None)
+    if (drain := held.pop(operators.DRAIN_KEY, None)) is not None:
+        operators.restore_drain(core, drain)
+    for key, record in held.items():
+        gpu = core.gpus.get(GpuId(str(record["gpu"])))
+        if record.get("state") in AWAY:
+            if doubt is None:
+                _restore_away(core, record)
+            else:  # it may have been granted again since: its holder tells
+                core.forget(key)
+        elif gpu is None:
+            core.forget(key)
+        elif key.startswith("residue:"):
+            process = ProcessKey(int(record["pid"]), int(record["start_ticks"]))
+            account = gpu.ledger.accounts.get(process)
+            # it lies within what the process is charged for its leases, which were restored before it
+            own_bytes = 0 if account is None else account.approved_bytes()
+            residue_bytes = min(int(record["residue_bytes"]), _room_bytes(gpu) + own_bytes)
+            floor_bytes = min(int(record.get("floor_bytes", residue_bytes)), residue_bytes)
+            gpu.ledger.set_residue(process, residue_bytes, core.now, floor_bytes)
+            if (
+                not residue_bytes
+            ):  # stale leases fill the card: nobody would ever take the record out
+                core.forget(key)
+        else:
+            _restore(core, gpu, record)
+    parents = {
+        LeaseId(str(r["lease_id"])): str(r["parent"]) for r in held.values() if r.get("parent")
+    }
+    for gpu in core.gpus.values():
+        families.tie(core, gpu, parents)
+    if not held or doubt is not None:
+        core.recovering.add(EMPTY_JOURNAL)
+        await_unnamed(core)
+    facts: dict[str, Any] = {} if doubt is None else {"doubt": str(doubt["why"])}
+    core.note("recovered", leases=sorted(core.recovering), records=len(held), **facts)
+
+
+def await_unnamed(core: Core) -> None:
+    """Holders that the journal does not name have their time from now on. A process with bytes that stays silent is a stowaway then."""
+    grace_s = defaults.LEASE_TTL_S + core.settings.fence_grace_s
+    core.timers.set(("recover", EMPTY_JOURNAL), core.now + grace_s)
+
+
+def _restore_away(core: Core, record: Mapping[str, Any]) -> None:
+    """A lease that is away holds nothing on a card: nobody waits for its holder, but it does not come back before him either."""
+    lease = _remembered(core, record, LeaseState(str(record["state"])))
+    lease.gpus = tuple(gpu.info.id for gpu in placement.selected(core, lease.spec))
+    if not lease.gpus:  # the only card that it may come back to is gone
+        core.forget(f"lease:{lease.id}")
+        return
+    core.add(lease)
+    core.nonces[lease.process, lease.nonce] = lease.id
+    lease.away_since = core.now
+    core.away[lease.id] = lease
+    core.host.find(lease.id, int(record.get("parked_bytes", 0)))
+    core.timers.set(("ttl", lease.id), core.now + lease.spec.ttl_s + core.settings.fence_grace_s)
+
+
+def _remembered(core: Core, record: Mapping[str, Any], state: LeaseState) -> Lease:
+    """The lease of a record, on no card yet."""
+    spec = spec_from_record(record["spec"])
+    return Lease(
+        id=LeaseId(str(record["lease_id"])),
+        nonce=str(record["nonce"]),
+        spec=spec,
+        process=ProcessKey(int(record["pid"]), int(record["start_ticks"])),
+        client=ClientId(""),
+        arrived_at=core.now,
+        arrival=core.next_arrival(),
+        load_peak_bytes=int(record["load_peak_bytes"]),
+        steady_bytes=max(spec.steady_bytes, spec.residue_bytes),
+        gpus=(),
+        state=state,
+        since=core.now,
+        token=Token(int(record["token"][0]), int(record["token"][1])),
+        measured_bytes=record["measured_bytes"],
+        granted_at=core.now,
+        held_from=min(core.now, float(record.get("held_from", core.now))),
+        ready_at=core.now,
+        last_used_at=core.now,
+        answered=True,
+        exiting=bool(record["exiting"]),
+        said_ready=bool(record.get("said_ready", True)),
+        pinned=None if record.get("pinned") is None else Order(*record["pinned"]),
+        attached=False,
+        dismissed=bool(record.get("dismissed", False)),
+        parks=bool(record.get("parks", False)),
+        comes_back=bool(record.get("comes_back", False)),
+        left_for=str(record.get("left_for", "")),
+        story=[(core.now, state, "recovered from the journal")],
+    )
+
+
+def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
+    state = str(record["state"])
+    asked = state == LeaseState.REVOKING
+    lease = _remembered(
+        core, record, LeaseState.HELD if asked or state == "debt" else LeaseState(state)
+    )
+    lease.asked_before = asked
+    lease_id, process, token, spec = lease.id, lease.process, lease.token, lease.spec
+    lease.gpu, lease.gpus = gpu.info.id, (gpu.info.id,)
+    _place(core, gpu, lease, int(record["charge_bytes"]))
+    core.nonces[process, lease.nonce] = lease_id
+    if state == "debt":
+        gpu.ledger.to_debt(lease_id)
+        grace_s = core.settings.fence_grace_s
+        fenced_at = core.now + spec.ttl_s + grace_s
+        begin_for_lease(core, gpu, lease, alive=True, grace_s=grace_s, fenced_at=fenced_at)
+        core.remember(
+            Ended(lease_id, process, lease.nonce, token, LeaseState.LOST, lost_error(lease_id))
+        )
+        return
+    core.add(lease)
+    core.host.find(lease.id, int(record.get("parked_bytes", 0)))
+    gpu.residents[lease_id] = lease
+    if record["estate"] is not None:
+        families.restore(gpu, lease, record["estate"])
+    if lease.state is LeaseState.VERIFYING:
+        begin_for_lease(core, gpu, lease, alive=True)
+        return
+    if record.get("gang") is not None:
+        gangs.restore(core, lease, str(record["gang"][0]), int(record["gang"][1]))
+    lease.expires_at = core.now + spec.ttl_s + core.settings.fence_grace_s
+    core.timers.set(("ttl", lease_id), lease.expires_at)
+    if lease.state is LeaseState.HELD:
+        uses.restore(core, lease, record.get("users", ()))
+    assert core.recovering is not None, "restoring outside recovery"
+    core.recovering.add(lease_id)
+
+
+def _place(core: Core, gpu: Gpu, lease: Lease, charge_bytes: int) -> None:
+    """Charge what is there anyway. What the budget does not hold was never approved: it is pressure."""
+    approved_bytes = min(charge_bytes, _room_bytes(gpu))
+    gpu.ledger.charge(lease.id, lease.process, charge_bytes, approved_bytes, core.now)
+    gpu.returning.give_up(lease.process, max(0, lease.load_peak_bytes - charge_bytes), core.now)
+    gpu.changed_at = core.now
+
+
+def _room_bytes(gpu: Gpu) -> int:
+    """What can still be approved. A disk that was full keeps records that should be gone, and they may say more than the card has."""
+    return max(0, gpu.ledger.budget_bytes - gpu.ledger.approved_bytes())
+
+
+def spec_from_record(record: Mapping[str, Any]) -> Spec:
+    """The inverse of what `Core.record_lease` writes."""
+    return Spec(
+        consumer=str(record["consumer"]),
+        key=ModelKey(str(record["model_id"]), str(record["revision"])),
+        gpu=str(record["gpu"]),
+        exclusive=bool(record["exclusive"]),
+        load_peak_bytes=int(record["load_peak_bytes"]),
+        steady_bytes=int(record["steady_bytes"]),
+        residue_bytes=int(record["residue_bytes"]),
+        priority=int(record["priority"]),
+        evictable=bool(record["evictable"]),
+        ttl_s=float(record["ttl_s"]),
+        min_residency_s=float(record["min_residency_s"]),
+        deny_on_deadline=bool(record["deny_on_deadline"]),
+        standby=bool(record.get("standby", False)),
+        on_overstay=str(record.get("on_overstay", "wait")),
+        park_bytes=int(record.get("park_bytes", 0)),
+        parent=None
+        if record.get("parent") is None
+        else (LeaseId(record["parent"][0]), Token(*record["parent"][1:])),
+        independent=bool(record.get("independent", False)),
+        gang=None
+        if record.get("gang") is None
+        else (str(record["gang"][0]), int(record["gang"][1])),
+    )
+
+
+def lost_error(lease_id: LeaseId) -> dict[str, Any]:
+    return {
+        "code": "lease_lost",
+        "message": f"{lease_id} is no longer held",
+        "hint": "unload, then acquire again",
+        "details": {},
+    }
+
+
+# -- coming back -------------------------------------------------------------------------------------------------------
+def on_reattached(core: Core, event: Reattached) -> None:
+    """A client tells what it still holds. Every lease is answered for itself; nothing is lost because of a neighbour."""
+    client = client_of(core, event.client)
+    answers: list[dict[str, Any]] = []
+    for item in event.leases:
+        try:
+            lease = _reattach(core, client, item)
+        except Refused as refused:
+            answers.append({"lease_id": item.lease, "kept": False, "error": refused.wire()})
+        else:
+            answers.append(
+                {"lease_id": item.lease, "kept": True, "lease": explain.view(core, lease)}
+            )
+    core.reply(event.client, event.request, {"leases": answers})
+
+
+def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
+    lease = core.leases.get(item.lease)
+    if lease is None:
+        if item.lease in core.ended:
+            raise ended_error(core.ended[item.lease])
+        lease = _adopt(core, client, item)
+    elif _journal_is_behind(core, lease, client, item):
+        lease.token = item.token
+        core.record_lease(lease)
+    elif lease.token != item.token and not _missed_its_grant(lease, client, item):
+        raise Refused(
+            "stale_token",
+            f"{item.token} is not the token of {item.lease}",
+            "unload, then acquire again",
+        )
+    elif lease.process != client.process:
+        raise Refused(
+            "not_permitted",
+            f"{item.lease} belongs to process {lease.process.pid}",
+            "ask as its holder",
+        )
+    core.hand_to(lease, client.id)
+    if not lease.attached:
+        lease.attached = True
+        # its residency begins anew: who marked uses on it may still be on the way back
+        lease.ready_at = core.now
+        if lease.gpu is not None:
+            core.gpu_of(lease).residents.recent[lease.id] = lease
+    if item.away:
+        _believe_away(core, lease, item)
+    elif (
+        lease.state is LeaseState.LOADING and item.held
+    ):  # its `ready` was lost, or a sub-lease's was heard
+        lease.said_ready = lease.estate is None or item.measured_bytes is not None
+        become_held(core, lease, item.measured_bytes)
+        core.record_line(lease)
+    if lease.gpu is not None:
+        _restore_uses(core, lease, client, item)
+    touch(core, lease)
+    account_for(core, lease.id)
+    core.note("reattached", lease, uses=len(lease.uses), state=str(lease.state))
+    return lease
+
+
+def _journal_is_behind(core: Core, lease: Lease, client: Client, item: ReattachedLease) -> bool:
+    """The journal is in doubt and has lost the lease's last grant, which its holder knows."""
+    return (
+        core.recovering is not None
+        and EMPTY_JOURNAL in core.recovering
+        and lease.process == client.process
+        and lease.token is not None
+        and lease.token < item.token
+        and item.token.epoch < core.settings.epoch
+    )
+
+
+def _missed_its_grant(lease: Lease, client: Client, item: ReattachedLease) -> bool:
+    """It came back from standby while its holder was not connected, who knows the token before."""
+    return (
+        item.away
+        and lease.state is LeaseState.LOADING
+        and lease.process == client.process
+        and lease.token is not None
+        and item.token < lease.token
+    )
+
+
+def _believe_away(core: Core, lease: Lease, item: ReattachedLease) -> None:
+    """The holder says that it let go. What was lost on the way is made up for: its `release`, or the `granted` to it."""
+    if lease.state in AWAY:
+        core.timers.clear(("ttl", lease.id))
+        standby.wake_all(core, lease)
+    elif lease.token != item.token:
+        core.push(lease, {"push": "granted", "lease": explain.view(core, lease)})
+    elif lease.state in EXPIRING:
+        back = lease.spec.standby and not lease.dismissed
+        if item.parked:
+            core.host.find(lease.id, lease.spec.park_bytes)
+        let_go(
+            core,
+            lease,
+            exiting=False,
+            why="let go, says its holder",
+            comes_back=back,
+            parks=item.parked,
+        )
+
+
+def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLease) -> None:
+    """What this client says runs is what runs, as far as its own uses go.
+
+    Other connections, of this process too, answer for theirs: after a restart they may have begun them again before this one
+    came. An earlier connection of the same instance is no other: ROUTER never says that it is gone.
+    """
+    others = {c.id for c in core.clients.values() if c.instance != client.instance}
+    for use in list(lease.uses.values()):
+        if use.process == client.process and use.id not in item.uses and use.client not in others:
+            core.unmark(lease, use)
+    if lease.state in (LeaseState.HELD, LeaseState.REVOKING):
+        for use_id in item.uses:
+            key = (client.process, use_id)
+            known = lease.uses.get(key) or lease.yielded.get(key)
+            began = Use(use_id, client.id, client.process, "", core.now)
+            core.mark(lease, began if known is None else replace(known, client=client.id))
+    eviction.ask_again(core, lease)
+    core.wake(core.gpu_of(lease))
+
+
+def _seen_bytes(gpu: Gpu, process: ProcessKey) -> int:
+    """What the newest reading shows of a process; nothing where it cannot say. The journal that knew the card is lost."""
+    return 0 if gpu.sample is None else process_bytes(gpu.sample, process) or 0
+
+
+def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
+    """The journal does not know this lease but its token is of an earlier epoch: its holder is believed while recovering."""
+    if core.recovering is None or item.token.epoch >= core.settings.epoch:
+        raise Refused("lease_lost", f"{item.lease} is not known", "unload, then acquire again")
+    gpus = placement.selected(core, item.spec)
+    if not gpus:
+        raise Refused(
+            "unknown_gpu", f"there is no GPU {item.spec.gpu!r}", "unload, then acquire again"
+        )
+    gpu = max(gpus, key=lambda gpu: (_seen_bytes(gpu, client.process), -gpu.info.index))
+    spec = item.spec
+    peak, steady = drift.expected_bytes(core, spec)
+    charge = peak
+    if item.held:
+        charge = (
+            steady if item.measured_bytes is None else max(item.measured_bytes, spec.residue_bytes)
+        )
+    lease = Lease(
+        id=item.lease,
+        nonce=f"adopted {item.lease}",
+        spec=spec,
+        process=client.process,
+        client=client.id,
+        arrived_at=core.now,
+        arrival=core.next_arrival(),
+        load_peak_bytes=peak,
+        steady_bytes=steady,
+        gpus=(gpu.info.id,),
+        state=LeaseState.HELD if item.held else LeaseState.LOADING,
+        since=core.now,
+        token=item.token,
+        gpu=gpu.info.id,
+        measured_bytes=item.measured_bytes,
+        granted_at=core.now,
+        held_from=core.now,
+        ready_at=core.now,
+        last_used_at=core.now,
+        answered=True,
+        said_ready=item.held,
+        story=[(core.now, LeaseState.HELD, "adopted: the journal did not know it")],
+    )
+    core.add(lease)
+    core.nonces[lease.process, lease.nonce] = lease.id
+    if item.away:
+        lease.state = LeaseState.PARKED if item.parked else LeaseState.STANDBY
+        lease.gpu, lease.comes_back, lease.parks = (
+            None,
+            spec.standby or not item.parked,
+            item.parked,
+        )
+        if item.parked:
+            core.host.find(lease.id, spec.park_bytes)
+        lease.gpus = tuple(gpu.info.id for gpu in gpus)
+        standby.enter(core, lease)
+        return lease
+    _place(core, gpu, lease, charge)
+    gpu.residents[lease.id] = lease
+    _reunite(core, gpu, lease)
+    core.record_line(lease)
+    return lease
+
+
+def _reunite(core: Core, gpu: Gpu, lease: Lease) -> None:
+    """Adopted leases come in any order: tie this one to its parent and to its sub-leases, as far as they are here."""
+    parent = gpu.residents.get(lease.spec.parent[0]) if lease.spec.parent is not None else None
+    if parent is not None and parent.state in (LeaseState.LOADING, LeaseState.HELD):
+        families.join(core, gpu, parent, lease, 0)
+    for other in list(gpu.residents.values()):
+        if (
+            other.parent is None
+            and other.spec.parent is not None
+            and other.spec.parent[0] == lease.id
+        ):
+            families.join(core, gpu, lease, other, 0)
+
+
+# -- coming to an end --------------------------------------------------------------------------------------------------
+def account_for(core: Core, lease_id: LeaseId) -> None:
+    """One lease less to wait for."""
+    if core.recovering is not None and lease_id in core.recovering:
+        core.recovering.remove(lease_id)
+        if lease_id == EMPTY_JOURNAL:
+            core.forget(DOUBT_KEY)
+
+
+def on_recover_due(core: Core, subject: str) -> None:
+    account_for(core, LeaseId(subject))
+
+
+def account_for_the_empty(core: Core, sample: MemorySampled) -> None:
+    """The card is read as good as empty: nobody has to be waited for there.
+
+    The holders that have not come back live, and they alone can say that a lease is over, or their time: a model may sleep in host RAM,
+    and a reading may lie. Their bytes stay charged, and nobody asks them to leave before they are heard of.
+    """
+    gpu = core.gpus.get(sample.gpu)
+    if gpu is None or gpu.sample is not sample:
+        return  # it does not count (`readings.on_sample`)
+    if core.recovering is None or sample.taken_at < core.started_at:
+        return
+    noise_bytes = gpu.info.reserve_bytes + core.settings.verify_tolerance_bytes
+    if sample.used_bytes > noise_bytes:
+        return
+    for lease_id in gpu.residents:
+        account_for(core, lease_id)
+    if all(g.sample is not None and g.sample.used_bytes <= noise_bytes for g in core.gpus.values()):
+        account_for(core, EMPTY_JOURNAL)
+
+
+def serve_if_accounted(core: Core) -> None:
+    """Everybody is accounted for: begin to grant."""
+    if core.recovering is None or core.recovering:
+        return
+    core.recovering = None
+    core.note("serving", seconds=core.now - core.started_at)
+    for gpu in core.gpus.values():
+        core.wake(gpu)

@@ -1,0 +1,609 @@
+"""What clients ask for, one function a request. Each checks everything first (raising Refused) and then changes things.
+
+Who may: leases belong to a process, so a request on a lease must come from a client of that process. Uses (`uses`) are open to
+anyone who knows the exact token.
+"""
+
+from dataclasses import replace
+
+from vram_arbiter.arbiter.core.events import (
+    AcquireRequested,
+    CancelRequested,
+    OomReported,
+    Reacquired,
+    ReadyReported,
+    ReleaseReported,
+    Renewed,
+    RevokeAcknowledged,
+    Spec,
+    UnloadStarted,
+)
+from vram_arbiter.arbiter.core.eviction import eviction
+from vram_arbiter.arbiter.core.features import families, gangs, growth, standby
+from vram_arbiter.arbiter.core.learning import costs, crashes, drift
+from vram_arbiter.arbiter.core.model.lease import (
+    AWAY,
+    EXPIRING,
+    NONCES_MAX,
+    Lease,
+    LeaseState,
+    Recall,
+    Use,
+)
+from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Refused
+from vram_arbiter.arbiter.core.report import explain
+from vram_arbiter.arbiter.core.requests.limits import check_leases, check_waiters
+from vram_arbiter.arbiter.core.scheduling import placement
+from vram_arbiter.arbiter.core.verification.measure import begin_for_lease
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, RequestId, Token
+
+_HINT_ACQUIRE = "unload, then acquire again"
+
+
+# -- who and which -------------------------------------------------------------------------------------------------
+def client_of(core: Core, client: ClientId) -> Client:
+    known = core.clients.get(client)
+    if known is None:
+        raise Refused(
+            "unknown_session", "this connection has not said hello", "say hello, then re-attach"
+        )
+    return known
+
+
+def ended_error(ended: Ended) -> Refused:
+    """The answer to a late message on a lease that is over."""
+    if ended.error is not None:
+        error = ended.error
+        return Refused(
+            str(error["code"]), str(error["message"]), str(error["hint"]), **error["details"]
+        )
+    told = f": {ended.evicted}" if ended.evicted else ""
+    return Refused(
+        "bad_state", f"{ended.lease} is {ended.state}{told}", _HINT_ACQUIRE, state=str(ended.state)
+    )
+
+
+def lease_for(core: Core, lease_id: LeaseId, token: Token) -> Lease:
+    """A live lease by its exact token."""
+    lease = core.leases.get(lease_id)
+    if lease is None:
+        ended = core.ended.get(lease_id)
+        if ended is not None:
+            raise ended_error(ended)
+        raise Refused(
+            "unknown_lease",
+            f"there is no lease {lease_id}",
+            "acquire one; after a restart: re-attach",
+        )
+    if lease.token is None:
+        raise bad_state(lease, "it is still queued")
+    if lease.token != token:
+        raise Refused(
+            "stale_token",
+            f"{token} is not the token of {lease_id}",
+            "use the token that came with the grant",
+        )
+    return lease
+
+
+def own_lease(core: Core, client: ClientId, lease_id: LeaseId, token: Token) -> Lease:
+    """A live lease of the client's own process. Hearing from its holder keeps it alive."""
+    process = client_of(core, client).process
+    lease = lease_for(core, lease_id, token)
+    if lease.process != process:
+        raise Refused(
+            "not_permitted",
+            f"{lease_id} belongs to process {lease.process.pid}",
+            "ask as its holder",
+        )
+    touch(core, lease)
+    return lease
+
+
+def touch(core: Core, lease: Lease) -> None:
+    """The holder lives: its time to live starts anew."""
+    if lease.state in EXPIRING and lease.attached and not lease.departing:
+        lease.expires_at = core.now + lease.spec.ttl_s
+        core.timers.set(("ttl", lease.id), lease.expires_at)
+
+
+def bad_state(lease: Lease, what: str) -> Refused:
+    return Refused(
+        "bad_state",
+        f"{lease.id} is {lease.state}: {what}",
+        "see the lease's story",
+        state=str(lease.state),
+        uses=lease.busy_uses(),
+        children=len(lease.children),
+        story=lease.told(),
+    )
+
+
+# -- waiting ---------------------------------------------------------------------------------------------------------
+def acquire(core: Core, event: AcquireRequested) -> None:
+    """Queue a lease; the scheduling after this event may grant it in the same breath, and answers either way."""
+    client = client_of(core, event.client)
+    if find_again(core, event, client):
+        return
+    spec = replace(event.spec, exclusive=True) if core.settings.scheduling.alone else event.spec
+    load_peak, steady = drift.expected_bytes(core, spec)
+    if spec.gang is not None:
+        gangs.check(core, *spec.gang)
+    try:
+        gpus = placement.places(core, spec, load_peak)
+    except Refused as refused:
+        if spec.gang is not None:
+            gangs.left_out(core, spec.gang[0], refused.message)
+        raise
+    check_waiters(core, client, spec.priority)
+    away = (
+        None
+        if spec.gang is not None
+        else standby.find(core, client.process, spec.consumer, spec.key)
+    )
+    if away is not None:
+        _take_over(core, event, away, spec, gpus)
+        return
+    if spec.gang is None:
+        crashes.check(core, spec, load_peak, gpus)
+    lease = new_lease(core, event, client, spec, load_peak, steady, gpus)
+    core.unanswered.append(lease)
+    if spec.gang is None:
+        core.enqueue(lease)
+    else:
+        gangs.join(core, lease, *spec.gang)
+
+
+def new_lease(
+    core: Core,
+    event: AcquireRequested,
+    client: Client,
+    spec: Spec,
+    load_peak: int,
+    steady: int,
+    gpus: tuple[GpuId, ...],
+) -> Lease:
+    """A lease that is asked for, known by its nonce from now on. Refuses what is one too many for its connection."""
+    check_leases(core, client)
+    lease = Lease(
+        id=core.next_lease_id(),
+        nonce=event.nonce,
+        spec=spec,
+        process=client.process,
+        client=client.id,
+        uid=client.uid,
+        arrived_at=core.now,
+        arrival=core.next_arrival(),
+        load_peak_bytes=load_peak,
+        steady_bytes=steady,
+        gpus=gpus,
+        since=core.now,
+        wait_timeout_s=event.wait_timeout_s,
+        request=event.request,
+        traceparent=event.traceparent,
+        story=[(core.now, LeaseState.QUEUED, "acquired")],
+    )
+    core.add(lease)
+    core.nonces[client.process, event.nonce] = lease.id
+    costs.wanted(core, spec.consumer)
+    return lease
+
+
+def _take_over(
+    core: Core, event: AcquireRequested, lease: Lease, spec: Spec, gpus: tuple[GpuId, ...]
+) -> None:
+    """The process has a lease for this model, away: the acquire means that one, as it is asked for now."""
+    if len(lease.earlier_nonces) == NONCES_MAX:
+        core.nonces.pop((lease.process, lease.earlier_nonces[0]), None)
+    lease.earlier_nonces.append(lease.nonce)
+    lease.nonce = event.nonce
+    core.nonces[lease.process, event.nonce] = lease.id
+    lease.spec = spec
+    lease.load_peak_bytes, lease.steady_bytes = drift.expected_bytes(core, spec)
+    core.record_lease(lease)  # still away: if a restart ends the wait, it is this that comes back
+    lease.traceparent = event.traceparent
+    _call_back(core, lease, event.client, event.request, event.wait_timeout_s, gpus)
+
+
+def _want_back(
+    core: Core, lease: Lease, client: ClientId, request: RequestId, wait_timeout_s: float | None
+) -> None:
+    """A lease that is away becomes a waiter, as it was last asked for."""
+    gpus = placement.places(core, lease.spec, drift.expected_bytes(core, lease.spec)[0])
+    check_waiters(core, client_of(core, client), lease.spec.priority)
+    _call_back(core, lease, client, request, wait_timeout_s, gpus)
+
+
+def _call_back(
+    core: Core,
+    lease: Lease,
+    client: ClientId,
+    request: RequestId,
+    wait_timeout_s: float | None,
+    gpus: tuple[GpuId, ...],
+) -> None:
+    lease.gpus = gpus
+    lease.uid = client_of(core, client).uid
+    lease.load_peak_bytes, lease.steady_bytes = drift.expected_bytes(core, lease.spec)
+    standby.queue_again(core, lease, client, request, core.now, wait_timeout_s)
+    costs.wanted(core, lease.spec.consumer)
+    core.unanswered.append(lease)
+
+
+def reacquire(core: Core, event: Reacquired) -> None:
+    """A lease that is away, or on its way there, is wanted now. One that is wanted or back already is answered as it is."""
+    client = client_of(core, event.client)
+    lease = lease_for(core, event.lease, event.token)
+    if lease.process != client.process:
+        raise Refused(
+            "not_permitted",
+            f"{lease.id} belongs to process {lease.process.pid}",
+            "ask as its holder",
+        )
+    if lease.state in AWAY:
+        lease.traceparent = event.traceparent
+        _want_back(core, lease, event.client, event.request, event.wait_timeout_s)
+        return
+    if lease.state is LeaseState.VERIFYING and (lease.comes_back or lease.parks):
+        lease.traceparent = event.traceparent
+        lease.recalled = lease.recalled or Recall(core.now, event.wait_timeout_s)
+    elif lease.state is not LeaseState.QUEUED:
+        raise bad_state(
+            lease, "only a lease that is away, or being measured on its way there, is called back"
+        )
+    core.hand_to(lease, client.id)
+    core.reply(event.client, event.request, {"state": "queued", "lease": explain.view(core, lease)})
+
+
+def answer_queued(core: Core) -> None:
+    """After the scheduling: whoever was not granted at once is told that it waits, and why."""
+    for lease in core.unanswered:
+        if lease.state is LeaseState.QUEUED and not lease.answered and lease.request is not None:
+            lease.answered = True
+            view = explain.view(core, lease)
+            core.note(
+                "queued", lease, position=view["position"], reason=explain.wait_reason(core, lease)
+            )
+            core.reply(lease.client, lease.request, {"state": "queued", "lease": view})
+    core.unanswered.clear()
+
+
+def find_again(core: Core, event: AcquireRequested, client: Client) -> bool:
+    """Was this acquire said before? Then it is answered as it stands. Raises Refused where its lease is over."""
+    lease_id = core.nonces.get((client.process, event.nonce))
+    if lease_id is None:
+        return False
+    lease = core.leases.get(lease_id)
+    if lease is None:
+        raise ended_error(core.ended[lease_id])
+    if lease.state in AWAY and _still_waits(lease, event):
+        lease.traceparent = event.traceparent
+        _want_back(core, lease, event.client, event.request, event.wait_timeout_s)
+        return True
+    core.hand_to(
+        lease, event.client
+    )  # the newest connection of the process is the one that listens
+    state = str(lease.state) if lease.state in (LeaseState.QUEUED, *AWAY) else "loading"
+    core.reply(event.client, event.request, {"state": state, "lease": explain.view(core, lease)})
+    return True
+
+
+def _still_waits(lease: Lease, event: AcquireRequested) -> bool:
+    """Does the newest acquire of a lease that is away wait still? A restart ended its wait: what came back from the journal was, as far as
+    anybody knows, not granted since it was asked for. A late repeat of one that waited and was granted means nothing."""
+    return event.nonce == lease.nonce and lease.granted_at <= lease.arrived_at
+
+
+def cancel(core: Core, event: CancelRequested) -> None:
+    """Give up a queued lease. One that was granted meanwhile must be released instead."""
+    client = client_of(core, event.client)
+    lease = core.leases.get(event.lease)
+    if lease is None:
+        ended = core.ended.get(event.lease)
+        if ended is not None and ended.state is LeaseState.CANCELLED:
+            core.reply(event.client, event.request, {"state": "cancelled"})
+            return
+        raise (
+            ended_error(ended)
+            if ended
+            else Refused("unknown_lease", f"there is no lease {event.lease}", "")
+        )
+    if lease.process != client.process:
+        raise Refused(
+            "not_permitted",
+            f"{lease.id} belongs to process {lease.process.pid}",
+            "ask as its holder",
+        )
+    if lease.state in AWAY:
+        standby.give_up(core, lease, LeaseState.CANCELLED, "cancelled", "its holder gave up")
+        core.reply(event.client, event.request, {"state": "cancelled"})
+        return
+    if lease.state is LeaseState.VERIFYING and (lease.comes_back or lease.parks):
+        standby.renounce(
+            core, lease
+        )  # on its way there: its bytes are measured away, and then it is over
+        core.record_lease(lease)
+        core.reply(event.client, event.request, {"state": str(lease.state)})
+        return
+    if lease.state is not LeaseState.QUEUED:
+        raise bad_state(lease, "it is granted already, release it")
+    cancel_waiter(core, lease, "its holder gave up")
+    core.reply(event.client, event.request, {"state": "cancelled"})
+
+
+def cancel_waiter(core: Core, lease: Lease, why: str) -> None:
+    """A revoke that was sent for it stands: the holder may be unloading by now."""
+    lease.move(LeaseState.CANCELLED, core.now, why)
+    core.dequeue(lease)
+    core.note("cancelled", lease, reason=why)
+    core.end(
+        lease,
+        {
+            "code": "cancelled",
+            "message": f"{lease.id}: {why}",
+            "hint": "acquire again",
+            "details": {},
+        },
+    )
+
+
+def on_wait_timeout(core: Core, lease_id: str) -> None:
+    lease = core.waiting[LeaseId(lease_id)]
+    why = explain.explain_lease(core, lease)
+    error = {
+        "code": "wait_timeout",
+        "message": f"{lease.spec.consumer} waited {core.now - lease.arrived_at:.1f} s: {why['text']}",
+        "hint": "wait longer, or make room",
+        "details": {"why": why},
+    }
+    eviction.deny(core, lease, error)
+
+
+# -- holding -----------------------------------------------------------------------------------------------------------
+def ready(core: Core, event: ReadyReported) -> None:
+    """Loaded: from now on the steady bytes are charged, or what the holder measured."""
+    lease = own_lease(core, event.client, event.lease, event.token)
+    reserved = not lease.said_ready and lease.estate is not None
+    if lease.state is LeaseState.HELD or (
+        lease.state is LeaseState.REVOKING and reserved
+    ):  # a repeat, or
+        if not lease.said_ready:  # a sub-lease was ready before it: it is no mere reservation
+            lease.said_ready = True
+            _charge_held(core, lease, event.measured_bytes)
+            core.record_line(lease)
+        core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
+        return
+    if lease.state is not LeaseState.LOADING:
+        raise bad_state(lease, "only a loading lease becomes ready")
+    lease.said_ready = True
+    held = become_held(core, lease, event.measured_bytes)
+    core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
+    core.record_line(lease)
+    for one in held:
+        core.learn(one.spec.consumer, "load_s", core.now - one.granted_at)
+        core.note(
+            "ready",
+            one,
+            charge_bytes=core.gpu_of(one).ledger.charge_bytes(one.id),
+            declared_bytes=one.steady_bytes,
+            measured_bytes=one.measured_bytes,
+            load_ms=(core.now - one.granted_at) * 1e3,
+        )
+        core.note("switch", one, **explain.switch_record(core, one))
+    eviction.follow(core, lease)
+
+
+def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> list[Lease]:
+    """Loaded, and with it what it was carved out of, if that has not said so itself. Returns who became ready."""
+    lease.move(LeaseState.HELD, core.now, "ready")
+    lease.ready_at = lease.last_used_at = core.now
+    _charge_held(core, lease, measured_bytes)
+    core.host.drop(lease.id)
+    if lease.parent is not None and lease.parent.state is LeaseState.LOADING:
+        return [lease, *become_held(core, lease.parent, None)]
+    return [lease]
+
+
+def _charge_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
+    gpu = core.gpu_of(lease)
+    lease.measured_bytes = measured_bytes
+    drift.on_ready(core, lease, measured_bytes)
+    crashes.succeeded(core, lease)
+    steady = (
+        lease.steady_bytes
+        if measured_bytes is None
+        else max(measured_bytes, lease.spec.residue_bytes)
+    )
+    peak = max(lease.load_peak_bytes, lease.peak_seen_bytes)
+    gpu.returning.give_up(lease.process, max(0, peak - steady), core.now)
+    families.recharge(core, gpu, lease, steady)
+    gpu.changed_at = core.now
+    core.want_sample(gpu, core.now)  # what it holds now is what has to come back one day
+    core.wake(gpu)
+
+
+def renew(core: Core, event: Renewed) -> None:
+    """Keep leases alive. One that expired stays expired."""
+    client = client_of(core, event.client)
+    alive: list[str] = []
+    gone: list[dict[str, object]] = []
+    for lease_id, token in event.leases:
+        lease = core.leases.get(lease_id)
+        if (
+            lease is not None
+            and lease.state is LeaseState.QUEUED
+            and lease.process == client.process
+        ):
+            alive.append(lease_id)
+            continue
+        try:
+            own_lease(core, event.client, lease_id, token)
+            alive.append(lease_id)
+        except Refused as refused:
+            gone.append({"lease_id": lease_id, "error": refused.wire()})
+    core.reply(event.client, event.request, {"alive": alive, "gone": gone})
+
+
+# -- leaving -----------------------------------------------------------------------------------------------------------
+def revoke_ack(core: Core, event: RevokeAcknowledged) -> None:
+    lease = own_lease(core, event.client, event.lease, event.token)
+    eviction.acknowledge(core, lease, event.safe_point_eta_s)
+    core.reply(event.client, event.request, {"state": str(lease.state), "uses": lease.busy_uses()})
+
+
+def unloading(core: Core, event: UnloadStarted) -> None:
+    """The holder is at its safe point and unloads. Refused while anybody uses the lease: this is the safe-point rule."""
+    lease = own_lease(core, event.client, event.lease, event.token)
+    if lease.state is LeaseState.UNLOADING:  # a repeat
+        core.reply(event.client, event.request, {"state": str(lease.state)})
+        return
+    if lease.state not in (LeaseState.HELD, LeaseState.REVOKING):
+        raise bad_state(lease, "only a held lease is unloaded; a loading one is released")
+    if lease.children:
+        names = ", ".join(f"{child.spec.consumer} ({child.id})" for child in lease.children)
+        raise bad_state(
+            lease, f"sub-leases of it are still resident: {names}; release it, they are asked first"
+        )
+    if running := lease.busy_uses():
+        raise bad_state(lease, f"{running} uses still run; wait for the `revoke` that says 0 uses")
+    gpu = core.gpu_of(lease)
+    end_uses(core, lease, "unloaded while it paused")
+    growth.abandon(core, lease, "it unloads")
+    lease.move(LeaseState.UNLOADING, core.now, "at its safe point")
+    lease.hangs = False
+    core.timers.set(("revoke", lease.id), core.now + core.settings.revoke_deadline_s)
+    lease.baseline = gpu.sample
+    if lease.eviction is not None:
+        lease.eviction.unloading_at = core.now
+        core.learn(lease.spec.consumer, "drain_s", core.now - lease.eviction.asked_at)
+    core.reply(event.client, event.request, {"state": str(lease.state)})
+    core.note("unloading", lease, asked=lease.eviction is not None)
+    core.wake(gpu)
+
+
+def release(core: Core, event: ReleaseReported) -> None:
+    """The holder let go. Its bytes stay charged until they are measured gone. A repeat never ends a lease that went on standby."""
+    process = client_of(core, event.client).process
+    ended = core.ended.get(event.lease)
+    same = ended is not None and (ended.token, ended.process) == (event.token, process)
+    if ended is not None and same and ended.state is LeaseState.RELEASED:  # a repeat
+        core.reply(
+            event.client, event.request, {"state": str(ended.state), "next": str(ended.state)}
+        )
+        return
+    lease = own_lease(core, event.client, event.lease, event.token)
+    if lease.children and not event.parked:
+        eviction.depart(core, lease, exiting=event.exiting)
+    elif lease.gpu is not None and lease.state is not LeaseState.VERIFYING:  # else: a repeat
+        _keep_parked(core, lease, parked=event.parked, exiting=event.exiting)
+        let_go(
+            core,
+            lease,
+            exiting=event.exiting,
+            why="exits" if event.exiting else "let go",
+            comes_back=standby.stays_on(lease) and not event.exiting,
+            parks=event.parked,
+        )
+    after = {"state": str(lease.state), "next": str(standby.next_state(lease))}
+    core.reply(event.client, event.request, after)
+
+
+def end_uses(core: Core, lease: Lease, why: str) -> None:
+    """The bytes go: every use that is still on the lease ends with them, pausing ones too."""
+    for use in lease.all_uses():
+        if (use.process, use.id) in lease.uses:
+            core.unmark(lease, use)
+        note_ended(core, lease, use, why)
+    lease.yielded.clear()
+
+
+def note_ended(core: Core, lease: Lease, use: Use, why: str) -> None:
+    core.note(
+        "use_ended",
+        lease,
+        use_id=use.id,
+        label=use.label,
+        ms=(core.now - use.began_at) * 1e3,
+        reason=why,
+    )
+
+
+def _keep_parked(core: Core, lease: Lease, *, parked: bool, exiting: bool) -> None:
+    """Book host RAM for what the holder says that it keeps there; refuse what it has no room for."""
+    if not parked:
+        return
+    count = lease.spec.park_bytes
+    if exiting or not count:
+        what = "a process that exits keeps nothing" if exiting else "its spec has no park_bytes"
+        raise bad_state(lease, f"it cannot be parked: {what}")
+    if lease.id in core.host.booked or core.host.book(lease.id, count):
+        return
+    host = core.host
+    raise Refused(
+        "host_ram_insufficient",
+        f"{count} bytes of host RAM are asked for; of a budget of {host.budget_bytes} {host.used_bytes()} are booked",
+        "release without parking, or raise host.park_budget_bytes",
+        needed_bytes=count,
+        budget_bytes=host.budget_bytes,
+        booked_bytes=host.used_bytes(),
+    )
+
+
+def let_go(
+    core: Core,
+    lease: Lease,
+    *,
+    exiting: bool,
+    why: str,
+    comes_back: bool = False,
+    parks: bool = False,
+) -> None:
+    """From any resident state to verification. Uses that others left on it end with it."""
+    gpu = core.gpu_of(lease)
+    end_uses(core, lease, why)
+    before = lease.state
+    lease.exiting = exiting
+    growth.abandon(core, lease, "it let go")
+    lease.comes_back = comes_back
+    lease.parks = parks
+    if not parks:
+        core.host.drop(lease.id)
+    lease.move(LeaseState.VERIFYING, core.now, why)
+    core.timers.clear(("ttl", lease.id))
+    if lease.eviction is not None:
+        lease.eviction.unloading_at = lease.eviction.unloading_at or core.now
+        lease.eviction.released_at = core.now
+        core.learn(lease.spec.consumer, "unload_s", core.now - lease.eviction.unloading_at)
+    begin_for_lease(core, gpu, lease, alive=True)
+    eviction.part(core, gpu, lease)
+    lease.said_ready = False
+    core.record_lease(lease)
+    core.note("released", lease, exiting=exiting, was=str(before), reason=why)
+    core.wake(gpu)
+
+
+def oom(core: Core, event: OomReported) -> None:
+    """An allocation failed. If the holder asked for more than it was granted, its footprint was wrong: learn it."""
+    lease = own_lease(core, event.client, event.lease, event.token)
+    if lease.gpu is None:
+        raise bad_state(lease, "it holds nothing")
+    gpu = core.gpu_of(lease)
+    charge = gpu.ledger.charge_bytes(lease.id)
+    allocated = charge if event.allocated_bytes is None else event.allocated_bytes
+    wanted = min(allocated + event.requested_bytes, gpu.ledger.budget_bytes)
+    learnt = wanted > charge
+    if learnt:
+        core.footprints.out_of_memory(drift.model_name(lease.spec), wanted)
+    core.want_sample(gpu, core.now)
+    core.reply(event.client, event.request, {"learnt_load_peak_bytes": wanted if learnt else None})
+    core.note(
+        "oom",
+        lease,
+        requested_bytes=event.requested_bytes,
+        allocated_bytes=event.allocated_bytes,
+        charge_bytes=charge,
+        learnt_load_peak_bytes=wanted if learnt else None,
+        reason="it needs more than it declared"
+        if learnt
+        else "somebody else holds what was granted to it",
+    )

@@ -1,0 +1,168 @@
+"""Connections and processes that come and go, and a journal that fails.
+
+Leases belong to processes: a connection that drops loses nothing that is resident (its process re-attaches or the ttl runs
+out); `bye` gives everything back; death ends everything, and what was held is measured away before anyone else gets it.
+"""
+
+from dataclasses import replace
+
+from vram_arbiter.arbiter.core.events import BYE, ClientConnected, ClientLeft, JournalFailed
+from vram_arbiter.arbiter.core.features import families, standby
+from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.state import Client, Core, Refused
+from vram_arbiter.arbiter.core.requests.expiry import lose
+from vram_arbiter.arbiter.core.requests.recovery import account_for
+from vram_arbiter.arbiter.core.requests.requests import cancel_waiter, let_go
+from vram_arbiter.arbiter.core.requests.uses import end_use
+from vram_arbiter.arbiter.core.verification.measure import begin_for_residue, bereave
+from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey
+
+
+def on_connected(core: Core, event: ClientConnected) -> None:
+    """A hello. The same instance on a new connection is the same client: its leases, waits and uses are the new connection's."""
+    if event.client in core.clients:
+        _forget(core, core.clients[event.client])
+    instance = (event.process, event.instance)
+    earlier = core.instances.get(instance)
+    if earlier is not None:
+        _take_over(core, earlier, event.client)
+    core.join(Client(event.client, event.process, event.name, event.instance, event.uid))
+    core.instances[instance] = event.client
+    core.last_client_at = core.now
+    for gpu in core.gpus.values():
+        if gpu.sample is None or core.now - gpu.sample.taken_at > core.settings.sample_max_age_s:
+            core.want_sample(gpu, core.now - core.settings.sample_max_age_s)
+
+
+def _take_over(core: Core, earlier: ClientId, client: ClientId) -> None:
+    """However often somebody reconnects, only its newest connection is remembered."""
+    core.part(earlier)
+    mine = core.leases_of_client(earlier)
+    for lease in _concerned(core, mine):
+        for table in (lease.uses, lease.yielded):
+            for key, use in table.items():
+                if use.client == earlier:
+                    table[key] = replace(use, client=client)
+    for lease in mine:
+        core.hand_to(lease, client)
+
+
+def _forget(core: Core, client: Client) -> None:
+    core.part(client.id)
+    core.instances.pop((client.process, client.instance), None)
+
+
+def on_left(core: Core, event: ClientLeft) -> None:
+    """Queued leases and uses of the connection end. Resident leases end with a `bye` only."""
+    client = core.clients.get(event.client)
+    if client is None:
+        return
+    _forget(core, client)
+    core.last_client_at = core.now
+    for lease in _concerned(core, core.leases_of_client(event.client)):
+        for use in [use for use in lease.all_uses() if use.client == event.client]:
+            end_use(core, lease, use, f"its client left: {event.reason}")
+        if lease.client != event.client or lease.process != client.process:
+            continue
+        if lease.state is LeaseState.QUEUED:
+            cancel_waiter(core, lease, f"its client left: {event.reason}")
+        elif lease.state in AWAY:
+            standby.give_up(
+                core, lease, LeaseState.CANCELLED, "cancelled", f"its client left: {event.reason}"
+            )
+        elif lease.state is LeaseState.VERIFYING:
+            standby.renounce(core, lease)
+        elif lease.state in EXPIRING and event.reason == BYE:
+            let_go(core, lease, exiting=False, why="its client said bye")
+
+
+def concerns(core: Core, client: ClientId) -> bool:
+    """Whether a live lease, a request or a use is this client's: then losing its connection ends nothing."""
+    if core.count_of_client(client):
+        return True
+    return any(use.client == client for lease in _concerned(core, []) for use in lease.all_uses())
+
+
+def _concerned(core: Core, own: list[Lease]) -> list[Lease]:
+    """Somebody's own leases, and all that are in use, perhaps by him, in the order of their arrival."""
+    used = (
+        lease
+        for gpu in core.gpus.values()
+        for lease in gpu.in_state(LeaseState.HELD, LeaseState.REVOKING)
+        if lease.uses or lease.yielded
+    )
+    return sorted(
+        {lease.id: lease for lease in (*own, *used)}.values(), key=lambda lease: lease.arrival
+    )
+
+
+def on_died(core: Core, process: ProcessKey) -> None:
+    """Everything of a process ends. Its bytes become debts, measured gone before they count as free."""
+    core.refusals.pop(process, None)
+    gone = [client for client in core.clients.values() if client.process == process]
+    for client in gone:
+        _forget(core, client)
+    if gone:
+        core.last_client_at = core.now
+    for gpu in core.gpus.values():
+        account = gpu.ledger.accounts.get(process)
+        if account is None:
+            continue
+        gpu.ledger.bury(process)
+        for verification in gpu.verifications.values():
+            if verification.process == process:
+                bereave(core, gpu, verification)
+        if not account.charges and f"residue:{process}" not in gpu.verifications:
+            begin_for_residue(core, gpu, process)
+    for lease in _concerned(core, core.leases_of(process)):
+        for use in [use for use in lease.all_uses() if use.process == process]:
+            end_use(core, lease, use, "its process died")
+        if lease.process == process:
+            _bereave(core, lease)
+
+
+def _bereave(core: Core, lease: Lease) -> None:
+    account_for(core, lease.id)
+    if lease.state is LeaseState.QUEUED:
+        cancel_waiter(core, lease, "its process died")
+    elif lease.state in AWAY:
+        standby.give_up(core, lease, LeaseState.LOST, "lease_lost", "its process died")
+    elif lease.state in EXPIRING:
+        message = f"{lease.id}: process {lease.process.pid} died"
+        core.note("lost", lease, reason=message)
+        error = {"code": "lease_lost", "message": message, "hint": "acquire again", "details": {}}
+        lose(core, lease, LeaseState.LOST, error, alive=False)
+    else:  # a lease under verification goes on: only its residue is no longer expected
+        standby.renounce(core, lease)
+
+
+def on_journal_failed(core: Core, event: JournalFailed) -> None:
+    """A grant that could not be written was not sent: it is taken back. The executor refuses the request whose
+    reply it held back; a waiter that was to hear by push is denied here.
+
+    Other records only make a later recovery more careful; they are worth a note.
+    """
+    core.note("journal_failed", key=event.key, reason=event.reason)
+    lease = core.leases.get(LeaseId(event.key.removeprefix("lease:")))
+    if (
+        not event.gates
+        or lease is None
+        or lease.state is not LeaseState.LOADING
+        or lease.estate is not None
+    ):
+        return  # with an estate, a sub-lease was carved out of it: its own grant was written and heard of long ago
+    gpu = core.gpu_of(lease)
+    gpu.ledger.withdraw(lease.id, core.now)
+    families.gone(core, gpu, lease.id, lease.process)
+    core.forget(event.key)
+    refused = Refused(
+        "journal_unavailable",
+        f"the grant of {lease.id} could not be written: {event.reason}",
+        "look at the daemon's log and its disk",
+        key=event.key,
+    )
+    lease.move(LeaseState.DENIED, core.now, refused.message)
+    if lease.request is None:  # else: whoever held the reply back has refused the request
+        core.push(lease, {"push": "denied", "lease_id": lease.id, "error": refused.wire()})
+    core.note("denied", lease, code=refused.code, reason=refused.message)
+    core.end(lease, refused.wire())

@@ -1,0 +1,1 @@
+"""Queue, admission, victims, backfill, placement, deadlock."""

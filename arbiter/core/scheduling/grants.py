@@ -1,0 +1,226 @@
+"""Who gets a card next: one pass over the cards that changed.
+
+Per card, in this order (the numbers stand in `_serve`):
+  1. under pressure: ask idle holders to leave, grant nothing
+  2. a gang loads here: its next member; blocked (recovering, drained, reading unknown, a load under way): grant nothing, ask nobody
+  3. nobody waits: whoever is on standby and fits may come back, asking nobody to leave
+  4. the head is one of a gang: all of it or nothing, on all its cards (`gangs`); nobody passes it
+  5. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a head for which another card is
+     being emptied is passed over from here on
+  6. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out already
+  7. backfill: the first waiter behind the head that fits, evicts nobody and cannot delay the head; behind one that waits for bytes
+     nobody can be asked for (a stowaway's), only who fits beside it on the day that they are gone, and may be asked itself
+"""
+
+from collections.abc import Mapping
+
+from vram_arbiter.arbiter.core.eviction import eviction
+from vram_arbiter.arbiter.core.features import families, gangs, growth, standby
+from vram_arbiter.arbiter.core.learning import costs
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
+from vram_arbiter.arbiter.core.model.state import Core, Gpu
+from vram_arbiter.arbiter.core.report import explain
+from vram_arbiter.arbiter.core.scheduling import policy
+from vram_arbiter.arbiter.core.verification.readings import note_pressure
+from vram_arbiter.schemas.ids import LeaseId
+
+
+def schedule(core: Core) -> None:
+    """Serve every card that changed. A grant on one card may free a waiter's place on another, so until nothing is dirty."""
+    pending = True
+    while pending:
+        pending = False
+        for gpu in core.gpus.values():
+            if gpu.dirty:
+                gpu.dirty = False
+                pending = True
+                _serve(core, gpu)
+
+
+def _serve(core: Core, gpu: Gpu) -> None:
+    note_pressure(core, gpu)
+    gpu.blocked = policy.blocked(core, gpu)
+    if gpu.pressed and core.recovering is None:  # 1
+        _relieve(core, gpu)
+        return
+    if gpu.gang is not None:  # 2
+        member = gangs.next_load(core, gpu, gpu.gang) if core.recovering is None else None
+        if member is not None:
+            grant(core, gpu, member)
+        return
+    if gpu.blocked:  # 2
+        return
+    if gpu.queue.head() is None:  # 3
+        back = standby.next_back(core, gpu)
+        if back is not None:
+            _grant_if_measured(core, gpu, back)
+        return
+    head = policy.front(core, gpu)
+    if head is None:
+        return
+    if head.gang is not None:  # 4
+        gangs.serve(core, gpu, head.gang)
+        return
+    if policy.fits(gpu, head):  # 5
+        _grant_if_measured(core, gpu, head)
+        return
+    leaving = policy.leaving(gpu)
+    planned = policy.fits(gpu, head, leaving)
+    if planned:
+        head.reason = "room is being made"
+    elif _ask_victims(core, gpu, head, leaving):  # 6
+        leaving, planned = policy.leaving(gpu), True
+    _backfill(core, gpu, head, leaving, planned=planned)  # 7
+
+
+def _relieve(core: Core, gpu: Gpu) -> None:
+    leaving = policy.leaving(gpu)
+    over = gpu.ledger.total_if(leaving) - gpu.ledger.budget_bytes
+    if over <= 0:
+        return
+    for victim in policy.choose_relief(core, gpu, leaving, over):
+        eviction.ask(core, gpu, victim, None, "the card holds more than its budget")
+    policy.wake_when_evictable(core, gpu, None)
+
+
+def _grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> None:
+    room = policy.measured_room_bytes(core, gpu)
+    need = policy.measured_need_bytes(gpu, lease)
+    if room is None or (room < need and policy.sample_is_behind(gpu)):
+        lease.reason = "waits for a fresh reading of the card"
+        core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
+        return
+    if room < need:
+        lease.reason = "the ledger has room, the card does not: measured memory is not free yet"
+        gpu.blocked = lease.reason
+        return
+    grant(core, gpu, lease)
+
+
+def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int]) -> bool:
+    if policy.residue_under_measurement(gpu):
+        head.reason = "a dead process's memory is being measured"
+        return False
+    plan = policy.choose_victims(core, gpu, head, leaving)
+    if plan is None:
+        head.reason = "nobody who could make room may be asked now"
+        policy.wake_when_evictable(core, gpu, head)
+        return False
+    if len(head.gpus) > 1 and not policy.is_best_place(core, gpu, head, plan):
+        return False
+    head.planned_gpu = gpu.info.id
+    head.reason = "room is being made"
+    for victim in plan:
+        eviction.ask(core, gpu, victim, head, f"{head.spec.consumer} needs the room")
+    for gpu_id in head.gpus:
+        core.wake(core.gpus[gpu_id])  # those behind it there are no longer behind it
+    return True
+
+
+def _backfill(
+    core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int], *, planned: bool
+) -> None:
+    if len(gpu.queue) < 2 or head.spec.exclusive or not core.settings.scheduling.backfill:
+        return
+    fold = policy.largest_fold_bytes(gpu)
+    smallest, free = (
+        gpu.queue.smallest_need_bytes() - fold,
+        gpu.ledger.budget_bytes - gpu.ledger.total_bytes(),
+    )
+    if smallest > free:
+        return
+    if policy.room_is_coming(gpu):
+        return  # the head's room is about to come; a load now would only be in its way
+    if planned:
+        spare, stuck = policy.spare_beside_bytes(gpu, head, leaving), False
+    else:
+        spare, stuck = policy.spare_unplanned_bytes(
+            gpu, head, leaving, lambda lease: policy.passed(gpu, lease, head)
+        )
+        if stuck and policy.residue_under_measurement(gpu):
+            return
+    if smallest > spare:
+        return
+    most = min(free, spare) + fold
+    alone = not gpu.ledger.leases()
+    for lease in gpu.queue.behind_head():
+        if lease.load_peak_bytes > most or (lease.spec.exclusive and not alone):
+            continue  # seen at a glance: thousands may wait
+        if lease is head or lease.gang is not None or (stuck and not _may_be_asked(core, lease)):
+            continue
+        if policy.added_bytes(gpu, lease) <= spare and policy.fits(gpu, lease):
+            _grant_if_measured(core, gpu, lease)
+            return
+
+
+def _may_be_asked(core: Core, lease: Lease) -> bool:
+    """Could it be asked to leave once it is resident? If a stowaway gives back a part, the head may need what this one took."""
+    return (lease if lease.grows is None else core.leases[lease.grows]).evictable
+
+
+def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
+    """Give the lease its card and its token. The record goes to the journal before the holder hears of it."""
+    if lease.grows is not None:
+        _collect_evictions(core, gpu, lease)
+        growth.merge(core, gpu, lease)
+        return
+    core.dequeue(lease)
+    by_itself = standby.taken_back(core, lease)
+    token = core.next_token()
+    lease.token = token
+    lease.gpu = gpu.info.id
+    lease.move(LeaseState.LOADING, core.now, "came back by itself" if by_itself else "granted")
+    lease.granted_at = lease.held_from = core.now
+    lease.reason = ""
+    gpu.residents[lease.id] = lease
+    families.claim(core, gpu, lease.process)
+    gpu.ledger.charge(
+        lease.id, lease.process, lease.load_peak_bytes, lease.load_peak_bytes, core.now
+    )
+    gpu.changed_at = core.now
+    core.granted.append((token, gpu.info.id))
+    _collect_evictions(core, gpu, lease)
+    lease.expires_at = core.now + lease.spec.ttl_s
+    core.timers.set(("ttl", lease.id), lease.expires_at)
+    core.record_lease(lease, gates=True)
+    if lease.answered:
+        core.push(lease, {"push": "granted", "lease": explain.view(core, lease)})
+        lease.request = None
+    else:
+        assert lease.request is not None, f"{lease.id} was never asked for"
+        core.reply(
+            lease.client, lease.request, {"state": "loading", "lease": explain.view(core, lease)}
+        )
+        lease.answered = True
+    core.note(
+        "granted",
+        lease,
+        charge_bytes=lease.load_peak_bytes,
+        waited_ms=(core.now - lease.arrived_at) * 1e3,
+        evicted=[e.consumer for e in lease.evicted],
+        **({"by_itself": True} if by_itself else {}),
+        reason=_why_now(lease, by_itself=by_itself),
+    )
+    gpu.blocked = policy.blocked(core, gpu)
+
+
+def _why_now(lease: Lease, *, by_itself: bool) -> str:
+    if by_itself:
+        return "back from standby: there is room and nobody waits"
+    if lease.evicted:
+        return "fits after " + ", ".join(e.consumer for e in lease.evicted) + " left"
+    return "fits"
+
+
+def _collect_evictions(core: Core, gpu: Gpu, lease: Lease) -> None:
+    """Who left for this lease, or for a waiter that has gone since; the rest stays on the card's list."""
+    mine = [
+        e
+        for e in gpu.evictions
+        if e.wanted_by == lease.id
+        or (e.verdict and (e.wanted_by is None or e.wanted_by not in core.waiting))
+    ]
+    lease.evicted = [e for e in mine if e.verdict]
+    gpu.evictions = [e for e in gpu.evictions if e not in mine]
+    for gone in lease.evicted:
+        costs.switched(core, gone.consumer, lease.spec.consumer)

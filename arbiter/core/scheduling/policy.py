@@ -1,0 +1,521 @@
+"""Pure decisions about one card: does it fit, is the measurement willing, who should leave, who may pass the head.
+
+Nothing here changes anything but when a card is looked at again (`wake_when_evictable`, `is_best_place`).
+"""
+
+from bisect import bisect_left
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import combinations
+
+from vram_arbiter.arbiter.core.learning import costs
+from vram_arbiter.arbiter.core.ledger.ledger import NOTHING, process_bytes
+from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.state import Core, Gpu
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+
+EXACT_SEARCH_MAX = 12  # candidates; beyond that the search is greedy
+_WAKE_SLACK_S = (
+    0.001  # so that a wake-up for an ageing step does not come a rounding error too early
+)
+
+MISSING_NAMED = 3
+_LEAVING = (LeaseState.REVOKING, LeaseState.UNLOADING, LeaseState.VERIFYING)  # in a fixed order
+
+type _Covers = Callable[[Mapping[LeaseId, int]], bool]
+type _Choice = Callable[[Core, Sequence[Lease], _Covers, Mapping[LeaseId, int]], list[Lease]]
+
+
+# -- fits ------------------------------------------------------------------------------------------------------------
+def blocked(core: Core, gpu: Gpu) -> str:
+    """Why nothing can be granted on this card now, whoever asks; "" if grants are possible."""
+    if core.recovering is not None:
+        return f"recovering after a restart: {_missing(core, core.recovering)} must come back first"
+    if core.drain is not None:
+        return f"drained by {core.drain}"
+    if gpu.failed_at is not None:
+        return f"the card cannot be read: {gpu.failure}"
+    if gpu.sample is None:
+        return "the card has not been read yet"
+    if loading := gpu.in_state(LeaseState.LOADING):
+        return f"{loading[0].spec.consumer} is loading"
+    if gpu.gang is not None:
+        return f"gang {gpu.gang.name} is loading"
+    if gpu.pressed:
+        return f"pressure: {gpu.ledger.pressure_bytes()} bytes more than the budget are held"
+    return ""
+
+
+def _missing(core: Core, missing: Collection[LeaseId]) -> str:
+    """Who has not come back since a restart, by name. They live: whoever died meanwhile was lost at once."""
+    holders = [core.leases[lease_id] for lease_id in sorted(missing) if lease_id in core.leases]
+    if not holders:
+        return "holders that the journal may not name"
+    names = ", ".join(
+        f"{lease.spec.consumer} (pid {lease.process.pid})" for lease in holders[:MISSING_NAMED]
+    )
+    return (
+        names
+        if len(holders) <= MISSING_NAMED
+        else f"{names} and {len(holders) - MISSING_NAMED} more"
+    )
+
+
+def leaving(gpu: Gpu) -> dict[LeaseId, int]:
+    """Leases whose bytes are on their way back, with the residue each leaves. Those that outstayed a deadline do not count."""
+    going: dict[LeaseId, int] = {}
+    for lease in gpu.in_state(*_LEAVING):
+        if lease.parent is not None and lease.parent.state not in LEAVING:
+            continue  # its bytes are its parent's again
+        verification = gpu.verifications.get(lease.id)
+        overdue = lease.hangs or bool(lease.eviction and lease.eviction.overdue)
+        late = verification.overdue if verification else overdue
+        if not late:
+            going[lease.id] = lease.residue_bytes
+    staying = [parent for parent in gpu.estates.values() if parent.state not in LEAVING]
+    for verification in gpu.verifications.values():  # debts
+        if (
+            verification.lease is not None
+            and verification.lease not in gpu.residents
+            and not verification.overdue
+            and not any(
+                parent.estate and verification.lease in parent.estate.shares for parent in staying
+            )
+        ):
+            going[verification.lease] = verification.kept_bytes
+    return going
+
+
+def room_is_coming(gpu: Gpu) -> bool:
+    """Does anybody unload, or is anybody measured, who is not late with it?"""
+    for lease in gpu.in_state(LeaseState.UNLOADING, LeaseState.VERIFYING):
+        verification = gpu.verifications.get(lease.id)
+        if not (verification.overdue if verification else lease.hangs):
+            return True
+    return False
+
+
+def residue_under_measurement(gpu: Gpu) -> bool:
+    """A dead process's residue may come back any moment: nobody is asked to leave meanwhile."""
+    return any(v.lease is None and not v.overdue for v in gpu.verifications.values())
+
+
+def joining(lease: Lease) -> Mapping[ProcessKey, int]:
+    """What a grant charges, by process: one lease's load peak, or what a gang's members on one card need together."""
+    return {lease.process: lease.load_peak_bytes} if lease.needs is None else lease.needs
+
+
+def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool:
+    """Would the ledger hold this waiter at its load peak, once these leases are gone?"""
+    if lease.spec.exclusive:
+        if any(other not in going for other in gpu.ledger.leases()):
+            return False
+    elif gpu.residents.exclusive and any(
+        other not in going and other != lease.grows for other in gpu.residents.exclusive
+    ):
+        return False
+    elif gpu.verifications and any(
+        v.exclusive and v.lease not in going for v in gpu.verifications.values()
+    ):
+        return (
+            False  # it died or expired, and still has the card to itself until it is measured gone
+        )
+    return gpu.ledger.total_if(going, joining(lease)) <= gpu.ledger.budget_bytes
+
+
+def largest_growth_bytes(gpu: Gpu, lease: Lease) -> int:
+    """The most that a resident lease could ever get on top, once every other lease has ended."""
+    going = {other.id: 0 for other in gpu.residents.values() if other is not lease}
+    return gpu.ledger.budget_bytes - gpu.ledger.total_if(going)
+
+
+def added_bytes(gpu: Gpu, lease: Lease) -> int:
+    """What a grant would add to the ledger: the load peak less the residue it is folded with."""
+    return gpu.ledger.total_if(joining=joining(lease)) - gpu.ledger.total_bytes()
+
+
+def largest_fold_bytes(gpu: Gpu) -> int:
+    """The most that any waiter's need may shrink by what its process already holds here."""
+    ledger = gpu.ledger
+    folded = [
+        account.residue_bytes + account.measured_bytes for account in ledger.accounts.values()
+    ]
+    return max(
+        [*folded, *(stranger.used_bytes for stranger in ledger.strangers.values())], default=0
+    )
+
+
+def placed_elsewhere(core: Core, gpu: Gpu, lease: Lease) -> bool:
+    """Is another card being emptied for this waiter? Then it is nobody's head here, unless it fits as it is.
+
+    Not once a holder there has outstayed the deadline, or has left and it was not enough.
+    """
+    there = lease.planned_gpu
+    if there is None or there == gpu.info.id:
+        return False
+    return any(
+        e.wanted_by == lease.id and not e.verdict and not e.overdue
+        for e in core.gpus[there].evictions
+    )
+
+
+def front(core: Core, gpu: Gpu) -> Lease | None:
+    """Whose turn it is here: the head's, or of the first behind it for whom no other card is being emptied."""
+    head = gpu.queue.head()
+    if head is None or not placed_elsewhere(core, gpu, head) or fits(gpu, head):
+        return head
+    return next((lease for lease in gpu.queue if not placed_elsewhere(core, gpu, lease)), None)
+
+
+# -- the measurement ---------------------------------------------------------------------------------------------------
+def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
+    """Free bytes by the newest reading, less the leases that it cannot have seen. None: no reading young enough.
+
+    A lease that became ready since counts with its load peak: what it freed at the end of its load may not be back yet.
+    """
+    sample = gpu.sample
+    if (
+        sample is None
+        or gpu.failed_at is not None
+        or core.now - sample.taken_at > core.settings.sample_max_age_s
+    ):
+        return None
+    if any(
+        debt.confirmed_at > sample.taken_at and not debt.baseline_comparable
+        for debt in gpu.verifications.values()
+        if debt.lease not in gpu.residents
+    ):
+        return None  # who came and died since may still be on the card, with its load peak
+    unseen = sum(
+        max(gpu.ledger.charge_bytes(lease.id), lease.load_peak_bytes)
+        for lease in gpu.residents.unseen(sample.taken_at)
+    )
+    return min(gpu.info.capacity_bytes, sample.total_bytes) - sample.used_bytes - unseen
+
+
+def measured_need_bytes(gpu: Gpu, lease: Lease) -> int:
+    """What the reading must have free: what a grant charges, less what the processes already hold (their contexts)."""
+    if lease.needs is None:
+        return _unheld_bytes(gpu, lease.process, lease.load_peak_bytes)
+    return sum(_unheld_bytes(gpu, process, count) for process, count in lease.needs.items())
+
+
+def _unheld_bytes(gpu: Gpu, process: ProcessKey, count: int) -> int:
+    account = gpu.ledger.accounts.get(process)
+    if account is not None and any(lease not in gpu.ledger.reserved for lease in account.charges):
+        return count  # what it holds is of leases; bytes that are kept for a gang's members nobody holds
+    own = None if gpu.sample is None else process_bytes(gpu.sample, process)
+    if own is None:
+        own = account.residue_bytes if account is not None else 0
+    return max(0, count - own)
+
+
+def sample_is_behind(gpu: Gpu) -> bool:
+    """Something was granted, became ready or came back since the newest reading began."""
+    return gpu.sample is None or gpu.sample.taken_at < gpu.changed_at
+
+
+# -- victims -----------------------------------------------------------------------------------------------------------
+def choose_victims(
+    core: Core, gpu: Gpu, waiter: Lease, going: Mapping[LeaseId, int], at: float | None = None
+) -> list[Lease] | None:
+    """The cheapest holders whose leaving lets the waiter in. None: nobody may be asked now, or it would not help.
+
+    Idle holders may be asked by anyone once they have had their minimum residency, holders in use only by a waiter of
+    at least their priority (they finish first). If a set with fewer holders in use is only a residency away, it is waited for.
+    `at`: as it will be then, if nothing else changes (default: now).
+    """
+    at = core.now if at is None else at
+    priority = waiter.priority_at(at, core.settings.ageing_s_per_point)
+    willing = [
+        lease
+        for lease in gpu.in_state(LeaseState.HELD)
+        if may_ask(lease)
+        and lease.id != waiter.grows
+        and (not lease.in_use or lease.spec.priority <= priority)
+    ]
+    search = _oldest if core.settings.scheduling.least_recent else _search
+    ripe = [lease for lease in willing if residency_ends_at(core, lease, waiter) <= at]
+    now = _cheapest(core, gpu, waiter, going, ripe, search)
+    if now is not None and not _in_use(now):
+        return now
+    later = _cheapest(core, gpu, waiter, going, willing, search)
+    if now is None or later is None or _in_use(later) < _in_use(now):
+        return None
+    return now
+
+
+def choose_relief(
+    core: Core, gpu: Gpu, going: Mapping[LeaseId, int], over_bytes: int
+) -> list[Lease]:
+    """Idle holders to ask while the card is under pressure: the cheapest that cover it, or all of them."""
+    idle = [
+        lease
+        for lease in gpu.in_state(LeaseState.HELD)
+        if may_ask(lease) and not lease.in_use and residency_ends_at(core, lease, None) <= core.now
+    ]
+    ledger = gpu.ledger
+    total = ledger.total_if(going)
+
+    def covers(more: Mapping[LeaseId, int]) -> bool:
+        return total - ledger.total_if({**going, **more}) >= over_bytes
+
+    return _search(core, idle, covers, _freed(gpu, going, idle)) if covers(_leave(idle)) else idle
+
+
+def may_ask(lease: Lease) -> bool:
+    """Of a tree only the root is asked, and not while any of it loads. Nor is anybody of whom nothing was heard since a restart: who uses
+    it may be on the way back."""
+    if lease.gang is not None:
+        return False  # not before all of it is held
+    if lease.estate is None:
+        return lease.evictable and lease.parent is None and lease.attached
+    settled = all(
+        member.state is not LeaseState.LOADING and member.attached for member in lease.tree()
+    )
+    return lease.may_leave and lease.parent is None and settled
+
+
+def residency_ends_at(core: Core, lease: Lease, waiter: Lease | None) -> float:
+    """Until when a holder is not asked to leave for this waiter (or for relief).
+
+    Who came back by itself and was not used since has no claim to stay: its return must cost nobody time. Two that keep throwing each
+    other out stay longer, by what a switch of theirs costs.
+    """
+    if lease.uncalled:
+        return lease.ready_at
+    held_s = 0.0 if waiter is None else costs.hold_s(core, lease, waiter)
+    return lease.ready_at + max(lease.spec.min_residency_s, held_s)
+
+
+def wake_when_evictable(core: Core, gpu: Gpu, waiter: Lease | None) -> None:
+    """Look again when a residency ends or the waiter has aged enough to ask somebody in use."""
+    later = ask_times(core, gpu, waiter)
+    if later:
+        core.timers.set(("plan", gpu.info.id), min(later))
+
+
+def ask_times(core: Core, gpu: Gpu, waiter: Lease | None) -> list[float]:
+    """Instants to come at which somebody may be asked who may not be asked now."""
+    ageing_s = core.settings.ageing_s_per_point
+    times: list[float] = []
+    for lease in gpu.in_state(LeaseState.HELD):
+        if not may_ask(lease):
+            continue
+        times.append(residency_ends_at(core, lease, waiter))
+        if waiter is not None and lease.in_use:
+            gap = lease.spec.priority - waiter.spec.priority
+            times.append(waiter.arrived_at + gap * ageing_s + _WAKE_SLACK_S)
+    return [at for at in times if at > core.now]
+
+
+def is_best_place(core: Core, gpu: Gpu, waiter: Lease, plan: Sequence[Lease]) -> bool:
+    """Of several cards that a waiter could be placed on, is emptying this one the cheapest? Wakes the better one."""
+    best, best_cost = gpu, _cost(plan, gpu.info.index)
+    for gpu_id in waiter.gpus:
+        other = core.gpus[gpu_id]
+        if other is gpu or other.queue.head() is not waiter:
+            continue
+        going = leaving(other)
+        if (patience_ends_at := _load_ends_by(core, other)) > core.now and fits(
+            other, waiter, going
+        ):
+            core.timers.set(("plan", gpu.info.id), patience_ends_at)
+            return False  # it is the next there, once somebody has loaded
+        if blocked(core, other):
+            continue
+        if fits(other, waiter, going):
+            return False  # room comes there anyway
+        rival = choose_victims(core, other, waiter, going)
+        if rival is not None and _cost(rival, other.info.index) < best_cost:
+            best, best_cost = other, _cost(rival, other.info.index)
+    if best is gpu:
+        return True
+    core.wake(best)
+    return False
+
+
+def _load_ends_by(core: Core, gpu: Gpu) -> float:
+    """Until when a load is waited for, rather than emptying another card, if it is all that keeps this one from granting; else 0."""
+    loading = gpu.in_state(LeaseState.LOADING)
+    if (
+        not loading
+        or gpu.failed_at is not None
+        or gpu.sample is None
+        or gpu.gang is not None
+        or gpu.pressed
+    ):
+        return 0.0
+    return loading[0].granted_at + core.settings.revoke_deadline_s
+
+
+def _cost(plan: Sequence[Lease], index: int) -> tuple[int, int, int, int, int]:
+    return (
+        _in_use(plan),
+        max((lease.spec.priority for lease in plan), default=0),
+        len(plan),
+        sum(lease.steady_bytes for lease in plan),
+        index,
+    )
+
+
+def _in_use(plan: Sequence[Lease]) -> int:
+    return sum(1 for lease in plan if lease.in_use)
+
+
+def _leave(leases: Sequence[Lease]) -> dict[LeaseId, int]:
+    return {member.id: member.residue_bytes for lease in leases for member in lease.tree()}
+
+
+def _freed(
+    gpu: Gpu, going: Mapping[LeaseId, int], candidates: Sequence[Lease]
+) -> dict[LeaseId, int]:
+    total = gpu.ledger.total_if(going)
+    return {
+        lease.id: total - gpu.ledger.total_if({**going, **_leave([lease])}) for lease in candidates
+    }
+
+
+def _cheapest(
+    core: Core,
+    gpu: Gpu,
+    waiter: Lease,
+    going: Mapping[LeaseId, int],
+    candidates: Sequence[Lease],
+    search: _Choice,
+) -> list[Lease] | None:
+    if waiter.spec.exclusive:
+        must = list(candidates)
+    else:
+        must = [lease for lease in candidates if lease.spec.exclusive]
+    base = {**going, **_leave(must)}
+    if fits(gpu, waiter, base):
+        return must
+    rest = [lease for lease in candidates if lease.id not in base]
+
+    def covers(more: Mapping[LeaseId, int]) -> bool:
+        return fits(gpu, waiter, {**base, **more})
+
+    if not rest or not covers(_leave(rest)):
+        return None
+    return must + search(core, rest, covers, _freed(gpu, base, rest))
+
+
+def _search(
+    core: Core, candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]
+) -> list[Lease]:
+    """Cheapest covering set; all candidates together do cover. Fewest in use, then lowest priority, fewest; of those alike the ones that
+    can park, that cost the least to reload as far as that is likely, the least bytes, LRU."""
+    if len(candidates) > EXACT_SEARCH_MAX:
+        return _greedy(core, candidates, covers, freed)
+    idle = [lease for lease in candidates if not lease.in_use]
+    busy = [lease for lease in candidates if lease.in_use]
+    count = next(
+        k
+        for k in range(len(busy) + 1)
+        if any(covers(_leave([*idle, *some])) for some in combinations(busy, k))
+    )
+    groups = (
+        [
+            [*some, *others]
+            for some in combinations(lively, count)
+            for others in combinations(calm, size)
+        ]
+        for ceiling in sorted({lease.spec.priority for lease in candidates})
+        for calm in [[lease for lease in idle if lease.spec.priority <= ceiling]]
+        for lively in [[lease for lease in busy if lease.spec.priority <= ceiling]]
+        for size in range(len(calm) + 1)
+    )
+    found = next(
+        found for group in groups if (found := [plan for plan in group if covers(_leave(plan))])
+    )
+    return min(found, key=lambda plan: _fineness(core, plan, freed))
+
+
+def _oldest(
+    core: Core, candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]
+) -> list[Lease]:
+    """Idle ones first, then least recent use alone, until it is enough; all candidates together are."""
+    order = sorted(
+        candidates,
+        key=lambda lease: (lease.in_use, not freed[lease.id], lease.last_used_at, lease.arrival),
+    )
+    return order[: next(n for n in range(1, len(order) + 1) if covers(_leave(order[:n])))]
+
+
+def _fineness(
+    core: Core, plan: Sequence[Lease], freed: Mapping[LeaseId, int]
+) -> tuple[int, float, int, float, tuple[int, ...]]:
+    return (
+        sum(1 for lease in plan if not costs.can_park(core, lease)),
+        sum(costs.reload_s(core, lease) for lease in plan),
+        sum(freed[lease.id] for lease in plan),
+        max(lease.last_used_at for lease in plan),
+        tuple(lease.arrival for lease in plan),
+    )
+
+
+def _greedy(
+    core: Core, candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]
+) -> list[Lease]:
+    """Cheap classes first, the largest of a class first; then give back whoever turns out not to be needed."""
+    order = sorted(
+        candidates,
+        key=lambda lease: (
+            lease.in_use,
+            lease.spec.priority,
+            not costs.can_park(core, lease),
+            -freed[lease.id],
+            lease.last_used_at,
+            lease.arrival,
+        ),
+    )
+    size = 1 + bisect_left(range(1, len(order)), True, key=lambda n: covers(_leave(order[:n])))
+    plan = order[:size]
+    for lease in reversed(list(plan)):
+        without = [other for other in plan if other is not lease]
+        if covers(_leave(without)):
+            plan = without
+    return plan
+
+
+def spare_beside_bytes(gpu: Gpu, head: Lease, freed: Mapping[LeaseId, int]) -> int:
+    """How much a waiter behind the head may take and stay without delaying it, when these leases leave for it and that is enough."""
+    return gpu.ledger.budget_bytes - gpu.ledger.total_if(freed, joining(head))
+
+
+def spare_unplanned_bytes(
+    gpu: Gpu, head: Lease, going: Mapping[LeaseId, int], stays: Callable[[Lease], bool]
+) -> tuple[int, bool]:
+    """The same for a head that nothing is planned for; and: does it wait for bytes that nobody can be asked for?
+
+    Everything could leave some day, but for those that took their room while this one stood before them (`stays`). If it would not fit
+    even then, it is served when stowaways go; and if that is not enough either, when processes end that keep a residue. Only what is left
+    beside it on that day may be taken today.
+    """
+    ledger, joins = gpu.ledger, joining(head)
+    everything = _ever_freed(gpu, head, going, None)
+    day = ledger.total_if(everything, joins)
+    stay_bytes = ledger.total_if(_ever_freed(gpu, head, going, stays), joins) - day
+    stuck = day > ledger.budget_bytes
+    if day > ledger.budget_bytes:
+        day = ledger.total_if(everything, joins, stowaways=False)
+    if day > ledger.budget_bytes:
+        day = sum(joins.values())
+    return ledger.budget_bytes - day - stay_bytes, stuck
+
+
+def passed(gpu: Gpu, lease: Lease, head: Lease) -> bool:
+    """Was it granted, or did it grow, while this waiter stood before it?"""
+    overtook = lease.granted_at >= head.arrived_at and gpu.queue.precedes(head, lease)
+    return overtook or bool(lease.resized_at and lease.resized_at >= head.arrived_at)
+
+
+def _ever_freed(
+    gpu: Gpu, head: Lease, going: Mapping[LeaseId, int], stays: Callable[[Lease], bool] | None
+) -> dict[LeaseId, int]:
+    """All but the lease that it grows, and the trees that stay."""
+    roots = {lease.root.id: lease.root for lease in gpu.residents.values()}
+    leave = [
+        lease for lease in roots.values() if lease.id != head.grows and not (stays and stays(lease))
+    ]
+    return {**_leave(leave), **going}

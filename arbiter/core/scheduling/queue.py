@@ -1,0 +1,82 @@
+"""Order of the waiters of one card.
+
+Effective priority is priority + waited/ageing. Both sides of any comparison age at the same rate, so the order of two
+waiters is fixed when they arrive: `arrival time − priority × ageing` (smaller first), then arrival. That makes the queue a
+sorted list that time never disturbs, bounds every wait, and never reorders equals. Without ageing (0) it is the order of arrival.
+"""
+
+from bisect import bisect_left, bisect_right, insort
+from collections.abc import Iterator
+from itertools import islice
+
+from vram_arbiter.arbiter.core.model.lease import Lease
+from vram_arbiter.schemas.ids import LeaseId
+
+type Rank = tuple[float, int]
+
+
+class WaitQueue:
+    """Sorted waiters; the smallest need is known without looking at all of them."""
+
+    def __init__(self, ageing_s_per_point: float) -> None:
+        self._ageing_s = ageing_s_per_point
+        self._ranks: list[Rank] = []
+        self._leases: dict[int, Lease] = {}  # by arrival
+        self._needs: list[int] = []
+
+    def __len__(self) -> int:
+        return len(self._ranks)
+
+    def __iter__(self) -> Iterator[Lease]:
+        return (self._leases[arrival] for _, arrival in self._ranks)
+
+    def __contains__(self, lease: Lease) -> bool:
+        return lease.arrival in self._leases
+
+    def add(self, lease: Lease) -> None:
+        insort(self._ranks, self.rank(lease))
+        insort(self._needs, lease.load_peak_bytes)
+        self._leases[lease.arrival] = lease
+
+    def discard(self, lease: Lease) -> None:
+        """Take a waiter out; one that is not here is fine."""
+        if lease.arrival not in self._leases:
+            return
+        del self._leases[lease.arrival]
+        del self._ranks[bisect_left(self._ranks, self.rank(lease))]
+        del self._needs[bisect_left(self._needs, lease.load_peak_bytes)]
+
+    def head(self) -> Lease | None:
+        return self._leases[self._ranks[0][1]] if self._ranks else None
+
+    def behind_head(self) -> Iterator[Lease]:
+        for index in range(1, len(self._ranks)):
+            yield self._leases[self._ranks[index][1]]
+
+    def smallest_need_bytes(self) -> int:
+        """Of a queue that is not empty."""
+        return self._needs[0]
+
+    def precedes(self, first: Lease, second: Lease) -> bool:
+        """Is, or was, the one before the other? Neither has to wait still."""
+        return self.rank(first) < self.rank(second)
+
+    def position(self, lease: Lease) -> int:
+        """1 is the head."""
+        return bisect_left(self._ranks, self.rank(lease)) + 1
+
+    def ahead_of(self, lease: Lease) -> LeaseId | None:
+        """Who stands directly before this waiter."""
+        index = self.position(lease) - 2
+        return self._leases[self._ranks[index][1]].id if index >= 0 else None
+
+    def after(self, rank: Rank) -> Iterator[Lease]:
+        """Waiters behind a place in the order, whether or not one stands there now."""
+        first = bisect_right(self._ranks, rank)
+        return (self._leases[arrival] for _, arrival in islice(self._ranks, first, None))
+
+    def rank(self, lease: Lease) -> Rank:
+        """Its place in the order of any queue."""
+        if lease.rank is not None:
+            return (lease.rank, lease.arrival)
+        return (lease.arrived_at - lease.spec.priority * self._ageing_s, lease.arrival)

@@ -1,0 +1,1 @@
+"""Was the memory returned? Schedule, evidence, judge."""

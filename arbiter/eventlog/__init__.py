@@ -1,0 +1,1 @@
+"""The event log: writer, reader, codec, snapshot, replay."""

@@ -1,0 +1,212 @@
+"""Readings of the cards without ever blocking the loop: one thread per card, each reading with a deadline.
+
+A reading that fails or hangs is *unknown*. A thread that hangs cannot be ended, so the card stays unknown and no further reading is
+started until it returns. Requests are merged, except that one that comes after a reading began is answered by a fresh one: a
+verification must never be fed with a reading from before its question. Bytes of children are booked on the ancestor that holds the lease
+(`tree`): ancestors are read in the thread, who holds a lease is asked when the reading is handed on.
+"""
+
+import asyncio
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
+
+from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.arbiter.host.gpu.probe import GpuProbe, Reading
+from vram_arbiter.arbiter.host.process_tree import Known, Lineage, Lineages, on_owners
+from vram_arbiter.schemas.errors import ProbeFailed
+from vram_arbiter.schemas.ids import GpuId, ProcessKey
+
+log = logging.getLogger(__name__)
+
+CLOSE_S = 1.0
+
+
+class Prober:
+    """`sample(gpu)` ends by posting `MemorySampled` or `ProbeFailed`, exactly one for a request or for several merged ones.
+
+    `known(gpu)` is called on the loop's thread.
+    """
+
+    def __init__(
+        self,
+        probe: GpuProbe,
+        gpus: Sequence[GpuId],
+        deadline_s: float,
+        loop: asyncio.AbstractEventLoop,
+        post: Callable[[ev.Event], None],
+        known: Callable[[GpuId], Known],
+    ) -> None:
+        self._probe = probe
+        self._readers = {gpu: _Reader(probe, gpu, deadline_s, loop, post, known) for gpu in gpus}
+
+    def sample(self, gpu: GpuId) -> None:
+        self._readers[gpu].request()
+
+    def close(self) -> None:
+        """Ends the threads. A call that hangs in its driver is not waited for: it dies with the process (daemon threads)."""
+        for reader in self._readers.values():
+            reader.close()
+        closing = threading.Thread(target=self._probe.close, name="probe-close", daemon=True)
+        closing.start()
+        closing.join(CLOSE_S)
+
+
+class _Reader:
+    """One card: idle → reading → idle, or reading → stuck → idle when the hung call returns at last."""
+
+    def __init__(
+        self,
+        probe: GpuProbe,
+        gpu: GpuId,
+        deadline_s: float,
+        loop: asyncio.AbstractEventLoop,
+        post: Callable[[ev.Event], None],
+        known: Callable[[GpuId], Known],
+    ) -> None:
+        self._probe = probe
+        self._gpu = gpu
+        self._deadline_s = deadline_s
+        self._loop = loop
+        self._post = post
+        self._known = known
+        self._lineages = Lineages()  # the thread's
+        self._state: Literal["idle", "reading", "stuck", "closed"] = "idle"
+        self._again = False
+        self._timer: asyncio.TimerHandle | None = None
+        self._began_at = 0.0
+        self._work: queue.SimpleQueue[bool] = queue.SimpleQueue()  # True: read, False: end
+        self._thread: threading.Thread | None = None
+
+    def request(self) -> None:
+        match self._state:
+            case "idle":
+                self._begin()
+            case "reading":
+                self._again = True  # the reading under way began before this question
+            case "stuck":
+                self._again = True
+                if self._timer is None:  # no busy loop of questions and refusals
+                    self._timer = self._loop.call_later(self._deadline_s, self._still_stuck)
+            case "closed":
+                pass
+
+    def close(self) -> None:
+        self._state = "closed"
+        if self._timer is not None:
+            self._timer.cancel()
+        self._work.put(False)
+
+    def _begin(self) -> None:
+        if self._thread is None:
+            self._thread = threading.Thread(
+                target=self._run, name=f"probe-{self._gpu}", daemon=True
+            )
+            self._thread.start()
+        self._state, self._again = "reading", False
+        self._began_at = time.monotonic()
+        self._timer = self._loop.call_later(self._deadline_s, self._expired)
+        self._work.put(True)
+
+    def _expired(self) -> None:
+        self._timer = None
+        self._state = "stuck"
+        log.error(
+            "%s: no answer within %g s; unknown until the reading returns",
+            self._gpu,
+            self._deadline_s,
+        )
+        self._fail(f"no answer within {self._deadline_s:g} s")
+
+    def _still_stuck(self) -> None:
+        self._timer = None
+        self._fail(f"the reading hangs since {time.monotonic() - self._began_at:.1f} s")
+
+    def _fail(self, reason: str) -> None:
+        self._post(ev.ProbeFailed(self._gpu, time.monotonic(), reason))
+
+    def _done(
+        self, taken_at: float, outcome: Reading | str, lineages: Mapping[ProcessKey, Lineage]
+    ) -> None:
+        """Back on the loop's thread. A late answer is not used: it is as old as its question, and a fresh one costs nothing."""
+        if self._state == "closed":
+            return
+        was_stuck = self._state == "stuck"
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._state = "idle"
+        if was_stuck:
+            log.warning(
+                "%s: answers again after %.1f s", self._gpu, time.monotonic() - self._began_at
+            )
+            self._begin()  # whether it answers is known from a fresh reading only
+            return
+        if isinstance(outcome, Reading):
+            processes = outcome.processes
+            if processes is not None:
+                processes = on_owners(processes, lineages, self._known(self._gpu))
+            self._post(
+                ev.MemorySampled(
+                    self._gpu, taken_at, outcome.used_bytes, outcome.total_bytes, processes
+                )
+            )
+        else:
+            self._fail(outcome)
+        if self._again and self._state == "idle":
+            self._begin()  # else whoever handled this answer asked again: that one serves all
+
+    # -- the thread ----------------------------------------------------------------------------------------------
+    def _run(self) -> None:
+        while self._work.get():
+            taken_at = time.monotonic()
+            outcome: Reading | str
+            lineages: Mapping[ProcessKey, Lineage] = {}
+            try:
+                outcome = self._probe.sample(self._gpu)
+                lineages = self._lineages.trace(outcome.processes or ())
+            except ProbeFailed as error:
+                outcome = error.message
+            except Exception as error:  # outermost loop of a thread: a defect is an unknown card
+                log.exception("%s: the probe failed", self._gpu)
+                outcome = f"{type(error).__name__}: {error}"
+            try:
+                self._loop.call_soon_threadsafe(self._done, taken_at, outcome, lineages)
+            except RuntimeError:
+                return  # the loop closed meanwhile
+
+
+async def within[T](deadline_s: float, call: Callable[[], T], what: str) -> T:
+    """Run a blocking call in a thread of its own. Raises what it raises, or ProbeFailed after `deadline_s`."""
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[T] = loop.create_future()
+
+    def deliver(result: T | None, error: BaseException | None) -> None:
+        if future.done():
+            return
+        if error is not None:
+            future.set_exception(error)
+        else:
+            future.set_result(result)  # type: ignore[arg-type]  # no error: there is a result
+
+    def run() -> None:
+        result, failure = None, None
+        try:
+            result = call()
+        except BaseException as error:  # noqa: BLE001 - carried over to the caller
+            failure = error
+        try:
+            loop.call_soon_threadsafe(deliver, result, failure)
+        except RuntimeError:
+            pass  # the loop closed meanwhile
+
+    threading.Thread(target=run, name="probe-start", daemon=True).start()
+    try:
+        return await asyncio.wait_for(future, deadline_s)
+    except TimeoutError as error:
+        raise ProbeFailed(
+            f"{what} gave no answer within {deadline_s:g} s", hint="see dmesg and nvidia-smi"
+        ) from error

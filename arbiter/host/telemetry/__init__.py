@@ -1,0 +1,1 @@
+"""The daemon's log, spans and metrics."""

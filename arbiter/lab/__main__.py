@@ -1,0 +1,198 @@
+"""`python -m vram_arbiter.arbiter.lab`: what `vramctl replay` and `vramctl simulate` start. Parse, call, print.
+
+Exit codes: 0 identical or done, 1 a divergence or an input that cannot be read, 2 wrong usage; 130 Ctrl-C, 141 the reader of the output left.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from vram_arbiter.arbiter.core.scheduling.policies import DEFAULT, SCHEDULING
+from vram_arbiter.arbiter.eventlog import replay as runner
+from vram_arbiter.arbiter.eventlog.codec import to_json
+from vram_arbiter.arbiter.lab import compare, text
+from vram_arbiter.arbiter.lab.outcome import Outcome, as_plain
+from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.runtime import terminal
+from vram_arbiter.schemas.runtime.version import add_version
+
+DONE, NO = 0, 1
+TIMELINE_LINES = 40
+
+_POLICIES = (
+    "engine policies: "
+    + "; ".join(f"{name}: {rules.summary}" for name, rules in SCHEDULING.items())
+    + ". For comparison, rules of other programs: unmanaged (everybody loads at once), ollama_rules, llama_swap_rules."
+)
+_WHAT_TO_SIMULATE = "name a readable YAML file, or one that is shipped: desktop, find-navigate-grab, small-behind-large, two-thrashing"
+_EXIT = "exit codes: 0 identical or done \u00b7 1 a divergence, or an input that cannot be read \u00b7 2 wrong usage"
+
+
+def parser() -> argparse.ArgumentParser:
+    made = argparse.ArgumentParser(
+        prog="vramctl", description="Logs and scenarios, through the engine."
+    )
+    commands = made.add_subparsers(dest="command", required=True)
+    again = commands.add_parser(
+        "replay",
+        help="the same decisions, byte for byte?",
+        description="Feeds a log to the engine again and compares every decision: identical, or the first one that is another. "
+        "LOG is a file, or the state folder of a daemon (its newest start). With --policy: simulates what other policies would have done.",
+        epilog=f"{_POLICIES} {_EXIT}",
+    )
+    again.add_argument("log", metavar="LOG", type=Path)
+    what = commands.add_parser(
+        "simulate",
+        help="a scenario under one or more policies",
+        description="Runs a scenario (YAML: cards, consumers, arrivals) through the engine and prints the decisions, waits, switches and peak "
+        "bytes; with several policies, side by side. SCENARIO is a file, or the name of one that is shipped in configs/scenarios.",
+        epilog=f"{_POLICIES} {_EXIT}",
+    )
+    what.add_argument("scenario", metavar="SCENARIO", type=Path)
+    what.add_argument(
+        "--timeline",
+        metavar="N",
+        type=_count,
+        default=None,
+        help=f"so many lines of decisions (default: {TIMELINE_LINES} for one policy, else 0)",
+    )
+    add_version(made)
+    for command in (again, what):
+        add_version(command)
+        command.add_argument(
+            "--policy",
+            metavar="NAME",
+            action="append",
+            default=[],
+            choices=(*compare.POLICIES, "all"),
+            help="may be given several times; all: every one",
+        )
+        command.add_argument("--json", action="store_true", dest="as_json", help="print JSON")
+    return made
+
+
+def _count(written: str) -> int:
+    if not written.isdecimal():
+        raise argparse.ArgumentTypeError(f"{written!r} is no number of lines")
+    return int(written)
+
+
+@terminal.program
+def main(argv: Sequence[str] | None = None) -> int:
+    flags = parser().parse_args(argv)
+    policies = (
+        list(compare.POLICIES) if "all" in flags.policy else list(dict.fromkeys(flags.policy))
+    )
+    try:
+        if flags.command == "simulate":
+            return simulate(
+                flags.scenario, policies or [DEFAULT], flags.timeline, as_json=flags.as_json
+            )
+        if policies:
+            return what_if(flags.log, policies, as_json=flags.as_json)
+        return replay(flags.log, as_json=flags.as_json)
+    except VramError as error:
+        if flags.as_json:
+            print(json.dumps({"error": error.to_wire()}, indent=2))
+        else:
+            terminal.complain("vramctl", error)
+        return NO
+
+
+def replay(log: Path, *, as_json: bool) -> int:
+    found = runner.replay(runner.load(log))
+    if as_json:
+        _print_json(runner.report(found))
+    else:
+        print("\n".join(text.replay_lines(found)))
+    return DONE if found.identical else NO
+
+
+def what_if(log: Path, policies: Sequence[str], *, as_json: bool) -> int:
+    from vram_arbiter.arbiter.lab.extract import extract
+
+    found = extract(runner.load(log))
+    again = compare.under(found.workload, found.settings, found.settings.policy)
+    outcomes = [
+        again
+        if name == found.settings.policy
+        else compare.under(found.workload, found.settings, name)
+        for name in policies
+    ]
+    logged = found.logged
+    if as_json:
+        _print_json(
+            {
+                "simulation": True,
+                "logged": as_plain(logged),
+                "check": as_plain(again),
+                "policies": [as_plain(outcome) for outcome in outcomes],
+                "approximations": found.workload.approximations,
+            }
+        )
+        return DONE
+    logged.policy = f"{logged.policy} (logged)"
+    notices = text.notices(found.replayed) + [
+        f"note: {line}" for line in found.workload.approximations
+    ]
+    logged_and_all = [logged, *outcomes]
+    lines = [
+        *notices,
+        *compare.total_lines(logged_and_all),
+        "",
+        *compare.consumer_lines(logged_and_all),
+        "",
+    ]
+    logged.policy = found.settings.policy
+    print("\n".join([*lines, *compare.check_lines(logged, again)]))
+    return DONE
+
+
+def simulate(path: Path, policies: Sequence[str], timeline: int | None, *, as_json: bool) -> int:
+    from vram_arbiter.arbiter.lab.scenarios import settings_of, workload_of
+    from vram_arbiter.schemas.config.scenario import load_scenario
+    from vram_arbiter.schemas.yamltext import read_text
+
+    scenario = load_scenario(read_text(path, hint=_WHAT_TO_SIMULATE), path.name)
+    settings = settings_of(scenario)
+    outcomes = [compare.under(workload_of(scenario), settings, name) for name in policies]
+    shown = (TIMELINE_LINES if len(outcomes) == 1 else 0) if timeline is None else timeline
+    if as_json:
+        _print_json(
+            {
+                "scenario": path.name,
+                "about": scenario.about,
+                "policies": [
+                    as_plain(outcome) | _timeline(outcome, timeline or 0) for outcome in outcomes
+                ],
+            }
+        )
+        return DONE
+    print(f"{scenario.about} ({scenario.seconds:g} s, seed {scenario.seed})")
+    for outcome in outcomes:
+        if shown:
+            print("\n".join(["", *text.timeline_lines(outcome.policy, outcome.timeline, shown)]))
+    print("\n".join(["", *compare.total_lines(outcomes), "", *compare.consumer_lines(outcomes)]))
+    return DONE
+
+
+def _timeline(outcome: Outcome, limit: int) -> dict[str, Any]:
+    decided = [(at, kind, data) for at, kind, data in outcome.timeline if kind in text.DECISIONS][
+        :limit
+    ]
+    return (
+        {"timeline": [{"at_s": at, "kind": kind, **data} for at, kind, data in decided]}
+        if limit
+        else {}
+    )
+
+
+def _print_json(shown: dict[str, Any]) -> None:
+    print(json.dumps(json.loads(to_json(shown)), indent=2))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

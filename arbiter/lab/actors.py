@@ -1,0 +1,404 @@
+"""Who stands on the simulator's stage: cards that lag, and consumers that behave as our clients do.
+
+A consumer acquires when there is work and its model is not there, marks a use per job, lets the running ones end when it is asked to
+leave, unloads, releases. Knows nothing of who decides.
+"""
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+from vram_arbiter.arbiter.core.events import (
+    AcquireRequested,
+    ClientConnected,
+    Event,
+    MemorySampled,
+    ProcessDied,
+    ProcessUse,
+    ReadyReported,
+    ReleaseReported,
+    RevokeAcknowledged,
+    UnloadStarted,
+    UseBegan,
+    UseEnded,
+)
+from vram_arbiter.arbiter.lab.outcome import Tally
+from vram_arbiter.arbiter.lab.workload import CardPlan, Job, Plan
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
+
+START_S = 1000.0
+"""The engine's clock at the beginning."""
+OOM_RETRY_S = 1.0
+"""A load that failed for lack of memory is tried again after this."""
+FOREVER_S = 1e9
+"""Simulated consumers never forget to renew."""
+STRANGERS_PID = 900_000
+
+
+class Stage(Protocol):
+    """What an actor stands on."""
+
+    now: float
+    cards: dict[GpuId, "Card"]
+    holders_exit: bool
+
+    def at(self, when: float, call: Callable[[], None]) -> None: ...
+
+    def post(self, event: Event) -> None: ...
+
+    def next_request(self) -> RequestId: ...
+
+
+@dataclass(slots=True)
+class Card:
+    """Bytes on one card. What is given up is shown until the lag is over; what does not fit is refused."""
+
+    plan: CardPlan
+    held: dict[ProcessKey, int] = field(default_factory=dict)
+    names: dict[ProcessKey, str] = field(default_factory=dict)
+    peak_bytes: int = 0
+    _late: list[tuple[float, ProcessKey, int]] = field(default_factory=list)
+
+    def set(self, process: ProcessKey, count: int, now: float) -> bool:
+        """The process holds this many bytes from now on. False: the card has not that many, nothing changed."""
+        before = self.held.get(process, 0)
+        if count > before and self.used(now) + count - before > self.plan.total_bytes:
+            return False
+        if count < before and self.plan.release_lag_s:
+            self._late.append((now + self.plan.release_lag_s, process, before - count))
+        if count:
+            self.held[process] = count
+        else:
+            self.held.pop(process, None)
+        self.peak_bytes = max(self.peak_bytes, self.used(now))
+        return True
+
+    def others(self, now: float) -> list[tuple[str, int]]:
+        """Processes without a lease, by their newest entry."""
+        newest = {name: count for since, name, count in self.plan.others if since <= now - START_S}
+        return [(name, count) for name, count in newest.items() if count]
+
+    def shown(self, now: float) -> dict[ProcessKey, int]:
+        self._late = [item for item in self._late if item[0] > now]
+        seen = dict(self.held)
+        for _, process, count in self._late:
+            seen[process] = seen.get(process, 0) + count
+        return seen
+
+    def used(self, now: float) -> int:
+        others = sum(count for _, count in self.others(now))
+        return sum(self.shown(now).values()) + others + self.plan.overhead_bytes
+
+    def read(self, now: float) -> MemorySampled:
+        seen = [
+            ProcessUse(process, self.names[process], count)
+            for process, count in sorted(self.shown(now).items())
+        ]
+        seen += [
+            ProcessUse(ProcessKey(STRANGERS_PID + number, 1), name, count)
+            for number, (name, count) in enumerate(self.others(now))
+        ]
+        used = min(self.plan.total_bytes, self.used(now))
+        return MemorySampled(self.plan.info.id, now, used, self.plan.total_bytes, tuple(seen))
+
+
+@dataclass(slots=True)
+class _Work:
+    """A job that has arrived."""
+
+    job: Job
+    arrived_at: float
+    served: bool = False  # its wait is counted
+
+
+class Actor:
+    """One process. At most one lease; jobs are done in their order."""
+
+    def __init__(self, stage: Stage, plan: Plan, number: int, tally: Tally) -> None:
+        self.client = ClientId(f"s{number:04d}")
+        self.followers: Sequence[tuple[Actor, Sequence[Job]]] = ()
+        self._stage = stage
+        self._plan = plan
+        self._process = ProcessKey(1000 + number, 1)
+        self._tally = tally
+        self._state = "none"  # none, waiting, loading, held, leaving, gone
+        self._asked: RequestId | None = None  # the acquire that is not answered yet
+        self._lease = LeaseId("")
+        self._token = Token(0, 0)
+        self._gpu = GpuId("")
+        self._job = (
+            plan.jobs[0] if plan.jobs else None
+        )  # whose model, times and bytes the present lease has
+        self._held_at = 0.0
+        self._revoked = False
+        self._pending: deque[_Work] = deque()
+        self._settling: dict[UseId, _Work] = {}
+        self._using: dict[UseId, _Work] = {}
+        self._use_requests: dict[RequestId, UseId] = {}
+        self._numbers = 0
+        self._round = 0  # of the lease: what was planned in an earlier one is void
+        self._given = 0  # jobs handed to followers
+        self._departs = False
+
+    # -- work --------------------------------------------------------------------------------------------------------
+    def begin(self) -> None:
+        stage, plan = self._stage, self._plan
+        for card in stage.cards.values():
+            card.names[self._process] = plan.consumer
+        stage.post(ClientConnected(self.client, self._process, 1000, plan.consumer, self.client))
+        if plan.resident and plan.jobs:
+            self._acquire(plan.jobs[0])
+        for job in plan.jobs:
+            stage.at(START_S + job.due_s, _later(self.arrive, job))
+        if plan.leaves_s is not None:
+            stage.at(START_S + plan.leaves_s, self._depart)
+
+    def arrive(self, job: Job) -> None:
+        if self._state == "gone":
+            return
+        self._tally.jobs += 1
+        self._pending.append(_Work(job, self._stage.now))
+        self._go()
+
+    def finish(self) -> None:
+        """The time is up: who still waits has waited so long."""
+        if self._state == "held":
+            return
+        for work in self._pending:
+            if not work.served:
+                self._tally.waits_s.append(self._stage.now - work.arrived_at)
+                self._tally.unserved += 1
+
+    def _go(self) -> None:
+        if self._state == "none" and self._pending:
+            self._acquire(self._pending[0].job)
+        while self._state == "held" and not self._revoked and self._pending:
+            if (self._using or self._settling) and not self._pending[0].job.alongside:
+                return
+            self._start(self._pending.popleft())
+
+    def _start(self, work: _Work) -> None:
+        fresh = work.arrived_at < self._held_at
+        if not work.served:
+            work.served = True
+            self._tally.waits_s.append(max(0.0, self._held_at - work.arrived_at))
+        self._numbers += 1
+        use = UseId(f"u{self._numbers}")
+        self._settling[use] = work
+        settle_s = work.job.settle_s if fresh else 0.0
+        self._stage.at(self._stage.now + settle_s, _later(self._begin_use, use, self._round))
+
+    def _begin_use(self, use: UseId, turn: int) -> None:
+        work = self._settling.pop(use, None)
+        if work is None or turn != self._round:
+            return
+        if work.job.use_s is None:
+            self._over(work)
+            return
+        self._using[use] = work
+        request = self._stage.next_request()
+        self._use_requests[request] = use
+        self._stage.post(UseBegan(self.client, request, self._lease, self._token, use, ""))
+        self._stage.at(self._stage.now + work.job.use_s, _later(self._end_use, use, turn))
+
+    def _end_use(self, use: UseId, turn: int) -> None:
+        work = self._using.pop(use, None)
+        if work is None or turn != self._round:
+            return
+        self._stage.post(
+            UseEnded(self.client, self._stage.next_request(), self._lease, self._token, use)
+        )
+        self._over(work)
+
+    def _over(self, work: _Work) -> None:
+        self._pass_on()
+        if self._revoked and not self._using:
+            self._leave(self._plan.heed_s)
+            return
+        self._go()
+        if work.job.release_after_s is not None and self._idle():
+            turn, started = self._round, self._numbers
+            self._stage.at(
+                self._stage.now + work.job.release_after_s, lambda: self._let_go(turn, started)
+            )
+        elif self._departs:
+            self._depart()
+
+    def _pass_on(self) -> None:
+        """A job is over, well or not: whoever works after it gets his next."""
+        for actor, jobs in self.followers:
+            if self._given < len(jobs):
+                job = jobs[self._given]
+                self._stage.at(self._stage.now + job.due_s, _later(actor.arrive, job))
+        self._given += 1
+
+    def _idle(self) -> bool:
+        return not (self._pending or self._settling or self._using)
+
+    def _let_go(self, turn: int, started: int) -> None:
+        if (
+            (turn, started) == (self._round, self._numbers)
+            and self._state == "held"
+            and self._idle()
+        ):
+            self._leave(0.0)
+        if self._departs:
+            self._depart()
+
+    def _depart(self) -> None:
+        """The process ends, as soon as it has nothing to do any more."""
+        self._departs = True
+        if self._idle() and self._state in ("none", "held"):
+            self._state = "gone"
+            self._round += 1
+            for card in self._stage.cards.values():
+                card.set(self._process, 0, self._stage.now)
+            self._stage.post(ProcessDied(self._process))
+
+    # -- the lease -----------------------------------------------------------------------------------------------------
+    def _acquire(self, job: Job) -> None:
+        self._state, self._job = "waiting", job
+        self._asked = self._stage.next_request()
+        spec = replace(job.spec, ttl_s=FOREVER_S)
+        self._stage.post(
+            AcquireRequested(self.client, self._asked, f"n{self._asked}", spec, job.wait_timeout_s)
+        )
+
+    def answered(self, request: RequestId, lease: Mapping[str, Any] | None) -> None:
+        """A reply. Only that of the acquire says anything new."""
+        if request != self._asked or lease is None:
+            return
+        self._asked = None
+        self._lease = LeaseId(lease["lease_id"])
+        if lease["state"] == "loading":
+            self._granted(lease)
+
+    def refused(self, request: RequestId, code: str) -> None:
+        """A refusal: of the acquire, or of a use that came after the revoke."""
+        if request == self._asked:
+            self._asked = None
+            self._tally.denied += 1
+            self._give_up()
+        elif (use := self._use_requests.get(request)) in self._using and use is not None:
+            self._pending.appendleft(self._using.pop(use))
+
+    def told(self, body: Mapping[str, Any]) -> None:
+        """A push."""
+        match body["push"]:
+            case "granted":
+                self._granted(body["lease"])
+            case "denied" if body["lease_id"] == self._lease:
+                self._give_up()
+            case "revoke" if body["lease_id"] == self._lease and self._state in ("held", "loading"):
+                self._asked_to_leave()
+            case _:
+                pass
+
+    def _give_up(self) -> None:
+        self._state = "none"
+        if self._pending:
+            work = self._pending.popleft()
+            if not work.served:
+                self._tally.waits_s.append(self._stage.now - work.arrived_at)
+            self._pass_on()
+        self._go()
+
+    def _granted(self, lease: Mapping[str, Any]) -> None:
+        assert self._job is not None, "granted without a job"
+        self._state = "loading"
+        self._lease = LeaseId(lease["lease_id"])
+        self._token = Token(*lease["token"])
+        self._gpu = GpuId(lease["gpu"])
+        self._round += 1
+        turn = self._round
+        if not self._stage.cards[self._gpu].set(
+            self._process, self._job.spec.load_peak_bytes, self._stage.now
+        ):
+            self._tally.ooms += 1
+            self._stage.at(self._stage.now, lambda: self._out_of_memory(turn))
+            return
+        early = self._plan.resident and self._stage.now <= START_S + 1.0
+        self._stage.at(
+            self._stage.now + (0.0 if early else self._job.load_s), lambda: self._loaded(turn)
+        )
+
+    def _out_of_memory(self, turn: int) -> None:
+        """The load failed: as a program that crashed and is started again."""
+        if turn == self._round:
+            self._release()
+            self._stage.at(self._stage.now + OOM_RETRY_S, self._again)
+
+    def _again(self) -> None:
+        self._state = "none"
+        self._go()
+
+    def _loaded(self, turn: int) -> None:
+        if turn != self._round or self._state != "loading" or self._job is None:
+            return
+        job = self._job
+        count = job.spec.steady_bytes if job.measured_bytes is None else job.measured_bytes
+        self._stage.cards[self._gpu].set(self._process, count, self._stage.now)
+        self._state, self._held_at = "held", self._stage.now
+        request = self._stage.next_request()
+        self._stage.post(
+            ReadyReported(self.client, request, self._lease, self._token, job.measured_bytes)
+        )
+        if self._revoked:
+            self._leave(self._plan.heed_s)
+        self._go()
+
+    def _asked_to_leave(self) -> None:
+        if self._revoked:
+            return
+        self._revoked = True
+        self._stage.post(
+            RevokeAcknowledged(
+                self.client, self._stage.next_request(), self._lease, self._token, None
+            )
+        )
+        for use in reversed(list(self._settling)):
+            self._pending.appendleft(self._settling.pop(use))
+        if not self._using and self._state == "held":
+            self._leave(self._plan.heed_s)
+
+    def _leave(self, heed_s: float) -> None:
+        """To the way out: unloading, then released."""
+        if self._state != "held":
+            return
+        self._state = "leaving"
+        turn = self._round
+        self._stage.at(self._stage.now + heed_s, lambda: self._unload(turn))
+
+    def _unload(self, turn: int) -> None:
+        if turn != self._round or self._job is None:
+            return
+        self._stage.post(
+            UnloadStarted(self.client, self._stage.next_request(), self._lease, self._token)
+        )
+        self._stage.at(self._stage.now + self._job.unload_s, lambda: self._unloaded(turn))
+
+    def _unloaded(self, turn: int) -> None:
+        if turn != self._round or self._job is None:
+            return
+        kept = 0 if self._stage.holders_exit else self._job.spec.residue_bytes
+        self._stage.cards[self._gpu].set(self._process, kept, self._stage.now)
+        self._release()
+        self._state = "none"
+        self._go()
+        if self._departs:
+            self._depart()
+
+    def _release(self) -> None:
+        self._round += 1
+        self._revoked = False
+        self._settling.clear()
+        self._stage.post(
+            ReleaseReported(
+                self.client, self._stage.next_request(), self._lease, self._token, False
+            )
+        )
+
+
+def _later[*T](call: Callable[[*T], None], *arguments: *T) -> Callable[[], None]:
+    return lambda: call(*arguments)

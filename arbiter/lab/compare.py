@@ -1,0 +1,111 @@
+"""One workload under several policies: the engine's own, and the ports of other programs' rules. And the tables that tell."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from vram_arbiter.arbiter.core.scheduling.policies import SCHEDULING
+from vram_arbiter.arbiter.core.settings import Settings
+from vram_arbiter.arbiter.lab.outcome import Outcome, Tally
+from vram_arbiter.arbiter.lab.rules import RULES
+from vram_arbiter.arbiter.lab.simulator import Engine, Scheduler, simulate
+from vram_arbiter.arbiter.lab.text import table
+from vram_arbiter.arbiter.lab.workload import Workload
+from vram_arbiter.schemas.errors import CallerError
+from vram_arbiter.schemas.sizes import format_bytes
+
+POLICIES = (*SCHEDULING, *RULES)
+"""Every name that `--policy` takes: first the engine's, then the ports."""
+STARVED_S = 60.0
+"""Who waits longer than this is counted as starved."""
+
+
+class UnknownPolicy(CallerError):
+    code = "bad_request"
+
+
+def under(workload: Workload, settings: Settings, policy: str) -> Outcome:
+    """Simulate it under one policy. Raises UnknownPolicy."""
+    if policy in SCHEDULING:
+        scheduler: Scheduler = Engine.under(settings, policy)
+    elif policy in RULES:
+        scheduler = RULES[policy](workload.cards)
+    else:
+        raise UnknownPolicy(f"there is no policy {policy!r}", hint=f"known: {', '.join(POLICIES)}")
+    return simulate(workload, scheduler, policy)
+
+
+def starved(tally: Tally) -> int:
+    return sum(1 for wait in tally.waits_s if wait > STARVED_S)
+
+
+_COLUMNS = ("jobs", "unserved", "p50", "p99", "max", "loads", "evicted", "denied", "moved", "OOM")
+
+
+def total_lines(outcomes: Sequence[Outcome]) -> list[str]:
+    """One line per run: what matters for choosing."""
+    rows = []
+    for outcome in outcomes:
+        total = outcome.total
+        rows.append(
+            (
+                outcome.policy,
+                total.jobs,
+                total.unserved,
+                f"{total.wait_s(0.5):.1f} s",
+                f"{total.wait_s(0.99):.1f} s",
+                f"{total.wait_s(1.0):.1f} s",
+                starved(total),
+                outcome.switches,
+                total.loads,
+                total.denied,
+                total.ooms,
+                format_bytes(total.loaded_bytes),
+                format_bytes(outcome.peak_bytes),
+            )
+        )
+    head = (
+        "policy",
+        "jobs",
+        "unserved",
+        "p50 wait",
+        "p99",
+        "max",
+        f">{STARVED_S:.0f} s",
+        "switches",
+        "loads",
+    )
+    return table((*head, "denied", "OOM", "moved", "peak"), rows)
+
+
+def consumer_lines(outcomes: Sequence[Outcome]) -> list[str]:
+    """Every consumer under every policy, side by side."""
+    names = sorted({name for outcome in outcomes for name in outcome.consumers})
+    rows = []
+    for name in names:
+        for outcome in outcomes:
+            tally = outcome.of(name)
+            rows.append((name, outcome.policy, *_cells(tally)))
+    return table(("consumer", "policy", *_COLUMNS), rows, left=2)
+
+
+def check_lines(logged: Outcome, again: Outcome) -> list[str]:
+    """How far the simulator itself is off: the same policy simulated on what a log wanted, against what the log says came of it."""
+    then, now = logged.total, again.total
+    return [
+        "this is a simulation: arrivals, uses and loads are the log's, everything that depends on a decision is simulated",
+        f"its own error, by simulating the logged policy ({logged.policy}): switches {again.switches} (logged {logged.switches}), "
+        f"loads {now.loads} ({then.loads}), p50 wait {now.wait_s(0.5):.2f} s ({then.wait_s(0.5):.2f} s), "
+        f"p99 {now.wait_s(0.99):.2f} s ({then.wait_s(0.99):.2f} s), max {now.wait_s(1.0):.2f} s ({then.wait_s(1.0):.2f} s)",
+    ]
+
+
+def _cells(tally: Tally) -> tuple[Any, ...]:
+    waits = (f"{tally.wait_s(share):.1f} s" for share in (0.5, 0.99, 1.0))
+    counts = (
+        tally.loads,
+        tally.evicted,
+        tally.denied,
+        format_bytes(tally.loaded_bytes),
+        tally.ooms,
+    )
+    return (tally.jobs, tally.unserved, *waits, *counts)

@@ -1,0 +1,103 @@
+"""What came of a run, logged or simulated: waits, switches, evictions, bytes moved, per consumer. Counts only, decides nothing."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from vram_arbiter.arbiter.core.effects import Effect, Note
+
+
+@dataclass(slots=True)
+class Tally:
+    """One consumer."""
+
+    jobs: int = 0
+    waits_s: list[float] = field(
+        default_factory=list
+    )  # arrival of a job → its model is there; 0 if it was
+    unserved: int = 0  # still waiting at the end; their wait so far is in waits_s
+    loads: int = 0
+    evicted: int = 0
+    denied: int = 0
+    loaded_bytes: int = 0
+    ooms: int = 0
+
+    def wait_s(self, share: float) -> float:
+        """The wait that this share of the jobs does not exceed."""
+        if not self.waits_s:
+            return 0.0
+        ordered = sorted(self.waits_s)
+        return ordered[min(len(ordered) - 1, int(share * len(ordered)))]
+
+
+@dataclass(slots=True)
+class Outcome:
+    """One run under one policy."""
+
+    policy: str
+    seconds: float
+    consumers: dict[str, Tally] = field(default_factory=dict)
+    switches: int = 0
+    peak_bytes: int = 0
+    timeline: list[tuple[float, str, Mapping[str, Any]]] = field(default_factory=list)
+
+    def of(self, consumer: str) -> Tally:
+        return self.consumers.setdefault(consumer, Tally())
+
+    def watch(self, at_s: float, effects: Sequence[Effect]) -> None:
+        """Take notes of the engine into account."""
+        for effect in effects:
+            if not isinstance(effect, Note):
+                continue
+            data = effect.data
+            self.timeline.append((at_s, effect.kind, data))
+            consumer = str(data.get("consumer", ""))
+            match effect.kind:
+                case "granted":
+                    self.of(consumer).loads += 1
+                    self.of(consumer).loaded_bytes += int(data["charge_bytes"])
+                case "revoke_asked":
+                    self.of(consumer).evicted += 1
+                case "denied":
+                    self.of(consumer).denied += 1
+                case "switch" if data["switched"]:
+                    self.switches += 1
+
+    # -- of all consumers ----------------------------------------------------------------------------------------------
+    @property
+    def total(self) -> Tally:
+        every = Tally()
+        for tally in self.consumers.values():
+            every.waits_s += tally.waits_s
+            for name in ("jobs", "unserved", "loads", "evicted", "denied", "loaded_bytes", "ooms"):
+                setattr(every, name, getattr(every, name) + getattr(tally, name))
+        return every
+
+
+def as_plain(outcome: Outcome) -> dict[str, Any]:
+    """For `--json`, without the timeline."""
+    return {
+        "policy": outcome.policy,
+        "seconds": outcome.seconds,
+        "switches": outcome.switches,
+        "peak_bytes": outcome.peak_bytes,
+        "total": _plain_tally(outcome.total),
+        "consumers": {
+            name: _plain_tally(tally) for name, tally in sorted(outcome.consumers.items())
+        },
+    }
+
+
+def _plain_tally(tally: Tally) -> dict[str, Any]:
+    return {
+        "jobs": tally.jobs,
+        "unserved": tally.unserved,
+        "wait_p50_s": tally.wait_s(0.5),
+        "wait_p99_s": tally.wait_s(0.99),
+        "wait_max_s": tally.wait_s(1.0),
+        "loads": tally.loads,
+        "evicted": tally.evicted,
+        "denied": tally.denied,
+        "loaded_bytes": tally.loaded_bytes,
+        "ooms": tally.ooms,
+    }

@@ -1,0 +1,263 @@
+"""Ports of other programs' scheduling rules, to be run against the same consumers and cards. For comparison only, never part of a daemon.
+
+They hear the same events and answer with the same effects as the engine, but decide as their originals do, by the sources named below:
+`unmanaged`         nobody decides: whoever has work loads at once. What processes do without any of these programs.
+`ollama_rules`      ollama, server/sched.go: first come first served; a model that fits into free memory loads beside the others, else the first
+                    idle one (else the first) is unloaded, one at a time; free memory is waited for until 80 % of the estimate are back or
+                    5 s are over, then it goes on anyway. While one is unloaded everybody else waits. At most three models.
+`llama_swap_rules`  llama-swap without groups: one model at a time; the running requests of the present one end, its process ends, and the
+                    next one starts at once. Nobody looks at the card.
+All of them start and end model processes, so nothing stays on the card after an unload. None knows priorities, pins or load peaks.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from vram_arbiter.arbiter.core.effects import Effect, Note, Push, Refuse, Reply, Sample
+from vram_arbiter.arbiter.core.events import (
+    AcquireRequested,
+    ClientConnected,
+    Event,
+    MemorySampled,
+    ProcessDied,
+    ReadyReported,
+    ReleaseReported,
+    Spec,
+    Tick,
+    UnloadStarted,
+    UseBegan,
+    UseEnded,
+)
+from vram_arbiter.arbiter.lab.workload import CardPlan
+from vram_arbiter.schemas.errors import CallerError
+from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, Token
+
+OLLAMA_MODELS = 3
+OLLAMA_POLL_S = 0.25
+OLLAMA_RECOVERED = 0.8
+OLLAMA_PATIENCE_S = 5.0
+
+
+class OneCardOnly(CallerError):
+    """The ports know one card."""
+
+    code = "bad_request"
+
+
+@dataclass(slots=True)
+class _Model:
+    """One lease, as these programs would see it: a model that is loaded or waits for it."""
+
+    id: LeaseId
+    client: ClientId
+    spec: Spec
+    arrived_at: float
+    state: str = "queued"  # queued, loading, held, leaving
+    uses: set[str] = field(default_factory=set)
+    owed: bool = True  # whoever had it loaded has not been served yet: it is not idle
+    evicted: list[str] = field(default_factory=list)  # who left for it
+    wanted_by: "_Model | None" = None  # it is to leave, and hears so when it owes nothing
+
+
+class Rules(ABC):
+    """What the ports share: bookkeeping. `_serve` decides."""
+
+    holders_exit = True
+
+    def __init__(self, cards: Sequence[CardPlan]) -> None:
+        if len(cards) != 1:
+            raise OneCardOnly(
+                "the ports of other programs' rules know one card", hint="compare on one card"
+            )
+        self._card = cards[0]
+        self._now = 0.0
+        self._out: list[Effect] = []
+        self._models: dict[LeaseId, _Model] = {}  # in the order of their loading
+        self._queue: list[_Model] = []
+        self._clients: dict[ClientId, ProcessKey] = {}
+        self._used_bytes = 0
+        self._timer: float | None = None
+        self._serial = 0
+
+    def next_deadline(self) -> float | None:
+        return self._timer
+
+    def handle(self, event: Event, now: float) -> list[Effect]:
+        self._now, self._out = now, []
+        match event:
+            case ClientConnected(client, process):
+                self._clients[client] = process
+            case AcquireRequested():
+                self._asked(event)
+            case ReadyReported(client, request, lease):
+                model = self._models[lease]
+                model.state = "held"
+                self._out.append(Reply(client, request, {}))
+                self._note("switch", model, switched=bool(model.evicted))
+            case UseBegan(client, request, lease, _, use, _):
+                if self._models[lease].state == "leaving":
+                    self._out.append(
+                        Refuse(client, request, "lease_revoking", "it is being unloaded", "", {})
+                    )
+                else:
+                    self._models[lease].uses.add(use)
+            case UseEnded(_, _, lease, _, use):
+                if (ending := self._models.get(lease)) is not None:
+                    ending.uses.discard(use)
+                    self._served(ending)
+            case UnloadStarted(_, _, lease):
+                self._models[lease].state = "leaving"
+            case ReleaseReported(_, _, lease):
+                self._gone(lease)
+            case ProcessDied(process):
+                for model in [
+                    m for m in self._models.values() if self._clients[m.client] == process
+                ]:
+                    self._gone(model.id)
+            case MemorySampled():
+                self._used_bytes = event.used_bytes
+            case Tick() if self._timer is not None and self._timer <= now:
+                self._timer = None
+            case _:
+                pass
+        self._serve()
+        return self._out
+
+    # -- bookkeeping -------------------------------------------------------------------------------------------------
+    def _asked(self, event: AcquireRequested) -> None:
+        self._serial += 1
+        model = _Model(LeaseId(f"R-{self._serial}"), event.client, event.spec, self._now)
+        if event.spec.steady_bytes > self._card.total_bytes:
+            self._out.append(
+                Refuse(event.client, event.request, "vram_insufficient", "too large", "", {})
+            )
+            return
+        self._queue.append(model)
+        self._out.append(Reply(event.client, event.request, {"lease": self._view(model)}))
+
+    def _view(self, model: _Model) -> dict[str, Any]:
+        state = "queued" if model.state == "queued" else "loading"
+        token = Token(1, self._serial)
+        return {
+            "lease_id": model.id,
+            "state": state,
+            "token": [token.epoch, token.serial],
+            "gpu": self._card.info.id,
+        }
+
+    def _note(self, kind: str, model: _Model, **facts: Any) -> None:
+        self._out.append(
+            Note(kind, {"lease_id": model.id, "consumer": model.spec.consumer, **facts})
+        )
+
+    def _load(self, model: _Model, reason: str) -> None:
+        self._queue.remove(model)
+        self._models[model.id] = model
+        model.state = "loading"
+        facts: Mapping[str, Any] = {"charge_bytes": model.spec.load_peak_bytes, "reason": reason}
+        self._note("granted", model, waited_ms=(self._now - model.arrived_at) * 1e3, **facts)
+        self._out.append(Push(model.client, {"push": "granted", "lease": self._view(model)}))
+
+    def _ask(self, model: _Model, wanted_by: _Model) -> None:
+        """It unloads when its requests are served, that for which it was loaded included."""
+        if model.spec.consumer not in wanted_by.evicted:
+            wanted_by.evicted.append(model.spec.consumer)
+        self._note("revoke_asked", model, wanted_by=wanted_by.spec.consumer, uses=len(model.uses))
+        if model.owed:
+            model.wanted_by = wanted_by
+        else:
+            self._out.append(Push(model.client, {"push": "revoke", "lease_id": model.id}))
+
+    def _served(self, model: _Model) -> None:
+        model.owed = False
+        if model.wanted_by is not None:
+            model.wanted_by = None
+            self._out.append(Push(model.client, {"push": "revoke", "lease_id": model.id}))
+
+    def _gone(self, lease: LeaseId) -> None:
+        self._models.pop(lease, None)
+
+    @abstractmethod
+    def _serve(self) -> None:
+        """Decide who loads and who is asked to leave."""
+
+
+class Unmanaged(Rules):
+    """Nobody decides."""
+
+    def _serve(self) -> None:
+        for model in list(self._queue):
+            self._load(model, "nobody is asked")
+
+
+class OllamaRules(Rules):
+    """One pending request at a time."""
+
+    def __init__(self, cards: Sequence[CardPlan]) -> None:
+        super().__init__(cards)
+        self._leaving: _Model | None = None
+        self._released_at: float | None = None  # it has gone; its memory is waited for
+        self._used_before = 0
+
+    def _gone(self, lease: LeaseId) -> None:
+        super()._gone(lease)
+        if self._leaving is not None and self._leaving.id == lease:
+            self._released_at = self._now
+
+    def _serve(self) -> None:
+        if self._leaving is not None and not self._recovered(self._leaving):
+            return
+        if not self._queue:
+            return
+        head = self._queue[0]
+        if any(model.state == "loading" for model in self._models.values()):
+            return  # loads are not mixed; the end of this one comes back here
+        free = self._card.total_bytes - max(
+            self._used_bytes, sum(model.spec.steady_bytes for model in self._models.values())
+        )
+        if not self._models or (
+            len(self._models) < OLLAMA_MODELS and head.spec.steady_bytes <= free
+        ):
+            self._load(head, "fits into free memory" if self._models else "nothing else is loaded")
+            self._out.append(Sample(self._card.info.id))
+            return
+        idle = [model for model in self._models.values() if not model.uses and not model.owed]
+        self._leaving = (idle or list(self._models.values()))[0]
+        self._released_at, self._used_before = None, self._used_bytes
+        self._ask(self._leaving, head)
+
+    def _recovered(self, model: _Model) -> bool:
+        """Is 80 % of the estimate back, or the patience over? Looked at four times a second."""
+        if self._released_at is None:
+            return False
+        enough = self._used_before - self._used_bytes > OLLAMA_RECOVERED * model.spec.steady_bytes
+        if enough or self._now - self._released_at >= OLLAMA_PATIENCE_S:
+            self._leaving = None
+            return True
+        if self._timer is None:
+            self._timer = self._now + OLLAMA_POLL_S
+            self._out.append(Sample(self._card.info.id))
+        return False
+
+
+class LlamaSwapRules(Rules):
+    """One model at a time."""
+
+    def _serve(self) -> None:
+        if not self._queue:
+            return
+        if not self._models:
+            self._load(self._queue[0], "nothing else is loaded")
+            return
+        present = next(iter(self._models.values()))
+        if present.state == "held" and not self._queue[0].evicted:
+            self._ask(present, self._queue[0])
+
+
+RULES: Mapping[str, Callable[[Sequence[CardPlan]], Rules]] = {
+    "unmanaged": Unmanaged,
+    "ollama_rules": OllamaRules,
+    "llama_swap_rules": LlamaSwapRules,
+}

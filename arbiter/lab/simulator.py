@@ -1,0 +1,158 @@
+"""A small discrete-event simulation: consumers, cards that lag, and whoever decides (the engine, or rules of other programs).
+
+Consumers behave as our clients do: they acquire when there is work and the model is not there, mark uses, let the running ones end when
+they are asked to leave, unload, release. Everything that takes time is an entry in one heap; the same workload and scheduler
+give the same outcome. No clock, no threads, no randomness (that is in the workload).
+"""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from heapq import heappop, heappush
+from typing import Protocol
+
+from vram_arbiter.arbiter.core.arbiter import Arbiter
+from vram_arbiter.arbiter.core.effects import Effect, Push, Refuse, Reply, Sample
+from vram_arbiter.arbiter.core.events import Event, MemorySampled, Tick
+from vram_arbiter.arbiter.core.settings import Settings
+from vram_arbiter.arbiter.lab.actors import START_S, Actor, Card
+from vram_arbiter.arbiter.lab.outcome import Outcome
+from vram_arbiter.arbiter.lab.workload import Workload
+from vram_arbiter.schemas.ids import ClientId, GpuId, RequestId
+
+READING_S = 0.001
+"""How long a reading of a card takes."""
+EVENTS_MAX = 5_000_000
+"""A run that needs more goes in circles."""
+
+
+class Scheduler(Protocol):
+    """Who decides: the engine, or a port of somebody else's rules."""
+
+    holders_exit: bool
+    """Models are processes that end when they are unloaded: nothing stays on the card."""
+
+    def handle(self, event: Event, now: float) -> Sequence[Effect]: ...
+
+    def next_deadline(self) -> float | None: ...
+
+
+class Circling(Exception):
+    """The simulation does not come to its end."""
+
+
+@dataclass(slots=True)
+class Engine:
+    """The engine under one of its policies."""
+
+    arbiter: Arbiter
+    holders_exit: bool = False
+
+    @classmethod
+    def under(cls, settings: Settings, policy: str) -> "Engine":
+        return cls(Arbiter(replace(settings, policy=policy), START_S))
+
+    def handle(self, event: Event, now: float) -> Sequence[Effect]:
+        return self.arbiter.handle(event, now)
+
+    def next_deadline(self) -> float | None:
+        return self.arbiter.next_deadline()
+
+
+def simulate(workload: Workload, scheduler: Scheduler, policy: str) -> Outcome:
+    """Run it to its end. Raises Circling for one that has none."""
+    world = _World(workload, scheduler, Outcome(policy, workload.seconds))
+    world.run()
+    return world.outcome
+
+
+class _World:
+    """Time, cards and consumers of one run; the stage that the actors stand on."""
+
+    def __init__(self, workload: Workload, scheduler: Scheduler, outcome: Outcome) -> None:
+        self.scheduler = scheduler
+        self.holders_exit = scheduler.holders_exit
+        self.outcome = outcome
+        self.now = START_S
+        self.cards = {plan.info.id: Card(plan) for plan in workload.cards}
+        self.actors: dict[ClientId, Actor] = {}
+        self._end = START_S + workload.seconds
+        self._heap: list[tuple[float, int, Callable[[], None]]] = []
+        self._count = 0
+        self._requests = 0
+        self._reading: set[GpuId] = set()
+        self._posting: deque[Event] = deque()
+        self._busy = False
+        by_plan: dict[int, Actor] = {}
+        for number, plan in enumerate(workload.plans):
+            actor = by_plan[id(plan)] = Actor(self, plan, number, outcome.of(plan.consumer))
+            self.actors[actor.client] = actor
+        for plan in workload.plans:
+            followers = [(by_plan[id(follower.plan)], follower.jobs) for follower in plan.followers]
+            by_plan[id(plan)].followers = followers
+
+    # -- time --------------------------------------------------------------------------------------------------------
+    def at(self, when: float, call: Callable[[], None]) -> None:
+        self._count += 1
+        heappush(self._heap, (when, self._count, call))
+
+    def run(self) -> None:
+        self.post(Tick())
+        for actor in self.actors.values():
+            actor.begin()
+        for _ in range(EVENTS_MAX):
+            planned = self._heap[0][0] if self._heap else None
+            deadline = self.scheduler.next_deadline()
+            if deadline is not None and (planned is None or deadline < planned):
+                if deadline > self._end:
+                    break
+                self.now = max(self.now, deadline)
+                self.post(Tick())
+                continue
+            if planned is None or planned > self._end:
+                break
+            self.now = max(self.now, planned)
+            heappop(self._heap)[2]()
+        else:
+            raise Circling(f"more than {EVENTS_MAX} steps within {self.outcome.seconds:g} s")
+        self.now = self._end
+        for actor in self.actors.values():
+            actor.finish()
+        self.outcome.peak_bytes = max(card.peak_bytes for card in self.cards.values())
+
+    # -- the scheduler -------------------------------------------------------------------------------------------------
+    def post(self, event: Event) -> None:
+        """Hand an event over; what follows from its effects comes after it."""
+        self._posting.append(event)
+        if self._busy:
+            return
+        self._busy = True
+        while self._posting:
+            effects = self.scheduler.handle(self._posting.popleft(), self.now)
+            self.outcome.watch(self.now - START_S, effects)
+            for effect in effects:
+                self._perform(effect)
+        self._busy = False
+
+    def _perform(self, effect: Effect) -> None:
+        match effect:
+            case Reply(client, request, body):
+                self.actors[client].answered(request, body.get("lease"))
+            case Refuse(client, request, code, _, _, _):
+                self.actors[client].refused(request, code)
+            case Push(client, body):
+                self.actors[client].told(body)
+            case Sample(gpu) if gpu not in self._reading:
+                self._reading.add(gpu)
+                sample = self.cards[gpu].read(self.now)
+                self.at(self.now + READING_S, lambda: self._read(sample))
+            case _:
+                pass
+
+    def _read(self, sample: MemorySampled) -> None:
+        self._reading.discard(sample.gpu)
+        self.post(sample)
+
+    def next_request(self) -> RequestId:
+        self._requests += 1
+        return RequestId(self._requests)

@@ -1,0 +1,72 @@
+"""What consumers want, apart from what any arbiter decides: the input of a simulation.
+
+Made from a scenario (`scenarios`) or from a log (`extract`). Times are seconds since the beginning. Data only.
+"""
+
+from dataclasses import dataclass, field
+
+from vram_arbiter.arbiter.core.events import Spec
+from vram_arbiter.arbiter.core.settings import GpuInfo
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One piece of work that needs its consumer's model resident."""
+
+    due_s: float
+    spec: Spec
+    use_s: float | None  # None: it only holds the bytes and marks no use
+    load_s: float
+    unload_s: float
+    measured_bytes: int | None = None
+    settle_s: float = 0.0  # between ready and the beginning of the use
+    wait_timeout_s: float | None = None
+    release_after_s: float | None = (
+        None  # lets go by itself so long after this job, if there is no other
+    )
+    alongside: bool = False  # may begin before the one before it is over
+
+
+@dataclass(slots=True)
+class Plan:
+    """One process with one model at a time: what it will want, in order of arrival."""
+
+    consumer: str
+    jobs: list[Job]
+    heed_s: float = 0.0  # between its safe point and its `unloading`
+    leaves_s: float | None = None  # its process ends then, but not before its jobs are done
+    followers: list["Follower"] = field(default_factory=list)
+    resident: bool = False  # its first job's model is loaded when the simulation begins
+
+
+@dataclass(frozen=True, slots=True)
+class Follower:
+    """Another plan gets its next job when one of this plan is over; `jobs` holds them, `due_s` is the pause."""
+
+    plan: Plan
+    jobs: list[Job]
+
+
+@dataclass(frozen=True, slots=True)
+class CardPlan:
+    """One card, and how it behaves."""
+
+    info: GpuInfo
+    total_bytes: int
+    overhead_bytes: int = 0
+    release_lag_s: float = 0.0
+    others: tuple[
+        tuple[float, str, int], ...
+    ] = ()  # (since, name, bytes) of processes without a lease
+
+
+@dataclass(slots=True)
+class Workload:
+    """All of it."""
+
+    cards: list[CardPlan]
+    plans: list[Plan]
+    seconds: float
+    approximations: list[str] = field(
+        default_factory=list
+    )  # what of a log could not be taken over, in words

@@ -1,0 +1,308 @@
+"""One connection to the arbiter, sans-IO: hello and its repetition, requests and their replies, silence.
+
+It knows no sockets, no asyncio and no clock (messages are maps, time is passed in as `now`, monotonic seconds), and no leases: what
+lives on it is the `Above` (`clients._protocol.protocol`), which gets the pushes. The owner (`clients.client`) feeds `receive`, performs what
+`take_outgoing` and `take_events` hand out, and on `ContactLost` opens a fresh socket and calls `connected`.
+
+`phase`: `down` → `greeting` (hello is said) → `reattaching` (if something has to be attached again) → `up`. On the way up every request
+whose reply is missing is said again, which is safe because every op is idempotent. No request waits for ever: each has a deadline.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol
+
+from vram_arbiter.clients._protocol.records import (
+    ContactLost,
+    Event,
+    Failed,
+    Message,
+    OnError,
+    OnReply,
+    Pending,
+    Refused,
+    Replied,
+    Up,
+)  # fmt: skip
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.errors import ArbiterUnreachable, UnknownSession, VramError, from_wire
+
+HELLO_TIMEOUT_S = 2.0  # an unanswered hello is said again on a fresh socket
+REFUSED_RETRY_S = 1.0  # after a refused hello (a full server may have room later)
+SILENCE_BEATS = 3  # heartbeats without a word mean lost contact
+REQUEST_TIMEOUT_S = 30.0  # a restart of the daemon takes a few seconds: a request outlives it
+WAIT_SLACK_S = 5.0  # the arbiter ends waits; we only do if it does not
+
+
+class Above(Protocol):
+    """What lives on a connection."""
+
+    def reattachments(self) -> list[Message]:
+        """What the arbiter has to hear of before anything else (`schemas.wire.ReattachLease`); empty: nothing."""
+        ...
+
+    def reattached(self, reply: Message) -> None:
+        """Its verdict on them."""
+        ...
+
+    def say_again(self, now: float) -> None:
+        """We are up: ask again for what the arbiter may not know (of requests without a reply the connection takes care)."""
+        ...
+
+    def pushed(self, message: Message, now: float) -> None:
+        """The arbiter said something unasked."""
+        ...
+
+    def expects_grants(self) -> bool:
+        """Then the connection asks often enough to know how old a grant is."""
+        ...
+
+
+class Connection:
+    """`phase`, and what the arbiter said of itself: `welcome`, `epoch`, `heartbeat_s`, `grace_s`."""
+
+    def __init__(self, above: Above, *, name: str, instance: str, role: str) -> None:
+        self.instance = instance
+        self.phase = "down"
+        self.welcome: Message = {}
+        self.epoch: int | None = None
+        self.heartbeat_s = d.HEARTBEAT_S
+        self.grace_s = d.FENCE_GRACE_S
+        self.asked_at = 0.0
+        """When the newest request that this connection answered was *sent*: whatever we read now was said after that."""
+        self._above = above
+        self._hello = {
+            "op": "hello",
+            "version": d.WIRE_VERSION,
+            "name": name,
+            "instance": instance,
+            "role": role,
+        }
+        self._next_id = 1
+        self._outgoing: list[Message] = []
+        self._events: list[Event] = []
+        self._pending: dict[int, Pending] = {}
+        self._phase_deadline: float | None = None
+        self._handshake_id = 0
+        self._handshake_at = 0.0
+        self._heard_at = 0.0
+        self._pinged = False
+
+    # -- for the owner -----------------------------------------------------------------------------------------------
+    def take_outgoing(self) -> list[Message]:
+        taken, self._outgoing = self._outgoing, []
+        return taken
+
+    def take_events(self) -> list[Event]:
+        taken, self._events = self._events, []
+        return taken
+
+    def connected(self, now: float) -> None:
+        """A fresh socket is there: say hello on it."""
+        self._outgoing.clear()
+        self._pinged = False
+        self.phase = "greeting"
+        self._send_handshake(self._hello, now)
+
+    def contact_lost(self, reason: str) -> None:
+        """The transport says so, or silence does."""
+        if self.phase == "down":
+            return
+        self.phase = "down"
+        self._phase_deadline = None
+        self._outgoing.clear()
+        for request in self._pending.values():
+            request.sent_at = None
+        self._events.append(ContactLost(reason))
+
+    def receive(self, message: Message, now: float) -> None:
+        """One message from the arbiter. Replies to forgotten requests are ignored."""
+        if self.phase == "down":
+            return
+        self._heard_at, self._pinged = now, False
+        if "push" in message:
+            self._above.pushed(message, now)
+        elif message.get("re") == self._handshake_id and self.phase != "up":
+            self.asked_at = self._handshake_at
+            self._handshake_reply(message, now)
+        else:
+            self._reply(message, now)
+
+    def request(
+        self,
+        op: str,
+        fields: Mapping[str, Any],
+        now: float,
+        *,
+        timeout_s: float = REQUEST_TIMEOUT_S,
+    ) -> int:
+        """Ask anything; its end comes as `Replied` or `Failed`. Without contact it is kept and sent after the next greeting."""
+        return self.ask({"op": op, **fields}, now, timeout_s)
+
+    def forget(self, request_id: int) -> None:
+        """Nobody waits for this reply any more."""
+        request = self._pending.get(request_id)
+        if request is not None:
+            request.quiet = True
+
+    # -- for what is above -------------------------------------------------------------------------------------------
+    def ask(
+        self,
+        message: Message,
+        now: float,
+        timeout_s: float = REQUEST_TIMEOUT_S,
+        *,
+        on_reply: OnReply | None = None,
+        on_error: OnError | None = None,
+        quiet: bool = False,
+    ) -> int:
+        """A request whose end is heard by `on_reply` or `on_error` (also at its deadline) first, then told unless it is `quiet`."""
+        request_id = self._new_id()
+        request = Pending(
+            {**message, "id": request_id},
+            now + timeout_s,
+            on_reply=on_reply,
+            on_error=on_error,
+            quiet=quiet,
+        )
+        self._pending[request_id] = request
+        if self.phase == "up":
+            self._send(request, now)
+        return request_id
+
+    def awaits(self, request_id: int | None) -> bool:
+        """Is its reply still missing? Then it is said again after a reconnect."""
+        return request_id in self._pending
+
+    def drop_unsent(self, matches: Callable[[Message], bool]) -> None:
+        """What was not sent yet and has no meaning any more."""
+        for request_id in [
+            i for i, r in self._pending.items() if r.sent_at is None and matches(r.message)
+        ]:
+            del self._pending[request_id]
+
+    def tell(self, event: Event) -> None:
+        """Let the owner know."""
+        self._events.append(event)
+
+    # -- time --------------------------------------------------------------------------------------------------------
+    def deadlines(self) -> Iterator[float]:
+        for request in self._pending.values():
+            yield request.deadline
+        if self._phase_deadline is not None:
+            yield self._phase_deadline
+        if self.phase == "up":
+            yield self._silent_at() if self._pinged else self._ping_at()
+
+    def wait_ends_at(self, deadline: float | None) -> float:
+        """When a wait is ended here. While we are in contact the arbiter has the first word."""
+        if deadline is None:
+            return float("inf")
+        return deadline + (WAIT_SLACK_S if self.phase == "up" else 0.0)
+
+    def end_requests(self, now: float) -> None:
+        """Those past their deadline fail."""
+        for request_id in [i for i, r in self._pending.items() if now >= r.deadline]:
+            if request_id in self._pending:  # one's end may drop another
+                self._fail(request_id, _unreachable(self._pending[request_id].message["op"]), now)
+
+    def stays_up(self, now: float) -> bool:
+        """Declare contact lost if a hello or a ping had no answer. Are we up?"""
+        if self._phase_deadline is not None and now >= self._phase_deadline:
+            self.contact_lost("no answer to hello")
+        if self.phase == "up" and self._pinged and now >= self._silent_at():
+            self.contact_lost(f"the arbiter said nothing for {now - self._heard_at:.1f} s")
+        return self.phase == "up"
+
+    def ping_if_silent(self, now: float) -> None:
+        if not self._pinged and now >= self._ping_at():
+            self._pinged = True
+            self.ask({"op": "ping"}, now, quiet=True)
+
+    def _silent_at(self) -> float:
+        return self._heard_at + SILENCE_BEATS * self.heartbeat_s
+
+    def _ping_at(self) -> float:
+        """After a silence; and while we wait for a grant, so that its age is known, also if pushes keep coming."""
+        waits = self._above.expects_grants()
+        return (min(self._heard_at, self.asked_at) if waits else self._heard_at) + self.heartbeat_s
+
+    # -- steps: greeting ---------------------------------------------------------------------------------------------
+    def _send_handshake(self, message: Message, now: float) -> None:
+        """Hello or re-attachment: not a request like others, a fresh socket begins with the first of them."""
+        self._handshake_id, self._handshake_at = self._new_id(), now
+        self._phase_deadline = now + HELLO_TIMEOUT_S
+        self._outgoing.append({**message, "id": self._handshake_id})
+
+    def _handshake_reply(self, message: Message, now: float) -> None:
+        if not message.get("ok"):
+            error = from_wire(message.get("error") or {})
+            if isinstance(error, UnknownSession):
+                self.contact_lost("the arbiter forgot the session")
+                return
+            self._events.append(Refused(error))
+            self._phase_deadline = now + REFUSED_RETRY_S
+            return
+        if self.phase == "greeting":
+            self.welcome = message
+            self.epoch = int(message["epoch"])
+            self.heartbeat_s = float(message.get("heartbeat_s", self.heartbeat_s))
+            self.grace_s = float(message.get("grace_s", self.grace_s))
+            if kept := self._above.reattachments():
+                self.phase = "reattaching"
+                self._send_handshake({"op": "reattach", "leases": kept}, now)
+                return
+        else:
+            self._above.reattached(message)
+        self._come_up(now)
+
+    def _come_up(self, now: float) -> None:
+        self.phase = "up"
+        self._phase_deadline = None
+        assert self.epoch is not None
+        self._events.append(Up(self.epoch))
+        unanswered = list(self._pending.values())
+        self._above.say_again(now)
+        for request in unanswered:
+            self._send(request, now)
+
+    # -- steps: requests ---------------------------------------------------------------------------------------------
+    def _reply(self, message: Message, now: float) -> None:
+        request_id = message.get("re")
+        request = self._pending.get(request_id) if isinstance(request_id, int) else None
+        if request is not None and request.sent_at is not None:
+            self.asked_at = max(self.asked_at, request.sent_at)
+        if message.get("ok"):
+            if request is not None and isinstance(request_id, int):
+                del self._pending[request_id]
+                if request.on_reply is not None:
+                    request.on_reply(message, now)
+                if not request.quiet:
+                    self._events.append(Replied(request_id, message))
+            return
+        error = from_wire(message.get("error") or {})
+        if isinstance(error, UnknownSession):
+            # the daemon restarted behind a socket that reconnected by itself
+            self.contact_lost("the arbiter forgot the session")
+        elif request is not None and isinstance(request_id, int):
+            self._fail(request_id, error, now)
+
+    def _fail(self, request_id: int, error: VramError, now: float) -> None:
+        request = self._pending.pop(request_id)
+        if request.on_error is not None:
+            request.on_error(error, now)
+        if not request.quiet:
+            self._events.append(Failed(request_id, error))
+
+    def _send(self, request: Pending, now: float) -> None:
+        request.sent_at = now
+        self._outgoing.append(request.message)
+
+    def _new_id(self) -> int:
+        self._next_id += 1
+        return self._next_id - 1
+
+
+def _unreachable(op: str) -> ArbiterUnreachable:
+    return ArbiterUnreachable(
+        f"the arbiter did not answer {op} in time", hint="is it running? see `vramctl status`"
+    )

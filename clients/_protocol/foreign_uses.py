@@ -1,0 +1,57 @@
+"""Uses that this client has on leases of other processes, whose tokens were handed to it.
+
+A use that has begun is begun again after every reconnect until it ends; if the arbiter refuses that, the owner hears `UseLost`. It must
+know nothing of the client's own leases: their uses are part of what is re-attached (`clients._protocol.leases`).
+"""
+
+from vram_arbiter.clients._protocol.connection import Connection
+from vram_arbiter.clients._protocol.records import ForeignUseRecord, Message, TokenPair, UseLost
+from vram_arbiter.schemas.errors import VramError
+
+
+class ForeignUses:
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._uses: dict[str, ForeignUseRecord] = {}
+
+    def begin(
+        self,
+        lease_id: str,
+        token: TokenPair,
+        use_id: str,
+        label: str,
+        now: float,
+        timeout_s: float,
+        traceparent: str | None = None,
+    ) -> int:
+        use = ForeignUseRecord(lease_id, token, label, traceparent)
+        self._uses[use_id] = use
+
+        def begun(_: Message, __: float) -> None:
+            use.begun = True
+
+        def refused(_: VramError, __: float) -> None:
+            if self._uses.get(use_id) is use:
+                del self._uses[use_id]
+
+        return self._connection.ask(
+            use.begin(use_id), now, timeout_s, on_reply=begun, on_error=refused
+        )
+
+    def end(self, lease_id: str, token: TokenPair, use_id: str, now: float) -> int:
+        """Also right while the begin is under way: the arbiter hears both in order."""
+        self._uses.pop(use_id, None)
+        message = {"op": "use_end", "lease_id": lease_id, "token": list(token), "use_id": use_id}
+        return self._connection.ask(message, now, quiet=True)
+
+    def say_again(self, now: float) -> None:
+        for use_id, use in self._uses.items():
+            if use.begun:  # else its begin has no reply yet, and is repeated itself
+                self._begin_again(use_id, use, now)
+
+    def _begin_again(self, use_id: str, use: ForeignUseRecord, now: float) -> None:
+        def lost(error: VramError, _: float) -> None:
+            if self._uses.pop(use_id, None) is not None:
+                self._connection.tell(UseLost(use_id, error))
+
+        self._connection.ask(use.begin(use_id), now, on_error=lost, quiet=True)

@@ -1,0 +1,436 @@
+"""Leases that were granted to this client: held, or evicted and asleep until they come back.
+
+A held lease is renewed every ttl/3. Without the arbiter's word for ttl + grace it is *fenced*: the client gives it up by itself, because
+the arbiter may have given its bytes away. A lease on standby or parked is `asleep`: nothing is renewed, nothing is fenced; it is granted
+again by a push, or by the reply to `reacquire`, and the same record goes on under a new token. However a lease ends without
+our doing, the owner hears `Gone`.
+
+It must not know how the first grant came about (`clients._protocol.waits`), nor callbacks (`clients.lease`) and safe points (`clients.eviction`).
+"""
+
+from collections.abc import Iterable, Iterator
+
+from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S, Connection
+from vram_arbiter.clients._protocol.records import (
+    Gone,
+    LeaseRecord,
+    Message,
+    OnError,
+    OnReply,
+    Resized,
+    Returned,
+    RevokeAsked,
+    token_of,
+)  # fmt: skip
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.errors import (
+    ArbiterUnreachable,
+    LeaseLost,
+    LeaseRevoking,
+    VramError,
+    WaitTimeout,
+    from_wire,
+)
+
+GONE_CODES = frozenset({"lease_lost", "lease_expired", "unknown_lease", "stale_token"})
+"""Replies that say that the lease is no longer ours."""
+AWAY = ("standby", "parked")
+
+
+class Holdings:
+    """`held` and `asleep`, by lease id; a record is in one of them or it is over."""
+
+    def __init__(self, connection: Connection) -> None:
+        self.held: dict[str, LeaseRecord] = {}
+        self.asleep: dict[str, LeaseRecord] = {}
+        self._connection = connection
+
+    # -- asked by the holder -----------------------------------------------------------------------------------------
+    def ready(self, record: LeaseRecord, measured_bytes: int | None, now: float) -> int:
+        def held(_: Message, __: float) -> None:
+            record.held, record.measured_bytes = True, measured_bytes
+
+        message = {"op": "ready", **record.ref(), "measured_bytes": measured_bytes}
+        return self._ask(record, message, now, on_reply=held)
+
+    def use_begin(self, record: LeaseRecord, use_id: str, label: str, now: float) -> int:
+        """It counts from now on, so that a re-attachment on the way tells of it."""
+        record.uses.add(use_id)
+
+        def refused(_: VramError, __: float) -> None:
+            record.uses.discard(use_id)
+
+        message = {"op": "use_begin", **record.ref(), "use_id": use_id, "label": label}
+        return self._ask(record, message, now, on_error=refused)
+
+    def use_end(self, record: LeaseRecord, use_id: str, now: float) -> int:
+        record.uses.discard(use_id)
+        message = {"op": "use_end", **record.ref(), "use_id": use_id}
+        return self._connection.ask(message, now, quiet=True)
+
+    def use_yield(self, record: LeaseRecord, use_id: str, now: float) -> int:
+        """The use goes on, but no longer keeps the lease: `use_begin` with the same id takes it up again."""
+        record.uses.discard(use_id)
+        return self._ask(record, {"op": "yield", **record.ref(), "use_id": use_id}, now)
+
+    def resize(
+        self, record: LeaseRecord, footprint: Message, wait_timeout_s: float | None, now: float
+    ) -> int:
+        """Hold more, or less. The reply says `held` when it is done; else its end comes as `Resized`."""
+
+        record.resizing = footprint
+        record.resizing_until = None if wait_timeout_s is None else now + wait_timeout_s
+        return self._send_resize(record, footprint, now)
+
+    def oom(
+        self, record: LeaseRecord, requested_bytes: int, allocated_bytes: int | None, now: float
+    ) -> int:
+        message = {
+            "op": "oom",
+            **record.ref(),
+            "requested_bytes": requested_bytes,
+            "allocated_bytes": allocated_bytes,
+        }
+        return self._ask(record, message, now)
+
+    def revoke_ack(self, record: LeaseRecord, eta_s: float | None, now: float) -> int:
+        message = {"op": "revoke_ack", **record.ref(), "safe_point_eta_s": eta_s}
+        return self._ask(record, message, now, quiet=True)
+
+    def unloading(
+        self, record: LeaseRecord, now: float, timeout_s: float = REQUEST_TIMEOUT_S
+    ) -> int:
+        return self._ask(record, {"op": "unloading", **record.ref()}, now, timeout_s)
+
+    def release(
+        self, record: LeaseRecord, exiting: bool, now: float, timeout_s: float, *, asleep: str = ""
+    ) -> int:
+        """From here on nothing is held: no renewal. A lease that is gone already counts as released.
+
+        `asleep`: how it waits to come back (`standby`, `parked`), if the arbiter agrees; "" means never again. Nobody else would let go of
+        the room of one that sleeps, so it is said again until the arbiter has heard it, however long that takes.
+        """
+        record.released = True
+        self.held.pop(record.lease_id, None)
+        if record.resizing is not None:  # the arbiter drops it too, and says nothing of it
+            left = f"{record.lease_id} left the card before it had the size that was asked for"
+            self._resized(record, LeaseRevoking(left, hint="ask again when it is granted again"))
+        if asleep:
+            record.asleep = asleep
+            self.asleep[record.lease_id] = record
+        message = {
+            "op": "release",
+            **record.ref(),
+            "exiting": exiting,
+            "parked": asleep == "parked",
+        }
+        if asleep:
+            return self._say_asleep(record, message, now, timeout_s)
+
+        def let_go(reply: Message, at: float) -> None:
+            if str(reply.get("next", "")) in AWAY:
+                self._cancel(record, at)
+
+        return self._connection.ask(message, now, timeout_s, on_reply=let_go)
+
+    def reacquire(
+        self,
+        record: LeaseRecord,
+        wait_timeout_s: float | None,
+        now: float,
+        traceparent: str | None = None,
+    ) -> int:
+        """A lease that is asleep wants in now, as a waiter like any other. Its grant comes as `Returned`."""
+        record.wanted, record.wanted_by = True, traceparent
+        record.wanted_until = None if wait_timeout_s is None else now + wait_timeout_s
+        return self._send_reacquire(record, now)
+
+    def give_up_asleep(self, record: LeaseRecord, now: float) -> None:
+        """A lease that is asleep is not wanted any more."""
+        self._wake(record)
+        self._cancel(record, now)
+
+    # -- said by the arbiter -----------------------------------------------------------------------------------------
+    def hold(self, record: LeaseRecord) -> None:
+        """It is granted."""
+        self.held[record.lease_id] = record
+
+    def returned(self, view: Message) -> None:
+        """Granted again? The same record goes on under the new token."""
+        record = self.asleep.get(view["lease_id"])
+        if record is None or view.get("token") is None or view["state"] != "loading":
+            return
+        token = token_of(view)
+        if token <= record.token:
+            return
+        self._wake(record)
+        record.token, record.view = token, view
+        record.confirmed_at = record.renewed_at = (
+            self._connection.asked_at
+        )  # as for the first grant
+        record.held = record.released = False
+        record.measured_bytes = record.revoke = None
+        self.hold(record)
+        self._connection.tell(Returned(record))
+
+    def denied(self, lease_id: str, error: VramError) -> None:
+        """A wait that ended without a grant: of a resize, or of a lease that wanted to come back."""
+        if record := self.held.get(lease_id):
+            self._resized(record, error)
+        elif record := self.asleep.get(lease_id):
+            self._gone(record, error)
+
+    def resized(self, lease_id: str) -> None:
+        if record := self.held.get(lease_id):
+            self._resized(record)
+
+    def revoked(self, push: Message) -> None:
+        record = self.held.get(push["lease_id"])
+        if record is not None and record.token == token_of(push):
+            first, record.revoke = record.revoke is None, push
+            self._connection.tell(RevokeAsked(record, push, first))
+
+    def lost(self, push: Message) -> None:
+        record = self._record(push["lease_id"])
+        if record is not None and record.token == token_of(push):
+            self._gone(record, from_wire(push["error"]))
+
+    # -- contact -----------------------------------------------------------------------------------------------------
+    def reattachments(self) -> list[Message]:
+        return [record.reattachment() for record in (*self.held.values(), *self.asleep.values())]
+
+    def reattached(self, reply: Message) -> None:
+        for entry in reply.get("leases", ()):
+            record = self._record(entry["lease_id"])
+            if record is None:
+                continue
+            if entry.get("kept") and record.asleep:
+                self.returned(entry["lease"])  # if its grant was lost on the way
+            elif entry.get("kept"):
+                record.confirmed_at = record.renewed_at = self._connection.asked_at
+                record.revoke = None  # a push that is still meant comes again
+            else:
+                self._gone(record, _why_gone(entry))
+
+    def say_again(self, now: float) -> None:
+        """A new daemon knows from the re-attachment that a lease is away or held, not that it is wanted, or at another size."""
+        for record in self.asleep.values():
+            if record.wanted and not self._connection.awaits(record.reacquire_id):
+                self._send_reacquire(record, now, quiet=True)
+        for record in self.held.values():
+            if record.resizing is not None and not self._connection.awaits(record.resize_id):
+                self._send_resize(record, record.resizing, now, quiet=True)
+
+    # -- time --------------------------------------------------------------------------------------------------------
+    def deadlines(self) -> Iterator[float]:
+        for record in self.held.values():
+            yield self.fence_at(record)
+            if self._connection.phase == "up":
+                yield _renew_at(record)
+        for record in self.asleep.values():
+            if record.wanted and record.wanted_until is not None:
+                yield self._connection.wait_ends_at(record.wanted_until)
+
+    def fence_at(self, record: LeaseRecord) -> float:
+        return record.confirmed_at + record.ttl_s + self._connection.grace_s
+
+    def fence(self, now: float) -> None:
+        for record in [r for r in self.held.values() if now >= self.fence_at(r)]:
+            silent_s = now - record.confirmed_at
+            error = LeaseLost(
+                f"no word from the arbiter on {record.lease_id} for {silent_s:.1f} s: fenced",
+                hint="unload now; acquire again when the arbiter is back",
+                details={"lease_id": record.lease_id, "silent_s": silent_s},
+            )
+            self._gone(record, error, fenced=True)
+
+    def end_overdue(self, now: float) -> None:
+        """Leases that wanted to come back, and the arbiter did not say in time that they will not: it is out of reach."""
+        ends_at = self._connection.wait_ends_at
+        for record in [
+            r for r in self.asleep.values() if r.wanted and now >= ends_at(r.wanted_until)
+        ]:
+            self._gone(record, waited_in_vain(record.spec, "its return"))
+            self._cancel(record, now)
+
+    def renew(self, now: float) -> None:
+        """One message for all leases as soon as one is due."""
+        if any(now >= _renew_at(record) for record in self.held.values()):
+            for batch in _batches(self.held.values(), d.LEASES_PER_CLIENT_MAX):
+                self._renew(batch, now)
+
+    # -- steps -------------------------------------------------------------------------------------------------------
+    def _record(self, lease_id: str) -> LeaseRecord | None:
+        return self.held.get(lease_id) or self.asleep.get(lease_id)
+
+    def _ask(
+        self,
+        record: LeaseRecord,
+        message: Message,
+        now: float,
+        timeout_s: float = REQUEST_TIMEOUT_S,
+        *,
+        on_reply: OnReply | None = None,
+        on_error: OnError | None = None,
+        quiet: bool = False,
+    ) -> int:
+        """A request on a lease; an answer that this grant is not ours any more ends it."""
+        token = record.token
+
+        def refused(error: VramError, at: float) -> None:
+            if on_error is not None:
+                on_error(error, at)
+            if record.token == token and error.code in GONE_CODES:
+                self._gone(record, error)
+
+        return self._connection.ask(
+            message, now, timeout_s, on_reply=on_reply, on_error=refused, quiet=quiet
+        )
+
+    def _say_asleep(
+        self,
+        record: LeaseRecord,
+        release: Message,
+        now: float,
+        timeout_s: float,
+        *,
+        quiet: bool = False,
+    ) -> int:
+        """`quiet`: said again by ourselves, so that a refusal is told as the end of the lease. An answer that comes when it sleeps no more,
+        or again, is none to what it does now."""
+        token = record.token
+
+        def sleeps() -> bool:
+            return record.asleep != "" and record.token == token
+
+        def let_go(reply: Message, _: float) -> None:
+            then = str(reply.get("next", ""))
+            if not sleeps():
+                return
+            if then in AWAY:
+                record.asleep = then
+            else:
+                over(LeaseLost(f"{record.lease_id} may not come back", hint="acquire again"))
+
+        def refused(error: VramError, at: float) -> None:
+            if not sleeps():
+                return
+            if isinstance(error, ArbiterUnreachable):
+                self._say_asleep(record, release, at, timeout_s, quiet=True)
+            else:
+                over(error)
+
+        def over(error: VramError) -> None:
+            if quiet:
+                self._gone(record, error)
+            else:
+                self._wake(record)
+
+        return self._connection.ask(
+            release, now, timeout_s, on_reply=let_go, on_error=refused, quiet=quiet
+        )
+
+    def _send_reacquire(self, record: LeaseRecord, now: float, *, quiet: bool = False) -> int:
+        """`quiet`: said again by ourselves, so that a refusal is told as the end of the lease."""
+
+        def replied(reply: Message, _: float) -> None:
+            self.returned(reply["lease"])
+
+        def refused(error: VramError, _: float) -> None:
+            record.wanted = False
+            if quiet:
+                self._gone(record, error)
+
+        left_s = None if record.wanted_until is None else max(0.0, record.wanted_until - now)
+        message = {"op": "reacquire", **record.ref(), "wait_timeout_s": left_s}
+        if record.wanted_by is not None:
+            message["traceparent"] = record.wanted_by
+        record.reacquire_id = self._connection.ask(
+            message, now, on_reply=replied, on_error=refused, quiet=quiet
+        )
+        return record.reacquire_id
+
+    def _send_resize(
+        self, record: LeaseRecord, footprint: Message, now: float, *, quiet: bool = False
+    ) -> int:
+        """`quiet`: said again by ourselves, so that its end is told whatever it is."""
+
+        def replied(reply: Message, _: float) -> None:
+            record.spec = {**record.spec, "footprint": footprint}
+            if reply["state"] == "held" and quiet:
+                self._resized(record)
+            elif reply["state"] == "held":
+                record.resizing = None
+
+        def refused(error: VramError, _: float) -> None:
+            record.resizing = None
+            if quiet:
+                self._resized(record, error)
+
+        left_s = None if record.resizing_until is None else max(0.0, record.resizing_until - now)
+        message = {"op": "resize", **record.ref(), "footprint": footprint, "wait_timeout_s": left_s}
+        record.resize_id = self._ask(
+            record, message, now, on_reply=replied, on_error=refused, quiet=quiet
+        )
+        return record.resize_id
+
+    def _resized(self, record: LeaseRecord, error: VramError | None = None) -> None:
+        record.resizing = None
+        self._connection.tell(Resized(record, error))
+
+    def _cancel(self, record: LeaseRecord, now: float) -> None:
+        self._connection.ask({"op": "cancel", "lease_id": record.lease_id}, now, quiet=True)
+
+    def _renew(self, batch: list[LeaseRecord], now: float) -> None:
+        for record in batch:
+            record.renewed_at = now
+
+        def renewed(reply: Message, _: float) -> None:
+            alive = set(reply.get("alive", ()))
+            for record in batch:
+                if record.lease_id in alive:
+                    record.confirmed_at = max(record.confirmed_at, now)
+            for entry in reply.get("gone", ()):
+                gone = self.held.get(entry["lease_id"])
+                if gone is not None and gone in batch:
+                    self._gone(gone, _why_gone(entry))
+
+        message = {"op": "renew", "leases": [record.ref() for record in batch]}
+        self._connection.ask(message, now, on_reply=renewed, quiet=True)
+
+    def _wake(self, record: LeaseRecord) -> bool:
+        """It waits no longer. Did it?"""
+        record.asleep, record.wanted = "", False
+        return self.asleep.pop(record.lease_id, None) is not None
+
+    def _gone(self, record: LeaseRecord, error: VramError, fenced: bool = False) -> None:
+        if not (self.held.pop(record.lease_id, None) or self._wake(record)):
+            return
+        record.uses.clear()
+        self._connection.drop_unsent(
+            lambda m: m.get("lease_id") == record.lease_id and m["op"] in ("revoke_ack", "use_end")
+        )
+        self._connection.tell(Gone(record, error, fenced))
+
+
+def waited_in_vain(spec: Message, what: str, waited_s: float | None = None) -> WaitTimeout:
+    """A wait whose end the arbiter did not tell."""
+    within = "in time" if waited_s is None else f"within {waited_s:.1f} s"
+    return WaitTimeout(
+        f"no word on {what} for {spec.get('consumer')} {within}, and no contact to the arbiter",
+        hint="is the arbiter running? see `vramctl status`",
+        details={} if waited_s is None else {"waited_s": waited_s},
+    )
+
+
+def _why_gone(entry: Message) -> VramError:
+    return from_wire(entry.get("error") or {"code": "lease_lost"})
+
+
+def _renew_at(record: LeaseRecord) -> float:
+    return record.renewed_at + record.ttl_s * d.RENEW_FRACTION
+
+
+def _batches(records: Iterable[LeaseRecord], size: int) -> list[list[LeaseRecord]]:
+    every = list(records)
+    return [every[i : i + size] for i in range(0, len(every), size)]

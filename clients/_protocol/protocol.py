@@ -1,0 +1,95 @@
+"""The client's side of the arbiter's wire, sans-IO, put together: what to send, what it means, what is due when.
+
+- `connection` (`clients._protocol.connection`): hello, requests and replies, silence, reconnects; what to send, what to tell the owner.
+- `waits` (`clients._protocol.waits`): acquires that are not granted yet.
+- `holdings` (`clients._protocol.leases`): leases from their grant to their end, asleep or not.
+- `foreign_uses` (`clients._protocol.foreign_uses`): uses on leases of others.
+
+Each says what the owner may ask of it; this is only the order in which they are served: which push is whose, what is said again
+first, what a tick does first. It knows no sockets, no asyncio and no clock.
+"""
+
+from collections.abc import Iterator
+
+from vram_arbiter.clients._protocol.connection import Connection
+from vram_arbiter.clients._protocol.foreign_uses import ForeignUses
+from vram_arbiter.clients._protocol.leases import Holdings
+from vram_arbiter.clients._protocol.records import HistoryEvent, Message
+from vram_arbiter.clients._protocol.waits import Waits
+from vram_arbiter.schemas.errors import from_wire
+
+
+class ClientProtocol:
+    """One client. Whoever called anything on it or its parts looks at `connection.take_outgoing` and `take_events`, and at `next_deadline`."""
+
+    def __init__(self, *, name: str, instance: str, role: str = "client") -> None:
+        self.connection = Connection(self, name=name, instance=instance, role=role)
+        self.holdings = Holdings(self.connection)
+        self.waits = Waits(self.connection, self.holdings)
+        self.foreign_uses = ForeignUses(self.connection)
+        self._subscribed = False
+
+    def subscribe(self, now: float) -> int:
+        """History events from now on, also after reconnects."""
+
+        def subscribed(_: Message, __: float) -> None:
+            self._subscribed = True
+
+        return self.connection.ask({"op": "subscribe"}, now, on_reply=subscribed)
+
+    # -- time --------------------------------------------------------------------------------------------------------
+    def next_deadline(self) -> float | None:
+        """When `tick` has something to do at the latest."""
+        return min(self._deadlines(), default=None)
+
+    def tick(self, now: float) -> None:
+        """1. Fence leases. 2. End requests and waits past their deadline. 3. Hello again, or declare silence. 4. Renew, ping."""
+        self.holdings.fence(now)  # 1
+        self.connection.end_requests(now)  # 2
+        self.waits.end_overdue(now)
+        self.holdings.end_overdue(now)
+        if self.connection.stays_up(now):  # 3
+            self.holdings.renew(now)  # 4
+            self.connection.ping_if_silent(now)
+
+    def _deadlines(self) -> Iterator[float]:
+        yield from self.connection.deadlines()
+        yield from self.waits.deadlines()
+        yield from self.holdings.deadlines()
+
+    # -- for the connection (`clients._protocol.connection.Above`) -------------------------------------------------------------
+    def expects_grants(self) -> bool:
+        return bool(self.waits) or bool(self.holdings.asleep)
+
+    def reattachments(self) -> list[Message]:
+        return self.holdings.reattachments()
+
+    def reattached(self, reply: Message) -> None:
+        self.holdings.reattached(reply)
+
+    def say_again(self, now: float) -> None:
+        if self._subscribed:
+            self.connection.ask({"op": "subscribe"}, now, quiet=True)
+        self.waits.say_again(now)
+        self.holdings.say_again(now)
+        self.foreign_uses.say_again(now)
+
+    def pushed(self, message: Message, now: float) -> None:
+        """Pushes that we do not know are ignored: an older client lives with a newer arbiter."""
+        match message["push"]:
+            case "granted":
+                view = message["lease"]
+                if not self.waits.pushed_grant(view, now):
+                    self.holdings.returned(view)
+            case "denied":
+                error = from_wire(message["error"])
+                if not self.waits.pushed_denial(message["lease_id"], error):
+                    self.holdings.denied(message["lease_id"], error)
+            case "resized":
+                self.holdings.resized(message["lease_id"])
+            case "revoke":
+                self.holdings.revoked(message)
+            case "lost":
+                self.holdings.lost(message)
+            case "event":
+                self.connection.tell(HistoryEvent(message["event"]))

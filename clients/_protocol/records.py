@@ -1,0 +1,233 @@
+"""What the client's protocol tells its owner, and what it remembers of leases, waits, requests and uses. Plain data, no behaviour."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.errors import VramError
+
+Message = dict[str, Any]
+TokenPair = tuple[int, int]
+OnReply = Callable[[Message, float], None]
+OnError = Callable[[VramError, float], None]
+
+
+def token_of(message: Message) -> TokenPair:
+    """The token in a lease's view or in a push."""
+    epoch, serial = message["token"]
+    return int(epoch), int(serial)
+
+
+@dataclass(frozen=True, slots=True)
+class Eviction:
+    """Who made a lease leave, and why, by the arbiter's word."""
+
+    cause: str  # waiter, pressure, operator, parent; "": an arbiter that does not say
+    by: str  # the consumer that the room is for, or an operator with uid and pid; "" where there is neither
+    reason: str  # in words
+
+    @classmethod
+    def of(cls, push: Message) -> "Eviction":
+        order = push.get("order") or {}
+        return cls(
+            push.get("cause", ""),
+            order.get("by") or push.get("wanted_by", ""),
+            push.get("reason", ""),
+        )
+
+
+# -- what the owner is told -----------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class Up:
+    """Greeted and re-attached; requests flow. `epoch` changes with every start of the daemon."""
+
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class ContactLost:
+    """Open a fresh socket (the old one may still carry stale messages) and call `connected`."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """The arbiter does not want this client (version, role, full)."""
+
+    error: VramError
+
+
+@dataclass(frozen=True, slots=True)
+class Replied:
+    request_id: int
+    body: Message
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    request_id: int
+    error: VramError
+
+
+@dataclass(frozen=True, slots=True)
+class Granted:
+    nonce: str
+    record: "LeaseRecord"
+
+
+@dataclass(frozen=True, slots=True)
+class Denied:
+    nonce: str
+    error: VramError
+
+
+@dataclass(frozen=True, slots=True)
+class RevokeAsked:
+    """Asked to leave, or told again."""
+
+    record: "LeaseRecord"
+    push: Message
+    first: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Gone:
+    """A lease that ended without our doing. `fenced`: we ended it, the arbiter may not know."""
+
+    record: "LeaseRecord"
+    error: VramError
+    fenced: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Returned:
+    """A lease that was evicted is granted again, with a new token: load, then `ready`."""
+
+    record: "LeaseRecord"
+
+
+@dataclass(frozen=True, slots=True)
+class Resized:
+    """A resize came to its end: the bytes that are charged now, or why they did not change."""
+
+    record: "LeaseRecord"
+    error: VramError | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class UseLost:
+    """A use on somebody else's lease could not be renewed after a reconnect."""
+
+    use_id: str
+    error: VramError
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryEvent:
+    event: Message
+
+
+Event = (
+    Up
+    | ContactLost
+    | Refused
+    | Replied
+    | Failed
+    | Granted
+    | Denied
+    | RevokeAsked
+    | Gone
+    | Returned
+    | Resized
+    | UseLost
+    | HistoryEvent
+)
+
+
+# -- what it remembers ----------------------------------------------------------------------------------------------
+@dataclass(slots=True)
+class LeaseRecord:
+    """One granted lease, as this client believes it."""
+
+    lease_id: str
+    token: TokenPair
+    nonce: str
+    spec: Message
+    view: Message
+    confirmed_at: float  # when the last message that the arbiter confirmed was *sent*
+    renewed_at: float
+    held: bool = False  # False: still loading
+    measured_bytes: int | None = None
+    uses: set[str] = field(default_factory=set)
+    revoke: Message | None = None
+    released: bool = False
+    asleep: str = ""  # `standby` or `parked`: evicted, and may come back under the same id
+    wanted: bool = False  # asleep, and its owner waits for its return
+    wanted_until: float | None = None  # None: for ever
+    wanted_by: str | None = None  # the traceparent of whoever called it back
+    reacquire_id: int | None = None  # the newest request that asked for it
+    resizing: Message | None = None  # the footprint that its owner waits for
+    resizing_until: float | None = None  # None: for ever
+    resize_id: int | None = None  # the newest request that asked for it
+
+    @property
+    def ttl_s(self) -> float:
+        return float(self.spec.get("ttl_s", d.LEASE_TTL_S))
+
+    def ref(self) -> Message:
+        """`schemas.wire.LeaseRef`."""
+        return {"lease_id": self.lease_id, "token": list(self.token)}
+
+    def reattachment(self) -> Message:
+        """`schemas.wire.ReattachLease`."""
+        return {
+            **self.ref(),
+            "spec": self.spec,
+            "state": self.asleep or ("held" if self.held else "loading"),
+            "measured_bytes": self.measured_bytes,
+            "use_ids": sorted(self.uses),
+        }
+
+
+@dataclass(slots=True)
+class Waiter:
+    """An acquire that is not granted yet."""
+
+    nonce: str
+    spec: Message
+    extra: Message
+    asked_at: float
+    deadline: float | None
+    lease_id: str | None = None
+    request_id: int | None = None
+    abandoned: bool = False
+
+
+@dataclass(slots=True)
+class Pending:
+    """A request whose reply is not here yet; sent again after a reconnect."""
+
+    message: Message
+    deadline: float
+    sent_at: float | None = None
+    on_reply: OnReply | None = None  # our own bookkeeping, before the owner hears
+    on_error: OnError | None = None
+    quiet: bool = False  # nobody waits for it
+
+
+@dataclass(slots=True)
+class ForeignUseRecord:
+    """A use on somebody else's lease; begun again after a reconnect."""
+
+    lease_id: str
+    token: TokenPair
+    label: str
+    traceparent: str | None = None
+    begun: bool = False
+
+    def begin(self, use_id: str) -> Message:
+        on = {"lease_id": self.lease_id, "token": list(self.token)}
+        message = {"op": "use_begin", **on, "use_id": use_id, "label": self.label}
+        return message | ({"traceparent": self.traceparent} if self.traceparent else {})

@@ -1,0 +1,47 @@
+"""The caller's trace, for the clients: what they send along, and where an answer's work belongs.
+
+A program that has not imported OpenTelemetry can have no present span: it pays nothing for this, not even the import.
+"""
+
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+
+def present() -> str | None:
+    """The present span as W3C traceparent; None outside any."""
+    if "opentelemetry.trace" not in sys.modules:
+        return None
+    from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+
+    return tracing.traceparent()
+
+
+def along(fields: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The fields of a message, with the present span's traceparent where there is one."""
+    sent = dict(fields or {})
+    if (traceparent := present()) is not None:
+        sent.setdefault("traceparent", traceparent)
+    return sent
+
+
+def environ() -> dict[str, str]:
+    """For the environment of a program that is started here: it joins the present trace (`schemas.runtime.telemetry.commands`)."""
+    traceparent = present()
+    return {} if traceparent is None else {"TRACEPARENT": traceparent}
+
+
+@contextmanager
+def joined(traceparent: object) -> Iterator[None]:
+    """Within the block (and in the tasks made there) the present span is the one that a message named, or none.
+
+    What a message makes us do belongs to its sender, not to whoever happened to read the socket.
+    """
+    if "opentelemetry.trace" not in sys.modules:
+        yield
+        return
+    from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+
+    with tracing.joined(traceparent if isinstance(traceparent, str) else None):
+        yield

@@ -1,0 +1,171 @@
+"""Acquires that are not granted yet: asked, queued, then granted, denied, cancelled, or ended here.
+
+One acquire: `acquire` asks, with a nonce that makes the question repeatable → the reply says that it waits (`queued`, under a lease id) or is
+granted (`loading`) → a push says `granted` or `denied`. A grant becomes a `LeaseRecord` in `clients._protocol.leases`, and the owner hears
+`Granted` or `Denied` with the nonce. Whoever turns away (`cancel`) is remembered until the arbiter knows, so that a grant that crosses
+the cancel is handed back. After a reconnect the same acquire is asked again, with the time that is left.
+
+It must not know what becomes of a lease once it is granted.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S, Connection
+from vram_arbiter.clients._protocol.leases import Holdings, waited_in_vain
+from vram_arbiter.clients._protocol.records import (
+    Denied,
+    Granted,
+    LeaseRecord,
+    Message,
+    Waiter,
+    token_of,
+)
+from vram_arbiter.schemas.errors import VramError
+
+
+class Waits:
+    """False if nobody waits."""
+
+    def __init__(self, connection: Connection, holdings: Holdings) -> None:
+        self._connection = connection
+        self._holdings = holdings
+        self._waiters: dict[str, Waiter] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._waiters)
+
+    # -- asked by the owner ------------------------------------------------------------------------------------------
+    def acquire(
+        self,
+        nonce: str,
+        spec: Mapping[str, Any],
+        now: float,
+        *,
+        wait_timeout_s: float | None = None,
+        traceparent: str | None = None,
+    ) -> None:
+        """Ask for a lease; ends as `Granted` or `Denied` with this nonce."""
+        deadline = None if wait_timeout_s is None else now + wait_timeout_s
+        extra = {"traceparent": traceparent} if traceparent else {}
+        waiter = Waiter(nonce, dict(spec), extra, now, deadline)
+        self._waiters[nonce] = waiter
+        self._ask(waiter, now)
+
+    def cancel(self, nonce: str, now: float) -> None:
+        """Give up a wait. If the grant is on its way already, it is released when it comes."""
+        waiter = self._waiters.get(nonce)
+        if waiter is None:
+            return
+        waiter.abandoned = True
+        if waiter.lease_id is not None:
+            self._ask_to_cancel(waiter, now)
+
+    # -- said by the arbiter -----------------------------------------------------------------------------------------
+    def pushed_grant(self, view: Message, now: float) -> bool:
+        """Was it for one of these?"""
+        waiter = self._of(view["lease_id"])
+        if waiter is not None:
+            self._granted(waiter, view, now)
+        return waiter is not None
+
+    def pushed_denial(self, lease_id: str, error: VramError) -> bool:
+        """Was it for one of these?"""
+        waiter = self._of(lease_id)
+        if waiter is not None:
+            self._denied(waiter, error)
+        return waiter is not None
+
+    # -- contact and time --------------------------------------------------------------------------------------------
+    def say_again(self, now: float) -> None:
+        for waiter in self._waiters.values():
+            if not self._connection.awaits(waiter.request_id):
+                self._ask(waiter, now)
+
+    def deadlines(self) -> Iterator[float]:
+        for waiter in self._waiters.values():
+            if waiter.deadline is not None:
+                yield self._connection.wait_ends_at(waiter.deadline)
+
+    def end_overdue(self, now: float) -> None:
+        """Their time is over and the arbiter did not say so: it is out of reach."""
+        ends_at = self._connection.wait_ends_at
+        for waiter in [w for w in self._waiters.values() if now >= ends_at(w.deadline)]:
+            if not waiter.abandoned:
+                error = waited_in_vain(waiter.spec, "a lease", now - waiter.asked_at)
+                self._connection.tell(Denied(waiter.nonce, error))
+            waiter.abandoned, waiter.deadline = True, None
+            if waiter.lease_id is not None:
+                self._ask_to_cancel(waiter, now)
+
+    # -- steps -------------------------------------------------------------------------------------------------------
+    def _of(self, lease_id: str) -> Waiter | None:
+        return next((w for w in self._waiters.values() if w.lease_id == lease_id), None)
+
+    def _ask(self, waiter: Waiter, now: float) -> None:
+        left_s = None if waiter.deadline is None else max(0.0, waiter.deadline - now)
+        message = {
+            "op": "acquire",
+            "nonce": waiter.nonce,
+            "spec": waiter.spec,
+            "wait_timeout_s": 0.0 if waiter.abandoned else left_s,
+            **waiter.extra,
+        }
+
+        def replied(reply: Message, at: float) -> None:
+            if waiter.nonce in self._waiters:
+                self._replied(waiter, reply, at)
+
+        waiter.request_id = self._connection.ask(
+            message,
+            now,
+            REQUEST_TIMEOUT_S if left_s is None else max(REQUEST_TIMEOUT_S, left_s),
+            on_reply=replied,
+            on_error=lambda error, _: self._denied(waiter, error),
+            quiet=True,
+        )
+
+    def _replied(self, waiter: Waiter, reply: Message, now: float) -> None:
+        view = reply["lease"]
+        waiter.lease_id = view["lease_id"]
+        if (
+            reply.get("state") == "loading"
+        ):  # not by its token: one that was away shows its last one
+            self._granted(waiter, view, now)
+        elif waiter.abandoned:
+            self._ask_to_cancel(waiter, now)
+
+    def _granted(self, waiter: Waiter, view: Message, now: float) -> None:
+        """The message may have waited for us longer than the lease lives: what is sure is only that it was sent after the arbiter
+        heard the newest request that it has answered."""
+        self._waiters.pop(waiter.nonce, None)
+        heard_at = self._connection.asked_at
+        record = LeaseRecord(
+            lease_id=view["lease_id"],
+            token=token_of(view),
+            nonce=waiter.nonce,
+            spec=waiter.spec,
+            view=view,
+            confirmed_at=heard_at,
+            renewed_at=heard_at,
+        )
+        if (
+            waiter.abandoned
+        ):  # granted while we turned away: hand it back at once, nothing was loaded
+            self._connection.ask(
+                {"op": "release", **record.ref(), "exiting": False}, now, quiet=True
+            )
+            return
+        self._holdings.hold(record)
+        self._connection.tell(Granted(waiter.nonce, record))
+
+    def _denied(self, waiter: Waiter, error: VramError) -> None:
+        if self._waiters.pop(waiter.nonce, None) is not None and not waiter.abandoned:
+            self._connection.tell(Denied(waiter.nonce, error))
+
+    def _ask_to_cancel(self, waiter: Waiter, now: float) -> None:
+        def over(_: object, __: float) -> None:
+            self._waiters.pop(waiter.nonce, None)
+
+        message = {"op": "cancel", "lease_id": waiter.lease_id}
+        self._connection.ask(message, now, on_reply=over, on_error=over, quiet=True)

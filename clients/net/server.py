@@ -1,0 +1,270 @@
+"""The server of the programs that are not the arbiter (sidecars, runner, reasoner): one msgpack map
+per message, on `schemas.runtime.router`.
+
+It owns the socket, decoding, size limits and the error reply for what is not a message. A handler
+gets the decoded map and may answer at once, later, or several times. Peers are unmodified pyzmq
+DEALER and REQ sockets. Only `ipc://PATH` is served: on loopback tcp any user of the machine could
+drive the robot. It must not know what a message means.
+"""
+
+import asyncio
+import contextlib
+import logging
+import os
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from vram_arbiter.clients._protocol.codec import pack
+from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MIB, RATE_PER_CLIENT_PER_S
+from vram_arbiter.schemas.errors import LimitExceeded, MessageTooLarge, VramError
+from vram_arbiter.schemas.runtime.endpoints import socket_path
+from vram_arbiter.schemas.runtime.folders import LockFile, socket_folder
+from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
+from vram_arbiter.schemas.runtime.router import Connection, Limits, Router
+from vram_arbiter.schemas.runtime.zmtp import Oversize
+
+log = logging.getLogger(__name__)
+
+Message = dict[str, Any]
+REASON_MAX_CHARS = 500
+ENVELOPE_MAX_BYTES = 64 * 1024
+IMAGES_MAX_BYTES = IMAGE_MESSAGE_MAX_BYTES + ENVELOPE_MAX_BYTES
+VALUES_MAX = 12_288
+"""msgpack values of one message: 800 points of a trajectory of six joints; at most 4 ms of
+decoding.
+"""
+KEYS_MAX = 256
+"""Keys of one map: each that is unknown costs the event loop one more error, 3 µs."""
+ITEMS_MAX = 1024
+"""Items of one list."""
+LINGER_S = 3.0
+"""How long a server that ends waits until its last answers are read; only peers that do not read
+cost so long.
+"""
+SILENT_S = 300.0
+"""A connection without one good message is cut then, and earlier where its place is needed. libzmq
+connects again by itself.
+"""
+CONNECTIONS_MAX = 512
+WAITING_MAX = 512
+"""Requests of one user that wait for their answers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """Sender of a message: where to answer, and which process and user the kernel says it is.
+
+    `identity` is the serial of its connection, never reused. `pid` is 0 for a process that cannot
+    be seen from here.
+    """
+
+    identity: int
+    pid: int
+    uid: int
+
+
+Handler = Callable[[Peer, Message], Awaitable[None]]
+ErrorReply = Callable[[VramError], Message]
+
+
+@dataclass(slots=True)
+class _Client:
+    """What the server keeps of a connection."""
+
+    connection: Connection
+    peer: Peer
+    budget: float = RATE_PER_CLIENT_PER_S  # messages it may send at once
+    counted_at: float = 0.0
+
+    def within_rate(self, now: float) -> bool:
+        rate = float(RATE_PER_CLIENT_PER_S)
+        self.budget = min(rate, self.budget + (now - self.counted_at) * rate) - 1.0
+        self.counted_at = now
+        return self.budget >= 0
+
+
+@dataclass(slots=True)
+class _Waiting:
+    """Requests of one user that are being answered."""
+
+    count: int = 0
+    size_bytes: int = 0
+
+
+def check_free(endpoint: str) -> None:
+    """Before a server has moved or recorded anything: may it serve there? Claims nothing; binding
+    decides which server gets the endpoint.
+
+    Raises what `RouterServer` does.
+    """
+    path = path_of(endpoint)
+    _lock_of(path).check_free()
+
+
+def path_of(endpoint: str) -> Path:
+    """Path of the socket of an endpoint that a server may bind. Raises ConfigError."""
+    return Path(socket_path(endpoint))
+
+
+def _lock_of(path: Path) -> LockFile:
+    return LockFile(Path(f"{path}.lock"), f"ipc://{path}", "a server")
+
+
+class RouterServer:
+    """`async with RouterServer(endpoint, on_error) as server: await server.serve(handler)`.
+
+    A handler runs in a task of its own, so that a slow one delays no other request; its work up to
+    the first wait is done at once.
+    Args: `message_max_bytes` bounds one request; beside binary values, as pictures are, it holds at
+    most 1 MiB. `work_share` as in `schemas.runtime.router.Limits`.
+    Raises ConfigError for an endpoint that cannot be bound, AlreadyRunning when a living server has
+    it.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        on_error: ErrorReply,
+        *,
+        message_max_bytes: int = IMAGES_MAX_BYTES,
+        work_share: float = 1.0,
+    ) -> None:
+        self.endpoint = endpoint
+        self._path = path_of(endpoint)
+        self._on_error = on_error
+        self._unpack = UnpackLimits(
+            message_max_bytes, values_max=VALUES_MAX, keys_max=KEYS_MAX, items_max=ITEMS_MAX
+        )
+        several_bytes = max(64 * MIB, 8 * message_max_bytes)
+        self._waiting_max_bytes = several_bytes
+        limits = Limits(
+            message_max_bytes=message_max_bytes,
+            stranger_message_max_bytes=message_max_bytes,  # these wires have no hello: the first request may be a picture
+            skip_max_bytes=several_bytes,
+            hello_s=SILENT_S,
+            connections_max=CONNECTIONS_MAX,
+            out_max_bytes=several_bytes,
+            user_out_max_bytes=2 * several_bytes,
+            user_in_max_bytes=several_bytes,
+            work_share=work_share,
+        )
+        self._router = Router(self._path, self, limits)
+        self._clients: dict[int, _Client] = {}  # by serial
+        self._waiting: dict[int, _Waiting] = {}  # by uid
+        self._handler: Handler | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._stack = contextlib.AsyncExitStack()
+
+    async def __aenter__(self) -> Self:
+        socket_folder(self._path.parent, os.environ, shared=True)
+        lock = _lock_of(self._path)
+        lock.acquire()
+        self._stack.callback(lock.release)
+        try:
+            self._router.bind()
+        except BaseException:
+            await self._stack.aclose()
+            raise
+        self._stack.push_async_callback(self._router.aclose, LINGER_S)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """What was sent by now reaches its peer, though the process ends behind this. Then the
+        endpoint is free.
+        """
+        self._router.stop_receiving()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._stack.aclose()
+
+    async def serve(self, handler: Handler) -> None:
+        """Read until cancelled."""
+        loop = asyncio.get_running_loop()
+        self._handler = handler
+        self._router.start(loop)
+        try:
+            await loop.create_future()
+        finally:
+            self._router.stop_receiving()
+
+    async def send(self, peer: Peer, message: Message) -> None:
+        """Answer or push. A peer that is gone gets nothing; one that does not read is hung up on."""
+        client = self._clients.get(peer.identity)
+        if client is not None and not client.connection.send(pack(message)):
+            client.connection.close("it does not read its answers")
+
+    # -- for the router --------------------------------------------------------------------------------------------------
+    def connected(self, connection: Connection) -> None:
+        peer = Peer(connection.serial, connection.peer.process.pid, connection.peer.uid)
+        self._clients[connection.serial] = _Client(connection, peer)
+
+    def disconnected(self, connection: Connection, reason: str) -> None:
+        del self._clients[connection.serial]
+
+    def received(self, connection: Connection, payload: bytes | bytearray | Oversize) -> bool:
+        client, loop = self._clients[connection.serial], asyncio.get_running_loop()
+        within_rate = client.within_rate(loop.time())
+        try:
+            message, size = self._decoded(payload)
+            waiting = self._waiting_of(client.peer.uid, size)
+        except VramError as error:
+            connection.send(pack(self._on_error(error)))
+            return within_rate
+        if not connection.admitted:
+            connection.admit()
+        waiting.count += 1
+        waiting.size_bytes += size
+        task = asyncio.Task(
+            self._run(client.peer, message, waiting, size), loop=loop, eager_start=True
+        )
+        if not task.done():
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+        return within_rate
+
+    def _decoded(self, payload: bytes | bytearray | Oversize) -> tuple[Message, int]:
+        """The message and its size. Raises MessageTooLarge and BadFrame."""
+        if isinstance(payload, Oversize):
+            raise MessageTooLarge(
+                f"the message has {payload.size} bytes, the limit is {payload.limit}",
+                hint="send a smaller image",
+                details={"size_bytes": payload.size, "limit_bytes": payload.limit},
+            )
+        return unpack_map(payload, self._unpack), len(payload)
+
+    def _waiting_of(self, uid: int, size: int) -> _Waiting:
+        """Raises LimitExceeded where a user has all the requests, or bytes of them, that may wait."""
+        waiting = self._waiting.setdefault(uid, _Waiting())
+        full = "requests" if waiting.count >= WAITING_MAX else "bytes of requests"
+        if waiting.count >= WAITING_MAX or waiting.size_bytes + size > self._waiting_max_bytes:
+            limit = WAITING_MAX if full == "requests" else self._waiting_max_bytes
+            raise LimitExceeded(
+                f"{limit} {full} of uid {uid} wait for their answers",
+                hint="wait for answers before asking more",
+                details={"limit": full, "value": limit},
+            )
+        return waiting
+
+    async def _run(self, peer: Peer, message: Message, waiting: _Waiting, size: int) -> None:
+        assert self._handler is not None, "nothing is received before serve()"
+        try:
+            await self._handler(peer, message)
+        finally:
+            waiting.count -= 1
+            waiting.size_bytes -= size
+            if not waiting.count:
+                self._waiting.pop(peer.uid, None)
+
+
+def reason_of(message: Message) -> str:
+    """The `reason` of a request that must never be refused for its words, as a cancel: on one line,
+    of bounded length.
+    """
+    words = message.get("reason")
+    text = "" if words is None else str(words)[: 4 * REASON_MAX_CHARS]
+    return "".join(letter if letter.isprintable() else " " for letter in text).strip()[
+        :REASON_MAX_CHARS
+    ]

@@ -1,0 +1,298 @@
+"""The arbiter's configuration: one model, one YAML file, every key with purpose, default and range.
+
+Pure: `load_config(text, name)` takes the text of a file; the daemon reads the file. `configs/arbiter.yaml` states the same
+keys with the same defaults, and a test holds both together. No key is required: an empty file is the default configuration.
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.endpoints import check_endpoint
+from vram_arbiter.schemas.runtime.telemetry.setup import checked_url
+from vram_arbiter.schemas.units import ByteSize, parse_bytes
+from vram_arbiter.schemas.yamltext import Path, parse_yaml, validated
+
+Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
+Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class GpuConfig(_Section):
+    """Which cards are leased and how much of each."""
+
+    source: str = "auto"
+    """`auto`: `nvml` or `unified`, by what this machine is. `nvml`: its NVIDIA cards. `unified`: the memory that CPU and GPU share on a
+    Jetson or a GB10. `fake:8GiB`: one simulated card. `fake:FOLDER`: the card in that folder."""
+    reserve_bytes: ByteSize = d.RESERVE_BYTES
+    """Bytes of every card that are never leased: driver, display, allocator slack. At least 15 % of a memory shared with the CPU."""
+    capacity_bytes: dict[str, ByteSize] = Field(default_factory=dict)
+    """Cap per card, by UUID or index as text: lease out less than the card has. A card that is not named has no cap."""
+
+    pids: Literal["auto", "own", "host"] = "auto"
+    """In whose pid namespace the driver counts. `auto`: this one on a host, the host's in a container."""
+    host_proc: Annotated[str, Field(pattern="^/")] | None = None
+    """In a container: where the host's /proc is mounted, so that the driver's pids can be told apart. Null: lists are no evidence there."""
+
+    @field_validator("source")
+    @classmethod
+    def _known_source(cls, value: str) -> str:
+        if value not in ("auto", "nvml", "unified") and not (
+            value.startswith("fake:") and len(value) > 5
+        ):
+            raise ValueError(
+                f"{value!r} is no source of cards; write auto, nvml, unified, fake:8GiB or fake:FOLDER"
+            )
+        sizes = (
+            value.removeprefix("fake:") if value.startswith("fake:") and "/" not in value else ""
+        )
+        if sizes and not all(parse_bytes(size) for size in sizes.split(",")):
+            raise ValueError(f"{value!r} is a card without memory; write fake:8GiB")
+        return value
+
+
+class SchedulingConfig(_Section):
+    """Who is next."""
+
+    ageing_s_per_point: Seconds = d.AGEING_S_PER_POINT
+    """A waiter gains one point of priority per so many seconds, so that nobody starves."""
+    thrash_window_s: Seconds = d.THRASH_WINDOW_S
+    """Two consumers that made each other leave within so many seconds are thrashing."""
+    thrash_hold_max_s: Annotated[float, Field(ge=0, le=86_400, allow_inf_nan=False)] = (
+        d.THRASH_HOLD_MAX_S
+    )
+    """Of two that thrash, whoever is there stays for what a switch costs, at most so long. 0: never."""
+    policy: Literal["default", "fifo", "no_backfill", "lru", "one_model"] = "default"
+    """Who is next and who leaves; docs/policies.md compares them."""
+
+
+class RevokeConfig(_Section):
+    """The ladder towards a holder that is asked to leave."""
+
+    resend_s: Annotated[float, Field(ge=0.01, le=60, allow_inf_nan=False)] = d.REVOKE_RESEND_S
+    """`revoke` is sent again at this interval until the holder acknowledges it."""
+    remind_s: Seconds = d.REVOKE_REMIND_S
+    """After this long without a safe point the history says so."""
+    deadline_s: Seconds = d.REVOKE_DEADLINE_S
+    """After this long the waiter's own policy applies: keep waiting (`wait`) or a typed error (`deny`)."""
+    terminate_grace_s: Seconds = d.TERMINATE_GRACE_S
+    """A holder whose lease says `on_overstay: kill` is killed so long after it was told to terminate."""
+
+
+class VerifyConfig(_Section):
+    """Was the memory really given back?"""
+
+    timeout_s: Seconds = d.VERIFY_TIMEOUT_S
+    """A verification ends with a verdict after this long."""
+    poll_s: Annotated[
+        tuple[Annotated[float, Field(ge=0.001, le=10, allow_inf_nan=False)], ...],
+        Field(min_length=1, max_length=16),
+    ] = d.VERIFY_POLL_S
+    """Pauses between samples, the first one while memory usually comes back; the last one repeats."""
+    poll_until_s: Annotated[tuple[Seconds, ...], Field(max_length=15)] = d.VERIFY_POLL_UNTIL_S
+    """Until when after the release each pause but the last is kept. A consumer known to take longer is looked at for longer."""
+    confirm_s: Annotated[float, Field(ge=0.001, le=1, allow_inf_nan=False)] = d.VERIFY_CONFIRM_S
+    """After a sample that is on target: when the second one is taken, which has to agree."""
+    slow_poll_s: Seconds = d.VERIFY_SLOW_POLL_S
+    """Pause between samples after a verdict that does not allow a grant."""
+    tolerance_bytes: ByteSize = d.VERIFY_TOLERANCE_BYTES
+    """Difference between expected and measured bytes that is no difference."""
+
+    @model_validator(mode="after")
+    def _one_end_per_pause(self) -> Self:
+        if len(self.poll_until_s) != len(self.poll_s) - 1 or list(self.poll_until_s) != sorted(
+            self.poll_until_s
+        ):
+            raise ValueError(
+                f"poll_until_s needs {len(self.poll_s) - 1} rising times, one for each of poll_s but the last"
+            )
+        return self
+
+
+class ProbeConfig(_Section):
+    """Reading the cards."""
+
+    deadline_s: Seconds = d.PROBE_DEADLINE_S
+    """A reading that takes longer has failed: the card is unknown, which blocks grants."""
+    period_s: Seconds = d.PROBE_PERIOD_S
+    """Background readings while anybody holds or waits."""
+    load_s: Annotated[float, Field(ge=0.005, le=60, allow_inf_nan=False)] = d.LOAD_PROBE_S
+    """Readings while somebody loads: its load peak is learnt from them, and what falls between two is not seen."""
+    sample_max_age_s: Seconds = d.SAMPLE_MAX_AGE_S
+    """An older reading does not gate a grant; a fresh one is taken first."""
+
+
+class LeaseConfig(_Section):
+    """Life of a lease on the daemon's side."""
+
+    fence_grace_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = d.FENCE_GRACE_S
+    """After a lease's ttl and this grace without the arbiter a client unloads by itself."""
+
+
+class HostConfig(_Section):
+    """Memory of the machine itself."""
+
+    park_budget_bytes: ByteSize | None = None
+    """Host RAM that parked models may keep together; 0: nobody parks. Null: half of what is available when the daemon starts."""
+
+
+class LimitsConfig(_Section):
+    """Every queue and message has a limit; its breach is a typed error."""
+
+    message_max_bytes: Annotated[ByteSize, Field(ge=4096, le=64 * d.MIB)] = d.MESSAGE_MAX_BYTES
+    """Largest request."""
+    connections_max: Annotated[int, Field(ge=4, le=65_536)] = d.CONNECTIONS_MAX
+    """Connections at a time, with those that have not said hello. Less where the daemon may open fewer files (three per connection)."""
+    sessions_max: Annotated[int, Field(ge=1, le=65_536)] = d.SESSIONS_MAX
+    """Clients at a time: connections that have said hello."""
+    operator_reserve: Annotated[int, Field(ge=0, le=1024)] = d.OPERATOR_RESERVE
+    """Of these, how many only operators get."""
+    waiters_max: Annotated[int, Field(ge=1, le=1_000_000)] = d.WAITERS_MAX
+    """Queued leases at a time."""
+    process_share: Share = d.PROCESS_SHARE
+    """Part of the connections, clients, subscribers and places of `waiters_max`, and of the uses of another process's lease, that one
+    process may take."""
+    user_share: Share = d.USER_SHARE
+    """The same for all processes of one user together, but that operators always find room as clients."""
+    priority_reserve: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = (
+        d.PRIORITY_RESERVE
+    )
+    """Part of the places of `waiters_max` that is kept for requests above the default priority."""
+    leases_per_client_max: Annotated[int, Field(ge=1, le=4096)] = d.LEASES_PER_CLIENT_MAX
+    """Live leases of one client."""
+    uses_per_lease_max: Annotated[int, Field(ge=1, le=65_536)] = d.USES_PER_LEASE_MAX
+    """Uses of one lease at a time: its holder's own, and as many of others."""
+    rate_per_client_per_s: Annotated[int, Field(ge=10, le=1_000_000)] = d.RATE_PER_CLIENT_PER_S
+    """Requests a second of one connection; a burst of one second's worth is allowed. Each KiB of a request counts as one more."""
+    rate_per_process_per_s: Annotated[int, Field(ge=10, le=1_000_000)] = d.RATE_PER_PROCESS_PER_S
+    """The same for all connections of one process together."""
+    subscribers_max: Annotated[int, Field(ge=0, le=65_536)] = d.SUBSCRIBERS_MAX
+    """Connections that receive every event."""
+
+
+class HistoryConfig(_Section):
+    """What happened, kept on disk."""
+
+    max_events: Annotated[int, Field(ge=100, le=10_000_000)] = d.HISTORY_MAX_EVENTS
+    """Older events are dropped beyond this number."""
+    days: Annotated[float, Field(gt=0, le=3650, allow_inf_nan=False)] = d.HISTORY_DAYS
+    """Older events are dropped after this many days."""
+
+
+class RecordConfig(_Section):
+    """The event log: what `vramctl replay` reads."""
+
+    enabled: bool = True
+    """Write what the engine was told, and a digest of what it decided, to the state folder."""
+    max_bytes: Annotated[ByteSize, Field(ge=128 * d.KIB)] = d.RECORD_MAX_BYTES
+    """All files together; the oldest go."""
+    file_bytes: Annotated[ByteSize, Field(ge=64 * d.KIB)] = d.RECORD_FILE_BYTES
+    """One file; the next one begins with the engine's whole state."""
+
+
+class WireConfig(_Section):
+    """The socket."""
+
+    endpoint: str | None = None
+    """`ipc:///run/vram-arbiter/arbiter.sock`. Null: `VRAM_ARBITER_ENDPOINT`, else `arbiter.sock` in the runtime folder."""
+    heartbeat_s: Annotated[float, Field(ge=0.1, le=60, allow_inf_nan=False)] = d.HEARTBEAT_S
+    """How often clients are asked to say that they are there."""
+    group: Annotated[str, Field(min_length=1, max_length=64)] | None = None
+    """Unix group that may connect and hold leases, beside the daemon's own user and root. Null: that of `operators_group`."""
+    operators_group: Annotated[str, Field(min_length=1, max_length=64)] | None = None
+    """Unix group that may act by hand (evict, pin, drain), beside the daemon's own user and root. Where `group` is set, operators are
+    members of both. Null: no group may."""
+
+    @field_validator("endpoint")
+    @classmethod
+    def _ipc_only(cls, value: str | None) -> str | None:
+        return None if value is None else check_endpoint(value)
+
+
+class StateConfig(_Section):
+    """Files that outlive the daemon."""
+
+    dir: Annotated[str, Field(min_length=1)] | None = None
+    """Folder of journal and history. Null: `$STATE_DIRECTORY` under systemd, else `~/.local/state/vram-arbiter`; with a
+    simulated card `state` in the runtime folder."""
+
+
+class LogConfig(_Section):
+    """The daemon's log on stderr."""
+
+    format: Literal["human", "json"] = "human"
+    """`human`: one readable line each. `json`: one object a line."""
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    """Lowest level that is written."""
+
+
+class TelemetryConfig(_Section):
+    """Traces and metrics, with the extra `telemetry`. What is set here wins over the OTEL_* variables; nothing set anywhere: off."""
+
+    endpoint: str | None = None
+    """OTLP collector (HTTP, protobuf) for spans and metrics. Null: `OTEL_EXPORTER_OTLP_ENDPOINT`, else none."""
+    prometheus_port: Annotated[int, Field(ge=0, le=65_535)] | None = None
+    """Port of a Prometheus endpoint on 127.0.0.1; 0: any free one, said in the log. Null: none, unless `OTEL_METRICS_EXPORTER` says so."""
+    sample_ratio: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] | None = None
+    """Share of the traces that begin in the daemon; the others are kept where their beginning was. Null: `OTEL_TRACES_SAMPLER_ARG`, else 1."""
+
+    @field_validator("endpoint")
+    @classmethod
+    def _a_collector(cls, value: str | None) -> str | None:
+        try:
+            return None if value is None else checked_url(value, "endpoint")
+        except ConfigError as error:
+            raise ValueError(f"{error.message}; {error.hint}") from None
+
+
+class ArbiterConfig(_Section):
+    """Everything that an operator can set. Sizes may be written `8GiB`, `450MiB`, `5.3GB` or in bytes."""
+
+    gpu: GpuConfig = GpuConfig()
+    scheduling: SchedulingConfig = SchedulingConfig()
+    revoke: RevokeConfig = RevokeConfig()
+    verify: VerifyConfig = VerifyConfig()
+    probe: ProbeConfig = ProbeConfig()
+    lease: LeaseConfig = LeaseConfig()
+    host: HostConfig = HostConfig()
+    limits: LimitsConfig = LimitsConfig()
+    history: HistoryConfig = HistoryConfig()
+    record: RecordConfig = RecordConfig()
+    wire: WireConfig = WireConfig()
+    state: StateConfig = StateConfig()
+    log: LogConfig = LogConfig()
+    telemetry: TelemetryConfig = TelemetryConfig()
+
+
+def known_keys() -> Mapping[Path, Collection[str]]:
+    """The keys of every section, by path: what suggestions for a mistyped key are taken from."""
+    found: dict[Path, Collection[str]] = {(): list(ArbiterConfig.model_fields)}
+    for name, field in ArbiterConfig.model_fields.items():
+        section = field.annotation
+        if isinstance(section, type) and issubclass(section, BaseModel):
+            found[(name,)] = list(section.model_fields)
+    return found
+
+
+def load_config(text: str, name: str) -> ArbiterConfig:
+    """Read the text of a configuration file; `name` is how errors call the file.
+
+    Raises ConfigError with every mistake, each with its line: `arbiter.yaml:12: verify.tiemout_s: unknown key; did you mean
+    timeout_s?`
+    """
+    source = parse_yaml(text, name)
+    data = source.data
+    if isinstance(data, dict):
+        # `verify:` with all its keys commented out is an empty section, not a mistake
+        data = {
+            key: {} if value is None and (key,) in known_keys() else value
+            for key, value in data.items()
+        }
+    return validated(ArbiterConfig, replace(source, data=data), known_keys())

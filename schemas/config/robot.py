@@ -1,0 +1,176 @@
+"""A deployment: which robot, which cameras, which skill, at which rate. The YAML file that `vram-runner deploy` reads.
+
+Pure: `load_robot(text, name)` takes the text of a file. Field names are those of the field's `RobotEnvironment` files, so that they load
+unchanged. Nothing is guessed: what an adapter or a reader needs beyond these fields stands in `transport`, `params` and `backend_params`
+and is checked by that adapter, before anything moves.
+"""
+
+from collections.abc import Collection, Mapping
+from enum import StrEnum
+from typing import Annotated, Any, Literal, Self, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from vram_arbiter.schemas.body import Body, Capability
+from vram_arbiter.schemas.manifest.contracts import Quantization, SafetyEnvelope
+from vram_arbiter.schemas.manifest.vocabulary import EmbodimentTag
+from vram_arbiter.schemas.yamltext import Path, YamlText, parse_yaml, validated
+
+RATE_HZ_MAX = 1000.0
+MAX_AGE_MS = 100.0
+
+Text = Annotated[str, Field(min_length=1, max_length=256)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class SensorBackend(StrEnum):
+    """How the frames of a camera come in."""
+
+    OPENCV_THREAD = "opencv_thread"
+    ROS2_IMAGE = "ros2_image"
+    GSTREAMER = "gstreamer"
+    HOLOSCAN = "holoscan"
+
+
+class SensorReaderConfig(_Section):
+    """One camera."""
+
+    sensor_id: Text
+    """Name under which its frames appear in the world state; a skill's manifest refers to it."""
+    backend: SensorBackend = SensorBackend.OPENCV_THREAD
+    """`holoscan` is reserved: it is refused when the runner starts."""
+    backend_params: dict[str, Any] = {}
+    """What this backend needs: a device, a URL, a topic, a pipeline."""
+    max_age_ms: Positive = MAX_AGE_MS
+    """An older frame is stale: it is not shown to the skill."""
+    publish_to_ros: bool = False
+    """Publish the frames on a ROS 2 topic as well, for recorders and viewers."""
+    publish_topic: Text | None = None
+    publish_rate_hz: Positive | None = None
+    """At most so many frames a second are published; null: all."""
+
+    @model_validator(mode="after")
+    def _topic_goes_with_publishing(self) -> Self:
+        if self.publish_to_ros != (self.publish_topic is not None):
+            raise ValueError("publish_to_ros and publish_topic go together: give both or neither")
+        if self.publish_rate_hz is not None and not self.publish_to_ros:
+            raise ValueError("publish_rate_hz without publish_to_ros publishes nothing")
+        return self
+
+
+class HalConfig(_Section):
+    """The robot's hardware adapter."""
+
+    adapter: Text
+    """`so101_mujoco`, `so101_kinematic` or `lerobot:TYPE`."""
+    transport: dict[str, Any] = {}
+    """Port, ids, calibration: how the hardware is reached."""
+    params: dict[str, Any] = {}
+
+
+class TaskSpec(_Section):
+    """What the robot is to do when nobody sends goals."""
+
+    id: Text
+    scene_id: str = ""
+    instruction: Annotated[str, Field(max_length=2000)] = ""
+    max_steps: Annotated[int, Field(gt=0)] | None = None
+    success_key: str | None = None
+    metadata: dict[str, Any] = {}
+
+
+class VlaSpec(_Section):
+    """The skill that runs the task: an installed rSkill by name, without a scheme."""
+
+    id: Text
+    """The skill's name; or, as the field writes it, the policy's family (`act`), and then
+    `weights_uri` names the skill: `rskills/so101-grab`."""
+    weights_uri: str = ""
+    device: str = "auto"
+    runtime: str | None = None
+    quantization: Quantization | None = None
+    """A block as in the skill's manifest, or its `dtype` alone."""
+    deterministic: bool = False
+    extra: dict[str, Any] = {}
+
+    @field_validator("quantization", mode="before")
+    @classmethod
+    def _a_word_is_a_dtype(cls, value: object) -> object:
+        return {"dtype": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _bare_reference(self) -> Self:
+        if "://" in self.id:
+            raise ValueError(
+                f"{self.id!r}: write the skill's name, OWNER/REPOSITORY, without a scheme"
+            )
+        return self
+
+
+class RobotEnvironment(_Section):
+    """One robot as it is deployed."""
+
+    robot_id: Text
+    embodiment_tags: tuple[Text, ...] = ()
+    """What the robot is, e.g. `so101_follower`; empty: what its adapter is known to be. Skills made
+    for other robots are refused. A tag that no manifest can name is a warning."""
+    capabilities: dict[str, Capability] = {}
+    """Facts that manifests ask for by name: `has_vision: true`, `can_lift_kg: 0.5`. Cameras and grippers are seen without being named here."""
+    hal: HalConfig
+    sensors: tuple[SensorReaderConfig, ...] = ()
+    task: TaskSpec | None = None
+    vla: VlaSpec | None = None
+    safety: SafetyEnvelope | None = None
+    """Tightens the robot's own limits; it can never widen them."""
+    rate_hz: Annotated[float, Field(gt=0, le=RATE_HZ_MAX, allow_inf_nan=False)] = 30.0
+    thumbnail_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 25.0
+    deadline_overrun_policy: Literal["warn", "drop", "raise"] = "warn"
+    max_ticks: Annotated[int, Field(gt=0)] | None = None
+    save_dir: str | None = None
+    """Folder of the recorded dataset; null: nothing is recorded."""
+    metadata: dict[str, Any] = {}
+
+    @model_validator(mode="after")
+    def _names_are_unique(self) -> Self:
+        names = [sensor.sensor_id for sensor in self.sensors]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"sensor_id must be unique; given twice: {', '.join(twice)}")
+        if (self.vla is None) != (self.task is None):
+            raise ValueError("task and vla go together: give both, or neither to serve goals only")
+        Body.model_validate({"embodiment_tags": self.known_tags, "capabilities": self.capabilities})
+        return self
+
+    @property
+    def known_tags(self) -> tuple[str, ...]:
+        """The tags that manifests have words for."""
+        return tuple(tag for tag in self.embodiment_tags if tag in get_args(EmbodimentTag))
+
+
+def known_keys() -> Mapping[Path, Collection[str]]:
+    """The keys of each section, for suggestions."""
+    return {
+        (): list(RobotEnvironment.model_fields),
+        ("hal",): list(HalConfig.model_fields),
+        ("task",): list(TaskSpec.model_fields),
+        ("vla",): list(VlaSpec.model_fields),
+        ("vla", "quantization"): list(Quantization.model_fields),
+        ("safety",): list(SafetyEnvelope.model_fields),
+        **{("sensors", index): list(SensorReaderConfig.model_fields) for index in range(64)},
+    }
+
+
+def load_robot(text: str, name: str) -> RobotEnvironment:
+    """Read the text of a deployment file; `name` is how errors call it.
+
+    Raises ConfigError with every mistake and its line: `robot.yaml:7: sensors[0].bakend: unknown key; did you mean backend?`
+    """
+    return robot_of(parse_yaml(text, name))
+
+
+def robot_of(source: YamlText) -> RobotEnvironment:
+    """Return a parsed deployment file as its model. Raises ConfigError with every mistake and its line."""
+    return validated(RobotEnvironment, source, known_keys())

@@ -1,0 +1,1 @@
+"""Telemetry names, set-up and spans."""

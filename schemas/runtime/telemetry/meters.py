@@ -1,0 +1,45 @@
+"""Counts and measurements by the names of `schemas.runtime.telemetry.names`. On the API alone: costs next to nothing until `schemas.runtime.telemetry.setup` has installed an SDK.
+
+Labels are ATTR_ names with values from small sets (a skill, a tool, an operation, a code of an error), never ids: each combination is
+a series that is kept as long as the process lives.
+"""
+
+import math
+from collections.abc import Mapping
+from functools import cache
+
+from opentelemetry import metrics
+
+from vram_arbiter.schemas.runtime.telemetry import exported
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+
+Labels = Mapping[str, str]
+
+_METER = metrics.get_meter(telemetry.TRACER)  # a proxy: it finds the SDK whenever that comes
+_UNITS = {
+    telemetry.METRIC_TICK: "ms",
+    telemetry.METRIC_INFERENCE: "ms",
+    telemetry.METRIC_SIDECAR_REQUEST: "ms",
+    telemetry.METRIC_SIDECAR_LOAD: "s",
+}
+
+
+def count(name: str, labels: Labels | None = None, times: int = 1) -> None:
+    """Something happened `times` times."""
+    _counter(name).add(times, exported.labels(labels))
+
+
+def measure(name: str, value: float, labels: Labels | None = None) -> None:
+    """One value of a distribution, in the unit of its name. What is no number, or negative, is no measurement and left out."""
+    if math.isfinite(value) and value >= 0:
+        _histogram(name).record(value, exported.labels(labels))
+
+
+@cache
+def _counter(name: str) -> metrics.Counter:
+    return _METER.create_counter(name, unit="1")
+
+
+@cache
+def _histogram(name: str) -> metrics.Histogram:
+    return _METER.create_histogram(name, unit=_UNITS[name])

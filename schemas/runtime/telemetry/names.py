@@ -1,0 +1,102 @@
+"""Names of all spans, span events, metrics and attributes, in one place. Names only: nothing is recorded here.
+
+Who records what: the arbiter `lease.*`, the runner `rskill.*` and the parts of a tick, the reasoner `reasoner.*`, a sidecar `sidecar.*`,
+every command line `cli.command`. One trace runs through all of them by the W3C `traceparent` on their sockets.
+"""
+
+TRACER = "vram-arbiter"
+
+# -- spans ------------------------------------------------------------------------------------------------------------
+SPAN_COMMAND = "cli.command"
+
+SPAN_ACQUIRE = "lease.acquire"  # from the request to `ready`; children: what the time went into
+SPAN_QUEUE = "lease.queue"
+SPAN_EVICT = "lease.evict"  # one for each lease that had to leave
+SPAN_VERIFY = "lease.verify"
+SPAN_LOAD = "lease.load"
+
+SPAN_GOAL = "rskill.goal"
+SPAN_ACTIVATE = "rskill.activate"
+SPAN_TICK = "rskill.tick"
+SPAN_SENSORS = "sensors.read"
+SPAN_WORLD = "world_state.snapshot"
+SPAN_INFERENCE = "inference"
+SPAN_CHUNK = "rskill.chunk_inference"
+SPAN_SAFETY = "safety.check"
+SPAN_SEND = "hal.send_action"
+SPAN_EPISODE = "sim.episode"
+
+SPAN_REASONER_TICK = "reasoner.tick"
+SPAN_PLAN = "reasoner.plan"
+SPAN_TOOL = "reasoner.tool"
+
+SPAN_SIDECAR_LOAD = "sidecar.load"
+SPAN_SIDECAR_UNLOAD = "sidecar.unload"
+SPAN_SIDECAR_REQUEST = "sidecar.request"
+
+# -- events within a span -----------------------------------------------------------------------------------------------
+EVENT_DEADLINE_MISSED = "vram.event.deadline_missed"
+EVENT_ESTOP = "vram.event.estop_requested"
+EVENT_STALE = "vram.event.staleness_latched"
+EVENT_ACTION_WITHHELD = "vram.event.action_withheld"
+EVENT_REVOKE_ACKED = "vram.event.revoke_acked"  # within lease.evict
+EVENT_REMINDED = "vram.event.reminded"
+EVENT_DEADLINE_PASSED = "vram.event.deadline_passed"
+EVENT_SIGNALLED = "vram.event.signalled"
+EVENT_UNLOADING = "vram.event.unloading"
+EVENT_VERDICT = "vram.event.verdict"  # within lease.verify: one that allows no grant yet
+EVENT_DAEMON_STOPPED = "vram.event.daemon_stopped"  # the lease goes on, its span cannot
+EVENT_PREFETCH_HIT = "vram.event.chunk_prefetch_hit"
+EVENT_PREFETCH_MISS = "vram.event.chunk_prefetch_miss"
+
+# -- metrics: name, unit in the name's comment; labels are ATTR_ names -----------------------------------------------------
+METRIC_GRANTS = "vram.lease.grants"  # 1, by consumer
+METRIC_DENIALS = "vram.lease.denials"  # 1, by reason
+METRIC_WAIT = "vram.lease.wait"  # s, from request to grant
+METRIC_WAITERS = "vram.lease.waiters"  # 1, now
+METRIC_EVICTIONS = "vram.evictions"  # 1, by verdict
+METRIC_HANDOVER = "vram.handover"  # s, from the first ask to the grant that needed the room
+METRIC_CHARGED = "vram.gpu.charged"  # By, by GPU and consumer
+METRIC_MEASURED = (
+    "vram.gpu.measured"  # By, by GPU and consumer; the sum over consumers is METRIC_USED
+)
+METRIC_USED = "vram.gpu.used"  # By, by GPU
+METRIC_CAPACITY = "vram.gpu.capacity"  # By, by GPU
+METRIC_PRESSURE = "vram.gpu.pressure"  # By, by GPU: held beyond what was granted
+METRIC_READING_AGE = "vram.gpu.reading_age"  # s, by GPU: since the newest successful reading
+METRIC_DRAINED = "vram.drained"  # 1 while an operator's drain stops grants, else 0
+METRIC_JOURNAL_HEALTHY = "vram.journal.healthy"  # 1, or 0 while the journal cannot be written
+METRIC_JOURNAL_WRITE = "vram.journal.write"  # s, one transaction
+METRIC_JOURNAL_FAILURES = "vram.journal.failures"  # 1, transactions that failed
+METRIC_BUILD = "vram.build.info"  # always 1, by version and Python's version
+METRIC_TICK = "vram.tick.duration"  # ms
+METRIC_INFERENCE = "vram.inference.duration"  # ms
+METRIC_DEADLINE_MISSES = "vram.tick.deadline_misses"  # 1
+METRIC_SAFETY_VIOLATIONS = "vram.safety.violations"  # 1
+METRIC_WITHHELD = "vram.safety.withheld"  # 1
+METRIC_GOALS = "vram.goals"  # 1, by skill and state
+METRIC_TOOL_CALLS = "vram.reasoner.tool_calls"  # 1, by tool and outcome
+METRIC_SIDECAR_LOAD = "vram.sidecar.load"  # s, by model
+METRIC_SIDECAR_REQUEST = "vram.sidecar.request"  # ms, by operation and outcome
+
+# -- attributes and labels: a closed set, so that no metric's cardinality grows with use -----------------------------------------
+ATTR_LEASE = "vram.lease_id"  # spans only
+ATTR_CONSUMER = "vram.consumer"
+ATTR_MODEL = "vram.model"
+ATTR_GPU = "vram.gpu"
+ATTR_VERDICT = "vram.verdict"
+ATTR_REASON = "vram.reason"
+ATTR_BYTES = "vram.bytes"  # spans only
+ATTR_BYTES_BEFORE = "vram.bytes_before"  # spans only: the whole card when the unloading began
+ATTR_BYTES_AFTER = "vram.bytes_after"  # spans only: and at the verdict
+ATTR_WANTED_BY = "vram.wanted_by"  # spans only: the consumer that needs the room
+ATTR_SKILL = "rskill.id"
+ATTR_REVISION = "rskill.revision"
+ATTR_GOAL = "rskill.goal_id"  # spans only
+ATTR_TOOL = "reasoner.tool"
+ATTR_OPERATION = "sidecar.operation"
+ATTR_OUTCOME = "outcome"
+ATTR_VERSION = "version"
+ATTR_PYTHON = "python"
+ATTR_COMMAND = "cli.command"
+ATTR_EXIT_CODE = "process.exit.code"  # spans only

@@ -1,0 +1,1 @@
+"""Model classes of our own small checkpoints."""

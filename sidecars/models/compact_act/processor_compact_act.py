@@ -1,0 +1,21 @@
+"""Pre- and postprocessing of the compact policy: lerobot's default pipelines (batch, device, normalise, unnormalise)."""
+
+from typing import Any
+
+from lerobot.processor import (
+    PolicyAction,
+    PolicyProcessorPipeline,
+    make_default_pre_post_processors,
+)
+
+from vram_arbiter.sidecars.models.compact_act.configuration_compact_act import CompactActConfig
+
+
+def make_compact_act_pre_post_processors(
+    config: CompactActConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
+) -> tuple[
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
+    PolicyProcessorPipeline[PolicyAction, PolicyAction],
+]:
+    """Both pipelines for a fresh policy; lerobot's factory finds this function by its name."""
+    return make_default_pre_post_processors(config, dataset_stats, normalizer_device=config.device)  # type: ignore[no-any-return]
