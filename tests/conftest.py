@@ -12,10 +12,11 @@ from tests.support import machines
 from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
 
+_ROOT = Path(__file__).parents[1]
 machines.register()
 # Programs that tests start import `tests.support` too.
 os.environ["PYTHONPATH"] = os.pathsep.join(
-    [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    [f"{_ROOT}/src", str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
 )
 # MuJoCo reads it when it is first imported, by whichever test of this process that is.
 os.environ.setdefault("MUJOCO_GL", "egl")

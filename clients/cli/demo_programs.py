@@ -37,12 +37,12 @@ class Programs:
     environ: Mapping[str, str]
     running: dict[str, Program] = field(default_factory=dict)
 
-    async def start(self, name: str, *arguments: str) -> Program:
-        """Start `python -m ARGUMENTS`; its output goes to `<log_dir>/<name>.log`."""
+    async def start(self, name: str, package: str, *arguments: str) -> Program:
+        """Start `python -m vram_arbiter.PACKAGE ARGUMENTS`; its output goes to `<log_dir>/<name>.log`."""
         log = self.log_dir / f"{name}.log"
         with log.open("wb") as sink:
             process = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", *arguments,
+                sys.executable, "-m", f"vram_arbiter.{package}", *arguments,
                 stdin=asyncio.subprocess.DEVNULL, stdout=sink, stderr=sink, env=dict(os.environ) | traces.environ() | dict(self.environ),
             )  # fmt: skip
         program = self.running[name] = Program(name, process, log)

@@ -216,10 +216,10 @@ def test_a_core_that_fails_ends_the_daemon_with_70(make_arbiter: Make) -> None:
     arbiter = make_arbiter()
     script = """
         import sys
-        import arbiter.daemon as daemon
-        from arbiter.__main__ import main
-        from arbiter.core.events import ClientConnected
-        from arbiter.core.invariants import InvariantViolation
+        import vram_arbiter.arbiter.daemon as daemon
+        from vram_arbiter.arbiter.__main__ import main
+        from vram_arbiter.arbiter.core.events import ClientConnected
+        from vram_arbiter.arbiter.core.invariants import InvariantViolation
 
         class Defective(daemon.Arbiter):
             def handle(self, event, now):

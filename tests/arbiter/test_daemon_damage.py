@@ -28,9 +28,9 @@ PATIENCE_S = 60.0
 HOLDER = """
 import asyncio, sys
 from pathlib import Path
-from clients.client import ArbiterClient
-from schemas.wire import Footprint, LeaseSpec
-from sidecars.device.fake import FakeMemory
+from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.sidecars.device.fake import FakeMemory
 
 async def main():
     memory, size = FakeMemory(Path(sys.argv[1]), "holder", 0), 2 << 30

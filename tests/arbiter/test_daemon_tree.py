@@ -20,7 +20,7 @@ PATIENCE_S = 60.0
 CHILD = """
 import os, sys
 from pathlib import Path
-from sidecars.device.fake import FakeMemory
+from vram_arbiter.sidecars.device.fake import FakeMemory
 memory = FakeMemory(Path(sys.argv[1]), "job")
 memory.allocate("weights", int(sys.argv[2]) - (450 << 20))
 print(os.getpid(), flush=True)

@@ -59,9 +59,9 @@ def planted(arbiter: ArbiterProcess, defect: str) -> Path:
     os.mkfifo(pipe)
     script = f"""
     import sys
-    import arbiter.daemon as daemon
-    from arbiter.__main__ import main
-    from arbiter.core.events import ClientConnected
+    import vram_arbiter.arbiter.daemon as daemon
+    from vram_arbiter.arbiter.__main__ import main
+    from vram_arbiter.arbiter.core.events import ClientConnected
 
     def wait_for_ever():
         with open({str(pipe)!r}, "rb") as file:

@@ -10,7 +10,9 @@ from harness import SHIPPED, Peer, Suite, arbiter, elapsed_us, environ, in_turns
 
 QUIET_AFTER_S = 11.0
 """The card is read in the background until 10 s after the last client."""
-STATUS = "import sys; sys.argv[1:] = ['status']; from clients.cli.main import main; main()"
+STATUS = (
+    "import sys; sys.argv[1:] = ['status']; from vram_arbiter.clients.cli.main import main; main()"
+)
 
 
 def run(suite: Suite) -> None:

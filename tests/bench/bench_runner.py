@@ -195,7 +195,16 @@ async def _measure(daemon: ArbiterProcess, rounds: int, stretch_s: float) -> Mea
     found = Measured([], [], [], [], [], [], [], [], [], [], [], [], [])
     timings = daemon.runtime / "ticks.jsonl"
     video = daemon.runtime / "episode.mp4"
-    words = ["runner", "sim", "--seed", "1", "--video", str(video), "--timings", str(timings)]
+    words = [
+        "vram_arbiter.runner",
+        "sim",
+        "--seed",
+        "1",
+        "--video",
+        str(video),
+        "--timings",
+        str(timings),
+    ]
     async with AsyncExitStack() as stack:
         sidecars = {name: stack.enter_context(_sidecar(daemon, name)) for name in SKILLS}
         detector = await stack.enter_async_context(
@@ -385,7 +394,7 @@ def _sidecar(
 ) -> Iterator["subprocess.Popen[bytes]"]:
     manifest = ROOT / "configs/rskills" / (skill or SKILLS[name]) / "rskill.yaml"
     words = [
-        "sidecars",
+        "vram_arbiter.sidecars",
         "--name",
         name,
         "--rskill",

@@ -340,7 +340,7 @@ def arbiter(config: str = WIDE, gpu: str = "fake:8GiB") -> Iterator[ArbiterProce
 
 def environ() -> dict[str, str]:
     """For processes of ours: they import what this one imports."""
-    return os.environ | {"PYTHONPATH": str(HERE.parents[1])}
+    return os.environ | {"PYTHONPATH": f"{HERE.parents[1]}/src:{HERE.parents[1]}"}
 
 
 def spawn(script: str, *arguments: str) -> "subprocess.Popen[str]":

@@ -37,7 +37,7 @@ def bench(out: Path, *subjects: str) -> list[dict[str, object]]:
     ]
     done = subprocess.run(
         command,
-        env=os.environ | {"PYTHONPATH": str(HERE.parents[1])},
+        env=os.environ | {"PYTHONPATH": f"{HERE.parents[1]}/src:{HERE.parents[1]}"},
         capture_output=True,
         text=True,
     )

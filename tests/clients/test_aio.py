@@ -509,7 +509,7 @@ async def test_a_hung_daemon_is_noticed_by_silence(
 
 RUNNER = """
 import sys
-from clients.sync import SyncArbiterClient
+from vram_arbiter.clients.sync import SyncArbiterClient
 with SyncArbiterClient(name="runner") as client, client.use(sys.argv[1], (int(sys.argv[2]), int(sys.argv[3])), "goal") as use:
     print("in use", flush=True)
     sys.stdin.readline()

@@ -28,7 +28,7 @@ STOPPED_LIMIT_S = 3.0
 WELCOME = {"ok": True, "epoch": 1, "version": 1}
 CLIENT = f"""
 import asyncio, sys
-from clients.sidecar.base import SidecarClient
+from vram_arbiter.clients.sidecar.base import SidecarClient
 
 async def ask():
     async with SidecarClient(sys.argv[1]) as client:
@@ -175,7 +175,7 @@ def test_an_answer_that_came_while_the_process_was_stopped_counts(
     endpoint = serve(stop, go_on)
     child = subprocess.Popen(
         [sys.executable, "-c", CLIENT, endpoint],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+        env={**os.environ, "PYTHONPATH": f"{Path(__file__).parents[2]}/src"},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:

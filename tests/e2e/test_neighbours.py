@@ -31,7 +31,7 @@ revoke: {deadline_s: 0.5, terminate_grace_s: 0.3}
 GAME = """
 import sys
 from pathlib import Path
-from sidecars.device.fake import FakeMemory
+from vram_arbiter.sidecars.device.fake import FakeMemory
 FakeMemory(Path(sys.argv[1]), "game", 0).allocate("textures", int(sys.argv[2]))
 print("up", flush=True)
 sys.stdin.readline()

@@ -237,8 +237,8 @@ def test_the_flags_of_the_units_are_understood(tmp_path: Path) -> None:
         package = {"arbiter": "arbiter", "sidecar": "sidecars"}.get(program, program)
         arguments = ["sim", "--help"] if program == "runner" else ["--help"]
         done = subprocess.run(
-            [sys.executable, "-m", package, *arguments],
-            env={**os.environ, "PYTHONPATH": str(TREE)}, cwd=tmp_path,
+            [sys.executable, "-m", f"vram_arbiter.{package}", *arguments],
+            env={**os.environ, "PYTHONPATH": str(TREE / "src")}, cwd=tmp_path,
             capture_output=True, text=True, timeout=60, check=True,
         )  # fmt: skip
         for flag in re.findall(r"--[a-z-]+", line):

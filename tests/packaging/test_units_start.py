@@ -180,7 +180,7 @@ def test_the_unit_of_a_user_starts_in_the_manager_of_a_user(machine: Machine) ->
 
 LOAD = """
 import asyncio, sys
-from clients.sidecar.base import SidecarClient
+from vram_arbiter.clients.sidecar.base import SidecarClient
 async def load():
     async with SidecarClient(sys.argv[1], connect_timeout_s=60) as sidecar:
         await sidecar.load()

@@ -284,7 +284,7 @@ def test_a_place_that_is_always_of_long_ago_is_none(
 ) -> None:
     """Regression: the second answer was taken for one of now, however long it had taken."""
     now = [100.0]
-    monkeypatch.setattr("reasoner.tools.monotonic", lambda: now[0])
+    monkeypatch.setattr("vram_arbiter.reasoner.tools.monotonic", lambda: now[0])
 
     async def story() -> tuple[Any, list[str]]:
         async with looking(a_runner, a_sidecar) as (_, sidecar, detector, tools):
@@ -333,7 +333,7 @@ def test_what_was_seen_before_the_detector_was_loaded_is_no_place(
 ) -> None:
     """Regression: a detector that waited two minutes for the card told where the thing had stood when it was asked."""
     now = [100.0]
-    monkeypatch.setattr("reasoner.tools.monotonic", lambda: now[0])
+    monkeypatch.setattr("vram_arbiter.reasoner.tools.monotonic", lambda: now[0])
 
     async def story() -> tuple[str, list[str]]:
         async with looking(a_runner, a_sidecar) as (_, sidecar, detector, tools):
@@ -456,7 +456,7 @@ def test_a_goal_without_an_end_is_given_up(a_runner: Any) -> None:
 def test_a_goal_whose_runner_is_gone_is_not_called_cancelled(
     a_runner: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("reasoner.tools.CANCEL_S", 0.3)
+    monkeypatch.setattr("vram_arbiter.reasoner.tools.CANCEL_S", 0.3)
 
     async def story() -> Any:
         async with contextlib.AsyncExitStack() as stack:

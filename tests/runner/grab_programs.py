@@ -32,7 +32,7 @@ class GrabPrograms:
         self.log = arbiter.runtime / "programs.log"
         environ = arbiter.environ | {"OMP_NUM_THREADS": "1"}
         sidecar = [
-            "sidecars",
+            "vram_arbiter.sidecars",
             "--name",
             "grab",
             "--rskill",
@@ -45,7 +45,7 @@ class GrabPrograms:
                 subprocess.Popen(
                     [sys.executable, "-m", *words], cwd=ROOT, env=environ, stdout=log, stderr=log
                 )
-                for words in (sidecar, ["runner", *runner])
+                for words in (sidecar, ["vram_arbiter.runner", *runner])
             )
 
     def play(self, scenario: Coroutine[Any, Any, None]) -> None:

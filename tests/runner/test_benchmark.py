@@ -380,7 +380,7 @@ def test_a_signal_ends_it_with_a_report_of_what_was_played(tmp_path: Path) -> No
         ),
         *("--episodes", "1000000", "--out", str(tmp_path)),
     ]
-    environ = os.environ | {"PYTHONPATH": f"{ROOT}:{HERE}"}
+    environ = os.environ | {"PYTHONPATH": f"{ROOT}/src:{ROOT}:{HERE}"}
     process = subprocess.Popen(
         argv, cwd=ROOT, env=environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )

@@ -25,9 +25,9 @@ def programs(
 ) -> Iterator[list["subprocess.Popen[bytes]"]]:
     environ = arbiter_daemon.environ | {"OMP_NUM_THREADS": "1"}
     sidecar = [
-        "sidecars", "--name", "passthrough", "--rskill", str(RSKILL), "--device", f"fake:{arbiter_daemon.card}"
+        "vram_arbiter.sidecars", "--name", "passthrough", "--rskill", str(RSKILL), "--device", f"fake:{arbiter_daemon.card}"
     ]  # fmt: skip
-    runner = ["runner", "sim", "--seed", "1", "--skills", str(RSKILL)]
+    runner = ["vram_arbiter.runner", "sim", "--seed", "1", "--skills", str(RSKILL)]
     log = tmp_path / "programs.log"
     with log.open("ab") as sink:
         started = [

@@ -133,7 +133,7 @@ async def diagnosed(client: RunnerClient, as_what: str) -> None:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """The command waits as long as the tests do: whether the motors are told is what counts here, not how soon."""
-    monkeypatch.setattr("runner.cli.estop.ANSWER_S", 60.0)
+    monkeypatch.setattr("vram_arbiter.runner.cli.estop.ANSWER_S", 60.0)
 
 
 @pytest.mark.parametrize("prompt", ["nod", "hang in the start"])
@@ -274,7 +274,8 @@ def test_whoever_names_no_endpoint_stops_the_system_service_too(
 ) -> None:
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(tmp_path / "of-this-login"))
     monkeypatch.setattr(
-        "runner.cli.estop.SYSTEM_RUNTIME", endpoint.removeprefix("ipc://").rpartition("/")[0]
+        "vram_arbiter.runner.cli.estop.SYSTEM_RUNTIME",
+        endpoint.removeprefix("ipc://").rpartition("/")[0],
     )
 
     async def body(b: Bench, client: RunnerClient) -> None:
@@ -297,7 +298,8 @@ def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_fr
 ) -> None:
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", "not/absolute")
     monkeypatch.setattr(
-        "runner.cli.estop.SYSTEM_RUNTIME", endpoint.removeprefix("ipc://").rpartition("/")[0]
+        "vram_arbiter.runner.cli.estop.SYSTEM_RUNTIME",
+        endpoint.removeprefix("ipc://").rpartition("/")[0],
     )
 
     async def body(b: Bench, client: RunnerClient) -> None:
@@ -309,7 +311,7 @@ def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_fr
 
 def test_a_stop_does_not_wait_for_the_imports_of_other_commands(endpoint: str) -> None:
     code = (
-        "import sys; from runner.__main__ import main; "
+        "import sys; from vram_arbiter.runner.__main__ import main; "
         "code = main(['estop', '--endpoint', sys.argv[1]]); "
         "print(code, sorted({'vram_arbiter.runner.cli.deploy', 'vram_arbiter.runner.cli.sim', 'pydantic', 'numpy', 'zmq', 'msgpack'} & set(sys.modules)))"
     )

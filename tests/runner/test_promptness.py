@@ -55,13 +55,13 @@ def test_programs_that_it_starts_are_ordinary_ones() -> None:
 def test_where_nothing_is_allowed_it_goes_on_without() -> None:
     code = (
         "import os, resource\n"
-        "from runner.realtime import hasten\n"
+        "from vram_arbiter.runner.realtime import hasten\n"
         "resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))\n"
         "resource.setrlimit(resource.RLIMIT_NICE, (0, 0))\n"
         "if os.getuid() == 0: os.setuid(65534)\n"
         "print(hasten(realtime=True), os.sched_getscheduler(0))\n"
     )
-    environ = os.environ | {"PYTHONPATH": str(ROOT)}
+    environ = os.environ | {"PYTHONPATH": f"{ROOT}/src:{ROOT}"}
     done = subprocess.run(
         [sys.executable, "-c", code],
         env=environ,

@@ -216,7 +216,7 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
     ]
     environ = os.environ | {
         "VRAM_ARBITER_RUNTIME": str(tmp_path),
-        "PYTHONPATH": f"{ROOT}:{HERE}",
+        "PYTHONPATH": f"{ROOT}/src:{ROOT}:{HERE}",
         "OMP_NUM_THREADS": "1",
     }
     process = subprocess.Popen(argv, cwd=ROOT, env=environ, stdout=subprocess.PIPE)

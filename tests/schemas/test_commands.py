@@ -23,7 +23,7 @@ def program(lines: str, collector: Collector | None, **environ: str) -> "subproc
     body = "\n".join(f"    {line}" for line in lines.splitlines())
     code = f"import signal, sys\nfrom schemas.runtime.telemetry.commands import command\nwith command('tool', 'do') as running:\n{body}\n"
     given = {
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": f"{ROOT}/src:{ROOT}",
         "PATH": "/usr/bin",
         **(collector.environ() if collector else {}),
         **environ,
@@ -84,12 +84,12 @@ def test_variables_that_make_no_sense_are_told_in_one_line(tmp_path: Path) -> No
     """Each program says it before it does anything."""
     nowhere = {"OTEL_EXPORTER_OTLP_ENDPOINT": "collector", "VRAM_ARBITER_RUNTIME": str(tmp_path)}
     for argv, code in (
-        (["clients", "history"], 2),
-        (["reasoner", "--say", "x"], 2),
-        (["runner", "replay", "--dataset", "x", "--frame", "0"], 2),
+        (["vram_arbiter.clients", "history"], 2),
+        (["vram_arbiter.reasoner", "--say", "x"], 2),
+        (["vram_arbiter.runner", "replay", "--dataset", "x", "--frame", "0"], 2),
     ):
         done = subprocess.run(
-            [sys.executable, "-m", *argv], env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin", **nowhere},
+            [sys.executable, "-m", *argv], env={"PYTHONPATH": f"{ROOT}/src:{ROOT}", "PATH": "/usr/bin", **nowhere},
             capture_output=True, text=True, timeout=WAIT_S,
         )  # fmt: skip
         assert done.returncode == code, done.stderr
@@ -109,7 +109,7 @@ def test_an_emergency_stop_is_not_refused_for_the_telemetrys_sake(tmp_path: Path
         ):
             done = subprocess.run(
                 [sys.executable, "-m", "vram_arbiter.runner", "estop", "--endpoint", f"ipc://{tmp_path}/runner.sock"],
-                env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin", **said},
+                env={"PYTHONPATH": f"{ROOT}/src:{ROOT}", "PATH": "/usr/bin", **said},
                 capture_output=True, text=True, timeout=WAIT_S,
             )  # fmt: skip
             assert done.returncode == 1, done.stderr
@@ -120,7 +120,7 @@ def test_the_quick_commands_send_nothing_and_the_others_do(tmp_path: Path) -> No
     """`vramctl status` is typed and polled too often to pay for an SDK."""
     with Collector() as collector:
         environ = {
-            "PYTHONPATH": str(ROOT),
+            "PYTHONPATH": f"{ROOT}/src:{ROOT}",
             "PATH": "/usr/bin",
             "VRAM_ARBITER_RUNTIME": str(tmp_path),
             **collector.environ(),

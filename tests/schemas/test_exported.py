@@ -59,8 +59,8 @@ def test_there_is_an_end_to_everything() -> None:
 
 PROGRAM = """
 import urllib.request
-import schemas.runtime.telemetry.setup as o
-from schemas import meters, tracing
+import vram_arbiter.schemas.runtime.telemetry.setup as o
+from vram_arbiter.schemas.runtime.telemetry import meters, spans as tracing
 t = o.set_up('robot', prometheus_port=0, attributes={'robot': 'a\\ud800'})
 half = 'half a pair: \\ud800'
 with tracing.span('good', attributes={'a': 'b'}):

@@ -218,7 +218,7 @@ def test_packages_that_are_missing_are_asked_for() -> None:
 # -- on -----------------------------------------------------------------------------------------------------------------
 PROGRAM = """
 import sys, schemas.runtime.telemetry.setup as o
-from schemas import telemetry, tracing
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry, spans as tracing
 from opentelemetry import metrics
 made_before = metrics.get_meter(telemetry.TRACER).create_counter(telemetry.METRIC_GOALS)
 t = o.set_up('vram-runner', attributes={'robot.model': 'so101'})
@@ -281,7 +281,7 @@ def test_a_trace_that_began_elsewhere_is_kept_if_it_was_kept_there(flag: str, ke
 def test_prometheus_is_read_on_loopback_and_not_after_the_end() -> None:
     result = run(
         "import http.client, schemas.runtime.telemetry.setup as o\n"
-        "from schemas import telemetry as n\n"
+        "from vram_arbiter.schemas.runtime.telemetry import names as n\n"
         "t = o.set_up('vram-arbiter', prometheus_port=0)\n"
         "from opentelemetry import metrics\n"
         "m = metrics.get_meter(n.TRACER)\n"
@@ -323,7 +323,7 @@ def test_a_collector_that_is_away_is_complained_of_once_and_holds_up_no_end() ->
         result = run(
             "import logging; logging.basicConfig(format='%(message)s')\n"
             "import time, schemas.runtime.telemetry.setup as o\n"
-            "from schemas import tracing\n"
+            "from vram_arbiter.schemas.runtime.telemetry import spans as tracing\n"
             "t = o.set_up('robot')\n"
             "from opentelemetry import trace\n"
             "for n in range(3):\n"
@@ -369,8 +369,8 @@ def test_what_the_sdk_refuses_is_the_operators_error_and_leaves_no_half(
     wrong: dict[str, str],
 ) -> None:
     result = run(
-        "import schemas.runtime.telemetry.setup as o\n"
-        "from schemas.errors import ConfigError\n"
+        "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
+        "from vram_arbiter.schemas.errors import ConfigError\n"
         "try:\n    o.set_up('robot', prometheus_port=0)\n"
         "except ConfigError as error:\n    print(error)\n"
         "from opentelemetry import metrics, trace\n"
@@ -388,7 +388,7 @@ def test_an_operators_time_limits_win_over_ours() -> None:
     """Regression: a limit for one signal was overridden by our 3 s."""
     result = run(
         "import gc\n"
-        "import schemas.runtime.telemetry.setup as o\n"
+        "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "t = o.set_up('robot')\n"
         "from opentelemetry.exporter.otlp.common.http import _OTLPHTTPClient as C\n"
         "print({c._kind: c._timeout for c in gc.get_objects() if isinstance(c, C)})\n"
@@ -402,9 +402,9 @@ def test_an_operators_time_limits_win_over_ours() -> None:
 def test_no_secret_stands_in_a_message() -> None:
     result = run(
         "import logging; logging.basicConfig()\n"
-        "import schemas.runtime.telemetry.setup as o\n"
-        "from schemas.config.arbiter import ArbiterConfig\n"
-        "from schemas.errors import ConfigError\n"
+        "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
+        "from vram_arbiter.schemas.config.arbiter import ArbiterConfig\n"
+        "from vram_arbiter.schemas.errors import ConfigError\n"
         "t = o.set_up('robot')\n"
         "for url in ('htps://me:geheim@host', 'htps://host/?key=geheim'):\n"
         "    try:\n        o.checked_url(url, 'it')\n"
@@ -424,7 +424,7 @@ def test_no_secret_stands_in_a_message() -> None:
 def test_a_full_queue_of_spans_is_complained_of_as_seldom_as_its_collector() -> None:
     result = run(
         "import logging; logging.basicConfig(format='%(message)s')\n"
-        "import schemas.runtime.telemetry.setup as o\n"
+        "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "o.set_up('robot')\n"
         "sdk = logging.getLogger('opentelemetry.sdk._shared_internal')\n"
         "for n in range(3):\n"

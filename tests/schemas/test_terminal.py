@@ -61,7 +61,7 @@ def test_ctrl_c_is_no_defect() -> None:
     """The first line of a simulation is printed when the whole is known: it is told before, while it works."""
     program = (
         "import signal, sys\n"
-        "from schemas import terminal\n"
+        "from vram_arbiter.schemas.runtime import terminal\n"
         "@terminal.program\n"
         "def main():\n"
         "    print('there', flush=True)\n"
@@ -103,13 +103,13 @@ def test_the_exit_code_and_the_arguments_pass() -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["schemas", "check", str(MANIFEST)],
-        ["arbiter", "--help"],
-        ["runner", "--help"],
-        ["clients", "doctor"],
-        ["clients", "status", "--json"],
-        ["clients", "--help"],
-        ["clients", "simulate", "find-navigate-grab"],
+        ["vram_arbiter.schemas", "check", str(MANIFEST)],
+        ["vram_arbiter.arbiter", "--help"],
+        ["vram_arbiter.runner", "--help"],
+        ["vram_arbiter.clients", "doctor"],
+        ["vram_arbiter.clients", "status", "--json"],
+        ["vram_arbiter.clients", "--help"],
+        ["vram_arbiter.clients", "simulate", "find-navigate-grab"],
     ],
 )
 def test_a_full_output_device_is_one_line(arguments: list[str], tmp_path: Path) -> None:
@@ -152,12 +152,21 @@ def test_another_error_of_the_system_keeps_its_traceback() -> None:
 @pytest.mark.parametrize(
     ("arguments", "extra"),
     [
-        (["clients", "demo"], "all"),
+        (["vram_arbiter.clients", "demo"], "all"),
         (
-            ["sidecars", "--name", "x", "--rskill", str(GRAB), "--device", "none", "--no-arbiter"],
+            [
+                "vram_arbiter.sidecars",
+                "--name",
+                "x",
+                "--rskill",
+                str(GRAB),
+                "--device",
+                "none",
+                "--no-arbiter",
+            ],
             "sidecars",
         ),
-        (["runner", "sim", "--no-arbiter"], "runner"),
+        (["vram_arbiter.runner", "sim", "--no-arbiter"], "runner"),
     ],
 )
 def test_a_missing_extra_is_one_line(arguments: list[str], extra: str, tmp_path: Path) -> None:

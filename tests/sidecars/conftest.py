@@ -144,7 +144,7 @@ def lone_box():
     box = Box(
         runtime,
         runtime / "fakegpu",
-        {**os.environ, "VRAM_ARBITER_RUNTIME": str(runtime), "PYTHONPATH": root},
+        {**os.environ, "VRAM_ARBITER_RUNTIME": str(runtime), "PYTHONPATH": f"{root}/src:{root}"},
     )
     yield box
     try:

@@ -70,7 +70,7 @@ class ArbiterProcess:
             if not key.startswith(("VRAM_ARBITER_", "WATCHDOG_", "OTEL_"))
         }
         environ["VRAM_ARBITER_RUNTIME"] = str(self.runtime)
-        environ["PYTHONPATH"] = str(_ROOT)
+        environ["PYTHONPATH"] = f"{_ROOT}/src:{_ROOT}"
         environ["PYTHONUNBUFFERED"] = "1"
         return environ
 

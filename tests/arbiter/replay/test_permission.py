@@ -9,8 +9,8 @@ ROOT = Path(__file__).parents[3]
 STRANGER = """
 import os, sys
 from pathlib import Path
-from arbiter.eventlog.replay import load
-from schemas.errors import VramError
+from vram_arbiter.arbiter.eventlog.replay import load
+from vram_arbiter.schemas.errors import VramError
 if os.getuid() == 0:  # root may read everything
     os.setgroups([]); os.setresgid(65534, 65534, 65534); os.setresuid(65534, 65534, 65534)
 try:

@@ -23,12 +23,12 @@ def folder() -> Iterator[Path]:
 @pytest.mark.parametrize(
     "command",
     [
-        ["clients", "status", "--endpoint", "EP"],
-        ["clients", "evict", "x", "-r", "y", "--endpoint", "EP"],
-        ["clients", "run", "--vram", "1GiB", "--endpoint", "EP", "true"],
-        ["clients", "watch", "--endpoint", "EP"],
-        ["arbiter", "--gpu", "fake:8GiB", "--endpoint", "EP"],
-        ["runner", "estop", "--endpoint", "EP"],
+        ["vram_arbiter.clients", "status", "--endpoint", "EP"],
+        ["vram_arbiter.clients", "evict", "x", "-r", "y", "--endpoint", "EP"],
+        ["vram_arbiter.clients", "run", "--vram", "1GiB", "--endpoint", "EP", "true"],
+        ["vram_arbiter.clients", "watch", "--endpoint", "EP"],
+        ["vram_arbiter.arbiter", "--gpu", "fake:8GiB", "--endpoint", "EP"],
+        ["vram_arbiter.runner", "estop", "--endpoint", "EP"],
     ],
 )
 def test_a_mistyped_endpoint_makes_no_folders(command: list[str], folder: Path) -> None:

@@ -328,7 +328,7 @@ async def test_the_peak_is_what_the_arbiter_measured_of_the_program(
 ) -> None:
     """The bytes of the program's process, charged to the lease of its parent; they are gone when the peak is said."""
     holder = (
-        "import sys; from pathlib import Path; from sidecars.device.fake import FakeMemory\n"
+        "import sys; from pathlib import Path; from vram_arbiter.sidecars.device.fake import FakeMemory\n"
         "memory = FakeMemory(Path(sys.argv[1]), 'job', 0); memory.allocate('x', 2 << 30); sys.stdin.read()"
     )
     spec = RunSpec(["job"], None, 1 << 30, "any", 40, None, False, "priority", None)

@@ -42,7 +42,7 @@ def nowhere(tmp_path: Path) -> dict[str, str]:
     """An environment without an arbiter."""
     root = str(Path(__file__).parents[3])
     kept = {key: value for key, value in os.environ.items() if not key.startswith("VRAM_ARBITER_")}
-    return {**kept, "VRAM_ARBITER_RUNTIME": str(tmp_path), "PYTHONPATH": root}
+    return {**kept, "VRAM_ARBITER_RUNTIME": str(tmp_path), "PYTHONPATH": f"{root}/src:{root}"}
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def client(arbiter_daemon: ArbiterProcess) -> Iterator[SyncArbiterClient]:
 def test_the_path_of_status_imports_nothing_heavy(nowhere: dict[str, str]) -> None:
     code = (
         "import sys; sys.argv = ['vramctl', 'status']\n"
-        "from clients.cli.main import main\n"
+        "from vram_arbiter.clients.cli.main import main\n"
         "try: main()\n"
         "except SystemExit as end: assert end.code == 3, end.code\n"
         "import msgpack, zmq\n"
@@ -138,20 +138,27 @@ def test_every_program_and_command_has_it(flag: str, nowhere: dict[str, str]) ->
         "    said[' '.join(line)] = out.getvalue()\n"
         "print(json.dumps(said))\n"
     )
-    lines = [["clients", flag], *(["clients", command, flag] for command in EVERY_COMMAND)]
-    lines += [
-        ["runner", flag],
-        *(["runner", command, flag] for command in ("sim", "deploy", "estop")),
+    lines = [
+        ["vram_arbiter.clients", flag],
+        *(["vram_arbiter.clients", command, flag] for command in EVERY_COMMAND),
     ]
-    lines += [[name, flag] for name in ("arbiter", "sidecars", "reasoner", "schemas")]
-    lines += [["schemas", "check", flag], ["vram_arbiter.arbiter.lab", "replay", flag]]
+    lines += [
+        ["vram_arbiter.runner", flag],
+        *(["vram_arbiter.runner", command, flag] for command in ("sim", "deploy", "estop")),
+    ]
+    lines += [
+        [f"vram_arbiter.{name}", flag] for name in ("arbiter", "sidecars", "reasoner", "schemas")
+    ]
+    lines += [["vram_arbiter.schemas", "check", flag], ["vram_arbiter.arbiter.lab", "replay", flag]]
     done = subprocess.run(
         [sys.executable, "-c", program, json.dumps(lines)],
         env=nowhere, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     wanted = "vram-arbiter " if flag == "--version" else "sage: "
-    through_a_program = {f"clients {command} {flag}" for command in ("replay", "simulate")}
+    through_a_program = {
+        f"vram_arbiter.clients {command} {flag}" for command in ("replay", "simulate")
+    }
     wrong = {
         line: said for line, said in json.loads(done.stdout.splitlines()[-1]).items()
         if wanted not in said and not (flag == "-h" and line in through_a_program)

@@ -15,7 +15,7 @@ from vram_arbiter.schemas.errors import BadRequest
 
 def test_plain_values_pass_and_numpy_is_not_imported_for_them() -> None:
     code = (
-        "import sys; from clients.sidecar import npy; v = {'a': [1, 'x', None, (2.0,)], 'b': b'y'}; "
+        "import sys; from vram_arbiter.clients.sidecar import npy; v = {'a': [1, 'x', None, (2.0,)], 'b': b'y'}; "
         "assert npy.unpack(npy.pack(v)) == {'a': [1, 'x', None, [2.0]], 'b': b'y'}; assert 'numpy' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

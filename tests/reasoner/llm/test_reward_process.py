@@ -62,7 +62,7 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
 
     async def story() -> None:
         serve = (
-            "sidecars",
+            "vram_arbiter.sidecars",
             "--name",
             "reward",
             "--rskill",
@@ -71,12 +71,21 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
             f"fake:{arbiter_daemon.card}",
         )
         think = (
-            "reasoner", "--task", "grab the red cube", "--planner", "openai", "--detector", "none", "--scene-vlm", "none",
+            "vram_arbiter.reasoner", "--task", "grab the red cube", "--planner", "openai", "--detector", "none", "--scene-vlm", "none",
             "--reward", "--result", str(result),
         )  # fmt: skip
         async with (
             program(environ, *serve) as sidecar,
-            program(environ, "runner", "sim", "--no-arbiter", "--seed", "1", "--skills", *SKILLS),
+            program(
+                environ,
+                "vram_arbiter.runner",
+                "sim",
+                "--no-arbiter",
+                "--seed",
+                "1",
+                "--skills",
+                *SKILLS,
+            ),
             RewardClient(f"ipc://{runtime}/reward.sock", connect_timeout_s=120.0) as reward,
             RunnerClient(f"ipc://{runtime}/runner.sock", connect_timeout_s=120.0) as runner,
         ):

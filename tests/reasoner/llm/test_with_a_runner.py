@@ -65,11 +65,13 @@ class Programs:
 
     def runner(self) -> Any:
         skill = str(ROOT / "configs/rskills/so101-navigate")
-        return self.run("runner", "sim", "--skills", skill, "--no-arbiter", "--seed", "1")
+        return self.run(
+            "vram_arbiter.runner", "sim", "--skills", skill, "--no-arbiter", "--seed", "1"
+        )
 
     def reasoner(self, planner: str) -> Any:
         return self.run(
-            "reasoner", "--task", "turn round", "--planner", planner, "--detector", "none", "--scene-vlm", "none",
+            "vram_arbiter.reasoner", "--task", "turn round", "--planner", planner, "--detector", "none", "--scene-vlm", "none",
             "--result", str(self.folder / "result.json"),
         )  # fmt: skip
 

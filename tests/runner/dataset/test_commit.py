@@ -137,7 +137,7 @@ def test_only_ones_own_or_an_empty_folder_is_recorded_into(dataset: Path, tmp_pa
 HOLDER = """
 import sys
 from pathlib import Path
-from runner.dataset import commit
+from vram_arbiter.runner.dataset import commit
 with commit.locked(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()

@@ -32,7 +32,7 @@ def record(
     given = {
         "VRAM_ARBITER_RUNTIME": str(runtime),
         "OMP_NUM_THREADS": "1",
-        "PYTHONPATH": f"{ROOT}:{HERE}",
+        "PYTHONPATH": f"{ROOT}/src:{ROOT}:{HERE}",
     }
     argv = [
         sys.executable,

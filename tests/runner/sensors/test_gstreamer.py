@@ -368,9 +368,9 @@ def test_no_password_in_messages() -> None:
 
 # -- beside the other heavy packages ----------------------------------------------------------------------------------
 TAKE_ONE = """
-from runner.clock import SystemClock
-from runner.sensors.gstreamer import make
-from schemas.config.robot import SensorReaderConfig
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.sensors.gstreamer import make
+from vram_arbiter.schemas.config.robot import SensorReaderConfig
 params = {"source": "test", "pattern": "red", "width": 16, "height": 16}
 clock = SystemClock()
 camera = make(SensorReaderConfig(sensor_id="wrist", backend="gstreamer", backend_params=params), clock, None)

@@ -6,10 +6,10 @@ import sys
 CODE = """
 import sys
 sys.modules["gi"] = None  # what an import finds where it is not installed
-from runner.clock import SystemClock
-from runner.sensors.gstreamer import make
-from schemas.errors import ConfigError
-from schemas.config.robot import SensorReaderConfig
+from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.sensors.gstreamer import make
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.config.robot import SensorReaderConfig
 try:
     make(SensorReaderConfig(sensor_id="wrist", backend="gstreamer", backend_params={"source": "test"}), SystemClock(), None)
 except ConfigError as error:

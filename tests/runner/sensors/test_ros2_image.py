@@ -404,9 +404,9 @@ def test_a_network_that_is_not_there_is_said_at_the_start(
     """In a process of its own: Cyclone reads its settings once."""
     monkeypatch.setenv("CYCLONEDDS_URI", NETWORK.replace('name="lo"', 'name="no-such-if"'))
     code = (
-        "from runner.clock import SystemClock\n"
-        "from runner.sensors.factory import make_reader\n"
-        "from schemas.config.robot import SensorReaderConfig\n"
+        "from vram_arbiter.runner.clock import SystemClock\n"
+        "from vram_arbiter.runner.sensors.factory import make_reader\n"
+        "from vram_arbiter.schemas.config.robot import SensorReaderConfig\n"
         f"reader = make_reader(SensorReaderConfig(sensor_id='a', backend='ros2_image', backend_params={{'topic': {topic!r}}}), SystemClock())\n"
         "try:\n    reader.start()\nexcept Exception as error:\n    print(type(error).__name__, error)\n"
     )

@@ -210,7 +210,7 @@ def test_a_video_that_the_disk_had_no_room_for_is_none(tmp_path: Path) -> None:
 import resource, signal, sys
 from pathlib import Path
 import numpy as np
-from runner.recorder import Recorder
+from vram_arbiter.runner.recorder import Recorder
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 for room in (20_000, 1 << 20):
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))

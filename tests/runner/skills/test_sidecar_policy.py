@@ -498,7 +498,7 @@ def test_a_goal_that_is_over_before_its_policy_is_there_takes_the_load_back(
 ) -> None:
     """Regressions: the sidecar went on and made others leave the card for a goal that had been canceled; also one that was called back
     from standby, or left in that moment, and said neither `waiting` nor `loading`."""
-    monkeypatch.setattr("runner.skills.sidecar_policy.WITHDRAW_S", 60.0)
+    monkeypatch.setattr("vram_arbiter.runner.skills.sidecar_policy.WITHDRAW_S", 60.0)
 
     async def play(b: Bench) -> None:
         b.sidecar.state, b.sidecar.wanted, b.sidecar.loads = state, wanted, asyncio.Event()
@@ -516,7 +516,7 @@ def test_a_load_is_taken_back_from_a_sidecar_that_is_slow_to_answer(
     bench: Callable[..., Bench], run_async: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: it was asked for a second whether anybody wants the model, and kept it for nobody."""
-    monkeypatch.setattr("runner.skills.sidecar_policy.WITHDRAW_S", 60.0)
+    monkeypatch.setattr("vram_arbiter.runner.skills.sidecar_policy.WITHDRAW_S", 60.0)
 
     async def play(b: Bench) -> None:
         b.sidecar.wanted, b.sidecar.loads = True, asyncio.Event()

@@ -50,8 +50,8 @@ def test_ballast_fills_up_and_goes():
 
 BIND = """
 import os
-from schemas.errors import BadState
-from sidecars.device.cuda import CudaMemory
+from vram_arbiter.schemas.errors import BadState
+from vram_arbiter.sidecars.device.cuda import CudaMemory
 uuid = os.environ["TEST_UUID"]
 memory = CudaMemory()
 assert memory.bind(uuid) == uuid

@@ -22,8 +22,8 @@ GIB = 2**30
 CONTENDER = """
 import random, sys
 from pathlib import Path
-from schemas.fakegpu import SimulatedOutOfMemory
-from sidecars.device.fake import FakeMemory
+from vram_arbiter.schemas.fakegpu import SimulatedOutOfMemory
+from vram_arbiter.sidecars.device.fake import FakeMemory
 
 memory, dice, blocks, refused = FakeMemory(Path(sys.argv[1]), "contender", 10 << 20), random.Random(int(sys.argv[2])), [], 0
 for _ in range(60):
@@ -42,7 +42,7 @@ print(refused)
 HOLDER = """
 import sys
 from pathlib import Path
-from sidecars.device.fake import FakeMemory
+from vram_arbiter.sidecars.device.fake import FakeMemory
 
 memory = FakeMemory(Path(sys.argv[1]), "holder", 450 << 20)
 block = memory.allocate("weights", 4 << 30)

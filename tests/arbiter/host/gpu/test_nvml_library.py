@@ -13,7 +13,7 @@ from tests.support.nvml_stub import GIB, MIB, NvmlStub
 
 pytest.importorskip("pynvml")
 READ = """
-    from arbiter.host.gpu.nvml import NvmlProbe
+    from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
     probe = NvmlProbe()
     cards = probe.cards()
     reading = probe.sample(cards[0].id)
@@ -25,16 +25,16 @@ READ = """
     }))
 """
 REFUSED = """
-    from arbiter.host.gpu.nvml import NvmlProbe
-    from schemas.errors import VramError
+    from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
+    from vram_arbiter.schemas.errors import VramError
     try:
         NvmlProbe().cards()
     except VramError as error:
         print(json.dumps([type(error).__name__, error.message, error.hint]))
 """
 LOST = """
-    from arbiter.host.gpu.nvml import NvmlProbe
-    from schemas.errors import ProbeFailed
+    from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
+    from vram_arbiter.schemas.errors import ProbeFailed
     probe = NvmlProbe()
     gpu = probe.cards()[0].id
     said = []
