@@ -82,6 +82,7 @@ def test_a_typo_in_the_configuration_is_named_with_its_line(make_arbiter: Make) 
 def test_wrong_flags_end_with_2_and_say_what_to_do(
     make_arbiter: Make, arguments: list[str], words: str
 ) -> None:
+    """Regression: `--gpu fake:0` ended with a traceback and exit code 1, which systemd retries."""
     done = run(make_arbiter(), *arguments)
     assert done.returncode == 2
     assert words in done.stderr

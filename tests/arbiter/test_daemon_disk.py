@@ -177,6 +177,8 @@ def test_a_full_disk_blocks_grants_and_nothing_else(
 def test_a_start_on_a_full_disk_says_so_and_is_worth_another_try(
     arbiter: ArbiterProcess, tmpfs: Tmpfs
 ) -> None:
+    """Regression: it ended with a traceback, or with an exit code for wrong configuration, which
+    systemd does not retry."""
     tmpfs.fill()
     with pytest.raises(RuntimeError, match="ended with 5"):
         arbiter.start()

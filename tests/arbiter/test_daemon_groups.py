@@ -1,4 +1,8 @@
-"""Two roles by group: members of `wire.group` hold leases, members of `wire.operators_group` act by hand. Real daemon, real users."""
+"""Two roles by group: `wire.group` may hold leases, `wire.operators_group` may act by hand.
+
+Regression: with one group for both roles every holder could drain the arbiter.
+Real daemon, real users.
+"""
 
 import grp
 import json

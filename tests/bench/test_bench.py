@@ -98,6 +98,7 @@ def test_the_runners_ticks_are_measured_beside_real_sidecars(tmp_path: Path) -> 
 
 
 def test_a_loop_that_stood_still_is_in_the_figures_however_long() -> None:
+    """Regression: gaps of a second counted as pauses between stretches and were left out."""
     sys.path.insert(0, str(HERE))
     from bench_runner import Measured, Tick
 

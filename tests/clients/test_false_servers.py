@@ -112,6 +112,7 @@ async def ask_reasoner(endpoint: str) -> None:
     ],
 )
 def test_nothing_is_said_to_a_false_server(ask: Callable[[str], object], folder: Path) -> None:
+    """Regression: clients believed any process that served the path."""
     with false_server(folder, "s") as heard:
         with pytest.raises(UntrustedServer, match=r"served by uid \d+ \(nobody\)"):
             asyncio.run(ask(f"ipc://{folder}/s"))  # type: ignore[arg-type]
@@ -119,6 +120,7 @@ def test_nothing_is_said_to_a_false_server(ask: Callable[[str], object], folder:
 
 
 def test_vramctl_says_who_serves_there(folder: Path) -> None:
+    """Regression: clients believed any process that served the path."""
     environ = {**os.environ, "VRAM_ARBITER_ENDPOINT": f"ipc://{folder}/s"}
     with false_server(folder, "s") as heard:
         for command in (["status"], ["status", "--json"], ["resume"], ["watch"]):

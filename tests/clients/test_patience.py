@@ -159,6 +159,7 @@ def test_a_loop_that_stood_still_before_it_could_ask_still_asks(
 def test_an_answer_that_came_while_the_process_was_stopped_counts(
     serve: Callable[..., str],
 ) -> None:
+    """Regression: answer and time-out were found together after a stop, and the time-out won."""
     stopped: list[int] = []
 
     def stop(peer: Peer) -> None:

@@ -19,6 +19,8 @@ def refused(error: VramError) -> Message:
 
 
 def test_the_last_answer_reaches_its_peer_though_the_server_ends_behind_it(tmp_path: Path) -> None:
+    """Regression: the socket closed without lingering and dropped answers that were not written
+    yet."""
     endpoint = f"ipc://{tmp_path}/s.sock"
 
     async def answer_and_end() -> None:
@@ -75,6 +77,8 @@ def test_words_that_utf8_has_no_bytes_for_reach_the_other_side(tmp_path: Path) -
 def test_an_endpoint_is_free_when_its_server_has_ended_and_when_it_never_began(
     tmp_path: Path,
 ) -> None:
+    """Regression: a failed bind kept the endpoint's lock, so the same program seemed to serve
+    there."""
     endpoint = f"ipc://{tmp_path}/s.sock"
 
     async def one_after_the_other() -> None:

@@ -88,6 +88,7 @@ def test_a_cancel_over_the_socket_ends_an_episode_whose_planner_hangs(tmp_path: 
 
 
 def test_a_cancel_is_not_refused_for_its_words(tmp_path: Path) -> None:
+    """Regression: the length of the reason was checked before the cancel was obeyed."""
     endpoint = f"ipc://{tmp_path}/reasoner.sock"
 
     async def story() -> list[Any]:

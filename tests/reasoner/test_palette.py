@@ -279,6 +279,7 @@ def test_a_skill_that_describes_no_parameters_takes_none() -> None:
 
 
 def test_only_role_s1_is_offered_as_an_action() -> None:
+    """Regression: a skill of role s2 was offered as an action."""
     slow = manifest("vla", name="lab/slow", role="s2")
     found = palette(slow, manifest("vla"))
     assert list(found.executable) == ["lab/vla"]

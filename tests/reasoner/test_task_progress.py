@@ -220,6 +220,8 @@ def test_no_answer_is_never_no_progress(
 def test_a_strange_answer_is_an_error(
     a_runner: Any, a_sidecar: Any, judgement: dict[str, Any]
 ) -> None:
+    """Regression: a reward model's opinion about three pictures was reported for two."""
+
     def strange(runner: Any, sidecar: Any) -> None:
         sidecar.judgement = judgement
 

@@ -88,6 +88,9 @@ def test_a_goals_end_becomes_an_outcome(a_runner: Any) -> None:
 
 
 def test_a_goal_nobody_waits_for_any_more_is_cancelled_and_its_end_is_heard(a_runner: Any) -> None:
+    """Regression: a goal went on moving the arm after the reasoner that had sent it was told to
+    end."""
+
     async def story() -> tuple[list[str], bool]:
         async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
             doing = asyncio.create_task(Tools(client, None, None)(GRAB))
@@ -103,6 +106,8 @@ def test_a_goal_nobody_waits_for_any_more_is_cancelled_and_its_end_is_heard(a_ru
 
 
 def test_a_goal_whose_acceptance_was_not_heard_is_cancelled_by_its_name(a_runner: Any) -> None:
+    """Regression: a goal whose acceptance was not received was forgotten and went on."""
+
     async def story() -> bool:
         async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
             runner.deaf.add("goal")
@@ -456,6 +461,7 @@ def test_a_goal_without_an_end_is_given_up(a_runner: Any) -> None:
 def test_a_goal_whose_runner_is_gone_is_not_called_cancelled(
     a_runner: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Regression: lost contact and a missing result were one case, reported as canceled."""
     monkeypatch.setattr("vram_arbiter.reasoner.tools.CANCEL_S", 0.3)
 
     async def story() -> Any:

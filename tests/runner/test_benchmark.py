@@ -319,6 +319,8 @@ def test_mistakes_are_said_in_one_line(
 
 @pytest.mark.heavy
 def test_without_videos_a_skill_sees_what_it_saw_with_them() -> None:
+    """Regression: `--no-videos` rendered nothing, so a skill that looks through `render` was
+    refused."""
     parser = argparse.ArgumentParser()
     add_parser(parser.add_subparsers())
     for flags, cameras in (
@@ -338,6 +340,7 @@ def test_without_videos_a_skill_sees_what_it_saw_with_them() -> None:
 def test_two_cells_of_one_name_do_not_overwrite_each_others_videos(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Regression: scenes of one file name in different folders shared their videos and their row."""
     scenes = [tmp_path / folder / "table.yaml" for folder in ("near", "far")]
     for scene in scenes:
         scene.parent.mkdir()

@@ -172,5 +172,7 @@ class AnsweredAsOneLooks(concurrent.futures.Future[list[Row]]):
 
 @pytest.mark.parametrize("wait_s", [0.0, 0.001])
 def test_an_answer_that_comes_right_behind_the_wait_is_no_timeout(wait_s: float) -> None:
+    """Regression: an answer between the end of the wait and the check counted as the policy's
+    time-out."""
     player = ChunkPlayer(lambda _: AnsweredAsOneLooks(), wait_s=wait_s)
     assert player.next_row("o") == Played(0, (1.0,))

@@ -83,6 +83,9 @@ def test_a_loop_that_dies_fails_what_waits(make_runner: Make, env: Any, run_asyn
 def test_an_end_that_fails_leaves_nobody_waiting(
     make_runner: Make, env: Any, run_async: Run, fails: str
 ) -> None:
+    """Regression: the control thread died silently when disconnecting raised, and its waiters never
+    heard."""
+
     def stuck() -> None:
         raise TypeError("the driver's defect")
 

@@ -260,6 +260,7 @@ def test_after_an_emergency_stop_a_task_is_not_restarted_and_the_robot_stays_con
 def test_a_stopped_robot_does_not_move_again_because_its_runner_was_killed_and_restarted(
     start: Start, tmp_path: Path
 ) -> None:
+    """Regression: the latch was kept in memory only, and systemd restarts a killed runner."""
     mark = tmp_path / "robot-bench.estop"
     first = start()
 

@@ -99,6 +99,7 @@ def test_the_mark_of_a_stop_that_nobody_looked_at_refuses_the_start_for_good(
 def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_robot_moves(
     dry_run: DryRun, tmp_path: Path
 ) -> None:
+    """Regression: only the deployment file's own block was searched for limits that cannot be kept."""
     folder = tmp_path / "skills" / "careful"
     folder.mkdir(parents=True)
     text = (

@@ -203,6 +203,9 @@ def test_a_second_goal_is_refused_and_the_first_goes_on(
 def test_a_cancel_or_stop_while_a_goal_finishes_does_not_cost_its_result(
     bench: Any, endpoint: str, run_async: Run, by: str
 ) -> None:
+    """Regression: one cancellation hit the task that answers for the goal, and every later goal was
+    refused."""
+
     async def body(b: Bench, client: RunnerClient) -> None:
         goal = await client.send_goal(RSKILL, prompt="end slowly")
         while not b.made:
@@ -223,6 +226,9 @@ def test_a_cancel_or_stop_while_a_goal_finishes_does_not_cost_its_result(
 def test_a_result_that_no_wire_carries_still_reaches_the_client(
     bench: Any, endpoint: str, run_async: Run, what: str
 ) -> None:
+    """Regression: a skill's own data held values that msgpack does not carry, and the client never
+    heard of the end."""
+
     async def body(b: Bench, client: RunnerClient) -> None:
         goal = await client.send_goal(RSKILL, prompt=f"end with a {what}")
         result = await goal.result(60)
@@ -236,6 +242,9 @@ def test_a_result_that_no_wire_carries_still_reaches_the_client(
 def test_no_goal_is_accepted_once_the_control_loop_has_ended(
     bench: Any, endpoint: str, run_async: Run
 ) -> None:
+    """Regression: only a signal counted as stopping, so a goal was accepted and would have loaded
+    its model."""
+
     async def body(b: Bench, client: RunnerClient) -> None:
         goal = await client.send_goal(RSKILL, prompt="end, and leave slowly")
         assert (await goal.result(60))["success"]
@@ -251,6 +260,8 @@ def test_no_goal_is_accepted_once_the_control_loop_has_ended(
 def test_a_skill_that_could_not_undo_a_failed_start_can_be_started_again(
     bench: Any, endpoint: str, run_async: Run
 ) -> None:
+    """Regression: such a skill stayed `starting` and was refused for ever."""
+
     async def body(b: Bench, client: RunnerClient) -> None:
         goal = await client.send_goal(RSKILL, prompt="unavailable for ever")
         assert (await goal.result(60))["status"] == "failed"
@@ -262,6 +273,9 @@ def test_a_skill_that_could_not_undo_a_failed_start_can_be_started_again(
 def test_a_skill_that_breaks_while_it_finishes_still_gives_a_result(
     bench: Any, endpoint: str, run_async: Run
 ) -> None:
+    """Regression: a skill that failed in `finish` lost the result, and every later goal was
+    refused."""
+
     async def body(b: Bench, client: RunnerClient) -> None:
         goal = await client.send_goal(RSKILL, prompt="end badly")
         assert (await goal.result(60))["success"]

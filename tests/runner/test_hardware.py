@@ -281,6 +281,7 @@ def test_a_late_action_is_withheld_under_drop(
 def test_a_goal_whose_actions_all_come_too_late_fails(
     make: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
+    """Regression: under `drop` such a goal succeeded without one command to a motor."""
     runner = make(deadline_policy=DeadlinePolicy.DROP)
     runner.activate()
     ended = begin(runner, nod(steps=100, on_step=lambda world: clock.advance(2 * PERIOD_S)))
@@ -294,6 +295,7 @@ def test_a_goal_whose_actions_all_come_too_late_fails(
 def test_an_action_that_was_thought_out_for_too_long_is_not_sent(
     make: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
+    """Regression: the gate judged the state's age by its stamp and not by the clock."""
     own = RobotGate(twin.description, rate_hz=30.0, now_ns=clock.now_ns)
     runner = make(make_gate=lambda skill: own)  # under WARN: what is merely late is sent
     runner.activate()

@@ -184,6 +184,8 @@ def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(
 
 
 def test_what_was_fresh_is_stale_while_the_loop_hangs(bench: Any, run_async: Run) -> None:
+    """Regression: `state` showed the last world state, which was fresh when it was made."""
+
     async def body(b: Bench, client: RunnerClient) -> None:
         await client.send_goal(RSKILL, prompt="hang in the step")
         await b.skill.begun.wait()
@@ -215,6 +217,9 @@ def test_the_command_line_stops_the_robot(
 def test_a_stop_that_did_not_reach_the_motors_is_no_success_and_is_tried_again(
     bench: Any, run_async: Run, endpoint: str, capfd: pytest.CaptureFixture[str], cause: Exception
 ) -> None:
+    """Regression: the runner counted the attempt as the stop: a lost packet left the motors running
+    and the command exited 0."""
+
     async def body(b: Bench, client: RunnerClient) -> None:
         b.twin.halt_breaks = cause
         goal = await client.send_goal(RSKILL, prompt="nod")
@@ -238,6 +243,9 @@ def test_a_stop_that_did_not_reach_the_motors_is_no_success_and_is_tried_again(
 def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_being_read(
     bench: Any, run_async: Run
 ) -> None:
+    """Regression: requests that waited for a hanging control loop held all slots, so a stop was not
+    read."""
+
     async def body(b: Bench, client: RunnerClient) -> None:
         await client.send_goal(RSKILL, prompt="hang in the step")
         await b.skill.begun.wait()
@@ -256,6 +264,8 @@ def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_being_read
 
 @pytest.mark.parametrize("reason", ["x" * 10_000, "smoke \udcff", "\x1b[2J\n\u202e", ""])
 def test_a_stop_is_not_refused_for_its_words(bench: Any, run_async: Run, reason: str) -> None:
+    """Regression: a reason of more than 500 characters made the runner refuse the stop."""
+
     async def body(b: Bench, client: RunnerClient) -> None:
         assert "stand still" in (await client.estop(reason)).message
         assert b.runner.estop is not None
@@ -272,6 +282,8 @@ def test_whoever_names_no_endpoint_stops_the_system_service_too(
     monkeypatch: pytest.MonkeyPatch,
     capfd: Any,
 ) -> None:
+    """Regression: a login shell has another runtime folder, so `vram-runner estop` did not find the
+    system service."""
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(tmp_path / "of-this-login"))
     monkeypatch.setattr(
         "vram_arbiter.runner.cli.estop.SYSTEM_RUNTIME",
@@ -296,6 +308,7 @@ def test_whoever_names_no_endpoint_stops_the_system_service_too(
 def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_from_being_stopped(
     bench: Any, run_async: Run, endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Regression: the path was checked before anything was stopped."""
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", "not/absolute")
     monkeypatch.setattr(
         "vram_arbiter.runner.cli.estop.SYSTEM_RUNTIME",

@@ -137,6 +137,7 @@ def test_wrong_flags_are_usage_errors(capsys: pytest.CaptureFixture[str]) -> Non
 def test_wrong_files_are_named(
     capsys: pytest.CaptureFixture[str], flags: list[str], said: str
 ) -> None:
+    """Regression: `--sidecar` for a skill that is not installed was ignored."""
     assert main(["sim", "--no-arbiter", *flags]) == 2
     assert said in capsys.readouterr().err
 
@@ -171,6 +172,7 @@ def test_a_runner_serves_no_tcp_and_says_so_before_a_robot_has_power(
     capsys: pytest.CaptureFixture[str],
     command: list[str],
 ) -> None:
+    """Regression: over loopback TCP another user of the machine could command the robot."""
     (tmp_path / "robot.yaml").write_text(
         "robot_id: bench\nhal: {adapter: so101_mujoco}\nsensors: []\n"
     )

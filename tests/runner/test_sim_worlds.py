@@ -327,6 +327,7 @@ def test_a_served_policy_is_started_anew_for_every_seed_and_released(
 def test_a_file_that_cannot_be_written_is_said_in_one_line_before_the_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], argv: list[str]
 ) -> None:
+    """Regression: output paths were checked when they were written, after hours of running."""
     (tmp_path / "file").write_text("no folder", encoding="utf-8")
     words = [word.format(tmp_path / "file") for word in argv]
     assert main([*words, "--env", "gym:CartPole-v1", "--policy", "random"]) in (1, 2)

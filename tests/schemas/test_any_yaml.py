@@ -106,6 +106,7 @@ CASES = [
 def test_any_value_at_any_key_is_read_or_found_fault_with(
     case: tuple[str, Any, tuple[Any, ...]], raw: str
 ) -> None:
+    """Regression: `model_family: []` ended in a TypeError."""
     name, document, place = case
     try:
         READERS[name][0](written(document, place, raw))

@@ -141,6 +141,7 @@ def test_a_wrong_list_item_is_named_by_its_place() -> None:
     ],
 )
 def test_bad_text_is_a_config_error_with_a_line(text: str, line: int, words: str) -> None:
+    """Regression: a control character in `arbiter.yaml` ended the daemon with a traceback."""
     message = problem(text)
     assert re.match(rf"arbiter\.yaml:{line}(:\d+)?: ", message)
     assert words in message

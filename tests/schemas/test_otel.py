@@ -173,6 +173,8 @@ def test_a_configuration_wins_over_the_environment() -> None:
     ],
 )
 def test_what_makes_no_sense_is_named(environ: Mapping[str, str], words: str) -> None:
+    """Regression: our default of 3 s overrode the operator's time limits, and 0, -1 and `soon` were
+    accepted."""
     with pytest.raises(ConfigError, match=words.replace("(", r"\(").replace(")", r"\)")):
         plan(environ)
 
@@ -368,6 +370,8 @@ def test_ending_waits_for_nobody_longer_than_it_was_told() -> None:
 def test_what_the_sdk_refuses_is_the_operators_error_and_leaves_no_half(
     wrong: dict[str, str],
 ) -> None:
+    """Regression: a bad number in an `OTEL_` variable ended programs with a traceback and left half
+    a set-up."""
     result = run(
         "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "from vram_arbiter.schemas.errors import ConfigError\n"
@@ -400,6 +404,8 @@ def test_an_operators_time_limits_win_over_ours() -> None:
 
 @needs_sdk
 def test_no_secret_stands_in_a_message() -> None:
+    """Regression: the SDK writes an unreadable header into its warning, and our message named the
+    address as given."""
     result = run(
         "import logging; logging.basicConfig()\n"
         "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
@@ -422,6 +428,7 @@ def test_no_secret_stands_in_a_message() -> None:
 
 @needs_sdk
 def test_a_full_queue_of_spans_is_complained_of_as_seldom_as_its_collector() -> None:
+    """Regression: only the exporters were quietened: "Queue full" was logged every 20 s."""
     result = run(
         "import logging; logging.basicConfig(format='%(message)s')\n"
         "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"

@@ -1,4 +1,7 @@
-"""The Prometheus endpoint against readers that mean no good. Real sockets on loopback."""
+"""Prometheus endpoint against hostile readers. Real sockets on loopback.
+
+Regression: eight silent connections kept Prometheus out for ever.
+"""
 
 import http.client
 import os

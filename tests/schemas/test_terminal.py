@@ -41,6 +41,7 @@ BUFFERED = {key: value for key, value in os.environ.items() if key != "PYTHONUNB
     ],
 )
 def test_a_reader_that_left_is_no_defect(arguments: list[str]) -> None:
+    """Regression: `vramctl simulate | head` ended with a traceback."""
     reading, writing = os.pipe()
     os.close(reading)  # nobody will ever read
     try:

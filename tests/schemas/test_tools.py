@@ -169,5 +169,6 @@ def test_a_skills_function_takes_its_parameters_by_name() -> None:
     ],
 )
 def test_numbers_that_are_none_and_keys_given_twice_are_refused(arguments: Any) -> None:
+    """Regression: a language model's `NaN` reached a skill; Python's JSON reader accepts it."""
     with pytest.raises(BadRequest):
         parse_tool_call("execute_rskill", arguments)

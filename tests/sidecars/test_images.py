@@ -90,6 +90,7 @@ def test_a_jpeg_of_thousands_of_scans_costs_nothing() -> None:
     ],
 )  # fmt: skip
 def test_what_asks_for_too_much_is_refused_by_its_header(data: bytes, told: str) -> None:
+    """Regression: Pillow clips 16-bit gray at 255, so such a PNG was seen as white."""
     with pytest.raises(BadRequest, match=told):
         images.decode(data)
 

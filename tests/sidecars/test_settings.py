@@ -235,6 +235,7 @@ def test_what_only_a_person_can_mend_is_not_started_again_and_what_may_come_is(
 
 @pytest.mark.parametrize("name", ["", "../x", "a\nb", "x" * 1000])
 def test_a_name_that_nobody_could_use_is_refused_at_once(rskill, capsys, name):
+    """Regression: `--name ""` and `--name ../x` served at a path that no client looks at."""
     with pytest.raises(SystemExit) as caught:
         main(
             [

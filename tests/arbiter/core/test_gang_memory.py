@@ -36,6 +36,8 @@ def say(driver: CoreDriver, lease: LeaseId) -> str:
 
 @pytest.mark.parametrize("lists", [True, False])
 def test_a_member_does_not_load_into_the_peak_of_the_one_before(lists: bool) -> None:
+    """Regression: only the ledger was checked before a member's load, and it ran out of memory
+    beside the earlier peak."""
     driver = hidden_card(lists=lists, lag_s=0.8)
     a, b = driver.consumer("a"), driver.consumer("b")
     first, second = member(a, 5, 2.5), member(b, 4.5, 2.5)
@@ -50,6 +52,8 @@ def test_a_member_does_not_load_into_the_peak_of_the_one_before(lists: bool) -> 
 
 
 def test_while_a_member_waits_for_its_memory_the_card_is_not_read_without_pause() -> None:
+    """Regression: each reading that showed too little asked for the next at once: a thousand
+    readings a second."""
     driver = hidden_card(lag_s=5.0)
     a, b = driver.consumer("a"), driver.consumer("b")
     first, second = member(a, 5, 2.5), member(b, 4.5, 2.5)
@@ -157,6 +161,7 @@ def test_a_member_whose_process_is_still_giving_back_needs_all_its_bytes() -> No
 
 @pytest.mark.parametrize("asked", [False, True])
 def test_a_gang_that_broke_is_not_waited_for_after_a_restart(asked: bool) -> None:
+    """Regression: the members' records were rewritten only when the gang was complete."""
     driver = hidden_card()
     a, b = driver.consumer("a"), driver.consumer("b")
     first, second = member(a, 3, 3), member(b, 4, 4)
@@ -174,6 +179,8 @@ def test_a_gang_that_broke_is_not_waited_for_after_a_restart(asked: bool) -> Non
 
 
 def test_bytes_kept_for_the_next_member_hide_no_context_of_the_one_before() -> None:
+    """Regression: bytes reserved for the next member's load covered the context of an earlier
+    member's process; moving them counted both and broke an invariant."""
     driver = hidden_card(lag_s=0.8)
     first, lease = held(driver, "first", 1, residue_bytes=GIB)
     first.unload(lease)  # its context stays
@@ -197,6 +204,8 @@ def test_bytes_kept_for_the_next_member_hide_no_context_of_the_one_before() -> N
 
 
 def test_who_came_and_died_since_the_reading_may_still_be_on_the_card() -> None:
+    """Regression: a reading from before a process came cannot show its bytes; only living processes
+    were added to it."""
     driver = CoreDriver(8 * GIB)
     driver.card.lists_processes = False
     driver.card.lag_s = 0.03

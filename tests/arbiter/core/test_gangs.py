@@ -505,6 +505,8 @@ def test_an_idle_card_beside_a_busy_one_is_no_place_for_half_a_gang() -> None:
 
 
 def test_a_gang_goes_ahead_of_a_waiter_for_which_another_card_is_being_emptied() -> None:
+    """Regression: only the head of the queue was asked for its turn, so a gang waited although its
+    room was free."""
     driver = CoreDriver(8 * GIB, cards=2)
     busy, lease = held(driver, "busy", 5, gpu="0", priority=90)
     busy.use_begin(lease)

@@ -35,6 +35,7 @@ LIES: list[dict[str, Any]] = [
 def test_nothing_is_granted_on_an_impossible_reading_until_a_plausible_one(
     lie: dict[str, Any],
 ) -> None:
+    """Regression: a changed capacity, -1 or 2^60 bytes used were believed."""
     driver = CoreDriver(8 * GIB)
     driver.card.lies = lie
     driver.advance(3.0)

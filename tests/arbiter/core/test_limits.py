@@ -40,6 +40,7 @@ def waiting(person: Consumer, **spec: Any) -> dict[str, Any]:
 
 
 def test_a_process_and_a_user_have_a_share_of_the_queue() -> None:
+    """Regression: one process could take all 16,384 places."""
     driver, _, _ = full()
     greedy = driver.consumer("greedy", uid=7)
     assert waiting(greedy) == {"limit": "waiters_max", "value": 8, "share": "of this process"}

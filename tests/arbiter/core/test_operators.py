@@ -301,6 +301,8 @@ def test_a_waiter_has_nothing_to_be_given_up(driver: CoreDriver, ops: Consumer) 
 def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
     driver: CoreDriver, ops: Consumer
 ) -> None:
+    """Regression: recovery ended with the verdict on a declared-dead holder and not with its lease,
+    so all requests waited."""
     det, lease = held(driver, "det", 5 * GIB, ttl_s=600.0)
     driver.restart()
     ops.connect()
@@ -362,6 +364,8 @@ def test_who_is_given_up_and_is_too_small_to_be_seen_has_its_lease_until_it_fenc
 def test_who_is_given_up_while_it_loads_may_load_on_until_it_fences_itself(
     driver: CoreDriver, ops: Consumer
 ) -> None:
+    """Regression: an exclusive lease was granted beside a frozen holder that still believed in its
+    lease (seed 697)."""
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB, ttl_s=60.0)
     driver.until(lambda: driver.state(lease) == "loading")

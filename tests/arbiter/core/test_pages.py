@@ -42,6 +42,7 @@ def crowd() -> CoreDriver:
 
 
 def test_pages_hold_every_lease_once_whatever_their_size() -> None:
+    """Regression: one reply with thousands of leases held the loop for seconds."""
     driver = crowd()
     (whole,) = pages(driver, 1000)
     assert whole == driver.arbiter.status(driver.now)["leases"]

@@ -310,6 +310,8 @@ def test_adopting_more_than_the_card_has_is_pressure_not_a_crash() -> None:
 
 
 def test_a_lease_that_shrank_just_before_the_restart_is_not_taken_for_gone() -> None:
+    """Regression: a resize that is not journaled made a nearly empty GPU look as if a larger lease
+    had gone."""
     driver = CoreDriver(8 * GIB)
     driver.card.lists_processes = False
     det, lease, token = held(driver, "det", 1)

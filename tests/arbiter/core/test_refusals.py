@@ -57,6 +57,7 @@ def called_back_though_it_is_here(person: Consumer) -> None:
 def test_what_is_refused_at_once_is_noted_with_its_reason(
     driver: CoreDriver, ask: Any, code: str, leased: bool
 ) -> None:
+    """Regression: only waits that ended were in the history."""
     person = driver.consumer("big")
     ask(person)
     (note,) = driver.notes("refused")

@@ -70,6 +70,8 @@ def test_nothing_that_is_said_to_others_holds_a_token() -> None:
 
 
 def test_a_token_cannot_be_guessed_from_the_lease_id_or_from_another_token() -> None:
+    """Regression: tokens were the next number, so any client could keep a holder in use for ever."""
+
     def tokens(secret: str) -> list[int]:
         driver = CoreDriver(8 * GIB, settings={"token_secret": secret})
         job = driver.consumer("job")

@@ -150,6 +150,8 @@ def test_a_suspend_after_the_restart_gives_the_user_its_whole_time_anew() -> Non
 
 
 def test_a_holder_that_was_asked_and_is_used_is_not_taken_for_gone() -> None:
+    """Regression: records written after a first restart forgot that the holder had been revoked,
+    and a standby lease did not return."""
     driver = CoreDriver(8 * GIB)
     sidecar, lease, token, runner = used(driver, standby=True)
     driver.consumer("vlm").acquire(5 * GIB, priority=90)

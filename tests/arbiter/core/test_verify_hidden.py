@@ -23,6 +23,8 @@ def verdicts(driver: CoreDriver) -> list[tuple[str, bool]]:
 def test_a_living_holder_that_nobody_lists_is_charged_for_what_it_did_not_give_back(
     since: str,
 ) -> None:
+    """Regression: a process that the list omits counted as one without bytes, and its memory was
+    granted again after ten seconds."""
     driver = CoreDriver(8 * GIB)
     if since == "always":
         driver.card.unlisted.add(ProcessKey(101, 707))
@@ -165,6 +167,8 @@ def test_one_that_comes_onto_the_list_by_its_load_has_grown() -> None:
 
 
 def test_what_another_holder_grew_by_right_hides_no_dead_one() -> None:
+    """Regression: growth within a charge counted twice, as allowed and as taken, so a dead holder's
+    bytes were granted again."""
     driver = CoreDriver(8 * GIB)
     driver.card.lag_s = 15.0
     other, _ = held(driver, "other", 4)
@@ -236,6 +240,8 @@ def test_a_newcomer_that_is_ready_before_a_reading_ends_hides_no_release(leaves:
 
 
 def test_what_its_own_process_loads_hides_no_release() -> None:
+    """Regression: after a restart a load of the same process counted as present already and
+    verified a release early (seed 20778062337)."""
     driver = hidden_card(lists=False, lag_s=2.0)
     person, lease = held(driver, "person", 0.5)
     driver.advance(1.0)

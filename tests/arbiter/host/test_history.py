@@ -222,6 +222,8 @@ class HangingDisk:
 
 
 def test_a_disk_that_hangs_lets_no_more_pile_up_than_the_bound() -> None:
+    """Regression: the bound held for the next batch and not for batches that waited for the hanging
+    thread."""
     disk = HangingDisk()
 
     async def run() -> None:

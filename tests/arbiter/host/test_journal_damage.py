@@ -82,6 +82,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damage_is_doubted_until_the_core_deletes_the_doubt(tmp_path: Path, damage: str) -> None:
+    """Regression: the doubt was kept in memory only, so a second restart forgot it."""
     folder = tmp_path / "state"
     killed(folder, [{"a": {"n": 1}}, {"b": {"n": 2}}])
     spoil, why = DAMAGES[damage]

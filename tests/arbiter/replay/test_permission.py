@@ -1,4 +1,7 @@
-"""What a replay says of a log that its user may not read."""
+"""Replay of a log that its user may not read.
+
+Regression: `Path.is_dir` raises without permission, and `vramctl replay` ended with a traceback.
+"""
 
 import subprocess
 import sys

@@ -153,6 +153,7 @@ def test_what_is_no_log_of_ours_is_told_with_its_file(
     ],
 )
 def test_a_damaged_line_is_named_with_what_can_be_replayed(log: Path, line: str) -> None:
+    """Regression: a damaged event log ended `vramctl replay` with a traceback."""
     lines = log.read_text().splitlines()
     log.write_text("\n".join([*lines[:5], line, *lines[5:], ""]))
     with pytest.raises(LogError, match=r":6: not a line of an event log.*head -n 5"):

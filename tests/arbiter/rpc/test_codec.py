@@ -134,6 +134,7 @@ def test_validation_makes_few_errors_whatever_is_wrong(message: dict[str, Any]) 
 
 
 def test_a_megabyte_of_unknown_keys_is_not_built() -> None:
+    """Regression: it stopped the loop for 0.7 to 4.3 s: one validation error per key."""
     bad = undecodable(pack(op="ping", id=1, **{f"k{n:06d}": 0 for n in range(100_000)}))
     assert isinstance(bad.error, MessageTooLarge)
     assert bad.error.details["limit_values"] == VALUES_MAX

@@ -95,6 +95,8 @@ def test_2_what_is_mistyped_is_told_before_anybody_is_asked(
 def test_1_for_what_cannot_be_done(
     client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
+    """Regression: empty reasons were journaled, and an unknown kind of event printed an empty
+    history."""
     environ = arbiter_daemon.environ
     det = client.acquire(spec("det", 1))
     det.ready()
@@ -135,6 +137,8 @@ def test_1_for_what_cannot_be_done(
 def test_who_is_no_operator_may_look_and_is_told_who_may_act(
     client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
+    """Regression: `vramctl` waited 3 s and reported a missing arbiter to users without permission
+    on the socket."""
     environ = arbiter_daemon.environ
     lease = client.acquire(spec("det", 1))
     lease.ready()
@@ -173,6 +177,8 @@ def test_who_is_no_operator_may_look_and_is_told_who_may_act(
 
 
 def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) -> None:
+    """Regression: libzmq reconnects silently; `vramctl` waited 3 s and reported a missing arbiter
+    after a kill."""
     environ = arbiter_daemon.environ
     os.kill(arbiter_daemon.pid, signal.SIGSTOP)
     try:

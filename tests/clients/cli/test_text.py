@@ -261,6 +261,7 @@ def test_an_event() -> None:
     ],
 )
 def test_fields_of_an_event_have_units(field: dict[str, Any], said: str) -> None:
+    """Regression: the history printed `ms=3.51e+03` and no dates."""
     assert text.event_line({"at_wall_s": 0.0, "kind": "verified", **field}).endswith(f"  {said}")
 
 

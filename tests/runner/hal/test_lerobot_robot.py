@@ -241,6 +241,7 @@ def test_a_stop_that_does_not_reach_the_motors_says_so(make: Make) -> None:
 
 
 def test_a_cable_that_is_pulled_is_a_fault_whatever_the_serial_port_makes_of_it(make: Make) -> None:
+    """Regression: `termios.error` is not an OSError, so the runner neither worked nor ended."""
     hal = make()
     hal.connect()
     robot_of(hal).fault = termios.error(

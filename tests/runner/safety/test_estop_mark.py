@@ -9,6 +9,7 @@ from vram_arbiter.schemas.errors import EstopRequested
 
 
 def test_the_first_reason_is_the_one_that_is_read_later(tmp_path: Path) -> None:
+    """Regression: a second `estop` overwrote the reason of the first."""
     mark = EstopMark(tmp_path / "robot-arm.estop")
     mark.leave("hand in the way")
     mark.leave("on request")  # whoever presses again only wants to be sure

@@ -126,6 +126,7 @@ def test_a_state_or_target_that_is_no_number_cannot_be_built(value: float) -> No
 def test_a_target_that_is_no_number_is_withheld_however_it_was_built(
     value: float, kinematic: bool
 ) -> None:
+    """Regression: copies of an action are not validated, and every comparison with NaN is false."""
     action = to(0.0, 1.0, 0.5).model_copy(
         update={"joint_targets": ((value, 1.0, 0.5),)}
     )  # not validated
@@ -426,6 +427,7 @@ def test_envelopes_only_tighten() -> None:
     ],
 )
 def test_an_envelope_that_limits_nothing_is_refused(envelope: Any, field: str, said: str) -> None:
+    """Regression: a no-go zone with exchanged corners has no inside, so it kept nothing out."""
     with pytest.raises(ConfigError) as caught:
         gate(**envelope)
     found = caught.value.details["fields"][0]
@@ -475,6 +477,7 @@ def test_a_stop_button_that_nobody_listens_to_is_told() -> None:
 
 
 def test_a_limit_of_force_is_told_as_not_kept_where_no_effort_is_measured() -> None:
+    """Regression: such limits were dropped silently."""
     asked = {"max_force_n": 3.0, "max_torque_nm": 2.0, "contact_force_threshold_n": 5.0}
     blind = gate(**asked).unkept
     assert {line.split(" ")[0] for line in blind} == {f"safety.{key}" for key in asked}

@@ -119,6 +119,7 @@ def test_an_episode_whose_last_step_fails_is_not_the_one_before(run_async: Run) 
 
 
 def test_a_world_that_speaks_only_of_successes_does_not_make_them_all(run_async: Run) -> None:
+    """Regression: episodes without a word were left out, which gave 100 % success for one in ten."""
     env = world({2: GOOD})
     cell = play(run_async, env, 1, 1, 1)
     assert [e.success for e in cell.episodes] == [False, True, False]
@@ -148,6 +149,8 @@ def test_a_world_that_speaks_only_of_successes_does_not_make_them_all(run_async:
 def test_what_was_not_promised_is_the_worlds_failure_and_the_next_episode_is_played(
     run_async: Run, odd: Any
 ) -> None:
+    """Regression: `"False"` counted as success, and a short vector ended the whole benchmark with a
+    traceback."""
     cell = play(run_async, world({2: odd, 6: GOOD}, **JOINTS), 3, 3, 3)
     assert (cell.episodes[0].success, cell.episodes[0].error) == (None, "environment_failed")
     assert any(e.success for e in cell.episodes[1:])
@@ -165,6 +168,7 @@ def test_every_plain_yes_is_one(said: Any) -> None:
 
 
 def test_a_number_that_is_none_does_not_pass_however_it_was_built() -> None:
+    """Regression: copies of an action are not validated, and every comparison with NaN is false."""
     env = world({})
     env.reset(0)
     broken = env.action_of([0.0]).model_copy(update={"joint_targets": ((float("nan"),),)})
@@ -175,6 +179,7 @@ def test_a_number_that_is_none_does_not_pass_however_it_was_built() -> None:
 
 
 def test_a_run_in_which_only_a_success_was_told_is_not_all_successes() -> None:
+    """Regression: episodes without a word were left out, which gave 100 % success for one in ten."""
     env = world({2: GOOD}, hold=[0.0])
     policy = Policy("test", lambda env, seed: lambda seen: [0.0])
     runner = SimRunner(lambda: env, rate_hz=0, episodes=3, max_steps=1, policy=policy.play)
@@ -183,6 +188,8 @@ def test_a_run_in_which_only_a_success_was_told_is_not_all_successes() -> None:
 
 
 def test_a_policy_that_is_done_as_its_world_fails_does_not_play_for_ever() -> None:
+    """Regression: both in one tick left no listener for the failure, and the episode was repeated
+    for ever."""
     env = world({n: ZeroDivisionError("again") for n in range(1, 9)}, hold=[0.0])
     policy = Policy("test", lambda env, seed: lambda seen: None)
     runner = SimRunner(lambda: env, rate_hz=0, episodes=1, policy=policy.play)
@@ -194,6 +201,8 @@ def test_a_policy_that_is_done_as_its_world_fails_does_not_play_for_ever() -> No
 
 
 def test_pictures_that_change_their_size_do_not_garble_a_video(tmp_path: Path) -> None:
+    """Regression: ffmpeg receives bytes, so a picture of another size garbled the rest of the
+    video."""
     from vram_arbiter.runner.recorder import Recorder
 
     recorder = Recorder(tmp_path / "v.mp4", fps=30, wait=True)
@@ -264,6 +273,7 @@ if "test/Sketch-v0" not in gymnasium.registry:
 
 
 def test_a_picture_that_was_taken_does_not_change_any_more() -> None:
+    """Regression: an environment that reuses its array changed pictures that were being encoded."""
     env = GymEnv("test/Sketch-v0")
     env.reset(0)
     taken = [env.render(camera) for camera in ("eye", "render")]
@@ -306,11 +316,13 @@ for name, kind in (("test/Silent-v0", Silent), ("test/Broken-v0", Broken)):
 
 
 def test_an_environment_without_spaces_is_refused() -> None:
+    """Regression: it ended the runner with a traceback."""
     with pytest.raises(ConfigError, match="test/Silent-v0 has no action_space"):
         GymEnv("test/Silent-v0")
 
 
 def test_an_action_space_that_fails_is_the_environments_failure() -> None:
+    """Regression: only errors of `make`, `reset` and `step` were taken for foreign code."""
     with pytest.raises(EnvironmentFailed, match=r"Broken-v0.reset: RuntimeError: no dice"):
         GymEnv("test/Broken-v0", render=False).reset(0)
     env = GymEnv("test/Broken-v0", GymConfig(kwargs={"works": "seed"}), render=False)

@@ -179,6 +179,7 @@ def test_actions_that_are_no_row_of_numbers_are_refused_with_the_reason(
 
 
 def test_a_discretes_copy_that_is_no_choice_does_not_pass() -> None:
+    """Regression: copies are not validated, and only rows were checked again."""
     env = plain(spaces.Discrete(3))
     env.reset(0)
     for number in (float("nan"), -7.0, 7.0):
@@ -249,6 +250,8 @@ def test_pictures_in_a_tuple_are_cameras() -> None:
 
 
 def test_two_pictures_of_the_same_last_name_are_two_cameras() -> None:
+    """Regression: the last key was the camera's name, so one of `left.rgb` and `right.rgb` was
+    lost."""
     eyes = spaces.Dict(left=spaces.Dict(rgb=PICTURE), right=spaces.Dict(rgb=PICTURE), top=PICTURE)
     env = plain(spaces.Discrete(2), eyes)
     env.reset(0)
@@ -257,6 +260,7 @@ def test_two_pictures_of_the_same_last_name_are_two_cameras() -> None:
 
 
 def test_an_observed_picture_that_is_called_render_is_that_picture() -> None:
+    """Regression: a key named `render` was taken for the environment's own rendering."""
     env = plain(spaces.Discrete(2), spaces.Dict(render=PICTURE))
     env.reset(0)
     assert (env.render("render") == env.observation["render"]).all()

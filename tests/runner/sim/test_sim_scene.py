@@ -60,6 +60,8 @@ CAMERA = "{parent: %s, width_px: 64, height_px: 48, fovy_deg: 43.0, pos_m: [0, 0
     ],
 )
 def test_mistakes_in_a_scene_file_are_named_by_line(tmp_path: Path, text: str, said: str) -> None:
+    """Regression: they ended the simulator with a traceback, and an unsuitable time step changed
+    the speed of time."""
     file = tmp_path / "scene.yaml"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=said):
@@ -69,6 +71,7 @@ def test_mistakes_in_a_scene_file_are_named_by_line(tmp_path: Path, text: str, s
 
 
 def test_a_scene_without_an_overview_is_filmed_by_another_camera(tmp_path: Path) -> None:
+    """Regression: `--video` took the `overview` camera for granted."""
     file = tmp_path / "scene.yaml"
     file.write_text(f"cameras:\n  side: {CAMERA % 'world'}\n", encoding="utf-8")
     assert (so101_world(file).video_camera, so101_world(file).cameras) == ("side", ())
@@ -76,6 +79,7 @@ def test_a_scene_without_an_overview_is_filmed_by_another_camera(tmp_path: Path)
 
 
 def test_a_scene_whose_objects_do_not_fit_is_the_environments_failure() -> None:
+    """Regression: it ended the simulator with a traceback."""
     crowded = SimEnv(SceneConfig(object_count=8, zone_half_width_m=0.05))
     with pytest.raises(EnvironmentFailed, match=r"the scene of seed 3 cannot be set up: 8 objects"):
         ArmEnvironment(crowded, so101(simulated=True)).reset(3)

@@ -86,6 +86,7 @@ def test_a_folder_of_another_user_is_refused(
 
 
 def test_only_the_runtime_folder_is_made_for_a_socket(tmp_path: Path) -> None:
+    """Regression: a mistyped endpoint left a trail of folders."""
     environ = {"VRAM_ARBITER_RUNTIME": str(tmp_path / "run")}
     with pytest.raises(ConfigError, match="No such file"):
         socket_folder(tmp_path / "mistyped", environ)

@@ -430,6 +430,9 @@ def test_what_was_sent_before_closing_arrives(path: Path) -> None:
 
 
 def test_the_last_answer_arrives_though_the_server_ends_behind_it(path: Path) -> None:
+    """Regression: a finished connection was not read any more, so closing waited its whole flush
+    time for absent peers."""
+
     async def scenario() -> None:
         handler = Echo()
         async with serving(path, handler) as router:

@@ -212,6 +212,7 @@ def refused(load: Callable[[Weights, str], Any], folder: Path, device: str) -> M
 def test_only_a_whole_checkpoint_is_loaded(
     saved: Callable[[str], Path], tmp_path: Path, name: str, device: str
 ) -> None:
+    """Regression: the libraries' loaders fill missing parameters with random numbers and go on."""
     import torch
     from safetensors.torch import load_file, save_file
 
@@ -268,6 +269,7 @@ def test_a_checkpoint_in_parts_needs_all_of_them(tmp_path: Path, device: str) ->
 def test_a_quantized_checkpoint_is_compared_with_its_statistics(
     saved: Callable[[str], Path], tmp_path: Path, device: str
 ) -> None:
+    """Regression: `--check` would have refused every checkpoint written by bitsandbytes."""
     pytest.importorskip("bitsandbytes")
     from safetensors.torch import load_file, save_file
     from transformers import AutoModelForZeroShotObjectDetection, BitsAndBytesConfig
@@ -337,6 +339,7 @@ def test_a_policy_without_its_statistics_is_refused(tmp_path: Path, part: str, d
 def test_check_compares_the_weights_and_ends_with_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Regression: the libraries' loaders fill missing parameters with random numbers and go on."""
     from safetensors.torch import load_file, save_file
 
     from vram_arbiter.sidecars.__main__ import main

@@ -59,6 +59,7 @@ def test_a_process_is_listed_with_its_bytes_and_a_dead_one_is_not(probe, folder)
 def test_a_name_that_is_cut_in_the_middle_of_a_letter_fails_no_reading(
     probe, folder, half_a_letter
 ):
+    """Regression: the kernel cuts names at 15 bytes, and `/proc/PID/stat` was decoded as text."""
     stowaway(folder, half_a_letter, GIB)
     (use,) = probe.sample(probe.cards()[0].id).processes
     assert (use.process.pid, use.used_bytes) == (half_a_letter, GIB)

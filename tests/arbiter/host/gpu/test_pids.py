@@ -65,6 +65,7 @@ def test_in_a_container_a_host_pid_leads_to_one_of_ours(container: tuple[Path, P
 def test_in_a_container_a_name_that_ends_in_half_a_letter_makes_no_stowaway(
     container: tuple[Path, Path],
 ) -> None:
+    """Regression: the kernel cuts names at 15 bytes, and `/proc/PID/stat` was decoded as text."""
     own, host = container
     for stat in (own / "7" / "stat", host / "500" / "stat"):
         stat.write_bytes(stat.read_bytes().replace(b"detector", b"abcdefghijklmn\xc3"))
@@ -116,6 +117,7 @@ def test_this_very_process_is_found_with_the_real_proc() -> None:
 def test_a_name_that_is_cut_in_the_middle_of_a_letter_hides_no_start_time(
     half_a_letter: int,
 ) -> None:
+    """Regression: the kernel cuts names at 15 bytes, and `/proc/PID/stat` was decoded as text."""
     key, _ = PidMap("own").translate(half_a_letter)
     assert key == ProcessKey(half_a_letter, start_ticks(half_a_letter) or 0)
     assert key.start_ticks > 0
