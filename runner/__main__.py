@@ -32,7 +32,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     commands = parser.add_subparsers(dest="command", required=True)
     given = sys.argv[1:] if argv is None else argv
     for name in [URGENT] if given[:1] == [URGENT] else COMMANDS:
-        module = import_module(f"runner.cli.{name}")
+        module = import_module(f"vram_arbiter.runner.cli.{name}")
         flags = module.add_parser(commands)
         add_version(flags)
         flags.add_argument(

@@ -1,6 +1,6 @@
-"""An environment with the product installed in it, as `pip install .` leaves one, in a second and without a network.
+"""Environment with the product installed as by `pip install .`, in a second and without a network.
 
-The packages are copied as pyproject.toml says of the wheel, so that nothing comes from the checkout.
+The packages are copied as pyproject.toml says of the wheel, so nothing comes from the checkout.
 The dependencies are those of the environment that runs the tests.
 """
 
@@ -22,18 +22,18 @@ def install_into(
     python: Path = PYTHON,
     dependencies: Path = DEPENDENCIES,
 ) -> None:
-    """Make `prefix` an environment. `seen_at`, `python` and `dependencies` are the paths as the programs see them."""
+    """Make `prefix` an environment.
+
+    `seen_at`, `python` and `dependencies` are the paths as the programs see them.
+    """
     project = tomllib.loads((TREE / "pyproject.toml").read_text(encoding="utf-8"))
     version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
     packages = prefix / "lib" / version / "site-packages"
     packages.mkdir(parents=True)
     wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
-    for name in wheel["only-include"]:
-        target = packages / wheel["sources"].get(name, name)
-        if (TREE / name).is_dir():
-            shutil.copytree(TREE / name, target)
-        else:
-            shutil.copy2(TREE / name, target)
+    left_out = shutil.ignore_patterns(*(name.strip("/") for name in wheel["exclude"]))
+    for name in wheel["packages"]:  # its links are followed, as by the wheel's builder
+        shutil.copytree(TREE / name, packages / Path(name).name, ignore=left_out)
     (packages / "dependencies.pth").write_text(f"{dependencies}\n")
 
     (prefix / "pyvenv.cfg").write_text(

@@ -84,7 +84,10 @@ def test_it_takes_the_first_interpreter_that_works_and_works_once(project: Path)
     assert first.returncode == 0, first.stderr
     made, installed = log.read_text(encoding="utf-8").splitlines()
     assert made == f"venv --quiet --clear --python {project}/bin/python3.13 .venv-core"
-    assert installed == "pip install --python .venv-core/bin/python -c constraints.txt -e .[dev]"
+    assert (
+        installed
+        == "pip install --python .venv-core/bin/python -c constraints.txt --group dev -e ."
+    )
 
     assert set_up(project, "core").returncode == 0
     assert len(log.read_text(encoding="utf-8").splitlines()) == 2, "nothing changed, nothing to do"
@@ -141,18 +144,18 @@ def test_without_gstreamer_everything_else_is_installed_and_what_is_missing_is_s
     assert result.returncode == 0, result.stderr
     assert "cameras through GStreamer are left out" in result.stderr
     assert "sudo apt-get install gcc libc6-dev pkg-config libgirepository1.0-dev" in result.stderr
-    assert installed(full) == [".[all,dev]"]
+    assert installed(full) == [".[all]"]
     assert "apt-get" not in (full / "log").read_text(encoding="utf-8"), "only root may"
 
 
 def test_libraries_that_came_later_are_a_reason_to_begin_again(full: Path) -> None:
     assert set_up(full, "full").returncode == 0
     assert set_up(full, "full").returncode == 0
-    assert installed(full) == [".[all,dev]"]
+    assert installed(full) == [".[all]"]
     (full / "headers").touch()
     result = set_up(full, "full")
     assert result.returncode == 0, result.stderr
-    assert installed(full) == [".[all,dev]", ".[all,dev,gstreamer]"]
+    assert installed(full) == [".[all]", ".[all,gstreamer]"]
     assert set_up(full, "full").returncode == 0
     assert len(installed(full)) == 2
 
@@ -171,7 +174,7 @@ def test_root_gets_the_libraries_by_apt(full: Path) -> None:
     assert first == "apt-get update -qq"
     assert second.startswith("apt-get install -y -qq")
     assert "gstreamer1.0-plugins-good" in second
-    assert installed(full) == [".[all,dev,gstreamer]"]
+    assert installed(full) == [".[all,gstreamer]"]
 
 
 @pytest.mark.parametrize("trouble", ["offline", "unbuildable"])
@@ -183,4 +186,4 @@ def test_trouble_with_gstreamer_stops_nothing_else(full: Path, trouble: str) -> 
         pytest.skip("this machine lacks EGL, too, and that is wanted")
     assert result.returncode == 0, result.stderr
     assert "cameras through GStreamer are left out" in result.stderr
-    assert installed(full)[-1] == ".[all,dev]"
+    assert installed(full)[-1] == ".[all]"
