@@ -18,6 +18,7 @@ ROOTS: dict[str, str] = {
     "rskill": "vram_arbiter.schemas.manifest:RSkillManifest",
     "arbiter": "vram_arbiter.schemas.config.arbiter:ArbiterConfig",
     "robot": "vram_arbiter.schemas.config.robot:RobotEnvironment",
+    "scenario": "vram_arbiter.schemas.config.scenario:Scenario",
 }
 """Documents with a single root: name → `module:class`."""
 

@@ -10,11 +10,11 @@ ARBITER = Path(__file__).parents[2] / "arbiter"
 READERS = {
     "host/history.py": "dates of events, and which events of earlier runs are old",
     "host/seal.py": "the epoch, which grows past every known one whatever it says",
-    "host/otel.py": "dates of spans",
-    "host/recorder.py": "dates in the event log",
-    "replay/logfile.py": "names of its files",
-    "replay/text.py": "dates for people",
-    "telemetry.py": "dates for people",
+    "host/telemetry/spans.py": "dates of spans",
+    "eventlog/writer.py": "dates in the event log",
+    "eventlog/logfile.py": "names of its files",
+    "lab/text.py": "dates for people",
+    "log.py": "dates for people",
 }
 WALL = {
     "time",

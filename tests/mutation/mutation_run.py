@@ -62,7 +62,8 @@ class Mutant:
 
     @property
     def module(self) -> str:
-        return f"arbiter.core.{self.stem}"
+        (path,) = CORE.rglob(f"{self.stem}.py")
+        return ".".join(("vram_arbiter", *path.relative_to(CORE.parents[1]).with_suffix("").parts))
 
 
 # -- which there are -------------------------------------------------------------------------------------------------
@@ -98,7 +99,7 @@ def choose(
     sample: int, seed: int, only: Mapping[str, str], folder: Path = CORE
 ) -> tuple[int, list[Mutant]]:
     """How many mutants there are, and `sample` of them by chance (0: all), or exactly those of `only`: their names and diffs."""
-    found = [item for path in sorted(folder.glob("*.py")) for item in _of_file(path)]
+    found = [item for path in sorted(folder.rglob("*.py")) for item in _of_file(path)]
     if only:
         chosen = _again(found, only)
         return len(found), chosen

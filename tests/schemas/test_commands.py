@@ -21,7 +21,7 @@ WAIT_S = 60.0
 def program(lines: str, collector: Collector | None, **environ: str) -> "subprocess.Popen[str]":
     """A program of these lines inside `command("tool", "do")`; `serves` and `sys` are at hand."""
     body = "\n".join(f"    {line}" for line in lines.splitlines())
-    code = f"import signal, sys\nfrom schemas.runtime.telemetry.commands import command\nwith command('tool', 'do') as running:\n{body}\n"
+    code = f"import signal, sys\nfrom vram_arbiter.schemas.runtime.telemetry.commands import command\nwith command('tool', 'do') as running:\n{body}\n"
     given = {
         "PYTHONPATH": f"{ROOT}/src:{ROOT}",
         "PATH": "/usr/bin",
@@ -126,7 +126,7 @@ def test_the_quick_commands_send_nothing_and_the_others_do(tmp_path: Path) -> No
             **collector.environ(),
         }
         lines = (
-            "import sys\nfrom clients.cli.main import main\nsys.argv = ['vramctl', *sys.argv[1:]]\n"
+            "import sys\nfrom vram_arbiter.clients.cli.main import main\nsys.argv = ['vramctl', *sys.argv[1:]]\n"
             "try: main()\nfinally: print([name for name in sys.modules if name == 'opentelemetry'], file=sys.stderr)"
         )
         said = {}

@@ -131,7 +131,7 @@ def test_a_full_output_device_is_one_line(arguments: list[str], tmp_path: Path) 
 
 
 def test_a_full_disk_behind_a_file_is_named() -> None:
-    program = "import errno, os\nfrom schemas import terminal\n"
+    program = "import errno, os\nfrom vram_arbiter.schemas.runtime import terminal\n"
     program += "@terminal.program\ndef main():\n"
     program += "    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), 'out/summary.json')\n"
     program += "raise SystemExit(main())\n"

@@ -410,5 +410,5 @@ def test_what_throws_in_cpp_lives_on_after_it(before: str) -> None:
 
 
 def test_importing_it_loads_no_gstreamer() -> None:
-    loaded = "import sys, runner.sensors.gstreamer\nprint([name for name in ('gi', 'cv2', 'torch', 'numpy') if name in sys.modules])"
+    loaded = "import sys, vram_arbiter.runner.sensors.gstreamer\nprint([name for name in ('gi', 'cv2', 'torch', 'numpy') if name in sys.modules])"
     assert fresh(loaded).strip() == "[]"
