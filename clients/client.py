@@ -42,7 +42,7 @@ from vram_arbiter.clients.net.diagnose import START, obstacle
 from vram_arbiter.clients.net.timeouts import answered
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VramError
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
-from vram_arbiter.schemas.wire import Gang, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Gang, LeaseSpec
 
 log = logging.getLogger(__name__)
 

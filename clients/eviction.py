@@ -15,7 +15,7 @@ from vram_arbiter.clients._protocol.leases import GONE_CODES
 from vram_arbiter.clients._protocol.protocol import ClientProtocol
 from vram_arbiter.clients._protocol.records import LeaseRecord
 from vram_arbiter.schemas.errors import ArbiterUnreachable, BadState, VramError
-from vram_arbiter.schemas.wire import LeaseSpec
+from vram_arbiter.schemas.wire.requests import LeaseSpec
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients._protocol.records import Eviction, LeaseRecord, TokenPair
 from vram_arbiter.clients.eviction import Driver, Leaving, Unload
 from vram_arbiter.schemas.errors import BadState, LeaseLost, LeaseRevoking, VramError
-from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 log = logging.getLogger(__name__)
 

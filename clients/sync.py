@@ -24,7 +24,7 @@ from vram_arbiter.clients._protocol.records import Eviction
 from vram_arbiter.clients.client import CONNECT_TIMEOUT_S, ArbiterClient
 from vram_arbiter.clients.lease import ForeignUse, Lease, LeaseState, SafePointEta, Use
 from vram_arbiter.schemas.errors import BadState, VramError
-from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 T = TypeVar("T")
 Message = dict[str, Any]

@@ -13,6 +13,7 @@ from typing import Any, Literal, is_typeddict
 from pydantic import BaseModel, TypeAdapter
 
 from vram_arbiter import schemas
+from vram_arbiter.schemas import wire
 
 ROOTS: dict[str, str] = {
     "rskill": "vram_arbiter.schemas.manifest:RSkillManifest",
@@ -33,9 +34,11 @@ def documents() -> dict[str, str]:
         model: type[BaseModel] = getattr(importlib.import_module(module), attribute)
         found[name] = model.model_json_schema()
     for name in modules():
-        module_schema = _of_module(importlib.import_module(f"vram_arbiter.schemas.{name}"))
-        if module_schema["$defs"]:
-            found[name] = {"title": f"schemas.{name}", **module_schema}
+        document = name.partition(".")[0]
+        definitions = _of_module(importlib.import_module(f"vram_arbiter.schemas.{name}"))
+        if definitions:
+            empty = {"title": f"schemas.{document}", "$defs": {}}
+            found.setdefault(document, empty)["$defs"].update(definitions)
     return {
         f"{name}.json": json.dumps(
             {"$schema": _DIALECT, **schema}, indent=1, ensure_ascii=False, sort_keys=True
@@ -46,12 +49,13 @@ def documents() -> dict[str, str]:
 
 
 def modules() -> list[str]:
-    """Names of the modules of `schemas`; each that defines models gets its document. Packages have roots instead."""
-    return [
-        found.name
-        for found in pkgutil.iter_modules(schemas.__path__)
-        if not found.ispkg and found.name[0] != "_"
-    ]
+    """Names of the modules of `schemas`; each that defines models gets its document.
+
+    The modules of `wire` share one document. Other packages have roots instead.
+    """
+    plain = [found.name for found in pkgutil.iter_modules(schemas.__path__) if not found.ispkg]
+    of_wire = [f"wire.{found.name}" for found in pkgutil.iter_modules(wire.__path__)]
+    return [name for name in (*plain, *of_wire) if name[0] != "_"]
 
 
 def public_models(module: ModuleType) -> list[type]:
@@ -76,4 +80,4 @@ def _of_module(module: ModuleType) -> dict[str, Any]:
     for (name, _), schema in found.items():
         if schema != {"$ref": f"#/$defs/{name}"}:
             defs[name] = schema
-    return {"$defs": defs}
+    return defs

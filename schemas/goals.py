@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from vram_arbiter.schemas.runtime.telemetry.traceparent import Traceparent
-from vram_arbiter.schemas.wire import Name, Seconds
+from vram_arbiter.schemas.wire.requests import Name, Seconds
 
 
 class _Call(BaseModel):

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
 from vram_arbiter.schemas.runtime.telemetry.traceparent import Traceparent
-from vram_arbiter.schemas.wire import Seconds, TokenPair
+from vram_arbiter.schemas.wire.requests import Seconds, TokenPair
 
 ImageBytes = Annotated[bytes, Field(min_length=8, max_length=16 * 1024 * 1024)]
 Question = Annotated[str, Field(min_length=1, max_length=2000)]

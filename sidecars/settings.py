@@ -11,7 +11,7 @@ from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
 from vram_arbiter.schemas.units import ByteSize, parse_bytes
-from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.schemas.yamltext import read_yaml
 from vram_arbiter.sidecars.weights import Weights, resolve
 

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from vram_arbiter.schemas.errors import BadRequest, UnknownOp, VramError
 from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
-from vram_arbiter.schemas.wire import OPS, REQUEST, Request
+from vram_arbiter.schemas.wire.requests import OPS, REQUEST, Request
 
 FIELDS_MAX = 20  # problems listed in one reply; the peer's text is never echoed at length
 KEYS_MAX = 64

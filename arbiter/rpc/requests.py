@@ -1,8 +1,8 @@
 """Requests that can change the engine, turned into its events. Pure: no sessions, no sockets, no answers."""
 
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.schemas import wire as w
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ModelKey, RequestId, Token, UseId
+from vram_arbiter.schemas.wire import requests as w
 
 HOLDING = frozenset(("acquire", "reacquire", "reattach", "use_begin"))
 """Ops that can make the engine remember something of a client beyond its connection."""

@@ -24,7 +24,6 @@ from vram_arbiter.arbiter.rpc.shares import (
     share_of,
     spend,
 )
-from vram_arbiter.schemas import wire as w
 from vram_arbiter.schemas.defaults import KIB, WIRE_VERSION
 from vram_arbiter.schemas.errors import (
     BadRequest,
@@ -39,6 +38,7 @@ from vram_arbiter.schemas.errors import (
 from vram_arbiter.schemas.ids import ClientId, ProcessKey, RequestId
 from vram_arbiter.schemas.runtime.peercred import Peer
 from vram_arbiter.schemas.runtime.zmtp import Oversize
+from vram_arbiter.schemas.wire import requests as w
 
 HISTORY_PAGE = 2000
 """Events in one reply, whatever was asked for: packing more would hold the loop for too long."""

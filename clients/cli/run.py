@@ -25,7 +25,7 @@ from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
-from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 PRIORITY = 40
 """Below that of other leases: programs make room for a robot's models, and queue among themselves."""

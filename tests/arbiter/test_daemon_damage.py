@@ -29,7 +29,7 @@ HOLDER = """
 import asyncio, sys
 from pathlib import Path
 from vram_arbiter.clients.client import ArbiterClient
-from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
 async def main():

@@ -6,7 +6,7 @@ import threading
 import msgpack
 import zmq
 
-from vram_arbiter.schemas.wire import REQUEST
+from vram_arbiter.schemas.wire.requests import REQUEST
 
 PAD = "x" * 160
 

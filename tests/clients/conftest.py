@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from vram_arbiter.schemas.defaults import GIB
-from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 sys.path.insert(0, str(Path(__file__).parent))  # for the helpers beside it
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.protocol import ClientProtocol
-from vram_arbiter.schemas import wire
+from vram_arbiter.schemas.wire import requests as wire
 
 SPEC = wire.LeaseSpec(
     consumer="detector",

@@ -28,7 +28,7 @@ from vram_arbiter.schemas.errors import (
     VramInsufficient,
     WaitTimeout,
 )
-from vram_arbiter.schemas.wire import LeaseSpec
+from vram_arbiter.schemas.wire.requests import LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]

@@ -18,7 +18,7 @@ from vram_arbiter.schemas.errors import (
     VramInsufficient,
     WouldDeadlock,
 )
-from vram_arbiter.schemas.wire import Footprint, LeaseRef, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseRef, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]

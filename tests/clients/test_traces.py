@@ -18,7 +18,7 @@ from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.clients.sync import SyncArbiterClient
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
-from vram_arbiter.schemas.wire import LeaseSpec
+from vram_arbiter.schemas.wire.requests import LeaseSpec
 
 PARENT = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
 OTHER = "00-1af7651916cd43dd8448eb211c80319d-c7ad6b7169203332-01"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from vram_arbiter.clients.client import ArbiterClient
 from vram_arbiter.clients.lease import Lease
-from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 from vram_arbiter.sidecars.device.memory import Block
 

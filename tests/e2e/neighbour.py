@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vram_arbiter.clients.client import ArbiterClient
-from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 from vram_arbiter.sidecars.device.memory import Block
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vram_arbiter.clients.client import ArbiterClient
-from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
 TTL_S = 120.0  # a daemon that is started again on a busy machine is away for seconds, and nobody is to fence himself

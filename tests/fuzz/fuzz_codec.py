@@ -15,7 +15,7 @@ with atheris.instrument_imports(
     include=[
         "vram_arbiter.arbiter.rpc.codec",
         "vram_arbiter.schemas.runtime.msgpack_codec",
-        "vram_arbiter.schemas.wire",
+        "vram_arbiter.schemas.wire.requests",
         "vram_arbiter.schemas.errors",
         "msgpack",
     ]
@@ -23,7 +23,7 @@ with atheris.instrument_imports(
     from tests.support.hostile import BOMBS, Forger, pack
     from vram_arbiter.arbiter.rpc import codec
     from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
-    from vram_arbiter.schemas.wire import OPS
+    from vram_arbiter.schemas.wire.requests import OPS
 
 ANSWER_MAX_BYTES = 16_384
 SEEDS_PER_OP = 4

@@ -15,7 +15,7 @@ from grab_programs import GOAL_S, GRAB, SKILLS, GrabPrograms, need_checkpoint
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import ArbiterClient
 from vram_arbiter.clients.runner import RunnerClient
-from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(340)]
 

@@ -8,7 +8,7 @@ from vram_arbiter.schemas.goals import RUNNER_REQUEST
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.runtime.telemetry.traceparent import read
 from vram_arbiter.schemas.sidecar import ENDPOINT_REQUEST, OP_REQUEST
-from vram_arbiter.schemas.wire import REQUEST
+from vram_arbiter.schemas.wire.requests import REQUEST
 
 TRACE, SPAN = "0af7651916cd43dd8448eb211c80319c", "b7ad6b7169203331"
 GOOD = f"00-{TRACE}-{SPAN}-01"

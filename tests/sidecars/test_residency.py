@@ -8,7 +8,7 @@ import pytest
 from vram_arbiter.clients.client import ArbiterClient
 from vram_arbiter.schemas.errors import NotResident
 from vram_arbiter.schemas.manifest import parse_manifest
-from vram_arbiter.schemas.wire import Footprint
+from vram_arbiter.schemas.wire.requests import Footprint
 from vram_arbiter.sidecars.device.fake import FakeMemory
 from vram_arbiter.sidecars.residency import Residency
 from vram_arbiter.sidecars.settings import Settings

@@ -21,7 +21,7 @@ from vram_arbiter.clients.net.dealer import Transport
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VramError
 from vram_arbiter.schemas.ids import GpuId
-from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 SIZES = (600 * d.MIB, d.GIB, 2 * d.GIB, 3_300_000_000, 4_300_000_000, 5_300_000_000, 7 * d.GIB)
 RESIDUES = (0, 200 * d.MIB, 450 * d.MIB)

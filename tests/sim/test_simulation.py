@@ -15,7 +15,7 @@ from tests.support.simulation.world import Entitlement, SimFailure, World
 from vram_arbiter.clients.lease import Lease
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
-from vram_arbiter.schemas.wire import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 A, B, GPU = ProcessKey(1, 1), ProcessKey(2, 2), GpuId("GPU-0")
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgpack
 
-from vram_arbiter.schemas.wire import OPS, REQUEST
+from vram_arbiter.schemas.wire.requests import OPS, REQUEST
 
 _SCHEMA = REQUEST.json_schema()
 _BY_OP: Mapping[str, Mapping[str, Any]] = {

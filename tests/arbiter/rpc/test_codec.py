@@ -12,7 +12,7 @@ from vram_arbiter.arbiter.rpc import codec
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import VALUES_MAX
 from vram_arbiter.schemas.errors import BadFrame, BadRequest, MessageTooLarge, UnknownOp
-from vram_arbiter.schemas.wire import Acquire, Footprint, Gang, LeaseSpec, Ping, Reattach
+from vram_arbiter.schemas.wire.requests import Acquire, Footprint, Gang, LeaseSpec, Ping, Reattach
 
 LIMIT = 1 << 20
 

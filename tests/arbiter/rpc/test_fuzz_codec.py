@@ -14,7 +14,7 @@ from vram_arbiter.arbiter.rpc import codec
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES, MIB, VALUES_MAX
 from vram_arbiter.schemas.errors import MessageTooLarge
 from vram_arbiter.schemas.runtime.msgpack_codec import count_values
-from vram_arbiter.schemas.wire import OPS
+from vram_arbiter.schemas.wire.requests import OPS
 
 ANSWER_MAX_BYTES = 16_384
 RANDOM = st.randoms(use_true_random=False)

@@ -11,7 +11,6 @@ import pytest
 from tests.support.connections import KeptConnection, peer_of
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.rpc.session import SessionSettings, SessionTable
-from vram_arbiter.schemas import wire
 from vram_arbiter.schemas.ids import (
     ClientId,
     LeaseId,
@@ -23,6 +22,7 @@ from vram_arbiter.schemas.ids import (
 )
 from vram_arbiter.schemas.runtime.peercred import Peer
 from vram_arbiter.schemas.runtime.zmtp import Oversize
+from vram_arbiter.schemas.wire import requests as wire
 
 ME = peer_of(os.getpid())
 PARENT = peer_of(os.getppid())

@@ -18,7 +18,7 @@ from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.net.diagnose import obstacle
 from vram_arbiter.clients.sync import SyncArbiterClient
 from vram_arbiter.schemas.errors import CODES
-from vram_arbiter.schemas.wire import LeaseSpec
+from vram_arbiter.schemas.wire.requests import LeaseSpec
 
 pytestmark = pytest.mark.e2e
 Spec = Callable[..., LeaseSpec]

@@ -23,7 +23,7 @@ from vram_arbiter.clients.cli.run import RunSpec, _Run, lease_spec
 from vram_arbiter.clients.client import ArbiterClient
 from vram_arbiter.clients.lease import Lease
 from vram_arbiter.clients.sync import SyncArbiterClient
-from vram_arbiter.schemas.wire import LeaseSpec
+from vram_arbiter.schemas.wire.requests import LeaseSpec
 
 Spec = Callable[..., LeaseSpec]
 Finished = subprocess.CompletedProcess[str]

@@ -19,7 +19,7 @@ import pytest
 
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.sync import SyncArbiterClient
-from vram_arbiter.schemas.wire import LeaseSpec
+from vram_arbiter.schemas.wire.requests import LeaseSpec
 
 Spec = Callable[..., LeaseSpec]
 Finished = subprocess.CompletedProcess[str]

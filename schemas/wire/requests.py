@@ -1,16 +1,8 @@
-"""The arbiter's wire: one msgpack map per frame over ZeroMQ ROUTER/DEALER.
-
-Request   {"op": …, "id": n, …fields, "traceparent"?}            client → arbiter
-Reply     {"re": n, "epoch": e, "ok": true, …}                   arbiter → client
-          {"re": n, "epoch": e, "ok": false, "error": {"code", "message", "hint", "details"}}
-Push      {"push": "revoke" | "granted" | "denied" | "resized" | "lost" | "event", "seq": n, "epoch": e, …}
-
-Requests are validated here (frozen, unknown keys refused). Replies and pushes are plain maps: the shapes are the TypedDicts below,
-because dumping a model costs more than the whole codec. New fields always have defaults; a type never changes.
+"""Requests of the arbiter's wire, validated: frozen models that refuse unknown keys.
 
 The life of a lease on the wire: `acquire` → reply `loading` (granted at once) or `queued`, then push `granted` → `ready` →
 `use_begin`/`use_end`… → push `revoke` → `revoke_ack` → `unloading` → `release`. `renew` keeps all leases of a connection alive.
-A lease with `standby` that was asked to leave lives on after its `release`: push `granted` (with a new token) when it is back, or `reacquire`.
+A revoked lease with `standby` continues after its `release`: push `granted` (with a new token) when it is back, or `reacquire`.
 """
 
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
