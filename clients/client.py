@@ -1,6 +1,6 @@
 """The arbiter's client for asyncio programs.
 
-    async with ArbiterClient(name="detector") as client:
+    async with AsyncClient(name="detector") as client:
         async with client.lease(spec, unload=model.unload) as lease:
             await model.load()
             await lease.ready(model.allocated_bytes())
@@ -29,9 +29,9 @@ from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
 from vram_arbiter.clients._protocol.protocol import ClientProtocol
 from vram_arbiter.clients.eviction import Unload
 from vram_arbiter.clients.lease import (
+    AsyncForeignUse,
+    AsyncLease,
     Callbacks,
-    ForeignUse,
-    Lease,
     OnLost,
     OnReturn,
     OnRevoke,
@@ -53,7 +53,7 @@ REOPEN_S = 0.05  # between two sockets, so that a server that hangs up at once i
 SUBSCRIBER_QUEUE_MAX = 10_000  # events; a subscriber that does not read loses the oldest
 
 
-class ArbiterClient:
+class AsyncClient:
     """One connection to the arbiter. `async with`, or `connect` and `close`. Use it on one loop, in one process.
 
     `name` is what `vramctl` shows. Raises ArbiterUnreachable from `connect` after `connect_timeout_s` without an answer, UntrustedServer;
@@ -77,9 +77,9 @@ class ArbiterClient:
         self._timer: asyncio.TimerHandle | None = None
         self._greeted: asyncio.Future[None] | None = None
         self._replies: dict[int, asyncio.Future[r.Message]] = {}
-        self._acquires: dict[str, tuple[asyncio.Future[Lease], LeaseSpec, Callbacks]] = {}
-        self._leases: dict[str, Lease] = {}
-        self._foreign: dict[str, ForeignUse] = {}
+        self._acquires: dict[str, tuple[asyncio.Future[AsyncLease], LeaseSpec, Callbacks]] = {}
+        self._leases: dict[str, AsyncLease] = {}
+        self._foreign: dict[str, AsyncForeignUse] = {}
         self._subscribers: set[asyncio.Queue[r.Message]] = set()
         self._tasks: dict[asyncio.Task[None], None] = {}  # in the order of their beginning
         self._closing = False
@@ -104,7 +104,7 @@ class ArbiterClient:
         return self.protocol.connection.epoch
 
     @property
-    def leases(self) -> Sequence[Lease]:
+    def leases(self) -> Sequence[AsyncLease]:
         """Leases that this client holds now."""
         return tuple(lease for lease in self._leases.values() if lease.state != "gone")
 
@@ -164,7 +164,7 @@ class ArbiterClient:
         on_lost: OnLost | None = None,
         safe_point_eta_s: SafePointEta | None = None,
         traceparent: str | None = None,
-    ) -> Lease:
+    ) -> AsyncLease:
         """Wait for a lease; returns when it is granted (state `loading`): load the model now, then `lease.ready()`.
 
         With `spec.standby` or `park` the lease may be evicted and come back under the same object: `on_return` loads then, as
@@ -177,7 +177,7 @@ class ArbiterClient:
         if not inside.a_use():
             spec = spec.model_copy(update={"independent": True})
         nonce = self.new_id()
-        granted: asyncio.Future[Lease] = asyncio.get_running_loop().create_future()
+        granted: asyncio.Future[AsyncLease] = asyncio.get_running_loop().create_future()
         callbacks = Callbacks(
             unload=unload,
             park=park,
@@ -221,7 +221,7 @@ class ArbiterClient:
         on_revoke: OnRevoke | None = None,
         on_lost: OnLost | None = None,
         safe_point_eta_s: SafePointEta | None = None,
-    ) -> AsyncIterator[Lease]:
+    ) -> AsyncIterator[AsyncLease]:
         """`acquire`, and at the end of the block: unload and release, also when the block raises."""
         lease = await self.acquire(
             spec,
@@ -240,7 +240,7 @@ class ArbiterClient:
 
     async def gang(
         self, specs: Sequence[LeaseSpec], wait_timeout_s: float | None = None
-    ) -> AsyncIterator[tuple[int, Lease]]:
+    ) -> AsyncIterator[tuple[int, AsyncLease]]:
         """All of these leases or none: `async for index, lease in client.gang([policy, reward]): load, then await lease.ready()`.
 
         One is granted after the other, each as the one before is ready. Raises GangBroken, VramInsufficient, WaitTimeout; what was
@@ -250,7 +250,7 @@ class ArbiterClient:
             id=f"{self.protocol.connection.instance}/{uuid.uuid4().hex[:12]}", size=len(specs)
         )
 
-        async def member(index: int, spec: LeaseSpec) -> tuple[int, Lease]:
+        async def member(index: int, spec: LeaseSpec) -> tuple[int, AsyncLease]:
             return index, await self.acquire(spec.model_copy(update={"gang": gang}), wait_timeout_s)
 
         waiting = [asyncio.ensure_future(member(index, spec)) for index, spec in enumerate(specs)]
@@ -276,10 +276,10 @@ class ArbiterClient:
         label: str = "",
         *,
         timeout_s: float = REQUEST_TIMEOUT_S,
-    ) -> ForeignUse:
+    ) -> AsyncForeignUse:
         """Begin a use on a lease of another process, whose token was handed to us. Raises LeaseRevoking, StaleToken, LeaseLost …"""
         pair = (int(token[0]), int(token[1]))
-        use = ForeignUse(
+        use = AsyncForeignUse(
             self, lease_id, pair, f"{self.protocol.connection.instance}/{self.new_id()}"
         )
         request = self.protocol.foreign_uses.begin(
@@ -303,7 +303,7 @@ class ArbiterClient:
     @asynccontextmanager
     async def use(
         self, lease_id: str, token: Sequence[int], label: str = ""
-    ) -> AsyncIterator[ForeignUse]:
+    ) -> AsyncIterator[AsyncForeignUse]:
         """`begin_use` as a block: the lease's holder is not made to leave inside it."""
         use = await self.begin_use(lease_id, token, label)
         try:
@@ -545,11 +545,11 @@ class ArbiterClient:
             self.protocol.holdings.release(event.record, False, self.now(), REQUEST_TIMEOUT_S)
             return
         granted, spec, callbacks = entry
-        lease = Lease(self, event.record, spec, callbacks)
+        lease = AsyncLease(self, event.record, spec, callbacks)
         self._leases[lease.lease_id] = lease
         self.spawn(self._forget_when_over(lease), f"life of {lease.lease_id}")
         granted.set_result(lease)
 
-    async def _forget_when_over(self, lease: Lease) -> None:
+    async def _forget_when_over(self, lease: AsyncLease) -> None:
         await lease.wait_gone()
         self._leases.pop(lease.lease_id, None)

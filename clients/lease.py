@@ -21,9 +21,9 @@ from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 log = logging.getLogger(__name__)
 
 LeaseState = Literal["loading", "held", "revoking", "unloading", "standby", "parked", "gone"]
-OnRevoke = Callable[["Lease", Mapping[str, Any]], Awaitable[None] | None]
-OnLost = Callable[["Lease", VramError], Awaitable[None] | None]
-OnReturn = Callable[["Lease"], Awaitable[None] | None]
+OnRevoke = Callable[["AsyncLease", Mapping[str, Any]], Awaitable[None] | None]
+OnLost = Callable[["AsyncLease", VramError], Awaitable[None] | None]
+OnReturn = Callable[["AsyncLease"], Awaitable[None] | None]
 SafePointEta = Callable[[], float | None]
 
 
@@ -43,7 +43,7 @@ class Callbacks:
     safe_point_eta_s: SafePointEta | None = None
 
 
-class Lease:
+class AsyncLease:
     """A granted lease. Free it by `give_up` (runs `unload`) or by `release` (you freed the bytes yourself)."""
 
     def __init__(
@@ -126,14 +126,14 @@ class Lease:
         self._leaving.progress.changed()
 
     @asynccontextmanager
-    async def use(self, label: str = "") -> AsyncIterator["Use"]:
+    async def use(self, label: str = "") -> AsyncIterator["AsyncUse"]:
         """Mark a busy interval: nobody makes the holder leave inside it. Raises LeaseRevoking or LeaseLost before it begins.
 
         A lease can be *lost* within a use (expired, fenced): look at `state` where a use is long. A use that has to wait for
         somebody who may need this very room lets go of it meanwhile: `async with use.yielded(): …`.
         """
         self._raise_if_leaving()
-        use = Use(self, f"{self.lease_id}/{self._driver.new_id()}", label)
+        use = AsyncUse(self, f"{self.lease_id}/{self._driver.new_id()}", label)
         try:
             await use.begin()
             yield use
@@ -312,10 +312,10 @@ class Lease:
             log.exception("callback of %s failed", self.lease_id)
 
 
-class Use:
-    """A use on one's own lease; made by `Lease.use`."""
+class AsyncUse:
+    """A use on one's own lease; made by `AsyncLease.use`."""
 
-    def __init__(self, lease: Lease, use_id: str, label: str) -> None:
+    def __init__(self, lease: AsyncLease, use_id: str, label: str) -> None:
         self.use_id = use_id
         self._lease = lease
         self._label = label
@@ -357,7 +357,7 @@ class Use:
             await self.begin()
 
 
-class ForeignUse:
+class AsyncForeignUse:
     """A use on somebody else's lease, begun with its token. End it; a client that goes away ends it too."""
 
     def __init__(self, driver: Driver, lease_id: str, token: TokenPair, use_id: str) -> None:

@@ -1,6 +1,6 @@
 """The arbiter's client for programs with threads: the same surface as `clients.client`, blocking, with `with`.
 
-    with SyncArbiterClient(name="detector") as client:
+    with Client(name="detector") as client:
         with client.lease(spec, unload=model.unload) as lease:
             model.load()
             lease.ready(model.allocated_bytes())
@@ -21,25 +21,31 @@ from typing import Any, Self, TypeVar
 
 from vram_arbiter.clients import use_context as inside
 from vram_arbiter.clients._protocol.records import Eviction
-from vram_arbiter.clients.client import CONNECT_TIMEOUT_S, ArbiterClient
-from vram_arbiter.clients.lease import ForeignUse, Lease, LeaseState, SafePointEta, Use
+from vram_arbiter.clients.client import CONNECT_TIMEOUT_S, AsyncClient
+from vram_arbiter.clients.lease import (
+    AsyncForeignUse,
+    AsyncLease,
+    AsyncUse,
+    LeaseState,
+    SafePointEta,
+)
 from vram_arbiter.schemas.errors import BadState, VramError
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 T = TypeVar("T")
 Message = dict[str, Any]
 SyncUnload = Callable[[], None]
-SyncOnRevoke = Callable[["SyncLease", Mapping[str, Any]], None]
-SyncOnReturn = Callable[["SyncLease"], None]
-SyncOnLost = Callable[["SyncLease", VramError], None]
+SyncOnRevoke = Callable[["Lease", Mapping[str, Any]], None]
+SyncOnReturn = Callable[["Lease"], None]
+SyncOnLost = Callable[["Lease", VramError], None]
 
 CLOSE_TIMEOUT_S = 10.0  # the thread's own end, after leases are given up
 
 
-class SyncLease:
-    """A granted lease for threads; see `clients.lease.Lease`."""
+class Lease:
+    """A granted lease for threads; see `clients.lease.AsyncLease`."""
 
-    def __init__(self, client: "SyncArbiterClient", lease: Lease) -> None:
+    def __init__(self, client: "Client", lease: AsyncLease) -> None:
         self._client = client
         self._lease = lease
 
@@ -73,7 +79,7 @@ class SyncLease:
 
     @property
     def evicted(self) -> Eviction | None:
-        """Who made it leave, and why; see `clients.lease.Lease.evicted`."""
+        """Who made it leave, and why; see `clients.lease.AsyncLease.evicted`."""
         return self._lease.evicted
 
     @property
@@ -88,13 +94,13 @@ class SyncLease:
         self._client.run(self._lease.ready(measured_bytes))
 
     @contextmanager
-    def use(self, label: str = "") -> Iterator["SyncUse"]:
+    def use(self, label: str = "") -> Iterator["Use"]:
         """A busy interval. Raises LeaseRevoking or LeaseLost before it begins."""
         interval = self._lease.use(label)
         use = self._client.run(interval.__aenter__())
         inside.enter(use.use_id)  # the loop's thread entered it for itself only
         try:
-            yield SyncUse(self._client, use)
+            yield Use(self._client, use)
         finally:
             self._client.run(interval.__aexit__(None, None, None))
 
@@ -123,10 +129,10 @@ class SyncLease:
         self._client.run(self._lease.wait_gone())
 
 
-class SyncUse:
-    """A use on one's own lease; see `clients.lease.Use`."""
+class Use:
+    """A use on one's own lease; see `clients.lease.AsyncUse`."""
 
-    def __init__(self, client: "SyncArbiterClient", use: Use) -> None:
+    def __init__(self, client: "Client", use: AsyncUse) -> None:
         self._client = client
         self._use = use
 
@@ -142,8 +148,8 @@ class SyncUse:
             inside.enter(self._use.use_id)
 
 
-class SyncArbiterClient:
-    """`with`, or `connect` and `close`. Raises as `clients.client.ArbiterClient`."""
+class Client:
+    """`with`, or `connect` and `close`. Raises as `clients.client.AsyncClient`."""
 
     def __init__(
         self,
@@ -153,7 +159,7 @@ class SyncArbiterClient:
         role: str = "client",
         connect_timeout_s: float = CONNECT_TIMEOUT_S,
     ) -> None:
-        self._client = ArbiterClient(
+        self._client = AsyncClient(
             endpoint, name=name, role=role, connect_timeout_s=connect_timeout_s
         )
         self._pid = os.getpid()
@@ -231,20 +237,20 @@ class SyncArbiterClient:
         on_revoke: SyncOnRevoke | None = None,
         on_lost: SyncOnLost | None = None,
         safe_point_eta_s: SafePointEta | None = None,
-    ) -> SyncLease:
+    ) -> Lease:
         """Block until granted. Raises WaitTimeout, VramInsufficient, UnknownGpu, HolderBusy, LimitExceeded."""
 
-        async def revoked(lease: Lease, push: Mapping[str, Any]) -> None:
+        async def revoked(lease: AsyncLease, push: Mapping[str, Any]) -> None:
             if on_revoke is not None:
-                await asyncio.to_thread(on_revoke, SyncLease(self, lease), push)
+                await asyncio.to_thread(on_revoke, Lease(self, lease), push)
 
-        async def lost(lease: Lease, error: VramError) -> None:
+        async def lost(lease: AsyncLease, error: VramError) -> None:
             if on_lost is not None:
-                await asyncio.to_thread(on_lost, SyncLease(self, lease), error)
+                await asyncio.to_thread(on_lost, Lease(self, lease), error)
 
-        async def returned(lease: Lease) -> None:
+        async def returned(lease: AsyncLease) -> None:
             if on_return is not None:
-                await asyncio.to_thread(on_return, SyncLease(self, lease))
+                await asyncio.to_thread(on_return, Lease(self, lease))
 
         granted = self._client.acquire(
             spec,
@@ -256,7 +262,7 @@ class SyncArbiterClient:
             on_lost=lost,
             safe_point_eta_s=safe_point_eta_s,
         )
-        return SyncLease(self, self.run(granted))
+        return Lease(self, self.run(granted))
 
     @contextmanager
     def lease(
@@ -270,7 +276,7 @@ class SyncArbiterClient:
         on_revoke: SyncOnRevoke | None = None,
         on_lost: SyncOnLost | None = None,
         safe_point_eta_s: SafePointEta | None = None,
-    ) -> Iterator[SyncLease]:
+    ) -> Iterator[Lease]:
         """`acquire`, and at the end of the block: unload and release, also when the block raises."""
         lease = self.acquire(
             spec,
@@ -288,7 +294,9 @@ class SyncArbiterClient:
             lease.give_up()
 
     @contextmanager
-    def use(self, lease_id: str, token: Sequence[int], label: str = "") -> Iterator[ForeignUse]:
+    def use(
+        self, lease_id: str, token: Sequence[int], label: str = ""
+    ) -> Iterator[AsyncForeignUse]:
         """A use on a lease of another process, by its token."""
         use = self.run(self._client.begin_use(lease_id, token, label))
         inside.enter(use.use_id)

@@ -12,7 +12,7 @@ import signal
 from pathlib import Path
 from typing import Any, NoReturn
 
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.server import RouterServer
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.sidecar import EndpointCall
@@ -53,7 +53,7 @@ class SidecarHost:
             client = None
             if settings.arbiter is not None:
                 client = await stack.enter_async_context(
-                    ArbiterClient(settings.arbiter, name=settings.name)
+                    AsyncClient(settings.arbiter, name=settings.name)
                 )
             server = await stack.enter_async_context(
                 RouterServer(settings.endpoint, error_reply, work_share=WORK_SHARE)

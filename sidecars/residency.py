@@ -14,8 +14,8 @@ import time
 from collections.abc import AsyncIterator, Callable
 from typing import Any, Literal
 
-from vram_arbiter.clients.client import ArbiterClient
-from vram_arbiter.clients.lease import Lease
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.errors import (
     BadState,
     Evicted,
@@ -56,7 +56,7 @@ class Residency:
         adapter: ModelAdapter,
         memory: DeviceMemory,
         worker: Worker,
-        client: ArbiterClient | None,
+        client: AsyncClient | None,
     ) -> None:
         self._settings = settings
         self._adapter = adapter
@@ -71,12 +71,12 @@ class Residency:
         self._running = 0
         self._last_use_s = time.monotonic()
         self._resident_since_s = self._last_use_s
-        self._obtaining: asyncio.Task[Lease | None] | None = None
+        self._obtaining: asyncio.Task[AsyncLease | None] | None = None
         self._unloads = (
             0  # times that somebody said so: whoever waited for the model then waits no longer
         )
         self._calling: asyncio.Task[VramError | None] | None = None  # a lease on standby back
-        self.lease: Lease | None = None
+        self.lease: AsyncLease | None = None
         self.state: State = "unloaded"
         self.last_error: VramError | None = None
 
@@ -278,7 +278,7 @@ class Residency:
         if self._worker.stopping.is_set():
             raise SidecarUnavailable(f"{self._settings.name} is ending", hint="start it again")
 
-    async def _until_left(self, lease: Lease, deadline: float | None) -> None:
+    async def _until_left(self, lease: AsyncLease, deadline: float | None) -> None:
         """Wait until a lease that is leaving has left, its bytes unloaded. Raises Loading when the time is over."""
         try:
             async with asyncio.timeout(_left_s(deadline)):
@@ -292,7 +292,7 @@ class Residency:
             ) from None
 
     # -- coming back from standby -----------------------------------------------------------------------------------------
-    async def _brought_back(self, lease: Lease, deadline: float | None) -> bool:
+    async def _brought_back(self, lease: AsyncLease, deadline: float | None) -> bool:
         """Follow a lease that leaves until it is resident again, calling it back from standby. False: it ended, its bytes are unloaded.
 
         Raises Loading or WaitTimeout when the time is over, or what the arbiter refuses with. A wait that ends so goes on in the background:
@@ -324,13 +324,13 @@ class Residency:
         await self._until_left(lease, deadline)
         return False
 
-    def _called_back(self, lease: Lease) -> asyncio.Task[VramError | None]:
+    def _called_back(self, lease: AsyncLease) -> asyncio.Task[VramError | None]:
         """Ask for it as a waiter, once for all who want it, and without a limit: their own limits are shorter than a goal may be."""
         if self._calling is None or self._calling.done():
             self._calling = asyncio.create_task(self._call_back(lease), name="call back")
         return self._calling
 
-    async def _call_back(self, lease: Lease) -> VramError | None:
+    async def _call_back(self, lease: AsyncLease) -> VramError | None:
         """Until it is granted again or over. Says why the arbiter does not even let it wait."""
         _log.info("wanted: calling the lease back from standby")
         try:
@@ -342,7 +342,7 @@ class Residency:
                 return error
         return None
 
-    async def _on_return(self, lease: Lease) -> None:
+    async def _on_return(self, lease: AsyncLease) -> None:
         """Granted again, by itself or because it was called back. A load that fails ends the lease; the next request starts anew."""
         if self._worker.stopping.is_set():
             return  # `leave` gives it back
@@ -358,7 +358,7 @@ class Residency:
         else:
             self.last_error = None
 
-    async def _obtain(self, deadline: float | None) -> Lease | None:
+    async def _obtain(self, deadline: float | None) -> AsyncLease | None:
         """The host work done, and a lease granted. `unload` cancels it, which gives the place in the queue back.
 
         Imports take half a minute and more on a busy machine; the lease is waited for from then on, for as long as was left before.
@@ -389,7 +389,7 @@ class Residency:
             hint="ask again if it is wanted",
         )
 
-    async def _load(self, lease: Lease | None) -> None:
+    async def _load(self, lease: AsyncLease | None) -> None:
         """Put the model on the card; on failure everything is taken back before the lease is."""
         attributes = self._labels() | (
             {telemetry.ATTR_LEASE: lease.lease_id} if lease is not None else {}
@@ -397,7 +397,7 @@ class Residency:
         with tracing.span(telemetry.SPAN_SIDECAR_LOAD, attributes=attributes):
             await self._load_measured(lease)
 
-    async def _load_measured(self, lease: Lease | None) -> None:
+    async def _load_measured(self, lease: AsyncLease | None) -> None:
         began, unloads = time.monotonic(), self._unloads
 
         def given_up() -> bool:
@@ -427,7 +427,7 @@ class Residency:
         self.state = "resident"
         _log.info("resident after %.2f s: %s bytes on the card", time.monotonic() - began, measured)
 
-    async def _take_back(self, lease: Lease | None, error: BaseException) -> None:
+    async def _take_back(self, lease: AsyncLease | None, error: BaseException) -> None:
         """After a load that failed. Whatever else fails in it, the lease ends: it would be renewed for ever, for nothing."""
         try:
             await self._worker.run(self._unload_blocking)
@@ -497,7 +497,7 @@ class Residency:
             self._memory.free(block)
         self._memory.empty_cache()
 
-    def _on_lost(self, lease: Lease, error: VramError) -> None:
+    def _on_lost(self, lease: AsyncLease, error: VramError) -> None:
         self.last_error = error
         _log.warning("lease %s is lost: %s", lease.lease_id, error)
 
@@ -520,7 +520,9 @@ class Residency:
         )
 
     @contextlib.asynccontextmanager
-    async def _use(self, lease: Lease | None, label: str, *, handed: bool) -> AsyncIterator[None]:
+    async def _use(
+        self, lease: AsyncLease | None, label: str, *, handed: bool
+    ) -> AsyncIterator[None]:
         """Mark a use. Under a handed-over token the caller's own use protects the model, also while it is asked to leave.
 
         Without contact to the arbiter nothing is marked: nobody can be granted anything then, and an unload waits for the op

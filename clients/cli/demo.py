@@ -28,7 +28,7 @@ from vram_arbiter.clients.cli.demo_report import (
     read_samples,
     summarise,
 )
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient, SceneVlmClient
@@ -199,7 +199,7 @@ async def _boot(
     arbiter: bool,
     gpu: str,
     out: Path,
-) -> ArbiterClient | None:
+) -> AsyncClient | None:
     """Start everything and wait until each answers. The arbiter's client, if there is an arbiter."""
     typer.echo(
         f"starting {'the arbiter, ' if arbiter else ''}three sidecars and the runner (imports take a while) …"
@@ -235,8 +235,8 @@ async def _boot(
     return client
 
 
-def _arbiter_client(runtime: Path) -> ArbiterClient:
-    return ArbiterClient(
+def _arbiter_client(runtime: Path) -> AsyncClient:
+    return AsyncClient(
         f"ipc://{runtime}/arbiter.sock", name="demo", role="observer", connect_timeout_s=30.0
     )
 
@@ -255,7 +255,7 @@ async def _until_up(programs: Programs, ping: Any) -> None:
 async def _watch(
     programs: Programs,
     reasoner: Program,
-    client: ArbiterClient | None,
+    client: AsyncClient | None,
     display: Display,
     watch: Watch,
 ) -> None:
@@ -275,7 +275,7 @@ async def _watch(
         ended.cancel()
 
 
-async def _look(client: ArbiterClient | None, display: Display, watch: Watch) -> None:
+async def _look(client: AsyncClient | None, display: Display, watch: Watch) -> None:
     if client is None:
         display.show(None)
         return

@@ -148,13 +148,13 @@ async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None 
 
     Raises ArbiterUnreachable if nobody answers at first.
     """
-    from vram_arbiter.clients.client import ArbiterClient
+    from vram_arbiter.clients.client import AsyncClient
 
     def tell(event: Mapping[str, Any]) -> None:
         if wanted.keeps(event):
             print(json.dumps(event) if as_json else text.event_line(event), flush=True)
 
-    client = ArbiterClient(
+    client = AsyncClient(
         endpoint, name="vramctl history", role="observer", connect_timeout_s=quick.TIMEOUT_S
     )
     live: asyncio.Queue[Message] = asyncio.Queue()

@@ -19,8 +19,8 @@ from typing import Any, Literal
 from vram_arbiter.clients import cuda
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.cli.signals import Forwarding
-from vram_arbiter.clients.client import ArbiterClient
-from vram_arbiter.clients.lease import Lease
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.runtime.printable import printable
@@ -81,7 +81,7 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
         code, problem = _why_not(spec.command[0])
         _say(f"{spec.command[0]}: {problem}")
         return code
-    async with ArbiterClient(
+    async with AsyncClient(
         endpoint, name=f"vramctl run {spec.consumer}"[:NAME_MAX_CHARS]
     ) as client:
         run = _Run(spec, client)
@@ -111,7 +111,7 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
 class _Run:
     """One program under one lease, from its start to its end."""
 
-    def __init__(self, spec: RunSpec, client: ArbiterClient) -> None:
+    def __init__(self, spec: RunSpec, client: AsyncClient) -> None:
         self._spec = spec
         self._client = client
         self._child: asyncio.subprocess.Process | None = None
@@ -121,7 +121,7 @@ class _Run:
         self._reason = "its lease is over"  # said when the program is made to end
         self._told: set[str] = set()  # whom the program keeps waiting
 
-    async def until_ended(self, child: asyncio.subprocess.Process, lease: Lease) -> int:
+    async def until_ended(self, child: asyncio.subprocess.Process, lease: AsyncLease) -> int:
         self._child = child
         held = self._client.spawn(self._hold(lease), f"use of {lease.lease_id}")
         watched = self._client.spawn(self._watch(lease), f"watch of {lease.lease_id}")
@@ -139,14 +139,14 @@ class _Run:
             _say("peak not measured: no reading showed bytes of the program")
         return code
 
-    async def _hold(self, lease: Lease) -> None:
+    async def _hold(self, lease: AsyncLease) -> None:
         """The program is one long use, unless any request may end it."""
         await lease.ready()
         if self._spec.on_revoke != "term":
             async with lease.use(self._spec.consumer):
                 await asyncio.Event().wait()  # until canceled
 
-    async def _watch(self, lease: Lease) -> None:
+    async def _watch(self, lease: AsyncLease) -> None:
         """Measure the peak, and see which requests the program keeps waiting."""
         pause_s = FIRST_LOOK_S
         while True:
@@ -162,7 +162,7 @@ class _Run:
                 self._decide(lease, status)
             pause_s = LOOK_S
 
-    def _measure(self, lease: Lease, status: Mapping[str, Any]) -> None:
+    def _measure(self, lease: AsyncLease, status: Mapping[str, Any]) -> None:
         used = sum(
             process["used_bytes"] or 0
             for gpu in status["gpus"]
@@ -172,14 +172,14 @@ class _Run:
         self.peak_bytes = max(self.peak_bytes, used)
 
     # -- revoke ------------------------------------------------------------------------------------------------------
-    def revoke_asked(self, lease: Lease, push: Mapping[str, Any]) -> None:
+    def revoke_asked(self, lease: AsyncLease, push: Mapping[str, Any]) -> None:
         self._reason = push["reason"]
         self._wake.set()
 
-    def lost(self, lease: Lease, error: VramError) -> None:
+    def lost(self, lease: AsyncLease, error: VramError) -> None:
         _say(f"{lease.lease_id} was lost: {error}")
 
-    def _decide(self, lease: Lease, status: Mapping[str, Any]) -> None:
+    def _decide(self, lease: AsyncLease, status: Mapping[str, Any]) -> None:
         """End the program where a revoke is for a higher priority. A request that came after the revoke is seen in `status`."""
         push = lease.revoke
         if push is None or self._ending or self._spec.on_revoke != "priority":
@@ -223,8 +223,8 @@ class _Run:
 
 
 async def _tell_why(
-    client: ArbiterClient, acquiring: asyncio.Future[Lease], consumer: str
-) -> Lease:
+    client: AsyncClient, acquiring: asyncio.Future[AsyncLease], consumer: str
+) -> AsyncLease:
     """The lease; a person who waits for it is told once whom for."""
     try:
         done, _ = await asyncio.wait({acquiring}, timeout=PATIENCE_S)
@@ -250,7 +250,7 @@ def _why_not(command: str) -> tuple[int, str]:
     return NOT_STARTED, "is a directory" if os.path.isdir(found[0]) else "permission denied"
 
 
-def _environ(lease: Lease) -> dict[str, str]:
+def _environ(lease: AsyncLease) -> dict[str, str]:
     return {
         **os.environ,
         **traces.environ(),

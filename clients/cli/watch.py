@@ -7,7 +7,7 @@ from collections import deque
 from typing import Any
 
 from vram_arbiter.clients.cli import quick, text
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 
 REFRESH_S = 0.5
 """Between two readings of the status; every event refreshes at once as well."""
@@ -15,7 +15,7 @@ REFRESH_S = 0.5
 
 async def watch(endpoint: str | None, events_shown: int) -> int:
     """Until Ctrl-C. Raises ArbiterUnreachable if nobody answers at first; later it waits for the arbiter to come back."""
-    client = ArbiterClient(
+    client = AsyncClient(
         endpoint, name="vramctl watch", role="observer", connect_timeout_s=quick.TIMEOUT_S
     )
     async with client:
@@ -28,7 +28,7 @@ async def watch(endpoint: str | None, events_shown: int) -> int:
     return quick.OK
 
 
-async def _live(client: ArbiterClient, events_shown: int) -> None:
+async def _live(client: AsyncClient, events_shown: int) -> None:
     from rich.console import Console
     from rich.live import Live
     from rich.text import Text

@@ -132,10 +132,10 @@ def warm_up() -> None:
 
 async def connect_arbiter(endpoint: str | None, stack: contextlib.AsyncExitStack) -> Any:
     """A plain client of the arbiter. A robot does not start half-safe: an arbiter that is missing is an error, said at once."""
-    from vram_arbiter.clients.client import ArbiterClient
+    from vram_arbiter.clients.client import AsyncClient
 
     try:
-        return await stack.enter_async_context(ArbiterClient(endpoint, name="runner"))
+        return await stack.enter_async_context(AsyncClient(endpoint, name="runner"))
     except ArbiterUnreachable as error:
         raise ArbiterUnreachable(
             error.message,

@@ -86,7 +86,7 @@ class Use(Protocol):
 
 
 class Arbiter(Protocol):
-    """What is needed of `clients.client.ArbiterClient`."""
+    """What is needed of `clients.client.AsyncClient`."""
 
     async def begin_use(self, lease_id: str, token: Sequence[int], label: str = "") -> Use: ...
 

@@ -66,8 +66,8 @@ def reattach(client: WireClient, on: dict[str, Any], name: str, size: int) -> di
 
 RUNNER = """
 import sys
-from vram_arbiter.clients.sync import SyncArbiterClient
-with SyncArbiterClient(name="runner") as client, client.use(sys.argv[1], (int(sys.argv[2]), int(sys.argv[3])), "goal") as use:
+from vram_arbiter.clients.sync import Client
+with Client(name="runner") as client, client.use(sys.argv[1], (int(sys.argv[2]), int(sys.argv[3])), "goal") as use:
     print("in use", flush=True)
     sys.stdin.readline()
     print(use.lost, flush=True)

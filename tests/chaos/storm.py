@@ -32,7 +32,7 @@ from tests.support.forkserver import Child, ForkServer
 from tests.support.lease_check import Finding, Hindrance, Story, check_leases, read_lines
 from tests.support.process import ArbiterProcess
 from vram_arbiter.arbiter.host.gpu.fake import locked
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.errors import VramError
 
@@ -192,7 +192,7 @@ class Storm:
 
     # -- following the arbiter -----------------------------------------------------------------------------------------
     async def _watch(self) -> None:
-        async with ArbiterClient(
+        async with AsyncClient(
             self._arbiter.endpoint, name="watch", role="operator", connect_timeout_s=60.0
         ) as client:
             async for event in client.subscribe():
@@ -204,7 +204,7 @@ class Storm:
                 ):
                     self._start(self._tell_user(client, str(event["lease_id"])))
 
-    async def _tell_user(self, client: ArbiterClient, lease: str) -> None:
+    async def _tell_user(self, client: AsyncClient, lease: str) -> None:
         """Give the user a lease to mark a use on. Only an operator's status shows its token."""
         with contextlib.suppress(VramError):
             shown = {view["lease_id"]: view for view in (await client.status())["leases"]}
@@ -484,7 +484,7 @@ class Storm:
         """Nothing is left: no lease, no byte, no connection but ours."""
         status: dict[str, Any] = {}
 
-        async def clean(client: ArbiterClient) -> bool:
+        async def clean(client: AsyncClient) -> bool:
             nonlocal status
             status = dict(await client.status())
             return (
@@ -494,7 +494,7 @@ class Storm:
                 and all(gpu["measured_used_bytes"] == 0 for gpu in status["gpus"])
             )
 
-        async with ArbiterClient(
+        async with AsyncClient(
             self._arbiter.endpoint, name="settled", connect_timeout_s=30.0
         ) as client:
             if not await _eventually(lambda: clean(client), CALM_S):

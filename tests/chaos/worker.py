@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.support.attacks import ATTACKS
-from vram_arbiter.clients.client import ArbiterClient
-from vram_arbiter.clients.lease import Lease
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.fakegpu import SimulatedOutOfMemory
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
@@ -66,7 +66,7 @@ class Consumer:
 
     async def run(self) -> None:
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._stopping.set)
-        async with ArbiterClient(name=self._name, connect_timeout_s=CONNECT_S) as client:
+        async with AsyncClient(name=self._name, connect_timeout_s=CONNECT_S) as client:
             while not self._stopping.is_set():
                 await self._round(client)
         self._memory.close()
@@ -89,7 +89,7 @@ class Consumer:
             ),
         )
 
-    async def _round(self, client: ArbiterClient) -> None:
+    async def _round(self, client: AsyncClient) -> None:
         """Acquire, load, use, leave. Whatever goes wrong ends the round, never the process."""
         spec = self._spec()
         blocks: list[Block] = []
@@ -100,7 +100,7 @@ class Consumer:
             await self._free(blocks)
             say("unloaded", lease_id=lease_id)
 
-        def lost(lease: Lease, error: VramError) -> None:
+        def lost(lease: AsyncLease, error: VramError) -> None:
             say("lost", lease_id=lease.lease_id, code=error.code)
 
         lease_id = ""
@@ -146,7 +146,7 @@ class Consumer:
             await self._free(blocks)
             say("over", lease_id=lease_id)
 
-    async def _load(self, lease: Lease, spec: LeaseSpec, blocks: list[Block]) -> None:
+    async def _load(self, lease: AsyncLease, spec: LeaseSpec, blocks: list[Block]) -> None:
         """In pieces, up to the peak and down again, as real loaders do."""
         peak = spec.footprint.load_peak_bytes - self._residue
         extra = spec.footprint.load_peak_bytes - spec.footprint.steady_bytes
@@ -161,11 +161,11 @@ class Consumer:
         await lease.ready(await asyncio.to_thread(self._memory.used_bytes))
         self._trace.say("ready", lease_id=lease.lease_id)
 
-    async def _allocate(self, lease: Lease, size: int) -> Block:
+    async def _allocate(self, lease: AsyncLease, size: int) -> Block:
         """Off the loop, as real loaders do: the card's lock may be held by a process that was stopped."""
         return await asyncio.to_thread(self._memory.allocate, lease.lease_id, size)
 
-    async def _unless_stopping(self, work: Coroutine[Any, Any, Lease]) -> Lease | None:
+    async def _unless_stopping(self, work: Coroutine[Any, Any, AsyncLease]) -> AsyncLease | None:
         """What the work gives; None if this process is to stop first."""
         task = asyncio.ensure_future(work)
         stop = asyncio.ensure_future(self._stopping.wait())
@@ -178,7 +178,7 @@ class Consumer:
             await task
         return None
 
-    async def _use(self, lease: Lease) -> None:
+    async def _use(self, lease: AsyncLease) -> None:
         for _ in range(self._random.randint(1, 4)):
             if self._stopping.is_set():
                 return
@@ -217,7 +217,7 @@ async def take_bytes(card: Path, trace: Trace, size: int) -> None:
 async def mark_uses(trace: Trace) -> None:
     """Like a runner: marks a use on the lease of whoever it is told of (`LEASE EPOCH SERIAL`), by its token."""
     reader = await lines()
-    async with ArbiterClient(name="user", connect_timeout_s=CONNECT_S) as client:
+    async with AsyncClient(name="user", connect_timeout_s=CONNECT_S) as client:
         while line := await reader.readline():
             lease_id, epoch, serial = line.decode().split()
             try:

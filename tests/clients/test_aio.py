@@ -15,7 +15,7 @@ import pytest
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
 from vram_arbiter.clients._protocol.records import Eviction
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.defaults import STATUS_PAGE
 from vram_arbiter.schemas.errors import (
     ArbiterUnreachable,
@@ -38,12 +38,12 @@ Until = Callable[[Callable[[], bool]], Awaitable[None]]
 WAIT_S = 60.0
 
 
-async def states(client: ArbiterClient) -> dict[str, str]:
+async def states(client: AsyncClient) -> dict[str, str]:
     return {lease["consumer"]: lease["state"] for lease in (await client.status())["leases"]}
 
 
 async def test_acquire_ready_use_release(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         lease = await client.acquire(spec("a", 5))
         assert (lease.state, lease.token[0]) == ("loading", client.epoch)
         await lease.ready(5 << 30)
@@ -63,8 +63,8 @@ async def test_an_evicted_holder_hears_by_whom_and_why(
 ) -> None:
     """After an eviction every call on the lease said that it "was released", as if its holder had wanted that."""
     async with (
-        ArbiterClient(arbiter_daemon.endpoint, name="t") as client,
-        ArbiterClient(arbiter_daemon.endpoint, name="ops", role="operator") as ops,
+        AsyncClient(arbiter_daemon.endpoint, name="t") as client,
+        AsyncClient(arbiter_daemon.endpoint, name="ops", role="operator") as ops,
     ):
         first = await client.acquire(spec("a", 5))
         await first.ready()
@@ -89,7 +89,7 @@ async def test_status_is_whole_though_it_comes_in_pages(
     waiters = STATUS_PAGE + 40
     async with contextlib.AsyncExitStack() as stack:
         clients = [
-            await stack.enter_async_context(ArbiterClient(arbiter_daemon.endpoint, name="t"))
+            await stack.enter_async_context(AsyncClient(arbiter_daemon.endpoint, name="t"))
             for _ in range(5)
         ]
         await clients[0].acquire(spec("holder", 5))
@@ -121,7 +121,7 @@ async def test_a_block_unloads_and_releases_also_when_it_raises(
     async def unload() -> None:
         unloaded.append("a")
 
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         with pytest.raises(ZeroDivisionError):
             async with client.lease(spec("a", 5), unload=unload) as lease:  # fails while loading
                 raise ZeroDivisionError
@@ -137,7 +137,7 @@ async def test_a_plain_function_may_unload(
     """The README's example does it so: its end was a traceback, and a lease whose bytes nobody had freed."""
     unloaded: list[str] = []
     async with (
-        ArbiterClient(arbiter_daemon.endpoint, name="t") as client,
+        AsyncClient(arbiter_daemon.endpoint, name="t") as client,
         client.lease(spec("a", 5), unload=lambda: unloaded.append("a")) as lease,
     ):
         await lease.ready()
@@ -152,8 +152,8 @@ async def test_closing_the_client_gives_up_its_leases(
     async def unload() -> None:
         unloaded.set()
 
-    async with ArbiterClient(arbiter_daemon.endpoint, name="other") as other:
-        async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="other") as other:
+        async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
             lease = await client.acquire(spec("a", 5), unload=unload)
             await lease.ready()
         assert unloaded.is_set()
@@ -169,7 +169,7 @@ async def test_leaving_does_not_wait_for_an_arbiter_that_is_away(
         unloaded.set()
 
     arbiter = make_arbiter().start()
-    async with asyncio.timeout(WAIT_S), ArbiterClient(arbiter.endpoint, name="t") as client:
+    async with asyncio.timeout(WAIT_S), AsyncClient(arbiter.endpoint, name="t") as client:
         lease = await client.acquire(spec("a", 5, ttl_s=3600), unload=unload)
         await lease.ready()
         process = arbiter.process
@@ -194,8 +194,8 @@ async def test_revoked_at_the_safe_point_and_not_before(
         story.append(f"revoke for {push['wanted_by']}")
 
     async with (
-        ArbiterClient(arbiter_daemon.endpoint, name="holder") as holder,
-        ArbiterClient(arbiter_daemon.endpoint, name="waiter") as waiter,
+        AsyncClient(arbiter_daemon.endpoint, name="holder") as holder,
+        AsyncClient(arbiter_daemon.endpoint, name="waiter") as waiter,
     ):
         lease = await holder.acquire(
             spec("a", 5), unload=unload, on_revoke=revoked, safe_point_eta_s=lambda: 0.5
@@ -227,8 +227,8 @@ async def test_a_use_of_somebody_else_keeps_the_holder_in_place(
         unloaded.set()
 
     async with (
-        ArbiterClient(arbiter_daemon.endpoint, name="sidecar") as sidecar,
-        ArbiterClient(arbiter_daemon.endpoint, name="runner") as runner,
+        AsyncClient(arbiter_daemon.endpoint, name="sidecar") as sidecar,
+        AsyncClient(arbiter_daemon.endpoint, name="runner") as runner,
     ):
         lease = await sidecar.acquire(spec("a", 5), unload=unload)
         await lease.ready()
@@ -247,7 +247,7 @@ async def test_a_use_of_somebody_else_keeps_the_holder_in_place(
 
 
 async def test_a_use_needs_the_right_token(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         lease = await client.acquire(spec("a", 1))
         await lease.ready()
         with pytest.raises(StaleToken):
@@ -256,7 +256,7 @@ async def test_a_use_needs_the_right_token(arbiter_daemon: ArbiterProcess, spec:
 
 
 async def test_typed_refusals(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         with pytest.raises(VramInsufficient) as never:
             await client.acquire(spec("a", 9))
         assert never.value.details["capacity_bytes"] == 8 << 30
@@ -269,7 +269,7 @@ async def test_typed_refusals(arbiter_daemon: ArbiterProcess, spec: Spec) -> Non
 
 
 async def test_wait_timeout_says_who_blocked(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
         async with lease.use():
@@ -281,7 +281,7 @@ async def test_wait_timeout_says_who_blocked(arbiter_daemon: ArbiterProcess, spe
 async def test_a_cancelled_acquire_leaves_the_queue(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
         async with lease.use():
@@ -298,7 +298,7 @@ async def test_a_cancelled_acquire_leaves_the_queue(
 async def test_an_acquire_cancelled_at_any_moment_leaks_nothing(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         for steps in range(12):  # of the loop, between asking and turning away
             waiting = asyncio.create_task(client.acquire(spec(f"c{steps}", 5)))
             for _ in range(steps * 3):
@@ -324,7 +324,7 @@ async def test_callbacks_that_raise_do_not_keep_the_lease(
     def revoked(*_: object) -> None:
         raise ValueError("another")
 
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         lease = await client.acquire(spec("a", 5), unload=unload, on_revoke=revoked)
         await lease.ready()
         second = await client.acquire(spec("b", 5), WAIT_S)
@@ -335,7 +335,7 @@ async def test_a_word_that_the_arbiter_refuses_is_said_again(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: one `unloading` beyond the client's rate ended the task that leaves, and the holder stayed until it was killed for it."""
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
         said: list[int] = []
@@ -354,7 +354,7 @@ async def test_a_word_that_the_arbiter_refuses_is_said_again(
         monkeypatch.setattr(client.protocol.holdings, "unloading", counted)
         monkeypatch.setattr(client, "reply", refused_once)
         async with (
-            ArbiterClient(arbiter_daemon.endpoint, name="other") as other,
+            AsyncClient(arbiter_daemon.endpoint, name="other") as other,
             asyncio.timeout(WAIT_S),
         ):
             await (await other.acquire(spec("b", 5))).release()
@@ -366,7 +366,7 @@ async def test_a_release_that_is_refused_ends_the_lease_all_the_same(
     arbiter_daemon: ArbiterProcess, spec: Spec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: its holder renewed nothing any more, and waited for ever for a lease that was neither held nor over."""
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         lease = await client.acquire(spec("a", 5))
         reply = client.reply
 
@@ -384,7 +384,7 @@ async def test_a_release_that_is_refused_ends_the_lease_all_the_same(
 
 
 async def test_nobody_at_the_endpoint(tmp_path: Path) -> None:
-    client = ArbiterClient(f"ipc://{tmp_path}/none.sock", name="t", connect_timeout_s=0.2)
+    client = AsyncClient(f"ipc://{tmp_path}/none.sock", name="t", connect_timeout_s=0.2)
     with pytest.raises(ArbiterUnreachable) as unreachable:
         await client.connect()
     assert "VRAM_ARBITER_ENDPOINT" in unreachable.value.hint
@@ -395,7 +395,7 @@ async def test_nobody_at_the_endpoint(tmp_path: Path) -> None:
 async def test_an_observer_may_look_but_not_acquire(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t", role="observer") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t", role="observer") as client:
         assert (await client.status())["clients"] == 1
         with pytest.raises(VramError, match="observer"):
             await client.acquire(spec("a", 1))
@@ -404,7 +404,7 @@ async def test_an_observer_may_look_but_not_acquire(
 async def test_subscribers_see_events_in_order(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
     kinds: list[str] = []
 
-    async def follow(client: ArbiterClient, started: asyncio.Event) -> None:
+    async def follow(client: AsyncClient, started: asyncio.Event) -> None:
         events = client.subscribe()
         first = asyncio.ensure_future(anext(events))
         await client.ping(timeout_s=WAIT_S)
@@ -415,7 +415,7 @@ async def test_subscribers_see_events_in_order(arbiter_daemon: ArbiterProcess, s
             if event["kind"] == "released":
                 return
 
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         started = asyncio.Event()
         following = asyncio.create_task(follow(client, started))
         await started.wait()
@@ -436,7 +436,7 @@ async def test_a_restart_of_the_daemon_is_ridden_out(
     make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
 ) -> None:
     arbiter = make_arbiter().start()
-    async with ArbiterClient(arbiter.endpoint, name="t") as client:
+    async with AsyncClient(arbiter.endpoint, name="t") as client:
         pinned = await client.acquire(spec("a", 5))
         waiting = asyncio.create_task(client.acquire(spec("b", 2), WAIT_S))
         while "b" not in await states(client):
@@ -470,7 +470,7 @@ async def test_self_fencing(
         unloaded.set()
 
     arbiter = make_arbiter().start()
-    async with ArbiterClient(arbiter.endpoint, name="t") as client:
+    async with AsyncClient(arbiter.endpoint, name="t") as client:
         lease = await client.acquire(
             spec("a", 5), unload=unload, on_lost=lambda _, error: lost.append(error)
         )
@@ -495,7 +495,7 @@ async def test_a_hung_daemon_is_noticed_by_silence(
     make_arbiter: Callable[..., ArbiterProcess], until: Until
 ) -> None:
     arbiter = make_arbiter().start()
-    async with ArbiterClient(arbiter.endpoint, name="t") as client:
+    async with AsyncClient(arbiter.endpoint, name="t") as client:
         client.protocol.connection.heartbeat_s = 0.1
         process = arbiter.process
         assert process is not None
@@ -509,8 +509,8 @@ async def test_a_hung_daemon_is_noticed_by_silence(
 
 RUNNER = """
 import sys
-from vram_arbiter.clients.sync import SyncArbiterClient
-with SyncArbiterClient(name="runner") as client, client.use(sys.argv[1], (int(sys.argv[2]), int(sys.argv[3])), "goal") as use:
+from vram_arbiter.clients.sync import Client
+with Client(name="runner") as client, client.use(sys.argv[1], (int(sys.argv[2]), int(sys.argv[3])), "goal") as use:
     print("in use", flush=True)
     sys.stdin.readline()
     print(use.lost, flush=True)
@@ -529,7 +529,7 @@ async def test_leases_and_uses_survive_a_kill_of_the_daemon(
         memory.empty_cache()
         unloaded.set()
 
-    async with ArbiterClient(arbiter.endpoint, name="sidecar") as client:
+    async with AsyncClient(arbiter.endpoint, name="sidecar") as client:
         lease = await client.acquire(spec("a", 5), unload=unload)
         block = memory.allocate("a", 5 << 30)
         await lease.ready(memory.used_bytes())

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from tests.support.process import ArbiterProcess
-from vram_arbiter.clients.client import ArbiterClient
-from vram_arbiter.clients.lease import Lease, LeaseState, Use
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.lease import AsyncLease, AsyncUse, LeaseState
 from vram_arbiter.schemas.errors import (
     BadState,
     GangBroken,
@@ -41,18 +41,18 @@ class Model:
     async def park(self) -> None:
         self.did.append("park")
 
-    async def load(self, lease: Lease) -> None:
+    async def load(self, lease: AsyncLease) -> None:
         self.did.append("load")
         await lease.ready()
 
 
-async def lend(use: Use, work: Awaitable[object]) -> None:
+async def lend(use: AsyncUse, work: Awaitable[object]) -> None:
     """Wait for something without keeping the lease meanwhile."""
     async with use.yielded():
         await work
 
 
-async def on_standby(client: ArbiterClient, spec: Spec, model: Model) -> Lease:
+async def on_standby(client: AsyncClient, spec: Spec, model: Model) -> AsyncLease:
     """A detector that is resident, and comes back when it was sent away."""
     detector = await client.acquire(
         spec("detector", 5, standby=True), unload=model.unload, on_return=model.load
@@ -61,7 +61,7 @@ async def on_standby(client: ArbiterClient, spec: Spec, model: Model) -> Lease:
     return detector
 
 
-async def parkable(client: ArbiterClient, spec: Spec, model: Model) -> Lease:
+async def parkable(client: AsyncClient, spec: Spec, model: Model) -> AsyncLease:
     """A detector that is resident, and may keep its weights in host RAM when it leaves."""
     detector = await client.acquire(
         spec("detector", 5, park_bytes=5 * GIB),
@@ -73,7 +73,7 @@ async def parkable(client: ArbiterClient, spec: Spec, model: Model) -> Lease:
     return detector
 
 
-async def states(client: ArbiterClient) -> dict[str, str]:
+async def states(client: AsyncClient) -> dict[str, str]:
     return {lease["consumer"]: lease["state"] for lease in (await client.status())["leases"]}
 
 
@@ -81,7 +81,7 @@ async def test_a_standby_lease_returns_by_itself_when_there_is_room(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
 ) -> None:
     model = Model()
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         detector = await on_standby(client, spec, model)
         first = detector.token
         policy = await client.acquire(spec("policy", 4), WAIT_S)
@@ -100,7 +100,7 @@ async def test_a_standby_lease_returns_by_itself_when_there_is_room(
         assert (model.did[-1], detector.state) == ("unload", "gone")
 
 
-async def followed(lease: Lease, last: LeaseState) -> list[LeaseState]:
+async def followed(lease: AsyncLease, last: LeaseState) -> list[LeaseState]:
     """The states of a lease from now on, up to `last`."""
     seen = [lease.state]
     while seen[-1] != last:
@@ -112,7 +112,7 @@ async def test_whoever_follows_a_lease_hears_where_it_went(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     model = Model()
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client, asyncio.timeout(WAIT_S):
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client, asyncio.timeout(WAIT_S):
         detector = await on_standby(client, spec, model)
         assert (detector.state, detector.given_up) == ("held", False)
         policy = await client.acquire(spec("policy", 4), WAIT_S)
@@ -138,7 +138,7 @@ async def test_a_standby_lease_survives_the_daemon(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
 ) -> None:
     model = Model()
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         detector = await on_standby(client, spec, model)
         memory = FakeMemory(arbiter_daemon.card, "t", 0)
         policy = await client.acquire(spec("policy", 4), WAIT_S)
@@ -158,7 +158,7 @@ async def test_a_standby_lease_can_ask_to_come_back_or_be_given_up(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
 ) -> None:
     model = Model()
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         detector = await on_standby(client, spec, model)
         other = Model()
         policy = await client.acquire(spec("policy", 4), WAIT_S, unload=other.unload)
@@ -178,7 +178,7 @@ async def test_weights_are_parked_where_the_budget_has_room(
 ) -> None:
     arbiter = make_arbiter(config="host:\n  park_budget_bytes: 6GiB\n").start()
     model = Model()
-    async with ArbiterClient(arbiter.endpoint, name="t") as client:
+    async with AsyncClient(arbiter.endpoint, name="t") as client:
         detector = await parkable(client, spec, model)
         policy = await client.acquire(
             spec("policy", 4, park_bytes=5 * GIB), WAIT_S, unload=model.unload
@@ -202,7 +202,7 @@ async def test_who_parks_hears_how_it_ended_not_how_it_was_meant(
     """Regression: whatever happened on the lease while the arbiter was asked ended the wait, and it was `parked`, and gone a moment later."""
     arbiter = make_arbiter(config="host:\n  park_budget_bytes: 0\n").start()
     model = Model()
-    async with ArbiterClient(arbiter.endpoint, name="t") as client, asyncio.timeout(WAIT_S):
+    async with AsyncClient(arbiter.endpoint, name="t") as client, asyncio.timeout(WAIT_S):
         detector = await parkable(client, spec, model)
         parking = asyncio.create_task(detector.park())
         while not parking.done():
@@ -218,7 +218,7 @@ async def test_a_yielded_use_lets_the_holder_go_and_says_so_at_its_end(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     model = Model()
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         job = await client.acquire(spec("job", 5), unload=model.unload)
         await job.ready()
         async with job.use("render") as use:
@@ -233,8 +233,8 @@ async def test_a_yielded_use_lets_the_holder_go_and_says_so_at_its_end(
 async def test_a_gang_is_granted_together_one_load_after_the_other(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
-        held: list[Lease] = []
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+        held: list[AsyncLease] = []
         async for _, lease in client.gang([spec("policy", 4), spec("reward", 3)], WAIT_S):
             assert [other.state for other in held] == ["held"] * len(held)
             await lease.ready()
@@ -249,10 +249,10 @@ async def test_a_lease_grows_and_shrinks(arbiter_daemon: ArbiterProcess, spec: S
     def size(gib: int) -> Footprint:
         return Footprint(load_peak_bytes=gib * GIB, steady_bytes=gib * GIB, residue_bytes=0)
 
-    async def charged(client: ArbiterClient) -> int:
+    async def charged(client: AsyncClient) -> int:
         return int((await client.status())["leases"][0]["charge_bytes"])
 
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         cache = await client.acquire(spec("cache", 2))
         await cache.ready()
         await cache.resize(size(4), WAIT_S)
@@ -272,12 +272,12 @@ async def test_a_resize_ends_with_the_stay_on_the_card(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
 ) -> None:
     """Regression: what a lease that was asked to leave had waited for was dropped, and its `resize` never returned."""
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         cache = await client.acquire(spec("cache", 2, standby=True))
         await cache.ready()
         busy = await client.acquire(spec("busy", 3, priority=90), WAIT_S)
         await busy.ready()
-        async with ArbiterClient(arbiter_daemon.endpoint, name="u") as other, busy.use():
+        async with AsyncClient(arbiter_daemon.endpoint, name="u") as other, busy.use():
             growing = asyncio.create_task(cache.resize(five_gib()))
             await until_growing(client)
             policy = await other.acquire(spec("policy", 4, priority=95), WAIT_S)
@@ -290,7 +290,7 @@ async def test_a_resize_ends_with_the_stay_on_the_card(
 async def test_a_resize_that_waits_outlives_the_daemon(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
 ) -> None:
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         cache = await client.acquire(spec("cache", 2))
         memory = FakeMemory(arbiter_daemon.card, "t", 0)
         memory.allocate("cache", 2 * GIB)
@@ -312,7 +312,7 @@ async def test_a_resize_that_waits_outlives_the_daemon(
         assert cache.spec.footprint.steady_bytes == 5 * GIB
 
 
-async def until_growing(client: ArbiterClient) -> None:
+async def until_growing(client: AsyncClient) -> None:
     async with asyncio.timeout(WAIT_S):
         while not any(lease.get("resizing") for lease in (await client.status())["leases"]):
             await asyncio.sleep(0.02)
@@ -324,14 +324,14 @@ async def test_a_sub_lease_is_carved_out_of_its_parents(
     """The runner holds the room, its sidecar holds the bytes: the eviction asks the sidecar first, and the runner hears of it."""
     asked: list[str] = []
 
-    def told(lease: Lease, _: Any) -> None:
+    def told(lease: AsyncLease, _: Any) -> None:
         asked.append(lease.spec.consumer)
 
     model = Model()
     async with (
-        ArbiterClient(arbiter_daemon.endpoint, name="runner") as runner,
-        ArbiterClient(arbiter_daemon.endpoint, name="sidecar") as sidecar,
-        ArbiterClient(arbiter_daemon.endpoint, name="other") as other,
+        AsyncClient(arbiter_daemon.endpoint, name="runner") as runner,
+        AsyncClient(arbiter_daemon.endpoint, name="sidecar") as sidecar,
+        AsyncClient(arbiter_daemon.endpoint, name="other") as other,
     ):
         root = await runner.acquire(spec("goal", 5), on_revoke=told)
         parent = LeaseRef(lease_id=root.lease_id, token=root.token)
@@ -361,7 +361,7 @@ async def test_a_job_that_waits_for_its_own_room_is_told(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     """It holds in use what it would itself have to give up: that would never end. Another task of the process may wait."""
-    async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
         job = await client.acquire(spec("job", 5))
         await job.ready()
         inside = asyncio.Event()
@@ -381,6 +381,6 @@ async def test_a_job_that_waits_for_its_own_room_is_told(
         assert (await prefetch).state == "loading"
 
 
-async def asked_when(happens: asyncio.Event, client: ArbiterClient, spec: LeaseSpec) -> Lease:
+async def asked_when(happens: asyncio.Event, client: AsyncClient, spec: LeaseSpec) -> AsyncLease:
     await happens.wait()
     return await client.acquire(spec, WAIT_S)

@@ -20,11 +20,11 @@ import pytest
 
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.cli import quick
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient
 from vram_arbiter.clients.sidecar.spawn import SpawnSpec
-from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.clients.sync import Client
 from vram_arbiter.reasoner.server import send
 from vram_arbiter.schemas.errors import ConfigError, UntrustedServer
 
@@ -72,7 +72,7 @@ def folder() -> Iterator[Path]:
 
 
 async def ask_arbiter(endpoint: str) -> None:
-    async with ArbiterClient(endpoint, name="t"):
+    async with AsyncClient(endpoint, name="t"):
         pass
 
 
@@ -151,7 +151,7 @@ def test_a_lease_is_not_told_to_a_server_that_took_the_arbiters_place(
     arbiter_daemon: ArbiterProcess, spec: Callable[..., object], caplog: pytest.LogCaptureFixture
 ) -> None:
     """libzmq reconnects by itself, to whatever listens then; the re-attachment holds every token."""
-    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    with Client(arbiter_daemon.endpoint, name="t") as client:
         lease = client.acquire(spec("detector", 1))  # type: ignore[arg-type]
         lease.ready()
         assert arbiter_daemon.stop() == 0

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.server import Message, Peer, RouterServer
 from vram_arbiter.clients.net.timeouts import answered
 from vram_arbiter.clients.runner import RunnerClient
@@ -93,7 +93,7 @@ def serve() -> Iterator[Callable[..., str]]:
 
 
 async def connect(endpoint: str) -> None:
-    async with ArbiterClient(endpoint, name="t", connect_timeout_s=LIMIT_S):
+    async with AsyncClient(endpoint, name="t", connect_timeout_s=LIMIT_S):
         pass
 
 

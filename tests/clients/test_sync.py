@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.process import ArbiterProcess
-from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.errors import (
     ArbiterUnreachable,
     BadState,
@@ -25,12 +25,12 @@ PATIENCE_S = 60.0
 
 
 @pytest.fixture
-def client(arbiter_daemon: ArbiterProcess) -> Iterator[SyncArbiterClient]:
-    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+def client(arbiter_daemon: ArbiterProcess) -> Iterator[Client]:
+    with Client(arbiter_daemon.endpoint, name="t") as client:
         yield client
 
 
-def test_lease_use_release(client: SyncArbiterClient, spec: Spec) -> None:
+def test_lease_use_release(client: Client, spec: Spec) -> None:
     with client.lease(spec("a", 5)) as lease:
         lease.ready(5 << 30)
         with lease.use("detect"):
@@ -42,12 +42,12 @@ def test_lease_use_release(client: SyncArbiterClient, spec: Spec) -> None:
         pytest.fail("a use began on a released lease")
 
 
-def test_typed_errors_reach_the_thread(client: SyncArbiterClient, spec: Spec) -> None:
+def test_typed_errors_reach_the_thread(client: Client, spec: Spec) -> None:
     with pytest.raises(VramInsufficient):
         client.acquire(spec("a", 9))
 
 
-def test_revoked_between_uses_in_a_worker_thread(client: SyncArbiterClient, spec: Spec) -> None:
+def test_revoked_between_uses_in_a_worker_thread(client: Client, spec: Spec) -> None:
     loop_thread = threading.Event()
     unloaded, asked = threading.Event(), threading.Event()
 
@@ -75,17 +75,17 @@ def test_revoked_between_uses_in_a_worker_thread(client: SyncArbiterClient, spec
 
 
 def test_a_use_on_anothers_lease(
-    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+    client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     lease = client.acquire(spec("a", 5))
     lease.ready()
-    with SyncArbiterClient(arbiter_daemon.endpoint, name="runner") as runner:
+    with Client(arbiter_daemon.endpoint, name="runner") as runner:
         with runner.use(lease.lease_id, lease.token, "goal"):
             assert runner.status()["leases"][0]["uses"] == 1
         assert runner.status()["leases"][0]["uses"] == 0
 
 
-def test_events_can_be_iterated(client: SyncArbiterClient, spec: Spec) -> None:
+def test_events_can_be_iterated(client: Client, spec: Spec) -> None:
     kinds: list[str] = []
     seen = threading.Event()
 
@@ -104,7 +104,7 @@ def test_events_can_be_iterated(client: SyncArbiterClient, spec: Spec) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
-def test_not_across_a_fork(client: SyncArbiterClient, spec: Spec) -> None:
+def test_not_across_a_fork(client: Client, spec: Spec) -> None:
     lease = client.acquire(spec("a", 1))
     pid = os.fork()
     if pid == 0:
@@ -120,7 +120,7 @@ def test_not_across_a_fork(client: SyncArbiterClient, spec: Spec) -> None:
 
 
 def test_closed_or_unreachable(tmp_path: Path) -> None:
-    client = SyncArbiterClient(f"ipc://{tmp_path}/none.sock", name="t", connect_timeout_s=0.2)
+    client = Client(f"ipc://{tmp_path}/none.sock", name="t", connect_timeout_s=0.2)
     with pytest.raises(ArbiterUnreachable):
         client.connect()
     with pytest.raises(BadState):

@@ -11,12 +11,12 @@ import pytest
 
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients._protocol import traces
-from vram_arbiter.clients.client import ArbiterClient
-from vram_arbiter.clients.lease import Lease
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.clients.net.server import Message, Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
-from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.wire.requests import LeaseSpec
 
@@ -71,7 +71,7 @@ def test_the_arbiter_hears_of_the_trace_of_an_acquire(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     async def story() -> None:
-        async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
             with tracing.joined(PARENT):
                 present = await client.acquire(spec("present", 1))
                 await present.ready()
@@ -89,7 +89,7 @@ def test_the_arbiter_hears_of_the_trace_of_an_acquire(
         assert traced_in(history, "nobody") == {None}
 
     asyncio.run(story())
-    with SyncArbiterClient(arbiter_daemon.endpoint, name="threads") as client:
+    with Client(arbiter_daemon.endpoint, name="threads") as client:
         with tracing.joined(PARENT):
             lease = client.acquire(spec("sync", 1))
         assert PARENT in traced_in(client.history(), "sync")
@@ -104,14 +104,14 @@ def test_a_model_that_is_called_back_is_loaded_in_the_trace_of_who_wants_it(
     loaded: list[str | None] = []
 
     async def story() -> None:
-        async def load(lease: Lease) -> None:
+        async def load(lease: AsyncLease) -> None:
             loaded.append(traces.present())
             await lease.ready()
 
         async def unload() -> None:
             pass
 
-        async with ArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+        async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
             with tracing.joined(PARENT):
                 model = await client.acquire(
                     spec("model", 5, standby=True), unload=unload, on_return=load

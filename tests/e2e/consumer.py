@@ -11,8 +11,8 @@ import os
 import sys
 from pathlib import Path
 
-from vram_arbiter.clients.client import ArbiterClient
-from vram_arbiter.clients.lease import Lease
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 from vram_arbiter.sidecars.device.memory import Block
@@ -50,7 +50,7 @@ async def main(name: str, size: int, card: Path, residue: int) -> None:
         blocks.clear()
         memory.empty_cache()
 
-    def lost(_: Lease, error: Exception) -> None:
+    def lost(_: AsyncLease, error: Exception) -> None:
         say("lost", error=str(error))
 
     spec = LeaseSpec(
@@ -58,7 +58,7 @@ async def main(name: str, size: int, card: Path, residue: int) -> None:
         footprint=Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=residue),
     )  # fmt: skip
     reader = await commands()
-    async with ArbiterClient(
+    async with AsyncClient(
         name=name, connect_timeout_s=60.0
     ) as client:  # the arbiter may be starting still
         say("waiting", pid=os.getpid())

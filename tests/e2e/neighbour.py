@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 from vram_arbiter.sidecars.device.memory import Block
@@ -50,7 +50,7 @@ async def live(name: str, size: int, card: Path, habits: dict[str, Any]) -> None
         footprint=footprint,
         **({"min_residency_s": 0.0, "ttl_s": TTL_S} | habits.get("spec", {})),
     )
-    async with ArbiterClient(name=name, connect_timeout_s=60.0) as client:
+    async with AsyncClient(name=name, connect_timeout_s=60.0) as client:
         for _ in range(2 if habits.get("again") else 1):
             say("waiting")
             lease = await client.acquire(spec, unload=unload)

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
@@ -51,7 +51,7 @@ async def live(name: str, size: int, card: Path, residue: int) -> None:
         consumer=name, model_id=name, ttl_s=TTL_S, min_residency_s=0.0,
         footprint=Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=residue),
     )  # fmt: skip
-    async with ArbiterClient(name=name, connect_timeout_s=60.0) as client:
+    async with AsyncClient(name=name, connect_timeout_s=60.0) as client:
         say("waiting")
         lease = await client.acquire(spec, unload=unload)
         say("loading", token=list(lease.token))

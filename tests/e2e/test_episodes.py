@@ -22,7 +22,7 @@ import pytest
 from tests.support.fakegpu_check import check_log
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.cli.quick import UNREACHABLE
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.runner import Goal as AcceptedGoal
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient
@@ -165,7 +165,7 @@ class Stage:
         self.programs = programs
         self.events: list[dict[str, Any]] = []
         self._more = asyncio.Event()
-        self.arbiter: ArbiterClient
+        self.arbiter: AsyncClient
         self.runner: RunnerClient
         self.detector: DetectorClient
 
@@ -173,7 +173,7 @@ class Stage:
     async def open(cls, programs: Programs, stack: AsyncExitStack) -> "Stage":
         stage, where = cls(programs), f"ipc://{programs.runtime}"
         stage.arbiter = await stack.enter_async_context(
-            ArbiterClient(
+            AsyncClient(
                 programs.arbiter.endpoint, name="witness", role="operator", connect_timeout_s=WAIT_S
             )
         )

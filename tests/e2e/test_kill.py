@@ -18,7 +18,7 @@ import pytest
 
 from tests.support.fakegpu_check import check_log
 from vram_arbiter.arbiter.host.gpu.fake import make_card
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.errors import ArbiterUnreachable
 from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
 
@@ -101,8 +101,8 @@ class Box:
         )
 
     @contextlib.asynccontextmanager
-    async def client(self) -> AsyncIterator[ArbiterClient]:
-        async with ArbiterClient(
+    async def client(self) -> AsyncIterator[AsyncClient]:
+        async with AsyncClient(
             f"ipc://{self.runtime}/arbiter.sock",
             name="test",
             role="operator",

@@ -16,7 +16,7 @@ import pytest
 from installed import TREE, install_into
 
 from tests.support.process import ArbiterProcess
-from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.clients.sync import Client
 
 pytestmark = pytest.mark.e2e
 PAGE = (TREE / "README.md").read_text(encoding="utf-8")
@@ -115,7 +115,7 @@ def test_the_example_runs_as_printed(arbiter_daemon: ArbiterProcess, tmp_path: P
         timeout=LIMIT_S,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "detecting\n", "")
-    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    with Client(arbiter_daemon.endpoint, name="t") as client:
         kinds = [
             event["kind"]
             for event in client.history()["events"]

@@ -11,7 +11,7 @@ import pytest
 from grab_programs import GOAL_S, GRAB, SKILL, GrabPrograms, need_checkpoint
 
 from tests.support.process import ArbiterProcess
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.runner import RunnerClient
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(340)]
@@ -68,7 +68,7 @@ def uses(status: dict[str, Any]) -> list[int]:
 async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
     async with (
         RunnerClient(f"ipc://{arbiter.runtime}/runner.sock", connect_timeout_s=60.0) as runner,
-        ArbiterClient(arbiter.endpoint, name="watcher") as watcher,
+        AsyncClient(arbiter.endpoint, name="watcher") as watcher,
     ):
         assert (await runner.call("ping"))["arbiter"] is True
         begun = await runner.state()

@@ -10,7 +10,7 @@ import pytest
 from grab_programs import ROOT
 
 from tests.support.process import ArbiterProcess
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.runner import RunnerClient
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(300)]
@@ -50,7 +50,7 @@ def programs(
 async def scenario(daemon: ArbiterProcess, sidecar: "subprocess.Popen[bytes]") -> None:
     async with (
         RunnerClient(f"ipc://{daemon.runtime}/runner.sock", connect_timeout_s=120.0) as runner,
-        ArbiterClient(daemon.endpoint, name="watcher", role="observer") as watcher,
+        AsyncClient(daemon.endpoint, name="watcher", role="observer") as watcher,
     ):
         before = (await runner.state())["world"]["joint_state"]["position"]
         goal = await runner.send_goal(SKILL, deadline_s=120.0)

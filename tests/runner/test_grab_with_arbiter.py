@@ -13,7 +13,7 @@ import pytest
 from grab_programs import GOAL_S, GRAB, SKILLS, GrabPrograms, need_checkpoint
 
 from tests.support.process import ArbiterProcess
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
@@ -42,7 +42,7 @@ def leases(status: dict[str, Any], consumer: str) -> list[tuple[str, int]]:
 async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
     async with (
         RunnerClient(f"ipc://{arbiter.runtime}/runner.sock", connect_timeout_s=60.0) as runner,
-        ArbiterClient(arbiter.endpoint, name="rival") as rival,
+        AsyncClient(arbiter.endpoint, name="rival") as rival,
     ):
         await runner.ping(timeout_s=60.0)
         truth = await runner.ground_truth()

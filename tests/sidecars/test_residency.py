@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from vram_arbiter.clients.client import ArbiterClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.errors import NotResident
 from vram_arbiter.schemas.manifest import parse_manifest
 from vram_arbiter.schemas.wire.requests import Footprint
@@ -63,7 +63,7 @@ class Model:
         return {"ok": True}
 
 
-class Client(ArbiterClient):
+class Client(AsyncClient):
     """Does something in the very moment in which a lease is granted, before whoever waits for it goes on."""
 
     def __init__(self, endpoint):
@@ -117,7 +117,7 @@ async def test_a_process_that_cannot_change_its_gpu_asks_for_that_one(arbiter_da
     """A sidecar loaded on the first GPU whichever was granted."""
     daemon = arbiter_daemon
     worker = Worker()
-    async with ArbiterClient(daemon.endpoint, name="eye") as client, asyncio.timeout(WAIT_S):
+    async with AsyncClient(daemon.endpoint, name="eye") as client, asyncio.timeout(WAIT_S):
         memory = OneGpu(daemon.card, "eye", GB // 10)
         residency = Residency(settings(daemon), Model(), memory, worker, client)
         await residency.load()

@@ -15,8 +15,8 @@ from tests.support.simulation.card import SimOutOfMemory
 from tests.support.simulation.clock import ProcessLoop
 from tests.support.simulation.world import Entitlement, SimProcess, World
 from vram_arbiter.clients._protocol.protocol import ClientProtocol
-from vram_arbiter.clients.client import ArbiterClient
-from vram_arbiter.clients.lease import Lease
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.clients.net.dealer import Transport
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VramError
@@ -30,7 +30,7 @@ CONNECT_PAUSE_S = 0.3
 LOAD_STEPS = 3
 
 
-class SimClient(ArbiterClient):
+class SimClient(AsyncClient):
     """The real client with simulated time, names and transport."""
 
     def __init__(self, world: World, process: SimProcess, role: str = "client") -> None:
@@ -57,7 +57,7 @@ class SimClient(ArbiterClient):
             super().pump()
             self._world.touch()
 
-    def may_load(self, lease: Lease) -> bool:
+    def may_load(self, lease: AsyncLease) -> bool:
         """What a careful holder asks before it puts more on the card: is the lease still mine, by my own clock too?"""
         record = self.protocol.holdings.held.get(lease.lease_id)
         return record is not None and self.now() < self.protocol.holdings.fence_at(record)
@@ -91,7 +91,7 @@ class Holding:
 
     client: SimClient
     process: SimProcess
-    lease: Lease
+    lease: AsyncLease
     gpu: GpuId
     loaded: bool = False
     over: bool = False
@@ -131,7 +131,7 @@ class Cast:
     ooms: int = 0
     refusals: dict[str, int] = field(default_factory=dict)
     clients: list[SimClient] = field(default_factory=list)
-    offers: dict[str, Lease] = field(
+    offers: dict[str, AsyncLease] = field(
         default_factory=dict
     )  # leases out of which others may carve theirs
 
@@ -247,7 +247,7 @@ class Consumer(Program):
     def _spec(self, slot: int) -> LeaseSpec:
         chance, choice = self.world.clock.chance, self.random.choice
         peak = choice(SIZES)
-        parent: Lease | None = None
+        parent: AsyncLease | None = None
         if self.cast.offers and chance(self.character.borrows):
             parent = choice(list(self.cast.offers.values()))
             peak = int(parent.spec.footprint.load_peak_bytes * choice((0.3, 0.6, 1.0)))
@@ -278,7 +278,7 @@ class Consumer(Program):
             }
         )
 
-    async def _acquire(self, slot: int) -> Lease | None:
+    async def _acquire(self, slot: int) -> AsyncLease | None:
         timeout_s = self.random.choice(WAITS)
         spec = self._spec(slot)
         ask = Ask(self.process.name, self.world.clock.now, timeout_s, self.process, spec)
@@ -328,7 +328,7 @@ class Consumer(Program):
             raise
 
     # -- holding -----------------------------------------------------------------------------------------------------
-    async def _hold(self, lease: Lease) -> None:
+    async def _hold(self, lease: AsyncLease) -> None:
         holding = self.cast.holdings[lease.lease_id]
         try:
             await self._make_use_of(holding)
@@ -366,7 +366,7 @@ class Consumer(Program):
         self.world.faults["returned"] += 1
         await self._make_use_of(holding)
 
-    async def _want_back(self, lease: Lease) -> None:
+    async def _want_back(self, lease: AsyncLease) -> None:
         ask = Ask(self.process.name, self.world.clock.now, 10.0, self.process, lease.spec)
         self.cast.asks.append(ask)
         self.world.faults["reacquired"] += 1

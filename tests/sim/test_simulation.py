@@ -12,7 +12,7 @@ from tests.support.simulation.card import Device, SimOutOfMemory
 from tests.support.simulation.clock import Clock, ProcessLoop
 from tests.support.simulation.daemon import Happening
 from tests.support.simulation.world import Entitlement, SimFailure, World
-from vram_arbiter.clients.lease import Lease
+from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
@@ -127,7 +127,9 @@ def test_the_card_refuses_what_it_has_not_got_and_gives_back_late() -> None:
 
 
 # -- clients -----------------------------------------------------------------------------------------------------------
-async def parked_slowly(client: SimClient, size: int, parked: list[str], **fields: object) -> Lease:
+async def parked_slowly(
+    client: SimClient, size: int, parked: list[str], **fields: object
+) -> AsyncLease:
     """A lease that is loaded and can park, which takes it a second."""
 
     async def park() -> None:

@@ -16,7 +16,7 @@ import pytest
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.cli import history
 from vram_arbiter.clients.cli.history import Wanted, collect, parse_since
-from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.wire.requests import LeaseSpec
 
 PATIENCE_S = 60.0
@@ -133,7 +133,7 @@ def vramctl(arbiter: ArbiterProcess, *arguments: str) -> "subprocess.CompletedPr
 def test_following_shows_the_past_and_then_the_present(
     arbiter_daemon: ArbiterProcess, spec: Callable[..., LeaseSpec]
 ) -> None:
-    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+    with Client(arbiter_daemon.endpoint, name="t") as client:
         client.acquire(spec("early", 1)).ready()
         shown = vramctl(arbiter_daemon, "history", "--since", "1h", "-c", "early", "--json")
         kinds = [event["kind"] for event in json.loads(shown.stdout)["events"]]

@@ -16,7 +16,7 @@ import pytest
 
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.net.diagnose import obstacle
-from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.errors import CODES
 from vram_arbiter.schemas.wire.requests import LeaseSpec
 
@@ -66,8 +66,8 @@ def typed(done: Finished) -> str:
 
 
 @pytest.fixture
-def client(arbiter_daemon: ArbiterProcess) -> Iterator[SyncArbiterClient]:
-    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+def client(arbiter_daemon: ArbiterProcess) -> Iterator[Client]:
+    with Client(arbiter_daemon.endpoint, name="t") as client:
         yield client
 
 
@@ -93,7 +93,7 @@ def test_2_what_is_mistyped_is_told_before_anybody_is_asked(
 
 
 def test_1_for_what_cannot_be_done(
-    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+    client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     """Regression: empty reasons were journaled, and an unknown kind of event printed an empty
     history."""
@@ -135,7 +135,7 @@ def test_1_for_what_cannot_be_done(
 
 @pytest.mark.skipif(os.getuid() != 0, reason="needs root to become somebody else")
 def test_who_is_no_operator_may_look_and_is_told_who_may_act(
-    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+    client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     """Regression: `vramctl` waited 3 s and reported a missing arbiter to users without permission
     on the socket."""
@@ -209,7 +209,7 @@ def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) 
 
 
 def test_a_look_at_the_socket_disturbs_nobody(
-    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess
+    client: Client, arbiter_daemon: ArbiterProcess
 ) -> None:
     """`obstacle` connects and says nothing."""
     for _ in range(300):

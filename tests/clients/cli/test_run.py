@@ -20,9 +20,9 @@ import pytest
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients import cuda
 from vram_arbiter.clients.cli.run import RunSpec, _Run, lease_spec
-from vram_arbiter.clients.client import ArbiterClient
-from vram_arbiter.clients.lease import Lease
-from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.lease import AsyncLease
+from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.wire.requests import LeaseSpec
 
 Spec = Callable[..., LeaseSpec]
@@ -84,12 +84,12 @@ def running(
 
 
 @pytest.fixture
-def client(arbiter_daemon: ArbiterProcess) -> Iterator[SyncArbiterClient]:
-    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+def client(arbiter_daemon: ArbiterProcess) -> Iterator[Client]:
+    with Client(arbiter_daemon.endpoint, name="t") as client:
         yield client
 
 
-def view(client: SyncArbiterClient, consumer: str) -> dict[str, Any]:
+def view(client: Client, consumer: str) -> dict[str, Any]:
     (found,) = [lease for lease in client.status()["leases"] if lease["consumer"] == consumer]
     return dict(found)
 
@@ -237,7 +237,7 @@ def test_the_terminals_interrupt_reaches_the_program_once(arbiter_daemon: Arbite
 @pytest.mark.e2e
 @pytest.mark.parametrize("options", [(), ("--pin",)], ids=["default", "pinned"])
 def test_two_programs_that_do_not_fit_together_run_one_after_the_other(
-    options: tuple[str, ...], client: SyncArbiterClient, arbiter_daemon: ArbiterProcess
+    options: tuple[str, ...], client: Client, arbiter_daemon: ArbiterProcess
 ) -> None:
     """The second was denied at once, because the first was pinned."""
     with running(arbiter_daemon.environ, *options) as first:
@@ -268,7 +268,7 @@ def test_a_program_waits_for_as_long_as_it_was_told(arbiter_daemon: ArbiterProce
 
 @pytest.mark.e2e
 def test_a_higher_priority_behind_an_equal_one_ends_the_program(
-    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+    client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     """The revoke was for the first of them, and no second one comes."""
     with running(arbiter_daemon.environ) as process:
@@ -299,7 +299,7 @@ def test_an_operator_ends_the_program_although_it_keeps_another_waiting(
 
 @pytest.mark.e2e
 def test_a_program_that_does_not_end_in_its_grace_is_killed(
-    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+    client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     with running(arbiter_daemon.environ, "--grace", "0.1", program=DEAF) as process:
         lease = client.acquire(spec("b", 5), PATIENCE_S)
@@ -309,7 +309,7 @@ def test_a_program_that_does_not_end_in_its_grace_is_killed(
 
 @pytest.mark.e2e
 def test_run_is_pinned_only_on_request(
-    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+    client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     with running(arbiter_daemon.environ, "--pin"):
         assert view(client, "job")["evictable"] is False
@@ -334,10 +334,10 @@ async def test_the_peak_is_what_the_arbiter_measured_of_the_program(
     spec = RunSpec(["job"], None, 1 << 30, "any", 40, None, False, "priority", None)
     async with (
         asyncio.timeout(PATIENCE_S),
-        ArbiterClient(arbiter_daemon.endpoint, name="t") as client,
+        AsyncClient(arbiter_daemon.endpoint, name="t") as client,
     ):
         run = _Run(spec, client)
-        lease: Lease = await client.acquire(lease_spec(spec))
+        lease: AsyncLease = await client.acquire(lease_spec(spec))
         child = await asyncio.create_subprocess_exec(
             sys.executable, "-c", holder, str(arbiter_daemon.card),
             env=arbiter_daemon.environ, stdin=subprocess.PIPE,

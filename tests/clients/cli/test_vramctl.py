@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.process import ArbiterProcess
-from vram_arbiter.clients.sync import SyncArbiterClient
+from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.wire.requests import LeaseSpec
 
 Spec = Callable[..., LeaseSpec]
@@ -46,8 +46,8 @@ def nowhere(tmp_path: Path) -> dict[str, str]:
 
 
 @pytest.fixture
-def client(arbiter_daemon: ArbiterProcess) -> Iterator[SyncArbiterClient]:
-    with SyncArbiterClient(arbiter_daemon.endpoint, name="t") as client:
+def client(arbiter_daemon: ArbiterProcess) -> Iterator[Client]:
+    with Client(arbiter_daemon.endpoint, name="t") as client:
         yield client
 
 
@@ -197,9 +197,7 @@ def test_a_socket_that_nobody_serves(nowhere: dict[str, str]) -> None:
 
 # -- with a daemon -------------------------------------------------------------------------------------------------
 @pytest.mark.e2e
-def test_status_why_history(
-    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
-) -> None:
+def test_status_why_history(client: Client, arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
     environ = arbiter_daemon.environ
     lease = client.acquire(spec("detector", 5))
     lease.ready()
@@ -249,9 +247,7 @@ def test_status_why_history(
 
 
 @pytest.mark.e2e
-def test_an_operators_actions(
-    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
-) -> None:
+def test_an_operators_actions(client: Client, arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
     environ = arbiter_daemon.environ
     lease = client.acquire(spec("detector", 5))
     lease.ready()
@@ -308,7 +304,7 @@ def test_doctor_with_a_daemon(arbiter_daemon: ArbiterProcess) -> None:
 
 @pytest.mark.e2e
 def test_watch_prints_plain_lines_where_there_is_no_terminal(
-    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+    client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "vram_arbiter.clients", "watch"],
@@ -340,7 +336,7 @@ def test_watch_prints_plain_lines_where_there_is_no_terminal(
 
 @pytest.mark.e2e
 def test_watch_draws_the_status_on_a_terminal(
-    client: SyncArbiterClient, arbiter_daemon: ArbiterProcess, spec: Spec
+    client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     lease = client.acquire(spec("detector", 5))
     lease.ready()
