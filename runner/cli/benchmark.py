@@ -235,7 +235,7 @@ def worlds_of(args: argparse.Namespace) -> list[World]:
 
 def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
     """Every contestant in every world. Raises ConfigError and UnknownSkill before anything is played."""
-    from vram_arbiter.runner.catalogue import Catalogue, read_manifests
+    from vram_arbiter.runner.goals.catalogue import Catalogue, read_manifests
     from vram_arbiter.runner.sim.benchmark import PolicyContestant, SkillContestant
     from vram_arbiter.runner.sim.policies import policy_of
     from vram_arbiter.runner.sim.tasks import EXPERT, GRAB, TASKS, expert_policy, task_of

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.net.server import check_free
-from vram_arbiter.runner import frames
-from vram_arbiter.runner.skill_runner import SkillRunner
+from vram_arbiter.runner.control.skill_runner import SkillRunner
+from vram_arbiter.runner.goals import frames
 from vram_arbiter.schemas import estop
 from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 
 if TYPE_CHECKING:
-    from vram_arbiter.runner.dataset.recorder import DatasetRecorder
+    from vram_arbiter.runner.recording.recorder import DatasetRecorder
 
 log = logging.getLogger("runner")
 
@@ -151,7 +151,7 @@ async def record_into(
 
     Raises ConfigError for a folder or a rate that nothing can be recorded with, AlreadyRunning when somebody else records there.
     """
-    from vram_arbiter.runner.dataset.recorder import DatasetRecorder
+    from vram_arbiter.runner.recording.recorder import DatasetRecorder
 
     recorder = DatasetRecorder(
         folder,

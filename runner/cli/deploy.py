@@ -16,7 +16,6 @@ from pathlib import Path
 
 from vram_arbiter.clients.configs import configs_folder, shipped
 from vram_arbiter.clients.runner import RunnerClient
-from vram_arbiter.runner.catalogue import Catalogue, Maker, read_manifests, sidecar_endpoint
 from vram_arbiter.runner.cli.common import (
     add_serving_flags,
     check_endpoint,
@@ -27,9 +26,7 @@ from vram_arbiter.runner.cli.common import (
     record_into,
     sidecars_given,
 )
-from vram_arbiter.runner.clock import SystemClock
-from vram_arbiter.runner.control import ControlThread
-from vram_arbiter.runner.deployment import (
+from vram_arbiter.runner.cli.deployment import (
     DeploymentFile,
     Parts,
     make_parts,
@@ -40,10 +37,13 @@ from vram_arbiter.runner.deployment import (
     unkept,
     unused,
 )
-from vram_arbiter.runner.goals import GoalServer
-from vram_arbiter.runner.hardware import HardwareRunner
+from vram_arbiter.runner.control.clock import SystemClock
+from vram_arbiter.runner.control.hardware import HardwareRunner
+from vram_arbiter.runner.control.realtime import leaves_room, make_prompt
+from vram_arbiter.runner.control.thread import ControlThread
+from vram_arbiter.runner.goals.catalogue import Catalogue, Maker, read_manifests, sidecar_endpoint
+from vram_arbiter.runner.goals.server import GoalServer
 from vram_arbiter.runner.protocols import DeadlinePolicy, Skill
-from vram_arbiter.runner.realtime import leaves_room, make_prompt
 from vram_arbiter.runner.safety.estop_mark import EstopMark
 from vram_arbiter.runner.skills.ros_standins import TRAJECTORY, StandIn, StandIns
 from vram_arbiter.runner.skills.sidecar_policy import Arbiter

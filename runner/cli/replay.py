@@ -10,8 +10,8 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from vram_arbiter.runner.dataset.reader import Recorded, read_frame
-from vram_arbiter.runner.dataset.rows import ROBOT
+from vram_arbiter.runner.recording.reader import Recorded, read_frame
+from vram_arbiter.runner.recording.rows import ROBOT
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.printable import printable_lines
 

@@ -25,7 +25,7 @@ from vram_arbiter.runner.cli.common import (
     sidecars_given,
     warm_up,
 )
-from vram_arbiter.runner.control import ControlThread
+from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.schemas.errors import ConfigError, InternalError
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint
 from vram_arbiter.schemas.runtime.extras import need
@@ -93,12 +93,12 @@ async def run(args: argparse.Namespace) -> int:
     endpoint = args.endpoint or program_endpoint("runner", os.environ, os.getuid())
     check_endpoint(endpoint)
     need("the simulator", "numpy", "cv2", extra="runner")
-    from vram_arbiter.runner.catalogue import Catalogue, read_manifests
-    from vram_arbiter.runner.clock import SystemClock
-    from vram_arbiter.runner.goals import GoalServer
+    from vram_arbiter.runner.control.clock import SystemClock
+    from vram_arbiter.runner.control.realtime import leaves_room, make_prompt
+    from vram_arbiter.runner.goals.catalogue import Catalogue, read_manifests
+    from vram_arbiter.runner.goals.server import GoalServer
     from vram_arbiter.runner.protocols import DeadlinePolicy
-    from vram_arbiter.runner.realtime import leaves_room, make_prompt
-    from vram_arbiter.runner.recorder import Recorder
+    from vram_arbiter.runner.recording.video import Recorder
     from vram_arbiter.runner.sim.policies import policy_of
     from vram_arbiter.runner.sim.sim_runner import SimRunner
     from vram_arbiter.runner.sim.truth import truth_as_wire

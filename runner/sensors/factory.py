@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 
-from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.sensors.params import refuse_field
 from vram_arbiter.runner.sensors.slot import FrameTee, SlotReader
 from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.sensors.params import read_params, refuse, refuse_field
 from vram_arbiter.runner.sensors.pipelines import CAPS, SINK, GStreamerParams, build
 from vram_arbiter.runner.sensors.platform import probe_platform

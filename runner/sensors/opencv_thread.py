@@ -13,7 +13,7 @@ from urllib.parse import urlsplit, urlunsplit
 
 from pydantic import Field, model_validator
 
-from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.sensors.lag import LagMeter
 from vram_arbiter.runner.sensors.params import BackendParams, read_params, refuse, require_module
 from vram_arbiter.runner.sensors.slot import Feed, FrameTee, SlotReader

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.sensors.params import (
     BackendParams,
     read_params,

@@ -10,7 +10,7 @@ import threading
 from abc import ABC, abstractmethod
 from typing import Protocol
 
-from vram_arbiter.runner.clock import Clock
+from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.schemas.errors import FrameStale
 from vram_arbiter.schemas.world import SensorFrame
 

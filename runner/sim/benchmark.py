@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from vram_arbiter.runner.protocols import Goal, Skill, SkillEnded, Stepped
-from vram_arbiter.runner.recorder import Recorder
+from vram_arbiter.runner.recording.video import Recorder
 from vram_arbiter.runner.sim.environment import Environment
 from vram_arbiter.runner.sim.policies import Policy
 from vram_arbiter.runner.sim.sim_runner import SimRunner

@@ -15,9 +15,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from vram_arbiter.runner.clock import Clock
-from vram_arbiter.runner.frames import Snapshot
-from vram_arbiter.runner.loop import Applied, Decision
+from vram_arbiter.runner.control.clock import Clock
+from vram_arbiter.runner.control.loop import Applied, Decision
+from vram_arbiter.runner.control.skill_runner import SkillRunner
+from vram_arbiter.runner.goals.frames import Snapshot
 from vram_arbiter.runner.protocols import (
     DeadlinePolicy,
     Goal,
@@ -26,10 +27,9 @@ from vram_arbiter.runner.protocols import (
     Stepped,
     Transition,
 )
-from vram_arbiter.runner.recorder import Recorder
+from vram_arbiter.runner.recording.video import Recorder
 from vram_arbiter.runner.sim.environment import Environment, EnvStep
 from vram_arbiter.runner.sim.episodes import Episode, EpisodeView
-from vram_arbiter.runner.skill_runner import SkillRunner
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import (
     EnvironmentFailed,

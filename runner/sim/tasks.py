@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
-from vram_arbiter.runner.sim.dataset import stand_before
+from vram_arbiter.runner.sim.config import REST_POSE
 from vram_arbiter.runner.sim.env import SimEnv
 from vram_arbiter.runner.sim.expert import GrabExpert
 from vram_arbiter.runner.sim.kinematics import ArmKinematics
+from vram_arbiter.runner.sim.navigate import standoff_pose
 from vram_arbiter.runner.sim.policies import Policy, Step
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import RSkillManifest
@@ -25,6 +26,8 @@ HELD_STEPS: Final = 8  # a thing that is held this long, above the table, does n
 STANDS_M: Final = 0.03  # of the grasp spot: what the grab policy was trained to make up for
 AFTER_STEPS: Final = 8  # that the expert holds what it has lifted
 EXPERT: Final = "expert"
+NAVIGATION_ERROR_M: Final = 0.035
+NAVIGATION_ERROR_RAD: Final = 0.10
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +42,26 @@ class Task:
     prepare: Callable[[SimEnv, int], None] | None
     told: Callable[[SimEnv], tuple[str, dict[str, Any]]]
     """Prompt and goal parameters."""
+
+
+def stand_before(
+    env: SimEnv, name: str, rng: random.Random, *, error_m: float = NAVIGATION_ERROR_M
+) -> None:
+    """Put the base where an imperfect navigation would have left it in front of an object."""
+    x, y, _ = env.ground_truth().objects[name].position_map
+    goal = standoff_pose((x, y), env.config)
+    env.place(
+        (
+            min(
+                goal.x_m + rng.uniform(-error_m, error_m), standoff_pose((9.0, 0.0), env.config).x_m
+            ),
+            goal.y_m + rng.uniform(-error_m, error_m),
+            goal.yaw_rad + rng.uniform(-NAVIGATION_ERROR_RAD, NAVIGATION_ERROR_RAD),
+        ),
+        REST_POSE,
+    )
+    for _ in range(3):
+        env.step(None)
 
 
 def _stand(env: SimEnv, seed: int) -> None:

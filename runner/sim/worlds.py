@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from vram_arbiter.runner.body import SIMULATED
-from vram_arbiter.runner.catalogue import Maker, sidecar_endpoint
-from vram_arbiter.runner.hal.so101 import so101
-from vram_arbiter.runner.hal.so101_kinematics import kinematics_for
+from vram_arbiter.runner.goals.catalogue import Maker, sidecar_endpoint
 from vram_arbiter.runner.protocols import MobileBase, Skill
+from vram_arbiter.runner.robots.body import SIMULATED
+from vram_arbiter.runner.robots.so101 import so101
+from vram_arbiter.runner.robots.so101_kinematics import kinematics_for
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
 from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
 from vram_arbiter.runner.sim.env import MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S, SimEnv

@@ -20,8 +20,8 @@ from typing import Any, Protocol
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vram_arbiter.clients.sidecar.policy import PolicyClient
-from vram_arbiter.runner.pictures import as_rgb
 from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
+from vram_arbiter.runner.sensors.pictures import as_rgb
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.runner.skills.chunks import ChunkPlayer, Row
 from vram_arbiter.runner.skills.motion import JointRamp, bounded, is_at, joint_positions

@@ -71,7 +71,7 @@ def read_frames(folder: Path, cameras: Sequence[str] | None = None) -> list[Fram
     labels = folder / LABELS_FILE
     if not labels.is_file():
         raise BadDataset(
-            f"{labels} is missing: make a data set with `python -m vram_arbiter.runner.sim.dataset scenes`"
+            f"{labels} is missing: make a data set with `python -m vram_arbiter.runner.sim.training.dataset scenes`"
         )
     frames: list[Frame] = []
     for number, line in enumerate(labels.read_text(encoding="utf-8").splitlines(), start=1):

@@ -165,7 +165,7 @@ tabletop by `python -m vram_arbiter.sidecars.training.detector` (no pretrained w
 
 - Camera `{camera}`; frames are scaled to {image_px} x {image_px} by the processor. Recommended `score_threshold`: {threshold}.
 - Query with free text (`red cube`, `a photo of a blue ball`, `green object`). Several boxes may lie on one thing: take the best.
-- Data: `python -m vram_arbiter.runner.sim.dataset scenes --count 8000 --seed 1`; {train_frames} frames to train, {test_frames} held out by scene.
+- Data: `python -m vram_arbiter.runner.sim.training.dataset scenes --count 8000 --seed 1`; {train_frames} frames to train, {test_frames} held out by scene.
 - Training: seed {seed}, {steps} steps of {batch}, {train_s} s on {threads} thread(s), bfloat16 autocast; checkpoint float32, {bytes} bytes.
 - One query on one image: {inference_ms} ms on one core, pre- and post-processing included.
 

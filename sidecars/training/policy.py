@@ -1,6 +1,6 @@
 """Trains the small grab policy on recorded demonstrations: `python -m vram_arbiter.sidecars.training.policy --data DIR --out DIR`.
 
-Reads a folder written by `python -m vram_arbiter.runner.sim.dataset grab`; writes a lerobot checkpoint (config, weights, processors).
+Reads a folder written by `python -m vram_arbiter.runner.sim.training.dataset grab`; writes a lerobot checkpoint (config, weights, processors).
 Seeded; about ten minutes on two cores. `--smoke` runs a few seconds of the same code. Must not know the simulator.
 """
 
@@ -63,7 +63,7 @@ def _load_folder(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     path = folder / "info.json"
     if not path.is_file():
         raise BadDemonstrations(
-            f"{path} is missing: record with `python -m vram_arbiter.runner.sim.dataset grab --out {folder}`"
+            f"{path} is missing: record with `python -m vram_arbiter.runner.sim.training.dataset grab --out {folder}`"
         )
     info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     if info.get("format") != FORMAT:
@@ -281,7 +281,7 @@ def main(argv: list[str] | None = None) -> int:
         type=Path,
         required=True,
         nargs="+",
-        help="folders written by runner.sim.dataset grab",
+        help="folders written by runner.sim.training.dataset grab",
     )
     parser.add_argument("--init", type=Path, help="checkpoint to go on from")
     parser.add_argument("--out", type=Path, required=True, help="checkpoint folder")

@@ -1,6 +1,6 @@
 """Trains the small progress model: `python -m vram_arbiter.sidecars.training.progress --data DIR --out DIR`.
 
-Reads a folder written by `python -m vram_arbiter.runner.sim.progress`; writes a lerobot reward model (config, weights) and its model card with the held-out
+Reads a folder written by `python -m vram_arbiter.runner.sim.training.progress`; writes a lerobot reward model (config, weights) and its model card with the held-out
 figures. Seeded; under three minutes on two cores. `--smoke` runs a few seconds of the same code. Must not know the simulator.
 """
 
@@ -56,7 +56,7 @@ def load(folder: Path) -> Pictures:
     path = folder / "info.json"
     if not path.is_file():
         raise BadProgressData(
-            f"{path} is missing: record with `python -m vram_arbiter.runner.sim.progress --out {folder}`"
+            f"{path} is missing: record with `python -m vram_arbiter.runner.sim.training.progress --out {folder}`"
         )
     info = json.loads(path.read_text(encoding="utf-8"))
     if info.get("format") != FORMAT:
@@ -263,7 +263,7 @@ library_name: lerobot
 # so101-progress
 
 The demo's reward model: lerobot type `compact_progress`, trained from scratch by `python -m vram_arbiter.sidecars.training.progress` on
-`python -m vram_arbiter.runner.sim.progress` (wrist camera, two grabs in five miss on purpose). It stands in for Robometer-4B, judges each picture by itself, and knows
+`python -m vram_arbiter.runner.sim.training.progress` (wrist camera, two grabs in five miss on purpose). It stands in for Robometer-4B, judges each picture by itself, and knows
 the tabletop's colours and shapes only: an instruction has to name one thing by both.
 
 Progress is the simulator's truth, not time: nearing the named thing up to 0.5, both fingers on it 0.6, held from 0.7, carried 1. The policy's own grabs look
@@ -297,7 +297,7 @@ def main(argv: list[str] | None = None) -> int:
         prog="python -m vram_arbiter.sidecars.training.progress", description=__doc__
     )
     parser.add_argument(
-        "--data", type=Path, required=True, help="folder written by runner.sim.progress"
+        "--data", type=Path, required=True, help="folder written by runner.sim.training.progress"
     )
     parser.add_argument("--out", type=Path, required=True, help="checkpoint folder")
     parser.add_argument("--steps", type=int, default=4000)

@@ -118,7 +118,7 @@ the simulated tabletop by `python -m vram_arbiter.sidecars.training.scene_vlm` (
   a held thing is mostly hidden behind the gripper. Other cameras were not trained. Frames are scaled to {size} by the processor.
 - Ask `Has the robot gripper grasped the red cube?` (or: is it held, what is held, what is in view). Answers begin with `Yes,` or
   `No,` and say why: `Yes, the gripper holds the red cube.`, `No, the gripper is empty.`, `No, the gripper holds the blue ball.`
-- Data: `python -m vram_arbiter.runner.sim.dataset scenes --count 8000 --seed 1`; {train_frames} frames to train, {test_frames} held out by scene. A
+- Data: `python -m vram_arbiter.runner.sim.training.dataset scenes --count 8000 --seed 1`; {train_frames} frames to train, {test_frames} held out by scene. A
   third of the grabs misses on purpose: closed gripper beside or above the thing, things knocked over.
 - Training: seed {seed}; {vision_steps} steps of {batch} for the vision tower through throw-away heads, then {language_steps}
   for the language model and {both_steps} for both; {train_s} s on {threads} thread(s), bfloat16 autocast; checkpoint float32, {bytes} bytes.

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from small_robots import Nod
 
 from vram_arbiter.runner.__main__ import parse
-from vram_arbiter.runner.catalogue import Maker
 from vram_arbiter.runner.cli.deploy import Deploy
-from vram_arbiter.runner.deployment import Parts, read_deployment
+from vram_arbiter.runner.cli.deployment import Parts, read_deployment
+from vram_arbiter.runner.goals.catalogue import Maker
 from vram_arbiter.runner.skills.sidecar_policy import Arbiter
 from vram_arbiter.schemas.errors import ConfigError, EstopRequested, VramError
 from vram_arbiter.schemas.manifest import Kind

@@ -3,10 +3,10 @@
 import asyncio
 from collections.abc import Callable
 
-from vram_arbiter.runner.clock import Clock
-from vram_arbiter.runner.hal.kinematic import KinematicTwin
-from vram_arbiter.runner.hal.so101 import so101
+from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.protocols import Act, Done, Goal, StepOutcome
+from vram_arbiter.runner.robots.kinematic import KinematicTwin
+from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.sensors import Feed, SlotReader
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.schemas.control import ControlMode

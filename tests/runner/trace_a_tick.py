@@ -11,7 +11,7 @@ from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from small_robots import FedCamera, Nod, Twin
 
-from vram_arbiter.runner.hardware import HardwareRunner
+from vram_arbiter.runner.control.hardware import HardwareRunner
 from vram_arbiter.runner.protocols import Goal
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.skills.base import SkillState

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from vram_arbiter.runner.control.skill_runner import WITHHELD_IN_A_ROW_MAX
 from vram_arbiter.runner.protocols import Joint, MobileBase, RobotDescription
 from vram_arbiter.runner.safety.gate import LATE_MAX, MAX_FOLLOWING_ERROR_RAD, RobotGate
 from vram_arbiter.runner.safety.limits import Vector3
 from vram_arbiter.runner.safety.ranges import CLAMP_TOLERANCE_RAD
-from vram_arbiter.runner.skill_runner import WITHHELD_IN_A_ROW_MAX
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope

@@ -2,7 +2,7 @@
 
 import pytest
 
-from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.protocols import SensorReader
 from vram_arbiter.runner.sensors.factory import BACKENDS, make_reader
 from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.sensors.gstreamer import _Run, load, make, without_credentials
 from vram_arbiter.runner.sensors.pipelines import GStreamerParams, build
 from vram_arbiter.runner.sensors.platform import probe_platform
@@ -368,7 +368,7 @@ def test_no_password_in_messages() -> None:
 
 # -- beside the other heavy packages ----------------------------------------------------------------------------------
 TAKE_ONE = """
-from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.sensors.gstreamer import make
 from vram_arbiter.schemas.config.robot import SensorReaderConfig
 params = {"source": "test", "pattern": "red", "width": 16, "height": 16}

@@ -6,7 +6,7 @@ import sys
 CODE = """
 import sys
 sys.modules["gi"] = None  # what an import finds where it is not installed
-from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.sensors.gstreamer import make
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.config.robot import SensorReaderConfig

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.sensors.factory import make_reader
 from vram_arbiter.runner.sensors.slot import SlotReader
 from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.sensors import SlotReader
 from vram_arbiter.runner.sensors.factory import make_reader
 from vram_arbiter.runner.sensors.opencv_thread import OpenCvReader, as_encoding, without_credentials

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.runner.clock import SystemClock
+from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.sensors import SlotReader
 from vram_arbiter.runner.sensors.factory import make_reader
 from vram_arbiter.runner.sensors.ros2_dds import dds_topic, dds_type, domain_of, full_topic, qos_of
@@ -404,7 +404,7 @@ def test_a_network_that_is_not_there_is_said_at_the_start(
     """In a process of its own: Cyclone reads its settings once."""
     monkeypatch.setenv("CYCLONEDDS_URI", NETWORK.replace('name="lo"', 'name="no-such-if"'))
     code = (
-        "from vram_arbiter.runner.clock import SystemClock\n"
+        "from vram_arbiter.runner.control.clock import SystemClock\n"
         "from vram_arbiter.runner.sensors.factory import make_reader\n"
         "from vram_arbiter.schemas.config.robot import SensorReaderConfig\n"
         f"reader = make_reader(SensorReaderConfig(sensor_id='a', backend='ros2_image', backend_params={{'topic': {topic!r}}}), SystemClock())\n"

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.runner.clock import Clock, SystemClock
+from vram_arbiter.runner.control.clock import Clock, SystemClock
 from vram_arbiter.runner.protocols import SensorReader
 from vram_arbiter.runner.sensors import Feed, LatestSlot, SlotReader
 from vram_arbiter.schemas.errors import FrameStale

@@ -203,7 +203,7 @@ def test_a_policy_that_is_done_as_its_world_fails_does_not_play_for_ever() -> No
 def test_pictures_that_change_their_size_do_not_garble_a_video(tmp_path: Path) -> None:
     """Regression: ffmpeg receives bytes, so a picture of another size garbled the rest of the
     video."""
-    from vram_arbiter.runner.recorder import Recorder
+    from vram_arbiter.runner.recording.video import Recorder
 
     recorder = Recorder(tmp_path / "v.mp4", fps=30, wait=True)
     for size in (64, 64, 96, 64):
@@ -219,7 +219,7 @@ def test_a_video_that_the_disk_had_no_room_for_is_none(tmp_path: Path) -> None:
 import resource, signal, sys
 from pathlib import Path
 import numpy as np
-from vram_arbiter.runner.recorder import Recorder
+from vram_arbiter.runner.recording.video import Recorder
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 for room in (20_000, 1 << 20):
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))

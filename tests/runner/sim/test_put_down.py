@@ -10,9 +10,9 @@ pytest.importorskip("mujoco")
 
 from vram_arbiter.runner.protocols import Act, Done, Goal
 from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE
-from vram_arbiter.runner.sim.dataset import stand_before
 from vram_arbiter.runner.sim.expert import GrabExpert
 from vram_arbiter.runner.sim.kinematics import ArmKinematics
+from vram_arbiter.runner.sim.tasks import stand_before
 from vram_arbiter.runner.sim.worlds import so101_world
 from vram_arbiter.runner.skills.trajectory import FollowJointTrajectory
 from vram_arbiter.schemas.manifest import load_manifest

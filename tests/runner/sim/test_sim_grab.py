@@ -13,12 +13,13 @@ import cv2
 import numpy as np
 
 from vram_arbiter.runner.sim.config import REST_POSE, SceneConfig
-from vram_arbiter.runner.sim.dataset import VIEWS, main, stand_before, write_grab
 from vram_arbiter.runner.sim.env import SimEnv
-from vram_arbiter.runner.sim.evaluate import attempt
 from vram_arbiter.runner.sim.expert import CLOSED_RAD, GrabExpert, RestController, run_expert
 from vram_arbiter.runner.sim.kinematics import ArmKinematics
-from vram_arbiter.runner.sim.learned import LoadedPolicy
+from vram_arbiter.runner.sim.tasks import stand_before
+from vram_arbiter.runner.sim.training.dataset import VIEWS, main, write_grab
+from vram_arbiter.runner.sim.training.evaluate import attempt
+from vram_arbiter.runner.sim.training.learned import LoadedPolicy
 
 pytestmark = pytest.mark.heavy
 

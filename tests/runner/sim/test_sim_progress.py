@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("mujoco")
 import numpy as np
 
-from vram_arbiter.runner.sim.progress import LIFTED_FROM, REACHED, SIZE_PX, main
+from vram_arbiter.runner.sim.training.progress import LIFTED_FROM, REACHED, SIZE_PX, main
 
 pytestmark = pytest.mark.heavy
 

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("mujoco")
 import numpy as np
 
-from vram_arbiter.runner.hal.so101 import so101
+from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
 from vram_arbiter.runner.sim.config import (
     ARM_JOINTS,

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vram_arbiter.runner.hal.so101 import so101
 from vram_arbiter.runner.protocols import Act, Done, Goal, StepOutcome
+from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.safety.limits import Limits, own_limits
 from vram_arbiter.runner.skills.ros_standins import (
     NAVIGATE,

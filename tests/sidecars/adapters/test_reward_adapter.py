@@ -50,10 +50,10 @@ def test_a_grab_makes_progress_and_only_for_the_thing_it_grabs(shipped: RewardAd
     """A scene that the training never saw; the pictures are what the runner would serve."""
     import random
 
-    from vram_arbiter.runner.sim.dataset import stand_before
     from vram_arbiter.runner.sim.env import SimEnv
     from vram_arbiter.runner.sim.expert import GrabExpert, run_expert
     from vram_arbiter.runner.sim.kinematics import ArmKinematics
+    from vram_arbiter.runner.sim.tasks import stand_before
 
     with SimEnv() as env:
         env.reset(4711, names=("red cube", "blue ball", "green cylinder"))

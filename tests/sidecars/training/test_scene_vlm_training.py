@@ -134,10 +134,10 @@ def test_a_folder_without_labels_ends_with_status_2(
 def test_the_shipped_checkpoint_tells_held_from_empty_and_from_another(tmp_path: Path) -> None:
     from PIL import Image
 
-    from vram_arbiter.runner.sim.dataset import stand_before
     from vram_arbiter.runner.sim.env import SimEnv
     from vram_arbiter.runner.sim.expert import GrabExpert
     from vram_arbiter.runner.sim.kinematics import ArmKinematics
+    from vram_arbiter.runner.sim.tasks import stand_before
 
     asker = Asker(SHIPPED)
     image = tmp_path / "wrist.png"

@@ -1,0 +1,329 @@
+"""A deployment file, checked and taken apart: robot, cameras, skills and task that fit together, or every mistake by line and field.
+
+Nothing here opens a device, loads a model or moves anything; what can be wrong is said before any of that. Puts no program together:
+`runner.cli.deploy` does. Licences are looked at here, because a robot at work is commercial use unless somebody says otherwise.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from vram_arbiter.runner.control.clock import Clock
+from vram_arbiter.runner.goals.catalogue import EXECUTABLE, Catalogue, Maker
+from vram_arbiter.runner.protocols import Hal, SensorReader
+from vram_arbiter.runner.recording.commit import check_folder
+from vram_arbiter.runner.recording.recorder import whole_rate
+from vram_arbiter.runner.robots.body import body_of
+from vram_arbiter.runner.safety.gate import RobotGate
+from vram_arbiter.runner.sensors.world_state import JOINT_STATE
+from vram_arbiter.runner.skills.sidecar_policy import wire_up
+from vram_arbiter.schemas.config.robot import RobotEnvironment, VlaSpec, robot_of
+from vram_arbiter.schemas.errors import ConfigError, ManifestInvalid, UnknownSkill
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest
+from vram_arbiter.schemas.yamltext import Path as FieldPath
+from vram_arbiter.schemas.yamltext import Problem, YamlText, config_error, parse_yaml, read_text
+
+LICENCE_FLAG = "--allow-noncommercial"
+
+
+@dataclass(frozen=True, slots=True)
+class DeploymentFile:
+    """The file's content, and its text for the lines of mistakes that only an adapter can find."""
+
+    robot: RobotEnvironment
+    source: YamlText
+
+    def error(self, *found: tuple[str, str]) -> ConfigError:
+        """`(field, problem)` pairs as one error: `robot.yaml:7: sensors[0].backend_params.device: …`"""
+        problems = [
+            Problem(self.source.line(_path(field)), field, _on_one_line(text))
+            for field, text in found
+        ]
+        return config_error(self.source.name, sorted(problems, key=lambda problem: problem.line))
+
+    def merged(self, errors: Iterable[ConfigError]) -> ConfigError:
+        """Several located errors as one."""
+        return self.error(
+            *((item["field"], item["problem"]) for e in errors for item in e.details["fields"])
+        )
+
+    def located(self, error: ConfigError, section: str) -> ConfigError:
+        """An adapter's mistakes, whose fields may be relative to its section, with this file's lines."""
+        found = []
+        for item in error.details.get("fields") or [{"field": "", "problem": error.message}]:
+            field = str(item["field"])
+            full = (
+                field
+                if field == section or field.startswith(f"{section}.")
+                else f"{section}.{field}"
+            )
+            found.append((full.rstrip("."), str(item["problem"])))
+        return self.error(*found)
+
+
+def read_deployment(path: Path) -> DeploymentFile:
+    """Raises ConfigError: the file cannot be read, or every mistake in it by line and field."""
+    source = parse_yaml(read_text(path, hint="--config takes a deployment file"), path.name)
+    return DeploymentFile(robot_of(source), source)
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """What a deployment is made of; nothing of it is opened yet. The gate is the robot's own, with the file's `safety`."""
+
+    hal: Hal
+    readers: tuple[SensorReader, ...]
+    gate: RobotGate
+
+
+def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
+    """Adapter, cameras and gate. Raises ConfigError with everything that they do not take."""
+    from vram_arbiter.runner.robots.factory import make_hal
+    from vram_arbiter.runner.robots.so101_kinematics import kinematics_for
+    from vram_arbiter.runner.sensors.factory import make_reader
+
+    robot = file.robot
+    errors: list[ConfigError] = []
+    readers: list[SensorReader] = []
+    for index, sensor in enumerate(robot.sensors):
+        if sensor.sensor_id == JOINT_STATE:
+            errors.append(
+                file.error(
+                    (f"sensors[{index}].sensor_id", f"no camera may be called {JOINT_STATE}")
+                )
+            )
+        try:
+            readers.append(make_reader(sensor, clock))
+        except ConfigError as error:
+            errors.append(file.located(error, f"sensors[{index}]"))
+    try:
+        hal = make_hal(robot.hal)
+    except ConfigError as error:
+        raise file.merged([*errors, file.located(error, "hal")]) from error
+    if robot.save_dir is not None:
+        try:
+            whole_rate(robot.rate_hz)
+            check_folder(Path(robot.save_dir))
+        except ConfigError as error:
+            errors.append(file.error(("save_dir", str(error))))
+    try:
+        gate = RobotGate(
+            hal.description,
+            rate_hz=robot.rate_hz,
+            kinematics=kinematics_for(hal.description),
+            envelopes={"safety": robot.safety},
+            sent=hal.sent,
+            now_ns=clock.now_ns,
+        )
+    except ConfigError as error:
+        raise file.merged([*errors, file.located(error, "safety")]) from error
+    except ImportError as error:
+        text = f"its kinematics need MuJoCo: pip install 'vram-arbiter[runner]' ({error})"
+        raise file.merged([*errors, file.error(("hal.adapter", text))]) from error
+    if errors:
+        raise file.merged(errors)
+    return Parts(hal, tuple(readers), gate)
+
+
+def unkept(parts: Parts, catalogue: Catalogue) -> tuple[str, ...]:
+    """What the file's `safety`, and the envelope of any skill that goals may ask for, want and the gate does not keep."""
+    found = dict.fromkeys(parts.gate.unkept)
+    for manifest in catalogue.executable():
+        found |= dict.fromkeys(parts.gate.for_skill(manifest, ()).unkept)
+    return tuple(found)
+
+
+# -- skills -----------------------------------------------------------------------------------------------------------
+def offered(
+    file: DeploymentFile,
+    parts: Parts,
+    manifests: Iterable[RSkillManifest],
+    makers: Mapping[Kind, Maker],
+    allow_noncommercial: bool,
+) -> Catalogue:
+    """What goals may ask for. Raises ConfigError when the skill of the file's own task is not among it or does not fit the robot.
+
+    Skills that nobody executes here (detectors, scene VLMs) are listed for whoever plans; their licences are their sidecars' matter.
+    """
+    spec = file.robot.vla
+    manifests = list(manifests)
+    wanted = None if spec is None else skill_named(spec, manifests)
+    kept, refused = [], {}
+    for manifest in manifests:
+        found = misfits(file.robot, parts, manifest)
+        if manifest.kind not in EXECUTABLE:
+            kept.append(manifest)
+        elif not (allow_noncommercial or manifest.is_commercial_use_allowed):
+            refused[manifest.name] = (
+                f"its licence, {manifest.license}, does not allow commercial use; {LICENCE_FLAG} lets it run all the same"
+            )
+        elif found and wanted != manifest.name:
+            refused[manifest.name] = "; ".join(problem for _, problem in found)
+        else:
+            kept.append(manifest)
+    body = body_of(file.robot, parts.hal.description)
+    catalogue = Catalogue(kept, makers, refused=refused, body=body)
+    if spec is None or wanted is None:
+        return catalogue
+    try:
+        _, _, manifest = catalogue.find(wanted)
+    except UnknownSkill as error:
+        raise file.error(("vla.id", str(error))) from error
+    if problems := [*_contradictions(spec, manifest), *misfits(file.robot, parts, manifest)]:
+        raise file.error(*problems)
+    return catalogue
+
+
+def skill_named(spec: VlaSpec, manifests: Iterable[RSkillManifest]) -> str:
+    """Return the name of the skill that the file means: `vla.id`, else as the field writes it the
+    one that `vla.weights_uri` names by name or folder (`rskills/so101-grab`)."""
+    names = [manifest.name for manifest in manifests]
+    folder = spec.weights_uri.rstrip("/").rpartition("/")[2]
+    found = [
+        name
+        for name in names
+        if spec.weights_uri == name
+        or (folder and "://" not in spec.weights_uri and folder == _folder_of(name))
+    ]
+    return found[0] if spec.id not in names and len(found) == 1 else spec.id
+
+
+def _folder_of(name: str) -> str:
+    return name.rpartition("/")[2].removeprefix("rskill-")
+
+
+def misfits(
+    robot: RobotEnvironment, parts: Parts, manifest: RSkillManifest
+) -> list[tuple[str, str]]:
+    """What of a skill does not fit this robot: its envelope; of a learnt policy its joints and cameras, too."""
+    problems = []
+    try:
+        parts.gate.for_skill(manifest, ())
+    except ConfigError as error:
+        problems.append(("vla.id", error.message))
+    if manifest.kind is not Kind.VLA:
+        return problems
+    description = parts.hal.description
+    joints = description.joint_names
+    for actuator in manifest.actuators_required:
+        order = actuator.control_mode_semantics.joint_order
+        if order is not None and order != joints:
+            problems.append(
+                (
+                    "vla.id",
+                    f"{manifest.name} moves {', '.join(order)}; the robot has {', '.join(joints)}",
+                )
+            )
+    try:
+        wiring = wire_up(manifest, joints, description.rest_pose_rad)
+    except ManifestInvalid as error:
+        return [*problems, ("vla.id", str(error))]
+    there = [sensor.sensor_id for sensor in robot.sensors]
+    if missing := [name for name in wiring.cameras if name not in there]:
+        problems.append(
+            (
+                "sensors",
+                f"{manifest.name} looks at {', '.join(missing)}; there is {', '.join(there) or 'none'}",
+            )
+        )
+    return problems
+
+
+def _contradictions(spec: VlaSpec, manifest: RSkillManifest) -> list[tuple[str, str]]:
+    """The file may say again what the manifest says, never something else: the weights are the sidecar's to load."""
+    said: list[tuple[str, object, object]] = [("runtime", spec.runtime, manifest.runtime)]
+    if spec.id == manifest.name:
+        said.append(("weights_uri", spec.weights_uri or None, manifest.weights_uri))
+    elif manifest.model_family is not None:
+        said.append(("id", spec.id, manifest.model_family))
+    for field in sorted(spec.quantization.model_fields_set if spec.quantization else ()):
+        wanted, there = (
+            getattr(block, field) for block in (spec.quantization, manifest.quantization)
+        )
+        said.append(("quantization", f"{field} {wanted}", f"{field} {there}"))
+    return [
+        (f"vla.{field}", f"{wanted} is not what {manifest.name} is installed with: {installed}")
+        for field, wanted, installed in said
+        if wanted is not None and str(wanted) != str(installed)
+    ]
+
+
+def unused(robot: RobotEnvironment) -> list[str]:
+    """Fields that are given but mean nothing here, with the reason: nobody shall believe that they had an effect."""
+    notes = [
+        f"embodiment_tags: {tag!r}, which no manifest can name"
+        for tag in robot.embodiment_tags
+        if tag not in robot.known_tags
+    ]
+    if "thumbnail_hz" in robot.model_fields_set:
+        notes.append("thumbnail_hz: pictures are made when somebody asks for them")
+    if robot.vla is not None:
+        for field in ("device", "deterministic", "extra"):
+            if field in robot.vla.model_fields_set:
+                notes.append(f"vla.{field}: the policy's sidecar decides, by its own flags")
+    if robot.task is not None and robot.task.scene_id:
+        notes.append("task.scene_id: the scene is the real one")
+    return notes
+
+
+# -- for people ---------------------------------------------------------------------------------------------------------
+def plan(
+    file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Iterable[tuple[str, str]]
+) -> str:
+    """What would run, a line a part. `facts` are lines of whoever puts the program together."""
+    robot, description = file.robot, parts.hal.description
+    twin = ", simulated" if description.simulated else ""
+    body = body_of(robot, description)
+    able = ", ".join(f"{name} {value}" for name, value in body.capabilities.items())
+    lines = [
+        ("robot", f"{robot.robot_id}: {description.name} by {robot.hal.adapter}{twin}"),
+        (
+            "body",
+            f"{' and '.join(body.embodiment_tags) or 'not said: embodiment_tags is empty'}; {able}",
+        ),
+    ]
+    lines += [
+        (
+            "joint",
+            f"{j.name} {j.lower_rad:+.3f} … {j.upper_rad:+.3f} rad, at most {j.max_speed_rad_s:g} rad/s",
+        )
+        for j in description.joints
+    ]
+    for sensor in robot.sensors:
+        topic = f", published on {sensor.publish_topic}" if sensor.publish_topic else ""
+        text = (
+            f"{sensor.sensor_id} by {sensor.backend}, at most {sensor.max_age_ms:g} ms old{topic}"
+        )
+        lines.append(("camera", text))
+    lines.append(("rate", f"{robot.rate_hz:g} Hz; late actions: {robot.deadline_overrun_policy}"))
+    if robot.safety is not None:
+        given = robot.safety.model_dump(exclude_unset=True)
+        lines.append(("safety", ", ".join(f"{key} {value}" for key, value in given.items())))
+    else:
+        lines.append(("safety", "none given: only the joints' own ranges and speeds are limits"))
+    lines += [("NOT KEPT", text) for text in unkept(parts, catalogue)]
+    lines += [("skill", text) for text in catalogue.summary()]
+    if robot.task is not None and robot.vla is not None:
+        limit = f", at most {robot.task.max_steps} ticks" if robot.task.max_steps else ""
+        skill = skill_named(robot.vla, catalogue.executable())
+        lines.append(("task", f"{robot.task.id}: {skill} {robot.task.instruction!r}{limit}"))
+    if robot.save_dir is not None:
+        lines.append(("record", f"every goal, as an episode of the dataset in {robot.save_dir}"))
+    if robot.max_ticks is not None:
+        lines.append(("end", f"after {robot.max_ticks} ticks"))
+    lines += facts
+    lines += [("unused", text) for text in unused(robot)]
+    return "\n".join(f"{label:<9} {text}" for label, text in lines)
+
+
+def _path(field: str) -> FieldPath:
+    return tuple(
+        int(part) if part.isdecimal() else part for part in re.findall(r"[^.\[\]]+", field)
+    )
+
+
+def _on_one_line(text: str) -> str:
+    return " ".join(text.split())

@@ -1,0 +1,114 @@
+"""Pictures for other processes: the newest frame of a camera, encoded, with its stamp, or a typed refusal.
+
+A frame that is older than the caller accepts is never served: `frame_stale` says how old it would have been. Knows the control
+thread, no goals and no wire.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+from vram_arbiter.runner.control.clock import Clock
+from vram_arbiter.runner.control.thread import ControlThread
+from vram_arbiter.schemas.errors import BadRequest, FrameStale, InternalError
+from vram_arbiter.schemas.goals import FrameReply
+from vram_arbiter.schemas.world import CameraModel
+
+Encoding = Literal["jpeg", "png"]
+JPEG_QUALITY = 90
+PNG_COMPRESSION = 1  # local sockets are fast, cores are few
+FIRST_FRAME_GRACE_S = (
+    1.0  # a tick may be long once (scene set-up); a hung loop is refused after this at the latest
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """One rendered or read picture: RGB uint8 height × width × 3, when it was taken, and where its camera stood then."""
+
+    camera: str
+    rgb: Any
+    stamp_ns: int
+    model: CameraModel | None = None
+
+
+class Picture(Protocol):
+    """What `Snapshot` is; its colours may be made late."""
+
+    @property
+    def rgb(self) -> Any: ...
+
+    @property
+    def stamp_ns(self) -> int: ...
+
+    @property
+    def model(self) -> CameraModel | None: ...
+
+
+class FrameSource(Protocol):
+    """What the control thread offers; both are called on it."""
+
+    def camera_names(self) -> tuple[str, ...]: ...
+
+    def snapshot(self, camera: str, max_age_s: float) -> Picture: ...
+
+
+def encode(rgb: Any, encoding: Encoding) -> bytes:
+    """Compress an RGB picture. Raises InternalError if OpenCV refuses."""
+    import cv2
+
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    if encoding == "png":
+        done, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
+    else:
+        done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not done:
+        raise InternalError(f"the picture could not be encoded as {encoding}")
+    return bytes(data)
+
+
+async def fetch(
+    control: ControlThread,
+    source: FrameSource,
+    clock: Clock,
+    camera: str,
+    max_age_ms: float,
+    encoding: Encoding,
+) -> FrameReply:
+    """The newest picture of `camera` ("" takes the first one). Raises BadRequest for an unknown camera, FrameStale otherwise."""
+    known = source.camera_names()
+    name = camera or (known[0] if known else "")
+    if name not in known:
+        raise BadRequest(f"there is no camera {camera!r}", hint=f"choose from {', '.join(known)}")
+    max_age_s = max_age_ms / 1e3
+    try:
+        async with asyncio.timeout(max(max_age_s, FIRST_FRAME_GRACE_S)):
+            taken = await control.call(lambda: source.snapshot(name, max_age_s))
+    except TimeoutError:
+        raise FrameStale(
+            f"camera {name} has given no frame for {max(max_age_s, FIRST_FRAME_GRACE_S):.1f} s",
+            hint="the control loop hangs or is overloaded",
+        ) from None
+    data = await asyncio.to_thread(lambda: encode(taken.rgb, encoding))
+    age_ms = (clock.now_ns() - taken.stamp_ns) / 1e6
+    if age_ms > max_age_ms:
+        raise FrameStale(
+            f"the newest frame of {name} is {age_ms:.0f} ms old, {max_age_ms:.0f} ms are accepted",
+            hint="accept older frames or look at the control loop's rate",
+            details={"age_ms": age_ms},
+        )
+    height, width = taken.rgb.shape[:2]
+    reply = FrameReply(
+        camera=name,
+        encoding=encoding,
+        data=data,
+        width=int(width),
+        height=int(height),
+        stamp_monotonic_ns=taken.stamp_ns,
+        age_ms=age_ms,
+    )
+    if taken.model is not None:
+        reply["camera_model"] = taken.model.model_dump(mode="json")
+    return reply

@@ -1,0 +1,354 @@
+"""One goal at a time, from its acceptance to its one result, whatever happens to the client or the skill.
+
+A goal: accept (or refuse) → resident skill → `start` → the arm → `finish` → result. The deadline counts from acceptance and covers all of it:
+status `deadline` is no success. The arm is given to a skill on the control thread and taken back by cancel, deadline, failure or end; a client that
+went away finds its result again. Knows no socket: whom to tell what goes through `Tell`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Protocol
+
+from vram_arbiter.clients._protocol.codec import pack
+from vram_arbiter.clients.net.server import Message, Peer
+from vram_arbiter.runner.control.clock import Clock
+from vram_arbiter.runner.control.thread import ControlThread
+from vram_arbiter.runner.goals.catalogue import Catalogue
+from vram_arbiter.runner.protocols import Goal, Progress, Skill, SkillEnded, SkillKey
+from vram_arbiter.runner.skills.residency import Residency
+from vram_arbiter.schemas.errors import (
+    BadRequest,
+    BadState,
+    EstopRequested,
+    GoalRejected,
+    InternalError,
+    VramError,
+)
+from vram_arbiter.schemas.goals import FeedbackPush, ResultPush, SendGoal
+from vram_arbiter.schemas.runtime.telemetry import meters
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+
+log = logging.getLogger(__name__)
+
+RESULTS_KEPT = 64
+LISTENERS_MAX = 16  # of one goal: a client that comes back again and again takes its own old places
+FEEDBACK_PERIOD_S = 0.2  # at most five a second
+FEEDBACK_QUIET_S = 1.0  # said again after this long even if nothing changed
+FINISHING = "finishing"
+FINISH_S = (
+    8.0  # a skill that has not finished by then is left to itself; nobody waits longer for a result
+)
+
+Status = Literal["succeeded", "failed", "canceled", "deadline"]
+Tell = Callable[[Peer, Message], Awaitable[None]]
+
+
+class Performer(Protocol):
+    """What a goal reads and writes of the runner. The attributes are replaced whole, never changed in place."""
+
+    progress: Progress
+    caption: tuple[str, ...]
+    estop: EstopRequested | None
+
+
+@dataclass(slots=True)
+class _Running:
+    goal: Goal
+    key: str
+    peers: list[Peer]
+    task: asyncio.Task[None] | None = None
+    begun: bool = False
+    canceled: bool = False
+    stopped_by: VramError | None = None
+    skill: Skill | None = None
+    phase: str = "acquiring"
+    so_far: dict[str, Any] = field(
+        default_factory=dict
+    )  # what became of its actions, once the arm was taken back
+    began_s: float = 0.0
+    sent: Progress | None = None
+    sent_s: float = field(default=float("-inf"))
+
+
+class OneGoal:
+    """`accept` begins a goal, `close` ends the one that runs and lets the resident skill go. With `stopping` set no goal is accepted."""
+
+    def __init__(
+        self,
+        control: ControlThread,
+        robot: Performer,
+        catalogue: Catalogue,
+        clock: Clock,
+        tell: Tell,
+        stopping: asyncio.Event,
+    ) -> None:
+        self._control = control
+        self._robot = robot
+        self._catalogue = catalogue
+        self._clock = clock
+        self._tell_peer = tell
+        self._stopping = stopping
+        self._residency = Residency()
+        self._running: _Running | None = None
+        self._results: OrderedDict[str, ResultPush] = OrderedDict()
+
+    @property
+    def goal(self) -> Goal | None:
+        """The one that runs."""
+        return self._running.goal if self._running is not None else None
+
+    @property
+    def phase(self) -> str:
+        return self._running.phase if self._running is not None else "idle"
+
+    @property
+    def resident(self) -> SkillKey | None:
+        return self._residency.resident
+
+    def result_of(self, goal_id: str) -> ResultPush | None:
+        """How a goal ended; None while it has not, or if it never was accepted."""
+        return self._results.get(goal_id)
+
+    def stop(self, error: VramError) -> None:
+        """The goal that runs, if one does, fails with this."""
+        if (running := self._running) is not None:
+            running.stopped_by = error
+            self._stop(running)
+
+    async def close(self) -> None:
+        """The goal that runs is canceled and answered."""
+        if (running := self._running) is not None and running.task is not None:
+            self._stop(running)
+            await asyncio.gather(running.task, return_exceptions=True)
+        await self._residency.close()
+
+    # -- what a client asks --------------------------------------------------------------------------------------------
+    def accept(self, peer: Peer, request: SendGoal) -> Message:
+        """The reply. Raises EstopRequested, GoalRejected and what the catalogue says of the skill."""
+        if self._robot.estop is not None:
+            raise self._robot.estop
+        if (running := self._running) is not None:
+            if running.goal.goal_id == request.goal_id and running.key == _identity(request):
+                if all(peer.identity != known.identity for known in running.peers):
+                    running.peers.append(peer)  # the same client on a new connection
+                    del running.peers[:-LISTENERS_MAX]
+                return {"goal_id": request.goal_id, "accepted": True}
+            raise GoalRejected(
+                f"goal {running.goal.goal_id} ({running.goal.rskill_id}) is running",
+                hint="wait for its result or cancel it",
+                details={"goal_id": running.goal.goal_id},
+            )
+        if request.goal_id in self._results:
+            raise GoalRejected(
+                f"goal {request.goal_id} has ended",
+                hint="ask for its result, or send a new goal_id",
+            )
+        if self._stopping.is_set():
+            raise GoalRejected("the runner is stopping", hint="start it again")
+        _, make, manifest = self._catalogue.find(request.rskill_id, request.revision)
+        goal = Goal(
+            goal_id=request.goal_id,
+            rskill_id=request.rskill_id,
+            revision=request.revision,
+            prompt=request.prompt,
+            params=request.goal_params,
+            deadline_s=self._catalogue.deadline_s(manifest, request.deadline_s),
+            max_ticks=request.max_ticks,
+            traceparent=request.traceparent,
+        )
+        running = _Running(goal, _identity(request), [peer], began_s=self._clock.now_s())
+        self._running = running
+        running.task = asyncio.create_task(
+            self._execute(running, make), name=f"goal {goal.goal_id}"
+        )
+        return {"goal_id": goal.goal_id, "accepted": True}
+
+    def cancel(self, goal_id: str) -> Message:
+        """The reply; the result still comes. Raises BadRequest."""
+        running = self._running
+        if running is None or running.goal.goal_id != goal_id:
+            if goal_id in self._results:
+                return {"goal_id": goal_id, "status": self._results[goal_id]["status"]}
+            raise BadRequest(
+                f"there is no goal {goal_id}", hint="it never was accepted, or ended long ago"
+            )
+        self._stop(running)
+        return {"goal_id": goal_id}
+
+    @staticmethod
+    def _stop(running: _Running) -> None:
+        """At most one cancellation reaches the task, and none when its end is decided: what it does to end cleanly is not interrupted."""
+        if running.task is not None and not running.canceled and running.phase != FINISHING:
+            running.canceled = True
+            if running.begun:  # a task that is cancelled before its first step would never answer
+                running.task.cancel()
+
+    def result(self, goal_id: str) -> Message:
+        """The reply. Raises BadState while it runs, BadRequest."""
+        if (result := self._results.get(goal_id)) is not None:
+            return {key: value for key, value in result.items() if key != "push"}
+        if self._running is not None and self._running.goal.goal_id == goal_id:
+            raise BadState(f"goal {goal_id} is still running", hint="wait for its result")
+        raise BadRequest(
+            f"there is no goal {goal_id}", hint=f"the last {RESULTS_KEPT} results are kept"
+        )
+
+    # -- a goal --------------------------------------------------------------------------------------------------------
+    async def _execute(self, running: _Running, make: Callable[[], Skill]) -> None:
+        """All of it is one span, `rskill.goal`: the caller's child, and the parent of activation and ticks."""
+        goal = running.goal
+        running.begun = True
+        attributes = {telemetry.ATTR_SKILL: goal.rskill_id, telemetry.ATTR_GOAL: goal.goal_id}
+        if goal.revision:
+            attributes[telemetry.ATTR_REVISION] = goal.revision
+        with tracing.span(telemetry.SPAN_GOAL, goal.traceparent, attributes) as span:
+            running.goal = replace(goal, traceparent=tracing.traceparent())
+            status = await self._carry_out(running, make)
+            span.set_attribute(telemetry.ATTR_OUTCOME, status)
+            labels = {telemetry.ATTR_SKILL: goal.rskill_id, telemetry.ATTR_OUTCOME: status}
+            meters.count(telemetry.METRIC_GOALS, labels)
+
+    async def _carry_out(self, running: _Running, make: Callable[[], Skill]) -> Status:
+        goal = running.goal
+        log.info("goal %s: %s %s", goal.goal_id, goal.rskill_id, goal.prompt)
+        telling = asyncio.create_task(self._tell(running))
+        status: Status = "failed"
+        error: VramError | None = None
+        data: dict[str, Any] = {}
+        try:
+            if running.canceled:
+                raise asyncio.CancelledError
+            async with asyncio.timeout(goal.deadline_s):
+                ended = await self._run(running, make)
+            data, error = dict(ended.data), ended.error
+            status = "succeeded" if error is None else "failed"
+        except TimeoutError:
+            status, error, data = "deadline", None, running.so_far
+        except VramError as raised:
+            error = raised
+        except (
+            asyncio.CancelledError
+        ):  # our own cancel, or the server's end: the result still goes out
+            status, error = (
+                ("failed", running.stopped_by) if running.stopped_by else ("canceled", None)
+            )
+            data = running.so_far
+        except Exception as raised:
+            log.exception("goal %s failed", goal.goal_id)
+            error = InternalError(f"{type(raised).__name__}: {raised}", hint="see the runner's log")
+        running.phase = FINISHING
+        if running.skill is not None:
+            await self._finish(running.skill)
+        telling.cancel()
+        await asyncio.gather(telling, return_exceptions=True)
+        await self._conclude(running, status, error, data)
+        return status
+
+    @staticmethod
+    async def _finish(skill: Skill) -> None:
+        """The goal's result is what it is, whatever happens here; the lease's use ends with our connection at the latest."""
+        try:
+            async with asyncio.timeout(FINISH_S):
+                await skill.finish()
+        except (VramError, TimeoutError) as error:
+            log.warning(
+                "%s did not finish cleanly: %s",
+                skill.key,
+                str(error) or f"not within {FINISH_S:.0f} s",
+            )
+        except Exception:
+            log.exception("%s did not finish cleanly", skill.key)
+
+    async def _run(self, running: _Running, make: Callable[[], Skill]) -> SkillEnded:
+        """Raises what acquiring and starting raise; the arm is taken back whenever this ends."""
+        goal = running.goal
+        key, _, _ = self._catalogue.find(goal.rskill_id, goal.revision)
+        self._caption(running)
+        with tracing.span(telemetry.SPAN_ACTIVATE, attributes={telemetry.ATTR_SKILL: str(key)}):
+            running.skill = skill = await self._residency.acquire(key, make)
+            running.phase = "starting"
+            self._caption(running)
+            await self._residency.start(skill, goal)
+
+        def begun() -> None:
+            running.phase = "running"
+            self._caption(running)
+
+        return await self._control.run_skill(skill, goal, begun, running.so_far.update)
+
+    async def _conclude(
+        self, running: _Running, status: Status, error: VramError | None, data: dict[str, Any]
+    ) -> None:
+        goal = running.goal
+        message = {
+            "succeeded": "",
+            "failed": str(error) if error else "failed",
+            "canceled": "canceled on request",
+            "deadline": f"not done within {goal.deadline_s:.0f} s",
+        }[status]
+        result = ResultPush(
+            push="result",
+            goal_id=goal.goal_id,
+            status=status,
+            success=status == "succeeded",
+            code=error.code if error else "",
+            message=message,
+            data={**_sendable(data), "elapsed_s": round(self._clock.now_s() - running.began_s, 3)},
+        )
+        self._results[goal.goal_id] = result
+        while len(self._results) > RESULTS_KEPT:
+            self._results.popitem(last=False)
+        self._running = None
+        self._robot.caption = (f"idle, after {goal.rskill_id}: {status}",)
+        log.info("goal %s: %s %s", goal.goal_id, status, message)
+        for peer in running.peers:
+            await self._tell_peer(peer, dict(result))
+
+    # -- progress ------------------------------------------------------------------------------------------------------
+    async def _tell(self, running: _Running) -> None:
+        while True:
+            progress = (
+                self._robot.progress if running.phase == "running" else Progress(0.0, running.phase)
+            )
+            now_s = self._clock.now_s()
+            if progress != running.sent or now_s - running.sent_s >= FEEDBACK_QUIET_S:
+                running.sent, running.sent_s = progress, now_s
+                feedback = FeedbackPush(
+                    push="feedback",
+                    goal_id=running.goal.goal_id,
+                    progress=progress.fraction,
+                    state=progress.state,
+                    tick_idx=progress.tick_idx,
+                    detail=progress.detail,
+                )
+                for peer in running.peers:
+                    await self._tell_peer(peer, dict(feedback))
+            await asyncio.sleep(FEEDBACK_PERIOD_S)
+
+    def _caption(self, running: _Running) -> None:
+        goal = running.goal
+        self._robot.caption = (
+            (f"{goal.rskill_id}: {running.phase}", goal.prompt)
+            if goal.prompt
+            else (f"{goal.rskill_id}: {running.phase}",)
+        )
+
+
+def _identity(request: SendGoal) -> str:
+    """What makes a repeated goal the same goal."""
+    return request.model_dump_json(exclude={"id", "traceparent"})
+
+
+def _sendable(data: dict[str, Any]) -> dict[str, Any]:
+    """A skill's own words, if a wire carries them; a result reaches its client whatever they are."""
+    try:
+        pack(data)
+    except (TypeError, ValueError, OverflowError):
+        return {"unsendable": repr(data)[:500]}
+    return data

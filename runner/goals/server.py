@@ -1,0 +1,303 @@
+"""The goal server: what the runner is asked on its socket, and who answers it.
+
+Speaks `schemas.goals` on a `RouterServer`. Goals are `runner.goals.one_goal`'s, pictures `runner.goals.frames`'; the emergency stop has a socket and a thread of
+its own beside it (`runner.safety.estop`). It knows no model and no simulator.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol
+
+from pydantic import ValidationError
+
+from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.runner.control.clock import Clock
+from vram_arbiter.runner.control.thread import ControlThread
+from vram_arbiter.runner.goals import frames
+from vram_arbiter.runner.goals.catalogue import Catalogue
+from vram_arbiter.runner.goals.one_goal import OneGoal, Performer
+from vram_arbiter.runner.safety.estop import OBEY_S, EstopServer
+from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
+from vram_arbiter.schemas.errors import (
+    BadRequest,
+    EstopRequested,
+    InternalError,
+    LimitExceeded,
+    UnknownOp,
+    VramError,
+)
+from vram_arbiter.schemas.goals import (
+    RUNNER_REQUEST,
+    CancelGoal,
+    GetFrame,
+    GetGroundTruth,
+    GetResult,
+    GetSkills,
+    GetState,
+    PingRunner,
+    ResultPush,
+    SendGoal,
+    ShutdownRunner,
+)
+from vram_arbiter.schemas.world import WorldState
+
+log = logging.getLogger(__name__)
+
+READS_MAX = 16  # requests that wait for the control thread; more are refused, so that its mailbox keeps room for others
+WORK_SHARE = 0.25  # of the time, for the goal socket: the control thread waits for this thread's turn with the interpreter
+LOOP_SILENT_S = 1.0  # a control loop that has not looked at the world for so long hangs
+OPS = ("goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "ping", "shutdown")
+
+
+class Robot(frames.FrameSource, Performer, Protocol):
+    """What the server reads of the runner. The attributes are replaced whole by the control thread, never changed in place."""
+
+    world: WorldState | None
+    rate_hz: float
+    tick_idx: int
+    deadline_misses: int
+    estop_ns: int
+
+    def request_estop(self, reason: str) -> None: ...
+
+    def obey_estop(self) -> EstopRequested | None: ...
+
+
+class GoalServer:
+    """`await GoalServer(...).serve()` until `shutdown` or cancellation; then the running goal is canceled and answered.
+
+    `estop_s`: a control loop that has not obeyed an emergency stop by then is said to hang. `realtime`: the emergency stop's thread goes
+    before other programs.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        control: ControlThread,
+        robot: Robot,
+        catalogue: Catalogue,
+        clock: Clock,
+        *,
+        ground_truth: Callable[[], dict[str, Any]] | None = None,
+        identity: dict[str, Any] | None = None,
+        on_bound: Callable[[], None] | None = None,
+        stopping: asyncio.Event | None = None,
+        estop_s: float = OBEY_S,
+        realtime: bool = False,
+    ) -> None:
+        self._endpoint = endpoint
+        self._control = control
+        self._robot = robot
+        self._catalogue = catalogue
+        self._clock = clock
+        self._ground_truth = ground_truth
+        self._identity = identity or {}
+        self._on_bound = on_bound
+        self._estop_s = estop_s
+        self._realtime = realtime
+        self._server: RouterServer | None = None
+        self._reads = 0
+        self.stopping = stopping or asyncio.Event()
+        self._goals = OneGoal(control, robot, catalogue, clock, self._send, self.stopping)
+        self.bound = asyncio.Event()
+
+    async def serve(self) -> None:
+        """Raises AlreadyRunning when another runner serves the endpoint."""
+        loop = asyncio.get_running_loop()
+
+        def on_stop(reason: str, pid: int, uid: int) -> None:
+            with contextlib.suppress(
+                RuntimeError
+            ):  # the loop has ended: the stop is latched all the same
+                loop.call_soon_threadsafe(self._stopped, reason, pid, uid)
+
+        async with contextlib.AsyncExitStack() as stack:
+            server = await stack.enter_async_context(
+                RouterServer(
+                    self._endpoint,
+                    lambda error: _refusal(None, error),
+                    message_max_bytes=MESSAGE_MAX_BYTES,
+                    work_share=WORK_SHARE,
+                )
+            )
+            stack.enter_context(
+                EstopServer(
+                    self._endpoint,
+                    self._robot,
+                    self._control.runner.mailbox,
+                    on_stop=on_stop,
+                    robot_id=str(self._identity.get("robot", "")),
+                    obey_s=self._estop_s,
+                    realtime=self._realtime,
+                )
+            )
+            self._server = server
+            serving = asyncio.create_task(server.serve(self._handle))
+            stopping = asyncio.create_task(self.stopping.wait())
+            ended = asyncio.ensure_future(asyncio.wait([self._control.ended]))
+            self.bound.set()
+            if self._on_bound is not None:
+                self._on_bound()
+            try:
+                await asyncio.wait([serving, stopping, ended], return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                self.stopping.set()  # whatever ended it: no goal is accepted any more
+                await self._goals.close()
+                for task in (serving, stopping, ended):
+                    task.cancel()
+                await asyncio.gather(serving, stopping, ended, return_exceptions=True)
+            if (
+                serving.done()
+                and not serving.cancelled()
+                and (error := serving.exception()) is not None
+            ):
+                raise error
+
+    def result_of(self, goal_id: str) -> ResultPush | None:
+        """How a goal ended; None while it has not, or if it never was accepted."""
+        return self._goals.result_of(goal_id)
+
+    # -- requests ------------------------------------------------------------------------------------------------------
+    async def _handle(self, peer: Peer, message: Message) -> None:
+        request_id = message.get("id") if isinstance(message.get("id"), int) else None
+        try:
+            reply = await self._answer(peer, _parse(message))
+        except VramError as error:
+            await self._send(peer, _refusal(request_id, error))
+        except Exception as error:
+            log.exception("request failed")
+            await self._send(
+                peer,
+                _refusal(
+                    request_id,
+                    InternalError(f"{type(error).__name__}: {error}", hint="see the log"),
+                ),
+            )
+        else:
+            await self._send(peer, {"re": request_id, "ok": True, **reply})
+            if message.get("op") == "shutdown":
+                self.stopping.set()
+
+    async def _answer(self, peer: Peer, request: Any) -> Message:
+        match request:
+            case SendGoal():
+                return self._goals.accept(peer, request)
+            case CancelGoal():
+                return self._goals.cancel(request.goal_id)
+            case GetResult():
+                return self._goals.result(request.goal_id)
+            case GetFrame():
+                with self._waiting_read():
+                    reply = await frames.fetch(
+                        self._control,
+                        self._robot,
+                        self._clock,
+                        request.camera,
+                        request.max_age_ms,
+                        request.encoding,
+                    )
+                return dict(reply)
+            case GetState():
+                return self._state()
+            case GetSkills():
+                return {
+                    "skills": self._catalogue.as_wire(),
+                    "body": self._catalogue.body_as_wire(),
+                    "resident": _text(self._goals.resident),
+                }
+            case GetGroundTruth():
+                if self._ground_truth is None:
+                    raise UnknownOp("only a simulator knows the truth", details={"known": [*OPS]})
+                with self._waiting_read():
+                    return await self._control.call(self._ground_truth)
+            case PingRunner():
+                goal = self._goals.goal
+                return {
+                    "pid": os.getpid(),
+                    "goal_id": goal.goal_id if goal else None,
+                } | self._identity
+            case ShutdownRunner():
+                return {}
+        raise UnknownOp("unknown request", details={"known": [*OPS]})
+
+    @contextlib.contextmanager
+    def _waiting_read(self) -> Iterator[None]:
+        """Around what waits for the control thread. Raises LimitExceeded when too many do."""
+        if self._reads >= READS_MAX:
+            raise LimitExceeded(
+                f"{READS_MAX} requests wait for the control loop",
+                hint="ask again, and for fewer pictures at once",
+                details={"limit": READS_MAX},
+            )
+        self._reads += 1
+        try:
+            yield
+        finally:
+            self._reads -= 1
+
+    def _stopped(self, reason: str, pid: int, uid: int) -> None:
+        """An emergency stop was latched on its own thread; words for the log, and the end of the goal, are left to this one."""
+        log.critical("emergency stop by process %d of uid %d: %s", pid, uid, reason)
+        if (error := self._robot.estop) is not None:
+            self._goals.stop(error)
+
+    def _state(self) -> Message:
+        robot, goal = self._robot, self._goals.goal
+        return {
+            "world": self._world(),
+            "goal": goal.goal_id if goal else None,
+            "rskill_id": goal.rskill_id if goal else None,
+            "phase": self._goals.phase,
+            "resident": _text(self._goals.resident),
+            "rate_hz": robot.rate_hz,
+            "ticks": robot.tick_idx,
+            "deadline_misses": robot.deadline_misses,
+            "estop": robot.estop.message if robot.estop is not None else None,
+            "cameras": list(robot.camera_names()),
+        }
+
+    def _world(self) -> dict[str, Any] | None:
+        """The newest world state. What was fresh when the control loop last looked is not fresh while it hangs."""
+        robot = self._robot
+        if (world := robot.world) is None:
+            return None
+        told = world.model_dump(mode="json", exclude={"image_frames"})
+        limit_s = max(LOOP_SILENT_S, 3 / robot.rate_hz if robot.rate_hz else 0.0)
+        if (self._clock.now_ns() - world.stamp_ns) / 1e9 > limit_s:
+            told["diagnostics"] = dict.fromkeys(world.diagnostics, "stale")
+        return told
+
+    async def _send(self, peer: Peer, message: Message) -> None:
+        if self._server is not None:
+            await self._server.send(peer, message)
+
+
+def _parse(message: Message) -> Any:
+    if message.get("op") not in OPS:
+        raise UnknownOp(
+            f"unknown op {str(message.get('op'))[:64]!r}",
+            hint=f"one of {', '.join(OPS)}",
+            details={"known": [*OPS]},
+        )
+    try:
+        return RUNNER_REQUEST.validate_python(message)
+    except ValidationError as error:
+        fields = [
+            {"path": ".".join(str(part)[:64] for part in item["loc"][1:]), "problem": item["msg"]}
+            for item in error.errors(include_url=False, include_input=False)
+        ]
+        text = "; ".join(f"{item['path']}: {item['problem']}" for item in fields)
+        raise BadRequest(f"{message['op']}: {text}", details={"fields": fields}) from error
+
+
+def _refusal(request_id: int | None, error: VramError) -> Message:
+    return {"re": request_id, "ok": False, "error": error.to_wire()}
+
+
+def _text(key: object) -> str | None:
+    return None if key is None else str(key)

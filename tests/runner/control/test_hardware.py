@@ -1,0 +1,443 @@
+"""The loop on a robot: what reaches the motors, what is withheld and why, and how it begins and ends. Time moves only when told."""
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+from small_robots import FedCamera, Nod, Twin
+
+from vram_arbiter.runner.control.clock import SystemClock
+from vram_arbiter.runner.control.hardware import (
+    FIRST_DATA_SLICE_S,
+    FIRST_STATE_TRIES,
+    HardwareRunner,
+)
+from vram_arbiter.runner.control.skill_runner import WITHHELD_IN_A_ROW_MAX
+from vram_arbiter.runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded
+from vram_arbiter.runner.robots.so101 import so101
+from vram_arbiter.runner.safety.gate import RobotGate
+from vram_arbiter.runner.safety.ranges import JointRanges
+from vram_arbiter.runner.sensors import Feed
+from vram_arbiter.runner.skills.base import SkillState
+from vram_arbiter.schemas.errors import (
+    BadRequest,
+    Cancelled,
+    EstopRequested,
+    FrameStale,
+    LimitExceeded,
+    RobotFault,
+    StateStale,
+)
+from vram_arbiter.schemas.manifest import load_manifest
+from vram_arbiter.schemas.world import SensorFrame, WorldState
+
+PERIOD_S = 1 / 30
+MakeRunner = Callable[..., HardwareRunner]
+
+
+def gate(skill: Skill) -> SafetyGate:
+    return JointRanges(
+        {joint.name: (joint.lower_rad, joint.upper_rad) for joint in so101(simulated=True).joints}
+    )
+
+
+@pytest.fixture
+def twin(clock: Any) -> Twin:
+    return Twin(clock)
+
+
+@pytest.fixture
+def front(clock: Any) -> FedCamera:
+    return FedCamera("front", clock)
+
+
+@pytest.fixture
+def make(clock: Any, twin: Twin) -> MakeRunner:
+    def build(cameras: Sequence[FedCamera] = (), **options: Any) -> HardwareRunner:
+        readers = [(camera, 100.0) for camera in cameras]
+        return HardwareRunner(twin, readers, options.pop("make_gate", gate), clock=clock, **options)
+
+    return build
+
+
+@pytest.fixture
+def nod(navigate_manifest: Any) -> Callable[..., Nod]:
+    def active(**options: Any) -> Nod:
+        skill = Nod(load_manifest(navigate_manifest), **options)
+        skill.state = SkillState.ACTIVE
+        return skill
+
+    return active
+
+
+def tick(runner: HardwareRunner, clock: Any, times: int = 1) -> Any:
+    for _ in range(times):
+        result = runner.tick()
+        clock.advance(PERIOD_S)
+    return result
+
+
+def begin(runner: HardwareRunner, skill: Nod, **goal: Any) -> list[SkillEnded]:
+    ended: list[SkillEnded] = []
+    runner.begin_skill(skill, Goal("g", "vram-arbiter/nod", **goal), ended.append)
+    return ended
+
+
+def test_a_skill_sees_the_cameras_and_its_actions_reach_the_motors(
+    make: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
+) -> None:
+    seen: list[WorldState] = []
+    runner = make([front])
+    runner.activate()
+    ended = begin(runner, nod(cameras=("front",), steps=3, on_step=seen.append))
+    result = tick(runner, clock)
+    assert result.action_applied
+    assert twin.sent[0].joint_names == ("wrist_flex",)
+    assert seen[0].image_frames is not None
+    assert seen[0].image_frames["front"].data == bytes([255, 0, 0, 0, 0, 255])  # inline, untouched
+    assert seen[0].diagnostics == {"front": "ok", "joint_state": "ok"}
+    tick(runner, clock, 3)
+    assert ended == [SkillEnded({"ticks": 3, "withheld": 0, "clamped": 0, "nods": 3})]
+    assert len(twin.sent) == 3
+    assert not tick(runner, clock).action_applied  # without a skill nothing is sent
+    runner.deactivate()
+    assert twin.story == ["connect", "disconnect"]
+
+
+@pytest.mark.parametrize("cause", ["hangs", "ends", "is not there"])
+def test_a_stale_camera_withholds_and_fails_the_goal_if_it_lasts(
+    make: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any, cause: str
+) -> None:
+    runner = make([front])
+    runner.activate()
+    skill = nod(cameras=("rear",) if cause == "is not there" else ("front",))
+    ended = begin(runner, skill)
+    if cause != "is not there":
+        tick(runner, clock, 3)
+    front.always = False
+    if cause == "ends":
+        assert front.feed is not None
+        front.feed.end("end of file")
+    clock.advance(0.2)
+    asked, sent = skill.taken, len(twin.sent)
+    result = tick(runner, clock)
+    assert not result.action_applied
+    assert "is stale" in result.safety_violations[0]
+    assert not ended
+    tick(runner, clock, 40)
+    assert (skill.taken, len(twin.sent)) == (asked, sent)  # neither asked nor moved, not even once
+    assert isinstance(ended[0].error, FrameStale)
+    assert {"hangs": "ms old", "ends": "end of file", "is not there": "no such camera"}[
+        cause
+    ] in str(ended[0].error)
+    assert len([text for text in runner.violations if "is stale" in text]) == 1
+
+
+def test_a_camera_that_comes_back_in_time_lets_the_goal_go_on(
+    make: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
+) -> None:
+    runner = make([front])
+    runner.activate()
+    ended = begin(runner, nod(cameras=("front",)))
+    front.always = False
+    clock.advance(0.2)
+    tick(runner, clock, 5)
+    assert not twin.sent
+    front.always = True
+    applied = [tick(runner, clock).action_applied for _ in range(4)]
+    assert applied == [False, False, True, True]  # three fresh pictures in a row
+    assert not ended
+
+
+def test_a_camera_that_no_skill_looks_at_stops_nobody(
+    make: MakeRunner, front: FedCamera, nod: Any, clock: Any
+) -> None:
+    runner = make([front])
+    runner.activate()
+    begin(runner, nod())
+    front.stop()
+    clock.advance(0.2)
+    assert tick(runner, clock).action_applied
+    assert runner.world is not None
+    assert runner.world.image_frames == {}
+
+
+def test_a_lost_answer_of_the_bus_is_bridged_and_a_silent_bus_withholds(
+    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+) -> None:
+    runner = make()
+    runner.activate()
+    ended = begin(runner, nod())
+    tick(runner, clock)
+    twin.silent = True
+    assert tick(runner, clock).action_applied
+    twin.silent = False
+    assert tick(runner, clock).action_applied
+    twin.silent = True
+    clock.advance(0.1)
+    result = tick(runner, clock)
+    assert not result.action_applied
+    assert "no answer from motor 3" in result.safety_violations[0]
+    tick(runner, clock, 35)
+    assert isinstance(ended[0].error, StateStale)
+    assert runner.world is not None
+    assert "joint_state" in runner.world.stale
+
+
+def test_what_cannot_be_sent_fails_the_goal(
+    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+) -> None:
+    runner = make()
+    runner.activate()
+    ended = begin(runner, nod())
+    twin.deaf = True
+    assert not tick(runner, clock).action_applied
+    assert isinstance(ended[0].error, RobotFault)
+    assert runner.progress.state == "ended"
+
+
+def test_the_gate_is_made_for_the_skill_and_what_it_refuses_is_not_sent(
+    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+) -> None:
+    asked: list[Skill] = []
+
+    def narrow(skill: Skill) -> SafetyGate:
+        asked.append(skill)
+        return JointRanges({"wrist_flex": (-0.1, 0.1)})
+
+    runner = make(make_gate=narrow)
+    runner.activate()
+    skill = nod()
+    begin(runner, skill)
+    result = tick(runner, clock)
+    assert asked == [skill]
+    assert not result.action_applied
+    assert "wrist_flex" in result.safety_violations[0]
+    assert not twin.sent
+
+
+def test_a_gate_that_cannot_be_made_gives_nobody_the_arm(make: MakeRunner, nod: Any) -> None:
+    def broken(skill: Skill) -> SafetyGate:
+        raise LimitExceeded("the envelope is empty")
+
+    runner = make(make_gate=broken)
+    runner.activate()
+    with pytest.raises(LimitExceeded):
+        begin(runner, nod())
+    assert runner.progress.state == "idle"
+    runner.deactivate()
+
+
+def test_the_emergency_stop_comes_before_anything_else(
+    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+) -> None:
+    told: list[str] = []
+    runner = make(on_estop=told.append)
+    runner.activate()
+    skill = nod(on_step=lambda world: runner.request_estop("a hand is in the way"))
+    ended = begin(runner, skill)
+    assert not tick(
+        runner, clock
+    ).action_applied  # the step that was under way is not sent any more
+    assert not twin.sent
+    assert twin.story == ["connect", "halt"]
+    assert told == ["a hand is in the way"]
+    assert isinstance(ended[0].error, EstopRequested)
+    assert "a hand is in the way; all joints stand still" in ended[0].error.message
+    tick(runner, clock, 3)
+    assert twin.story == ["connect", "halt"]
+    with pytest.raises(EstopRequested):
+        begin(runner, nod())
+    runner.request_estop("another reason")
+    assert runner.estop is not None
+    assert runner.estop.details["reason"] == "a hand is in the way"
+
+
+def test_a_stop_that_the_robot_latched_by_itself_is_the_runners_too(
+    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+) -> None:
+    told: list[str] = []
+    runner = make(on_estop=told.append)
+    runner.activate()
+    ended = begin(runner, nod())
+    with pytest.raises(EstopRequested):
+        twin.estop("its button")
+    assert not tick(runner, clock).action_applied
+    assert "its button" in told[0]
+    tick(runner, clock, 3)
+    assert len(told) == 1
+    assert isinstance(ended[0].error, EstopRequested)
+    assert runner.estop is ended[0].error
+
+
+def test_a_late_action_is_withheld_under_drop(
+    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+) -> None:
+    runner = make(deadline_policy=DeadlinePolicy.DROP)
+    runner.activate()
+    begin(runner, nod(on_step=lambda world: clock.advance(2 * PERIOD_S)))
+    result = tick(runner, clock)
+    assert (result.action_applied, result.deadline_missed) == (False, True)
+    assert not twin.sent
+
+
+def test_a_goal_whose_actions_all_come_too_late_fails(
+    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+) -> None:
+    """Regression: under `drop` such a goal succeeded without one command to a motor."""
+    runner = make(deadline_policy=DeadlinePolicy.DROP)
+    runner.activate()
+    ended = begin(runner, nod(steps=100, on_step=lambda world: clock.advance(2 * PERIOD_S)))
+    tick(runner, clock, 30)
+    assert not twin.sent
+    assert isinstance(ended[0].error, LimitExceeded)
+    assert "too late" in ended[0].error.message
+    assert ended[0].data["withheld"] == WITHHELD_IN_A_ROW_MAX
+
+
+def test_an_action_that_was_thought_out_for_too_long_is_not_sent(
+    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+) -> None:
+    """Regression: the gate judged the state's age by its stamp and not by the clock."""
+    own = RobotGate(twin.description, rate_hz=30.0, now_ns=clock.now_ns)
+    runner = make(make_gate=lambda skill: own)  # under WARN: what is merely late is sent
+    runner.activate()
+    begin(runner, nod(on_step=lambda world: clock.advance(0.5)))
+    result = tick(runner, clock)
+    assert not result.action_applied
+    assert "the joint state is stale: 0.50 s old" in result.safety_violations[0]
+    assert not twin.sent
+
+
+def test_a_tick_says_where_its_time_went(
+    make: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
+) -> None:
+    runner = make([front])
+    runner.activate()
+    begin(runner, nod(on_step=lambda world: clock.advance(0.004)))
+    result = runner.tick()
+    assert result.inference_ms == pytest.approx(4.0)
+    assert result.tick_ms == pytest.approx(4.0)
+    assert (result.sensors_ms, result.world_state_ms, result.safety_ms, result.hal_ms) == (
+        0,
+        0,
+        0,
+        0,
+    )
+
+
+def test_a_goal_ends_after_as_many_ticks_as_it_may_take(
+    make: MakeRunner, nod: Any, clock: Any
+) -> None:
+    runner = make()
+    runner.activate()
+    ended = begin(runner, nod(), max_ticks=5)
+    tick(runner, clock, 8)
+    assert isinstance(ended[0].error, LimitExceeded)
+    assert (ended[0].data["ticks"], ended[0].data["truncated"]) == (5, True)
+
+
+@pytest.mark.heavy
+def test_pictures_for_others_come_in_their_colours_and_never_too_old(
+    make: MakeRunner, front: FedCamera, clock: Any
+) -> None:
+    runner = make([front])
+    runner.activate()
+    assert runner.snapshot("front", 0.1).rgb.tolist() == [[[0, 0, 255], [255, 0, 0]]]
+    front.always = False
+    clock.advance(0.5)
+    with pytest.raises(FrameStale, match="500 ms old"):
+        runner.snapshot("front", 0.1)
+    assert runner.snapshot("front", 1.0).camera == "front"
+    with pytest.raises(BadRequest, match="choose from front"):
+        runner.snapshot("rear", 1.0)
+
+
+def test_it_does_not_start_on_a_camera_that_shows_nothing(
+    make: MakeRunner, twin: Twin, front: FedCamera, clock: Any
+) -> None:
+    front.always = False
+    front._run_begins = lambda feed: feed.end("there is no /dev/video7")  # type: ignore[method-assign]
+    runner = make([front])
+    with pytest.raises(FrameStale, match="video7"):
+        runner.activate()
+    runner.deactivate()
+    assert twin.story == []  # a robot that nobody sees gets no power
+
+
+def test_everything_is_stopped_whatever_one_of_them_raises(
+    make: MakeRunner, twin: Twin, front: FedCamera, clock: Any
+) -> None:
+    class Stubborn(FedCamera):
+        def _run_ends(self) -> None:
+            raise OSError("the driver hangs")
+
+    runner = make([front, Stubborn("wrist", clock)])
+    runner.activate()
+    with pytest.raises(OSError, match="hangs"):
+        runner.deactivate()
+    assert twin.story == ["connect", "disconnect"]
+    assert front.feed is None
+
+
+class Distant(FedCamera):
+    """A camera over a network: each picture arrives later than one slice of the wait for the first is long."""
+
+    def deliver(self, feed: Feed, frame: SensorFrame) -> None:
+        taken_ns = frame.stamp_monotonic_ns - round(1.5 * FIRST_DATA_SLICE_S * 1e9)
+        super().deliver(feed, frame.model_copy(update={"stamp_monotonic_ns": taken_ns}))
+
+
+def test_it_starts_on_a_camera_whose_pictures_take_their_time() -> None:
+    clock, over = SystemClock(), threading.Event()
+    twin = Twin(clock)
+    far = Distant("far", clock, 60_000.0, always=False)
+    runner = HardwareRunner(twin, [(far, 60_000.0)], gate, clock=clock, first_data_s=50.0)
+
+    def film() -> None:
+        while not over.wait(0.01):
+            if far.feed is not None:
+                far.show()
+
+    thread = threading.Thread(target=film)
+    thread.start()
+    try:
+        runner.activate()
+    finally:
+        over.set()
+        thread.join(30)
+    assert twin.story == ["connect"]
+    runner.deactivate()
+
+
+def test_it_does_not_start_on_a_robot_that_says_nothing(make: MakeRunner, twin: Twin) -> None:
+    twin.silent = True
+    runner = make()
+    with pytest.raises(StateStale, match="motor 3"):
+        runner.activate()
+    runner.deactivate()
+    assert twin.story == ["connect", "disconnect"]
+
+
+def test_a_robot_whose_first_answer_is_lost_starts(
+    make: MakeRunner, twin: Twin, clock: Any
+) -> None:
+    twin.answers_lost = FIRST_STATE_TRIES - 1
+    runner = make()
+    runner.activate()
+    assert runner.world is not None
+    assert runner.world.stale == ()
+    runner.deactivate()
+
+
+def test_waiting_for_a_camera_ends_when_the_runner_is_to_stop(
+    make: MakeRunner, twin: Twin, front: FedCamera
+) -> None:
+    front.always = False
+    runner = make([front])
+    runner.request_stop()
+    with pytest.raises(Cancelled):
+        runner.activate()
+    runner.deactivate()
+    assert twin.story == []

@@ -1,0 +1,187 @@
+"""The base loop on a clock that moves only when told: rates, deadline policies, resynchronisation, figures."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vram_arbiter.runner.control.loop import Applied, Decision, RunnerBase
+from vram_arbiter.runner.control.timings import Timings, percentile
+from vram_arbiter.runner.protocols import DeadlineMissed, DeadlinePolicy, InferenceRunner
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.world import Action
+
+ACTION = Action(
+    control_mode=ControlMode.JOINT_POSITION, joint_targets=((0.0,),), joint_names=("a",)
+)
+
+
+class Scripted(RunnerBase):
+    """Deciding takes what the script says, in seconds; what was applied is kept."""
+
+    def __init__(
+        self, clock: Any, decide_s: list[float], apply_s: float = 0.0, **options: Any
+    ) -> None:
+        super().__init__(clock=clock, **options)
+        self.manual, self.decide_s, self.apply_s = clock, decide_s, apply_s
+        self.applied: list[Action | None] = []
+        self.began_s: list[float] = []
+
+    def activate(self) -> None: ...
+
+    def deactivate(self) -> None: ...
+
+    def _decide(self, tick_idx: int) -> Decision:
+        self.began_s.append(self.manual.time_s)
+        self.manual.advance(self.decide_s[tick_idx] if tick_idx < len(self.decide_s) else 0.0)
+        return Decision(
+            action=ACTION, inference_ms=1e3 * (self.decide_s[tick_idx : tick_idx + 1] or [0.0])[0]
+        )
+
+    def _apply(self, decision: Decision) -> Applied:
+        self.applied.append(decision.action)
+        self.manual.advance(self.apply_s)
+        return Applied(action_applied=decision.action is not None)
+
+
+def test_the_base_is_an_inference_runner(clock: Any) -> None:
+    assert isinstance(Scripted(clock, []), InferenceRunner)
+
+
+def test_ticks_stand_on_the_grid_of_the_rate(clock: Any) -> None:
+    runner = Scripted(clock, [0.01, 0.02, 0.0], rate_hz=10)
+    result = runner.run(max_ticks=3)
+    assert runner.began_s == pytest.approx([100.0, 100.1, 100.2])
+    assert (result.n_ticks, result.budget_violations) == (3, 0)
+
+
+def test_a_long_tick_costs_its_own_slots_and_no_burst_follows(clock: Any) -> None:
+    runner = Scripted(clock, [0.0, 0.35, 0.0, 0.0], rate_hz=10)
+    result = runner.run(max_ticks=4)
+    assert runner.began_s == pytest.approx([100.0, 100.1, 100.5, 100.6])
+    assert result.budget_violations == 1
+
+
+def test_warn_applies_a_late_action_and_counts_it(clock: Any) -> None:
+    runner = Scripted(clock, [0.25], rate_hz=10, deadline_policy=DeadlinePolicy.WARN)
+    result = runner.tick()
+    assert result.action_applied
+    assert result.deadline_missed
+    assert runner.applied == [ACTION]
+
+
+def test_drop_really_withholds_a_late_action(clock: Any) -> None:
+    runner = Scripted(clock, [0.25, 0.0], rate_hz=10, deadline_policy=DeadlinePolicy.DROP)
+    assert runner.run(max_ticks=2).budget_violations == 1
+    assert runner.applied == [None, ACTION]
+    assert runner.result().metadata["late_actions_withheld"] == 1
+
+
+def test_drop_keeps_an_action_that_was_decided_in_time(clock: Any) -> None:
+    runner = Scripted(clock, [0.05], apply_s=0.08, rate_hz=10, deadline_policy=DeadlinePolicy.DROP)
+    result = runner.tick()
+    assert result.action_applied
+    assert result.deadline_missed
+
+
+def test_raise_holds_and_ends_the_run(clock: Any) -> None:
+    runner = Scripted(clock, [0.25], rate_hz=10, deadline_policy=DeadlinePolicy.RAISE)
+    with pytest.raises(DeadlineMissed, match="250\\.0 ms of its 100\\.0 ms"):
+        runner.run(max_ticks=3)
+    assert runner.applied == [None]
+
+
+def test_rate_zero_never_sleeps_and_never_misses(clock: Any) -> None:
+    runner = Scripted(clock, [5.0, 5.0], rate_hz=0, deadline_policy=DeadlinePolicy.RAISE)
+    assert runner.run(max_ticks=2).budget_violations == 0
+    assert clock.slept == []
+
+
+@pytest.mark.parametrize("rate", [-1.0, float("nan"), float("inf")])
+def test_a_rate_that_is_none_is_refused(clock: Any, rate: float) -> None:
+    with pytest.raises(ValueError, match="rate_hz"):
+        Scripted(clock, [], rate_hz=rate)
+
+
+def test_figures_of_a_run(clock: Any) -> None:
+    runner = Scripted(clock, [0.01, 0.02, 0.03, 0.04], rate_hz=10)
+    result = runner.run(max_ticks=4)
+    assert result.avg_inference_ms == pytest.approx(25.0)
+    assert result.p99_inference_ms == pytest.approx(39.7)
+    assert result.avg_tick_ms == pytest.approx(25.0)
+    assert result.p99_tick_ms == pytest.approx(39.7)
+
+
+def test_a_second_run_counts_its_own_ticks(clock: Any) -> None:
+    """Its result was of both runs; the ticks' indices still go on."""
+    runner = Scripted(clock, [0.0, 0.25, 0.01, 0.01], rate_hz=10)
+    first = runner.run(max_ticks=2)
+    assert (first.n_ticks, first.budget_violations) == (2, 1)
+    second = runner.run(max_ticks=2)
+    assert (second.n_ticks, second.budget_violations, runner.tick_idx) == (2, 0, 4)
+    assert second.avg_tick_ms == pytest.approx(10.0)
+    assert runner.result() == second
+
+
+@pytest.mark.parametrize(
+    ("values", "share", "expected"),
+    [
+        ([], 0.99, 0.0),
+        ([7.0], 0.5, 7.0),
+        ([1.0, 2.0], 0.5, 1.5),
+        ([4.0, 1.0, 3.0, 2.0], 0.99, 3.97),
+    ],
+)
+def test_percentile_interpolates(values: list[float], share: float, expected: float) -> None:
+    assert percentile(values, share) == pytest.approx(expected)
+
+
+def test_ticks_carry_the_callers_trace(clock: Any) -> None:
+    from opentelemetry import context, propagate
+
+    parent = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
+    token = context.attach(propagate.extract({"traceparent": parent}))
+    try:
+        result = Scripted(clock, []).tick()
+    finally:
+        context.detach(token)
+    assert result.trace_context is not None
+    assert result.trace_context["traceparent"].split("-")[1] == parent.split("-")[1]
+    assert Scripted(clock, []).tick().trace_context is None
+
+
+def test_make_runner_is_a_real_runner(make_runner: Callable[..., Any]) -> None:
+    assert isinstance(make_runner(), InferenceRunner)
+
+
+class Oversleeper:
+    """A manual clock on a busy machine: its sleeps end late, by so much each."""
+
+    def __init__(self, clock: Any, late_s: list[float]) -> None:
+        self._clock, self._late_s = clock, list(late_s)
+        self.now_s, self.now_ns, self.wall_ns = clock.now_s, clock.now_ns, clock.wall_ns
+
+    def sleep_s(self, duration_s: float) -> None:
+        self._clock.sleep_s(duration_s + self._late_s.pop(0))
+
+
+def test_how_far_behind_its_slot_a_tick_began_is_kept(clock: Any, tmp_path: Path) -> None:
+    runner = Scripted(clock, [0.01, 0.02], rate_hz=10)
+    runner.clock = Oversleeper(clock, [0.003, 0.0, 0.0])
+    result = runner.run(max_ticks=3)
+    assert runner.timings.late_ms == pytest.approx([0.0, 3.0, 0.0])
+    assert result.metadata["start_late_ms"] == pytest.approx({"p50": 0.0, "p99": 2.94, "max": 3.0})
+    runner.timings.write(tmp_path / "ticks.jsonl")
+    lines = [json.loads(line) for line in (tmp_path / "ticks.jsonl").read_text().splitlines()]
+    assert [line["started_s"] for line in lines] == pytest.approx([100.0, 100.103, 100.2])
+    assert [line["tick_ms"] for line in lines] == pytest.approx([10.0, 20.0, 0.0])
+    assert [line["reset"] for line in lines] == [False] * 3
+
+
+def test_only_so_many_timings_are_kept() -> None:
+    timings = Timings(kept=2)
+    for n in range(4):
+        timings.add(float(n), 0.0, float(n), 0.0)
+    assert timings.tick_ms == [2.0, 3.0]

@@ -1,0 +1,154 @@
+"""The control thread: work between ticks, failures that reach who asked, an end that leaves nobody waiting."""
+
+import asyncio
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from vram_arbiter.runner.control.thread import MAILBOX_MAX, ControlThread, Mailbox
+from vram_arbiter.runner.protocols import Goal, Hold, SkillKey, StepOutcome
+from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.schemas.errors import BadState, InternalError
+from vram_arbiter.schemas.world import WorldState
+
+Run = Callable[[Any], Any]
+Make = Callable[..., SimRunner]
+
+
+class Forever:
+    manifest: Any = None
+    key = SkillKey("test/skill")
+    holds_gpu = False
+    cameras: tuple[str, ...] = ()
+    fraction = 0.0
+
+    def wants_frames(self) -> bool:
+        return False
+
+    def step(self, world: WorldState) -> StepOutcome:
+        return Hold("for ever")
+
+
+def test_work_runs_on_the_control_thread(make_runner: Make, run_async: Run) -> None:
+    async def scenario() -> None:
+        runner = make_runner(rate_hz=500.0)
+        async with ControlThread(runner) as control:
+            name = await control.call(lambda: threading.current_thread().name)
+            assert name == "control"
+            with pytest.raises(BadState, match="no"):
+                await control.call(_refuse)
+        assert control.ended.result().n_ticks == runner.tick_idx
+
+    run_async(scenario())
+
+
+def _refuse() -> None:
+    raise BadState("no")
+
+
+def test_a_runner_that_cannot_start_says_why(make_runner: Make, env: Any, run_async: Run) -> None:
+    def broken() -> Any:
+        raise FileNotFoundError("no scene")
+
+    async def scenario() -> None:
+        control = ControlThread(SimRunner(broken, cameras=()))
+        with pytest.raises(FileNotFoundError, match="no scene"):
+            await control.__aenter__()
+        with pytest.raises(InternalError, match="does not take work"):
+            await control.call(lambda: None)
+        assert control.ended.exception() is not None
+
+    run_async(scenario())
+
+
+def test_a_loop_that_dies_fails_what_waits(make_runner: Make, env: Any, run_async: Run) -> None:
+    async def scenario() -> None:
+        async with ControlThread(make_runner(rate_hz=500.0)) as control:
+            running = asyncio.create_task(control.run_skill(Forever(), Goal("g", "r")))
+            await control.call(lambda: None)
+            await control.call(lambda: setattr(env, "step", None))  # the robot is gone
+            outcome = (await asyncio.gather(running, return_exceptions=True))[0]
+            assert isinstance(getattr(outcome, "error", outcome), InternalError)
+            with pytest.raises(InternalError):
+                await control.call(lambda: None)
+        assert isinstance(control.ended.exception(), TypeError)
+        assert env.closed == 1
+
+    run_async(scenario())
+
+
+@pytest.mark.parametrize("fails", ["at the start", "at the end"])
+def test_an_end_that_fails_leaves_nobody_waiting(
+    make_runner: Make, env: Any, run_async: Run, fails: str
+) -> None:
+    """Regression: the control thread died silently when disconnecting raised, and its waiters never
+    heard."""
+
+    def stuck() -> None:
+        raise TypeError("the driver's defect")
+
+    def broken() -> None:
+        raise FileNotFoundError("no robot")
+
+    async def scenario() -> None:
+        runner = make_runner(rate_hz=500.0)
+        runner.deactivate = stuck  # type: ignore[method-assign]
+        if fails == "at the start":
+            runner.activate = broken  # type: ignore[method-assign]
+            with pytest.raises(FileNotFoundError, match="no robot"):
+                await asyncio.wait_for(ControlThread(runner).__aenter__(), 60)
+            return
+        control = ControlThread(runner)
+        await control.__aenter__()
+        await asyncio.wait_for(control.__aexit__(), 60)
+        assert isinstance(control.ended.exception(), TypeError)
+
+    run_async(scenario())
+
+
+def test_cancelling_a_skill_takes_the_arm_back(make_runner: Make, run_async: Run) -> None:
+    async def scenario() -> None:
+        runner = make_runner(rate_hz=500.0)
+        async with ControlThread(runner) as control:
+            for _ in range(3):
+                running = asyncio.create_task(control.run_skill(Forever(), Goal("g", "r")))
+                while await control.call(lambda: runner.progress.state) != "running":
+                    await asyncio.sleep(0)
+                running.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await running
+                assert await control.call(lambda: runner.progress.state) == "idle"
+
+    run_async(scenario())
+
+
+def test_the_mailbox_is_bounded_and_fails_what_it_cannot_do() -> None:
+    mailbox, answers = Mailbox(), []
+
+    def deliver(result: Any, error: BaseException | None) -> None:
+        answers.append((result, error))
+
+    mailbox.post(lambda: 1, deliver)
+    mailbox.run_pending()
+    assert answers == [(1, None)]
+    for _ in range(MAILBOX_MAX):
+        mailbox.post(lambda: 2, deliver)
+    with pytest.raises(InternalError):
+        mailbox.post(lambda: 3, deliver)
+    mailbox.close()
+    assert len(answers) == 1 + MAILBOX_MAX
+    assert all(isinstance(error, InternalError) for _, error in answers[1:])
+
+
+def test_work_that_posts_work_does_not_hold_the_tick() -> None:
+    mailbox, done = Mailbox(), []
+
+    def again() -> None:
+        done.append(1)
+        mailbox.post(again, lambda *_: None)
+
+    mailbox.post(again, lambda *_: None)
+    mailbox.run_pending()
+    assert done == [1]

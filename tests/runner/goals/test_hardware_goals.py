@@ -1,0 +1,387 @@
+"""Goals on a robot over a real socket: the emergency stop, cancels, pictures. Control thread and server as `vram-runner deploy` has them."""
+
+import asyncio
+import subprocess
+import sys
+import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from small_robots import FedCamera, Nod, Twin
+
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.runner.__main__ import main
+from vram_arbiter.runner.control.clock import SystemClock
+from vram_arbiter.runner.control.hardware import HardwareRunner
+from vram_arbiter.runner.control.thread import ControlThread
+from vram_arbiter.runner.goals.catalogue import Catalogue
+from vram_arbiter.runner.goals.server import GoalServer
+from vram_arbiter.runner.protocols import Goal
+from vram_arbiter.runner.safety.ranges import JointRanges
+from vram_arbiter.schemas.errors import (
+    EstopRequested,
+    FrameStale,
+    InternalError,
+    LimitExceeded,
+    RobotFault,
+)
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
+from vram_arbiter.schemas.world import WorldState
+
+Run = Callable[[Any], Any]
+RSKILL = "vram-arbiter/so101-navigate"
+
+
+class Told(Nod):
+    """A nod that hangs in its start or in its step when the prompt says so."""
+
+    def __init__(self, manifest: RSkillManifest) -> None:
+        super().__init__(manifest, on_step=self._wait)
+        self.go_on = threading.Event()
+
+    async def _start(self, goal: Goal) -> None:
+        await super()._start(goal)
+        self.prompt = goal.prompt
+        if goal.prompt == "hang in the start":
+            self.begun.set()
+            await asyncio.Event().wait()
+
+    def _wait(self, world: WorldState) -> None:
+        if self.prompt == "hang in the step":
+            assert self._loop is not None
+            self._loop.call_soon_threadsafe(self.begun.set)
+            self.go_on.wait(60)
+
+
+class Bench:
+    def __init__(self, twin: Twin, camera: FedCamera, skill: Told, runner: HardwareRunner) -> None:
+        self.twin, self.camera, self.skill, self.runner = twin, camera, skill, runner
+
+
+@pytest.fixture
+def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
+    """`estop_s`: short only where the control loop hangs. A machine that stands still for a second is no loop that hangs."""
+
+    @asynccontextmanager
+    async def serving(estop_s: float = 60.0) -> AsyncIterator[tuple[Bench, RunnerClient]]:
+        clock = SystemClock()
+        twin, camera, skill = (
+            Twin(clock),
+            FedCamera("front", clock),
+            Told(load_manifest(navigate_manifest)),
+        )
+        limits = {
+            joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints
+        }
+        runner = HardwareRunner(
+            twin,
+            [(camera, 100.0)],
+            lambda _: JointRanges(limits),
+            rate_hz=200.0,
+            clock=clock,
+        )
+        catalogue = Catalogue([skill.manifest], {Kind.ROS_ACTION: lambda manifest: skill})
+        async with ControlThread(runner) as control:
+            server = GoalServer(
+                endpoint,
+                control,
+                runner,
+                catalogue,
+                clock,
+                identity={"robot": "bench"},
+                estop_s=estop_s,
+            )
+            task = asyncio.create_task(server.serve())
+            await server.bound.wait()
+            try:
+                async with RunnerClient(endpoint) as client:
+                    yield Bench(twin, camera, skill, runner), client
+            finally:
+                skill.go_on.set()
+                server.stopping.set()
+                await task
+        assert twin.story[-1] == "disconnect"
+
+    return serving
+
+
+def play(
+    run_async: Run,
+    bench: Callable[..., Any],
+    body: Callable[[Bench, RunnerClient], Any],
+    **options: Any,
+) -> None:
+    async def scenario() -> None:
+        async with bench(**options) as (b, client):
+            await body(b, client)
+
+    run_async(scenario())
+
+
+async def diagnosed(client: RunnerClient, as_what: str) -> None:
+    """Until the joints and the camera are called this. What is fresh is stale for some ticks wherever the machine stood still."""
+    while (await client.state())["world"]["diagnostics"] != {
+        "front": as_what,
+        "joint_state": as_what,
+    }:
+        await asyncio.sleep(0.05)
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command waits as long as the tests do: whether the motors are told is what counts here, not how soon."""
+    monkeypatch.setattr("vram_arbiter.runner.cli.estop.ANSWER_S", 60.0)
+
+
+@pytest.mark.parametrize("prompt", ["nod", "hang in the start"])
+def test_the_stop_fails_the_goal_and_refuses_new_ones(
+    bench: Any, run_async: Run, prompt: str
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt=prompt)
+        await b.skill.begun.wait()
+        reply = await client.estop("a hand is in the way")
+        assert "a hand is in the way; all joints stand still" in reply.message
+        assert b.twin.story == ["connect", "halt"]
+        sent = len(b.twin.sent)
+        result = await goal.result(60)
+        assert (result["status"], result["success"], result["code"]) == (
+            "failed",
+            False,
+            "estop_requested",
+        )
+        with pytest.raises(EstopRequested, match="a hand is in the way"):
+            await client.send_goal(RSKILL, prompt="nod")
+        state = await client.state()
+        assert "a hand is in the way" in state["estop"]
+        await diagnosed(client, "ok")  # it can still be looked at
+        again = await client.estop("once more")
+        assert "a hand is in the way" in again.message
+        assert len(b.twin.sent) == sent
+
+    play(run_async, bench, body)
+
+
+def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(
+    bench: Any, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        await client.send_goal(RSKILL, prompt="hang in the step")
+        await b.skill.begun.wait()
+        with pytest.raises(InternalError, match="cut the robot's power"):
+            await client.estop("it hangs")
+        with pytest.raises(EstopRequested):
+            await client.send_goal(RSKILL)
+        b.skill.go_on.set()
+        while "stand still" not in (await client.state())["estop"]:
+            await asyncio.sleep(0.01)
+        assert b.twin.sent == []  # what the step came back with was not sent
+
+    play(run_async, bench, body, estop_s=0.5)
+
+
+def test_what_was_fresh_is_stale_while_the_loop_hangs(bench: Any, run_async: Run) -> None:
+    """Regression: `state` showed the last world state, which was fresh when it was made."""
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        await client.send_goal(RSKILL, prompt="hang in the step")
+        await b.skill.begun.wait()
+        await diagnosed(client, "stale")
+        b.skill.go_on.set()
+        await diagnosed(client, "ok")
+
+    play(run_async, bench, body)
+
+
+@pytest.mark.usefixtures("patient")
+def test_the_command_line_stops_the_robot(
+    bench: Any, run_async: Run, endpoint: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        argv = ["estop", "--reason", "smoke", "--endpoint", endpoint]
+        assert await asyncio.to_thread(main, argv) == 0
+        assert b.runner.estop is not None
+        assert b.twin.story == ["connect", "halt"]
+
+    play(run_async, bench, body)
+    assert "bench: emergency stop: smoke; all joints stand still" in capfd.readouterr().out
+
+
+@pytest.mark.usefixtures("patient")
+@pytest.mark.parametrize(
+    "cause", [RobotFault("motor 2 does not answer"), TypeError("a driver's defect")]
+)
+def test_a_stop_that_did_not_reach_the_motors_is_no_success_and_is_tried_again(
+    bench: Any, run_async: Run, endpoint: str, capfd: pytest.CaptureFixture[str], cause: Exception
+) -> None:
+    """Regression: the runner counted the attempt as the stop: a lost packet left the motors running
+    and the command exited 0."""
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        b.twin.halt_breaks = cause
+        goal = await client.send_goal(RSKILL, prompt="nod")
+        await b.skill.begun.wait()
+        argv = ["estop", "--reason", "smoke", "--endpoint", endpoint]
+        assert await asyncio.to_thread(main, argv) == 1
+        assert "cut the robot's power" in capfd.readouterr().err
+        assert (await goal.result(60))["code"] == "estop_requested"
+        assert "halt" not in b.twin.story
+        b.twin.halt_breaks = None  # the bus is back: nobody has to ask again
+        while "halt" not in b.twin.story:
+            await client.state()
+        assert await asyncio.to_thread(main, argv) == 0
+        said = capfd.readouterr().out
+        assert "emergency stop: smoke; all joints stand still" in said
+        assert b.twin.story.count("halt") == 1
+
+    play(run_async, bench, body)
+
+
+def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_being_read(
+    bench: Any, run_async: Run
+) -> None:
+    """Regression: requests that waited for a hanging control loop held all slots, so a stop was not
+    read."""
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        await client.send_goal(RSKILL, prompt="hang in the step")
+        await b.skill.begun.wait()
+        flood = [asyncio.create_task(client.frame("front", max_age_ms=60_000)) for _ in range(100)]
+        await asyncio.wait(flood, return_when=asyncio.FIRST_COMPLETED)
+        with pytest.raises(InternalError, match="cut the robot's power"):
+            await client.estop("it hangs")
+        assert b.runner.estop is not None
+        b.skill.go_on.set()
+        answers = await asyncio.gather(*flood, return_exceptions=True)
+        assert any(isinstance(answer, LimitExceeded) for answer in answers)
+        assert b.twin.sent == []
+
+    play(run_async, bench, body, estop_s=0.5)
+
+
+@pytest.mark.parametrize("reason", ["x" * 10_000, "smoke \udcff", "\x1b[2J\n\u202e", ""])
+def test_a_stop_is_not_refused_for_its_words(bench: Any, run_async: Run, reason: str) -> None:
+    """Regression: a reason of more than 500 characters made the runner refuse the stop."""
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        assert "stand still" in (await client.estop(reason)).message
+        assert b.runner.estop is not None
+        assert b.twin.story == ["connect", "halt"]
+
+    play(run_async, bench, body)
+
+
+def test_whoever_names_no_endpoint_stops_the_system_service_too(
+    bench: Any,
+    run_async: Run,
+    endpoint: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: Any,
+) -> None:
+    """Regression: a login shell has another runtime folder, so `vram-runner estop` did not find the
+    system service."""
+    monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(tmp_path / "of-this-login"))
+    monkeypatch.setattr(
+        "vram_arbiter.runner.cli.estop.SYSTEM_RUNTIME",
+        endpoint.removeprefix("ipc://").rpartition("/")[0],
+    )
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
+        assert b.twin.story == ["connect", "halt"]
+        (tmp_path / "of-this-login").mkdir()
+        (
+            tmp_path / "of-this-login" / "runner.sock"
+        ).touch()  # nobody answers there: was that the robot that moves?
+        assert await asyncio.to_thread(main, ["estop"]) == 1
+        said = capfd.readouterr()
+        assert said.out.count("bench: emergency stop: smoke") == 2
+        assert "cut its power" in said.err
+
+    play(run_async, bench, body)
+
+
+def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_from_being_stopped(
+    bench: Any, run_async: Run, endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: the path was checked before anything was stopped."""
+    monkeypatch.setenv("VRAM_ARBITER_RUNTIME", "not/absolute")
+    monkeypatch.setattr(
+        "vram_arbiter.runner.cli.estop.SYSTEM_RUNTIME",
+        endpoint.removeprefix("ipc://").rpartition("/")[0],
+    )
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
+        assert b.twin.story == ["connect", "halt"]
+
+    play(run_async, bench, body)
+
+
+def test_a_stop_does_not_wait_for_the_imports_of_other_commands(endpoint: str) -> None:
+    code = (
+        "import sys; from vram_arbiter.runner.__main__ import main; "
+        "code = main(['estop', '--endpoint', sys.argv[1]]); "
+        "print(code, sorted({'vram_arbiter.runner.cli.deploy', 'vram_arbiter.runner.cli.sim', 'pydantic', 'numpy', 'zmq', 'msgpack'} & set(sys.modules)))"
+    )
+    argv = [sys.executable, "-c", code, endpoint]
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "1 []"
+
+
+def test_a_stop_that_nobody_hears_is_an_error(
+    endpoint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["estop", "--endpoint", endpoint]) == 1
+    assert "cut its power" in capsys.readouterr().err
+
+
+def test_a_canceled_goal_leaves_the_arm_where_it_was_sent(bench: Any, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="nod")
+        await b.skill.begun.wait()
+        await goal.cancel()
+        assert (await goal.result(60))["status"] == "canceled"
+        sent = len(b.twin.sent)
+        ticks = (await client.state())["ticks"]
+        while (await client.state())["ticks"] < ticks + 5:
+            pass
+        assert len(b.twin.sent) == sent
+        assert (await client.state())["estop"] is None
+
+    play(run_async, bench, body)
+
+
+def test_a_goal_is_limited_in_ticks(bench: Any, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="nod", max_ticks=4)
+        result = await goal.result(60)
+        assert (result["status"], result["code"]) == ("failed", "limit_exceeded")
+        assert (
+            result["data"]["ticks"] >= 4
+        )  # more where the machine stood still, and the skill was not asked
+        assert b.skill.taken <= 4
+
+    play(run_async, bench, body)
+
+
+@pytest.mark.heavy
+def test_pictures_go_out_in_their_colours_and_a_dead_camera_gives_none(
+    bench: Any, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        import cv2
+        import numpy as np
+
+        reply = await client.frame("front", max_age_ms=60_000, encoding="png")
+        picture = cv2.imdecode(np.frombuffer(reply["data"], dtype=np.uint8), cv2.IMREAD_COLOR)
+        assert picture.tolist() == [[[255, 0, 0], [0, 0, 255]]]
+        b.camera.stop()
+        with pytest.raises(FrameStale, match="stopped"):
+            await client.frame("front", max_age_ms=60_000)
+
+    play(run_async, bench, body)

@@ -1,0 +1,585 @@
+"""The goal server over real sockets with the real client: one goal at a time, exactly one result, whatever happens."""
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+import zmq
+import zmq.asyncio
+
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.runner.control.clock import SystemClock
+from vram_arbiter.runner.control.thread import ControlThread
+from vram_arbiter.runner.goals.catalogue import Catalogue, read_manifests
+from vram_arbiter.runner.goals.one_goal import LISTENERS_MAX
+from vram_arbiter.runner.goals.server import GoalServer
+from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
+from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.runner.skills.base import SkillBase
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import (
+    AlreadyRunning,
+    BadRequest,
+    BadState,
+    EstopRequested,
+    Evicted,
+    GoalRejected,
+    ManifestInvalid,
+    SidecarUnavailable,
+    UnknownOp,
+    UnknownSkill,
+)
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
+from vram_arbiter.schemas.world import Action, WorldState
+
+Run = Callable[[Any], Any]
+RSKILL = "vram-arbiter/so101-navigate"
+
+
+class Told(SkillBase):
+    """Does what the goal's prompt says: ends, waits, fails, or hangs in its start."""
+
+    def __init__(self, manifest: RSkillManifest) -> None:
+        super().__init__(manifest)
+        self.story: list[str] = []
+        self.begun = asyncio.Event()
+        self.finishing, self.finished = asyncio.Event(), asyncio.Event()
+        self.loop = asyncio.get_running_loop()
+
+    async def _start(self, goal: Goal) -> None:
+        self.story.append(f"start {goal.prompt}")
+        self.todo = goal.prompt
+        self.steps = 0
+        self.begun.clear()
+        if goal.prompt == "hang":
+            self.begun.set()
+            await asyncio.Event().wait()
+        if goal.prompt in ("unavailable", "unavailable for ever"):
+            raise SidecarUnavailable("no process", hint="start it")
+
+    def _step(self, world: WorldState) -> StepOutcome:
+        self.steps += 1
+        self.loop.call_soon_threadsafe(self.begun.set)
+        match self.todo:
+            case "end with a set":
+                return Done({"seen": {1, 2}})
+            case "end with a large number":
+                return Done({"seen": 2**70})
+            case "end" | "end, and leave slowly" | "end slowly" | "end badly" if self.steps > 3:
+                return Done({"steps": self.steps})
+            case "evicted" if self.steps > 2:
+                raise Evicted("another model is there")
+            case "defect":
+                raise ZeroDivisionError("oops")
+        row = (
+            0.01 * (self.steps % 20),
+        ) * 2  # to and fro within the joints' ranges: "forever" is as long as a test is
+        names = ("shoulder_pan", "wrist_roll")
+        if self.steps % 2:
+            return Hold("thinking")
+        return Act(
+            Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), joint_names=names)
+        )
+
+    async def _finish(self) -> None:
+        self.story.append("finish")
+        if self.todo == "end slowly":
+            self.finishing.set()
+            await self.finished.wait()
+        if self.todo in ("end badly", "unavailable for ever"):
+            raise ZeroDivisionError("oops")
+
+    async def _release(self) -> None:
+        self.story.append("release")
+        if self.todo == "end, and leave slowly":
+            self.finishing.set()
+            await self.finished.wait()
+
+
+class Bench:
+    def __init__(self, runner: SimRunner, server: GoalServer, env: Any, made: list[Told]) -> None:
+        self.runner, self.server, self.env, self.made = runner, server, env, made
+
+
+@pytest.fixture
+def bench(
+    make_runner: Callable[..., SimRunner], env: Any, endpoint: str, navigate_manifest: Path
+) -> Callable[..., Any]:
+    @asynccontextmanager
+    async def serving() -> AsyncIterator[Bench]:
+        made: list[Told] = []
+
+        def make(manifest: RSkillManifest) -> Told:
+            made.append(Told(manifest))
+            return made[-1]
+
+        runner = make_runner(rate_hz=200.0)
+        catalogue = Catalogue([load_manifest(navigate_manifest)], {Kind.ROS_ACTION: make})
+        async with ControlThread(runner) as control:
+            await control.call(lambda: None)
+            server = GoalServer(
+                endpoint,
+                control,
+                runner,
+                catalogue,
+                SystemClock(),
+                ground_truth=lambda: {"target": "red cube"},
+                estop_s=60.0,  # a machine that stands still for a second is no loop that hangs
+            )
+            task = asyncio.create_task(server.serve())
+            await server.bound.wait()
+            try:
+                yield Bench(runner, server, env, made)
+            finally:
+                server.stopping.set()
+                await task
+
+    return serving
+
+
+def play(
+    run_async: Run,
+    bench: Callable[..., Any],
+    endpoint: str,
+    body: Callable[[Bench, RunnerClient], Any],
+) -> None:
+    async def scenario() -> None:
+        async with bench() as b, RunnerClient(endpoint) as client:
+            await body(b, client)
+
+    run_async(scenario())
+
+
+def test_a_goal_feeds_back_and_ends_with_one_result(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="end")
+        states = [feedback["state"] async for feedback in goal.feedback()]
+        result = await goal.result(60)
+        assert (result["status"], result["success"], result["code"]) == ("succeeded", True, "")
+        assert result["data"]["steps"] == 4
+        assert states
+        assert b.made[0].story == ["start end", "finish"]
+        again = await client.call("result", {"goal_id": goal.goal_id})
+        assert again["status"] == "succeeded"
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_the_next_goal_of_the_same_skill_reuses_it(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        for _ in range(3):
+            assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
+        assert len(b.made) == 1
+        assert b.made[0].story == ["start end", "finish"] * 3
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_second_goal_is_refused_and_the_first_goes_on(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        first = await client.send_goal(RSKILL, prompt="forever", goal_id="one")
+        with pytest.raises(GoalRejected, match="goal one"):
+            await client.send_goal(RSKILL, prompt="end")
+        assert not first.done
+        await first.cancel()
+        assert (await first.result(60))["status"] == "canceled"
+        assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
+
+    play(run_async, bench, endpoint, body)
+
+
+@pytest.mark.parametrize("by", ["cancel", "estop"])
+def test_a_cancel_or_stop_while_a_goal_finishes_does_not_cost_its_result(
+    bench: Any, endpoint: str, run_async: Run, by: str
+) -> None:
+    """Regression: one cancellation hit the task that answers for the goal, and every later goal was
+    refused."""
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="end slowly")
+        while not b.made:
+            await asyncio.sleep(0)
+        await b.made[0].finishing.wait()
+        await (goal.cancel() if by == "cancel" else client.estop("smoke"))
+        b.made[0].finished.set()
+        assert (await goal.result(60))["status"] == "succeeded"  # it was over by then
+        assert (await client.state())["goal"] is None
+        if by == "cancel":
+            again = await client.send_goal(RSKILL, prompt="end")
+            assert (await again.result(60))["success"]
+
+    play(run_async, bench, endpoint, body)
+
+
+@pytest.mark.parametrize("what", ["set", "large number"])
+def test_a_result_that_no_wire_carries_still_reaches_the_client(
+    bench: Any, endpoint: str, run_async: Run, what: str
+) -> None:
+    """Regression: a skill's own data held values that msgpack does not carry, and the client never
+    heard of the end."""
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt=f"end with a {what}")
+        result = await goal.result(60)
+        assert result["success"]
+        assert "seen" in result["data"]["unsendable"]
+        assert (await client.call("result", {"goal_id": goal.goal_id}))["status"] == "succeeded"
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_no_goal_is_accepted_once_the_control_loop_has_ended(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    """Regression: only a signal counted as stopping, so a goal was accepted and would have loaded
+    its model."""
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="end, and leave slowly")
+        assert (await goal.result(60))["success"]
+        b.runner.request_stop()
+        await b.made[0].finishing.wait()
+        with pytest.raises(GoalRejected, match="stopping"):
+            await client.send_goal(RSKILL, prompt="end")
+        b.made[0].finished.set()
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_skill_that_could_not_undo_a_failed_start_can_be_started_again(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    """Regression: such a skill stayed `starting` and was refused for ever."""
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="unavailable for ever")
+        assert (await goal.result(60))["status"] == "failed"
+        assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_skill_that_breaks_while_it_finishes_still_gives_a_result(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    """Regression: a skill that failed in `finish` lost the result, and every later goal was
+    refused."""
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="end badly")
+        assert (await goal.result(60))["success"]
+        assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
+
+    play(run_async, bench, endpoint, body)
+
+
+@pytest.mark.parametrize("prompt", ["forever", "hang"])
+def test_cancel_takes_the_arm_back(bench: Any, endpoint: str, run_async: Run, prompt: str) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt=prompt)
+        while not b.made or not b.made[0].begun.is_set():
+            await asyncio.sleep(0.01)
+        await goal.cancel()
+        result = await goal.result(60)
+        assert (result["status"], result["success"]) == ("canceled", False)
+        assert b.made[0].story[-1] == "finish"
+        steps = b.made[0].steps
+        if prompt == "forever":  # it had the arm
+            assert result["data"]["ticks"] == steps
+            assert result["data"]["withheld"] == 0
+        else:
+            assert set(result["data"]) == {"elapsed_s"}
+        await goal.cancel()  # late and harmless
+        await client.state()
+        assert b.made[0].steps == steps
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_cancel_right_behind_the_goal_still_gives_a_result(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        socket = zmq.asyncio.Context.instance().socket(zmq.DEALER)
+        try:
+            socket.connect(endpoint)
+            await socket.send(
+                msgpack.packb(
+                    {"op": "goal", "id": 1, "goal_id": "g", "rskill_id": RSKILL, "prompt": "hang"}
+                )
+            )
+            await socket.send(msgpack.packb({"op": "cancel", "id": 2, "goal_id": "g"}))
+            results = []
+            while not results:
+                message = msgpack.unpackb(await socket.recv())
+                results += [message] if message.get("push") == "result" else []
+            assert results[0]["status"] == "canceled"
+        finally:
+            socket.close(0)
+
+    play(run_async, bench, endpoint, body)
+
+
+@pytest.mark.parametrize("prompt", ["forever", "hang"])
+def test_a_deadline_is_no_success(bench: Any, endpoint: str, run_async: Run, prompt: str) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt=prompt, deadline_s=0.3)
+        result = await goal.result(60)
+        assert (result["status"], result["success"]) == ("deadline", False)
+        assert b.made[0].story[-1] == "finish"
+
+    play(run_async, bench, endpoint, body)
+
+
+@pytest.mark.parametrize(
+    ("prompt", "code"),
+    [("evicted", "evicted"), ("unavailable", "sidecar_unavailable"), ("defect", "internal")],
+)
+def test_failures_are_typed(
+    bench: Any, endpoint: str, run_async: Run, prompt: str, code: str
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        result = await (await client.send_goal(RSKILL, prompt=prompt)).result(60)
+        assert (result["status"], result["success"], result["code"]) == ("failed", False, code)
+        assert result["message"]
+        assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_client_that_vanished_finds_its_result(bench: Any, endpoint: str, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        async with RunnerClient(endpoint) as gone:
+            await gone.send_goal(RSKILL, prompt="end", goal_id="mine")
+        while True:
+            try:
+                result = await client.call("result", {"goal_id": "mine"})
+                break
+            except BadState:  # still running
+                await asyncio.sleep(0.02)
+        assert result["status"] == "succeeded"
+        with pytest.raises(GoalRejected, match="has ended"):
+            await client.send_goal(RSKILL, prompt="end", goal_id="mine")
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_the_same_goal_sent_again_is_the_same_goal(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="forever", goal_id="same")
+        async with RunnerClient(endpoint) as other:
+            again = await other.send_goal(RSKILL, prompt="forever", goal_id="same")
+            await again.cancel()
+            assert (await again.result(60))["status"] == "canceled"
+        assert (await goal.result(60))["status"] == "canceled"
+        assert b.made[0].story == ["start forever", "finish"]
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_goal_sent_from_ever_new_connections_is_told_on_the_newest(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="forever", goal_id="same")
+        async with AsyncExitStack() as stack:
+            for _ in range(LISTENERS_MAX):
+                newest = await stack.enter_async_context(RunnerClient(endpoint))
+                again = await newest.send_goal(RSKILL, prompt="forever", goal_id="same")
+            assert b.server._goals._running is not None
+            assert len(b.server._goals._running.peers) == LISTENERS_MAX
+            await again.cancel()
+            assert (await again.result(60))["status"] == "canceled"
+        assert (await client.call("result", {"goal_id": goal.goal_id}))["status"] == "canceled"
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_reads(bench: Any, endpoint: str, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        assert (await client.ping(timeout_s=60))["goal_id"] is None
+        assert (await client.ground_truth())["target"] == "red cube"
+        installed = await client.skills()
+        assert installed["body"] is None, "this bench takes any skill"
+        skills = installed["skills"]
+        assert [(skill["name"], skill["kind"]) for skill in skills] == [(RSKILL, "ros_action")]
+        state = await client.state()
+        assert state["phase"] == "idle"
+        assert state["world"]["base_pose"]["frame_id"] == "map"
+        with pytest.raises(BadRequest, match="no camera 'rear'"):
+            await client.call("frame", {"camera": "rear"})
+
+    play(run_async, bench, endpoint, body)
+
+
+@pytest.mark.parametrize(
+    ("message", "code"),
+    [
+        (b"\xc1\xc1", "bad_frame"),
+        (msgpack.packb([1, 2]), "bad_frame"),
+        (msgpack.packb({"op": "dance", "id": 1}), "unknown_op"),
+        (msgpack.packb({"id": 1}), "unknown_op"),
+        (msgpack.packb({"op": "goal", "id": 1, "goal_id": "g"}), "bad_request"),
+        (
+            msgpack.packb(
+                {"op": "goal", "id": 1, "goal_id": "g", "rskill_id": "x", "deadline_s": -1}
+            ),
+            "bad_request",
+        ),
+        (
+            msgpack.packb({"op": "goal", "id": 1, "goal_id": "g", "rskill_id": "a/b"}),
+            "unknown_skill",
+        ),
+        (msgpack.packb({"op": "ping", "id": 1, "extra": 1}), "bad_request"),
+        (msgpack.packb({"op": "ping", "id": "one"}), "bad_request"),
+        (msgpack.packb({"op": "cancel", "id": 1, "goal_id": "none"}), "bad_request"),
+        (msgpack.packb({"op": "result", "id": 1, "goal_id": "none"}), "bad_request"),
+    ],
+)
+def test_bad_input_gets_an_answer_and_harms_nothing(
+    bench: Any, endpoint: str, run_async: Run, message: bytes, code: str
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        socket = zmq.asyncio.Context.instance().socket(zmq.DEALER)
+        try:
+            socket.connect(endpoint)
+            await socket.send(message)
+            reply = msgpack.unpackb(await socket.recv())
+            assert reply["error"]["code"] == code
+            assert reply["error"]["message"]
+        finally:
+            socket.close(0)
+        assert (await client.ping(timeout_s=60))["ok"]
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_shutdown_answers_cancels_and_ends(bench: Any, endpoint: str, run_async: Run) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="forever")
+        await client.shutdown()
+        assert (await goal.result(60))["status"] == "canceled"
+        assert b.made[0].story == ["start forever", "finish", "release"]
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_second_runner_on_the_same_socket_is_refused(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    async def scenario() -> None:
+        async with bench() as b, RunnerClient(endpoint) as client:
+            control = b.server._control
+            second = GoalServer(endpoint, control, b.runner, b.server._catalogue, SystemClock())
+            with pytest.raises(AlreadyRunning):
+                await second.serve()
+            assert (await client.ping(timeout_s=60))["ok"]
+
+    run_async(scenario())
+
+
+def test_only_skills_that_move_something_can_be_executed(navigate_manifest: Path) -> None:
+    manifest = load_manifest(navigate_manifest)
+    with pytest.raises(UnknownSkill, match="choose from"):
+        Catalogue([manifest], {Kind.ROS_ACTION: Told}).find("no/such")
+    with pytest.raises(UnknownSkill, match=r"installed as 0\.1\.0"):
+        Catalogue([manifest], {Kind.ROS_ACTION: Told}).find(RSKILL, "9.9.9")
+    detector = manifest.model_copy(update={"kind": Kind.DETECTOR})
+    with pytest.raises(UnknownSkill, match="is a detector"):
+        Catalogue([detector], {Kind.DETECTOR: Told}).find(RSKILL)
+
+
+def test_manifests_are_read_from_folders_and_checked(
+    tmp_path: Path, navigate_manifest: Path
+) -> None:
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one/rskill.yaml").write_text(navigate_manifest.read_text())
+    assert [manifest.name for manifest in read_manifests([tmp_path])] == [RSKILL]
+    with pytest.raises(ManifestInvalid, match="installed twice"):
+        read_manifests([tmp_path, navigate_manifest])
+    (tmp_path / "one/rskill.yaml").write_text("name: x\n")
+    with pytest.raises(ManifestInvalid, match="rskill"):
+        read_manifests([tmp_path])
+    (tmp_path / "one/empty").mkdir()
+    with pytest.raises(ManifestInvalid, match="no skill"):
+        read_manifests([tmp_path / "one" / "empty"])
+
+
+@pytest.mark.parametrize("prompt", ["forever", "hang"])
+def test_the_emergency_stop_of_a_simulator_ends_its_goal_too(
+    bench: Any, endpoint: str, run_async: Run, prompt: str
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt=prompt)
+        while not b.made:
+            await client.ping(timeout_s=60)
+        await b.made[0].begun.wait()
+        assert "emergency stop: smoke" in (await client.estop("smoke")).message
+        result = await goal.result(60)
+        assert (result["status"], result["code"]) == ("failed", "estop_requested")
+        assert b.made[0].story == [f"start {prompt}", "finish"]
+        with pytest.raises(EstopRequested, match="smoke"):
+            await client.send_goal(RSKILL, prompt="end")
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_a_goal_runs_when_it_has_the_arm_and_not_before(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    """Regression: until the control thread took it up, a goal was fed back with the progress of the goal before: ended, all of it done."""
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        first = await client.send_goal(RSKILL, prompt="end")
+        assert (await first.result(60))["success"]
+        assert b.runner.progress.state == "ended"
+        busy, go_on = threading.Event(), threading.Event()
+
+        def hold_up() -> None:
+            busy.set()
+            go_on.wait(60)
+
+        b.runner.mailbox.post(hold_up, lambda *_: None)
+        await asyncio.to_thread(busy.wait, 60)
+        second = await client.send_goal(RSKILL, prompt="wait")
+        feedback = aiter(second.feedback())
+        while (told := await anext(feedback))["state"] != "starting":
+            assert told["state"] == "acquiring"
+        told = await anext(feedback)  # said again, since nothing changes
+        assert (told["state"], told["progress"]) == ("starting", 0.0)
+        assert (await client.state())["phase"] == "starting"
+        go_on.set()
+        while (told := await anext(feedback))["state"] == "starting":
+            assert told["progress"] == 0.0
+        assert told["state"] == "running"
+        await second.cancel()
+        assert (await second.result(60))["status"] == "canceled"
+
+    play(run_async, bench, endpoint, body)
+
+
+def test_an_answer_does_not_repeat_a_mebibyte_of_mistakes(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    async def body(b: Bench, client: RunnerClient) -> None:
+        with pytest.raises(UnknownOp) as unknown:
+            await client.call("x" * 1_000_000)
+        with pytest.raises(BadRequest) as wrong:
+            await client.call("state", {"k" * 1_000_000: 0})
+        assert len(str(unknown.value)) < 1000
+        assert len(str(wrong.value)) < 1000
+
+    play(run_async, bench, endpoint, body)

@@ -1,0 +1,369 @@
+"""Recording for real: a writer's process, lerobot's files on disk, lerobot's own reader; and what is left when something is killed."""
+
+import io
+import json
+import logging
+import os
+import shutil
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vram_arbiter.runner import __main__ as program
+from vram_arbiter.runner.cli.replay import as_text
+from vram_arbiter.runner.protocols import Transition
+from vram_arbiter.runner.recording import commit, wire
+from vram_arbiter.runner.recording.lerobot_files import LerobotFiles, features_of, frame_of
+from vram_arbiter.runner.recording.reader import read_frame
+from vram_arbiter.runner.recording.recorder import QUEUE_TICKS, DatasetRecorder, whole_rate
+from vram_arbiter.runner.recording.rows import row_of
+from vram_arbiter.runner.recording.writer import EpisodeWriter
+from vram_arbiter.schemas.errors import (
+    AlreadyRunning,
+    BadRequest,
+    ConfigError,
+    InternalError,
+    VramError,
+)
+
+sys.path.insert(0, str(Path(__file__).parent))  # for the helper beside it
+
+from ticks import DONE, FAILED, HEIGHT, TRACE, WIDTH, goal, picture, span_of, tick
+
+pytestmark = [
+    pytest.mark.heavy,
+    pytest.mark.timeout(600),
+]  # lerobot, torch: seconds to import, a minute on a busy machine
+
+WAIT_S = 280.0
+FIRST, SECOND = goal("g1", "grab the cube"), goal("g2", "put it down")
+
+
+def recorder(root: Path, **options: Any) -> DatasetRecorder:
+    given: dict[str, Any] = {"rate_hz": 30.0, "cameras": lambda: ("front",), "robot": "bench"}
+    return DatasetRecorder(root, **given | options)
+
+
+def until(so: Callable[[], bool]) -> None:
+    until_s = time.monotonic() + WAIT_S
+    while not so():
+        assert time.monotonic() < until_s, "it never came"
+        time.sleep(0.01)
+
+
+def play(made: DatasetRecorder, of: Any, ended: Any, ticks: int, **options: Any) -> None:
+    for index in range(ticks):
+        made.tick(tick(index, of=of, **options))
+    made.goal_ended(of, ended)
+
+
+def lerobot_reads(root: Path, monkeypatch: pytest.MonkeyPatch, cache: Path) -> Any:
+    """The dataset by lerobot's own class, offline."""
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    import datasets
+    from lerobot.datasets import LeRobotDataset
+
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", cache)
+    return LeRobotDataset("local/recording", root=root, video_backend="pyav")
+
+
+@dataclass(frozen=True)
+class Recorded:
+    root: Path
+    first: DatasetRecorder
+    second: DatasetRecorder
+    cut_off: bool  # after the first run
+    said: str  # by the second one
+    blocked: VramError | None  # what it said of a goal whose files could not be written
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """Two goals in a first run, whose writer is killed in a third; then a second run with goals that fit and goals that do not."""
+    root = tmp_path_factory.mktemp("recorded") / "set"
+    first = recorder(root)
+    first.start()
+    first.tick(tick(0, of=FIRST, targets={"pan": 0.0}))  # nobody has told the gripper anything yet
+    play(first, FIRST, DONE, 6)
+    play(first, SECOND, FAILED, 4)
+    until(lambda: first.episodes == 2)
+    for index in range(QUEUE_TICKS):
+        first.tick(tick(index, of=goal("lost")))
+    until((root / commit.FOLDER / commit.OPEN).exists)
+    os.kill(first.pid, signal.SIGKILL)
+    first.close()
+    first.tick(tick(0))  # the robot goes on
+    cut_off = not read_frame(root, 9).complete  # and what was finished can be read
+
+    said = io.StringIO()
+    handler = logging.StreamHandler(said)
+    logging.getLogger("vram_arbiter.runner.recording").addHandler(handler)
+    small = {"front": picture("front", 1, width=16, height=16, data=bytes(16 * 16 * 3))}
+    torn = {"front": picture("front", 1, encoding="jpeg", data=b"no jpeg")}
+    second = recorder(root)
+    second.start()
+    try:
+        with pytest.raises(AlreadyRunning), commit.locked(root, 0.0):
+            pass
+        in_the_way = root / "data/chunk-000/file-002.parquet"
+        in_the_way.mkdir()
+        play(second, goal("blocked"), DONE, 2)
+        until(lambda: second.error is not None)
+        blocked = second.error
+        in_the_way.rmdir()
+        play(second, goal("small"), DONE, 3, frames=small)
+        play(second, goal("g3"), None, 3)
+        play(second, goal("short"), DONE, 1)
+        second.tick(tick(0, of=goal("torn"), frames=torn))
+        play(second, goal("torn"), DONE, 2)
+    finally:
+        second.close()
+        logging.getLogger("vram_arbiter.runner.recording").removeHandler(handler)
+    return Recorded(root, first, second, cut_off, said.getvalue(), blocked)
+
+
+def test_lerobots_own_reader_finds_every_tick(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    dataset = lerobot_reads(recorded.root, monkeypatch, tmp_path)
+    assert (dataset.num_episodes, len(dataset), dataset.fps) == (4, 15, 30)
+    assert dataset.meta.robot_type == "bench"
+    assert dataset.meta.features["observation.state"]["names"] == ["pan", "grip"]
+    rows = [dataset[index] for index in range(15)]
+    assert [int(row["episode_index"]) for row in rows] == [0] * 6 + [1] * 4 + [2] * 3 + [3] * 2
+    assert [row["task"] for row in rows] == ["grab the cube"] * 6 + ["put it down"] * 4 + [
+        "grab the cube"
+    ] * 5
+    for row, index in zip(rows, [*range(6), *range(4), *range(3), *range(2)], strict=True):
+        assert row["observation.state"].tolist() == pytest.approx([0.1 * index, 0.5])
+        assert row["action"].tolist() == pytest.approx([0.1 * index + 0.05, 0.4])
+        assert (row["trace_id"], row["span_id"], bool(row["trace_sampled"])) == (
+            TRACE,
+            span_of(index),
+            True,
+        )
+        assert int(row["tick.index"]) == 100 + index
+        assert float(row["timestamp"]) == pytest.approx(index / 30)
+        seen = row["observation.images.front"]
+        assert tuple(seen.shape) == (3, HEIGHT, WIDTH)
+        assert float(seen.mean()) * 255 == pytest.approx(
+            10 * index, abs=3
+        )  # the picture of this very tick
+    assert [index for index, row in enumerate(rows) if row["next.done"]] == [5, 9, 12, 14]
+    assert "next.success" not in dataset.meta.features, "no world judged"
+
+
+def test_a_run_says_what_it_recorded_and_what_not(recorded: Recorded) -> None:
+    first, second = recorded.first, recorded.second
+    assert (first.episodes, first.frames, first.dropped) == (2, 10, 0)
+    assert dict(first.incomplete) == {"joint grip has no target yet": 1}
+    assert "1 ticks left out: joint grip has no target yet" in first.summary()
+    assert (second.episodes, second.frames) == (2, 5)
+    assert (first.facts()["left_out"], first.facts()["skipped"], second.facts()["skipped"]) == (
+        1,
+        0,
+        1,
+    )
+    assert second.facts()["error"] == second.error.message
+    notes = commit.notes(recorded.root)
+    kept = [(note["goal_id"], note["status"], note["code"], note["incomplete"]) for note in notes]
+    assert kept == [
+        ("g1", "succeeded", "", 1),
+        ("g2", "failed", "model_error", 0),
+        ("g3", "taken_back", "", 0),
+        ("torn", "succeeded", "", 1),
+    ]
+    assert not (recorded.root / commit.FOLDER / commit.CACHE).exists()
+
+
+def test_a_killed_writer_is_said_and_the_next_recording_mends(recorded: Recorded) -> None:
+    assert isinstance(recorded.first.error, InternalError)
+    assert "NOT ALL WAS RECORDED" in recorded.first.summary()
+    assert recorded.cut_off
+    assert (
+        "an earlier recording was cut off: an episode was being written; it is lost"
+        in recorded.said
+    )
+
+
+def test_a_disk_that_takes_nothing_costs_the_goal_and_no_more(recorded: Recorded) -> None:
+    assert isinstance(recorded.blocked, InternalError)
+    assert "file-002.parquet" in recorded.blocked.message
+    assert (
+        read_frame(recorded.root, 10).goal["goal_id"] == "g3"
+    )  # its files have the name that was taken
+
+
+def test_a_goal_with_other_columns_is_said_and_costs_only_itself(recorded: Recorded) -> None:
+    assert isinstance(recorded.second.error, ConfigError)
+    assert "recorded with other columns: observation.images.front" in recorded.second.error.message
+    assert "goal short is not recorded: 1 rows are no episode" in recorded.said
+
+
+def test_a_damaged_dataset_is_said_and_not_touched(recorded: Recorded, tmp_path: Path) -> None:
+    """A page that cannot be unpacked: the file's end, which is read first, is whole."""
+    root = tmp_path / "set"
+    shutil.copytree(recorded.root, root)
+    (damaged, *_) = sorted((root / "meta/episodes").rglob("*.parquet"))
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[:100] + bytes(300) + whole[400:])
+    with pytest.raises(ConfigError, match="cannot be read"):
+        LerobotFiles(root, fps=30, robot="bench").totals()
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_frame(root, 0)
+
+
+# -- replay ----------------------------------------------------------------------------------------------------------
+def test_a_frame_leads_back_to_its_tick_and_trace(recorded: Recorded) -> None:
+    found = read_frame(recorded.root, 8)
+    assert (found.episode, found.frame_in_episode, found.task) == (1, 2, "put it down")
+    assert (found.trace_id, found.span_id, found.trace_sampled) == (TRACE, span_of(2), True)
+    assert dict(found.state) == pytest.approx({"pan": 0.2, "grip": 0.5})
+    assert dict(found.action) == pytest.approx({"pan": 0.25, "grip": 0.4})
+    assert found.timings_ms["inference"] == 3.0
+    assert found.goal["status"] == "failed"
+    assert Path(found.pictures["front"]["path"]).is_file()
+    assert found.complete
+    assert read_frame(recorded.root, 2, episode=1) == found
+
+
+def record_verdicts(root: Path, *verdicts: bool | None) -> list[wire.Header]:
+    """An episode of two ticks for each word of a world; what the writer answered."""
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        writer = EpisodeWriter(theirs, LerobotFiles(root, fps=30, robot="bench"))
+        for said in verdicts:
+            try:
+                for index in range(2):
+                    writer.row(
+                        *row_of(tick(index, of=goal(str(said)), frames={}, success=said), ())
+                    )
+                writer.ended({"goal_id": str(said), "status": "succeeded"})
+            except ConfigError as error:
+                writer.failed(str(said), error)
+        theirs.shutdown(socket.SHUT_RDWR)
+        answers = []
+        while (answer := wire.receive(ours)) is not None:
+            answers.append(answer[0])
+        return answers
+
+
+def test_success_is_what_the_world_says_and_no_skill(tmp_path: Path) -> None:
+    """Regression: a live grab that lifted nothing was recorded with `next.success` true, because
+    its skill said that it was done. Policies are trained on this column."""
+    record_verdicts(tmp_path / "judged", False, True)
+    said = [read_frame(tmp_path / "judged", 1, episode).tick["success"] for episode in range(2)]
+    assert said == [False, True]
+    assert [note["judged"] for note in commit.notes(tmp_path / "judged")] == [False, True]
+
+    record_verdicts(tmp_path / "live", None, True)
+    assert [read_frame(tmp_path / "live", 1, episode).tick["success"] for episode in range(2)] == [
+        None
+    ] * 2
+    assert (
+        "next.success" not in json.loads((tmp_path / "live/meta/info.json").read_text())["features"]
+    )
+    assert [note["judged"] for note in commit.notes(tmp_path / "live")] == [None, True]
+
+
+def test_what_no_world_judges_does_not_go_into_a_dataset_of_verdicts(tmp_path: Path) -> None:
+    """Its episodes would stand there as failures, or as successes."""
+    *_, answer = record_verdicts(tmp_path, True, None)
+    assert answer["kind"] == "failed"
+    assert "next.success" in answer["error"]["message"]
+    assert "new folder" in answer["error"]["hint"]
+    assert len(commit.notes(tmp_path)) == 1
+
+
+def test_a_state_or_an_action_of_one_number_is_replayed(tmp_path: Path) -> None:
+    """lerobot makes a column of plain numbers of it, not of lists."""
+    files = LerobotFiles(tmp_path, fps=30, robot="bench")
+    rows = [
+        row_of(
+            replace(tick(index), transition=Transition({"gap": 0.5 * index}, {"push": -1.0})), ()
+        )[0]
+        for index in range(2)
+    ]
+    features = features_of(rows[0])
+    files.begin(features)
+    for row in rows:
+        files.add(frame_of(row, (), features))
+    files.finish({"units": rows[0]["units"]})
+    found = read_frame(tmp_path, 1)
+    assert (found.units, dict(found.state), dict(found.action)) == (
+        "own",
+        {"gap": 0.5},
+        {"push": -1.0},
+    )
+    assert "shown    gap: +0.5\nsent     push: -1" in as_text(found, None)
+
+
+@pytest.mark.parametrize(
+    ("frame", "episode", "said"),
+    [
+        (15, None, "there is no frame 15 .0 to 14"),
+        (4, 1, "episode 1 has no frame 4 .0 to 3"),
+        (0, 4, "there is no episode 4 .there are 4"),
+    ],
+)
+def test_a_frame_that_is_not_there_is_said(
+    recorded: Recorded, frame: int, episode: int | None, said: str
+) -> None:
+    with pytest.raises(BadRequest, match=said):
+        read_frame(recorded.root, frame, episode)
+
+
+def test_the_command_prints_the_frame_and_opens_its_trace(
+    recorded: Recorded, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    root = str(recorded.root)
+    url = "http://localhost:16686/trace/{trace_id}?uiFind={span_id}"
+    assert program.main(["replay", "--dataset", root, "--frame", "9", "--trace-url", url]) == 0
+    out = capsys.readouterr().out
+    assert f"http://localhost:16686/trace/{TRACE}?uiFind={span_of(3)}" in out
+    assert "goal     g2: test/grab@abc failed: lost the cube" in out
+    assert "joint    grip: at +0.5000 rad, told +0.4000" in out
+    assert "last of its episode" in out
+    assert program.main(["replay", "--dataset", root, "--frame", "99"]) == 1
+    assert program.main(["replay", "--dataset", str(tmp_path), "--frame", "0"]) == 2
+    assert (
+        program.main(["replay", "--dataset", root, "--frame", "0", "--trace-url", "http://x"]) == 2
+    )
+    assert "is no dataset that this program recorded" in capsys.readouterr().err
+
+
+def test_two_cameras_of_one_column_are_refused() -> None:
+    """A column has no `/`: the pictures of the one would have been the other's."""
+    frames = {name: picture(name, 10) for name in ("arm/top", "arm_top")}
+    with pytest.raises(
+        ConfigError, match=r"two cameras would have the column observation\.images\.arm_top"
+    ):
+        features_of(row_of(tick(0, frames=frames), tuple(frames))[0])
+
+
+def test_a_world_of_nothing_but_pictures_has_no_state() -> None:
+    row, _ = row_of(replace(tick(0), transition=Transition({}, {"push": 1.0})), ("front",))
+    assert "observation.state" not in features_of(row)
+
+
+# -- what cannot be recorded -----------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("rate_hz", [0.0, 12.5, 0.5])
+def test_only_whole_rates_are_recorded(rate_hz: float) -> None:
+    with pytest.raises(ConfigError, match="a whole number of ticks a second"):
+        whole_rate(rate_hz)
+
+
+def test_a_slow_writer_costs_ticks_never_time(tmp_path: Path) -> None:
+    """Nobody takes from the queue: what does not fit is dropped and counted, and the control thread goes on."""
+    made = recorder(tmp_path / "set")
+    for index in range(QUEUE_TICKS + 5):
+        made.tick(tick(index))
+    assert made.dropped == 5
+    assert "5 ticks were dropped" in made.summary()

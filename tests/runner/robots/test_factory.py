@@ -1,0 +1,126 @@
+"""The `hal` section of a deployment file → an adapter: every mistake names its field, nothing is opened."""
+
+from typing import Any
+
+import pytest
+
+from vram_arbiter.runner.robots.factory import make_hal
+from vram_arbiter.runner.robots.kinematic import KinematicTwin
+from vram_arbiter.runner.robots.units import JointScale, JointUnit
+from vram_arbiter.schemas.config.robot import HalConfig
+from vram_arbiter.schemas.errors import ConfigError
+
+
+def fields(adapter: str, **sections: dict[str, Any]) -> list[tuple[str, str]]:
+    with pytest.raises(ConfigError) as caught:
+        make_hal(HalConfig(adapter=adapter, **sections), source="robot.yaml")
+    assert str(caught.value).startswith("robot.yaml: hal.")
+    return [(field["field"], field["problem"]) for field in caught.value.details["fields"]]
+
+
+@pytest.mark.parametrize(
+    ("adapter", "sections", "field", "said"),
+    [
+        ("so101_mujocu", {}, "hal.adapter", "did you mean so101_mujoco"),
+        ("lerobot", {}, "hal.adapter", "unknown adapter"),
+        (
+            "so101_kinematic",
+            {"transport": {"port": "/dev/ttyACM0"}},
+            "hal.transport.port",
+            "no transport",
+        ),
+        (
+            "so101_kinematic",
+            {"params": {"start_pose": {}}},
+            "hal.params.start_pose",
+            "did you mean start_pose_rad",
+        ),
+        (
+            "so101_kinematic",
+            {"params": {"start_pose_rad": {"elbow": 0.1}}},
+            "hal.params.start_pose_rad.elbow",
+            "elbow_flex",
+        ),
+        (
+            "so101_kinematic",
+            {"params": {"start_pose_rad": {"gripper": float("nan")}}},
+            "hal.params.start_pose_rad.gripper",
+            "finite",
+        ),
+        (
+            "so101_kinematic",
+            {"params": {"start_pose_rad": {"gripper": 3.0}}},
+            "hal.params.start_pose_rad.gripper",
+            "outside",
+        ),
+        (
+            "lerobot:so101_follower",
+            {"params": {"joints": {"gripper": {"unit": "furlongs"}}}},
+            "hal.params.joints.gripper.unit",
+            "deg",
+        ),
+        (
+            "lerobot:so101_follower",
+            {"params": {"joints": {"gripper": {"lower_rad": 1, "upper_rad": 0}}}},
+            "hal.params.joints.gripper",
+            "lower_rad must be below",
+        ),
+        (
+            "lerobot:so101_follower",
+            {"params": {"joints": {"gripper": {"sing": 1}}}},
+            "hal.params.joints.gripper.sing",
+            "sign",
+        ),
+        ("lerobot:so101_follower", {"params": {"estop": "pray"}}, "hal.params.estop", "hold"),
+    ],
+)
+def test_each_mistake_names_its_field(adapter: str, sections: Any, field: str, said: str) -> None:
+    ((found, problem),) = fields(adapter, **sections)
+    assert found == field
+    assert said in problem
+
+
+def test_all_mistakes_are_told_at_once() -> None:
+    found = fields("so101_kinematic", params={"start_pose_rad": {"a": 1.0, "b": 2.0}})
+    assert [field for field, _ in found] == [
+        "hal.params.start_pose_rad.a",
+        "hal.params.start_pose_rad.b",
+    ]
+
+
+def test_the_kinematic_twin_is_made_without_moving() -> None:
+    hal = make_hal(HalConfig(adapter="so101_kinematic"))
+    assert isinstance(hal, KinematicTwin)
+    assert hal.description.simulated
+    assert len(hal.description.joints) == 6
+    assert [joint.name for joint in hal.description.joints if joint.gripper] == ["gripper"]
+
+
+@pytest.mark.parametrize("unit", list(JointUnit))
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("angle_rad", [-1.0, -0.2, 0.0, 0.7, 2.0])
+def test_units_come_back_as_they_went(unit: JointUnit, sign: int, angle_rad: float) -> None:
+    scale = JointScale(unit, -1.0, 2.0, sign, 0.25)
+    assert scale.to_rad(scale.from_rad(angle_rad)) == pytest.approx(angle_rad)
+
+
+@pytest.mark.parametrize(
+    ("scale", "value", "angle_rad"),
+    [
+        (JointScale(JointUnit.DEG, -2, 2), 90.0, 1.5707963),
+        (JointScale(JointUnit.DEG, -2, 2, -1, 0.5), 90.0, -1.0707963),
+        (JointScale(JointUnit.RAD, -2, 2, -1), 0.5, -0.5),
+        (JointScale(JointUnit.PERCENT, -0.5, 1.5), 0.0, -0.5),
+        (JointScale(JointUnit.PERCENT, -0.5, 1.5), 75.0, 1.0),
+        (JointScale(JointUnit.PERCENT, -0.5, 1.5, -1), 100.0, -0.5),
+        (JointScale(JointUnit.SIGNED_PERCENT, -1.0, 3.0), 0.0, 1.0),
+        (JointScale(JointUnit.SIGNED_PERCENT, -1.0, 3.0), 100.0, 3.0),
+        (
+            JointScale(JointUnit.PERCENT, 0.0, 1.0),
+            110.0,
+            1.1,
+        ),  # beyond its range is told, not hidden
+    ],
+)
+def test_units_mean_what_they_say(scale: JointScale, value: float, angle_rad: float) -> None:
+    assert scale.to_rad(value) == pytest.approx(angle_rad)

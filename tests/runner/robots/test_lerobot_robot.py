@@ -1,0 +1,256 @@
+"""Any lerobot robot in rad: units, what it really did, faults, stop. The robot is one that lerobot itself finds and makes."""
+
+import math
+import termios
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vram_arbiter.runner.robots.factory import make_hal
+from vram_arbiter.runner.robots.lerobot_robot import LerobotHal
+from vram_arbiter.schemas.config.robot import HalConfig
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import ConfigError, EstopRequested, RobotFault
+from vram_arbiter.schemas.world import Action
+
+pytestmark = pytest.mark.heavy
+
+RANGE = {"lower_rad": -1.0, "upper_rad": 1.0, "max_speed_rad_s": 3.0}
+JOINTS: dict[str, Any] = {
+    "motor_1": {**RANGE, "lower_rad": -1.5, "upper_rad": 1.5},
+    "motor_2": RANGE,
+    "motor_3": {**RANGE, "gripper": True},
+}
+Make = Callable[..., LerobotHal]
+
+
+def to(**targets: float) -> Action:
+    return Action(
+        control_mode=ControlMode.JOINT_POSITION,
+        joint_targets=(tuple(targets.values()),),
+        joint_names=tuple(targets),
+    )
+
+
+@pytest.fixture(autouse=True)
+def plugin(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parent / "plugin"))
+
+
+@pytest.fixture
+def make(tmp_path: Path, clock: Any) -> Make:
+    def made(params: dict[str, Any] | None = None, **transport: Any) -> LerobotHal:
+        config = HalConfig(
+            adapter="lerobot:memory_robot",
+            transport={"calibration_dir": str(tmp_path), "id": "test", **transport},
+            params={"joints": JOINTS} if params is None else params,
+        )
+        hal = make_hal(config, clock=clock)
+        assert isinstance(hal, LerobotHal)
+        return hal
+
+    return made
+
+
+def robot_of(hal: LerobotHal) -> Any:
+    return hal._robot
+
+
+def test_it_reads_in_rad_what_lerobot_says_in_its_units(make: Make, clock: Any) -> None:
+    hal = make(values=[90.0, -50.0, 25.0])
+    hal.connect()
+    state = hal.read_state()
+    assert state.name == hal.description.joint_names == ("motor_1", "motor_2", "motor_3")
+    assert state.position == pytest.approx((math.pi / 2, -0.5, -0.5))
+    assert (state.velocity, state.effort) == (
+        (),
+        (),
+    )  # lerobot does not say them: nothing is made up
+    assert state.stamp_ns == clock.now_ns()
+
+
+def test_it_sends_in_lerobots_units_what_is_said_in_rad(make: Make) -> None:
+    hal = make()
+    hal.connect()
+    hal.send_action(to(motor_1=-math.pi / 4, motor_2=1.0, motor_3=1.0))
+    assert robot_of(hal).sent[-1] == pytest.approx(
+        {"motor_1": -45.0, "motor_2": 100.0, "motor_3": 100.0}
+    )
+    assert hal.read_state().position == pytest.approx((-math.pi / 4, 1.0, 1.0))
+
+
+def test_joints_that_are_left_out_stay_where_they_were_sent(make: Make) -> None:
+    hal = make(values=[10.0, 20.0, 30.0])
+    hal.connect()
+    hal.send_action(to(motor_1=0.1))
+    assert robot_of(hal).sent[-1] == pytest.approx(
+        {"motor_1": math.degrees(0.1), "motor_2": 20, "motor_3": 30}
+    )
+    hal.send_action(to(motor_2=0.0))
+    assert robot_of(hal).sent[-1]["motor_1"] == pytest.approx(math.degrees(0.1))
+
+
+def test_a_shortened_step_is_remembered_as_it_was_made(make: Make) -> None:
+    hal = make(max_relative_target=5.0)
+    hal.connect()
+    hal.send_action(to(motor_1=1.0))
+    assert hal.sent()["motor_1"] == pytest.approx(math.radians(5.0))
+    hal.send_action(to(motor_2=0.0))  # motor_1 was left out: it does not creep on to 1.0 rad
+    assert hal.read_state().position[0] == pytest.approx(math.radians(5.0))
+
+
+def test_the_files_word_goes_before_lerobots(make: Make) -> None:
+    joints = {
+        **JOINTS,
+        "motor_1": {**JOINTS["motor_1"], "unit": "rad", "sign": -1, "offset_rad": 0.5},
+    }
+    hal = make({"joints": joints}, values=[0.25, 0.0, 0.0])
+    hal.connect()
+    assert hal.read_state().position[0] == pytest.approx(0.25)
+    hal.send_action(to(motor_1=0.5))
+    assert robot_of(hal).sent[-1]["motor_1"] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(
+    ("transport", "params", "field", "said"),
+    [
+        ({"prot": "x"}, {}, "hal.transport.prot", "did you mean port"),
+        ({"cameras": {"front": {}}}, {}, "hal.transport.cameras", "sensors"),
+        ({"values": "many"}, {}, "hal.transport.values", ""),
+        ({"extra_feature": "x.vel"}, {}, "hal.adapter", "x.vel"),
+        ({}, {"joints": {"motor_9": RANGE}}, "hal.params.joints.motor_9", "no such joint"),
+        ({}, {"joints": {}}, "hal.params.joints.motor_1", "lower_rad, upper_rad, max_speed_rad_s"),
+        ({"bus": False}, {"joints": JOINTS}, "hal.params.joints.motor_1", "unit"),
+        (
+            {"bus": False},
+            {"joints": {name: {**joint, "unit": "deg"} for name, joint in JOINTS.items()}, "estop": "torque_off"},
+            "hal.params.estop",
+            "use hold",
+        ),
+        ({}, {"joints": JOINTS, "rest_pose_rad": {"elbow": 0}}, "hal.params.rest_pose_rad.elbow", "no such"),
+    ],
+)  # fmt: skip
+def test_each_mistake_names_its_field(
+    make: Make, transport: Any, params: Any, field: str, said: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        make(params, **transport)
+    found = caught.value.details["fields"][0]
+    assert found["field"] == field
+    assert said in found["problem"]
+
+
+def test_an_unknown_robot_is_told_with_what_lerobot_knows() -> None:
+    with pytest.raises(ConfigError, match="did you mean so101_follower"):
+        make_hal(HalConfig(adapter="lerobot:so101_folower"))
+
+
+def test_a_connection_that_fails_half_way_is_taken_back_and_tried_again(make: Make) -> None:
+    hal = make(lost_answers=2)
+    hal.connect()
+    assert robot_of(hal).is_connected
+    assert hal.read_state().position[0] == 0.0
+    lost = make(lost_answers=100)
+    with pytest.raises(RobotFault, match="motor 3 is missing"):
+        lost.connect()
+    assert not robot_of(lost).is_connected
+
+
+def test_an_uncalibrated_robot_asks_nobody_on_the_terminal(make: Make) -> None:
+    hal = make(calibrated=False)
+    with pytest.raises(RobotFault, match="lerobot-calibrate"):
+        hal.connect()
+    assert not robot_of(hal).is_connected
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [ConnectionError("no status packet"), RuntimeError("motor 3 is missing"), OSError(5, "I/O")],
+)
+def test_faults_of_the_bus_are_typed(make: Make, fault: Exception) -> None:
+    hal = make()
+    robot_of(hal).fault = fault
+    with pytest.raises(RobotFault, match="does not connect"):
+        hal.connect()
+    robot_of(hal).fault = None
+    hal.connect()
+    robot_of(hal).fault = fault
+    with pytest.raises(RobotFault, match="does not answer"):
+        hal.read_state()
+    with pytest.raises(RobotFault, match="does not move"):
+        hal.send_action(to(motor_1=0.1))
+    hal.disconnect()  # a cable that is out does not keep the program from ending
+    assert not robot_of(hal).is_connected
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), None, "twelve"])
+def test_a_position_that_is_no_number_is_never_acted_upon(make: Make, value: Any) -> None:
+    hal = make()
+    hal.connect()
+    robot_of(hal).values["motor_2"] = value
+    with pytest.raises(RobotFault, match="motor_2"):
+        hal.read_state()
+
+
+def test_a_joint_that_is_not_reported_is_not_zero(make: Make) -> None:
+    hal = make()
+    hal.connect()
+    del robot_of(hal).values["motor_2"]
+    with pytest.raises(RobotFault, match="does not report motor_2"):
+        hal.read_state()
+
+
+@pytest.mark.parametrize(("how", "torque"), [("hold", True), ("torque_off", False)])
+def test_an_emergency_stop_holds_or_lets_go_as_the_file_says(
+    make: Make, how: str, torque: bool
+) -> None:
+    hal = make({"joints": JOINTS, "estop": how}, values=[10.0, 0.0, 50.0])
+    hal.connect()
+    hal.send_action(to(motor_1=1.0))
+    robot_of(hal).values["motor_1"] = 40.0  # it is still on its way
+    with pytest.raises(EstopRequested):
+        hal.estop("test")
+    assert robot_of(hal).bus.torque is torque
+    if torque:
+        assert robot_of(hal).sent[-1]["motor_1"] == pytest.approx(
+            40.0
+        )  # here, not where it was going
+    with pytest.raises(EstopRequested):
+        hal.send_action(to(motor_1=0.0))
+
+
+def test_a_stop_that_cannot_hold_switches_off(make: Make) -> None:
+    hal = make()
+    hal.connect()
+    robot_of(hal).values["motor_1"] = float("nan")
+    with pytest.raises(EstopRequested, match="the motors are off"):
+        hal.estop("test")
+    assert robot_of(hal).bus.torque is False
+
+
+def test_a_stop_that_does_not_reach_the_motors_says_so(make: Make) -> None:
+    bare = {name: {**joint, "unit": "deg"} for name, joint in JOINTS.items()}
+    hal = make({"joints": bare}, bus=False)
+    hal.connect()
+    robot_of(hal).fault = ConnectionError("cable")
+    with pytest.raises(EstopRequested, match="the motors may still be on") as caught:
+        hal.estop("test")
+    assert "cable" in caught.value.details["halted"]
+
+
+def test_a_cable_that_is_pulled_is_a_fault_whatever_the_serial_port_makes_of_it(make: Make) -> None:
+    """Regression: `termios.error` is not an OSError, so the runner neither worked nor ended."""
+    hal = make()
+    hal.connect()
+    robot_of(hal).fault = termios.error(
+        5, "Input/output error"
+    )  # no OSError, and no error of lerobot's
+    with pytest.raises(RobotFault, match="Input/output error"):
+        hal.read_state()
+    with pytest.raises(RobotFault):
+        hal.send_action(to(motor_1=0.1))
+    with pytest.raises(EstopRequested, match="the motors are off"):
+        hal.estop("smoke")
+    hal.disconnect()

@@ -1,0 +1,160 @@
+"""lerobot's own SO-101 driver, byte for byte over a serial port, behind our adapter: the arm as it is shipped, but for the motors."""
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vram_arbiter.runner.protocols import Hal
+from vram_arbiter.runner.robots.factory import make_hal
+from vram_arbiter.runner.robots.so101 import RANGES_RAD
+from vram_arbiter.schemas.config.robot import HalConfig
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import EstopRequested, RobotFault
+from vram_arbiter.schemas.world import Action
+
+from .servo_bus import PRESENT, ServoBus
+
+pytestmark = pytest.mark.heavy
+
+NAMES = tuple(RANGES_RAD)
+COUNTS_PER_RAD = 4095 / (2 * math.pi)  # as lerobot counts
+
+
+@pytest.fixture
+def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[ServoBus]:
+    """The driver waits for a servo as long as it may answer; the 50 ms of real ones say nothing on a busy machine."""
+    pytest.importorskip(
+        "scservo_sdk", reason="Feetech's driver is missing: pip install 'vram-arbiter[so101]'"
+    )
+    with ServoBus() as servos:
+
+        def wait_as_long_as_it_lives(port: Any, packet_length: int) -> None:
+            port.packet_start_time = port.getCurrentTime()
+            port.packet_timeout = 1.0 if servos.silent else 60_000.0  # ms
+
+        monkeypatch.setattr(
+            "lerobot.motors.feetech.feetech.patch_setPacketTimeout", wait_as_long_as_it_lives
+        )
+        yield servos
+
+
+@pytest.fixture
+def hal(bus: ServoBus, calibrated: Path, clock: Any) -> Iterator[Hal]:
+    made = make_hal(config(bus, calibrated), clock=clock)
+    made.connect()
+    yield made
+    made.disconnect()
+
+
+@pytest.fixture
+def calibrated(tmp_path: Path) -> Path:
+    calibration = {
+        name: {"id": i, "drive_mode": 0, "homing_offset": 0, "range_min": 0, "range_max": 4095}
+        for i, name in enumerate(NAMES, 1)
+    }
+    (tmp_path / "arm.json").write_text(json.dumps(calibration), encoding="utf-8")
+    return tmp_path
+
+
+def config(bus: ServoBus, folder: Path, **params: Any) -> HalConfig:
+    transport = {
+        "port": bus.path,
+        "id": "arm",
+        "calibration_dir": str(folder),
+        "num_read_retries": 20,
+    }
+    return HalConfig(adapter="lerobot:so101_follower", transport=transport, params=params)
+
+
+def to(**targets: float) -> Action:
+    return Action(
+        control_mode=ControlMode.JOINT_POSITION,
+        joint_targets=(tuple(targets.values()),),
+        joint_names=tuple(targets),
+    )
+
+
+def test_the_description_is_the_arms(hal: Hal) -> None:
+    assert hal.description.name == "so101"
+    assert not hal.description.simulated
+    assert hal.description.joint_names == NAMES
+
+
+def test_angles_are_read_from_the_servos_counts(hal: Hal, bus: ServoBus) -> None:
+    bus.put(1, PRESENT, 2047 + 652)  # a turn has 4096 counts
+    bus.put(6, PRESENT, 4095)  # open
+    state = hal.read_state()
+    assert state.name == NAMES
+    assert state.position[0] == pytest.approx(1.0, abs=0.002)
+    assert state.position[1:5] == pytest.approx((0.0,) * 4, abs=0.002)
+    assert state.position[5] == pytest.approx(RANGES_RAD["gripper"][1])
+
+
+def test_targets_reach_the_servos(hal: Hal, bus: ServoBus) -> None:
+    hal.send_action(to(elbow_flex=-0.5, gripper=RANGES_RAD["gripper"][0]))
+    assert hal.read_state().position[2] == pytest.approx(
+        -0.5, abs=0.002
+    )  # answered after the writes before it
+    assert bus.get(3, PRESENT) == pytest.approx(2047 - 0.5 * COUNTS_PER_RAD, abs=2)
+    assert bus.get(6, PRESENT) == 0
+    assert bus.get(1, PRESENT) == pytest.approx(2047, abs=1)  # was not named
+
+
+def test_a_range_that_the_file_narrows_limits_a_joint_and_does_not_stretch_it(
+    bus: ServoBus, calibrated: Path
+) -> None:
+    """lerobot counts the gripper in percent of its calibrated range: 0.8 rad are 0.8 rad, however far it may open here."""
+    hal = make_hal(config(bus, calibrated, joints={"gripper": {"upper_rad": 0.8}}))
+    hal.connect()
+    assert hal.description.joints[5].upper_rad == 0.8
+    low, high = RANGES_RAD["gripper"]
+    hal.send_action(to(gripper=0.8))
+    assert hal.read_state().position[5] == pytest.approx(0.8, abs=0.002)
+    assert bus.get(6, PRESENT) == pytest.approx(4095 * (0.8 - low) / (high - low), abs=2)
+    hal.disconnect()
+
+
+def test_the_stop_holds_and_the_end_lets_go(hal: Hal, bus: ServoBus) -> None:
+    hal.send_action(to(shoulder_pan=0.3))
+    with pytest.raises(EstopRequested, match="hold the present pose"):
+        hal.estop("test")
+    assert hal.read_state().position[0] == pytest.approx(0.3, abs=0.002)
+    assert all(bus.torque(servo) for servo in range(1, 7))
+    assert bus.get(1, PRESENT) == pytest.approx(2047 + 0.3 * COUNTS_PER_RAD, abs=2)
+    with pytest.raises(EstopRequested):
+        hal.send_action(to(shoulder_pan=0.0))
+    hal.disconnect()
+    assert not any(bus.torque(servo) for servo in range(1, 7))
+
+
+def test_a_cable_that_is_out_is_a_fault(hal: Hal, bus: ServoBus) -> None:
+    bus.cut()
+    with pytest.raises(RobotFault, match="so101 does not answer"):
+        hal.read_state()
+    hal.disconnect()
+    assert not hal._robot.is_connected  # the port is free again
+
+
+def test_an_arm_without_its_calibration_is_let_go_again(bus: ServoBus, tmp_path: Path) -> None:
+    hal = make_hal(config(bus, tmp_path))
+    with pytest.raises(RobotFault, match="lerobot-calibrate"):
+        hal.connect()
+    assert not any(bus.torque(servo) for servo in range(1, 7))
+
+
+def test_a_port_that_is_not_there_is_a_fault(tmp_path: Path) -> None:
+    pytest.importorskip(
+        "scservo_sdk", reason="Feetech's driver is missing: pip install 'vram-arbiter[so101]'"
+    )
+    hal = make_hal(
+        HalConfig(
+            adapter="lerobot:so101_follower",
+            transport={"port": str(tmp_path / "ttyACM9"), "calibration_dir": str(tmp_path)},
+        )
+    )
+    with pytest.raises(RobotFault, match="does not connect"):
+        hal.connect()

@@ -1,0 +1,611 @@
+"""SimRunner: one environment step per tick, as many reset ticks as episodes, one skill at the arm, everything else holds."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vram_arbiter.runner.control.skill_runner import WITHHELD_IN_A_ROW_MAX
+from vram_arbiter.runner.protocols import (
+    Act,
+    DeadlinePolicy,
+    Done,
+    Goal,
+    Hold,
+    RobotDescription,
+    SkillEnded,
+    SkillKey,
+    StepOutcome,
+)
+from vram_arbiter.runner.sim.arm_env import ArmEnvironment
+from vram_arbiter.runner.sim.episodes import episodes_of
+from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import (
+    ConfigError,
+    EnvironmentFailed,
+    Evicted,
+    InternalError,
+    ModelError,
+)
+from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
+from vram_arbiter.schemas.world import Action, WorldState
+
+Make = Callable[..., Any]
+GOAL = Goal("g", "test/skill")
+
+
+def joints(*row: float) -> Action:
+    names = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")[
+        : len(row)
+    ]
+    return Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), joint_names=names)
+
+
+class Scripted:
+    """Gives the outcomes of its script, then is done; raises the errors among them."""
+
+    manifest: Any = None
+    key = SkillKey("test/skill")
+    holds_gpu = False
+    cameras: tuple[str, ...] = ()
+    fraction = 0.5
+
+    def __init__(self, *script: StepOutcome | Exception) -> None:
+        self.script: list[StepOutcome | Exception] = list(script)
+        self.seen: list[WorldState] = []
+
+    def wants_frames(self) -> bool:
+        return bool(self.cameras)
+
+    def step(self, world: WorldState) -> StepOutcome:
+        self.seen.append(world)
+        outcome = self.script.pop(0) if self.script else Done({"played": True})
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    async def start(self, goal: Goal) -> None: ...
+
+    async def finish(self) -> None: ...
+
+    async def release(self) -> None: ...
+
+
+def play(
+    runner: Any, script: Sequence[StepOutcome | Exception], ticks: int
+) -> tuple[list[Any], list[SkillEnded]]:
+    """A reset tick, then the script; the results of the ticks after it and how the skill ended."""
+    ended: list[SkillEnded] = []
+    runner.activate()
+    runner.tick()
+    runner.begin_skill(Scripted(*script), GOAL, ended.append)
+    return [runner.tick() for _ in range(ticks)], ended
+
+
+# -- ticks and episodes ---------------------------------------------------------------------------------------------
+def test_the_first_tick_resets_and_every_other_one_steps(make_runner: Make, env: Any) -> None:
+    runner = make_runner(seed=7, rate_hz=0)
+    runner.activate()
+    first = runner.tick()
+    assert (env.resets, env.steps, first.step_idx, first.action_applied) == ([7], [], None, False)
+    second = runner.tick()
+    assert (env.resets, len(env.steps), second.step_idx, second.action_applied) == (
+        [7],
+        1,
+        0,
+        False,
+    )
+
+
+def test_n_episodes_are_n_resets_and_no_phantom_one(make_runner: Make, env: Any) -> None:
+    runner = make_runner(seed=3, rate_hz=0, episodes=2, max_steps=4)
+    runner.activate()
+    result = runner.run()
+    assert env.resets == [3, 4]
+    assert len(env.steps) == 8
+    assert result.n_ticks == 10
+    assert [(e.index, e.steps, e.truncated) for e in runner.episodes] == [
+        (0, 4, True),
+        (1, 4, True),
+    ]
+    assert result.success is None  # nobody judged
+
+
+def test_a_judge_ends_an_episode(make_runner: Make, env: Any) -> None:
+    runner = make_runner(rate_hz=0, episodes=2, max_steps=5, judge=lambda e: len(e.steps) == 3)
+    runner.activate()
+    result = runner.run()
+    assert [(e.steps, e.success) for e in runner.episodes] == [(3, True), (5, False)]
+    assert result.success is False
+
+
+def test_a_live_run_ends_when_asked(make_runner: Make, env: Any) -> None:
+    runner = make_runner(rate_hz=0)
+    runner.activate()
+    assert runner.run(max_ticks=5).n_ticks == 5
+    runner.request_stop()
+    assert runner.run(max_ticks=5).n_ticks == 0
+    runner.deactivate()
+    runner.deactivate()
+    assert env.closed == 1
+
+
+def test_episodes_are_read_off_the_ticks(make_runner: Make, env: Any) -> None:
+    runner = make_runner(
+        seed=3, rate_hz=0, episodes=3, max_steps=4, judge=lambda e: len(e.steps) == 6
+    )
+    runner.activate()
+    ticks = []
+    while not runner._finished():
+        ticks.append(runner.tick())
+    assert episodes_of(ticks) == runner.episodes
+    resets = [tick.tick_idx for tick in ticks if tick.step_idx is None]
+    assert [episode.first_tick for episode in runner.episodes] == resets == [0, 5, 8]
+    assert [tick.step_idx for tick in ticks if tick.step_idx is not None] == [
+        0,
+        1,
+        2,
+        3,
+        0,
+        1,
+        0,
+        1,
+        2,
+        3,
+    ]
+    assert [(e.steps, e.success, e.truncated) for e in runner.episodes] == [
+        (4, False, True),
+        (2, True, False),
+        (4, False, True),
+    ]
+    assert episodes_of(ticks[:-1]) == runner.episodes[:-1]
+
+
+def test_stopping_within_an_episode_leaves_no_phantom(make_runner: Make, env: Any) -> None:
+    runner = make_runner(seed=3, rate_hz=0, episodes=2, max_steps=4)
+    runner.activate()
+    runner.run(max_ticks=8)  # reset, 4 steps, reset, 2 steps
+    runner.deactivate()
+    assert env.resets == [3, 4]
+    assert [episode.index for episode in runner.episodes] == [0]
+    runner.activate()  # what was broken off is played again, from its reset on, with its own seed
+    assert runner.run().n_ticks == 5
+    assert env.resets == [3, 4, 4]
+    assert [(e.index, e.steps) for e in runner.episodes] == [(0, 4), (1, 4)]
+
+
+@settings(deadline=None)
+@given(
+    lengths=st.lists(st.integers(1, 6), min_size=1, max_size=6),
+    max_steps=st.none() | st.integers(1, 6),
+    stop_after=st.integers(0, 40),
+)
+def test_every_reset_is_an_episode_that_is_played(
+    make_env: Any,
+    kinematic: RobotDescription,
+    lengths: list[int],
+    max_steps: int | None,
+    stop_after: int,
+) -> None:
+    """Whatever ends the episodes, and wherever the run is stopped and taken up again."""
+    robot = make_env()
+    begun: list[int] = []  # steps of the robot at each reset
+
+    def judge() -> bool:
+        while len(begun) < len(robot.resets):
+            begun.append(len(robot.steps) - 1)
+        return len(robot.steps) - begun[-1] >= lengths[robot.resets[-1]]
+
+    runner = SimRunner(
+        lambda: ArmEnvironment(robot, kinematic, judge=judge),
+        rate_hz=0,
+        episodes=len(lengths),
+        max_steps=max_steps,
+    )
+    runner.activate()
+    first = runner.run(max_ticks=stop_after)
+    runner.deactivate()
+    open_ones = len(robot.resets) - len(runner.episodes)
+    assert open_ones in (0, 1)
+    runner.activate()
+    result = runner.run()
+    runner.deactivate()
+    assert len(robot.resets) == len(lengths) + open_ones
+    assert sorted(set(robot.resets)) == list(range(len(lengths)))
+    assert [e.steps for e in runner.episodes] == [min(n, max_steps or n) for n in lengths]
+    assert first.n_ticks + result.n_ticks == len(robot.resets) + len(robot.steps)
+
+
+def test_a_run_that_is_over_resets_nothing_however_often_it_is_run(
+    make_runner: Make, env: Any
+) -> None:
+    runner = make_runner(rate_hz=0, episodes=1, max_steps=2)
+    runner.activate()
+    assert [runner.run().n_ticks for _ in range(3)] == [3, 0, 0]
+    runner.deactivate()
+    assert env.resets == [0]
+
+
+def test_a_skill_loses_the_world_with_its_episode(make_runner: Make, env: Any) -> None:
+    runner = make_runner(rate_hz=0, max_steps=3, judge=lambda e: len(e.steps) == 5)
+    ticks, ended = play(runner, [Act(joints(0.1))] * 9, 3)
+    assert [tick.truncated for tick in ticks] == [False, False, True]
+    assert (ended[0].error.code, ended[0].error.details) == ("limit_exceeded", {"limit": "episode"})
+    assert ended[0].data["steps"] == 3
+    assert runner.tick().step_idx is None  # the live runner begins anew at once
+    runner.begin_skill(Scripted(*[Act(joints(0.1))] * 9), GOAL, ended.append)
+    runner.tick()
+    assert runner.tick().terminated
+    assert (ended[1].error, ended[1].data["success"]) == (None, True)
+    assert env.resets == [0, 1]
+
+
+def test_an_episode_that_nobody_judges_is_no_success(make_runner: Make) -> None:
+    _, ended = play(make_runner(rate_hz=0, max_steps=2), [Act(joints(0.1))] * 9, 2)
+    assert isinstance(ended[0].error, ModelError)
+    assert "nobody says" in ended[0].error.message
+
+
+def test_an_episode_may_end_with_its_skill(make_runner: Make, env: Any) -> None:
+    runner = make_runner(rate_hz=0, ends_with_skill=True, judge=lambda e: len(e.steps) > 99)
+    ticks, ended = play(runner, [Act(joints(0.1))], 2)
+    assert ended[0].error is None
+    assert [tick.truncated for tick in ticks] == [False, True]
+    assert [(e.steps, e.success, e.truncated) for e in runner.episodes] == [(2, False, True)]
+    runner.begin_episode(41)
+    runner.tick()
+    assert env.resets == [0, 41]
+    assert runner.tick().truncated is False  # the new episode had no skill yet
+
+
+def test_a_world_that_fails_ends_the_goal_and_is_reset(make_runner: Make, env: Any) -> None:
+    runner = make_runner(rate_hz=0, seed=5)
+    bad = Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.3, 0.0, 0.0, 0.0, 0.0, 0.1),))
+    _, ended = play(runner, [Act(joints(0.1))], 1)
+    env.fails = True
+    runner.end_skill()
+    runner.begin_skill(Scripted(Act(bad)), GOAL, ended.append)
+    failed = runner.tick()
+    assert isinstance(ended[0].error, EnvironmentFailed)
+    assert (failed.action_applied, failed.step_idx) == (False, None)
+    env.fails = False
+    runner.tick()
+    assert env.resets == [5, 5]
+    assert runner.episodes == []
+    env.fails = True
+    with pytest.raises(EnvironmentFailed):  # nobody asked it for anything: it is broken
+        runner.tick()
+
+
+# -- the skill at the arm -------------------------------------------------------------------------------------------
+def test_actions_reach_the_robot_in_order_and_done_ends_the_skill(
+    make_runner: Make, env: Any
+) -> None:
+    twist = Action(
+        control_mode=ControlMode.BODY_TWIST, body_twist=((0.3, 0.0, 0.0, 0.0, 0.0, 0.1),)
+    )
+    script = [Act(joints(0.1), chunk_index=4), Hold("thinking"), Act(twist)]
+    ticks, ended = play(make_runner(rate_hz=0), script, 5)
+    first = dict(zip(env.joints, (0.1, -1.20, 1.05, 1.35, 0.0, 0.60), strict=True))
+    assert env.steps == [
+        (first, None),
+        (None, None),
+        (None, (0.3, 0.0, 0.1)),
+        (None, None),
+        (None, None),
+    ]
+    assert [t.action_applied for t in ticks] == [True, False, True, False, False]
+    assert ticks[0].chunk_index == 4
+    assert [(e.data["played"], e.data["ticks"], e.error) for e in ended] == [(True, 3, None)]
+
+
+def test_joints_that_an_action_leaves_out_keep_their_last_target(
+    make_runner: Make, env: Any
+) -> None:
+    closed = joints(0.0, -1.0, 1.0, 1.0, 0.0, -0.1)
+    play(make_runner(rate_hz=0), [Act(closed), Hold("gripped"), Act(joints(0.3, -1.1))], 4)
+    assert list(env.steps[2][0].values()) == [0.3, -1.1, 1.0, 1.0, 0.0, -0.1]
+
+
+@pytest.mark.parametrize("error", [Evicted("gone"), ModelError("bad")])
+def test_a_typed_error_fails_the_goal_and_the_arm_holds(
+    make_runner: Make, env: Any, error: Exception
+) -> None:
+    runner = make_runner(rate_hz=0)
+    ticks, ended = play(runner, [Act(joints(0.1)), error], 4)
+    assert [e.error for e in ended] == [error]
+    assert env.steps[1:] == [(None, None)] * 3
+    assert ticks[1].safety_violations
+    assert runner.progress.state == "ended"
+
+
+def test_a_defect_of_a_skill_does_not_take_the_loop_with_it(make_runner: Make, env: Any) -> None:
+    _, ended = play(make_runner(rate_hz=0), [ZeroDivisionError("oops")], 3)
+    assert isinstance(ended[0].error, InternalError)
+    assert len(env.steps) == 3
+
+
+def test_an_action_outside_the_envelope_is_withheld_and_recorded(
+    make_runner: Make, env: Any
+) -> None:
+    runner = make_runner(rate_hz=0)
+    ticks, ended = play(runner, [Act(joints(3.0)), Act(joints(0.6))], 3)
+    assert env.steps[0] == (None, None)
+    assert env.steps[1][0]["shoulder_pan"] == 0.5
+    assert [t.action_applied for t in ticks[:2]] == [False, True]
+    assert "outside" in ticks[0].safety_violations[0]
+    assert len(runner.violations) == 2
+    assert (ended[0].data["withheld"], ended[0].data["clamped"]) == (1, 1)
+
+
+def test_the_gate_is_a_robots_and_each_skill_tightens_it(make_runner: Make, env: Any) -> None:
+    class Careful(Scripted):
+        manifest = SimpleNamespace(
+            name="test/careful", envelope=SafetyEnvelope(max_joint_speed_factor=0.1)
+        )
+
+    runner = make_runner(rate_hz=0)
+    play(runner, [Act(joints(0.2))], 2)
+    assert env.joints["shoulder_pan"] == 0.2  # 6 rad/s; the arm makes 30
+    ended: list[SkillEnded] = []
+    runner.begin_skill(Careful(Act(joints(0.4)), Act(joints(-0.3))), GOAL, ended.append)
+    ticks = [runner.tick() for _ in range(3)]
+    assert env.joints["shoulder_pan"] == pytest.approx(
+        0.35
+    )  # 3 rad/s, with the tick between that sent nothing
+    assert "is beyond 3.00 rad/s" in ticks[0].safety_violations[0]
+    assert [tick.action_applied for tick in ticks] == [True, False, False]
+    assert (ended[0].data["clamped"], ended[0].data["withheld"]) == (1, 1)
+
+
+def test_an_envelope_that_cannot_be_kept_is_refused_before_anything_moves(
+    make_runner: Make,
+) -> None:
+    class Boxed(Scripted):
+        manifest = SimpleNamespace(
+            name="test/boxed", envelope=SafetyEnvelope(workspace_box_max_xyz=(0.3, 0.3, 0.3))
+        )
+
+    runner = make_runner(rate_hz=0)
+    runner.activate()
+    with pytest.raises(ConfigError, match="no kinematics"):
+        runner.begin_skill(Boxed(), GOAL, lambda _: None)
+    runner.begin_skill(Scripted(), GOAL, lambda _: None)  # nobody has the arm
+
+
+def test_speeds_are_judged_by_simulated_time(make_runner: Make, env: Any, clock: Any) -> None:
+    runner = make_runner(rate_hz=0, clock=clock)
+    thinks_s = iter([0.0, 5.0, 0.0])
+
+    class Slow(Scripted):
+        def step(self, world: WorldState) -> StepOutcome:
+            clock.advance(next(thinks_s))  # the policy thinks, the world waits
+            return super().step(world)
+
+    ended: list[SkillEnded] = []
+    runner.activate()
+    runner.tick()
+    runner.begin_skill(
+        Slow(Act(joints(0.3)), Act(joints(-0.4)), Act(joints(-0.4))), GOAL, ended.append
+    )
+    ticks = [runner.tick() for _ in range(3)]
+    assert [tick.action_applied for tick in ticks] == [True, True, True]
+    assert env.joints["shoulder_pan"] == -0.4
+
+
+def test_a_policy_that_is_lost_fails_its_goal(make_runner: Make) -> None:
+    _, ended = play(make_runner(rate_hz=0), [Act(joints(9.0))] * 40, 30)
+    assert isinstance(ended[0].error, ModelError)
+    assert ended[0].data["withheld"] == WITHHELD_IN_A_ROW_MAX
+
+
+def test_a_late_action_is_dropped_on_the_way_to_the_simulator(
+    make_runner: Make, env: Any, clock: Any
+) -> None:
+    class Slow(Scripted):
+        def step(self, world: WorldState) -> StepOutcome:
+            clock.advance(0.2)
+            return super().step(world)
+
+    runner = make_runner(rate_hz=10, clock=clock, deadline_policy=DeadlinePolicy.DROP)
+    runner.activate()
+    runner.run(max_ticks=1)
+    runner.begin_skill(Slow(Act(joints(0.1))), GOAL, lambda _: None)
+    assert not runner.tick().action_applied
+    assert env.steps == [(None, None)]
+
+
+def test_one_skill_at_a_time_and_taking_the_arm_back(make_runner: Make, env: Any) -> None:
+    runner, ended = make_runner(rate_hz=0), []
+    play(runner, [Act(joints(0.1))] * 10, 2)
+    with pytest.raises(InternalError, match="another skill"):
+        runner.begin_skill(Scripted(), GOAL, ended.append)
+    runner.end_skill()
+    runner.end_skill()
+    runner.tick()
+    assert env.steps[-1] == (None, None)
+    assert ended == []
+
+
+def test_a_state_that_is_not_finite_fails_closed(make_runner: Make, env: Any) -> None:
+    runner, ended = make_runner(rate_hz=0), []
+    runner.activate()
+    runner.tick()
+    runner.begin_skill(Scripted(Act(joints(0.1))), GOAL, ended.append)
+    env.joints["gripper"] = float("nan")
+    assert not runner.tick().action_applied
+    assert isinstance(ended[0].error, InternalError)
+    assert runner.world is None
+
+
+def test_stopping_ends_the_skill_with_an_error(make_runner: Make) -> None:
+    runner = make_runner(rate_hz=0)
+    _, ended = play(runner, [Act(joints(0.1))] * 10, 1)
+    runner.deactivate()
+    assert isinstance(ended[0].error, InternalError)
+
+
+def test_the_ticks_of_a_goal_join_its_trace(make_runner: Make) -> None:
+    parent = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
+    runner = make_runner(rate_hz=0)
+    runner.activate()
+    runner.tick()
+    runner.begin_skill(Scripted(Hold("x")), Goal("g", "r", traceparent=parent), lambda _: None)
+    ticks = [runner.tick() for _ in range(3)]
+    assert [tick.trace_context is not None for tick in ticks] == [True, True, False]
+    assert ticks[0].trace_context["traceparent"].split("-")[1] == parent.split("-")[1]
+
+
+def test_goals_and_runs_say_what_became_of_chunks_and_actions(make_runner: Make) -> None:
+    runner = make_runner(rate_hz=0, seed=3)
+    runner.identity = {"robot": "arm", "scene": "table"}
+    script = [
+        Act(joints(0.1), chunk_index=0),
+        Act(joints(9.0), chunk_index=1, prefetched=True),
+        Act(joints(0.6), chunk_index=1),
+        Act(joints(0.1), chunk_index=2, prefetched=False),
+        Act(joints(0.1), chunk_index=3, prefetched=True),
+        Evicted("gone"),
+    ]
+    _, ended = play(runner, script, 6)
+    counts = {"withheld": 1, "clamped": 1, "prefetch": {"hits": 2, "misses": 1, "hit_rate": 2 / 3}}
+    assert ended[0].data == {"ticks": 5, **counts}
+    metadata = runner.result().metadata
+    assert metadata.items() >= {**counts, "robot": "arm", "scene": "table", "seed": 3}.items()
+    assert metadata["goals_by_skill"] == {"test/skill": 1}
+    assert (metadata["rate_hz"], metadata["deadline_policy"], metadata["deadline_misses"]) == (
+        0,
+        "warn",
+        0,
+    )
+
+
+def test_a_skill_without_chunks_says_nothing_of_them(make_runner: Make) -> None:
+    runner = make_runner(rate_hz=0)
+    _, ended = play(runner, [Act(joints(0.1))], 2)
+    assert "prefetch" not in ended[0].data
+    assert "prefetch" not in runner.result().metadata
+
+
+# -- pictures -------------------------------------------------------------------------------------------------------
+@pytest.mark.heavy
+def test_frames_are_rendered_on_demand_and_reused_while_young(
+    make_runner: Make, env: Any, clock: Any
+) -> None:
+    runner = make_runner(rate_hz=0, clock=clock, cameras=("front",))
+    runner.activate()
+    runner.tick()
+    first = runner.snapshot("front", 0.5)
+    clock.advance(0.05)
+    assert runner.snapshot("front", 0.5) is first
+    assert runner.snapshot("front", 0.02) is not first
+    clock.advance(0.2)
+    runner.tick()
+    assert runner.snapshot("front", 0.5).stamp_ns == clock.now_ns()
+
+
+@pytest.mark.heavy
+def test_a_crowd_of_requests_for_pictures_costs_a_tick_one_picture_a_camera(
+    make_runner: Make, env: Any, clock: Any
+) -> None:
+    """Each request that wanted a picture of this instant rendered one in the tick: sixteen of them made it half a second long."""
+    runner = make_runner(rate_hz=0, clock=clock, cameras=("front", "wrist"))
+    runner.activate()
+    runner.tick()
+    pictures = []
+    for _ in range(16):
+        clock.advance(0.001)
+        pictures.append(runner.snapshot("front", 1e-9))
+    assert all(picture is pictures[0] for picture in pictures)
+    assert runner.snapshot("wrist", 1e-9) is not pictures[0]
+    runner.tick()
+    clock.advance(0.001)
+    assert runner.snapshot("front", 1e-9) is not pictures[0]
+
+
+@pytest.mark.heavy
+def test_a_skill_sees_the_cameras_it_wants(make_runner: Make) -> None:
+    runner, skill = make_runner(rate_hz=0, cameras=("front", "wrist")), Scripted(Hold("x"))
+    skill.cameras = ("wrist",)
+    runner.activate()
+    runner.tick()
+    runner.begin_skill(skill, GOAL, lambda _: None)
+    runner.tick()
+    frames = skill.seen[0].image_frames
+    assert frames is not None
+    assert set(frames) == {"wrist"}
+    assert (frames["wrist"].width, frames["wrist"].height) == (32, 24)
+
+
+# -- the real simulator ---------------------------------------------------------------------------------------------
+@pytest.mark.heavy
+def test_navigating_the_real_simulator_and_filming_it(
+    tmp_path: Path, navigate_manifest: Path, run_async: Any
+) -> None:
+    import imageio_ffmpeg
+
+    from vram_arbiter.runner.recording.video import Recorder
+    from vram_arbiter.runner.sim.sim_runner import SimRunner
+    from vram_arbiter.runner.sim.worlds import so101_world
+    from vram_arbiter.runner.skills.navigate import Navigate
+    from vram_arbiter.schemas.manifest import load_manifest
+
+    world = so101_world(None)
+    env, scene = world.arm, world.scene
+    assert env is not None
+    assert scene is not None
+    recorder = Recorder(tmp_path / "episode.mp4", fps=10)
+    runner = SimRunner(world.make, cameras=("front",), seed=1, rate_hz=0, recorder=recorder)
+    skill = Navigate(load_manifest(navigate_manifest), scene, period_s=1 / 30)
+    ended: list[SkillEnded] = []
+    try:
+        runner.activate()
+        runner.tick()
+        x, y, z = env.ground_truth().objects[env.target].position_base
+        run_async(
+            skill.start(Goal("g", "navigate", params={"target_point": {"x": x, "y": y, "z": z}}))
+        )
+        runner.begin_skill(skill, GOAL, ended.append)
+        while not ended:
+            runner.tick()
+            assert runner.tick_idx < 400
+        assert ended[0].error is None
+        x, y, _ = env.ground_truth().objects[env.target].position_base
+        assert (x, y) == pytest.approx(scene.grasp_spot_in_base_m, abs=0.03)
+        model = runner.snapshot("front", 0.5).model
+        assert model is not None
+        box = env.seen_objects("front")[env.target].box
+        seen = model.ground_point((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
+        assert seen is not None
+        assert seen[:2] == pytest.approx((x, y), abs=0.012)
+    finally:
+        runner.deactivate()
+        recorder.close()
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "episode.mp4"))
+    assert frames == recorder.written
+    assert frames >= 10
+    assert seconds == pytest.approx(frames / 10, abs=0.2)
+
+
+def test_a_scene_that_takes_long_to_build_misses_no_deadline(
+    make_runner: Make, env: Any, clock: Any
+) -> None:
+    """There is no action that could come too late: `raise` would end every run before its first step."""
+    build = env.reset
+
+    def slowly(seed: int) -> None:
+        clock.advance(0.8)
+        build(seed)
+
+    env.reset = slowly
+    options = {"rate_hz": 10, "episodes": 2, "max_steps": 3, "clock": clock}
+    runner = make_runner(deadline_policy=DeadlinePolicy.RAISE, **options)
+    runner.activate()
+    result = runner.run()
+    assert (result.n_ticks, result.budget_violations) == (8, 0)
+    assert [episode.steps for episode in runner.episodes] == [3, 3]
