@@ -30,7 +30,7 @@ ARBITER = "vram-arbiter.service"
 def steps(heading: str) -> list[str]:
     """The commands of a section's first block, as root types them."""
     section = PAGE.read_text(encoding="utf-8").split(f"\n## {heading}\n")[1]
-    block = section.split("```sh\n")[1].split("```")[0]
+    block = section.split("```sh\n")[1].split("```")[0].replace("\\\n", "")
     return [line.replace("sudo ", "") for line in block.splitlines()]
 
 
@@ -50,7 +50,7 @@ def machine() -> Iterator[Machine]:
         install = steps("Install")
         assert "-m venv" in install[0]  # these two are done: the environment is mounted
         assert "pip install" in install[1]
-        for step in [*install[2:], steps("Who may use it")[2]]:
+        for step in [*install[2:], steps("Permissions")[2]]:
             made.run("bash", "-c", f"cd /opt/tree && {step}")
         yield made
     finally:
@@ -120,7 +120,7 @@ def test_each_group_may_do_its_part(machine: Machine) -> None:
     machine.run(*drain, user="vram-robot", code=1)
 
     machine.run("vramctl", "status", "--endpoint", ENDPOINT, user="daemon", code=3)
-    for step in steps("Who may use it")[:2]:
+    for step in steps("Permissions")[:2]:
         machine.run("env", "USER=daemon", "bash", "-c", step)
     machine.run(*drain, user="daemon")
     machine.run("vramctl", "resume", "--endpoint", ENDPOINT, user="daemon")
