@@ -46,7 +46,8 @@ from vram_arbiter.arbiter.core.events import (
     UseYielded,
 )
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import gangs, growth, resizing, subleases
+from vram_arbiter.arbiter.core.features import gangs, subleases
+from vram_arbiter.arbiter.core.features.resizing import Resizing
 from vram_arbiter.arbiter.core.model.state import Core, Refused
 from vram_arbiter.arbiter.core.report import explain, figures
 from vram_arbiter.arbiter.core.requests import (
@@ -79,7 +80,8 @@ class Arbiter:
     """The one owner of all leases. Not thread-safe: one task calls it."""
 
     def __init__(self, settings: Settings, now: float) -> None:
-        self._core = Core(settings, now)
+        self._resizing = Resizing()
+        self._core = Core(settings, now, features=(self._resizing,))
         for gpu_id in self._core.gpus:
             self._core.timers.set(("probe", gpu_id), now)  # the first reading
 
@@ -169,7 +171,6 @@ class Arbiter:
             # 1.3 the machine
             case MemorySampled():
                 readings.on_sample(core, event)
-                growth.on_sample(core, event)
                 recovery.account_for_the_empty(core, event)
             case ProbeFailed():
                 readings.on_probe_failed(core, event)
@@ -237,7 +238,7 @@ class Arbiter:
             case ReleaseReported():
                 requests.release(core, event)
             case ResizeAsked():
-                resizing.resize(core, event)
+                self._resizing.resize(core, event)
             case Reacquired():
                 requests.reacquire(core, event)
             case Reattached():
@@ -259,8 +260,6 @@ class Arbiter:
                     requests.on_wait_timeout(core, subject)
                 case "revoke":
                     eviction.on_ladder_due(core, subject)
-                case "shrink":
-                    growth.on_shrink_due(core, subject)
                 case "overstay":
                     eviction.on_overstay_due(core, subject)
                 case "verify":
@@ -273,8 +272,13 @@ class Arbiter:
                     uses.on_users_due(core, subject)
                 case "recover":
                     recovery.on_recover_due(core, subject)
-                case _:  # "plan": a residency ended, or somebody has aged; "return": the card has been quiet
+                case (
+                    "plan" | "return"
+                ):  # a residency ended, or a waiter has aged; the GPU has been quiet
                     core.wake(core.gpus[GpuId(subject)])
+                case _:
+                    owner = next(one for one in core.features if kind in one.timers)
+                    owner.on_timer(core, kind, subject)
 
     def _keep_reading(self) -> None:
         core = self._core

@@ -188,8 +188,10 @@ def _waiters(core: Core) -> None:
             raise InvariantViolation(
                 6, f"{head.id} is {head.state}, yet it is the head of {gpu.info.id}"
             )
-        if head.grows is not None and head.grows not in gpu.residents:
-            raise InvariantViolation(6, f"{head.id} waits to grow {head.grows}, which is not there")
+        if head.extends is not None and head.extends not in gpu.residents:
+            raise InvariantViolation(
+                6, f"{head.id} waits to extend {head.extends}, which is not there"
+            )
         if head.wait_timeout_s is not None and ("wait", head.id) not in core.timers:
             raise InvariantViolation(6, f"{head.id} has a bound and no timer")
         if ("probe", gpu.info.id) not in core.timers:

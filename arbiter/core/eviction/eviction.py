@@ -257,12 +257,12 @@ def deny(core: Core, waiter: Lease, error: Mapping[str, Any]) -> None:
     waiter.move(LeaseState.DENIED, core.now, str(error["message"]))
     core.dequeue(waiter)
     if waiter.answered or waiter.request is None:
-        core.push(waiter, {"push": "denied", "lease_id": waiter.grows or waiter.id, "error": error})
+        core.push(
+            waiter, {"push": "denied", "lease_id": waiter.extends or waiter.id, "error": error}
+        )
     else:  # it has only just asked
         refused = Refused(error["code"], error["message"], error["hint"], **error["details"])
         core.refuse(waiter.client, waiter.request, refused)
-    if waiter.grows is not None:
-        core.leases[waiter.grows].growth = None
     core.note("denied", waiter, code=error["code"], reason=error["message"])
     core.end(waiter, error)
 

@@ -1,28 +1,223 @@
-"""The request to change a held lease's size: it shrinks when a measurement agrees, it grows when it is its turn.
+"""Resizing: a held lease shrinks when readings agree, and grows when its request for more bytes is granted.
 
-Growing is waiting: an internal waiter for the difference stands in the card's queue with the holder's priority, asks others to leave and is
-backfilled like any other, and is merged into the lease when it is granted. Shrinking is being believed: the holder says that it gave bytes
-back, and its charge falls only when the card says so too. Both leave the lease held, in use or not. The mechanics are in `growth`.
+A growth is a request for the difference (`Lease.extends`): it waits in the GPU's queue with the holder's priority, has
+victims and a timeout like any other, and its bytes are added to the lease at its grant. A shrink is a claim of the
+holder: the charge falls when two readings in a row agree, or stays when none does in time. The lease stays held, in use
+or not.
 """
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
-from vram_arbiter.arbiter.core.events import ResizeAsked
-from vram_arbiter.arbiter.core.features import growth
+from vram_arbiter.arbiter.core.events import MemorySampled, ResizeAsked
+from vram_arbiter.arbiter.core.hooks import Feature
+from vram_arbiter.arbiter.core.ledger.ledger import process_bytes
 from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
 from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.requests.limits import check_waiters
 from vram_arbiter.arbiter.core.requests.requests import bad_state, own_lease
 from vram_arbiter.arbiter.core.scheduling.policy import largest_growth_bytes
+from vram_arbiter.schemas.ids import LeaseId
 
 
-def resize(core: Core, event: ResizeAsked) -> None:
-    """The reply says what it takes: nothing (`held`), a measurement (`shrinking`) or a turn (`growing`); then push `resized` or `denied`.
+@dataclass(slots=True)
+class Shrink:
+    """Bytes that a holder claims to have given back, until the readings agree."""
 
-    Said again it is the same; another figure replaces the one before.
-    """
-    lease = own_lease(core, event.client, event.lease, event.token)
+    target_bytes: int
+    asked_at: float
+    deadline_at: float
+    agreed: bool = False  # by the newest reading that counts
+
+
+@dataclass(slots=True)
+class Resizing(Feature):
+    """Resizes under way, by the id of the resident lease. A lease has at most one."""
+
+    growths: dict[LeaseId, LeaseId] = field(default_factory=dict)  # lease → its growth request
+    shrinks: dict[LeaseId, Shrink] = field(default_factory=dict)
+
+    timers = frozenset({"shrink"})
+
+    # -- the request -----------------------------------------------------------------------------------------------
+    def resize(self, core: Core, event: ResizeAsked) -> None:
+        """Begin to resize a held lease, and reply with what it waits for: nothing (`held`), readings (`shrinking`) or its
+        turn (`growing`). The push `resized` or `denied` follows. A repeat changes nothing; another size replaces the one
+        before. Raises Refused."""
+        lease = own_lease(core, event.client, event.lease, event.token)
+        _check_resizable(lease)
+        gpu = core.gpu_of(lease)
+        target = max(event.steady_bytes, event.residue_bytes)
+        charge = gpu.ledger.charge_bytes(lease.id)
+        if target > charge and self._growth_target(core, lease) != target:
+            _check_ever_fits(gpu, lease, target, charge)
+            check_waiters(core, core.clients[event.client], lease.spec.priority)
+            self._abandon(core, lease, "another size is asked for")
+            self._begin_growth(core, gpu, lease, event, target - charge)
+        elif target < charge and self._shrink_target(lease) != target:
+            self._abandon(core, lease, "another size is asked for")
+            self._begin_shrink(core, gpu, lease, target)
+        elif target == charge:
+            self._abandon(core, lease, "another size is asked for")
+        _declare(lease, event, target)
+        core.record_lease(lease)  # a restart must not read a smaller holder as one that is gone
+        state = self._resizing(lease) or "held"
+        core.reply(
+            event.client, event.request, {"state": state, "lease": explain.view(core, lease)}
+        )
+
+    def _growth_target(self, core: Core, lease: Lease) -> int | None:
+        growth = self.growths.get(lease.id)
+        if growth is None:
+            return None
+        charge = core.gpu_of(lease).ledger.charge_bytes(lease.id)
+        return charge + core.leases[growth].load_peak_bytes
+
+    def _shrink_target(self, lease: Lease) -> int | None:
+        shrink = self.shrinks.get(lease.id)
+        return None if shrink is None else shrink.target_bytes
+
+    def _resizing(self, lease: Lease) -> str:
+        if lease.id in self.growths:
+            return "growing"
+        return "shrinking" if lease.id in self.shrinks else ""
+
+    def _abandon(self, core: Core, lease: Lease, why: str) -> None:
+        """End the resize of a lease, if there is one."""
+        self._end_shrink(core, lease)
+        growth_id = self.growths.get(lease.id)
+        if growth_id is not None:
+            growth = core.leases[growth_id]
+            growth.move(LeaseState.CANCELLED, core.now, why)
+            core.dequeue(growth)
+            core.note("cancelled", growth, reason=why)
+            core.end(growth, None)
+
+    # -- growing ---------------------------------------------------------------------------------------------------
+    def _begin_growth(
+        self, core: Core, gpu: Gpu, lease: Lease, event: ResizeAsked, more_bytes: int
+    ) -> None:
+        spec = replace(
+            lease.spec,
+            exclusive=False,
+            evictable=False,
+            standby=False,
+            park_bytes=0,
+            parent=None,
+            gang=None,
+            load_peak_bytes=more_bytes,
+            steady_bytes=more_bytes,
+            residue_bytes=0,
+        )
+        growth = Lease(
+            id=core.next_lease_id(),
+            nonce=f"growth of {lease.id}",
+            spec=spec,
+            process=lease.process,
+            client=event.client,
+            uid=lease.uid,
+            arrived_at=core.now,
+            arrival=core.next_arrival(),
+            load_peak_bytes=more_bytes,
+            steady_bytes=more_bytes,
+            gpus=(gpu.info.id,),
+            since=core.now,
+            wait_timeout_s=event.wait_timeout_s,
+            answered=True,
+            extends=lease.id,
+            story=[(core.now, LeaseState.QUEUED, f"growth of {lease.id}")],
+        )
+        core.add(growth)
+        core.enqueue(growth)
+        self.growths[lease.id] = growth.id
+        position = gpu.queue.position(growth)
+        reason = f"{lease.id} grows by {more_bytes}"
+        core.note("queued", growth, position=position, grows=lease.id, reason=reason)
+
+    def grant(self, core: Core, gpu: Gpu, request: Lease) -> bool:
+        """Add the bytes of a growth to its lease. The record is written before the holder hears of it."""
+        if request.extends is None:
+            return False
+        lease, more_bytes = core.leases[request.extends], request.load_peak_bytes
+        core.dequeue(request)
+        request.move(LeaseState.RELEASED, core.now, f"merged into {lease.id}")
+        core.end(request, None)
+        charge = gpu.ledger.charge_of(lease.id)
+        booked, approved = charge.booked_bytes + more_bytes, charge.approved_bytes + more_bytes
+        gpu.ledger.rebook(lease.id, booked, approved, core.now)
+        gpu.residents.enlarge(lease, core.now)
+        gpu.changed_at = core.now
+        _tell(core, gpu, lease, more_bytes)
+        return True
+
+    # -- shrinking -------------------------------------------------------------------------------------------------
+    def _begin_shrink(self, core: Core, gpu: Gpu, lease: Lease, target_bytes: int) -> None:
+        """Wait for readings that begin from now on: the holder says that the bytes are freed already."""
+        deadline_at = core.now + core.settings.verify_timeout_s
+        self.shrinks[lease.id] = Shrink(target_bytes, core.now, deadline_at)
+        lease.steady_seen_bytes = 0  # seen under another declaration: no drift from the new one
+        core.timers.set(("shrink", lease.id), core.now + core.settings.verify_poll_s[0])
+        core.want_sample(gpu, core.now)
+
+    def on_timer(self, core: Core, kind: str, subject: str) -> None:
+        """Read the GPU for a lease that shrinks. At the deadline its charge stays as it is."""
+        lease = core.leases[LeaseId(subject)]
+        gpu = core.gpu_of(lease)
+        if core.now >= self.shrinks[lease.id].deadline_at:
+            self._end_shrink(core, lease)
+            lease.steady_bytes = gpu.ledger.charge_bytes(lease.id)
+            _tell(core, gpu, lease, 0)
+            return
+        core.want_sample(gpu, core.now)
+        core.timers.set(("shrink", lease.id), core.now + core.settings.verify_poll_s[-1])
+
+    def on_sample(self, core: Core, gpu: Gpu, sample: MemorySampled) -> None:
+        """Weigh a reading for the leases of its GPU that shrink."""
+        for lease_id, shrink in list(self.shrinks.items()):
+            lease = core.leases[lease_id]
+            if lease.gpu != gpu.info.id or sample.taken_at <= shrink.asked_at:
+                continue
+            if not _is_freed(core, gpu, lease, shrink, sample):
+                shrink.agreed = False
+            elif not shrink.agreed:
+                shrink.agreed = True
+            else:
+                before = gpu.ledger.charge_bytes(lease.id)
+                self._end_shrink(core, lease)
+                gpu.ledger.recharge(lease.id, shrink.target_bytes, core.now)
+                gpu.changed_at = core.now
+                core.wake(gpu)
+                _tell(core, gpu, lease, shrink.target_bytes - before)
+
+    def _end_shrink(self, core: Core, lease: Lease) -> None:
+        if self.shrinks.pop(lease.id, None) is not None:
+            core.timers.clear(("shrink", lease.id))
+
+    # -- hooks -----------------------------------------------------------------------------------------------------
+    def on_unloading(self, core: Core, lease: Lease, why: str) -> None:
+        """A lease that gives everything back needs no other size."""
+        self._abandon(core, lease, why)
+
+    def on_ended(self, core: Core, lease: Lease) -> None:
+        """Forget a lease's shrink, and a growth however it ended."""
+        self._end_shrink(core, lease)
+        if lease.extends is not None:
+            del self.growths[lease.extends]
+
+    def size_changes(self, lease: Lease) -> bool:
+        """Return whether the lease may show bytes that its holder has freed already."""
+        return lease.id in self.shrinks
+
+    def view(self, core: Core, lease: Lease) -> Mapping[str, object]:
+        """Show a growth as one, and the direction of a lease's resize."""
+        if lease.extends is not None:
+            return {"grows": lease.extends}
+        resizing = self._resizing(lease)
+        return {"resizing": resizing} if resizing else {}
+
+
+def _check_resizable(lease: Lease) -> None:
     if lease.state in LEAVING:
         raise Refused(
             "lease_revoking",
@@ -37,37 +232,6 @@ def resize(core: Core, event: ResizeAsked) -> None:
             lease,
             "a lease with sub-leases, or one of them, keeps its size: carve or release instead",
         )
-    gpu = core.gpu_of(lease)
-    target = max(event.steady_bytes, event.residue_bytes)
-    charge = gpu.ledger.charge_bytes(lease.id)
-    if target > charge and not _waits_for(core, lease, target):
-        _check_ever_fits(gpu, lease, target, charge)
-        check_waiters(core, core.clients[event.client], lease.spec.priority)
-        growth.abandon(core, lease, "another size is asked for")
-        growth.begin(core, gpu, lease, event, target - charge)
-    elif target < charge and (lease.shrink is None or lease.shrink.target_bytes != target):
-        growth.abandon(core, lease, "another size is asked for")
-        growth.begin_shrink(core, gpu, lease, target)
-    elif target == charge:
-        growth.abandon(core, lease, "another size is asked for")
-    peak = max(event.load_peak_bytes, target)
-    lease.spec = replace(
-        lease.spec,
-        load_peak_bytes=peak,
-        steady_bytes=event.steady_bytes,
-        residue_bytes=event.residue_bytes,
-    )
-    lease.load_peak_bytes, lease.steady_bytes = max(lease.load_peak_bytes, peak), target
-    core.record_lease(lease)  # a restart must not take who gave bytes back for gone
-    state = "growing" if lease.growth else "shrinking" if lease.shrink else "held"
-    core.reply(event.client, event.request, {"state": state, "lease": explain.view(core, lease)})
-
-
-def _waits_for(core: Core, lease: Lease, target: int) -> bool:
-    if lease.growth is None:
-        return False
-    waiter = core.leases[lease.growth]
-    return core.gpu_of(lease).ledger.charge_bytes(lease.id) + waiter.load_peak_bytes == target
 
 
 def _check_ever_fits(gpu: Gpu, lease: Lease, target: int, charge: int) -> None:
@@ -82,3 +246,44 @@ def _check_ever_fits(gpu: Gpu, lease: Lease, target: int, charge: int) -> None:
         capacity_bytes=gpu.info.capacity_bytes,
         reserve_bytes=gpu.info.reserve_bytes,
     )
+
+
+def _declare(lease: Lease, event: ResizeAsked, target: int) -> None:
+    """Make the new size the declared one."""
+    peak = max(event.load_peak_bytes, target)
+    lease.spec = replace(
+        lease.spec,
+        load_peak_bytes=peak,
+        steady_bytes=event.steady_bytes,
+        residue_bytes=event.residue_bytes,
+    )
+    lease.load_peak_bytes, lease.steady_bytes = max(lease.load_peak_bytes, peak), target
+
+
+def _is_freed(core: Core, gpu: Gpu, lease: Lease, shrink: Shrink, sample: MemorySampled) -> bool:
+    """Return whether a reading shows no more than the charges would be afterwards: on the GPU, and for the process where it is listed."""
+    ledger, tolerance = gpu.ledger, core.settings.verify_tolerance_bytes
+    less = ledger.charge_bytes(lease.id) - shrink.target_bytes
+    held = process_bytes(sample, lease.process)
+    if held is not None and held > ledger.booked_by(lease.process) - less + tolerance:
+        return False
+    unattributed = ledger.stowaway_bytes() + ledger.driver_bytes()
+    return sample.used_bytes <= ledger.booked_bytes() - less + unattributed + tolerance
+
+
+def _tell(core: Core, gpu: Gpu, lease: Lease, changed_bytes: int) -> None:
+    """Record the charge of a lease, and push it to its holder."""
+    charge = gpu.ledger.charge_bytes(lease.id)
+    if lease.measured_bytes is not None:  # measured by the holder before the resize
+        lease.measured_bytes = max(0, lease.measured_bytes + changed_bytes)
+    core.record_lease(lease)
+    token = lease.token
+    assert token is not None, f"{lease.id} is resident without a token"
+    pair = [token.epoch, token.serial]
+    core.push(
+        lease, {"push": "resized", "lease_id": lease.id, "token": pair, "charge_bytes": charge}
+    )
+    reason = "the bytes did not come back in time"
+    if changed_bytes:
+        reason = "grown" if changed_bytes > 0 else "shrunk"
+    core.note("resized", lease, charge_bytes=charge, changed_bytes=changed_bytes, reason=reason)

@@ -83,7 +83,7 @@ def acquire(core: Core, event: AcquireRequested, ref: tuple[LeaseId, Token]) -> 
 def _may_carve(core: Core, parent: Lease, spec: Spec) -> Gpu:
     if parent.gpu is None:
         raise bad_state(parent, "it holds nothing to carve from")
-    if parent.growth is not None or parent.shrink is not None:
+    if any(feature.size_changes(parent) for feature in core.features):
         raise bad_state(parent, "it changes its size; carve when it has the new one")
     gpu = core.gpu_of(parent)
     depth, lease = 2, parent

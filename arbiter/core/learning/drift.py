@@ -46,8 +46,8 @@ def on_evidence(core: Core, gpu: Gpu) -> None:
         if lease.state is LeaseState.LOADING:
             if held > lease.peak_seen_bytes:
                 lease.peak_seen_bytes, lease.grew_at = held, core.now
-        elif (
-            lease.state in _RESIDENT and lease.shrink is None
+        elif lease.state in _RESIDENT and not _size_changes(
+            core, lease
         ):  # else its bytes may still be on the way back
             lease.steady_seen_bytes = max(lease.steady_seen_bytes, held)
             if held > lease.spec.steady_bytes:
@@ -96,6 +96,10 @@ def measured_bytes(gpu: Gpu, lease: Lease) -> int:
     return account.measured_bytes if len(account.charges) == 1 else 0
 
 
+def _size_changes(core: Core, lease: Lease) -> bool:
+    return any(feature.size_changes(lease) for feature in core.features)
+
+
 def held_bytes(gpu: Gpu, lease: Lease) -> int:
     """The newest reading, else the holder's own word; 0: nobody can say."""
     return measured_bytes(gpu, lease) or lease.measured_bytes or 0
@@ -103,7 +107,7 @@ def held_bytes(gpu: Gpu, lease: Lease) -> int:
 
 def drift_bytes(core: Core, gpu: Gpu, lease: Lease) -> int:
     """How far a resident lease is above (below: negative) what it declared; within the tolerance it is 0, as where nobody can say."""
-    if lease.state not in _RESIDENT or lease.shrink is not None:
+    if lease.state not in _RESIDENT or _size_changes(core, lease):
         return 0
     drift = (held_bytes(gpu, lease) or lease.spec.steady_bytes) - lease.spec.steady_bytes
     return drift if abs(drift) > core.settings.verify_tolerance_bytes else 0

@@ -148,16 +148,6 @@ class Roster(Protocol):
     def moved(self, lease: "Lease", before: LeaseState) -> None: ...
 
 
-@dataclass(slots=True)
-class Shrink:
-    """Bytes that the holder says it gave back, until the card says so too."""
-
-    target_bytes: int
-    asked_at: float
-    deadline_at: float
-    agreed: bool = False  # by the newest counting reading
-
-
 @dataclass(frozen=True, slots=True)
 class Recall:
     """A wait that begins when the lease is measured away."""
@@ -288,10 +278,7 @@ class Lease:
     uncalled: bool = False  # it came back by itself and nobody has used it since
     returned: bool = False  # it was granted because it came back by itself
     recalled: Recall | None = None  # its holder wants it back before it is gone
-    grows: LeaseId | None = None  # it is no lease of its own: that one waits for so many bytes more
-    growth: LeaseId | None = None  # who waits for its bytes
-    shrink: Shrink | None = None
-    resized_at: float = 0.0
+    extends: LeaseId | None = None  # a request for more bytes of that resident lease
     eviction: Eviction | None = None
     evicted: list[Eviction] = field(default_factory=list)  # who left for it
     story: list[tuple[float, LeaseState, str]] = field(

@@ -24,6 +24,8 @@ class Residents(dict[LeaseId, Lease]):
         """Never asked to leave, by their own wish or an operator's."""
         self.recent: dict[LeaseId, Lease] = {}
         """All that were granted or became ready since the newest reading began, and perhaps some more."""
+        self.enlarged: dict[LeaseId, float] = {}
+        """When a resident was last granted more bytes."""
         self.touched: set[LeaseId] = set()
         """Came or went since the invariants were checked last."""
 
@@ -53,6 +55,7 @@ class Residents(dict[LeaseId, Lease]):
         lease.roster = None
         for table in (self._by_state[lease.state], self.exclusive, self.pinned, self.recent):
             table.pop(lease_id, None)
+        self.enlarged.pop(lease_id, None)
         self.touched.add(lease_id)
         return lease
 
@@ -70,9 +73,14 @@ class Residents(dict[LeaseId, Lease]):
         else:
             self.pinned[lease.id] = lease
 
+    def enlarge(self, lease: Lease, now: float) -> None:
+        """A resident was granted more bytes."""
+        self.enlarged[lease.id] = now
+        self.recent[lease.id] = lease
+
     def seen(self, taken_at: float) -> None:
         """A reading that began then knows of everything that happened before."""
-        for lease in [lease for lease in self.recent.values() if not _after(lease, taken_at)]:
+        for lease in [lease for lease in self.recent.values() if not self._after(lease, taken_at)]:
             del self.recent[lease.id]
 
     # -- reading ---------------------------------------------------------------------------------------------------
@@ -89,7 +97,10 @@ class Residents(dict[LeaseId, Lease]):
 
     def unseen(self, taken_at: float) -> list[Lease]:
         """Granted or become ready after a reading began (the newest, or one after it): it cannot have seen them."""
-        return [lease for lease in self.recent.values() if _after(lease, taken_at)]
+        return [lease for lease in self.recent.values() if self._after(lease, taken_at)]
+
+    def _after(self, lease: Lease, taken_at: float) -> bool:
+        return max(lease.granted_at, lease.ready_at, self.enlarged.get(lease.id, 0.0)) > taken_at
 
     def filling(self, since: float) -> Iterator[Lease]:
         """Who loads, or became ready after that moment. Leases are held in the order in which they became ready."""
@@ -122,7 +133,3 @@ class Residents(dict[LeaseId, Lease]):
         if self.pinned.keys() != {lease.id for lease in self.values() if not lease.evictable}:
             return f"{sorted(self.pinned)} are listed as pinned"
         return ""
-
-
-def _after(lease: Lease, taken_at: float) -> bool:
-    return max(lease.granted_at, lease.ready_at, lease.resized_at) > taken_at

@@ -22,6 +22,7 @@ from vram_arbiter.arbiter.core.effects import (
 )
 from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.arbiter.core.features.parking import HostRam
+from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.learning.footprints import Footprints
 from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger
 from vram_arbiter.arbiter.core.ledger.returning import Returning
@@ -150,9 +151,6 @@ class Gpu:
         default_factory=dict
     )  # leases that sub-leases were carved out of
     debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
-    shrinking: dict[LeaseId, Lease] = field(
-        default_factory=dict
-    )  # their measurement is awaited (`growth`)
 
     def in_state(self, *states: LeaseState) -> list[Lease]:
         return self.residents.in_state(*states)
@@ -170,8 +168,9 @@ class Gpu:
 class Core:
     """State plus the effects of the event being handled."""
 
-    def __init__(self, settings: Settings, now: float) -> None:
+    def __init__(self, settings: Settings, now: float, features: tuple[Feature, ...]) -> None:
         self.settings = settings
+        self.features = features
         self.started_at = now
         self.now = now
         self.out: list[Effect] = []
@@ -361,9 +360,6 @@ class Core:
                 return f"{lease.id} is not listed under its process and its client"
         if by_process or by_client:
             return f"{sorted({**by_process, **by_client})} are listed and gone"
-        shrinking = {lease.id for lease in self.leases.values() if lease.shrink is not None}
-        if shrinking != {lease_id for gpu in self.gpus.values() for lease_id in gpu.shrinking}:
-            return f"{sorted(shrinking)} shrink, others are listed"
         busy = {(*use, lease.id) for lease in self.leases.values() for use in lease.uses}
         if odd := busy ^ {
             (who, use, lease) for who, mine in self.users.items() for lease, use in mine
@@ -436,14 +432,15 @@ class Core:
         del self.leases[lease.id]
         _take_out(self._of_process, lease.process, lease.id)
         _take_out(self._of_client, lease.client, lease.id)
-        for kind in ("ttl", "revoke", "overstay", "shrink", "users"):
+        for kind in ("ttl", "revoke", "overstay", "users"):
             self.timers.clear((kind, lease.id))
+        for feature in self.features:
+            feature.on_ended(self, lease)
         self.away.pop(lease.id, None)
         self.host.drop(lease.id)
         if lease.gpu is not None:
             gpu = self.gpus[lease.gpu]
             gpu.residents.pop(lease.id, None)
-            gpu.shrinking.pop(lease.id, None)
             self.wake(gpu)
         elif lease.token is not None:  # it was resident once: the journal knows it as away
             self.forget(f"lease:{lease.id}")

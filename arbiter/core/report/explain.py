@@ -95,10 +95,8 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
         )
     if lease.yielded:
         shown["yielded"] = len(lease.yielded)
-    if lease.grows is not None:
-        shown["grows"] = lease.grows
-    if lease.growth is not None or lease.shrink is not None:
-        shown["resizing"] = "growing" if lease.growth is not None else "shrinking"
+    for feature in core.features:
+        shown.update(feature.view(core, lease))
     if lease.spec.standby:
         shown["standby"] = True
     if lease.id in core.host.booked:

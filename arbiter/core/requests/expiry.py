@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import growth, standby
+from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import crashes
 from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
@@ -78,7 +78,8 @@ def lose(
     for use in list(lease.uses.values()):
         core.unmark(lease, use)
     lease.yielded.clear()
-    growth.abandon(core, lease, "the lease is over")
+    for feature in core.features:
+        feature.on_unloading(core, lease, "the lease is over")
     gpu.ledger.to_debt(lease.id)
     core.record_lease(lease, debt=True)
     if lease.eviction is not None:

@@ -19,7 +19,7 @@ from vram_arbiter.arbiter.core.events import (
     UnloadStarted,
 )
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import families, gangs, growth, standby
+from vram_arbiter.arbiter.core.features import families, gangs, standby
 from vram_arbiter.arbiter.core.learning import costs, crashes, drift
 from vram_arbiter.arbiter.core.model.lease import (
     AWAY,
@@ -468,7 +468,8 @@ def unloading(core: Core, event: UnloadStarted) -> None:
         raise bad_state(lease, f"{running} uses still run; wait for the `revoke` that says 0 uses")
     gpu = core.gpu_of(lease)
     end_uses(core, lease, "unloaded while it paused")
-    growth.abandon(core, lease, "it unloads")
+    for feature in core.features:
+        feature.on_unloading(core, lease, "it unloads")
     lease.move(LeaseState.UNLOADING, core.now, "at its safe point")
     lease.hangs = False
     core.timers.set(("revoke", lease.id), core.now + core.settings.revoke_deadline_s)
@@ -563,7 +564,8 @@ def let_go(
     end_uses(core, lease, why)
     before = lease.state
     lease.exiting = exiting
-    growth.abandon(core, lease, "it let go")
+    for feature in core.features:
+        feature.on_unloading(core, lease, "it let go")
     lease.comes_back = comes_back
     lease.parks = parks
     if not parks:

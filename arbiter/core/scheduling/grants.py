@@ -15,7 +15,7 @@ Per card, in this order (the numbers stand in `_serve`):
 from collections.abc import Mapping
 
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import families, gangs, growth, standby
+from vram_arbiter.arbiter.core.features import families, gangs, standby
 from vram_arbiter.arbiter.core.learning import costs
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
@@ -155,14 +155,13 @@ def _backfill(
 
 def _may_be_asked(core: Core, lease: Lease) -> bool:
     """Could it be asked to leave once it is resident? If a stowaway gives back a part, the head may need what this one took."""
-    return (lease if lease.grows is None else core.leases[lease.grows]).evictable
+    return (lease if lease.extends is None else core.leases[lease.extends]).evictable
 
 
 def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     """Give the lease its card and its token. The record goes to the journal before the holder hears of it."""
-    if lease.grows is not None:
-        _collect_evictions(core, gpu, lease)
-        growth.merge(core, gpu, lease)
+    _collect_evictions(core, gpu, lease)
+    if any(feature.grant(core, gpu, lease) for feature in core.features):
         return
     core.dequeue(lease)
     by_itself = standby.taken_back(core, lease)
@@ -179,7 +178,6 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     )
     gpu.changed_at = core.now
     core.granted.append((token, gpu.info.id))
-    _collect_evictions(core, gpu, lease)
     lease.expires_at = core.now + lease.spec.ttl_s
     core.timers.set(("ttl", lease.id), lease.expires_at)
     core.record_lease(lease, gates=True)

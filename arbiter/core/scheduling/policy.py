@@ -6,6 +6,7 @@ Nothing here changes anything but when a card is looked at again (`wake_when_evi
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import combinations
+from math import inf
 
 from vram_arbiter.arbiter.core.learning import costs
 from vram_arbiter.arbiter.core.ledger.ledger import NOTHING, process_bytes
@@ -110,7 +111,7 @@ def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool
         if any(other not in going for other in gpu.ledger.leases()):
             return False
     elif gpu.residents.exclusive and any(
-        other not in going and other != lease.grows for other in gpu.residents.exclusive
+        other not in going and other != lease.extends for other in gpu.residents.exclusive
     ):
         return False
     elif gpu.verifications and any(
@@ -230,7 +231,7 @@ def choose_victims(
         lease
         for lease in gpu.in_state(LeaseState.HELD)
         if may_ask(lease)
-        and lease.id != waiter.grows
+        and lease.id != waiter.extends
         and (not lease.in_use or lease.spec.priority <= priority)
     ]
     search = _oldest if core.settings.scheduling.least_recent else _search
@@ -507,15 +508,17 @@ def spare_unplanned_bytes(
 def passed(gpu: Gpu, lease: Lease, head: Lease) -> bool:
     """Was it granted, or did it grow, while this waiter stood before it?"""
     overtook = lease.granted_at >= head.arrived_at and gpu.queue.precedes(head, lease)
-    return overtook or bool(lease.resized_at and lease.resized_at >= head.arrived_at)
+    return overtook or gpu.residents.enlarged.get(lease.id, -inf) >= head.arrived_at
 
 
 def _ever_freed(
     gpu: Gpu, head: Lease, going: Mapping[LeaseId, int], stays: Callable[[Lease], bool] | None
 ) -> dict[LeaseId, int]:
-    """All but the lease that it grows, and the trees that stay."""
+    """All but the lease that it extends, and the trees that stay."""
     roots = {lease.root.id: lease.root for lease in gpu.residents.values()}
     leave = [
-        lease for lease in roots.values() if lease.id != head.grows and not (stays and stays(lease))
+        lease
+        for lease in roots.values()
+        if lease.id != head.extends and not (stays and stays(lease))
     ]
     return {**_leave(leave), **going}

@@ -48,6 +48,8 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
     measure.on_reading(core, gpu, sample, answers_again=answers_again)
     note_pressure(core, gpu)
     core.wake(gpu)
+    for feature in core.features:
+        feature.on_sample(core, gpu, sample)
 
 
 def _impossible(core: Core, gpu: Gpu, sample: MemorySampled) -> str:

@@ -214,10 +214,6 @@ def gone_and_listed(b: Broken) -> None:
     del b.core.leases[b.held.id]
 
 
-def shrinking_off(b: Broken) -> None:
-    b.gpu.shrinking[b.held.id] = b.held
-
-
 def connected_off(b: Broken) -> None:
     b.core.connected[b.held.process] += 1
 
@@ -237,7 +233,6 @@ def waiters_off(b: Broken) -> None:
         (user_off, "uses are listed otherwise than they are"),
         (client_off, "not listed under its process and its client"),
         (gone_and_listed, "listed and gone"),
-        (shrinking_off, "shrink, others are listed"),
         (connected_off, "are connected, kept as"),
         (sum_off, "the sums are"),
         (account_off, "is charged"),

@@ -146,7 +146,7 @@ def test_one_reading_that_agrees_is_not_enough() -> None:
     vlm, lease = held(driver, "vlm", 6)
     vlm.hold(4 * GIB)
     vlm.resize(lease, 4 * GIB)
-    driver.until(lambda: bool(driver.arbiter._core.leases[lease].shrink.agreed), limit_s=1.0)  # type: ignore[union-attr]
+    driver.until(lambda: driver.arbiter._resizing.shrinks[lease].agreed, limit_s=1.0)
     vlm.hold(6 * GIB)
     driver.advance(5.0)
     assert charge(driver, lease) == 6 * GIB
@@ -271,11 +271,11 @@ def test_another_size_replaces_the_one_before() -> None:
     det, other = held(driver, "det", 3)
     det.use_begin(other)
     vlm.resize(lease, 6 * GIB)
-    before = driver.arbiter._core.leases[lease].growth
+    before = driver.arbiter._resizing.growths[lease]
     assert answer(vlm.resize(lease, 6 * GIB))["state"] == "growing"
-    assert driver.arbiter._core.leases[lease].growth == before, "a repeat keeps its place"
+    assert driver.arbiter._resizing.growths[lease] == before, "a repeat keeps its place"
     vlm.resize(lease, 5 * GIB)
-    assert driver.state(LeaseId(str(before))) == "over"
+    assert driver.state(before) == "over"
     assert answer(vlm.resize(lease, 4 * GIB))["state"] == "held"
     assert len(driver.arbiter._core.waiting) == 0
     vlm.hold(3 * GIB)
@@ -372,7 +372,29 @@ def test_the_invariant_of_a_growth() -> None:
     det.use_begin(other)
     vlm.resize(lease, 6 * GIB)
     core = driver.arbiter._core
-    growth = core.leases[core.leases[lease].growth or lease]
-    growth.grows = LeaseId("gone")
+    growth = core.leases[driver.arbiter._resizing.growths[lease]]
+    growth.extends = LeaseId("gone")
     with pytest.raises(InvariantViolation, match="which is not there"):
         invariants.check(core)
+
+
+@pytest.mark.parametrize("end", ["canceled", "connection lost"])
+def test_a_lease_outlives_its_growth(end: str) -> None:
+    """A growth that ended without a denial was still named by its lease, and the next request on that lease stopped the daemon."""
+    driver = CoreDriver(8 * GIB)
+    vlm, lease = held(driver, "vlm", 4)
+    det, other = held(driver, "det", 3)
+    det.use_begin(other)
+    vlm.resize(lease, 6 * GIB)
+    views = driver.arbiter.status(driver.now)["leases"]
+    (growth,) = (view["lease_id"] for view in views if view.get("grows") == lease)
+    if end == "canceled":
+        vlm.cancel(growth)
+    else:
+        vlm.leave("connection lost")
+        vlm.connect()
+    view = driver.view(lease)
+    assert view is not None
+    assert "resizing" not in view
+    assert answer(vlm.resize(lease, 5 * GIB))["state"] == "growing"
+    assert vlm.unloading(lease)
