@@ -26,6 +26,7 @@ from typing import Any
 
 from harness import SHIPPED, arbiter, p50, p99
 
+from tests.support.paths import ROOT
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient
@@ -33,12 +34,11 @@ from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.schemas.errors import RunnerUnreachable, SidecarUnavailable
 from vram_arbiter.schemas.estop import REPLY_MAX_BYTES, Answer, path_of, reply_in, request
 
-ROOT = Path(__file__).parents[2]
 SKILLS = {"detector": "so101-detector", "grab": "so101-grab"}
 GRAB = "vram-arbiter/so101-grab"
 NAVIGATE = "vram-arbiter/so101-navigate"
 TURN_RAD = 6.0  # some eight seconds of driving
-ATTACKER = ROOT / "tests/clients/attacker.py"
+ATTACKER = ROOT / "tests/support/attacker.py"
 ATTACKS = ("empties", "maps", "more", "connects")
 RATE_HZ = 30.0
 JITTER_MAX_US = 2000.0

@@ -12,7 +12,7 @@ from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 sys.path.insert(0, str(Path(__file__).parent))  # for the helpers beside it
 
-from protocol_wire import Wire
+from tests.support.protocol_wire import Wire
 
 DEADLINE_S = 60.0
 TTL_S = 120.0

@@ -11,7 +11,7 @@ from vram_arbiter import schemas
 from vram_arbiter.schemas.__main__ import main
 from vram_arbiter.schemas.export import documents, modules, public_models
 
-SAMPLES = sorted((Path(__file__).parent / "manifests").glob("*.yaml"))
+SAMPLES = sorted((Path(__file__).parent / "manifest/samples").glob("*.yaml"))
 EXPORTED = Path(schemas.__file__).parent / "json"
 
 

@@ -4,12 +4,12 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 from threading import Event
 from time import monotonic
 
 import pytest
 
+from tests.support.paths import SUPPORT
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.e2e
 GB = 10**9
 MB = 10**6
 PATIENCE_S = 60.0
-ATTACKER = str(Path(__file__).parents[1] / "clients/attacker.py")
+ATTACKER = str(SUPPORT / "attacker.py")
 
 
 @pytest.fixture

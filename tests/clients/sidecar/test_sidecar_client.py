@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.paths import SUPPORT
 from vram_arbiter.clients.sidecar import base
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.clients.sidecar.perception import Detection, DetectorClient, SceneVlmClient
@@ -27,7 +28,7 @@ from vram_arbiter.schemas.errors import (
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
-SERVER = Path(__file__).with_name("server_process.py")
+SERVER = SUPPORT / "server_process.py"
 PNG = b"\x89PNG\r\n\x1a\n"
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from small_robots import FedCamera, Nod, Twin
 
+from tests.support.paths import SUPPORT
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.hardware import HardwareRunner
@@ -25,7 +26,7 @@ from vram_arbiter.schemas.manifest import Kind, load_manifest
 
 pytestmark = pytest.mark.e2e
 
-ATTACKER = Path(__file__).parents[2] / "clients/attacker.py"
+ATTACKER = SUPPORT / "attacker.py"
 RSKILL = "vram-arbiter/so101-navigate"
 Run = Callable[[Any], Any]
 

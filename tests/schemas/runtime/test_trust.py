@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.paths import SUPPORT
 from vram_arbiter.schemas.errors import ConfigError, UntrustedServer, from_wire
 from vram_arbiter.schemas.runtime.trust import (
     SERVICE_USERS,
@@ -22,7 +23,7 @@ FOREIGN = 54_321
 as_root = pytest.mark.skipif(
     os.geteuid() != 0, reason="only root can start a server of another user"
 )
-FALSE_SERVER = Path(__file__).with_name("false_server.py")
+FALSE_SERVER = SUPPORT / "false_server.py"
 
 
 def test_root_and_the_own_user_are_trusted(tmp_path: Path) -> None:

@@ -1,17 +1,17 @@
 """The configuration: file and model say the same, and every mistake is named with its line."""
 
 import re
-from pathlib import Path
 
 import pytest
 import yaml
 
+from tests.support.paths import ROOT
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.config.arbiter import ArbiterConfig, load_config
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.yamltext import parse_yaml
 
-EXAMPLE = Path(__file__).parents[2] / "configs" / "arbiter.yaml"
+EXAMPLE = ROOT / "configs" / "arbiter.yaml"
 
 
 def test_the_example_equals_the_defaults() -> None:

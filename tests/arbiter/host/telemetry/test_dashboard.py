@@ -2,10 +2,11 @@
 
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.support.paths import ROOT
 
 pytest.importorskip("prometheus_client", reason="the extra `telemetry`")
 
@@ -24,8 +25,8 @@ from vram_arbiter.arbiter.host.telemetry.spans import LeaseTelemetry
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.runtime.telemetry import names as names
 
-GUIDE = Path(__file__).parents[3] / "docs" / "operating.md"
-DASHBOARD = Path(__file__).parents[3] / "configs" / "grafana" / "arbiter.json"
+GUIDE = ROOT / "docs" / "operating.md"
+DASHBOARD = ROOT / "configs" / "grafana" / "arbiter.json"
 
 
 class NeverCalled:

@@ -1,7 +1,6 @@
 """Acquires of the client's protocol from the question to the grant, the refusal or the cancel."""
 
-from protocol_wire import SPEC, Wire, view
-
+from tests.support.protocol_wire import SPEC, Wire, view
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.connection import WAIT_SLACK_S
 from vram_arbiter.schemas.errors import VramInsufficient, WaitTimeout

@@ -4,17 +4,16 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.paths import ROOT
 from vram_arbiter.schemas.errors import ManifestInvalid
 from vram_arbiter.schemas.manifest import Kind, ManifestError, Role, load_manifest, parse_manifest
 
-SAMPLES = sorted((Path(__file__).parent / "manifests").glob("*.yaml"))
-FIELD_FILES = sorted(
-    (Path(__file__).parents[3] / "shared" / "reference" / "manifests").glob("*.yaml")
-)
+SAMPLES = sorted((Path(__file__).parent / "samples").glob("*.yaml"))
+FIELD_FILES = sorted((ROOT.parent / "shared" / "reference" / "manifests").glob("*.yaml"))
 
 
 def sample(name: str) -> str:
-    return (Path(__file__).parent / "manifests" / f"{name}.yaml").read_text(encoding="utf-8")
+    return (Path(__file__).parent / "samples" / f"{name}.yaml").read_text(encoding="utf-8")
 
 
 def findings(text: str | bytes) -> list[str]:

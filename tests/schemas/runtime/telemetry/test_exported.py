@@ -14,7 +14,7 @@ from vram_arbiter.schemas.runtime.telemetry.exported import (
     text,
 )
 
-from .test_otel import needs_sdk, run
+from .test_setup import needs_sdk, run
 
 HALF = "half a pair: \ud800"
 

@@ -1,7 +1,6 @@
 """The client's connection without sockets and without time passing by itself: greeting, requests, silence, history."""
 
-from protocol_wire import WELCOME, Wire, view
-
+from tests.support.protocol_wire import WELCOME, Wire, view
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.connection import HELLO_TIMEOUT_S, SILENCE_BEATS
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VersionMismatch

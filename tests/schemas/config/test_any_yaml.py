@@ -3,7 +3,6 @@ traceback."""
 
 import json
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,12 +10,12 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.support.paths import ROOT
 from vram_arbiter.schemas.config.arbiter import load_config
 from vram_arbiter.schemas.config.robot import load_robot
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import ManifestError, parse_manifest
 
-ROOT = Path(__file__).parents[2]
 VALUES = [
     "[]", "{}", "{a: 1}", "!!timestamp x", "!!timestamp 2020-01-01", "2020-01-01", "null", "true", ".nan", ".inf",
     "-1", "0", "1e400", "9" * 30, "''", "[[1]]", "[null]", "{1: 2}", "!!set {a}", "!foo x", "1:30", "~", "[{}]", "x",

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from tests.support.collector import Collector
+from tests.support.paths import ROOT
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 pytestmark = pytest.mark.heavy  # the OpenTelemetry SDK
 
-ROOT = Path(__file__).parents[2]
 TRACE, PARENT = "0af7651916cd43dd8448eb211c80319c", "b7ad6b7169203331"
 WAIT_S = 60.0
 

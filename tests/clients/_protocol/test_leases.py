@@ -1,8 +1,8 @@
 """Leases that the client's protocol holds: renewal, fencing, operations, re-attachment."""
 
 import pytest
-from protocol_wire import Wire, view
 
+from tests.support.protocol_wire import Wire, view
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.connection import HELLO_TIMEOUT_S
 from vram_arbiter.schemas.errors import (

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.paths import ROOT
 from vram_arbiter.schemas.config.scenario import (
     Arrivals,
     Scenario,
@@ -15,7 +16,7 @@ from vram_arbiter.schemas.config.scenario import (
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.sizes import parse_bytes
 
-SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "scenarios").glob("*.yaml"))
+SHIPPED = sorted((ROOT / "configs" / "scenarios").glob("*.yaml"))
 SMALL = """\
 about: one
 seconds: 10

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.core_driver import CoreDriver
+from tests.support.paths import ROOT
 from tests.support.recording import record_workload, write_log
 from vram_arbiter.arbiter.eventlog import replay as runner
 from vram_arbiter.arbiter.lab import compare
@@ -16,7 +17,7 @@ from vram_arbiter.arbiter.lab.scenarios import settings_of, workload_of
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.config.scenario import Scenario, load_scenario
 
-SCENARIOS = Path(__file__).parents[3] / "configs" / "scenarios"
+SCENARIOS = ROOT / "configs" / "scenarios"
 GIB = d.GIB
 
 

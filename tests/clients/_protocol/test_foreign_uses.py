@@ -1,7 +1,6 @@
 """Uses of the client's protocol on leases of other processes."""
 
-from protocol_wire import Wire
-
+from tests.support.protocol_wire import Wire
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
 

@@ -2,8 +2,7 @@
 
 from typing import Any
 
-from protocol_wire import WELCOME, Wire, evict, view
-
+from tests.support.protocol_wire import WELCOME, Wire, evict, view
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
 from vram_arbiter.clients._protocol.records import Message

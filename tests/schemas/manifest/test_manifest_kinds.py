@@ -14,7 +14,7 @@ from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.manifest.kinds import KINDS, RULES, check_kind
 from vram_arbiter.schemas.manifest.problems import from_validation_error
 
-FOLDER = Path(__file__).parent / "manifests"
+FOLDER = Path(__file__).parent / "samples"
 SAMPLES: dict[Kind, dict[str, Any]] = {
     kind: yaml.safe_load((FOLDER / f"{kind.value}.yaml").read_text(encoding="utf-8"))
     for kind in KINDS

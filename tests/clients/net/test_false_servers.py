@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.paths import SUPPORT
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.cli import quick
 from vram_arbiter.clients.client import AsyncClient
@@ -32,7 +33,7 @@ pytestmark = pytest.mark.skipif(
     os.geteuid() != 0, reason="only root can start a server of another user"
 )
 
-SCRIPT = Path(__file__).parents[1] / "schemas/runtime/false_server.py"
+SCRIPT = SUPPORT / "false_server.py"
 DEADLINE_S = 60.0
 Heard = Callable[[], list[str]]
 

@@ -9,11 +9,11 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.support.paths import ROOT
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.server import Message, Peer, RouterServer
 from vram_arbiter.clients.net.timeouts import answered
@@ -176,7 +176,7 @@ def test_an_answer_that_came_while_the_process_was_stopped_counts(
     endpoint = serve(stop, go_on)
     child = subprocess.Popen(
         [sys.executable, "-c", CLIENT, endpoint],
-        env={**os.environ, "PYTHONPATH": f"{Path(__file__).parents[2]}/src"},
+        env={**os.environ, "PYTHONPATH": f"{ROOT}/src"},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.paths import ROOT
 from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.units import parse_bytes
 
-ROOT = Path(__file__).parents[2]
-MANIFEST = ROOT / "tests/schemas/manifests"
+MANIFEST = ROOT / "tests/schemas/manifest/samples"
 GRAB = ROOT / "configs/rskills/so101-grab/rskill.yaml"
 PATIENCE_S = 60
 BUFFERED = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}

@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-ROOT = Path(__file__).parents[3]
+from tests.support.paths import ROOT
+
 STRANGER = """
 import os, sys
 from pathlib import Path

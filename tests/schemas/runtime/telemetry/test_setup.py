@@ -8,11 +8,11 @@ import subprocess
 import sys
 import threading
 from collections.abc import Mapping
-from pathlib import Path
 
 import pytest
 
 from tests.support.collector import Collector
+from tests.support.paths import ROOT
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.telemetry.setup import OTLP_DEFAULT, Plan, Telemetry, plan, set_up
 
@@ -30,7 +30,7 @@ def run(code: str, environ: Mapping[str, str]) -> subprocess.CompletedProcess[st
     return subprocess.run(
         [sys.executable, "-c", code],
         env={**kept, **environ},
-        cwd=Path(__file__).parents[2],
+        cwd=ROOT,
         capture_output=True,
         text=True,
         timeout=120,
@@ -219,7 +219,7 @@ def test_packages_that_are_missing_are_asked_for() -> None:
 
 # -- on -----------------------------------------------------------------------------------------------------------------
 PROGRAM = """
-import sys, schemas.runtime.telemetry.setup as o
+import sys, vram_arbiter.schemas.runtime.telemetry.setup as o
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry, spans as tracing
 from opentelemetry import metrics
 made_before = metrics.get_meter(telemetry.TRACER).create_counter(telemetry.METRIC_GOALS)

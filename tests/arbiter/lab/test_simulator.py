@@ -1,9 +1,8 @@
 """Simulated consumers under the engine and under other programs' rules: safe, reproducible, and as each rule says."""
 
-from pathlib import Path
-
 import pytest
 
+from tests.support.paths import ROOT
 from vram_arbiter.arbiter.core.scheduling.policies import SCHEDULING
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.lab import compare
@@ -12,7 +11,7 @@ from vram_arbiter.arbiter.lab.rules import RULES, OneCardOnly
 from vram_arbiter.arbiter.lab.scenarios import settings_of, workload_of
 from vram_arbiter.schemas.config.scenario import Scenario, load_scenario
 
-SCENARIOS = Path(__file__).parents[3] / "configs" / "scenarios"
+SCENARIOS = ROOT / "configs" / "scenarios"
 
 
 def shipped(name: str) -> Scenario:
