@@ -7,6 +7,7 @@ One document a subject: `rskill.json` and the like have a root for editors, the 
 import importlib
 import json
 import pkgutil
+from dataclasses import fields, is_dataclass
 from types import ModuleType
 from typing import Any, Literal, is_typeddict
 
@@ -14,6 +15,7 @@ from pydantic import BaseModel, TypeAdapter
 
 from vram_arbiter import schemas
 from vram_arbiter.schemas import wire
+from vram_arbiter.schemas.ids import Token
 
 ROOTS: dict[str, str] = {
     "rskill": "vram_arbiter.schemas.manifest:RSkillManifest",
@@ -59,14 +61,18 @@ def modules() -> list[str]:
 
 
 def public_models(module: ModuleType) -> list[type]:
-    """The models and typed dicts that a module defines and does not hide behind an underscore, by name."""
+    """The models, typed dicts and messages that a module defines and does not hide behind an underscore, by name."""
     return [
         value
         for name, value in sorted(vars(module).items())
         if isinstance(value, type)
         and not name.startswith("_")
         and value.__module__ == module.__name__
-        and (issubclass(value, BaseModel) or is_typeddict(value))
+        and (
+            issubclass(value, BaseModel)
+            or is_typeddict(value)
+            or (is_dataclass(value) and ".wire." in module.__name__)
+        )
     ]
 
 
@@ -80,4 +86,23 @@ def _of_module(module: ModuleType) -> dict[str, Any]:
     for (name, _), schema in found.items():
         if schema != {"$ref": f"#/$defs/{name}"}:
             defs[name] = schema
+    for model in (Token, *public_models(module)):
+        if model.__name__ in defs:
+            _as_sent(model, defs[model.__name__])
     return defs
+
+
+def _as_sent(model: Any, schema: dict[str, Any]) -> None:
+    """Describe what `schemas.codec` makes of a dataclass: a list of its fields, or a map with its kind."""
+    if getattr(model, "COMPACT", False):
+        schema.clear()
+        schema.update(
+            type="array",
+            prefixItems=[{"title": field.name, "type": "integer"} for field in fields(model)],
+            minItems=len(fields(model)),
+            maxItems=len(fields(model)),
+        )
+    elif tag := getattr(model, "TAG", None):
+        key, value = tag
+        schema["properties"] = {key: {"const": value}, **schema.get("properties", {})}
+        schema["required"] = sorted([key, *schema.get("required", ())])

@@ -4,7 +4,7 @@ Standard library only: this is the one schema module that the sans-IO core may i
 """
 
 from dataclasses import dataclass
-from typing import NewType, Self
+from typing import ClassVar, NewType, Self
 
 LeaseId = NewType("LeaseId", str)
 """Names one lease for ever, e.g. `L3-17` (epoch 3, serial 17)."""
@@ -27,7 +27,10 @@ class Token:
     """Fencing token. Strictly increasing over all grants, also across restarts of the daemon.
 
     `epoch` counts starts of the daemon, `serial` counts grants within an epoch.
+    Its plain form is `[epoch, serial]` (`schemas.codec`).
     """
+
+    COMPACT: ClassVar = True
 
     epoch: int
     serial: int
@@ -50,6 +53,8 @@ class ProcessKey:
 
     `start_ticks` is field 22 of /proc/PID/stat (clock ticks since boot).
     """
+
+    COMPACT: ClassVar = True
 
     pid: int
     start_ticks: int

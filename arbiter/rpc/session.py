@@ -24,6 +24,7 @@ from vram_arbiter.arbiter.rpc.shares import (
     share_of,
     spend,
 )
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import KIB, WIRE_VERSION
 from vram_arbiter.schemas.errors import (
     BadRequest,
@@ -39,6 +40,7 @@ from vram_arbiter.schemas.ids import ClientId, ProcessKey, RequestId
 from vram_arbiter.schemas.runtime.peercred import Peer
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 from vram_arbiter.schemas.wire import requests as w
+from vram_arbiter.schemas.wire.replies import WelcomeReply
 
 HISTORY_PAGE = 2000
 """Events in one reply, whatever was asked for: packing more would hold the loop for too long."""
@@ -387,15 +389,16 @@ class SessionTable:
             )
 
     def _welcome(self, session: Session, hello: w.Hello) -> None:
-        welcome: w.WelcomeReply = {
-            "version": WIRE_VERSION,
-            "boot_id": self._settings.boot_id,
-            "server": self._settings.server,
-            "role": session.role,
-            "heartbeat_s": self._settings.heartbeat_s,
-            "grace_s": self._settings.grace_s,
-        }
-        self.reply(session.client, RequestId(hello.id), {**welcome})
+        settings = self._settings
+        welcome = WelcomeReply(
+            version=WIRE_VERSION,
+            boot_id=settings.boot_id,
+            server=settings.server,
+            role=session.role,
+            heartbeat_s=settings.heartbeat_s,
+            grace_s=settings.grace_s,
+        )
+        self.reply(session.client, RequestId(hello.id), to_map(welcome))
 
     def _hello_again(self, session: Session, hello: w.Hello) -> None:
         """A repeated hello is answered again; under another name it is another client's, which needs its own connection."""

@@ -1,0 +1,90 @@
+"""What the arbiter sends unasked: `{"push": kind, "seq": n, "epoch": e, …}`. Standard library only."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from vram_arbiter.schemas.ids import Token
+from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.views import LeaseView
+
+
+@dataclass(frozen=True, slots=True)
+class OrderView:
+    """An operator's order: `by` has the operator's name, uid and pid."""
+
+    by: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class RevokePush:
+    """The arbiter asks the holder to leave. Repeated every `REVOKE_RESEND_S` until acknowledged; idempotent."""
+
+    TAG: ClassVar = ("push", "revoke")
+
+    lease_id: str
+    token: Token
+    reason: str  # in words
+    wanted_by: str  # the consumer that the room is for; "" where there is none
+    deadline_in_s: float
+    cause: str = ""  # waiter, pressure, operator
+    order: OrderView | None = None  # an operator wants it
+    priority: int | None = None  # of the request that wants the room
+    uses: int = 0  # what still runs on the lease; `unloading` is refused before 0
+    park: bool = False  # host RAM for its weights is booked: release with `parked`
+    traceparent: str = ""  # of the eviction, or of the waiter: the unloading belongs to that trace
+    children: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class GrantedPush:
+    """A request that waited is granted."""
+
+    TAG: ClassVar = ("push", "granted")
+
+    lease: LeaseView
+
+
+@dataclass(frozen=True, slots=True)
+class DeniedPush:
+    """A request that waited ends without a grant."""
+
+    TAG: ClassVar = ("push", "denied")
+
+    lease_id: str
+    error: ErrorView
+
+
+@dataclass(frozen=True, slots=True)
+class ResizedPush:
+    """The lease has this size now: it has grown or shrunk, or it was not measured smaller in time."""
+
+    TAG: ClassVar = ("push", "resized")
+
+    lease_id: str
+    token: Token
+    charge_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class LostPush:
+    """The lease is over and its holder did not end it (expired, fenced): unload and acquire again."""
+
+    TAG: ClassVar = ("push", "lost")
+
+    lease_id: str
+    token: Token
+    error: ErrorView
+
+
+@dataclass(frozen=True, slots=True)
+class EventPush:
+    """One history event, for subscribers: `{"seq", "at_wall_s", "kind", "lease_id"?, …}`."""
+
+    TAG: ClassVar = ("push", "event")
+
+    event: Mapping[str, Any]
+
+
+type AnyPush = RevokePush | GrantedPush | DeniedPush | ResizedPush | LostPush | EventPush

@@ -1,0 +1,141 @@
+"""Answers to requests: `{"re": n, "epoch": e, "ok": true, …}`, one class per shape. Standard library only."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.views import GpuView, HostRamView, LeaseView, Totals
+
+
+@dataclass(frozen=True, slots=True)
+class DoneReply:
+    """Done, with nothing to say: `subscribe`, `bye`."""
+
+
+@dataclass(frozen=True, slots=True)
+class WelcomeReply:
+    """Answer to `hello`."""
+
+    version: int
+    boot_id: str
+    server: str
+    role: str
+    heartbeat_s: float
+    grace_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class PingReply:
+    server: str
+
+
+@dataclass(frozen=True, slots=True)
+class AcquireReply:
+    """Answer to `acquire` and `reacquire` (`loading`, `queued`), and to `resize` (`held`, `shrinking`, `growing`)."""
+
+    state: str
+    lease: LeaseView
+
+
+@dataclass(frozen=True, slots=True)
+class ReadyReply:
+    lease: LeaseView
+
+
+@dataclass(frozen=True, slots=True)
+class UsesReply:
+    """Answer to `use_begin`, `use_end` and `yield`: busy uses of the lease."""
+
+    uses: int
+
+
+@dataclass(frozen=True, slots=True)
+class StateReply:
+    """Answer to `revoke_ack`, `unloading` and `cancel`."""
+
+    state: str
+    uses: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseReply:
+    """`next`: what the lease becomes once its bytes are measured gone: `released`, `standby` or `parked`."""
+
+    state: str
+    next: str
+
+
+@dataclass(frozen=True, slots=True)
+class GoneLease:
+    lease_id: str
+    error: ErrorView
+
+
+@dataclass(frozen=True, slots=True)
+class RenewReply:
+    alive: tuple[str, ...]
+    gone: tuple[GoneLease, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ReattachedView:
+    """Verdict on one lease that a client named: `kept`, or `error` says why not."""
+
+    lease_id: str
+    kept: bool
+    lease: LeaseView | None = None
+    error: ErrorView | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReattachReply:
+    leases: tuple[ReattachedView, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class OomReply:
+    """`learnt_load_peak_bytes`: the footprint from now on; None: it was not the footprint."""
+
+    learnt_load_peak_bytes: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class StatusReply:
+    """The state of everything. `leases` is a page of the live ones: held, loading, …, then the queue in order."""
+
+    epoch: int
+    phase: Literal["recovering", "serving"]
+    uptime_s: float
+    gpus: tuple[GpuView, ...]
+    leases: tuple[LeaseView, ...]
+    totals: Totals
+    clients: int
+    host_ram: HostRamView
+    drained: str  # the operator that drained the arbiter, and why; "" while it grants
+    next: tuple[int, float, int] | None = None  # there may be more: ask again with this as `after`
+    problems: tuple[str, ...] = ()  # what is wrong with the daemon's own files, in words
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryReply:
+    """Events after a number, oldest first. `problem`: why older ones cannot be read, in words."""
+
+    events: tuple[Mapping[str, Any], ...]
+    last_seq: int
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorReply:
+    """Answer to `evict`, `pin`, `unpin` and `release_dead`; `lease` is None when it is over."""
+
+    state: str
+    lease: LeaseView | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DrainReply:
+    """Answer to `drain` and `resume`: the operator that drained the arbiter, and why; "" while it grants."""
+
+    drained: str

@@ -1,0 +1,86 @@
+"""Leases and GPUs as replies, pushes and `status` show them. Standard library only."""
+
+from dataclasses import dataclass
+
+from vram_arbiter.schemas.ids import Token
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseView:
+    """A lease. `token` is None while it is queued, and for readers that are neither its holder's process nor an operator."""
+
+    lease_id: str
+    token: Token | None
+    state: str
+    consumer: str
+    model: str
+    gpu: str | None
+    mode: str
+    priority: int
+    evictable: bool
+    charge_bytes: int
+    uses: int  # busy ones
+    pid: int
+    since_s: float  # seconds in this state
+    waited_s: float = 0.0
+    granted_s: float | None = None  # seconds since the grant, also across restarts of the daemon
+    position: int | None = None  # in its queue; 0: in none, its gang is not complete or loads
+    ttl_left_s: float | None = None
+    pinned: str = ""  # the operator that pinned it, and why
+    standby: bool = False  # once evicted, it comes back by itself
+    parked_bytes: int | None = None  # host RAM that is booked for it
+    drift_bytes: int = 0  # measured less declared, where that is more than the tolerance
+    yielded: int = 0  # uses that pause
+    grows: str | None = None  # the lease that this request asks more bytes for
+    resizing: str = ""  # growing or shrinking
+    gang: str = ""  # until all of it is held: name, phase, members that asked of all
+    parent: str | None = None
+    children: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessView:
+    """A process with bytes on a GPU."""
+
+    pid: int
+    name: str
+    used_bytes: int | None  # None: the driver does not say
+    lease_ids: tuple[str, ...]
+    charged_bytes: int
+    residue_bytes: int
+    stowaway: bool
+
+
+@dataclass(frozen=True, slots=True)
+class GpuView:
+    """A GPU: what is charged, what is measured, and why nothing is granted now."""
+
+    gpu: str
+    index: int
+    name: str
+    source: str  # what reads it: nvml, unified, fake
+    capacity_bytes: int
+    reserve_bytes: int
+    charged_bytes: int
+    stowaway_bytes: int
+    measured_used_bytes: int | None  # None: unknown, blocks grants
+    sample_age_s: float | None
+    pressure_bytes: int
+    blocked: str  # why nothing is granted now, "" if grants are possible
+    processes: tuple[ProcessView, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Totals:
+    """Leases of all pages of a status."""
+
+    leases: int
+    waiting: int
+
+
+@dataclass(frozen=True, slots=True)
+class HostRamView:
+    """Host RAM for parked weights."""
+
+    budget_bytes: int
+    parked_bytes: int

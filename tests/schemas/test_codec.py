@@ -1,0 +1,96 @@
+"""The codec of wire, journal and log: what is written, what is read back, and what is refused."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, ClassVar
+
+import pytest
+
+from vram_arbiter.schemas.codec import CodecError, from_map, to_map
+from vram_arbiter.schemas.ids import LeaseId, Token
+
+
+class Color(StrEnum):
+    RED = "red"
+
+
+@dataclass(frozen=True, slots=True)
+class Cat:
+    TAG: ClassVar = ("animal", "cat")
+
+    name: str
+    lives: int = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Dog:
+    TAG: ClassVar = ("animal", "dog")
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Everything:
+    lease: LeaseId
+    token: Token | None
+    tokens: tuple[Token, ...]
+    pair: tuple[int, str]
+    pet: Cat | Dog
+    by_name: Mapping[str, Token]
+    color: Color = Color.RED
+    pets: tuple[Cat | Dog, ...] = ()
+    own: "Everything | None" = None
+    free: Mapping[str, Any] = field(default_factory=dict)
+
+
+FULL = Everything(
+    LeaseId("L1-1"),
+    Token(1, 2),
+    (Token(1, 3), Token(1, 4)),
+    (5, "five"),
+    Cat("tom", 8),
+    {"a": Token(2, 1)},
+    pets=(Dog("rex"), Cat("kit")),
+    own=Everything(LeaseId("L1-2"), None, (), (1, "1"), Dog("ace"), {}),
+    free={"x": [1, 2]},
+)
+
+
+def test_values_come_back_as_they_were_and_defaults_are_not_written() -> None:
+    plain = to_map(FULL)
+    assert plain["token"] == [1, 2]
+    assert plain["pet"] == {"animal": "cat", "name": "tom", "lives": 8}
+    assert plain["pets"][1] == {"animal": "cat", "name": "kit"}
+    assert "color" not in plain
+    assert (plain["own"]["token"], plain["own"]["tokens"]) == (None, []), (
+        "what has no default stays"
+    )
+    assert from_map(Everything, plain, strict=True) == FULL
+
+
+def test_a_client_ignores_what_only_a_newer_arbiter_knows() -> None:
+    newer = {**to_map(FULL), "weather": "fine", "color": "green"}
+    assert from_map(Everything, newer).color == "green"
+    with pytest.raises(CodecError, match="Everything has no field weather"):
+        from_map(Everything, newer, strict=True)
+
+
+@pytest.mark.parametrize(
+    ("damaged", "problem"),
+    [
+        ({}, "Everything lacks by_name, lease, pair, pet, token, tokens"),
+        ({**to_map(FULL), "token": 7}, "Token: expected a map, got 7"),
+        ({**to_map(FULL), "tokens": {}}, "expected a list, got {}"),
+        ({**to_map(FULL), "pair": [1]}, r"expected a list of 2, got \[1\]"),
+        ([], r"Everything: expected a map, got \[\]"),
+    ],
+)
+def test_what_does_not_fit_is_named(damaged: Any, problem: str) -> None:
+    with pytest.raises(CodecError, match=problem):
+        from_map(Everything, damaged)
+
+
+def test_only_dataclasses_have_a_plain_form() -> None:
+    with pytest.raises(TypeError, match="int is not a dataclass"):
+        to_map(7)
