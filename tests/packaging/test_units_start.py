@@ -194,7 +194,7 @@ def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
     machine.run(
         "chmod", "-R", "g+rwX", "/run/vram-arbiter/fakegpu"
     )  # a driver serves several users
-    skill = "schemas/_configs/rskills/so101-progress/rskill.yaml"
+    skill = "vram_arbiter/configs/rskills/so101-progress/rskill.yaml"
     options = f"--rskill /opt/vram-arbiter/lib/python3*/site-packages/{skill} --device fake:/run/vram-arbiter/fakegpu"
     options = machine.run("sh", "-c", f"echo {options}").strip()
     machine.write("/etc/vram-arbiter/sidecar-reward.env", f'SIDECAR_OPTIONS="{options}"\n')
