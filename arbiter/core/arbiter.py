@@ -48,6 +48,7 @@ from vram_arbiter.arbiter.core.events import (
 from vram_arbiter.arbiter.core.eviction import eviction
 from vram_arbiter.arbiter.core.features import gangs, subleases
 from vram_arbiter.arbiter.core.features.resizing import Resizing
+from vram_arbiter.arbiter.core.inspection import Inspection
 from vram_arbiter.arbiter.core.model.state import Core, Refused
 from vram_arbiter.arbiter.core.report import explain, figures
 from vram_arbiter.arbiter.core.requests import (
@@ -104,6 +105,10 @@ class Arbiter:
     def check_all(self) -> None:
         """Every invariant over everything, and the tables that the check of each event stands on. For tests' drivers: O(leases)."""
         invariants.check_all(self._core)
+
+    def inspect(self) -> Inspection:
+        """Return a read-only view of the records, for tests and offline tools."""
+        return Inspection.of(self._core)
 
     def next_deadline(self) -> float | None:
         """When a Tick is due (monotonic seconds); None: nothing is planned."""

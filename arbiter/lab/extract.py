@@ -114,7 +114,7 @@ class _Reader:
     def see(self, arbiter: Arbiter, entry: Entry, effects: Sequence[Effect]) -> None:
         if self._began is None:
             self._began = entry.now
-        core = arbiter._core
+        core = arbiter.inspect()
         self.outcome.watch(entry.now - self._began, effects)
         event = entry.event
         match event:
@@ -187,7 +187,7 @@ class _Reader:
     def _acquired(
         self, arbiter: Arbiter, event: AcquireRequested, now: float, effects: Sequence[Effect]
     ) -> None:
-        client = arbiter._core.clients.get(event.client)
+        client = arbiter.inspect().clients.get(event.client)
         for effect in effects:
             match effect:
                 case Reply(_, request, body) if request == event.request and client is not None:
@@ -241,7 +241,7 @@ class _Reader:
             self._least_used.get(event.gpu, event.used_bytes), event.used_bytes
         )
         self._peak = max(self._peak, event.used_bytes)
-        gpu = arbiter._core.gpus.get(event.gpu)
+        gpu = arbiter.inspect().gpus.get(event.gpu)
         if gpu is None:
             return
         seen = {

@@ -163,7 +163,7 @@ def _settle(world: World, cast: Cast, nemesis: Nemesis) -> None:
     assert daemon is not None, "the daemon serves at the end"
 
     def empty() -> bool:
-        core = daemon.core._core
+        core = daemon.core.inspect()
         return not core.leases and all(
             not gpu.ledger.accounts and not gpu.verifications for gpu in core.gpus.values()
         )

@@ -35,7 +35,7 @@ def busy_driver(seed: int, steps: int = 120, policy: str = "default") -> CoreDri
                     lease = LeaseId(view["lease_id"])
                     if view["consumer"] == name and lease not in held:
                         held[lease] = person
-                        person.specs[lease] = driver.arbiter._core.leases[lease].spec
+                        person.specs[lease] = driver.arbiter.inspect().leases[lease].spec
             case 3:
                 driver.card.failing = "" if driver.card.failing else "the driver hangs"
             case 4 if random.random() < 0.3:

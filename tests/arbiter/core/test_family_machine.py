@@ -292,7 +292,7 @@ class Families(RuleBasedStateMachine):
             self.die(n)
         self.driver.advance(15.0)
         assert self.driver.gpu()["charged_bytes"] == 0, self.driver.arbiter.status(self.driver.now)
-        core = self.driver.arbiter._core
+        core = self.driver.arbiter.inspect()
         assert not core.users
         assert not core.gangs
         assert not any(gpu.estates or gpu.ledger.reserved or gpu.gang for gpu in core.gpus.values())

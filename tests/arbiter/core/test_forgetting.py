@@ -4,6 +4,7 @@ from collections.abc import Sized
 from typing import Any
 
 from tests.support.core_driver import CoreDriver
+from tests.support.engine_state import state_of
 from tests.support.scenes import held
 from vram_arbiter.arbiter.core.model import state
 from vram_arbiter.arbiter.core.model.lease import NONCES_MAX
@@ -24,7 +25,7 @@ def sizes(owner: object) -> dict[str, int]:
 def test_a_crowd_that_waited_and_went_leaves_nothing_but_the_memory_of_the_last_ones() -> None:
     driver = CoreDriver(8 * GIB)
     driver.consumer("holder").acquire(7 * GIB)
-    core = driver.arbiter._core
+    core = state_of(driver.arbiter)
     before = sizes(core)
     for number in range(30):
         person = driver.consumer(f"crowd{number}")
@@ -45,7 +46,7 @@ def test_a_crowd_that_waited_and_went_leaves_nothing_but_the_memory_of_the_last_
 
 def test_consumers_of_ever_new_names_are_remembered_up_to_a_number() -> None:
     driver = CoreDriver(8 * GIB)
-    core = driver.arbiter._core
+    core = state_of(driver.arbiter)
     for number in range(CONSUMERS_REMEMBERED + 10):
         core.learn(f"c{number}", "load_s", 1.0)
         core.seen_leaving(f"c{number}")
@@ -73,7 +74,7 @@ def test_a_lease_that_is_taken_over_again_and_again_is_known_by_its_last_nonces(
         driver.until(lambda: driver.state(lease) == "loading")
         det.load(lease)
         driver.advance(1.0)
-    core = driver.arbiter._core
+    core = state_of(driver.arbiter)
     mine = [
         nonce
         for (process, nonce), known in core.nonces.items()

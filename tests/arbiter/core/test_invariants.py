@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from tests.support.core_driver import CoreDriver
+from tests.support.engine_state import state_of
 from vram_arbiter.arbiter.core import invariants
 from vram_arbiter.arbiter.core.events import ProcessDied
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
@@ -30,7 +31,7 @@ class Broken:
         holder.use_begin(held)
         self.driver.advance(1.5)
         self.driver.consumer("b").acquire(5 * GIB, wait_timeout_s=50.0)
-        self.core: Core = self.driver.arbiter._core
+        self.core: Core = state_of(self.driver.arbiter)
         self.gpu: Gpu = self.core.gpus[GpuId("GPU-0")]
         self.held: Lease = self.core.leases[held]
         self.queued: Lease = next(iter(self.core.waiting.values()))

@@ -14,6 +14,7 @@ import hypothesis.strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
 from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.engine_state import state_of
 from tests.support.machines import walk
 from vram_arbiter.arbiter.core.effects import Push, Reply
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
@@ -106,11 +107,11 @@ class Leases(RuleBasedStateMachine):
             self.everybody_goes_on()
 
     def having(self, *states: LeaseState) -> list[LeaseId]:
-        leases = self.driver.arbiter._core.leases
+        leases = self.driver.arbiter.inspect().leases
         return [lease for lease in self.mine if lease in leases and leases[lease].state in states]
 
     def lease(self, lease: LeaseId) -> Lease:
-        return self.driver.arbiter._core.leases[lease]
+        return self.driver.arbiter.inspect().leases[lease]
 
     def pick(self, n: int, *states: LeaseState) -> LeaseId:
         found = self.having(*states)
@@ -334,7 +335,7 @@ class Leases(RuleBasedStateMachine):
     def every_byte_is_charged(self) -> None:
         """The ledger of the core never has less for a process than the process holds. Where the card lists nobody, what one holds is
         known as exactly only as what an empty card may show."""
-        (gpu,) = self.driver.arbiter._core.gpus.values()
+        (gpu,) = self.driver.arbiter.inspect().gpus.values()
         unsure = (
             0 if self.driver.card.lists_processes else d.RESERVE_BYTES + d.VERIFY_TOLERANCE_BYTES
         )
@@ -357,7 +358,7 @@ class Leases(RuleBasedStateMachine):
 
     def no_lost_wake_up(self) -> None:
         """Whenever readings are in and nothing blocks, the head does not fit (else it would have been granted)."""
-        core = self.driver.arbiter._core
+        core = state_of(self.driver.arbiter)
         (gpu,) = core.gpus.values()
         head = gpu.queue.head()
         if head is None or policy.blocked(core, gpu) or gpu.asked_at is not None:
@@ -371,7 +372,7 @@ class Leases(RuleBasedStateMachine):
 
     def waits_end_in_time(self) -> None:
         """Who said how long he can wait is served or denied by then."""
-        leases = self.driver.arbiter._core.leases
+        leases = self.driver.arbiter.inspect().leases
         for lease, until in list(self.bounds.items()):
             if lease not in leases or leases[lease].state is not QUEUED:
                 del self.bounds[lease]

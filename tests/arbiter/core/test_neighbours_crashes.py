@@ -102,4 +102,4 @@ def test_17_dying_while_resident_is_no_failed_load_and_the_table_is_bounded() ->
     driver = CoreDriver(8 * GIB)
     for n in range(NAMES_MAX + 3):
         crash(driver, f"p{n}", 1)
-    assert len(driver.arbiter._core.crashes) == NAMES_MAX
+    assert len(driver.arbiter.inspect().crashes) == NAMES_MAX

@@ -3,6 +3,7 @@
 import pytest
 
 from tests.support.core_driver import CoreDriver, answer, refusal
+from tests.support.engine_state import state_of
 from tests.support.scenes import charge, held
 from vram_arbiter.arbiter.core.effects import Signal
 from vram_arbiter.schemas import defaults as d
@@ -46,7 +47,7 @@ def test_4_an_idle_holder_does_not_keep_a_card_for_minutes(priority: int) -> Non
     }
     driver = CoreDriver(8 * GIB, settings={"learnt": learnt})
     person, lease = held(driver, "idle", 5)
-    core = driver.arbiter._core
+    core = state_of(driver.arbiter)
     core.switches["idle", "w"] = core.switches["w", "idle"] = driver.now
     waiter = driver.consumer("w").acquire(5 * GIB, priority=priority)
     assert driver.until(lambda: driver.state(lease) == "revoking") <= d.THRASH_HOLD_MAX_S + 0.1

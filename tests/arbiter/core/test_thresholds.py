@@ -19,7 +19,7 @@ BUDGET = 8 * GIB - d.RESERVE_BYTES
 def kept(driver: CoreDriver, who: Consumer) -> int:
     """What the journal has of the residue of a process, which is what is charged for it."""
     record = driver.journal.get(f"residue:{who.process}:GPU-0", {"residue_bytes": 0})
-    account = driver.arbiter._core.gpus[driver.card.gpu].ledger.accounts.get(who.process)
+    account = driver.arbiter.inspect().gpus[driver.card.gpu].ledger.accounts.get(who.process)
     assert (0 if account is None else account.residue_bytes) == record["residue_bytes"]
     return int(record["residue_bytes"])
 
@@ -207,7 +207,7 @@ def two_cards() -> tuple[CoreDriver, LeaseId, Consumer, LeaseId]:
 
 def test_a_load_elsewhere_is_waited_for_as_long_as_a_holder_that_was_asked() -> None:
     driver, idle, _, loading = two_cards()
-    granted_at = driver.arbiter._core.leases[loading].granted_at
+    granted_at = driver.arbiter.inspect().leases[loading].granted_at
     driver.consumer("w").acquire(4 * GIB)
     driver.advance(granted_at + d.REVOKE_DEADLINE_S - 0.001 - driver.now)
     assert driver.state(idle) == "held"
@@ -443,7 +443,7 @@ def test_a_residue_of_the_journal_takes_what_room_there_is(room: int) -> None:
     key = f"lease:{lease}"
     driver.journal[key] = {**driver.journal[key], "charge_bytes": BUDGET - room}
     driver.restart()
-    account = driver.arbiter._core.gpus[driver.card.gpu].ledger.accounts.get(person.process)
+    account = driver.arbiter.inspect().gpus[driver.card.gpu].ledger.accounts.get(person.process)
     found = (0, 0) if account is None else (account.residue_bytes, account.residue_floor_bytes)
     assert found == (room, room)
     assert (f"residue:{person.process}:GPU-0" in driver.journal) == bool(room)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.support.core_driver import START_S, CoreDriver
+from tests.support.engine_state import state_of
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.eventlog.codec import CodecError, digest
 from vram_arbiter.arbiter.eventlog.snapshot import freeze, from_plain, thaw, to_plain
@@ -48,7 +49,7 @@ def test_a_copy_shares_nothing_with_the_original(busy: CoreDriver) -> None:
 
 def test_a_function_in_the_state_is_refused(busy: CoreDriver) -> None:
     engine = through_memory(busy.arbiter)
-    engine._core.settings = print  # type: ignore[assignment]
+    state_of(engine).settings = print  # type: ignore[assignment]
     with pytest.raises(CodecError, match="no place in the engine's state"):
         to_plain(engine)
 

@@ -76,7 +76,7 @@ def test_a_log_that_begins_in_the_middle_begins_with_what_is_resident(tmp_path: 
     began = driver.events[0][0]
     back = driver.consumer("holder", pid=holder.process.pid)
     back.specs[lease] = holder.specs[lease]
-    token = driver.arbiter._core.leases[lease].token
+    token = driver.arbiter.inspect().leases[lease].token
     assert token is not None
     back.reattach(lease, token)
     driver.advance(2)

@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, given, settings
 
 from tests.support.connections import KeptConnection, peer_of
 from tests.support.core_driver import SimCard
+from tests.support.engine_state import state_of
 from tests.support.hostile import Forger, pack
 from vram_arbiter.arbiter.core import effects as fx
 from vram_arbiter.arbiter.core import events as ev
@@ -355,7 +356,7 @@ def test_acquire_and_cancel_for_ever_keeps_nothing() -> None:
             plant.ask(b"c", ATTACKERS[0], "cancel", lease_id=waiting["lease_id"])["state"]
             == "cancelled"
         )
-    inside = core.arbiter._core
+    inside = state_of(core.arbiter)
     assert len(inside.leases) == 1
     assert not inside.waiting
     assert len(inside.ended) <= 1024

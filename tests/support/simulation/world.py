@@ -300,7 +300,7 @@ class World:
                 self.fail(f"{card.gpu}: {others} beside the exclusive {exclusive.lease_id}")
 
     def _check_wake_up(self, daemon: SimDaemon) -> None:
-        core = daemon.core._core
+        core = daemon.core.inspect()
         for gpu in core.gpus.values():
             head = gpu.queue.head()
             if head is None or policy.blocked(core, gpu) or gpu.asked_at is not None:

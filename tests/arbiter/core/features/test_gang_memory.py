@@ -175,7 +175,7 @@ def test_a_gang_that_broke_is_not_waited_for_after_a_restart(asked: bool) -> Non
     driver.restart()
     a.connect()
     answer(a.reattach(first, token))
-    assert not driver.arbiter._core.gangs
+    assert not driver.arbiter.inspect().gangs
 
 
 def test_bytes_kept_for_the_next_member_hide_no_context_of_the_one_before() -> None:

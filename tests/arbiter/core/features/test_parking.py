@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.engine_state import state_of
 from tests.support.scenes import held
 from vram_arbiter.arbiter.core import invariants
 from vram_arbiter.arbiter.core.events import OperatorAsked
@@ -319,6 +320,6 @@ def test_a_lost_journal_does_not_lose_it(standby: bool) -> None:
 def test_the_invariant_of_the_budget() -> None:
     driver = driver_with(5)
     parked(driver)
-    driver.arbiter._core.host.booked[LeaseId("x")] = 1
+    state_of(driver.arbiter).host.booked[LeaseId("x")] = 1
     with pytest.raises(InvariantViolation, match="bytes are parked, the budget is"):
-        invariants.check(driver.arbiter._core)
+        invariants.check(state_of(driver.arbiter))

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.engine_state import state_of
 from tests.support.scenes import charge, shown
 from vram_arbiter.arbiter.core import invariants
 from vram_arbiter.arbiter.core.events import MemorySampled
@@ -109,7 +110,7 @@ def test_what_it_held_before_it_shrank_is_no_drift(lists: bool) -> None:
     vlm.unload(lease)
     driver.until(lambda: driver.state(lease) == "over")
     assert not driver.notes("drift")
-    steady = driver.arbiter._core.footprints.p95_bytes("vlm vlm-model", "steady")
+    steady = driver.arbiter.inspect().footprints.p95_bytes("vlm vlm-model", "steady")
     assert steady in (0, 4 * GIB)
 
 
@@ -134,11 +135,11 @@ def test_the_holders_own_word_follows_its_size(residue: int) -> None:
     vlm.load(lease, GIB if residue else 2 * GIB)
     driver.advance(2.0)
     assert answer(vlm.resize(lease, 3 * GIB))["state"] == "growing"
-    assert driver.arbiter._core.leases[lease].measured_bytes == (2 if residue else 3) * GIB
+    assert driver.arbiter.inspect().leases[lease].measured_bytes == (2 if residue else 3) * GIB
     vlm.hold(GIB // 2)
     vlm.resize(lease, GIB // 2)
     driver.until(lambda: charge(driver, lease) == GIB // 2, limit_s=2.0)
-    assert driver.arbiter._core.leases[lease].measured_bytes == (0 if residue else GIB // 2)
+    assert driver.arbiter.inspect().leases[lease].measured_bytes == (0 if residue else GIB // 2)
 
 
 def test_one_reading_that_agrees_is_not_enough() -> None:
@@ -215,7 +216,7 @@ def test_a_growth_makes_others_leave_and_is_a_waiter_like_any_other() -> None:
     det.unload(other)
     driver.until(lambda: charge(driver, lease) == 6 * GIB)
     assert not [v for v in driver.arbiter.status(driver.now)["leases"] if "grows" in v]
-    assert driver.arbiter._core.gpus[GpuId("GPU-0")].evictions == []
+    assert driver.arbiter.inspect().gpus[GpuId("GPU-0")].evictions == []
 
 
 def test_the_reading_that_did_not_see_a_growth_carries_no_grant() -> None:
@@ -277,7 +278,7 @@ def test_another_size_replaces_the_one_before() -> None:
     vlm.resize(lease, 5 * GIB)
     assert driver.state(before) == "over"
     assert answer(vlm.resize(lease, 4 * GIB))["state"] == "held"
-    assert len(driver.arbiter._core.waiting) == 0
+    assert len(driver.arbiter.inspect().waiting) == 0
     vlm.hold(3 * GIB)
     assert answer(vlm.resize(lease, 3 * GIB))["state"] == "shrinking"
     assert answer(vlm.resize(lease, 3 * GIB))["state"] == "shrinking"
@@ -301,7 +302,7 @@ def test_a_growth_ends_with_its_lease(end: str) -> None:
         vlm.die()
     else:
         driver.advance(10.1)
-    assert not driver.arbiter._core.waiting
+    assert not driver.arbiter.inspect().waiting
     driver.advance(20.0)
     assert not driver.pushes("resized")
 
@@ -371,7 +372,7 @@ def test_the_invariant_of_a_growth() -> None:
     det, other = held(driver, "det", 3)
     det.use_begin(other)
     vlm.resize(lease, 6 * GIB)
-    core = driver.arbiter._core
+    core = state_of(driver.arbiter)
     growth = core.leases[driver.arbiter._resizing.growths[lease]]
     growth.extends = LeaseId("gone")
     with pytest.raises(InvariantViolation, match="which is not there"):

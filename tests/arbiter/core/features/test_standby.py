@@ -217,7 +217,7 @@ def test_a_small_one_does_not_pass_an_exclusive_one() -> None:
     det.unload(alone)
     driver.until(lambda: driver.state(wanted) == "loading")
     driver.advance(0.1)
-    driver.post(ProcessDied(driver.arbiter._core.leases[wanted].process))
+    driver.post(ProcessDied(driver.arbiter.inspect().leases[wanted].process))
     _, resident = stay(driver, 4)
     driver.advance(20.0)
     assert [driver.state(lease) for lease in (alone, people["tiny"][1], resident)] == [
@@ -477,7 +477,7 @@ def test_late_repeats_of_earlier_acquires_never_call_it_back() -> None:
     assert (told["state"], told["lease"]["lease_id"]) == ("standby", lease)
     assert driver.state(wanted) == "held"
     det.cancel(lease)
-    core = driver.arbiter._core
+    core = driver.arbiter.inspect()
     for turn in range(1100):
         (nonce,) = [f"filler{turn}"]
         filler = det.try_acquire(8 * GIB - 300 * MIB - turn, nonce=nonce, key=nonce)

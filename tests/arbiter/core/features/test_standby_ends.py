@@ -5,6 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.engine_state import state_of
 from tests.support.scenes import held, order, sent_away
 from vram_arbiter.arbiter.core import invariants
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
@@ -176,7 +177,7 @@ def test_it_may_come_back_on_another_card() -> None:
 def test_invariants_of_what_is_away() -> None:
     driver = CoreDriver(8 * GIB)
     _, lease, _, _ = sent_away(driver)
-    core = driver.arbiter._core
+    core = state_of(driver.arbiter)
     core.granted.clear()
     one = core.leases[lease]
     one.state = LeaseState.HELD

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.engine_state import state_of
 from tests.support.scenes import held
 from vram_arbiter.arbiter.core.learning import costs
 from vram_arbiter.schemas import defaults as d
@@ -84,7 +85,7 @@ def test_who_never_comes_back_is_cheaper_to_send_away() -> None:
         come_and_go(driver, rare, 100.0)
     for _ in range(4):
         come_and_go(driver, regular, 1.0)
-    core = driver.arbiter._core
+    core = driver.arbiter.inspect()
     leases = {"regular": stay(driver, regular), "rare": stay(driver, rare)}
     assert core.reuse["regular"].chance() > 0.5 > core.reuse["rare"].chance()
     driver.consumer("w").acquire(4 * GIB)
@@ -137,7 +138,7 @@ def test_two_that_throw_each_other_out_stay_for_what_a_switch_costs() -> None:
     why = pair.driver.arbiter.why("b", pair.driver.now)["leases"]
     (blocker,) = next(one["blockers"] for one in why if one["lease_id"] == wanted)
     assert "they keep throwing each other out" in blocker["condition"]
-    core = pair.driver.arbiter._core
+    core = state_of(pair.driver.arbiter)
     expected = costs.hold_s(core, core.leases[pair.lease], core.leases[wanted])
     assert pair.switch(wanted) == pytest.approx(expected, abs=0.2)
     assert 3.0 < expected <= 8.0
@@ -165,10 +166,10 @@ def test_a_pair_that_was_calm_for_a_while_is_forgotten() -> None:
     pair.switch(pair.want())
     pair.driver.advance(10.0)
     assert pair.switch(pair.want()) < 0.1, "the first way is older than the window"
-    assert set(pair.driver.arbiter._core.switches) == {("b", "a"), ("a", "b")}
+    assert set(pair.driver.arbiter.inspect().switches) == {("b", "a"), ("a", "b")}
     pair.driver.advance(100.0)
     pair.switch(pair.want())
-    assert len(pair.driver.arbiter._core.switches) == 1
+    assert len(pair.driver.arbiter.inspect().switches) == 1
 
 
 def test_nothing_learnt_holds_nobody() -> None:

@@ -17,7 +17,7 @@ def crowd(count: int) -> tuple[Residents, list[Lease]]:
     for _ in range(count):
         ids.append(holder.acquire(d.MIB))
         holder.load(ids[-1])
-    core = driver.arbiter._core
+    core = driver.arbiter.inspect()
     return core.gpus[GpuId("GPU-0")].residents, [core.leases[lease_id] for lease_id in ids]
 
 

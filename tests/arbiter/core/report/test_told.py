@@ -17,7 +17,7 @@ GIB, MIB = d.GIB, d.MIB
 
 
 def core_lease(driver: CoreDriver, lease: LeaseId) -> Lease:
-    return driver.arbiter._core.leases[lease]
+    return driver.arbiter.inspect().leases[lease]
 
 
 def only(found: list[Any]) -> Any:

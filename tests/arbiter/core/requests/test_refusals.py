@@ -102,7 +102,7 @@ def test_a_flood_of_refusals_is_counted_instead(driver: CoreDriver) -> None:
 
 
 def test_little_is_remembered_of_those_who_were_refused(driver: CoreDriver) -> None:
-    refusals = driver.arbiter._core.refusals
+    refusals = driver.arbiter.inspect().refusals
     people = [driver.consumer(f"p{number}") for number in range(PROCESSES_REMEMBERED + 1)]
     for person in people:
         too_large(person)

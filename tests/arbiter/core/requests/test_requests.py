@@ -343,6 +343,6 @@ def test_what_is_over_is_remembered_for_a_bounded_while(driver: CoreDriver) -> N
         vlm.cancel(vlm.acquire(5 * GIB))
     assert refusal(vlm.release(first, token=Token(1, 1))).code == "unknown_lease"
     assert vlm.acquire(5 * GIB, nonce="first") != first
-    core = driver.arbiter._core
+    core = driver.arbiter.inspect()
     assert len(core.ended) == 1024
     assert len(core.nonces) == 1024 + 2

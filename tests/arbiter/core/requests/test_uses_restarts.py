@@ -146,7 +146,7 @@ def test_a_suspend_after_the_restart_gives_the_user_its_whole_time_anew() -> Non
     driver.advance(0.001)
     assert shown(driver, lease)["uses"] == 0
     driver.post(Resumed(3600.0))
-    assert ("users", lease) not in driver.arbiter._core.timers, "nobody is waited for any more"
+    assert ("users", lease) not in driver.arbiter.inspect().timers, "nobody is waited for any more"
 
 
 def test_a_holder_that_was_asked_and_is_used_is_not_taken_for_gone() -> None:

@@ -104,7 +104,7 @@ def test_whoever_waits_for_any_takes_the_first_card_that_is_free_and_leaves_both
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)
     assert place(driver, waiter) == ONE
     assert driver.state(people[0][1]) == "held", "nobody is asked in vain on the other card"
-    assert all(len(gpu.queue) == 0 for gpu in driver.arbiter._core.gpus.values())
+    assert all(len(gpu.queue) == 0 for gpu in driver.arbiter.inspect().gpus.values())
 
 
 def test_while_one_card_is_emptied_for_the_head_the_next_one_is_served_on_the_other() -> None:
@@ -371,7 +371,7 @@ def test_standby_returns_to_the_cards_that_its_selector_names(
     det, lease = on_standby(driver, selector)
     driver.advance(10.0)
     assert place(driver, lease) == wanted
-    policy = next(iter(driver.arbiter._core.gpus[ZERO].residents.values()))
+    policy = next(iter(driver.arbiter.inspect().gpus[ZERO].residents.values()))
     if wanted is None:
         driver.post(ProcessDied(policy.process))
         for one in driver.cards.values():

@@ -65,7 +65,7 @@ def test_whoever_names_another_card_or_is_too_large_waits_only_where_it_may_be(
     busy_and_pinned(driver)
     named = driver.consumer("named").acquire(5 * GIB, gpu="0")
     any_card = driver.consumer("any").acquire(7 * GIB)
-    waiting = driver.arbiter._core.waiting
+    waiting = driver.arbiter.inspect().waiting
     assert (waiting[named].gpus, waiting[any_card].gpus) == ((ZERO,), (ZERO, ONE))
 
 
@@ -78,7 +78,7 @@ def test_a_growth_stays_on_its_card(driver: CoreDriver) -> None:
     keeper.unload(pinned)
     driver.until(lambda: driver.state(pinned) == "over")
     driver.advance(1.0)
-    (growth,) = driver.arbiter._core.waiting.values()
+    (growth,) = driver.arbiter.inspect().waiting.values()
     assert growth.gpus == (ZERO,)
 
 

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.engine_state import state_of
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.arbiter.core.model.state import Gpu
 from vram_arbiter.arbiter.core.scheduling import policy
@@ -46,7 +47,7 @@ class Card:
 
     @property
     def gpu(self) -> Gpu:
-        return next(iter(self.driver.arbiter._core.gpus.values()))
+        return next(iter(state_of(self.driver.arbiter).gpus.values()))
 
 
 def test_nobody_is_asked_if_it_fits() -> None:
@@ -214,7 +215,7 @@ def test_greedy_gives_back_who_is_not_needed() -> None:
 
 def test_a_reading_that_is_missing_failed_or_old_gives_no_room() -> None:
     driver = CoreDriver(8 * GIB, start=False)
-    core = driver.arbiter._core
+    core = state_of(driver.arbiter)
     gpu = next(iter(core.gpus.values()))
     assert policy.measured_room_bytes(core, gpu) is None
     assert policy.blocked(core, gpu) == "the card has not been read yet"
@@ -228,7 +229,7 @@ def test_a_reading_that_is_missing_failed_or_old_gives_no_room() -> None:
 def test_the_measured_need_is_less_by_what_the_process_holds() -> None:
     card = Card()
     lease = card.hold("a", 3, residue_bytes=450 * MIB)
-    core = card.driver.arbiter._core
+    core = state_of(card.driver.arbiter)
     inner: Lease = core.leases[lease]
     assert policy.measured_need_bytes(card.gpu, inner) == 3 * GIB, (
         "beside a resident lease of its own: everything"

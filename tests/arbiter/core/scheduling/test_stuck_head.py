@@ -178,7 +178,7 @@ def test_whoever_passed_is_in_nobodys_way_when_the_stowaway_is_gone(seed: int) -
         for lease, owner in mine.items():
             if driver.state(lease) == "loading":
                 owner.load(lease)
-            elif driver.state(lease) == "held" and not driver.arbiter._core.leases[lease].uses:
+            elif driver.state(lease) == "held" and not driver.arbiter.inspect().leases[lease].uses:
                 owner.use_begin(lease)
     asked = len(driver.notes("revoke_asked"))
     stowaway(driver, 0)

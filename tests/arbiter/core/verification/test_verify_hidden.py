@@ -190,7 +190,7 @@ def test_what_another_holder_grew_by_right_hides_no_dead_one() -> None:
 def test_a_process_that_is_known_by_its_pid_alone_is_no_stranger() -> None:
     driver = CoreDriver(8 * GIB)
     det, _ = held(driver, "det", 3)
-    ledger = driver.arbiter._core.gpus[driver.card.gpu].ledger
+    ledger = driver.arbiter.inspect().gpus[driver.card.gpu].ledger
     assert (
         ledger.booked_by(ProcessKey(det.process.pid, 0)) == ledger.booked_by(det.process) == 3 * GIB
     )

@@ -471,7 +471,9 @@ def test_whatever_happens_spans_end_and_nest(busy: CoreDriver) -> None:
     for now, event in busy.events:
         heard.hear(engine.handle(event, now), now)
     states = {view["lease_id"]: view["state"] for view in engine.status(busy.now)["leases"]}
-    measured = {v.lease for gpu in engine._core.gpus.values() for v in gpu.verifications.values()}
+    measured = {
+        v.lease for gpu in engine.inspect().gpus.values() for v in gpu.verifications.values()
+    }
     assert {states.get(lease) for lease in heard.telemetry._acquires} <= {"queued", "loading"}
     on_its_way = {
         lease for lease, state in states.items() if state in ("revoking", "unloading", "verifying")
