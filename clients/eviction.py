@@ -237,7 +237,7 @@ class Leaving:
         try:
             await self._driver.reply(request)
         except BadState as error:
-            if error.details.get("uses") or error.details.get("children"):
+            if error.details.get("uses"):
                 await self.progress.wait(RETRY_UNLOADING_S)
                 return False
         except ArbiterUnreachable:

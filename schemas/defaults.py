@@ -4,7 +4,7 @@ KIB = 1024
 MIB = 1024 * KIB
 GIB = 1024 * MIB
 
-WIRE_VERSION = 1
+WIRE_VERSION = 2  # 2: no sub-leases; `parent` and `children` are gone
 
 # Leases
 LEASE_TTL_S = 10.0
@@ -53,7 +53,6 @@ SESSIONS_MAX = 1024
 OPERATOR_RESERVE = 16  # sessions that only operators get
 WAITERS_MAX = 16_384
 LEASES_PER_CLIENT_MAX = 64
-SUBLEASE_DEPTH_MAX = 4  # a lease, its sub-leases, theirs, and once more
 USES_PER_LEASE_MAX = 256
 PROCESS_SHARE = 1 / 8  # of the places of a limit that all share: the most that one process may take
 USER_SHARE = 3 / 4  # the most that the processes of one user may take together

@@ -106,10 +106,6 @@ class WouldDeadlock(CallerError):
     code = "would_deadlock"  # the wait is for what a use of this process keeps: details.cycle, who uses and waits for what
 
 
-class ParentTooSmall(CallerError):
-    code = "parent_too_small"  # a sub-lease needs more than its parent has left: details.needed_bytes, left_bytes
-
-
 class UnknownGpu(CallerError):
     code = "unknown_gpu"
 

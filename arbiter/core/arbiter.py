@@ -46,7 +46,7 @@ from vram_arbiter.arbiter.core.events import (
     UseYielded,
 )
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import gangs, subleases
+from vram_arbiter.arbiter.core.features import gangs
 from vram_arbiter.arbiter.core.features.resizing import Resizing
 from vram_arbiter.arbiter.core.inspection import Inspection
 from vram_arbiter.arbiter.core.model.state import Core, Refused
@@ -92,7 +92,6 @@ class Arbiter:
         core.now = max(core.now, now)
         core.out = []
         self._happened(event)  # 1
-        subleases.finish(core)
         recovery.serve_if_accounted(core)  # 2
         deadlock.resolve(core)  # 3
         gangs.settle(core)
@@ -218,10 +217,7 @@ class Arbiter:
         core = self._core
         match event:
             case AcquireRequested():
-                if event.spec.parent is not None:
-                    subleases.acquire(core, event, event.spec.parent)
-                else:
-                    requests.acquire(core, event)
+                requests.acquire(core, event)
             case CancelRequested():
                 requests.cancel(core, event)
             case ReadyReported():

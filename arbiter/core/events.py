@@ -70,7 +70,6 @@ class Spec:
     standby: bool = False
     park_bytes: int = 0
     on_overstay: str = "wait"  # or "terminate", "kill"
-    parent: tuple[LeaseId, Token] | None = None
     independent: bool = False
     gang: tuple[str, int] | None = None  # (id, size)
 

@@ -9,13 +9,13 @@ Numbers are those of ARCHITECTURE.md:
   2. nobody is resident beside an exclusive lease, nor comes before its bytes are measured gone; one lease at a time loads on a card
   3. nothing that is in use unloads
   4. bytes stay charged until a verdict: whoever is resident is charged, whoever is charged is resident, under measurement or of a gang that
-     loads, whoever is away is neither; a tree's bytes never exceed its root's grant, parked weights never exceed the budget of host RAM
+     loads, whoever is away is neither; parked weights never exceed the budget of host RAM
   5. tokens only grow
   6. every waiter is in a queue, has a timer if it has a bound, and its card has a next reading scheduled
   7. of a gang, until it is complete or broken, all that wait are charged or none
 """
 
-from vram_arbiter.arbiter.core.features import families, gangs
+from vram_arbiter.arbiter.core.features import gangs
 from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import NOT_COUNTED, Core, Gpu
 
@@ -87,7 +87,7 @@ def _residents(gpu: Gpu, *, granted: bool) -> None:
     residents = gpu.residents
     if granted:
         alone = next(iter(residents.exclusive.values()), None)
-        if alone is not None and any(lease.root is not alone for lease in residents.values()):
+        if alone is not None and any(lease is not alone for lease in residents.values()):
             raise InvariantViolation(
                 2, f"{alone.id} is exclusive, yet {sorted(residents)} are on {gpu.info.id}"
             )
@@ -136,8 +136,6 @@ def _charges(gpu: Gpu) -> None:
     for lease in residents.in_state(LeaseState.VERIFYING):
         if lease.id not in gpu.verifications:
             raise InvariantViolation(4, f"{lease.id} waits for a verdict that nobody works on")
-    if gpu.estates and (problem := families.unshared(gpu)):
-        raise InvariantViolation(4, problem)
 
 
 def _away(core: Core) -> None:

@@ -41,16 +41,8 @@ class _Spec(_Record):
     standby: bool = False
     on_overstay: Literal["wait", "terminate", "kill"] = "wait"
     park_bytes: Bytes = 0
-    parent: tuple[Id, Count, Count] | None = None
     independent: bool = False
     gang: tuple[Id, Annotated[int, Field(ge=2, le=16)]] | None = None
-
-
-class _Estate(_Record):
-    booked_bytes: Bytes
-    approved_bytes: Bytes
-    shares: dict[Id, tuple[Bytes, Bytes, Bytes]]
-    borne: list[tuple[Pid, Ticks, Bytes]]
 
 
 class LeaseRecord(_Record):
@@ -67,10 +59,7 @@ class LeaseRecord(_Record):
     load_peak_bytes: Bytes
     measured_bytes: Bytes | None
     exiting: bool
-    said_ready: bool = True
-    parent: Id | None = None
     gang: tuple[Id, Annotated[int, Field(ge=1, le=16)]] | None = None
-    estate: _Estate | None
     pinned: Order | None = None
     comes_back: bool = False
     parks: bool = False

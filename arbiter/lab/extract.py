@@ -98,9 +98,6 @@ class _Reader:
         self._stories: dict[LeaseId, _Story] = {}
         self._began: float | None = None
         self._away: dict[LeaseId, _Story] = {}  # on standby or parked: the same lease may come back
-        self._roots: dict[
-            LeaseId, LeaseId
-        ] = {}  # sub-lease → the lease that it is carved from, at the end
         self._died: dict[ProcessKey, float] = {}
         self._verified_s: list[float] = []
         self._totals: dict[GpuId, int] = {}
@@ -131,11 +128,7 @@ class _Reader:
             case _:
                 pass
         for lease in core.leases.values():
-            if (
-                lease.id not in self._stories
-                and lease.id not in self._away
-                and lease.id not in self._roots
-            ):
+            if lease.id not in self._stories and lease.id not in self._away:
                 self._inherit(lease, entry.now)
         for effect in effects:
             if isinstance(effect, Note):
@@ -148,27 +141,12 @@ class _Reader:
 
     def _inherit(self, lease: Lease, now: float) -> None:
         """Recovered, or there when the log began."""
-        if lease.spec.parent is not None:
-            self._child(lease.id, lease.spec.parent[0])
-            return
         known = self._stories[lease.id] = _Story(lease.process, lease.spec, now, inherited=True)
         if lease.ready_at:
             known.granted_at = known.ready_at = now
             known.measured_bytes = lease.measured_bytes
 
-    def _child(self, lease: LeaseId, parent: LeaseId) -> None:
-        self._roots[lease] = self._roots.get(parent, parent)
-        self._count("sub-leases are taken as part of the lease that they are carved from")
-
     def _hear(self, lease: LeaseId, kind: str, data: Mapping[str, Any], now: float) -> None:
-        if lease in self._roots:  # of a tree only the work counts; its bytes are the root's
-            lease = self._roots[lease]
-            story = self._stories.get(lease)
-            if story is not None and (
-                kind.startswith("use_") or (kind == "ready" and story.ready_at is None)
-            ):
-                self._noted(story, kind, data, now)
-            return
         if kind == "granted" and lease in self._away:
             self._back(lease, now)
             self._stories[lease].by_itself = True
@@ -193,9 +171,7 @@ class _Reader:
                 case Reply(_, request, body) if request == event.request and client is not None:
                     lease = LeaseId(body["lease"]["lease_id"])
                     self._away.pop(lease, None)
-                    if event.spec.parent is not None:
-                        self._child(lease, event.spec.parent[0])
-                    elif lease not in self._stories:
+                    if lease not in self._stories:
                         self._stories[lease] = _Story(
                             client.process, event.spec, now, event.wait_timeout_s
                         )

@@ -82,9 +82,6 @@ def to_spec(spec: w.LeaseSpec) -> ev.Spec:
         standby=spec.standby,
         on_overstay=spec.on_overstay,
         park_bytes=spec.park_bytes,
-        parent=None
-        if spec.parent is None
-        else (LeaseId(spec.parent.lease_id), Token(*spec.parent.token)),
         independent=spec.independent,
         gang=None if spec.gang is None else (spec.gang.id, spec.gang.size),
     )

@@ -383,8 +383,8 @@ class SessionTable:
     def _check_version(self, hello: w.Hello) -> None:
         if hello.version != WIRE_VERSION:
             raise VersionMismatch(
-                f"the arbiter speaks version {WIRE_VERSION} of the wire, the client {hello.version}",
-                hint="install the same version of the client and of the arbiter",
+                f"the arbiter speaks version {WIRE_VERSION} of the wire, the client speaks {hello.version}",
+                hint=f"upgrade the {'client' if hello.version < WIRE_VERSION else 'arbiter'}: both must speak the same version",
                 details={"server": WIRE_VERSION, "client": hello.version},
             )
 

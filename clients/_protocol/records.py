@@ -23,7 +23,7 @@ def token_of(message: Message) -> TokenPair:
 class Eviction:
     """Who made a lease leave, and why, by the arbiter's word."""
 
-    cause: str  # waiter, pressure, operator, parent; "": an arbiter that does not say
+    cause: str  # waiter, pressure, operator; "": an arbiter that does not say
     by: str  # the consumer that the room is for, or an operator with uid and pid; "" where there is neither
     reason: str  # in words
 

@@ -34,7 +34,6 @@ class RevokePush:
     uses: int = 0  # what still runs on the lease; `unloading` is refused before 0
     park: bool = False  # host RAM for its weights is booked: release with `parked`
     traceparent: str = ""  # of the eviction, or of the waiter: the unloading belongs to that trace
-    children: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,9 +73,6 @@ class LeaseSpec(_Frozen):
         0  # host RAM that keeps its weights while it is away; 0: it cannot be parked
     )
     gang: Gang | None = None
-    parent: LeaseRef | None = (
-        None  # a sub-lease: carved at once out of that lease's bytes, on its card
-    )
     independent: bool = False  # the process's own uses do not wait for this lease (a prefetch): no deadlock is seen in it
 
 

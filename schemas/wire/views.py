@@ -34,8 +34,6 @@ class LeaseView:
     grows: str | None = None  # the lease that this request asks more bytes for
     resizing: str = ""  # growing or shrinking
     gang: str = ""  # until all of it is held: name, phase, members that asked of all
-    parent: str | None = None
-    children: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

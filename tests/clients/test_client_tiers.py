@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from typing import Any
 
 import pytest
 
@@ -13,12 +12,11 @@ from vram_arbiter.schemas.errors import (
     BadState,
     GangBroken,
     LeaseRevoking,
-    ParentTooSmall,
     VramError,
     VramInsufficient,
     WouldDeadlock,
 )
-from vram_arbiter.schemas.wire.requests import Footprint, LeaseRef, LeaseSpec
+from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
@@ -316,45 +314,6 @@ async def until_growing(client: AsyncClient) -> None:
     async with asyncio.timeout(WAIT_S):
         while not any(lease.get("resizing") for lease in (await client.status())["leases"]):
             await asyncio.sleep(0.02)
-
-
-async def test_a_sub_lease_is_carved_out_of_its_parents(
-    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
-) -> None:
-    """The runner holds the room, its sidecar holds the bytes: the eviction asks the sidecar first, and the runner hears of it."""
-    asked: list[str] = []
-
-    def told(lease: AsyncLease, _: Any) -> None:
-        asked.append(lease.spec.consumer)
-
-    model = Model()
-    async with (
-        AsyncClient(arbiter_daemon.endpoint, name="runner") as runner,
-        AsyncClient(arbiter_daemon.endpoint, name="sidecar") as sidecar,
-        AsyncClient(arbiter_daemon.endpoint, name="other") as other,
-    ):
-        root = await runner.acquire(spec("goal", 5), on_revoke=told)
-        parent = LeaseRef(lease_id=root.lease_id, token=root.token)
-        with pytest.raises(ParentTooSmall):
-            await sidecar.acquire(spec("policy", 6, parent=parent))
-        leaf = await sidecar.acquire(
-            spec("policy", 4, parent=parent), unload=model.unload, on_revoke=told
-        )
-        await leaf.ready()
-        await root.ready()
-        async with root.use("grab"):
-            # one process plays all three: the goal does not wait for the detector
-            wanted = spec("detector", 5, independent=True)
-            waiting = asyncio.ensure_future(other.acquire(wanted, WAIT_S))
-            await until(lambda: sorted(asked) == ["goal", "policy"])
-            assert leaf.state == "revoking"
-            assert model.did == [], "the tree is in use"
-        detector = await waiting
-        async with asyncio.timeout(WAIT_S):  # each of the three hears on a connection of its own
-            await leaf.wait_gone()
-            await root.wait_gone()
-        assert model.did == ["unload"]
-        await detector.give_up()
 
 
 async def test_a_job_that_waits_for_its_own_room_is_told(

@@ -39,7 +39,6 @@ class SimClient(AsyncClient):
         self.protocol = ClientProtocol(
             name=process.name, instance=world.clock.new_id("i"), role=role
         )
-        self.reserves = False  # its leases are for others to carve theirs out of: by itself it puts nothing on a card
         process.on_kill.append(self._killed)
 
     @property
@@ -111,7 +110,6 @@ class Character:
     standby: float = 0.2
     parks: float = 0.2
     yields: float = 0.25
-    borrows: float = 0.3  # takes a sub-lease where one is offered
     leases: int = 1
 
 
@@ -131,14 +129,11 @@ class Cast:
     ooms: int = 0
     refusals: dict[str, int] = field(default_factory=dict)
     clients: list[SimClient] = field(default_factory=list)
-    offers: dict[str, AsyncLease] = field(
-        default_factory=dict
-    )  # leases out of which others may carve theirs
 
     def entitlements(self) -> Iterator[Entitlement]:
         """Leases that living clients believe in, and would not have fenced by their own clock."""
         for client in self.clients:
-            if not client.process.alive or client.reserves:
+            if not client.process.alive:
                 continue
             for record in client.protocol.holdings.held.values():
                 if client.now() >= client.protocol.holdings.fence_at(record):
@@ -247,10 +242,6 @@ class Consumer(Program):
     def _spec(self, slot: int) -> LeaseSpec:
         chance, choice = self.world.clock.chance, self.random.choice
         peak = choice(SIZES)
-        parent: AsyncLease | None = None
-        if self.cast.offers and chance(self.character.borrows):
-            parent = choice(list(self.cast.offers.values()))
-            peak = int(parent.spec.footprint.load_peak_bytes * choice((0.3, 0.6, 1.0)))
         steady = peak if chance(0.5) else max(peak // 2, self.residue_bytes)
         gpus = ["any", *(str(info.index) for info in self.world.gpus), *self.world.cards]
         return LeaseSpec.model_validate(
@@ -258,9 +249,7 @@ class Consumer(Program):
                 "consumer": self.process.name,
                 "model_id": f"{self.process.name}-{slot}",
                 "gpu": choice(gpus),
-                "mode": "exclusive"
-                if parent is None and chance(self.character.exclusive)
-                else "shared",
+                "mode": "exclusive" if chance(self.character.exclusive) else "shared",
                 "footprint": Footprint(
                     load_peak_bytes=max(peak, self.residue_bytes),
                     steady_bytes=steady,
@@ -273,7 +262,6 @@ class Consumer(Program):
                 "on_deadline": choice(("wait", "wait", "deny")),
                 "standby": chance(self.character.standby),
                 "park_bytes": steady if chance(self.character.parks) else 0,
-                "parent": parent and {"lease_id": parent.lease_id, "token": parent.token},
                 "independent": chance(0.2),
             }
         )
@@ -312,9 +300,6 @@ class Consumer(Program):
         held = Holding(self.client, self.process, lease, GpuId(lease.gpu))
         holding.append(held)
         self.cast.holdings[lease.lease_id] = held
-        if spec.parent is not None:
-            self.world.carved[lease.lease_id] = spec.parent.lease_id
-            self.world.faults["sublease"] += 1
         return lease
 
     async def _watched(self, work: Awaitable[None]) -> None:
@@ -492,43 +477,6 @@ class Runner(Program):
         await self.pause(self.random.choice((0.1, 1.0, 5.0)))
         del marks[use.use_id]
         await use.end()
-
-
-class Lender(Program):
-    """Takes a lease for others: puts nothing on the card itself, and lets whoever knows the token carve sub-leases out of it."""
-
-    async def life(self) -> None:
-        self.client.reserves = True
-        while not self.cast.stopping:
-            await self.pause(6.0)
-            if not self.cast.stopping:
-                try:
-                    await self._lend()
-                except VramError as error:
-                    self.cast.count_refusal(error)
-
-    async def _lend(self) -> None:
-        size = self.random.choice(SIZES[2:])
-        footprint = Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=0)
-        spec = LeaseSpec(
-            consumer=self.process.name,
-            model_id="reservation",
-            footprint=footprint,
-            ttl_s=5.0,
-            min_residency_s=0.5,
-        )
-        lease = await self.client.acquire(spec, 10.0)
-        self.cast.offers[lease.lease_id] = lease
-        try:
-            if self.world.clock.chance(0.5):
-                await lease.ready()
-                async with lease.use("goal"):
-                    await self.pause(5.0)
-            else:
-                await self.pause(5.0)
-        finally:
-            del self.cast.offers[lease.lease_id]
-        await lease.give_up()
 
 
 class Observer(Program):

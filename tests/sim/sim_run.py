@@ -22,7 +22,7 @@ from pathlib import Path
 if __name__ == "__main__":  # run as a file: the tree is found from here
     sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from sim_clients import Cast, Character, Consumer, Lender, Observer, Operator, Runner
+from sim_clients import Cast, Character, Consumer, Observer, Operator, Runner
 from sim_faults import Nemesis, Slot
 
 from tests.support.simulation.clock import TRACE_LINES
@@ -129,7 +129,6 @@ def _play(world: World, cast: Cast) -> None:
         )
         slots.append(Slot(lambda pid, n=n, c=character: Consumer(cast, f"consumer{n}", c, pid)))
     slots += [Slot(lambda pid, n=n: Runner(cast, f"runner{n}", pid)) for n in range(2)]
-    slots.append(Slot(lambda pid: Lender(cast, "lender", pid)))
     slots.append(Slot(lambda pid: Observer(cast, "observer", pid)))
     slots.append(Slot(lambda pid: Operator(cast, "operator", pid)))
     nemesis = Nemesis(world, cast, slots)

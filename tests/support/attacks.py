@@ -13,6 +13,7 @@ from itertools import cycle
 
 import msgpack
 
+from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.runtime.zmtp import GREETING, READY, encode
 
 CONNECTIONS = 600
@@ -62,7 +63,7 @@ def _hello(path: str) -> socket.socket:
     hello = {
         "op": "hello",
         "id": 1,
-        "version": 1,
+        "version": d.WIRE_VERSION,
         "name": "attacker",
         "instance": str(time.monotonic_ns()),
     }

@@ -387,7 +387,6 @@ class Consumer:
         standby: bool = False,
         park_bytes: int = 0,
         key: str | None = None,
-        parent: tuple[LeaseId, Token] | None = None,
         independent: bool = False,
         gang: tuple[str, int] | None = None,
     ) -> Spec:
@@ -408,7 +407,6 @@ class Consumer:
             standby=standby,
             on_overstay=on_overstay,
             park_bytes=park_bytes,
-            parent=parent,
             independent=independent,
             gang=gang,
         )

@@ -231,7 +231,7 @@ def _check_history(
                 uses.pop(lease, None)
             case "granted":
                 story.grants += 1
-                if loading[gpu] and not event.get("parent"):
+                if loading[gpu]:
                     others = ", ".join(loading[gpu].values())
                     story.bad("loading", t, f"{event['consumer']} is granted while {others} loads")
                 loading[gpu][lease] = str(event["consumer"])

@@ -5,6 +5,7 @@ from typing import Any
 
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.protocol import ClientProtocol
+from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.wire import requests as wire
 
 SPEC = wire.LeaseSpec(
@@ -14,7 +15,7 @@ SPEC = wire.LeaseSpec(
     footprint=wire.Footprint(load_peak_bytes=5, steady_bytes=4, residue_bytes=1),
 ).model_dump(mode="json")
 WELCOME = {
-    "version": 1,
+    "version": d.WIRE_VERSION,
     "boot_id": "b",
     "server": "s",
     "role": "client",

@@ -3,7 +3,6 @@
 from typing import Any, Literal
 
 from tests.support.core_driver import Consumer, CoreDriver
-from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.arbiter.core.events import OperatorAsked
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
@@ -76,44 +75,3 @@ def order(driver: CoreDriver, action: Literal["evict", "pin"], lease: LeaseId) -
     """An operator does this to a lease."""
     ops = driver.consumer("ops")
     driver.post(OperatorAsked(ops.client, driver.next_request(), action, lease, "ops", "test"))
-
-
-class Tree:
-    """A runner that reserves 5 GiB and a policy that loads under it, on a card of 8 GiB."""
-
-    def __init__(
-        self,
-        driver: CoreDriver | None = None,
-        steady: int = 5 * GIB,
-        stay_s: float = 0.0,
-        **child: Any,
-    ) -> None:
-        self.driver = driver or CoreDriver(8 * GIB)
-        self.runner = self.driver.consumer("runner")
-        self.policy = self.driver.consumer("policy")
-        self.root = self.runner.acquire(5 * GIB, steady, min_residency_s=stay_s)
-        self.token = self.runner.token(self.root)
-        self.leaf = self.carve(self.policy, 4 * GIB, **child)
-
-    def carve(self, who: Consumer, count: int, *spec: Any, **more: Any) -> LeaseId:
-        return who.acquire(count, *spec, **{"parent": (self.root, self.token), **more})
-
-    def held(self) -> "Tree":
-        self.policy.load(self.leaf)
-        self.driver.advance(0.01)
-        return self
-
-    def charges(self, *leases: LeaseId) -> list[int]:
-        views = [self.driver.view(lease) for lease in leases or (self.root, self.leaf)]
-        return [0 if view is None else view["charge_bytes"] for view in views]
-
-    def state(self, lease: LeaseId) -> str:
-        return self.driver.state(lease)
-
-    def total(self) -> int:
-        return int(self.driver.gpu()["charged_bytes"])
-
-
-def revokes(effects: list[Any]) -> list[tuple[str, int, int]]:
-    pushed = [e.body for e in effects if isinstance(e, Push) and e.body["push"] == "revoke"]
-    return [(p["lease_id"], p["uses"], p.get("children", 0)) for p in pushed]

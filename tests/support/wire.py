@@ -10,6 +10,8 @@ from typing import Any, Self
 import msgpack
 import zmq
 
+from vram_arbiter.schemas import defaults as d
+
 REPLY_S = 60.0
 """Every wait here is for something that comes; a busy machine may take its time over it."""
 TTL_S = 600.0
@@ -74,7 +76,7 @@ class WireClient:
     def hello(self, name: str = "test", **fields: Any) -> Self:
         """Say hello; raises AssertionError unless it is welcomed."""
         welcome = self.ask(
-            "hello", **{"version": 1, "name": name, "instance": f"{name}-1", **fields}
+            "hello", **{"version": d.WIRE_VERSION, "name": name, "instance": f"{name}-1", **fields}
         )
         assert welcome["ok"], welcome
         return self

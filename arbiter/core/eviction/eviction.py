@@ -8,8 +8,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 from vram_arbiter.arbiter.core.effects import Signal
-from vram_arbiter.arbiter.core.features import families
-from vram_arbiter.arbiter.core.model.lease import LEAVING, Cause, Eviction, Lease, LeaseState, Order
+from vram_arbiter.arbiter.core.model.lease import Cause, Eviction, Lease, LeaseState, Order
 from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
 from vram_arbiter.schemas.ids import LeaseId
 
@@ -21,36 +20,16 @@ def ask(
     waiter: Lease | None,
     reason: str,
     *,
-    cause: Cause | None = None,
     order: Order | None = None,
 ) -> None:
-    """Ask a holder to leave, and everything that was carved out of it: leaves first. A fresh reading is taken, so that there is
-    something to compare with. Without a waiter, an `order` of an operator or another `cause` it is for pressure."""
-    cause = cause or ("operator" if order else "waiter" if waiter else "pressure")
-    for member in reversed(list(holder.tree())):
-        if member.state is LeaseState.HELD:
-            member.move(LeaseState.REVOKING, core.now, reason)
-            _begin(core, gpu, member, waiter, reason, cause, order)
-    if holder.children:  # a restart must find the whole tree asked, or none of it
-        for member in holder.tree():
-            core.record_lease(member)
-    core.want_sample(gpu, core.now)
-    for member in reversed(list(holder.tree())):
-        if member.eviction is not None and member.eviction.asked_at == core.now:
-            _tell(core, member, member.eviction)
+    """Revoke a held lease: for a waiter, by an operator's `order`, or because of pressure.
 
-
-def _begin(
-    core: Core,
-    gpu: Gpu,
-    holder: Lease,
-    waiter: Lease | None,
-    reason: str,
-    cause: Cause,
-    order: Order | None,
-) -> None:
+    A fresh reading is taken, so that the verification has something to compare with.
+    """
+    cause: Cause = "operator" if order else "waiter" if waiter else "pressure"
+    holder.move(LeaseState.REVOKING, core.now, reason)
     holder.left_for = "" if waiter is None else waiter.spec.consumer
-    holder.eviction = Eviction(
+    eviction = holder.eviction = Eviction(
         lease=holder.id,
         consumer=holder.spec.consumer,
         charge_bytes=gpu.ledger.charge_bytes(holder.id),
@@ -63,15 +42,12 @@ def _begin(
         next_push_at=core.now + core.settings.revoke_resend_s,
         traceparent=None if waiter is None else waiter.traceparent,
     )
-    gpu.evictions.append(holder.eviction)
+    gpu.evictions.append(eviction)
     parks = core.host.book(holder.id, holder.spec.park_bytes)
     if holder.spec.standby or parks:
         # a restart must not take a release that was asked for as one that was wished for
         core.record_lease(holder)
-
-
-def _tell(core: Core, holder: Lease, eviction: Eviction) -> None:
-    """The first `revoke`, and the start of the ladder."""
+    core.want_sample(gpu, core.now)
     _push_now(core, holder, eviction)
     if holder.spec.on_overstay != "wait":
         core.timers.set(("overstay", holder.id), _overstays_at(core, holder, eviction))
@@ -80,7 +56,7 @@ def _tell(core: Core, holder: Lease, eviction: Eviction) -> None:
         holder,
         wanted_by=eviction.wanted_consumer,
         wanted_by_lease=eviction.wanted_by,
-        uses=holder.busy_uses(),
+        uses=len(holder.uses),
         cause=eviction.cause,
         reason=eviction.reason,
     )
@@ -106,8 +82,7 @@ def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
             "deadline_in_s": max(
                 0.0, eviction.asked_at + core.settings.revoke_deadline_s - core.now
             ),
-            "uses": holder.busy_uses(),
-            **({"children": len(holder.children)} if holder.children else {}),
+            "uses": len(holder.uses),
             "park": holder.id in core.host.booked,
             **({"traceparent": eviction.traceparent} if eviction.traceparent else {}),
         },
@@ -122,18 +97,13 @@ def acknowledge(core: Core, holder: Lease, eta_s: float | None) -> None:
     eviction.safe_point_eta_s = eta_s
     if eviction.acked_at is None:
         eviction.acked_at = core.now
-        core.note("revoke_acked", holder, safe_point_eta_s=eta_s, uses=holder.busy_uses())
+        core.note("revoke_acked", holder, safe_point_eta_s=eta_s, uses=len(holder.uses))
 
 
 def reached_safe_point(core: Core, holder: Lease) -> None:
-    """The last use ended while the holder is asked to leave: tell it, it may not know of uses that others marked."""
-    for member in reversed(list(holder.root.tree())):
-        if (
-            member.eviction is not None
-            and member.state is LeaseState.REVOKING
-            and not member.busy_uses()
-        ):
-            _push_now(core, member, member.eviction)
+    """Tell a revoked holder that the last use has ended: other processes may have marked uses."""
+    if holder.eviction is not None and holder.state is LeaseState.REVOKING and not holder.uses:
+        _push_now(core, holder, holder.eviction)
 
 
 def _push_now(core: Core, holder: Lease, eviction: Eviction) -> None:
@@ -161,11 +131,11 @@ def on_ladder_due(core: Core, lease_id: str) -> None:
     settings = core.settings
     if core.now >= eviction.next_push_at:
         eviction.next_push_at = core.now + settings.revoke_resend_s
-        if eviction.acked_at is None or _may_unload(holder):
+        if eviction.acked_at is None or not holder.uses:
             push_revoke(core, holder, eviction)
     if not eviction.reminded and core.now >= eviction.asked_at + settings.revoke_remind_s:
         eviction.reminded = True
-        core.note("reminded", holder, uses=holder.busy_uses(), acked=eviction.acked_at is not None)
+        core.note("reminded", holder, uses=len(holder.uses), acked=eviction.acked_at is not None)
     if not eviction.overdue and core.now >= eviction.asked_at + settings.revoke_deadline_s:
         eviction.overdue = True
         _deadline(core, holder, eviction)
@@ -183,7 +153,7 @@ def _unload_hangs(core: Core, holder: Lease) -> None:
 def _deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None:
     """The holder outstayed. Its waiter is denied if that is its wish; the `revoke` stands in any case."""
     wanted_by, consumer = (eviction.wanted_by, eviction.wanted_consumer) if eviction else (None, "")
-    core.note("deadline_passed", holder, uses=holder.busy_uses(), wanted_by=consumer)
+    core.note("deadline_passed", holder, uses=len(holder.uses), wanted_by=consumer)
     core.wake(core.gpu_of(holder))
     waiter = core.waiting.get(wanted_by) if wanted_by is not None else None
     for gpu_id in () if waiter is None else waiter.gpus:
@@ -201,7 +171,7 @@ def _deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None:
             "details": {
                 "lease_id": holder.id,
                 "consumer": holder.spec.consumer,
-                "uses": holder.busy_uses(),
+                "uses": len(holder.uses),
             },
         },
     )
@@ -248,7 +218,7 @@ def _overstays_at(core: Core, holder: Lease, eviction: Eviction) -> float:
 
 def _process_in_use(core: Core, holder: Lease) -> bool:
     return holder.process in core.users or any(
-        lease.busy_uses() for lease in core.leases_of(holder.process)
+        lease.uses for lease in core.leases_of(holder.process)
     )
 
 
@@ -267,49 +237,11 @@ def deny(core: Core, waiter: Lease, error: Mapping[str, Any]) -> None:
     core.end(waiter, error)
 
 
-def _may_unload(holder: Lease) -> bool:
-    return not holder.children and not holder.busy_uses()
-
-
 def _set_timer(core: Core, holder: Lease, eviction: Eviction) -> None:
     times = [eviction.asked_at + core.settings.revoke_deadline_s] if not eviction.overdue else []
     if not eviction.reminded:
         times.append(eviction.asked_at + core.settings.revoke_remind_s)
-    if eviction.acked_at is None or _may_unload(holder):
+    if eviction.acked_at is None or not holder.uses:
         times.append(eviction.next_push_at)
     if times:
         core.timers.set(("revoke", holder.id), min(times))
-
-
-# -- families --------------------------------------------------------------------------------------------------------
-def depart(core: Core, lease: Lease, *, exiting: bool) -> None:
-    """Its holder lets go while sub-leases are there: they are asked to leave first, then it is over."""
-    lease.departing, lease.exiting = True, exiting
-    core.timers.clear(("ttl", lease.id))  # its holder has said its last word on it
-    if lease.state is not LeaseState.REVOKING:
-        lease.move(LeaseState.REVOKING, core.now, "leaves after its sub-leases")
-    gpu = core.gpu_of(lease)
-    for child in list(lease.children):
-        ask(core, gpu, child, None, f"{lease.spec.consumer} ({lease.id}) leaves", cause="parent")
-
-
-def follow(core: Core, lease: Lease) -> None:
-    """A sub-lease finished loading while what it was carved out of was asked to leave: it is asked too."""
-    parent = lease.parent
-    if parent is None or parent.state not in LEAVING:
-        return
-    gpu = core.gpu_of(lease)
-    wanted = parent.eviction.wanted_by if parent.eviction is not None else None
-    waiter = None if wanted is None else core.waiting.get(wanted)
-    ask(core, gpu, lease, waiter, f"{parent.spec.consumer} ({parent.id}) leaves", cause="parent")
-
-
-def part(core: Core, gpu: Gpu, lease: Lease) -> None:
-    """A lease is over: what was carved out of it stands for itself from now on, and may have reached its safe point."""
-    heirs = list(lease.children)
-    families.close(gpu, lease)
-    for heir in heirs:
-        core.note(
-            "orphaned", heir, parent=lease.id, reason=f"{lease.spec.consumer} ({lease.id}) is over"
-        )
-        reached_safe_point(core, heir)

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import families
 from vram_arbiter.arbiter.core.model.lease import EXPIRING, Gang, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
 from vram_arbiter.arbiter.core.scheduling import policy
@@ -185,7 +184,6 @@ def _admit(core: Core, gang: Gang, placement: _Placement) -> None:
                 core.gpus[gpu_id].queue.discard(lease)
                 core.wake(core.gpus[gpu_id])
             lease.gpus, lease.gpu, lease.reason = (gpu.info.id,), gpu.info.id, ""
-            families.claim(core, gpu, lease.process)
             gpu.ledger.reserve(lease.id, lease.process, lease.steady_bytes, core.now)
         _set_headroom(core, gpu, gang, _headroom_bytes(some))
         here = [one.id for one in gang.members if one.gpu == gpu.info.id]
@@ -386,7 +384,7 @@ def _ever(core: Core, gpu: Gpu, some: list[Lease]) -> bool:
     """Would they fit if every lease ended but what their own unfinished gang holds already?"""
     mine = some[0].gang
     staying = [lease for lease in gpu.residents.values() if lease.gang is mine]
-    fixed = sum(gpu.ledger.charge_bytes(one.id) for root in staying for one in root.tree())
+    fixed = sum(gpu.ledger.charge_bytes(lease.id) for lease in staying)
     alone = any(one.spec.exclusive for one in [*some, *staying])
     if alone and len(some) + len(staying) > 1:
         return False

@@ -104,7 +104,6 @@ class Resizing(Feature):
             evictable=False,
             standby=False,
             park_bytes=0,
-            parent=None,
             gang=None,
             load_peak_bytes=more_bytes,
             steady_bytes=more_bytes,
@@ -227,11 +226,6 @@ def _check_resizable(lease: Lease) -> None:
         )
     if lease.state is not LeaseState.HELD:
         raise bad_state(lease, "only a held lease is resized")
-    if lease.parent is not None or lease.estate is not None:
-        raise bad_state(
-            lease,
-            "a lease with sub-leases, or one of them, keeps its size: carve or release instead",
-        )
 
 
 def _check_ever_fits(gpu: Gpu, lease: Lease, target: int, charge: int) -> None:

@@ -20,10 +20,12 @@ NOT_BACK = "its holder did not come back after the restart"
 
 # -- going away ------------------------------------------------------------------------------------------------------
 def stays_on(lease: Lease) -> bool:
-    """Does it go on standby when it lets go now? Only if the engine asked it to leave: who leaves by himself does not want back,
-    whom an operator evicts is not wanted back, and a sub-lease has no place of its own to come back to."""
+    """Whether a lease goes on standby when it releases now: only one that the engine revoked.
+
+    A holder that releases by itself does not want it back, and an operator who evicts it does not either.
+    """
     asked = lease.eviction is not None or lease.asked_before
-    return lease.spec.standby and asked and not lease.dismissed and lease.spec.parent is None
+    return lease.spec.standby and asked and not lease.dismissed
 
 
 def next_state(lease: Lease) -> LeaseState:

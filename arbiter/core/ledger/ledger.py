@@ -300,7 +300,7 @@ class GpuLedger:
         self._changed(account, now)
 
     def rebook(self, lease: LeaseId, booked_bytes: int, approved_bytes: int, now: float) -> None:
-        """Move bytes between the leases of a family: what one has less another has more (`families`)."""
+        """Change both figures of a charge: a lease has grown."""
         account = self.accounts[self._owner[lease]]
         before = account.charges[lease]
         if (before.booked_bytes, before.approved_bytes) != (booked_bytes, approved_bytes):

@@ -4,7 +4,7 @@ Knows nothing of bytes on a card (`ledger`), of order (`queue`) or of clients be
 """
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
@@ -44,8 +44,7 @@ TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
         # released from queued: a growth that was merged into its lease
         _S.QUEUED: frozenset({_S.LOADING, _S.DENIED, _S.CANCELLED, _S.RELEASED}),
         # denied from loading: the grant could not be journalled, so it was never sent
-        # revoking from loading: it gives up while its sub-leases still load
-        _S.LOADING: frozenset({_S.HELD, _S.REVOKING, _S.VERIFYING, _S.DENIED, *_GONE}),
+        _S.LOADING: frozenset({_S.HELD, _S.VERIFYING, _S.DENIED, *_GONE}),
         _S.HELD: frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING, *_GONE}),
         _S.REVOKING: frozenset({_S.UNLOADING, _S.VERIFYING, *_GONE}),
         _S.UNLOADING: frozenset({_S.VERIFYING, *_GONE}),
@@ -102,8 +101,8 @@ class Order:
         return f"{self.by}: {self.reason}" if self.reason else self.by
 
 
-Cause = Literal["waiter", "pressure", "operator", "parent"]
-"""Why a holder has to leave: for a request, for more bytes than the GPU has, by hand, or since what it was carved out of leaves."""
+Cause = Literal["waiter", "pressure", "operator"]
+"""Why a holder is revoked: for a request, because the GPU holds more than its budget, or by hand."""
 
 
 @dataclass(slots=True)
@@ -154,29 +153,6 @@ class Recall:
 
     asked_at: float
     wait_timeout_s: float | None
-
-
-@dataclass(slots=True)
-class Share:
-    """What one sub-lease takes from its parent. `fold_bytes` were its process's own before and are not taken."""
-
-    booked_bytes: int
-    approved_bytes: int
-    fold_bytes: int
-
-
-@dataclass(slots=True)
-class Estate:
-    """A lease that sub-leases were carved out of: what it was granted as a whole, and who has what of it (`families`)."""
-
-    booked_bytes: int
-    approved_bytes: int
-    # also of sub-leases that are over and not measured gone
-    shares: dict[LeaseId, Share] = field(default_factory=dict)
-    borne: dict[ProcessKey, int] = field(
-        default_factory=dict
-    )  # residues that former sub-leases left
-    told: bool = False  # asked to leave, it heard that its last sub-lease has
 
 
 @dataclass(slots=True)
@@ -284,16 +260,11 @@ class Lease:
     story: list[tuple[float, LeaseState, str]] = field(
         default_factory=list
     )  # the last STORY_MAX steps
-    parent: "Lease | None" = field(default=None, repr=False, compare=False)
-    children: list["Lease"] = field(default_factory=list, repr=False, compare=False)  # live ones
-    estate: Estate | None = None  # once anything was carved out of it
-    said_ready: bool = False  # by itself, not through a sub-lease
     gang: Gang | None = field(
         default=None, repr=False, compare=False
     )  # until it is complete or broken
     rank: float | None = None  # its gang's place in the queues
     needs: Mapping[ProcessKey, int] | None = None  # of a gang's members on one card together
-    departing: bool = False  # its holder let go; it is over when its last sub-lease is
     roster: Roster | None = field(
         default=None, repr=False, compare=False
     )  # of the card that it is on
@@ -320,47 +291,15 @@ class Lease:
         return self.spec.priority + int(max(0.0, now - self.arrived_at) / ageing_s_per_point)
 
     @property
-    def root(self) -> "Lease":
-        """The lease that its tree was carved out of; itself for most."""
-        lease = self
-        while lease.parent is not None:
-            lease = lease.parent
-        return lease
-
-    def tree(self) -> Iterator["Lease"]:
-        """Itself, then its sub-leases and theirs: parents before children."""
-        yield self
-        for child in self.children:
-            yield from child.tree()
-
-    @property
     def in_use(self) -> bool:
-        """A tree is in use while any lease of it is."""
-        if self.parent is None and not self.children:
-            return bool(self.uses)
-        return any(member.uses for member in self.root.tree())
-
-    def busy_uses(self) -> int:
-        """Uses that keep it from unloading: its own, those below and above it, and of all that was asked to leave with it."""
-        if self.parent is None and not self.children:
-            return len(self.uses)
-        unit, above, lease = self, 0, self
-        while lease.parent is not None:
-            lease = lease.parent
-            if lease.state in LEAVING:
-                unit, above = lease, 0
-            else:
-                above += len(lease.uses)
-        return above + sum(len(member.uses) for member in unit.tree())
-
-    @property
-    def may_leave(self) -> bool:
-        """May it be asked, with everything that was carved out of it?"""
-        return self.evictable and all(child.may_leave for child in self.children)
+        """Whether a use is in flight."""
+        return bool(self.uses)
 
     def users(self) -> list[Use]:
-        """The oldest busy use of each process but its own: what the journal keeps (`Core.record_lease`). The holder tells its own uses
-        when it re-attaches, and until then nobody asks it to leave."""
+        """Return the oldest in-flight use of each process but the holder: what the journal keeps.
+
+        The holder reports its own uses when it reattaches, and is not revoked before.
+        """
         oldest: dict[ProcessKey, Use] = {}
         for use in self.uses.values():
             oldest.setdefault(use.process, use)

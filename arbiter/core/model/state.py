@@ -28,7 +28,6 @@ from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger
 from vram_arbiter.arbiter.core.ledger.returning import Returning
 from vram_arbiter.arbiter.core.model.lease import (
     LEAVING,
-    Estate,
     Eviction,
     Failures,
     Gang,
@@ -147,9 +146,6 @@ class Gpu:
     pressed: bool = False  # a pressure note is out
 
     gang: Gang | None = None  # it is loading here
-    estates: dict[LeaseId, Lease] = field(
-        default_factory=dict
-    )  # leases that sub-leases were carved out of
     debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
 
     def in_state(self, *states: LeaseState) -> list[Lease]:
@@ -426,9 +422,6 @@ class Core:
 
     def end(self, lease: Lease, error: Mapping[str, Any] | None) -> None:
         """Drop a lease that reached a terminal state; a bounded memory of it stays."""
-        if lease.parent is not None:
-            lease.parent.children.remove(lease)
-            lease.parent = None
         del self.leases[lease.id]
         _take_out(self._of_process, lease.process, lease.id)
         _take_out(self._of_client, lease.client, lease.id)
@@ -500,10 +493,7 @@ class Core:
                 "load_peak_bytes": lease.load_peak_bytes,
                 "measured_bytes": lease.measured_bytes,
                 "exiting": lease.exiting,
-                "said_ready": lease.said_ready,
-                "parent": None if lease.parent is None else lease.parent.id,
                 "gang": None if lease.gang is None else [lease.gang.name, lease.gang.size],
-                "estate": None if lease.estate is None else _estate(lease.estate),
                 "pinned": None if lease.pinned is None else [lease.pinned.by, lease.pinned.reason],
                 "comes_back": lease.comes_back,
                 "parks": lease.parks,
@@ -528,21 +518,12 @@ class Core:
                     "standby": spec.standby,
                     "on_overstay": spec.on_overstay,
                     "park_bytes": spec.park_bytes,
-                    "parent": None
-                    if spec.parent is None
-                    else [spec.parent[0], *astuple(spec.parent[1])],
                     "independent": spec.independent,
                     "gang": None if spec.gang is None else [*spec.gang],
                 },
             },
             gates=gates,
         )
-
-    def record_line(self, lease: Lease) -> None:
-        """Write a resident lease and what it was carved out of: their bytes moved together."""
-        self.record_lease(lease)
-        if lease.parent is not None:
-            self.record_line(lease.parent)
 
     def record_residue(self, gpu: Gpu, process: ProcessKey, residue_bytes: int) -> None:
         """Write (or, with 0, delete) what a process keeps."""
@@ -571,17 +552,6 @@ class Core:
             or self.recovering
             or self.now - self.last_client_at <= IDLE_PROBE_S
         )
-
-
-def _estate(estate: Estate) -> dict[str, Any]:
-    return {
-        "booked_bytes": estate.booked_bytes,
-        "approved_bytes": estate.approved_bytes,
-        "shares": {lease: [*astuple(share)] for lease, share in estate.shares.items()},
-        "borne": [
-            [process.pid, process.start_ticks, count] for process, count in estate.borne.items()
-        ],
-    }
 
 
 def _forget_oldest[T](by_consumer: dict[str, T]) -> None:

@@ -130,11 +130,6 @@ def _debt_condition(gpu: Gpu, process: ProcessKey) -> str:
 def _holder_condition(core: Core, waiter: Lease, holder: Lease) -> str:
     if holder.state is LeaseState.LOADING:
         return loading(core, holder)
-    if holder.state is LeaseState.REVOKING and holder.children:
-        asked = (
-            "leaves by itself" if holder.departing else f"was asked to leave {ago(core, holder)}"
-        )
-        return f"{asked}, goes after {named(holder.children)}"
     if holder.state in LEAVING:
         return {
             LeaseState.REVOKING: f"was asked to leave {ago(core, holder)}, {uses(holder)}",
@@ -144,24 +139,19 @@ def _holder_condition(core: Core, waiter: Lease, holder: Lease) -> str:
     if not holder.attached:
         left_s = holder.expires_at - core.now
         return f"has not come back since the restart, is given up in {left_s:.1f} s"
-    root = holder.root
-    if root is not holder:
-        return f"belongs to {named([root])}, which {_holder_condition(core, waiter, root)}"
     if holder.gang is not None:
         return f"belongs to gang {holder.gang.name}, which is not complete"
-    if missing := [lease for lease in root.tree() if not lease.attached]:
-        return f"waits for {named(missing)} to come back since the restart, or to be given up"
-    if not root.may_leave:
+    if not holder.evictable:
         return f"is pinned by {holder.pinned}" if holder.pinned else "is pinned"
-    ends_at = policy.residency_ends_at(core, root, waiter)
+    ends_at = policy.residency_ends_at(core, holder, waiter)
     if ends_at > core.now:
-        stretched = ends_at > root.ready_at + root.spec.min_residency_s
+        stretched = ends_at > holder.ready_at + holder.spec.min_residency_s
         why = "they keep throwing each other out" if stretched else "minimum residency"
         return f"may stay {ends_at - core.now:.1f} s more ({why})"
     priority = waiter.priority_at(core.now, core.settings.ageing_s_per_point)
-    if root.in_use and root.spec.priority > priority:
-        return f"is in use and has priority {root.spec.priority}, the waiter {priority}"
-    return "is in use" if root.in_use else "is idle and may be asked"
+    if holder.in_use and holder.spec.priority > priority:
+        return f"is in use and has priority {holder.spec.priority}, the waiter {priority}"
+    return "is in use" if holder.in_use else "is idle and may be asked"
 
 
 # -- words -------------------------------------------------------------------------------------------------------------

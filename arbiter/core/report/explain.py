@@ -17,7 +17,6 @@ from vram_arbiter.arbiter.core.report.blockers import (
     ago,
     gib,
     loading,
-    named,
     unloading,
     uses,
     who_blocks,
@@ -29,7 +28,7 @@ NOTE_KINDS: tuple[str, ...] = (
     "queued", "granted", "ready", "switch", "use_began", "use_ended", "use_yielded", "revoke_asked", "revoke_acked", "reminded",
     "deadline_passed", "unloading", "released", "verified", "denied", "refused", "cancelled", "expired", "lost", "reattached", "oom",
     "pressure", "stowaway", "probe_failed", "probe_ok", "drift", "journal_failed", "recovered", "serving", "operator", "resumed",
-    "standby", "parked", "orphaned", "gang", "signalled", "resized",
+    "standby", "parked", "gang", "signalled", "resized",
 )  # fmt: skip
 """Every kind of `effects.Note`. `switch` comes with each `ready`; its field `switched` says whether anybody had to leave."""
 
@@ -85,10 +84,6 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
         shown["granted_s"] = core.now - lease.held_from
     if lease.pinned is not None:
         shown["pinned"] = str(lease.pinned)
-    if lease.parent is not None:
-        shown["parent"] = lease.parent.id
-    if lease.children:
-        shown["children"] = [child.id for child in lease.children]
     if lease.gang is not None:
         shown["gang"] = (
             f"{lease.gang.name}: {lease.gang.phase}, {len(lease.gang.members)} of {lease.gang.size}"
@@ -371,7 +366,6 @@ def _explain_resident(core: Core, gpu: Gpu, lease: Lease, free: int) -> dict[str
         LeaseState.UNLOADING: f"it {unloading(core, lease)}",
         LeaseState.VERIFYING: "it let go; its bytes are being measured",
     }.get(lease.state) or standby.outlook(core, lease)
-    says += _family(gpu, lease)
     if lease.gang is not None:
         says += f"; {gangs.unfinished(lease.gang, lease)}"
     if drift.drift_bytes(core, gpu, lease):
@@ -401,7 +395,6 @@ def _condition(
     if lease.gang is not None and position <= 1:
         return f"gang {lease.gang.phase}", gangs.outlook(lease.gang, lease)
     leaving = [other for other in gpu.residents.values() if other.state in LEAVING]
-    leaving.sort(key=lambda other: bool(other.children))
     if position > 1:
         return "queued", _behind(core, lease, position)
     if leaving and lease.planned_gpu == gpu.info.id:
@@ -431,10 +424,8 @@ def _condition(
 def _leaving_next(core: Core, gpu: Gpu, holder: Lease) -> str:
     charge = gib(gpu.ledger.charge_bytes(holder.id))
     name = holder.spec.consumer
-    if holder.state is LeaseState.REVOKING and holder.children:
-        return f"then {name} leaves with {charge}, once {named(holder.children)} has"
-    if holder.state is LeaseState.REVOKING and holder.busy_uses():
-        running = holder.busy_uses()
+    if holder.state is LeaseState.REVOKING and holder.uses:
+        running = len(holder.uses)
         plural = "use" if running == 1 else "uses"
         return (
             f"waits for {name} to finish {running} {plural} (asked {ago(core, holder)}), "
@@ -491,25 +482,7 @@ def medians(core: Core) -> dict[str, dict[str, float]]:
     }
 
 
-def _family(gpu: Gpu, lease: Lease) -> str:
-    """What it was carved out of and what it lends, in words."""
-    says = ""
-    if lease.parent is not None:
-        says += f"; it was carved out of {named([lease.parent])}"
-        if lease.state is LeaseState.VERIFYING and lease.parent.state not in LEAVING:
-            says += ", which has its bytes back then"
-    if lease.children:
-        lent = sum(
-            gpu.ledger.charge_bytes(member.id) for member in lease.tree() if member is not lease
-        )
-        says += f"; it lends {gib(lent)} to {named(lease.children)}"
-        says += ", who leave first" if lease.state in LEAVING else ""
-    return says
-
-
 def _wanted_by(lease: Lease) -> str:
-    if lease.departing:
-        return "its own wish, once its sub-leases have left"
     return (lease.eviction.wanted_consumer if lease.eviction else "") or "relief of pressure"
 
 

@@ -157,8 +157,6 @@ def _leaving(core: Core, gpu: Gpu, waiter: Lease, holder: Lease) -> Step:
             f"measures {name}'s bytes again",
             because,
         )
-    if holder.children:
-        return _step(core, "wait", holder, None, f"lets {name} go", "once its sub-leases have left")
     eviction = holder.eviction
     if eviction is None or eviction.overdue:
         because = "its unloading may hang" if holder.hangs else "it is on its way out"

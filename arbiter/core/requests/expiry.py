@@ -6,7 +6,6 @@ What they hold becomes a debt and is measured away (`measure`).
 from collections.abc import Mapping
 from typing import Any
 
-from vram_arbiter.arbiter.core.eviction import eviction
 from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import crashes
 from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState
@@ -86,6 +85,5 @@ def lose(
         lease.eviction.released_at = core.now
         lease.eviction.unloading_at = lease.eviction.unloading_at or core.now
     measure.begin_for_lease(core, gpu, lease, alive=alive, grace_s=grace_s, fenced_at=fenced_at)
-    eviction.part(core, gpu, lease)
     lease.move(to, core.now, str(error["message"]))
     core.end(lease, error)

@@ -93,7 +93,7 @@ def evict(core: Core, lease: Lease, order: Order) -> None:
         return
     if lease.state is not LeaseState.HELD:
         raise _refused_state(lease, "only a resident lease can be evicted")
-    if not lease.may_leave:
+    if not lease.evictable:
         by = "an operator pinned it" if lease.pinned else "its holder asked never to be evicted"
         hint = (
             "unpin it first"
@@ -154,7 +154,7 @@ def release_dead(core: Core, lease: Lease, order: Order) -> None:
         raise Refused(
             "bad_state",
             f"the holder of {lease.id} was heard of {silent_s:.1f} s ago: it is not dead",
-            "evict it instead" if lease.may_leave else "end its program: it is pinned",
+            "evict it instead" if lease.evictable else "end its program: it is pinned",
             state=str(lease.state),
             silent_s=silent_s,
         )

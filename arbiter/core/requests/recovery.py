@@ -3,6 +3,8 @@
 Until every recovered lease is accounted for (re-attached, given up, its process dead, or the card is read at baseline) nothing is
 granted. Recovered bytes are charged from the first moment, until their holder says that they are gone, dies, or its time is over.
 A journal in doubt names some leases at best: its holders are believed, and grants wait as long as any holder may keep what it has.
+A record of a sub-lease, as versions before 0.2.0 wrote it, comes back as a plain lease: parent and sub-lease are each charged their own
+bytes until they are measured gone.
 """
 
 from collections.abc import Mapping
@@ -18,7 +20,7 @@ from vram_arbiter.arbiter.core.events import (
     Spec,
 )
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import families, gangs, standby
+from vram_arbiter.arbiter.core.features import gangs, standby
 from vram_arbiter.arbiter.core.learning import drift
 from vram_arbiter.arbiter.core.ledger.ledger import process_bytes
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState, Order, Use
@@ -71,11 +73,6 @@ def on_recovered(core: Core, event: Recovered) -> None:
                 core.forget(key)
         else:
             _restore(core, gpu, record)
-    parents = {
-        LeaseId(str(r["lease_id"])): str(r["parent"]) for r in held.values() if r.get("parent")
-    }
-    for gpu in core.gpus.values():
-        families.tie(core, gpu, parents)
     if not held or doubt is not None:
         core.recovering.add(EMPTY_JOURNAL)
         await_unnamed(core)
@@ -128,7 +125,6 @@ def _remembered(core: Core, record: Mapping[str, Any], state: LeaseState) -> Lea
         last_used_at=core.now,
         answered=True,
         exiting=bool(record["exiting"]),
-        said_ready=bool(record.get("said_ready", True)),
         pinned=None if record.get("pinned") is None else Order(*record["pinned"]),
         attached=False,
         dismissed=bool(record.get("dismissed", False)),
@@ -162,8 +158,6 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
     core.add(lease)
     core.host.find(lease.id, int(record.get("parked_bytes", 0)))
     gpu.residents[lease_id] = lease
-    if record["estate"] is not None:
-        families.restore(gpu, lease, record["estate"])
     if lease.state is LeaseState.VERIFYING:
         begin_for_lease(core, gpu, lease, alive=True)
         return
@@ -208,9 +202,6 @@ def spec_from_record(record: Mapping[str, Any]) -> Spec:
         standby=bool(record.get("standby", False)),
         on_overstay=str(record.get("on_overstay", "wait")),
         park_bytes=int(record.get("park_bytes", 0)),
-        parent=None
-        if record.get("parent") is None
-        else (LeaseId(record["parent"][0]), Token(*record["parent"][1:])),
         independent=bool(record.get("independent", False)),
         gang=None
         if record.get("gang") is None
@@ -274,12 +265,9 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
             core.gpu_of(lease).residents.recent[lease.id] = lease
     if item.away:
         _believe_away(core, lease, item)
-    elif (
-        lease.state is LeaseState.LOADING and item.held
-    ):  # its `ready` was lost, or a sub-lease's was heard
-        lease.said_ready = lease.estate is None or item.measured_bytes is not None
+    elif lease.state is LeaseState.LOADING and item.held:  # its `ready` was lost
         become_held(core, lease, item.measured_bytes)
-        core.record_line(lease)
+        core.record_lease(lease)
     if lease.gpu is not None:
         _restore_uses(core, lease, client, item)
     touch(core, lease)
@@ -395,7 +383,6 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
         ready_at=core.now,
         last_used_at=core.now,
         answered=True,
-        said_ready=item.held,
         story=[(core.now, LeaseState.HELD, "adopted: the journal did not know it")],
     )
     core.add(lease)
@@ -414,23 +401,8 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
         return lease
     _place(core, gpu, lease, charge)
     gpu.residents[lease.id] = lease
-    _reunite(core, gpu, lease)
-    core.record_line(lease)
+    core.record_lease(lease)
     return lease
-
-
-def _reunite(core: Core, gpu: Gpu, lease: Lease) -> None:
-    """Adopted leases come in any order: tie this one to its parent and to its sub-leases, as far as they are here."""
-    parent = gpu.residents.get(lease.spec.parent[0]) if lease.spec.parent is not None else None
-    if parent is not None and parent.state in (LeaseState.LOADING, LeaseState.HELD):
-        families.join(core, gpu, parent, lease, 0)
-    for other in list(gpu.residents.values()):
-        if (
-            other.parent is None
-            and other.spec.parent is not None
-            and other.spec.parent[0] == lease.id
-        ):
-            families.join(core, gpu, lease, other, 0)
 
 
 # -- coming to an end --------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from vram_arbiter.arbiter.core.events import (
     UnloadStarted,
 )
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import families, gangs, standby
+from vram_arbiter.arbiter.core.features import gangs, standby
 from vram_arbiter.arbiter.core.learning import costs, crashes, drift
 from vram_arbiter.arbiter.core.model.lease import (
     AWAY,
@@ -102,7 +102,7 @@ def own_lease(core: Core, client: ClientId, lease_id: LeaseId, token: Token) -> 
 
 def touch(core: Core, lease: Lease) -> None:
     """The holder lives: its time to live starts anew."""
-    if lease.state in EXPIRING and lease.attached and not lease.departing:
+    if lease.state in EXPIRING and lease.attached:
         lease.expires_at = core.now + lease.spec.ttl_s
         core.timers.set(("ttl", lease.id), lease.expires_at)
 
@@ -113,8 +113,7 @@ def bad_state(lease: Lease, what: str) -> Refused:
         f"{lease.id} is {lease.state}: {what}",
         "see the lease's story",
         state=str(lease.state),
-        uses=lease.busy_uses(),
-        children=len(lease.children),
+        uses=len(lease.uses),
         story=lease.told(),
     )
 
@@ -363,45 +362,32 @@ def on_wait_timeout(core: Core, lease_id: str) -> None:
 def ready(core: Core, event: ReadyReported) -> None:
     """Loaded: from now on the steady bytes are charged, or what the holder measured."""
     lease = own_lease(core, event.client, event.lease, event.token)
-    reserved = not lease.said_ready and lease.estate is not None
-    if lease.state is LeaseState.HELD or (
-        lease.state is LeaseState.REVOKING and reserved
-    ):  # a repeat, or
-        if not lease.said_ready:  # a sub-lease was ready before it: it is no mere reservation
-            lease.said_ready = True
-            _charge_held(core, lease, event.measured_bytes)
-            core.record_line(lease)
+    if lease.state is LeaseState.HELD:  # a repeat
         core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
         return
     if lease.state is not LeaseState.LOADING:
         raise bad_state(lease, "only a loading lease becomes ready")
-    lease.said_ready = True
-    held = become_held(core, lease, event.measured_bytes)
+    become_held(core, lease, event.measured_bytes)
     core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
-    core.record_line(lease)
-    for one in held:
-        core.learn(one.spec.consumer, "load_s", core.now - one.granted_at)
-        core.note(
-            "ready",
-            one,
-            charge_bytes=core.gpu_of(one).ledger.charge_bytes(one.id),
-            declared_bytes=one.steady_bytes,
-            measured_bytes=one.measured_bytes,
-            load_ms=(core.now - one.granted_at) * 1e3,
-        )
-        core.note("switch", one, **explain.switch_record(core, one))
-    eviction.follow(core, lease)
+    core.record_lease(lease)
+    core.learn(lease.spec.consumer, "load_s", core.now - lease.granted_at)
+    core.note(
+        "ready",
+        lease,
+        charge_bytes=core.gpu_of(lease).ledger.charge_bytes(lease.id),
+        declared_bytes=lease.steady_bytes,
+        measured_bytes=lease.measured_bytes,
+        load_ms=(core.now - lease.granted_at) * 1e3,
+    )
+    core.note("switch", lease, **explain.switch_record(core, lease))
 
 
-def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> list[Lease]:
-    """Loaded, and with it what it was carved out of, if that has not said so itself. Returns who became ready."""
+def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
+    """Mark the lease held."""
     lease.move(LeaseState.HELD, core.now, "ready")
     lease.ready_at = lease.last_used_at = core.now
     _charge_held(core, lease, measured_bytes)
     core.host.drop(lease.id)
-    if lease.parent is not None and lease.parent.state is LeaseState.LOADING:
-        return [lease, *become_held(core, lease.parent, None)]
-    return [lease]
 
 
 def _charge_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
@@ -416,7 +402,7 @@ def _charge_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     )
     peak = max(lease.load_peak_bytes, lease.peak_seen_bytes)
     gpu.returning.give_up(lease.process, max(0, peak - steady), core.now)
-    families.recharge(core, gpu, lease, steady)
+    gpu.ledger.recharge(lease.id, steady, core.now)
     gpu.changed_at = core.now
     core.want_sample(gpu, core.now)  # what it holds now is what has to come back one day
     core.wake(gpu)
@@ -448,7 +434,7 @@ def renew(core: Core, event: Renewed) -> None:
 def revoke_ack(core: Core, event: RevokeAcknowledged) -> None:
     lease = own_lease(core, event.client, event.lease, event.token)
     eviction.acknowledge(core, lease, event.safe_point_eta_s)
-    core.reply(event.client, event.request, {"state": str(lease.state), "uses": lease.busy_uses()})
+    core.reply(event.client, event.request, {"state": str(lease.state), "uses": len(lease.uses)})
 
 
 def unloading(core: Core, event: UnloadStarted) -> None:
@@ -459,12 +445,7 @@ def unloading(core: Core, event: UnloadStarted) -> None:
         return
     if lease.state not in (LeaseState.HELD, LeaseState.REVOKING):
         raise bad_state(lease, "only a held lease is unloaded; a loading one is released")
-    if lease.children:
-        names = ", ".join(f"{child.spec.consumer} ({child.id})" for child in lease.children)
-        raise bad_state(
-            lease, f"sub-leases of it are still resident: {names}; release it, they are asked first"
-        )
-    if running := lease.busy_uses():
+    if running := len(lease.uses):
         raise bad_state(lease, f"{running} uses still run; wait for the `revoke` that says 0 uses")
     gpu = core.gpu_of(lease)
     end_uses(core, lease, "unloaded while it paused")
@@ -493,9 +474,7 @@ def release(core: Core, event: ReleaseReported) -> None:
         )
         return
     lease = own_lease(core, event.client, event.lease, event.token)
-    if lease.children and not event.parked:
-        eviction.depart(core, lease, exiting=event.exiting)
-    elif lease.gpu is not None and lease.state is not LeaseState.VERIFYING:  # else: a repeat
+    if lease.gpu is not None and lease.state is not LeaseState.VERIFYING:  # else: a repeat
         _keep_parked(core, lease, parked=event.parked, exiting=event.exiting)
         let_go(
             core,
@@ -577,8 +556,6 @@ def let_go(
         lease.eviction.released_at = core.now
         core.learn(lease.spec.consumer, "unload_s", core.now - lease.eviction.unloading_at)
     begin_for_lease(core, gpu, lease, alive=True)
-    eviction.part(core, gpu, lease)
-    lease.said_ready = False
     core.record_lease(lease)
     core.note("released", lease, exiting=exiting, was=str(before), reason=why)
     core.wake(gpu)

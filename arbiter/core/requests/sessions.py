@@ -7,7 +7,7 @@ out); `bye` gives everything back; death ends everything, and what was held is m
 from dataclasses import replace
 
 from vram_arbiter.arbiter.core.events import BYE, ClientConnected, ClientLeft, JournalFailed
-from vram_arbiter.arbiter.core.features import families, standby
+from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Client, Core, Refused
 from vram_arbiter.arbiter.core.requests.expiry import lose
@@ -144,16 +144,10 @@ def on_journal_failed(core: Core, event: JournalFailed) -> None:
     """
     core.note("journal_failed", key=event.key, reason=event.reason)
     lease = core.leases.get(LeaseId(event.key.removeprefix("lease:")))
-    if (
-        not event.gates
-        or lease is None
-        or lease.state is not LeaseState.LOADING
-        or lease.estate is not None
-    ):
-        return  # with an estate, a sub-lease was carved out of it: its own grant was written and heard of long ago
+    if not event.gates or lease is None or lease.state is not LeaseState.LOADING:
+        return
     gpu = core.gpu_of(lease)
     gpu.ledger.withdraw(lease.id, core.now)
-    families.gone(core, gpu, lease.id, lease.process)
     core.forget(event.key)
     refused = Refused(
         "journal_unavailable",

@@ -20,7 +20,7 @@ from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 WAITS_MAX = 64
 """A process that waits for more than so many leases at a time is not looked at: each look weighs all of them."""
-HINT = "carve it out of what you hold (`parent`), `yield` the use, release first, or mark the wait `independent`"
+HINT = "`yield` the use, release first, or mark the wait `independent`"
 
 
 def resolve(core: Core) -> None:
@@ -159,16 +159,16 @@ class _Reduction:
     def _going(self, gpu: Gpu, staying: Iterable[ProcessKey]) -> dict[LeaseId, int]:
         """Everything on a card that leaves as long as these processes do not end their uses."""
         kept = {
-            lease.root.id
+            lease.id
             for process in staying
             for lease in self.core.users[process].values()
             if lease.gpu == gpu.info.id
         }
-        kept.update(lease.root.id for lease in gpu.residents.pinned.values())
+        kept.update(gpu.residents.pinned)
         going: dict[LeaseId, int] = {
             lease.id: lease.residue_bytes
             for lease in gpu.residents.values()
-            if lease.root.id not in kept
+            if lease.id not in kept
         }
         going.update(
             (lease, 0) for lease in gpu.ledger.leases() if lease not in gpu.residents

@@ -15,7 +15,7 @@ Per card, in this order (the numbers stand in `_serve`):
 from collections.abc import Mapping
 
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import families, gangs, standby
+from vram_arbiter.arbiter.core.features import gangs, standby
 from vram_arbiter.arbiter.core.learning import costs
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
@@ -172,7 +172,6 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     lease.granted_at = lease.held_from = core.now
     lease.reason = ""
     gpu.residents[lease.id] = lease
-    families.claim(core, gpu, lease.process)
     gpu.ledger.charge(
         lease.id, lease.process, lease.load_peak_bytes, lease.load_peak_bytes, core.now
     )

@@ -10,7 +10,7 @@ from math import inf
 
 from vram_arbiter.arbiter.core.learning import costs
 from vram_arbiter.arbiter.core.ledger.ledger import NOTHING, process_bytes
-from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
@@ -65,22 +65,16 @@ def leaving(gpu: Gpu) -> dict[LeaseId, int]:
     """Leases whose bytes are on their way back, with the residue each leaves. Those that outstayed a deadline do not count."""
     going: dict[LeaseId, int] = {}
     for lease in gpu.in_state(*_LEAVING):
-        if lease.parent is not None and lease.parent.state not in LEAVING:
-            continue  # its bytes are its parent's again
         verification = gpu.verifications.get(lease.id)
         overdue = lease.hangs or bool(lease.eviction and lease.eviction.overdue)
         late = verification.overdue if verification else overdue
         if not late:
             going[lease.id] = lease.residue_bytes
-    staying = [parent for parent in gpu.estates.values() if parent.state not in LEAVING]
     for verification in gpu.verifications.values():  # debts
         if (
             verification.lease is not None
             and verification.lease not in gpu.residents
             and not verification.overdue
-            and not any(
-                parent.estate and verification.lease in parent.estate.shares for parent in staying
-            )
         ):
             going[verification.lease] = verification.kept_bytes
     return going
@@ -264,16 +258,11 @@ def choose_relief(
 
 
 def may_ask(lease: Lease) -> bool:
-    """Of a tree only the root is asked, and not while any of it loads. Nor is anybody of whom nothing was heard since a restart: who uses
-    it may be on the way back."""
-    if lease.gang is not None:
-        return False  # not before all of it is held
-    if lease.estate is None:
-        return lease.evictable and lease.parent is None and lease.attached
-    settled = all(
-        member.state is not LeaseState.LOADING and member.attached for member in lease.tree()
-    )
-    return lease.may_leave and lease.parent is None and settled
+    """Whether a holder may be revoked: not before its whole gang is held, nor before it reattached after a restart.
+
+    Processes that use a lease that has not reattached may be on their way back to it.
+    """
+    return lease.gang is None and lease.evictable and lease.attached
 
 
 def residency_ends_at(core: Core, lease: Lease, waiter: Lease | None) -> float:
@@ -364,7 +353,7 @@ def _in_use(plan: Sequence[Lease]) -> int:
 
 
 def _leave(leases: Sequence[Lease]) -> dict[LeaseId, int]:
-    return {member.id: member.residue_bytes for lease in leases for member in lease.tree()}
+    return {lease.id: lease.residue_bytes for lease in leases}
 
 
 def _freed(
@@ -514,11 +503,10 @@ def passed(gpu: Gpu, lease: Lease, head: Lease) -> bool:
 def _ever_freed(
     gpu: Gpu, head: Lease, going: Mapping[LeaseId, int], stays: Callable[[Lease], bool] | None
 ) -> dict[LeaseId, int]:
-    """All but the lease that it extends, and the trees that stay."""
-    roots = {lease.root.id: lease.root for lease in gpu.residents.values()}
+    """All leases but the one that `head` extends, and those that stay."""
     leave = [
         lease
-        for lease in roots.values()
+        for lease in gpu.residents.values()
         if lease.id != head.extends and not (stays and stays(lease))
     ]
     return {**_leave(leave), **going}

@@ -5,7 +5,7 @@ The bytes stay charged until then.
 """
 
 from vram_arbiter.arbiter.core.events import MemorySampled
-from vram_arbiter.arbiter.core.features import families, standby
+from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import costs, drift
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
@@ -22,8 +22,6 @@ def begin_for_lease(
     """Measure a lease's bytes away. Its charge is in the ledger and stays there until the verdict."""
     baseline = lease.baseline or gpu.sample or gpu.before_sleep
     drift.on_leaving(core, lease)
-    if lease.estate is not None and (baseline is None or baseline.processes is None):
-        baseline = None  # how much of a reservation was ever filled, a total cannot say
     comparable = baseline is not None and 0.0 < lease.ready_at <= baseline.taken_at
     verification = Verification(
         key=lease.id,
@@ -223,7 +221,6 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
     if verification.lease is None:
         gpu.left.append((core.now, held_bytes))
         gpu.ledger.set_residue(process, 0, core.now)
-        families.residue_fell(core, gpu, process)
         core.record_residue(gpu, process, 0)
         return
     drift.on_verdict(core, gpu, verification)
@@ -231,7 +228,6 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
         verification.lease, judgement.residue_bytes, verification.kept_bytes, core.now
     )
     gpu.left.append((core.now, held_bytes - gpu.ledger.filled_bytes(process)))
-    families.gone(core, gpu, verification.lease, process)
     core.record_residue(gpu, process, residue)
     core.forget(f"lease:{verification.lease}")
     _close_eviction(core, gpu, verification, judgement)

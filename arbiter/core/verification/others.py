@@ -5,7 +5,6 @@ What they may have taken must not count as missing, and what they may have left 
 """
 
 from vram_arbiter.arbiter.core.events import MemorySampled
-from vram_arbiter.arbiter.core.features import families
 from vram_arbiter.arbiter.core.ledger.ledger import process_bytes
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.arbiter.core.model.state import Gpu
@@ -21,7 +20,6 @@ def since_baseline(
         grown_bytes=_grown_by_right(gpu, verification, sample),
         left_bytes=_left_bytes(gpu, verification, sample, returns_s),
         loading_bytes=_loading_bytes(gpu, verification, sample),
-        unfilled_bytes=families.unfilled_bytes(gpu) if sample.processes is None else 0,
     )
 
 

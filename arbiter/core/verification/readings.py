@@ -5,7 +5,6 @@ frees nothing.
 """
 
 from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed
-from vram_arbiter.arbiter.core.features import families
 from vram_arbiter.arbiter.core.learning import drift
 from vram_arbiter.arbiter.core.ledger.ledger import is_hidden, process_bytes
 from vram_arbiter.arbiter.core.model.lease import LeaseState
@@ -172,5 +171,4 @@ def _shrink_residues(core: Core, gpu: Gpu, sample: MemorySampled) -> None:
         target = max(floor, held_bytes)
         if target + tolerance < account.residue_bytes:
             gpu.ledger.set_residue(process, target, core.now)
-            families.residue_fell(core, gpu, process)
             core.record_residue(gpu, process, target)

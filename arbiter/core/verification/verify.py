@@ -95,8 +95,6 @@ class Others:
     listed. 0 without a baseline."""
     loading_bytes: int
     """Charged for loads under way, and not seen to be there yet. 0 where lists say who grew."""
-    unfilled_bytes: int
-    """Charged for reservations that sub-leases are carved out of without another look at the card. 0 where the reading has a list."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,10 +143,7 @@ def judge(
 def _compare(
     v: Verification, ledger: GpuLedger, sample: MemorySampled, others: Others, tolerance_bytes: int
 ) -> _Comparison:
-    """Loads under way hide nothing: neither bound allows for bytes that may not have come yet.
-
-    Nor do reservations where nothing but the ledger bound can be checked: what comes back to one is carved out again without another look.
-    """
+    """Loads under way hide nothing: neither bound allows for bytes that may not have come yet."""
     expected = ledger.process_after_bytes(v.process, v.going(), dead=v.vanishes)
     ledger_bound = (
         ledger.total_after_bytes(v.process, v.going(), dead=v.vanishes) + ledger.driver_bytes()
@@ -156,9 +151,7 @@ def _compare(
     ledger_bound -= others.loading_bytes
     ledger_bound -= _doubtful_bytes(v, ledger, sample, expected, others.left_bytes, tolerance_bytes)
     delta_bound = _delta_bound(v, ledger, expected)
-    if delta_bound is None:
-        ledger_bound -= others.unfilled_bytes
-    else:
+    if delta_bound is not None:
         delta_bound += others.grown_bytes - others.loading_bytes
     held = process_bytes(sample, v.process)
     return _Comparison(sample.used_bytes, ledger_bound, delta_bound, held, expected)

@@ -398,7 +398,7 @@ def _refuses_a_lease(code: str, details: Mapping[str, Any]) -> bool:
     """Of what is refused at once, what is the refusal of a lease."""
     if code == "limit_exceeded":
         return details.get("limit") in ("waiters_max", "leases_per_client_max")
-    return code in ("vram_insufficient", "load_failing", "unknown_gpu", "parent_too_small")
+    return code in ("vram_insufficient", "load_failing", "unknown_gpu")
 
 
 def _bytes(event: Event, key: str) -> dict[str, Any]:

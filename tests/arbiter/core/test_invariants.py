@@ -123,24 +123,6 @@ def no_next_reading(b: Broken) -> None:
     b.core.timers.clear(("probe", b.gpu.info.id))
 
 
-def lend(b: Broken) -> Lease:
-    """A sub-lease of the holder."""
-    assert b.held.token is not None
-    who = b.driver.consumer("child")
-    return b.core.leases[who.acquire(GIB, parent=(b.held.id, b.held.token))]
-
-
-def lent_twice(b: Broken) -> None:
-    lend(b)
-    b.gpu.ledger.rebook(b.held.id, 2 * GIB, 2 * GIB, 0.0)
-    b.core.granted.clear()
-
-
-def child_without_parent(b: Broken) -> None:
-    lend(b).parent = None
-    b.core.granted.clear()
-
-
 def half_a_gang(b: Broken) -> None:
     one = b.driver.consumer("one")
     lease = b.core.leases[one.acquire(GIB, gang=("g", 2))]
@@ -160,8 +142,6 @@ def half_a_gang(b: Broken) -> None:
         (4, resident_without_charge, "not charged"),
         (4, verifying_without_verification, "nobody works on"),
         (4, charged_for_ever, "for ever"),
-        (4, lent_twice, "are left of it"),
-        (4, child_without_parent, "no sub-lease of"),
         (5, token_shrinks, "token 1.1 after"),
         (6, waiter_in_no_queue, "are in queues"),
         (6, queue_without_waiter, "is the head"),

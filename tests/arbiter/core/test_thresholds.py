@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
-from tests.support.scenes import charge, held, why
+from tests.support.scenes import held, why
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessDied, ProcessUse, Resumed
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
@@ -169,29 +169,6 @@ def test_a_process_without_a_figure_has_not_grown() -> None:
         driver.advance(0.5)
         driver.post(MemorySampled(driver.card.gpu, driver.now, GIB, 8 * GIB, uses))
     assert culprits(driver) == [(9, "browser", GIB)]
-
-
-# -- sub-leases ----------------------------------------------------------------------------------------------------------
-def test_what_a_process_kept_of_a_sub_lease_is_its_own_once_it_has_a_lease_of_its_own() -> None:
-    driver = CoreDriver(8 * GIB)
-    runner, policy = driver.consumer("runner"), driver.consumer("policy")
-    root = runner.acquire(5 * GIB)
-    token = runner.token(root)
-    leaf = policy.acquire(4 * GIB, residue_bytes=450 * MIB, parent=(root, token))
-    policy.load(leaf)
-    policy.unload(leaf)
-    driver.until(lambda: driver.state(leaf) == "over", limit_s=15.0)
-    assert charge(driver, root) == 5 * GIB - 450 * MIB, "its parent bears it"
-    own = policy.acquire(1 * GIB, residue_bytes=450 * MIB)
-    driver.until(lambda: driver.state(own) == "loading")
-    assert charge(driver, root) == 5 * GIB - 450 * MIB
-    estate = driver.journal[f"lease:{root}"]["estate"]
-    assert (estate["booked_bytes"], estate["approved_bytes"]) == (
-        5 * GIB - 450 * MIB,
-        5 * GIB - 450 * MIB,
-    )
-    assert estate["borne"] == []
-    assert driver.gpu()["charged_bytes"] == 6 * GIB - 450 * MIB
 
 
 # -- waiting for a load on another card ------------------------------------------------------------------------------------

@@ -205,7 +205,7 @@ class Plant:
         return answer
 
     def hello(self, via: bytes, peer: Peer, **fields: Any) -> dict[str, Any]:
-        facts = {"version": 1, "name": "n", "instance": via.hex(), **fields}
+        facts = {"version": d.WIRE_VERSION, "name": "n", "instance": via.hex(), **fields}
         return self.ask(via, peer, "hello", **facts)
 
     def everybody_dies(self) -> None:
@@ -245,7 +245,7 @@ def attack(plant: Plant, draw: random.Random, forger: Forger, frames: int) -> Co
         match draw.randint(0, 5):
             case 0:
                 role = draw.choice(["client", "client", "observer", "operator"])
-                frame = pack(forger.request("hello", id=number, version=1, role=role))
+                frame = pack(forger.request("hello", id=number, version=d.WIRE_VERSION, role=role))
             case 1 | 2 | 3:
                 frame = pack(forger.request(id=number))
             case _:

@@ -11,6 +11,7 @@ import pytest
 from tests.support.connections import KeptConnection, peer_of
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.rpc.session import SessionSettings, SessionTable
+from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import (
     ClientId,
     LeaseId,
@@ -117,7 +118,7 @@ class Bench:
     def hello(
         self, via: bytes = b"a", peer: Peer = ME, role: str = "client", **fields: Any
     ) -> dict[str, Any]:
-        facts = {"version": 1, "name": "n", "instance": f"i-{via.hex()}", **fields}
+        facts = {"version": d.WIRE_VERSION, "name": "n", "instance": f"i-{via.hex()}", **fields}
         return self.ask("hello", via, peer, role=role, **facts)
 
     def left(self) -> list[ClientId]:
@@ -153,7 +154,7 @@ def acquire(bench: Bench) -> None:
 def test_hello_is_welcomed_and_the_core_hears_the_kernels_word(bench: Bench) -> None:
     reply = bench.hello()
     assert reply == {
-        "re": 1, "epoch": 3, "ok": True, "version": 1, "boot_id": "boot", "server": "test", "role": "client",
+        "re": 1, "epoch": 3, "ok": True, "version": d.WIRE_VERSION, "boot_id": "boot", "server": "test", "role": "client",
         "heartbeat_s": 2.0, "grace_s": 5.0,
     }  # fmt: skip
     assert bench.events == [
@@ -170,10 +171,22 @@ def test_nothing_goes_before_hello(bench: Bench) -> None:
 
 
 def test_another_version_is_refused(bench: Bench) -> None:
-    reply = bench.hello(version=2)
-    assert code(reply) == "version_mismatch"
-    assert reply["error"]["details"] == {"server": 1, "client": 2}
+    for theirs, who in ((1, "client"), (d.WIRE_VERSION + 1, "arbiter")):
+        reply = bench.hello(version=theirs)
+        assert code(reply) == "version_mismatch"
+        assert reply["error"]["details"] == {"server": d.WIRE_VERSION, "client": theirs}
+        assert f"upgrade the {who}" in reply["error"]["hint"]
     assert len(bench.table) == 0
+
+
+def test_a_sub_lease_is_an_unknown_field(bench: Bench) -> None:
+    """Sub-leases went with version 2 of the wire: a spec that still names a parent is refused, not granted as a lease of its own."""
+    bench.hello()
+    spec = {"consumer": "c", "model_id": "m", "footprint": FOOTPRINT}
+    parent = {"lease_id": "L1-1", "token": [1, 1]}
+    reply = bench.ask("acquire", nonce="n", spec={**spec, "parent": parent})
+    assert code(reply) == "bad_request"
+    assert "parent" in str(reply["error"])
 
 
 def test_a_peer_that_cannot_be_seen_is_refused(bench: Bench) -> None:
@@ -297,7 +310,7 @@ def test_every_op_of_the_wire_is_dispatched(bench: Bench) -> None:
     """A new op without a case in `_dispatch` or `event_of` would be answered by nothing."""
     on = {"lease_id": "L3-1", "token": [3, 7]}
     fields: dict[str, dict[str, Any]] = {
-        "hello": {"version": 1, "name": "n", "instance": "i-61"},
+        "hello": {"version": d.WIRE_VERSION, "name": "n", "instance": "i-61"},
         "acquire": {"nonce": "n", "spec": {"consumer": "c", "model_id": "m", "footprint": FOOTPRINT}},
         "use_begin": {**on, "use_id": "u"}, "use_end": {**on, "use_id": "u"}, "renew": {"leases": []},
         "cancel": {"lease_id": "L"}, "reacquire": on, "resize": {**on, "footprint": FOOTPRINT}, "reattach": {"leases": []}, "oom": {**on, "requested_bytes": 1},

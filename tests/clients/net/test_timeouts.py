@@ -20,12 +20,13 @@ from vram_arbiter.clients.net.timeouts import answered
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.reasoner import server as reasoner
+from vram_arbiter.schemas import defaults as d
 
 PATIENCE_S = 60.0
 LIMIT_S = 0.5
 STOPPED_LIMIT_S = 3.0
 """Of a process of its own, which a busy machine may hold up before and after it is stopped, too."""
-WELCOME = {"ok": True, "epoch": 1, "version": 1}
+WELCOME = {"ok": True, "epoch": 1, "version": d.WIRE_VERSION}
 CLIENT = f"""
 import asyncio, sys
 from vram_arbiter.clients.sidecar.base import SidecarClient

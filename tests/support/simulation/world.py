@@ -109,9 +109,6 @@ class World:
         self.daemon: SimDaemon | None = None
         self.processes: dict[ProcessKey, SimProcess] = {}
         self.faults: Counter[str] = Counter()
-        self.carved: dict[
-            str, str
-        ] = {}  # sub-lease → the lease that it was carved out of, also when it is over
         self.entitlements: Callable[[], Iterator[Entitlement]] = lambda: iter(())
         self.failure: str | None = None
         self.distrusted_until = (
@@ -291,11 +288,7 @@ class World:
                 f"{weights}, contexts {contexts}, leaks {leaks}"
             )
         for exclusive in (e for e in granted if e.exclusive):
-            family = {
-                exclusive.lease_id,
-                *(c for c, p in self.carved.items() if p == exclusive.lease_id),
-            }
-            others = [e.lease_id for e in granted if e.lease_id not in family]
+            others = [e.lease_id for e in granted if e.lease_id != exclusive.lease_id]
             if others:
                 self.fail(f"{card.gpu}: {others} beside the exclusive {exclusive.lease_id}")
 

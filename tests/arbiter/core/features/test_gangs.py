@@ -110,14 +110,6 @@ def test_one_too_many_and_another_size_are_refused(driver: CoreDriver) -> None:
     assert "have come" in refusal(x.try_acquire(GIB, gang=("g", 2))).message
 
 
-def test_a_sub_lease_is_in_no_gang(driver: CoreDriver) -> None:
-    runner, root = held(driver, "runner", 4)
-    refused = refusal(
-        driver.consumer("x").try_acquire(1, parent=(root, runner.token(root)), gang=("g", 2))
-    )
-    assert refused.code == "bad_request"
-
-
 def test_what_can_never_fit_together_is_said_to_all_at_once(driver: CoreDriver) -> None:
     a = Member(driver, "a", 5)
     effects = driver.consumer("b").try_acquire(4 * GIB, gang=("g", 2))

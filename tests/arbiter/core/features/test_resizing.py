@@ -319,31 +319,6 @@ def test_who_was_asked_to_leave_or_holds_nothing_is_not_resized() -> None:
     assert refusal(loading.resize(one, 2 * GIB)).code == "bad_state"
 
 
-def test_a_family_keeps_its_size() -> None:
-    driver = CoreDriver(8 * GIB)
-    runner, parent = held(driver, "runner", 6)
-    runner.hold(0)
-    driver.advance(2.0)
-    child = driver.consumer("policy")
-    piece = child.acquire(2 * GIB, parent=(parent, runner.token(parent)))
-    child.load(piece)
-    for person, lease in ((runner, parent), (child, piece)):
-        assert refusal(person.resize(lease, 7 * GIB)).code == "bad_state"
-
-
-def test_nothing_is_carved_out_of_a_lease_that_changes_its_size_or_is_away() -> None:
-    driver = CoreDriver(8 * GIB)
-    runner, parent = held(driver, "runner", 6, standby=True)
-    runner.resize(parent, 4 * GIB)
-    child, token = driver.consumer("policy"), runner.token(parent)
-    assert refusal(child.try_acquire(1 * GIB, parent=(parent, token))).code == "bad_state"
-    driver.consumer("det").acquire(5 * GIB)
-    driver.until(lambda: driver.state(parent) == "revoking")
-    runner.unload(parent)
-    driver.until(lambda: driver.state(parent) == "standby")
-    assert refusal(child.try_acquire(1 * GIB, parent=(parent, token))).code == "bad_state"
-
-
 def test_a_full_queue_refuses_growth_too() -> None:
     driver = CoreDriver(8 * GIB, settings={"waiters_max": 1})
     vlm, lease = held(driver, "vlm", 4)

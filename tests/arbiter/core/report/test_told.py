@@ -6,12 +6,12 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import START_S, CoreDriver, answer, refusal
-from tests.support.scenes import Tree, held, order, sent_away
+from tests.support.scenes import held, order, sent_away
 from vram_arbiter.arbiter.core.events import OperatorAsked, ProbeFailed
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.arbiter.core.requests.recovery import spec_from_record
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.ids import LeaseId, ProcessKey, Token
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -153,49 +153,6 @@ def test_refusals_of_operators_say_why() -> None:
     assert refusal(other.post(evict)).message == f"{lease} is pinned: an operator pinned it"
 
 
-def test_refusals_about_sub_leases_say_why() -> None:
-    tree = Tree().held()
-    refused = refusal(tree.runner.resize(tree.root, 4 * GIB))
-    assert refused.message.endswith(
-        "a lease with sub-leases, or one of them, keeps its size: carve or release instead"
-    )
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5)
-    det.hold(4 * GIB)
-    det.resize(lease, 4 * GIB)
-    child = driver.consumer("child").try_acquire(1 * GIB, parent=(lease, det.token(lease)))
-    assert refusal(child).message.endswith("it changes its size; carve when it has the new one")
-
-
-def test_a_line_of_sub_leases_that_is_too_long_says_which_number_it_would_be() -> None:
-    driver = CoreDriver(8 * GIB)
-    lease, token = None, None
-    for n in range(d.SUBLEASE_DEPTH_MAX + 1):
-        person = driver.consumer(f"p{n}")
-        effects = person.try_acquire(
-            (7 - n) * GIB, parent=None if lease is None else (lease, token)
-        )
-        if n == d.SUBLEASE_DEPTH_MAX:
-            assert (
-                refusal(effects).message
-                == f"a sub-lease of {lease} would be number {n + 1} of its line"
-            )
-            return
-        lease = LeaseId(answer(effects)["lease"]["lease_id"])
-        token = Token(*answer(effects)["lease"]["token"])
-
-
-def test_a_parent_that_was_asked_to_leave_says_its_state() -> None:
-    tree = Tree().held()
-    tree.policy.use_begin(tree.leaf)
-    tree.driver.consumer("other").acquire(6 * GIB)
-    tree.driver.until(lambda: tree.state(tree.root) == "revoking")
-    refused = refusal(
-        tree.driver.consumer("late").try_acquire(GIB // 2, parent=(tree.root, tree.token))
-    )
-    assert (refused.code, refused.details["state"]) == ("lease_revoking", "revoking")
-
-
 # -- the history -----------------------------------------------------------------------------------------------------
 def test_a_load_is_noted_with_what_it_took() -> None:
     driver = CoreDriver(8 * GIB)
@@ -273,19 +230,6 @@ def test_who_is_parked_is_noted_with_its_host_ram() -> None:
     assert only(driver.notes("parked"))["parked_bytes"] == 2 * GIB
 
 
-def test_a_reservation_that_ends_by_itself_says_why() -> None:
-    tree = Tree().held()
-    tree.driver.consumer("other").acquire(6 * GIB)
-    tree.driver.until(lambda: tree.state(tree.leaf) == "revoking")
-    tree.policy.unload(tree.leaf)
-    tree.driver.until(lambda: bool(tree.driver.pushes("lost", tree.root)))
-    (push,) = tree.driver.pushes("lost", tree.root)
-    assert (
-        push["error"]["message"]
-        == f"{tree.root}: it was asked to leave and its last sub-lease has left: other needs the room"
-    )
-
-
 # -- who grows -------------------------------------------------------------------------------------------------------
 def test_a_growth_waits_for_its_bytes_alone() -> None:
     driver = CoreDriver(8 * GIB)
@@ -336,9 +280,7 @@ def test_a_record_holds_all_that_was_asked_for() -> None:
     same = sum(
         a == b for a, b in zip(astuple(spec), astuple(det.spec(1 * GIB, GIB // 2)), strict=True)
     )
-    assert same == 3, (
-        "all differ from what they are by default but the consumer's name, parent and gang"
-    )
+    assert same == 2, "all differ from their defaults but the consumer's name and the gang"
     lease = det.acquire(3 * GIB, 2 * GIB, **wishes)
     det.load(lease)
     record = driver.journal[f"lease:{lease}"]
@@ -357,10 +299,7 @@ def test_a_record_holds_all_that_was_asked_for() -> None:
         "load_peak_bytes": 3 * GIB,
         "measured_bytes": None,
         "exiting": False,
-        "said_ready": True,
-        "parent": None,
         "gang": None,
-        "estate": None,
         "pinned": None,
         "comes_back": False,
         "parks": False,

@@ -404,3 +404,35 @@ def test_records_that_a_full_disk_kept_may_say_more_than_the_card_has() -> None:
         view["lease_id"] for view in again.arbiter.status(again.now)["leases"]
     }
     assert again.gpu()["pressure_bytes"] > 0, "what was never approved is pressure"
+
+
+def test_records_of_sub_leases_come_back_as_plain_leases() -> None:
+    """Version 0.1 carved leases out of others. Each is charged its own bytes until it reattaches, or is measured gone."""
+    driver = CoreDriver(8 * GIB)
+    runner, root, _ = held(driver, "runner", 1, exclusive=False)
+    policy, leaf, token = held(driver, "policy", 4)
+    parent, child = f"lease:{root}", f"lease:{leaf}"
+    estate = {
+        "booked_bytes": 5 * GIB,
+        "approved_bytes": 5 * GIB,
+        "shares": {leaf: [4 * GIB, 4 * GIB, 0]},
+        "borne": [],
+    }
+    reserved = {**driver.journal[parent]["spec"], "ttl_s": 2.0, "exclusive": True, "parent": None}
+    carved = {**driver.journal[child]["spec"], "parent": [root, 1, 2]}
+    old = {"said_ready": True, "parent": None, "estate": None}
+    driver.journal[parent] = {**driver.journal[parent], **old, "estate": estate, "spec": reserved}
+    driver.journal[child] = {**driver.journal[child], **old, "parent": root, "spec": carved}
+    driver.restart()
+    assert driver.gpu()["charged_bytes"] == 5 * GIB
+    policy.connect()
+    assert answer(policy.reattach(leaf, token))["leases"][0]["kept"]
+    waiter = driver.consumer("vlm").acquire(2 * GIB)
+    runner.hold(0)
+    driver.until(lambda: driver.state(waiter) == "loading", limit_s=60.0)
+    assert (driver.state(root), driver.state(leaf)) == ("over", "held")
+    charge = {
+        view["lease_id"]: view["charge_bytes"]
+        for view in driver.arbiter.status(driver.now)["leases"]
+    }
+    assert charge[leaf] == 4 * GIB

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.scenes import Tree, held, shown
+from tests.support.scenes import held, shown
 from vram_arbiter.arbiter.core.effects import Effect, JournalPut, Reply
 from vram_arbiter.arbiter.core.events import ProcessDied, Resumed
 from vram_arbiter.schemas import defaults as d
@@ -167,22 +167,6 @@ def test_a_holder_that_was_asked_and_is_used_is_not_taken_for_gone() -> None:
     driver.post(ProcessDied(runner.process))
     live(driver, sidecar, lease, token, PATIENCE_S)
     assert answer(sidecar.unload(lease))["next"] == "standby"
-
-
-def test_a_tree_is_in_use_while_a_stopped_user_has_one_of_it() -> None:
-    tree = Tree().held()
-    driver, token = tree.driver, tree.policy.token(tree.leaf)
-    driver.consumer("goals").use_begin(tree.leaf, "goal", token)
-    driver.restart()
-    for who, lease, its in ((tree.runner, tree.root, tree.token), (tree.policy, tree.leaf, token)):
-        who.connect()
-        who.reattach(lease, its)
-    driver.consumer("vlm").acquire(5 * GIB, priority=90)
-    driver.advance(1.0)
-    assert refusal(tree.policy.unloading(tree.leaf)).details["uses"] == 1
-    assert tree.state(tree.root) != "held" or tree.state(tree.leaf) == "held", (
-        "asked together or not at all"
-    )
 
 
 def test_a_use_that_yields_after_a_restart_is_its_clients_own() -> None:

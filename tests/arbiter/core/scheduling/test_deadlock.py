@@ -137,17 +137,6 @@ def test_several_circles_are_all_broken(driver: CoreDriver) -> None:
     assert [driver.state(lease) for lease in waits] == ["queued", "queued"]
 
 
-def test_a_use_of_a_sub_lease_keeps_its_whole_tree(driver: CoreDriver) -> None:
-    runner, policy = driver.consumer("runner"), driver.consumer("policy")
-    root = runner.acquire(5 * GIB)
-    leaf = policy.acquire(4 * GIB, parent=(root, runner.token(root)))
-    policy.load(leaf)
-    runner.use_begin(leaf, "goal", policy.token(leaf))
-    driver.advance(0.01)
-    assert refusal(runner.try_acquire(6 * GIB)).code == "would_deadlock"
-    answer(runner.try_acquire(2 * GIB))
-
-
 # -- no circles --------------------------------------------------------------------------------------------------------
 def test_what_fits_beside_my_use_is_no_circle(driver: CoreDriver) -> None:
     job, _ = using(driver, "job", 4)

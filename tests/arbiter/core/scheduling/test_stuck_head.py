@@ -328,22 +328,6 @@ def test_one_that_was_there_before_the_head_did_not_pass_it() -> None:
     )
 
 
-def test_a_sub_lease_of_one_that_was_there_did_not_pass() -> None:
-    """It has its bytes from its parent, who was there before."""
-    driver = CoreDriver(8 * GIB)
-    runner = driver.consumer("runner", priority=90)
-    root = runner.acquire(3 * GIB)
-    runner.ready(root)  # a reservation: it holds nothing itself
-    runner.use_begin(root)
-    driver.advance(0.1)
-    head = driver.consumer("head").acquire(5 * GIB)
-    child = driver.consumer("child")
-    carved = child.acquire(2 * GIB, parent=(root, runner.token(root)))
-    child.load(carved)
-    _, small = held(driver, "small", 2)
-    assert (driver.state(head), driver.state(small)) == ("queued", "held")
-
-
 def test_what_grew_while_the_head_stood_before_it_stays() -> None:
     driver, busy, lease, head = unplanned()
     driver.advance(0.1)
