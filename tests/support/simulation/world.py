@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from tests.support.engine_state import state_of
 from tests.support.simulation.card import Device, ProbeFaults
 from tests.support.simulation.clock import TRACE_LINES, Clock, ProcessLoop
 from tests.support.simulation.daemon import Happening, Machine, SimDaemon
@@ -293,7 +294,7 @@ class World:
                 self.fail(f"{card.gpu}: {others} beside the exclusive {exclusive.lease_id}")
 
     def _check_wake_up(self, daemon: SimDaemon) -> None:
-        core = daemon.core.inspect()
+        core = state_of(daemon.core)
         for gpu in core.gpus.values():
             head = gpu.queue.head()
             if head is None or policy.blocked(core, gpu) or gpu.asked_at is not None:
