@@ -1,0 +1,30 @@
+"""`tests/measure_path.py` measures one acquire with one eviction in real processes."""
+
+from pathlib import Path
+
+import pytest
+
+from tests import measure_path
+
+pytestmark = pytest.mark.e2e
+
+
+@pytest.fixture(scope="module")
+def steps(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[measure_path.Step]]:
+    folder: Path = tmp_path_factory.mktemp("path")
+    return measure_path.record(folder)
+
+
+def test_every_figure_is_measured(steps: dict[str, list[measure_path.Step]]) -> None:
+    told = measure_path.figures(steps)
+    assert told.keys() == {"daemon", "holder", "waiter", "path"}
+    assert told["path"].keys() == measure_path.TARGETS.keys()
+    assert all(count > 0 for counts in told.values() for count in counts.values())
+
+
+def test_the_path_passes_the_engine_and_the_client(
+    steps: dict[str, list[measure_path.Step]],
+) -> None:
+    assert any(name == "Arbiter.handle" for _, name, _ in steps["daemon"])
+    assert any(file.startswith("clients/") for file, _, _ in steps["waiter"])
+    assert all(not file.startswith(("arbiter/", "tests/")) for file, _, _ in steps["waiter"])
