@@ -15,12 +15,16 @@ from vram_arbiter.schemas.errors import TransientError, VramError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.world import (
     Action,
+    CameraModel,
     JointState,
     RunResult,
     SensorFrame,
     TickResult,
     WorldState,
 )
+
+type GoalData = dict[str, Any]
+"""Fields of a goal's or a run's result: a JSON object."""
 
 
 class DeadlineMissed(TransientError):
@@ -41,7 +45,8 @@ class DeadlinePolicy(StrEnum):
 class InferenceRunner(Protocol):
     """A loop that turns observations into actions at a rate."""
 
-    rate_hz: float
+    @property
+    def rate_hz(self) -> float: ...
 
     def activate(self) -> None: ...
 
@@ -277,6 +282,23 @@ class Hal(Protocol):
         ...
 
     def estop(self, reason: str) -> NoReturn: ...
+
+
+class Picture(Protocol):
+    """One picture of a camera; its colors may be decoded only when they are read."""
+
+    @property
+    def rgb(self) -> Any:
+        """Colors: uint8, height × width × 3. Raises FrameStale, ModelError."""
+        ...
+
+    @property
+    def stamp_ns(self) -> int: ...
+
+    @property
+    def model(self) -> CameraModel | None:
+        """Where the camera stood when the picture was taken, if that is known."""
+        ...
 
 
 # -- cameras ------------------------------------------------------------------------------------------------------

@@ -166,7 +166,7 @@ async def _stop_with(stopping: asyncio.Event, bench: Benchmark) -> None:
 
 def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
     from vram_arbiter.runner.sim.benchmark import Benchmark
-    from vram_arbiter.runner.sim.sim_runner import SimRunner
+    from vram_arbiter.runner.sim.robot import sim_runner
 
     world, task, arm = entry.world, entry.task, entry.world.arm
 
@@ -180,7 +180,7 @@ def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
             judge=lambda: task.judge(arm),
             steady=task.steady,
         )
-    runner = SimRunner(
+    runner = sim_runner(
         world.make,
         cameras=world.cameras,
         rate_hz=0,
@@ -190,7 +190,7 @@ def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
         video_every=world.video_every,
     )
     runner.identity = dict(world.identity)
-    runner.trace_ticks = args.trace_ticks
+    runner.spans.share = args.trace_ticks
     return Benchmark(
         runner,
         world=world.name,

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.net.server import check_free
-from vram_arbiter.runner.control.skill_runner import SkillRunner
+from vram_arbiter.runner.control.loop import ControlLoop
+from vram_arbiter.runner.control.robot import Robot
 from vram_arbiter.runner.goals import frames
 from vram_arbiter.schemas import estop
 from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
@@ -144,8 +145,12 @@ async def connect_arbiter(endpoint: str | None, stack: contextlib.AsyncExitStack
         ) from error
 
 
-async def record_into(
-    folder: Path, runner: SkillRunner, rate_hz: float, robot: str, stack: contextlib.AsyncExitStack
+async def record_into[R: Robot](
+    folder: Path,
+    runner: ControlLoop[R],
+    rate_hz: float,
+    robot: str,
+    stack: contextlib.AsyncExitStack,
 ) -> DatasetRecorder:
     """Record the runner's goals, from before its control thread starts until after it has ended. `rate_hz` 0: as fast as possible.
 
@@ -167,8 +172,7 @@ async def record_into(
         recorder.abort()  # else the thread goes on waiting
         raise
     stack.push_async_callback(asyncio.to_thread, recorder.close)
-    runner.sink = recorder
-    runner.save_dir = str(recorder.root)
+    runner.follow(recorder, save_dir=str(recorder.root))
     return recorder
 
 

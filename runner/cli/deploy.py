@@ -38,12 +38,12 @@ from vram_arbiter.runner.cli.deployment import (
     unused,
 )
 from vram_arbiter.runner.control.clock import SystemClock
-from vram_arbiter.runner.control.hardware import HardwareRunner
 from vram_arbiter.runner.control.realtime import leaves_room, make_prompt
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue, Maker, read_manifests, sidecar_endpoint
 from vram_arbiter.runner.goals.server import GoalServer
 from vram_arbiter.runner.protocols import DeadlinePolicy, Skill
+from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
 from vram_arbiter.runner.safety.estop_mark import EstopMark
 from vram_arbiter.runner.skills.ros_standins import TRAJECTORY, StandIn, StandIns
 from vram_arbiter.runner.skills.sidecar_policy import Arbiter
@@ -172,7 +172,7 @@ class Deploy:
                 None if self._args.no_arbiter else await connect_arbiter(self._args.arbiter, stack)
             )
             runner = self._runner(parts, mark)
-            runner.trace_ticks = self._args.trace_ticks
+            runner.spans.share = self._args.trace_ticks
             if (folder := self._file.robot.save_dir) is not None:
                 rate_hz, name = self._file.robot.rate_hz, self._file.robot.robot_id
                 await record_into(Path(folder), runner, rate_hz, name, stack)
@@ -234,7 +234,7 @@ class Deploy:
 
         robot = self._file.robot
         ages = {sensor.sensor_id: sensor.max_age_ms for sensor in robot.sensors}
-        return HardwareRunner(
+        return hardware_runner(
             parts.hal,
             [(reader, ages[reader.sensor_id]) for reader in parts.readers],
             lambda skill: parts.gate.for_skill(skill.manifest, skill.cameras),
@@ -345,9 +345,9 @@ def summary(result: RunResult, runner: HardwareRunner, success: bool | None, rob
     """The run as one line of JSON."""
     facts = {
         "robot": robot_id,
-        "robot_model": runner.hal.description.name,
+        "robot_model": runner.robot.hal.description.name,
         "estop": runner.estop.message if runner.estop else None,
-        "violations": list(runner.violations)[-8:],
+        "violations": list(runner.slot.violations)[-8:],
     }
     full = result.model_copy(update={"success": success, "metadata": {**result.metadata, **facts}})
     return full.model_dump_json()

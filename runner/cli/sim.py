@@ -98,9 +98,9 @@ async def run(args: argparse.Namespace) -> int:
     from vram_arbiter.runner.goals.catalogue import Catalogue, read_manifests
     from vram_arbiter.runner.goals.server import GoalServer
     from vram_arbiter.runner.protocols import DeadlinePolicy
-    from vram_arbiter.runner.recording.video import Recorder
+    from vram_arbiter.runner.recording.video import VideoRecorder
     from vram_arbiter.runner.sim.policies import policy_of
-    from vram_arbiter.runner.sim.sim_runner import SimRunner
+    from vram_arbiter.runner.sim.robot import sim_runner
     from vram_arbiter.runner.sim.truth import truth_as_wire
     from vram_arbiter.runner.sim.worlds import makers_of, world_of
     from vram_arbiter.runner.skills.sidecar_policy import LOCKSTEP_WAIT_S
@@ -132,9 +132,11 @@ async def run(args: argparse.Namespace) -> int:
         recorder = None
         if args.video is not None:
             patient = policy is not None and args.rate == 0  # nobody else waits for this world
-            recorder = Recorder(args.video, fps=1.0 / period_s / world.video_every, wait=patient)
+            recorder = VideoRecorder(
+                args.video, fps=1.0 / period_s / world.video_every, wait=patient
+            )
             stack.callback(recorder.close)
-        runner = SimRunner(
+        runner = sim_runner(
             world.make,
             cameras=world.cameras,
             seed=args.seed,
@@ -150,8 +152,10 @@ async def run(args: argparse.Namespace) -> int:
         runner.identity = dict(world.identity)
         if policy is not None:
             runner.identity["policy"] = policy.name
-            runner.recorder = recorder  # from its first step on: it may be over before anybody asks
-        runner.trace_ticks = args.trace_ticks
+            runner.robot.video.recorder = (
+                recorder  # from its first step on: it may be over before anybody asks
+            )
+        runner.spans.share = args.trace_ticks
         if args.record is not None:
             dataset = await record_into(
                 args.record, runner, args.rate, str(runner.identity["robot"]), stack
@@ -173,7 +177,7 @@ async def run(args: argparse.Namespace) -> int:
             clock,
             ground_truth=None if arm is None else lambda: truth_as_wire(arm),
             on_bound=lambda: setattr(
-                runner, "recorder", recorder
+                runner.robot.video, "recorder", recorder
             ),  # not before: a second runner must not touch the first's video
             identity={
                 **runner.identity,
@@ -202,8 +206,8 @@ async def run(args: argparse.Namespace) -> int:
             runner.timings.write(args.timings)
         except OSError as error:
             raise ConfigError(f"--timings {args.timings} cannot be written: {error}") from error
-    if runner.policy_error is not None:
-        raise runner.policy_error
+    if runner.robot.policy_error is not None:
+        raise runner.robot.policy_error
     if policy is not None and dataset is not None and dataset.error is not None:
         raise dataset.error  # it was played for the recording; goals are served whatever becomes of theirs
     return 1 if control.ended.exception() is not None else 0

@@ -1,270 +1,387 @@
-"""The base of every runner: ticks at a rate, deadlines with a policy, timings, a trace span per tick.
+"""Control loop of hardware and simulator alike.
 
-Subclasses say what is sensed and decided (`_decide`) and how it reaches the robot (`_apply`); between the two the deadline
-policy acts, so that DROP really withholds a late action. Knows no robot, simulator, skill or socket.
+`ControlLoop` is composed of a `Robot`, a `SkillSlot` with the goal's safety gate, the emergency
+stop's latch, a pacing grid and observers of each tick. It knows no make of robot and no socket.
 
 One tick:
- 0. take what was posted (subclass): a goal that begins here has this tick in its trace
- 1. decide: sensors → world state → inference → safety (subclass)
- 2. was the slot over before the decision was there? DROP and RAISE withhold the action
- 3. apply, or hold (subclass)
- 4. measure; under RAISE a missed deadline ends the run
+ 1. take work: run what other threads posted; a goal that begins here has this tick in its trace
+ 2. sense: cameras and joints become the world state
+ 3. decide: ask the skill, unless an input is stale
+ 4. gate: every action passes the goal's safety gate
+ 5. deadline policy: WARN applies a late action, DROP and RAISE withhold it
+ 6. apply, or hold
+ 7. report: measure the tick and tell its observers; under RAISE a missed deadline ends the run
+
+A latched emergency stop acts before the steps 1, 3 and 6.
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
-from typing import Any
+import threading
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from typing import Protocol
 
 from vram_arbiter.runner.control.clock import Clock, SystemClock
+from vram_arbiter.runner.control.mailbox import Mailbox
+from vram_arbiter.runner.control.pacing import Pacing, Slot
+from vram_arbiter.runner.control.robot import Applied, Robot, Sensed
+from vram_arbiter.runner.control.skill_slot import Decision, SkillSlot
+from vram_arbiter.runner.control.tick_spans import TickSpans
 from vram_arbiter.runner.control.timings import Timings, mean, percentile
-from vram_arbiter.runner.protocols import DeadlineMissed, DeadlinePolicy
+from vram_arbiter.runner.protocols import (
+    DeadlineMissed,
+    DeadlinePolicy,
+    Goal,
+    GoalData,
+    GoalTick,
+    Picture,
+    Progress,
+    SkillEnded,
+    Stepped,
+    TickSink,
+)
+from vram_arbiter.runner.safety.estop_latch import EstopLatch
+from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.errors import EstopRequested, InternalError
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
-from vram_arbiter.schemas.world import Action, RunResult, TickResult
+from vram_arbiter.schemas.world import Action, RunResult, TickResult, WorldState
 
 _SHARES = {"p50": 0.5, "p99": 0.99, "max": 1.0}
 
 
-@dataclass(slots=True)
-class Decision:
-    """What one tick wants to do, and where its time went."""
+class Video(Protocol):
+    """Films the run. Called within the tick, after the action was applied."""
 
-    action: Action | None = None
-    sensors_ms: float = 0.0
-    world_state_ms: float = 0.0
-    inference_ms: float = 0.0
-    safety_ms: float = 0.0
-    chunk_index: int | None = None
-    safety_violations: tuple[str, ...] = ()
+    def show(
+        self, applied: Applied, *, tick_idx: int, skill_active: bool, caption: tuple[str, ...]
+    ) -> None: ...
+
+
+@dataclass(slots=True)
+class _Tick:
+    """What the steps of one tick tell each other."""
+
+    started_s: float
     reset: bool = False
+    slot: Slot = field(default_factory=Slot)
+    trace_context: dict[str, str] | None = None
+    sensed: Sensed = field(default_factory=Sensed)
+    decision: Decision = field(default_factory=Decision)
+    apply_s: float = 0.0
+    applied: Applied = field(default_factory=Applied)
 
 
-@dataclass(slots=True)
-class Applied:
-    """What became of it."""
+class ControlLoop[R: Robot]:
+    """Ticks at `rate_hz`; 0 runs as fast as it can, without deadlines.
 
-    action_applied: bool
-    step_idx: int | None = None
-    episode_idx: int | None = None
-    reward: float | None = None
-    terminated: bool | None = None
-    truncated: bool | None = None
-    success: bool | None = None
-
-
-class RunnerBase(ABC):
-    """`rate_hz` 0 runs as fast as it can, without deadlines. Raises DeadlineMissed from `tick` and `run` under RAISE."""
+    Everything runs on the control thread, except `request_stop`, `request_estop` and what the
+    event loop may read at any time: `progress`, `world`, `caption` and `estop` are replaced whole.
+    """
 
     def __init__(
         self,
+        robot: R,
         *,
         rate_hz: float = 30.0,
         deadline_policy: DeadlinePolicy = DeadlinePolicy.WARN,
         clock: Clock | None = None,
+        latch: EstopLatch | None = None,
+        video: Video | None = None,
     ) -> None:
-        if not math.isfinite(rate_hz) or rate_hz < 0:
-            raise ValueError(f"rate_hz must be 0 or more, not {rate_hz}")
-        self.rate_hz = rate_hz
-        self.deadline_policy = deadline_policy
         self.clock: Clock = clock or SystemClock()
+        self.robot = robot
+        self.deadline_policy = deadline_policy
+        self.latch = latch or EstopLatch()
+        self.slot = SkillSlot(self.clock)
+        self.mailbox = Mailbox()
+        self.timings = Timings()
+        self.spans = TickSpans()
         self.tick_idx = 0
-        self._first_tick = 0  # of the present run
         self.deadline_misses = 0
         self.late_actions_withheld = 0
-        self.save_dir: str | None = None  # folder of the dataset that this run is recorded into
-        self.traceparent: str | None = (
-            None  # of the goal that the ticks are for; they join its trace
-        )
-        self.labels: dict[str, str] = {}  # of what the ticks measure: the goal's skill
-        self.trace_ticks = 1.0  # share of the ticks that get spans, 0 to 1
-        self._still = True  # no action was applied yet: until then every tick gets spans
-        self._tick_credit = 0.0
-        self._due_s: float | None = None  # when the present tick should have begun
-        self.timings = Timings()
-        self.identity: dict[
-            str, Any
-        ] = {}  # what it is that runs: robot, scene, seed; goes into the result
-        self._trace_id: str | None = None
+        self.caption: tuple[str, ...] = ()  # lines for the video
+        self.identity: GoalData = {}  # what runs: robot, scene, seed; part of the result
+        self.save_dir: str | None = None  # folder of the dataset that the run is recorded into
+        self._video = video
+        self._pacing = Pacing(rate_hz, self.clock)
+        self._stopping = threading.Event()
+        self._first_tick = 0  # of the present run
 
-    # -- what a subclass provides --
-    def _take_posted(self) -> None:  # noqa: B027 - a run without an event loop has nobody who posts
-        """Work for this thread, before the tick begins."""
-
-    @abstractmethod
+    # -- life
     def activate(self) -> None:
-        """Acquire what a run needs. Raises when it cannot."""
+        """Acquire what a run needs. Raises what the robot raises."""
+        self.robot.open(self._stopping)
 
-    @abstractmethod
     def deactivate(self) -> None:
-        """Let go of everything; repeatable."""
+        """End the active goal and free everything. Repeatable."""
+        self.slot.end(SkillEnded({}, self.estop or InternalError("the runner is stopping")))
+        self.robot.close()
 
-    @abstractmethod
-    def _decide(self, tick_idx: int) -> Decision: ...
+    def run(self, max_ticks: int | None = None) -> RunResult:
+        """Tick until the run is over, or for `max_ticks` ticks.
 
-    @abstractmethod
-    def _apply(self, decision: Decision) -> Applied:
-        """Carry the decision out; `decision.action` None means hold."""
+        The result covers this run's ticks alone; tick indices continue from the run before.
+        """
+        if self.tick_idx != self._first_tick:
+            self._first_tick = self.tick_idx
+            self.timings.clear()
+            self.deadline_misses = self.late_actions_withheld = 0
+        first = self.tick_idx
+        self._pacing.start()
+        try:
+            while not self._finished() and (max_ticks is None or self.tick_idx - first < max_ticks):
+                self.tick()
+                self._pacing.wait()
+        finally:
+            self._pacing.stop()
+        return self.result()
+
+    def request_stop(self) -> None:
+        """End the run before its next tick. Any thread."""
+        self._stopping.set()
+
+    @property
+    def stopping(self) -> bool:
+        return self._stopping.is_set()
 
     def _finished(self) -> bool:
-        """Whether the run is over by itself, asked before every tick."""
-        return False
+        return self.stopping or self.robot.finished
 
-    def _came_too_late(self) -> None:  # noqa: B027 — most need not know
-        """The deadline policy has just withheld this tick's action."""
-
-    def _success(self) -> bool | None:
-        return None
-
-    def _ticked(self, decision: Decision, result: TickResult) -> None:  # noqa: B027 — not every runner is followed
-        """Called at the end of every tick, before a missed deadline may end the run; must not wait."""
-
-    # -- the loop --
+    # -- emergency stop
     @property
-    def period_s(self) -> float | None:
-        return 1.0 / self.rate_hz if self.rate_hz > 0 else None
+    def estop(self) -> EstopRequested | None:
+        """The latched stop; it stays for the life of the process."""
+        return self.latch.error
 
-    def tick(self) -> TickResult:
-        """One turn. See the module's docstring for its steps.
+    @property
+    def estop_ns(self) -> int:
+        """Monotonic time of the stop; 0: not latched."""
+        return self.latch.since_ns
 
-        Its span joins the trace of the goal, or the present one (a benchmark's command). Outside both a tick begins no trace of its own: a
-        robot that waits would begin thirty a second.
+    def request_estop(self, reason: str) -> None:
+        """Latch the emergency stop. Any thread. The loop obeys before it moves anything again."""
+        self.latch.request(reason)
+
+    def obey_estop(self) -> EstopRequested | None:
+        """Stop the motors and end the goal if the stop is latched. Repeatable.
+
+        Returns: the stop, with what became of the motors.
         """
-        started_s = self.clock.now_s()
-        self._take_posted()  # 0
-        with self._spanned():
-            carrier = tracing.carrier() or {}
-            if self._trace_id is None and "traceparent" in carrier:
-                self._trace_id = carrier["traceparent"].split("-")[1]
-            return self._tick(started_s, carrier or None)
+        if self.estop is not None:
+            self.robot.stop()
+            self.slot.end(SkillEnded({}, self.estop))
+        return self.estop
 
-    def _spanned(self) -> AbstractContextManager[object]:
-        """The tick's span; for one that is left out (`trace_ticks`) no span, and what it would have joined stands for it."""
-        if self.traceparent is None and not tracing.traced():
-            return tracing.left_out(None)
-        if not self._still:
-            self._tick_credit += self.trace_ticks
-            if self._tick_credit < 1.0:
-                return tracing.left_out(self.traceparent)
-            self._tick_credit -= 1.0
-        return tracing.span(telemetry.SPAN_TICK, self.traceparent, self.labels)
+    # -- goals
+    @property
+    def progress(self) -> Progress:
+        return self.slot.progress
 
-    def _tick(self, started_s: float, trace_context: dict[str, str] | None) -> TickResult:
-        due_s = started_s if self._due_s is None or self.period_s is None else self._due_s
-        late_ms = max(0.0, started_s - due_s) * 1e3
-        deadline_s = math.inf if self.period_s is None else due_s + self.period_s
-        decision = self._decide(self.tick_idx)  # 1
-        if decision.reset:  # a scene is built, no action can come too late
-            deadline_s = math.inf
-        withheld = (
-            self.clock.now_s() > deadline_s and self.deadline_policy is not DeadlinePolicy.WARN
-        )  # 2
-        if withheld and decision.action is not None:
-            decision.action = None
+    def begin_skill(self, skill: Stepped, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None:
+        """Give the robot to a skill.
+
+        Raises InternalError when another skill has it, EstopRequested when the stop is latched,
+        and what `Robot.admit` raises.
+        """
+        if self.estop is not None:
+            raise self.estop
+        if self.slot.busy:
+            raise InternalError("another skill has the robot")
+        self.slot.begin(skill, goal, on_end, self.robot.admit(skill))
+        self.spans.goal_began()
+
+    def end_skill(self) -> GoalData:
+        """Take the robot back; it holds. Returns the goal's counts so far. Repeatable."""
+        return self.slot.take_back()
+
+    def follow(self, sink: TickSink, save_dir: str | None = None) -> None:
+        """Report the ticks of all goals to `sink`, from before the first goal on."""
+        self.slot.follower.sink, self.save_dir = sink, save_dir
+
+    # -- what others look at
+    @property
+    def rate_hz(self) -> float:
+        return self._pacing.rate_hz
+
+    @property
+    def world(self) -> WorldState | None:
+        return self.robot.world
+
+    def camera_names(self) -> tuple[str, ...]:
+        """Return the observation cameras, the default one first."""
+        return self.robot.camera_names()
+
+    def snapshot(self, camera: str, max_age_s: float) -> Picture:
+        """Return a picture no older than `max_age_s`. Raises FrameStale, BadRequest."""
+        return self.robot.snapshot(camera, max_age_s)
+
+    # -- one tick
+    def tick(self) -> TickResult:
+        """Run one tick; the module's docstring lists its steps."""
+        tick = _Tick(self.clock.now_s())
+        self._take_work(tick)  # 1
+        with self.spans.tick(self.slot.traceparent, self.slot.labels):
+            self._open(tick)
+            self._sense(tick)  # 2
+            self._decide(tick)  # 3, 4
+            self._meet_deadline(tick)  # 5
+            self._apply(tick)  # 6
+            return self._report(tick)  # 7
+
+    def _take_work(self, tick: _Tick) -> None:
+        """Run posted work, but not before a latched stop is obeyed, nor before a scene stands."""
+        if self.estop is None and not self.robot.reset_due:
+            self.mailbox.run_pending()
+        tick.reset = self.robot.reset_due
+
+    def _open(self, tick: _Tick) -> None:
+        tick.trace_context = self.spans.carrier()
+        tick.slot = self._pacing.slot(tick.started_s)
+        if tick.reset:
+            tick.slot = Slot(tick.slot.late_ms, math.inf)  # no action can come too late
+        elif self.obey_estop() is not None:
+            self.mailbox.run_pending()
+
+    def _sense(self, tick: _Tick) -> None:
+        if tick.reset:
+            return
+        followed = self.slot.follower.sink is not None
+        tick.sensed = self.robot.sense(self.slot.skill, followed=followed)
+        if tick.sensed.problem:
+            tick.decision.violations = (tick.sensed.problem,)
+        if tick.sensed.ended is not None:
+            self.slot.end(tick.sensed.ended)
+
+    def _decide(self, tick: _Tick) -> None:
+        if tick.reset or self.obey_estop() is not None or not self.slot.busy:
+            return
+        if tick.sensed.stale is not None:
+            tick.decision = self.slot.input_stale(tick.sensed.stale)
+        elif self.world is not None:
+            tick.decision = self.slot.decide(self.world)
+
+    def _meet_deadline(self, tick: _Tick) -> None:
+        if self.deadline_policy is DeadlinePolicy.WARN or tick.decision.action is None:
+            return
+        if self.clock.now_s() > tick.slot.deadline_s:
+            tick.decision.action = None
             self.late_actions_withheld += 1
-            self._came_too_late()
-        apply_s = self.clock.now_s()
-        with nullcontext() if decision.action is None else tracing.span(telemetry.SPAN_SEND):
-            applied = self._apply(decision)  # 3
-        self._still = self._still and not applied.action_applied
+            self.slot.came_too_late()
+
+    def _apply(self, tick: _Tick) -> None:
+        tick.apply_s = self.clock.now_s()
+        if tick.reset:
+            tick.applied = self.robot.reset()
+        else:
+            action = tick.decision.action if self.obey_estop() is None else None
+            with nullcontext() if action is None else tracing.span(telemetry.SPAN_SEND):
+                tick.applied = self.robot.apply(action, skill_active=self.slot.busy)
+            if action is not None:
+                self.obey_estop()  # the hardware may have latched a stop of its own
+        if self._video is not None:
+            self._video.show(
+                tick.applied,
+                tick_idx=self.tick_idx,
+                skill_active=self.slot.busy,
+                caption=self.caption,
+            )
+        if tick.applied.problem:
+            self.slot.violations.append(tick.applied.problem)
+        if tick.applied.ended is not None:
+            self.slot.end(tick.applied.ended)
+
+    def _report(self, tick: _Tick) -> TickResult:
+        """Measure the tick and tell everything that follows it. Raises DeadlineMissed."""
+        result = self._measured(tick)
+        labels = self.slot.labels
+        self.tick_idx += 1
+        self.slot.tick_over()
+        self.spans.applied(result.action_applied)
+        self.timings.add(
+            tick.started_s,
+            result.late_ms,
+            result.tick_ms,
+            result.inference_ms,
+            result.hal_ms,
+            reset=tick.reset,
+        )
+        meters.measure(telemetry.METRIC_TICK, result.tick_ms, labels)
+        self.slot.follower.tick_over(lambda goal: self._goal_tick(goal, tick, result))
+        self.robot.ticked(result)
+        if result.deadline_missed:
+            self.deadline_misses += 1
+            meters.count(telemetry.METRIC_DEADLINE_MISSES, labels)
+            tracing.event(telemetry.EVENT_DEADLINE_MISSED, tick_ms=result.tick_ms)
+            if self.deadline_policy is DeadlinePolicy.RAISE:
+                raise DeadlineMissed(
+                    f"tick {result.tick_idx} took {result.tick_ms:.1f} ms"
+                    f" of its {1e3 / self.rate_hz:.1f} ms",
+                    hint="lower the rate or choose the policy warn or drop",
+                )
+        return result
+
+    def _measured(self, tick: _Tick) -> TickResult:
         ended_s = self.clock.now_s()
-        missed = ended_s > deadline_s
-        result = TickResult(
+        sensed, decision, applied = tick.sensed, tick.decision, tick.applied
+        return TickResult(
             stamp_ns=self.clock.now_ns(),
             tick_idx=self.tick_idx,
-            tick_ms=(ended_s - started_s) * 1e3,
-            late_ms=late_ms,
-            sensors_ms=decision.sensors_ms,
-            world_state_ms=decision.world_state_ms,
+            tick_ms=(ended_s - tick.started_s) * 1e3,
+            late_ms=tick.slot.late_ms,
+            sensors_ms=sensed.sensors_ms,
+            world_state_ms=sensed.world_state_ms,
             inference_ms=decision.inference_ms,
             safety_ms=decision.safety_ms,
-            hal_ms=(ended_s - apply_s) * 1e3,
+            hal_ms=(ended_s - tick.apply_s) * 1e3,
             chunk_index=decision.chunk_index,
-            safety_violations=decision.safety_violations,
+            safety_violations=decision.violations,
             action_applied=applied.action_applied,
-            deadline_missed=missed,
+            deadline_missed=ended_s > tick.slot.deadline_s,
             step_idx=applied.step_idx,
             episode_idx=applied.episode_idx,
             reward=applied.reward,
             terminated=applied.terminated,
             truncated=applied.truncated,
             success=applied.success,
-            trace_context=trace_context,
+            trace_context=tick.trace_context,
         )
-        self.tick_idx += 1
-        self.timings.add(
-            started_s,
-            late_ms,
-            result.tick_ms,
-            result.inference_ms,
-            result.hal_ms,
-            reset=decision.reset,
+
+    def _goal_tick(self, goal: Goal, tick: _Tick, result: TickResult) -> GoalTick | None:
+        if self.world is None:
+            return None
+        return GoalTick(
+            goal,
+            self.world,
+            result,
+            dict(self.robot.targets()),
+            _base_command(self.world, tick.decision.action),
+            self.robot.transition(),
         )
-        meters.measure(telemetry.METRIC_TICK, result.tick_ms, self.labels)
-        self._ticked(decision, result)
-        if missed:  # 4
-            self.deadline_misses += 1
-            meters.count(telemetry.METRIC_DEADLINE_MISSES, self.labels)
-            tracing.event(telemetry.EVENT_DEADLINE_MISSED, tick_ms=result.tick_ms)
-            if self.deadline_policy is DeadlinePolicy.RAISE:
-                raise DeadlineMissed(
-                    f"tick {result.tick_idx} took {result.tick_ms:.1f} ms of its {1e3 / self.rate_hz:.1f} ms",
-                    hint="lower the rate or choose the policy warn or drop",
-                )
-        return result
 
-    def run(self, max_ticks: int | None = None) -> RunResult:
-        """Tick until `_finished` or `max_ticks` more ticks. A long tick costs its own slots, never
-        those after it.
-
-        The result is of this run's ticks alone; their indices go on from the run before.
-        """
-        if self.tick_idx != self._first_tick:
-            self._first_tick, self.timings = self.tick_idx, Timings()
-            self.deadline_misses = self.late_actions_withheld = 0
-        first = self.tick_idx
-        self._due_s = self.clock.now_s()
-        try:
-            while not self._finished() and (max_ticks is None or self.tick_idx - first < max_ticks):
-                self.tick()
-                self._wait_for_next_slot()
-        finally:
-            self._due_s = None
-        return self.result()
-
-    def _wait_for_next_slot(self) -> None:
-        """Sleep to the next slot of the grid that is still to come: deadlines resynchronise, no burst catches up."""
-        if self.period_s is None or self._due_s is None:
-            return
-        self._due_s += self.period_s
-        behind_s = self.clock.now_s() - self._due_s
-        if behind_s > 0:
-            self._due_s += math.ceil(behind_s / self.period_s) * self.period_s
-        self.clock.sleep_s(self._due_s - self.clock.now_s())
-
+    # -- result
     def result(self) -> RunResult:
-        """The present run so far, or the last one."""
+        """Return the present run so far, or the last one."""
         tick_ms, inference_ms = self.timings.tick_ms, self.timings.inference_ms
         return RunResult(
             n_ticks=self.tick_idx - self._first_tick,
-            success=self._success(),
+            success=self.robot.success(),
             budget_violations=self.deadline_misses,
             avg_inference_ms=mean(inference_ms),
             p99_inference_ms=percentile(inference_ms, 0.99),
             avg_tick_ms=mean(tick_ms),
             p99_tick_ms=percentile(tick_ms, 0.99),
-            trace_id=self._trace_id,
+            trace_id=self.spans.trace_id,
             metadata=self._metadata(),
             save_dir=self.save_dir,
         )
 
-    def _metadata(self) -> dict[str, Any]:
-        """What else there is to say of the run; subclasses add what they know."""
-        late_ms = self.timings.late_ms
+    def _metadata(self) -> GoalData:
+        late_ms, sink = self.timings.late_ms, self.slot.follower.sink
         return {
             **self.identity,
             "rate_hz": self.rate_hz,
@@ -272,4 +389,18 @@ class RunnerBase(ABC):
             "deadline_misses": self.deadline_misses,
             "late_actions_withheld": self.late_actions_withheld,
             "start_late_ms": {name: percentile(late_ms, share) for name, share in _SHARES.items()},
+            **self.slot.total.as_data(),
+            "goals_by_skill": dict(self.slot.goals_by_skill),
+            **({} if sink is None else {"recorded": dict(sink.facts())}),
+            **self.robot.facts(),
         }
+
+
+def _base_command(world: WorldState, action: Action | None) -> tuple[float, float, float] | None:
+    """Return what the base was told (m/s, m/s, rad/s); None for a robot without a base."""
+    if world.base_pose is None:
+        return None
+    if action is None or action.control_mode is not ControlMode.BODY_TWIST:
+        return (0.0, 0.0, 0.0)  # a base without a command stands still
+    vx, vy, _, _, _, wz = action.rows[0]
+    return (vx, vy, wz)

@@ -9,17 +9,15 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from vram_arbiter.runner.control.mailbox import Mailbox
 from vram_arbiter.runner.protocols import Goal, SkillEnded
 from vram_arbiter.schemas.errors import InternalError, VramError
 from vram_arbiter.schemas.world import RunResult
 
 log = logging.getLogger(__name__)
-
-MAILBOX_MAX = 256
 
 
 class Controlled(Protocol):
@@ -39,49 +37,6 @@ class Controlled(Protocol):
     def begin_skill(self, skill: Any, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None: ...
 
     def end_skill(self) -> dict[str, Any]: ...
-
-
-class Mailbox:
-    """Work for the control thread, in order. Closed when the thread ends: what was posted then fails at once."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._posted: deque[
-            tuple[Callable[[], Any], Callable[[Any, BaseException | None], None]]
-        ] = deque()
-        self._closed = False
-
-    def post(
-        self, work: Callable[[], Any], deliver: Callable[[Any, BaseException | None], None]
-    ) -> None:
-        """Any thread. `deliver(result, error)` is called on the control thread. Raises InternalError when it has ended."""
-        with self._lock:
-            if self._closed or len(self._posted) >= MAILBOX_MAX:
-                raise InternalError(
-                    "the control thread does not take work", hint="see the runner's log; restart it"
-                )
-            self._posted.append((work, deliver))
-
-    def run_pending(self) -> None:
-        """Control thread only: do everything posted so far."""
-        for _ in range(len(self._posted)):
-            with self._lock:
-                work, deliver = self._posted.popleft()
-            try:
-                result = work()
-            except Exception as error:  # noqa: BLE001 — belongs to whoever posted it, never to the loop
-                deliver(None, error)
-            else:
-                deliver(result, None)
-
-    def close(self) -> None:
-        """Refuse further work and fail what still waits."""
-        with self._lock:
-            self._closed = True
-            left = list(self._posted)
-            self._posted.clear()
-        for _, deliver in left:
-            deliver(None, InternalError("the control thread has ended", hint="restart the runner"))
 
 
 class ControlThread:

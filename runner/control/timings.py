@@ -51,6 +51,10 @@ class Timings:
         """One tick: monotonic start, how far behind its slot that was, how long it took, its skill in it, and the robot."""
         self._rows.append((started_s, late_ms, tick_ms, inference_ms, hal_ms, float(reset)))
 
+    def clear(self) -> None:
+        """Forget all ticks."""
+        self._rows.clear()
+
     @property
     def tick_ms(self) -> list[float]:
         """Of all ticks."""

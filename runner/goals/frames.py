@@ -7,14 +7,13 @@ thread, no goals and no wire.
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.control.thread import ControlThread
+from vram_arbiter.runner.protocols import Picture
 from vram_arbiter.schemas.errors import BadRequest, FrameStale, InternalError
 from vram_arbiter.schemas.goals import FrameReply
-from vram_arbiter.schemas.world import CameraModel
 
 Encoding = Literal["jpeg", "png"]
 JPEG_QUALITY = 90
@@ -22,29 +21,6 @@ PNG_COMPRESSION = 1  # local sockets are fast, cores are few
 FIRST_FRAME_GRACE_S = (
     1.0  # a tick may be long once (scene set-up); a hung loop is refused after this at the latest
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """One rendered or read picture: RGB uint8 height × width × 3, when it was taken, and where its camera stood then."""
-
-    camera: str
-    rgb: Any
-    stamp_ns: int
-    model: CameraModel | None = None
-
-
-class Picture(Protocol):
-    """What `Snapshot` is; its colours may be made late."""
-
-    @property
-    def rgb(self) -> Any: ...
-
-    @property
-    def stamp_ns(self) -> int: ...
-
-    @property
-    def model(self) -> CameraModel | None: ...
 
 
 class FrameSource(Protocol):

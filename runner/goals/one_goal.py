@@ -52,9 +52,13 @@ Tell = Callable[[Peer, Message], Awaitable[None]]
 class Performer(Protocol):
     """What a goal reads and writes of the runner. The attributes are replaced whole, never changed in place."""
 
-    progress: Progress
     caption: tuple[str, ...]
-    estop: EstopRequested | None
+
+    @property
+    def progress(self) -> Progress: ...
+
+    @property
+    def estop(self) -> EstopRequested | None: ...
 
 
 @dataclass(slots=True)

@@ -54,14 +54,20 @@ LOOP_SILENT_S = 1.0  # a control loop that has not looked at the world for so lo
 OPS = ("goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "ping", "shutdown")
 
 
-class Robot(frames.FrameSource, Performer, Protocol):
+class ServedRunner(frames.FrameSource, Performer, Protocol):
     """What the server reads of the runner. The attributes are replaced whole by the control thread, never changed in place."""
 
-    world: WorldState | None
-    rate_hz: float
     tick_idx: int
     deadline_misses: int
-    estop_ns: int
+
+    @property
+    def world(self) -> WorldState | None: ...
+
+    @property
+    def rate_hz(self) -> float: ...
+
+    @property
+    def estop_ns(self) -> int: ...
 
     def request_estop(self, reason: str) -> None: ...
 
@@ -79,7 +85,7 @@ class GoalServer:
         self,
         endpoint: str,
         control: ControlThread,
-        robot: Robot,
+        robot: ServedRunner,
         catalogue: Catalogue,
         clock: Clock,
         *,

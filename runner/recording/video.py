@@ -20,8 +20,8 @@ LINE_PX = 22
 FONT_SCALE = 0.5
 
 
-class Recorder:
-    """`Recorder(path, fps)`; `submit(rgb, lines)` from any one thread; `close()` finishes the file. H.264 wants even sizes: an odd last row or
+class VideoRecorder:
+    """`VideoRecorder(path, fps)`; `submit(rgb, lines)` from any one thread; `close()` finishes the file. H.264 wants even sizes: an odd last row or
     column is cut off."""
 
     def __init__(self, path: Path, *, fps: float, wait: bool = False) -> None:

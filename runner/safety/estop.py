@@ -23,8 +23,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol, Self
 
+from vram_arbiter.runner.control.mailbox import Mailbox
 from vram_arbiter.runner.control.realtime import hasten
-from vram_arbiter.runner.control.thread import Mailbox
 from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError, EstopRequested, InternalError
 from vram_arbiter.schemas.estop import REQUEST_MAX_BYTES, Answer, Reply, path_of, reason_in
 from vram_arbiter.schemas.runtime.peercred import credentials
@@ -49,8 +49,11 @@ class Stoppable(Protocol):
     `obey_estop` on the control thread.
     """
 
-    estop: EstopRequested | None
-    estop_ns: int
+    @property
+    def estop(self) -> EstopRequested | None: ...
+
+    @property
+    def estop_ns(self) -> int: ...
 
     def request_estop(self, reason: str) -> None: ...
 

@@ -5,6 +5,7 @@ What cannot be turned into colours (depth, a handle on a device, a topic's name)
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -56,3 +57,13 @@ class FramePicture:
     @cached_property
     def rgb(self) -> Any:
         return as_rgb(self._frame)
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """One rendered or read picture: RGB uint8 height × width × 3, when it was taken, and where its camera stood then."""
+
+    camera: str
+    rgb: Any
+    stamp_ns: int
+    model: CameraModel | None = None

@@ -29,7 +29,7 @@ from vram_arbiter.runner.sensors.ros2_dds import (
     sample_of,
 )
 from vram_arbiter.runner.sensors.ros2_messages import (
-    Picture,
+    ImageContent,
     RosCompressedImage,
     RosImage,
     message_of,
@@ -225,7 +225,7 @@ class RosImageReader(SlotReader):
             self.deliver(feed, frame)
 
     def _frame(
-        self, message: RosImage | RosCompressedImage, picture: Picture, sent_ns: int
+        self, message: RosImage | RosCompressedImage, picture: ImageContent, sent_ns: int
     ) -> SensorFrame:
         """Raises ValueError for a stamp of the future."""
         now_ns, wall_ns = self.clock.now_ns(), self.clock.wall_ns()
@@ -277,7 +277,9 @@ class RosImagePublisher:
         try:
             if frame.data is None:
                 raise ValueError("the frame's bytes are not in this process")
-            picture = Picture(frame.encoding, frame.width, frame.height, frame.channels, frame.data)
+            picture = ImageContent(
+                frame.encoding, frame.width, frame.height, frame.channels, frame.data
+            )
             message = message_of(picture, frame.stamp_wall_ns, frame.sensor_id)
             kind: MessageKind = "image" if isinstance(message, RosImage) else "compressed"
             self._open(kind).write(sample_of(dds_type(kind), write_cdr(message)))

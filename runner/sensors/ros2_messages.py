@@ -60,7 +60,7 @@ class RosCompressedImage:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class ImageContent:
     """What a frame takes from either message."""
 
     encoding: FrameEncoding
@@ -70,7 +70,7 @@ class Picture:
     data: bytes
 
 
-def picture_of(message: RosImage | RosCompressedImage) -> Picture:
+def picture_of(message: RosImage | RosCompressedImage) -> ImageContent:
     """The picture in a message, without the padding of its rows, 16-bit values in little-endian order. Raises ValueError with the reason."""
     if isinstance(message, RosCompressedImage):
         return _compressed(message)
@@ -94,18 +94,20 @@ def picture_of(message: RosImage | RosCompressedImage) -> Picture:
         swapped = bytearray(data)
         swapped[0::2], swapped[1::2] = data[1::2], data[0::2]
         data = bytes(swapped)
-    return Picture(encoding, message.width, rows, 3 if per_pixel == 3 else 1, data)
+    return ImageContent(encoding, message.width, rows, 3 if per_pixel == 3 else 1, data)
 
 
-def _compressed(message: RosCompressedImage) -> Picture:
+def _compressed(message: RosCompressedImage) -> ImageContent:
     # image_transport writes "rgb8; jpeg compressed bgr8"; plain publishers write "jpeg" or "jpg"
     if "jpeg" not in message.format.lower() and "jpg" not in message.format.lower():
         raise ValueError(f"format {message.format!r} is not supported, only jpeg")
     width, height, channels = jpeg_size(message.data)
-    return Picture(FrameEncoding.JPEG, width, height, channels, message.data)
+    return ImageContent(FrameEncoding.JPEG, width, height, channels, message.data)
 
 
-def message_of(picture: Picture, stamp_ns: int, frame_id: str) -> RosImage | RosCompressedImage:
+def message_of(
+    picture: ImageContent, stamp_ns: int, frame_id: str
+) -> RosImage | RosCompressedImage:
     """A frame's picture as the ROS message that fits it. Raises ValueError for an encoding that ROS has no picture message for."""
     if not 0 <= stamp_ns < STAMP_END_NS:
         raise ValueError("ROS has no stamp for this time: its seconds end in 2038")

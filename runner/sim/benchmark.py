@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from vram_arbiter.runner.protocols import Goal, Skill, SkillEnded, Stepped
-from vram_arbiter.runner.recording.video import Recorder
+from vram_arbiter.runner.recording.video import VideoRecorder
 from vram_arbiter.runner.sim.environment import Environment
 from vram_arbiter.runner.sim.policies import Policy
-from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.runner.sim.robot import SimRunner
 from vram_arbiter.schemas.errors import Cancelled, LimitExceeded, ModelError, VramError
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
@@ -253,7 +253,7 @@ class Benchmark:
         path = self._video_of(contestant.name, seed)
         recorder = None
         if path is not None:
-            recorder = Recorder(path, fps=VIDEO_HZ / self._video_every, wait=True)
+            recorder = VideoRecorder(path, fps=VIDEO_HZ / self._video_every, wait=True)
         attributes = {telemetry.ATTR_SKILL: contestant.name}
         try:
             with tracing.span(telemetry.SPAN_EPISODE, attributes=attributes):
@@ -282,7 +282,7 @@ class Benchmark:
         except VramError as error:
             played = Played(seed, None, error=error.code, message=str(error))
         finally:
-            self.runner.recorder = None
+            self.runner.robot.video.recorder = None
             if recorder is not None:
                 await asyncio.to_thread(recorder.close)
         if played is None:
@@ -294,20 +294,20 @@ class Benchmark:
 
     # -- worker thread -------------------------------------------------------------------------------------------------
     def _reset(self, seed: int) -> Told:
-        self.runner.begin_episode(seed)
+        self.runner.robot.begin_episode(seed)
         self.runner.tick()
         return self._told()
 
     def _episode(
-        self, contestant: Contestant, goal: Goal, seed: int, recorder: Recorder | None
+        self, contestant: Contestant, goal: Goal, seed: int, recorder: VideoRecorder | None
     ) -> Played | None:
         """Ticks until the episode is over."""
-        runner, ended = self.runner, list[SkillEnded]()
-        runner.recorder = recorder
-        number, ends_s = runner.episode_idx, time.monotonic() + self._episode_s
-        runner.begin_skill(contestant.player(runner.env, seed), goal, ended.append)
+        runner, robot, ended = self.runner, self.runner.robot, list[SkillEnded]()
+        robot.video.recorder = recorder
+        number, ends_s = robot.episode_idx, time.monotonic() + self._episode_s
+        runner.begin_skill(contestant.player(robot.env, seed), goal, ended.append)
         while (
-            runner.episode_idx == number and not ended
+            robot.episode_idx == number and not ended
         ):  # a skill that ends, ends the episode in the same tick
             if self._stopping.is_set():
                 runner.end_skill()
@@ -322,9 +322,9 @@ class Benchmark:
         error = ended[0].error if ended and "episode" not in ended[0].data else None
         if error is not None and not isinstance(error, ModelError | LimitExceeded):
             raise error  # the episode may not even be one
-        if runner.failure is not None:  # in the tick in which the contestant was done
-            raise runner.failure
-        episode = runner.episodes[-1]
+        if robot.failure is not None:  # in the tick in which the contestant was done
+            raise robot.failure
+        episode = robot.episodes[-1]
         return Played(
             seed,
             False if error is not None and episode.success is not None else episode.success,

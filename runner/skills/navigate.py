@@ -64,7 +64,7 @@ class Orientation(_Part):
         )
 
 
-class Header(BaseModel):
+class PoseHeader(BaseModel):
     """As ROS writes it; stamps and the like are ignored."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -77,7 +77,7 @@ class PlainPose(_Part):
 
 
 class StampedPose(_Part):
-    header: Header
+    header: PoseHeader
     pose: PlainPose
 
 

@@ -50,7 +50,7 @@ class Duration(_Ros):
         return self.sec + self.nanosec / 1e9
 
 
-class Header(BaseModel):
+class IgnoredHeader(BaseModel):
     """Ignored: a trajectory begins when its goal does."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -67,7 +67,7 @@ class Point(_Ros):
 
 
 class JointTrajectory(_Ros):
-    header: Header = Header()
+    header: IgnoredHeader = IgnoredHeader()
     joint_names: Annotated[tuple[str, ...], FIRST, Field(max_length=JOINTS_MAX)] = ()
     points: Annotated[tuple[Point, ...], FIRST, Field(max_length=POINTS_MAX)] = ()
 

@@ -11,7 +11,7 @@ import pytest
 
 from vram_arbiter.runner.protocols import DeadlinePolicy, Joint, MobileBase, RobotDescription
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
-from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.runner.sim.robot import SimRunner, sim_runner
 from vram_arbiter.schemas.world import CameraModel
 
 sys.path.insert(0, str(Path(__file__).parent))  # for the helpers beside it
@@ -132,7 +132,7 @@ def make_runner(env: KinematicEnv) -> Callable[..., SimRunner]:
         options.setdefault("deadline_policy", DeadlinePolicy.WARN)
         judge = options.pop("judge", None)
         world = ArmEnvironment(env, KINEMATIC, judge=None if judge is None else lambda: judge(env))
-        return SimRunner(lambda: world, **options)
+        return sim_runner(lambda: world, **options)
 
     return make
 

@@ -11,8 +11,8 @@ from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from small_robots import FedCamera, Nod, Twin
 
-from vram_arbiter.runner.control.hardware import HardwareRunner
 from vram_arbiter.runner.protocols import Goal
+from vram_arbiter.runner.robots.hardware import hardware_runner
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.skills.base import SkillState
 from vram_arbiter.schemas.manifest import load_manifest
@@ -26,10 +26,10 @@ def main() -> None:
     clock = ManualClock()
     twin, camera = Twin(clock), FedCamera("front", clock)
     limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
-    runner = HardwareRunner(
+    runner = hardware_runner(
         twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock
     )
-    runner.trace_ticks = 0.25
+    runner.spans.share = 0.25
     runner.activate()
     skill = Nod(load_manifest(Path(sys.argv[1])), cameras=("front",))
     skill.state = SkillState.ACTIVE

@@ -8,13 +8,14 @@ import pytest
 from small_robots import FedCamera, Nod, Twin
 
 from vram_arbiter.runner.control.clock import SystemClock
-from vram_arbiter.runner.control.hardware import (
+from vram_arbiter.runner.control.skill_slot import WITHHELD_IN_A_ROW_MAX
+from vram_arbiter.runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded
+from vram_arbiter.runner.robots.hardware import (
     FIRST_DATA_SLICE_S,
     FIRST_STATE_TRIES,
     HardwareRunner,
+    hardware_runner,
 )
-from vram_arbiter.runner.control.skill_runner import WITHHELD_IN_A_ROW_MAX
-from vram_arbiter.runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.runner.safety.ranges import JointRanges
@@ -56,7 +57,9 @@ def front(clock: Any) -> FedCamera:
 def make(clock: Any, twin: Twin) -> MakeRunner:
     def build(cameras: Sequence[FedCamera] = (), **options: Any) -> HardwareRunner:
         readers = [(camera, 100.0) for camera in cameras]
-        return HardwareRunner(twin, readers, options.pop("make_gate", gate), clock=clock, **options)
+        return hardware_runner(
+            twin, readers, options.pop("make_gate", gate), clock=clock, **options
+        )
 
     return build
 
@@ -131,7 +134,7 @@ def test_a_stale_camera_withholds_and_fails_the_goal_if_it_lasts(
     assert {"hangs": "ms old", "ends": "end of file", "is not there": "no such camera"}[
         cause
     ] in str(ended[0].error)
-    assert len([text for text in runner.violations if "is stale" in text]) == 1
+    assert len([text for text in runner.slot.violations if "is stale" in text]) == 1
 
 
 def test_a_camera_that_comes_back_in_time_lets_the_goal_go_on(
@@ -393,7 +396,7 @@ def test_it_starts_on_a_camera_whose_pictures_take_their_time() -> None:
     clock, over = SystemClock(), threading.Event()
     twin = Twin(clock)
     far = Distant("far", clock, 60_000.0, always=False)
-    runner = HardwareRunner(twin, [(far, 60_000.0)], gate, clock=clock, first_data_s=50.0)
+    runner = hardware_runner(twin, [(far, 60_000.0)], gate, clock=clock, first_data_s=50.0)
 
     def film() -> None:
         while not over.wait(0.01):

@@ -1,100 +1,175 @@
-"""The base loop on a clock that moves only when told: rates, deadline policies, resynchronisation, figures."""
+"""The control loop on a clock that moves only when told: rates, deadline policies, resynchronisation, figures."""
 
 import json
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from vram_arbiter.runner.control.loop import Applied, Decision, RunnerBase
+from vram_arbiter.runner.control.loop import ControlLoop
+from vram_arbiter.runner.control.robot import Applied, Sensed
 from vram_arbiter.runner.control.timings import Timings, percentile
-from vram_arbiter.runner.protocols import DeadlineMissed, DeadlinePolicy, InferenceRunner
+from vram_arbiter.runner.protocols import (
+    Act,
+    DeadlineMissed,
+    DeadlinePolicy,
+    Goal,
+    InferenceRunner,
+    Picture,
+    SafetyGate,
+    SkillKey,
+    StepOutcome,
+    Stepped,
+)
+from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.schemas.control import ControlMode
-from vram_arbiter.schemas.world import Action
+from vram_arbiter.schemas.world import Action, JointState, TickResult, WorldState
 
 ACTION = Action(
     control_mode=ControlMode.JOINT_POSITION, joint_targets=((0.0,),), joint_names=("a",)
 )
 
 
-class Scripted(RunnerBase):
-    """Deciding takes what the script says, in seconds; what was applied is kept."""
+class Desk:
+    """A robot without sensors: it keeps what was applied, which takes `apply_s`."""
 
-    def __init__(
-        self, clock: Any, decide_s: list[float], apply_s: float = 0.0, **options: Any
-    ) -> None:
-        super().__init__(clock=clock, **options)
-        self.manual, self.decide_s, self.apply_s = clock, decide_s, apply_s
+    world: Any = WorldState(
+        stamp_ns=0, joint_state=JointState(stamp_ns=0, name=("a",), position=(0.0,))
+    )
+    finished = reset_due = False
+
+    def __init__(self, clock: Any, apply_s: float) -> None:
+        self.clock, self.apply_s = clock, apply_s
         self.applied: list[Action | None] = []
+
+    def open(self, stopping: threading.Event) -> None: ...
+
+    def close(self) -> None: ...
+
+    def admit(self, skill: Stepped) -> SafetyGate:
+        return JointRanges({"a": (-1.0, 1.0)})
+
+    def stop(self) -> None: ...
+
+    def reset(self) -> Applied:
+        return Applied()
+
+    def sense(self, skill: Stepped | None, *, followed: bool) -> Sensed:
+        return Sensed()
+
+    def apply(self, action: Action | None, *, skill_active: bool) -> Applied:
+        self.applied.append(action)
+        self.clock.advance(self.apply_s)
+        return Applied(action_applied=action is not None)
+
+    def ticked(self, result: TickResult) -> None: ...
+
+    def targets(self) -> dict[str, float]:
+        return {}
+
+    def transition(self) -> None: ...
+
+    def success(self) -> bool | None:
+        return None
+
+    def facts(self) -> dict[str, Any]:
+        return {}
+
+    def camera_names(self) -> tuple[str, ...]:
+        return ()
+
+    def snapshot(self, camera: str, max_age_s: float) -> Picture:
+        raise KeyError(camera)
+
+
+class Thinker:
+    """A skill whose steps take what the script says, in seconds."""
+
+    manifest = None
+    key = SkillKey("a/thinker")
+    cameras: tuple[str, ...] = ()
+    fraction = 0.0
+
+    def __init__(self, clock: Any, decide_s: list[float]) -> None:
+        self.clock, self.decide_s = clock, list(decide_s)
         self.began_s: list[float] = []
 
-    def activate(self) -> None: ...
+    def wants_frames(self) -> bool:
+        return False
 
-    def deactivate(self) -> None: ...
-
-    def _decide(self, tick_idx: int) -> Decision:
-        self.began_s.append(self.manual.time_s)
-        self.manual.advance(self.decide_s[tick_idx] if tick_idx < len(self.decide_s) else 0.0)
-        return Decision(
-            action=ACTION, inference_ms=1e3 * (self.decide_s[tick_idx : tick_idx + 1] or [0.0])[0]
-        )
-
-    def _apply(self, decision: Decision) -> Applied:
-        self.applied.append(decision.action)
-        self.manual.advance(self.apply_s)
-        return Applied(action_applied=decision.action is not None)
+    def step(self, world: WorldState) -> StepOutcome:
+        self.began_s.append(self.clock.time_s)
+        self.clock.advance(self.decide_s.pop(0) if self.decide_s else 0.0)
+        return Act(ACTION)
 
 
-def test_the_base_is_an_inference_runner(clock: Any) -> None:
-    assert isinstance(Scripted(clock, []), InferenceRunner)
+def scripted(
+    clock: Any,
+    decide_s: list[float],
+    apply_s: float = 0.0,
+    loop_clock: Any = None,
+    **options: Any,
+) -> tuple[ControlLoop[Desk], Thinker]:
+    """Return a loop whose skill decides as slowly as the script says."""
+    loop = ControlLoop(Desk(clock, apply_s), clock=loop_clock or clock, **options)
+    skill = Thinker(clock, decide_s)
+    loop.begin_skill(skill, Goal("g", "a/thinker"), lambda ended: None)
+    return loop, skill
+
+
+def test_the_loop_is_an_inference_runner(clock: Any) -> None:
+    assert isinstance(scripted(clock, [])[0], InferenceRunner)
 
 
 def test_ticks_stand_on_the_grid_of_the_rate(clock: Any) -> None:
-    runner = Scripted(clock, [0.01, 0.02, 0.0], rate_hz=10)
+    runner, skill = scripted(clock, [0.01, 0.02, 0.0], rate_hz=10)
     result = runner.run(max_ticks=3)
-    assert runner.began_s == pytest.approx([100.0, 100.1, 100.2])
+    assert skill.began_s == pytest.approx([100.0, 100.1, 100.2])
     assert (result.n_ticks, result.budget_violations) == (3, 0)
 
 
 def test_a_long_tick_costs_its_own_slots_and_no_burst_follows(clock: Any) -> None:
-    runner = Scripted(clock, [0.0, 0.35, 0.0, 0.0], rate_hz=10)
+    runner, skill = scripted(clock, [0.0, 0.35, 0.0, 0.0], rate_hz=10)
     result = runner.run(max_ticks=4)
-    assert runner.began_s == pytest.approx([100.0, 100.1, 100.5, 100.6])
+    assert skill.began_s == pytest.approx([100.0, 100.1, 100.5, 100.6])
     assert result.budget_violations == 1
 
 
 def test_warn_applies_a_late_action_and_counts_it(clock: Any) -> None:
-    runner = Scripted(clock, [0.25], rate_hz=10, deadline_policy=DeadlinePolicy.WARN)
+    runner, _ = scripted(clock, [0.25], rate_hz=10, deadline_policy=DeadlinePolicy.WARN)
     result = runner.tick()
     assert result.action_applied
     assert result.deadline_missed
-    assert runner.applied == [ACTION]
+    assert runner.robot.applied == [ACTION]
 
 
 def test_drop_really_withholds_a_late_action(clock: Any) -> None:
-    runner = Scripted(clock, [0.25, 0.0], rate_hz=10, deadline_policy=DeadlinePolicy.DROP)
+    runner, _ = scripted(clock, [0.25, 0.0], rate_hz=10, deadline_policy=DeadlinePolicy.DROP)
     assert runner.run(max_ticks=2).budget_violations == 1
-    assert runner.applied == [None, ACTION]
+    assert runner.robot.applied == [None, ACTION]
     assert runner.result().metadata["late_actions_withheld"] == 1
 
 
 def test_drop_keeps_an_action_that_was_decided_in_time(clock: Any) -> None:
-    runner = Scripted(clock, [0.05], apply_s=0.08, rate_hz=10, deadline_policy=DeadlinePolicy.DROP)
+    runner, _ = scripted(
+        clock, [0.05], apply_s=0.08, rate_hz=10, deadline_policy=DeadlinePolicy.DROP
+    )
     result = runner.tick()
     assert result.action_applied
     assert result.deadline_missed
 
 
 def test_raise_holds_and_ends_the_run(clock: Any) -> None:
-    runner = Scripted(clock, [0.25], rate_hz=10, deadline_policy=DeadlinePolicy.RAISE)
+    runner, _ = scripted(clock, [0.25], rate_hz=10, deadline_policy=DeadlinePolicy.RAISE)
     with pytest.raises(DeadlineMissed, match="250\\.0 ms of its 100\\.0 ms"):
         runner.run(max_ticks=3)
-    assert runner.applied == [None]
+    assert runner.robot.applied == [None]
 
 
 def test_rate_zero_never_sleeps_and_never_misses(clock: Any) -> None:
-    runner = Scripted(clock, [5.0, 5.0], rate_hz=0, deadline_policy=DeadlinePolicy.RAISE)
+    runner, _ = scripted(clock, [5.0, 5.0], rate_hz=0, deadline_policy=DeadlinePolicy.RAISE)
     assert runner.run(max_ticks=2).budget_violations == 0
     assert clock.slept == []
 
@@ -102,11 +177,11 @@ def test_rate_zero_never_sleeps_and_never_misses(clock: Any) -> None:
 @pytest.mark.parametrize("rate", [-1.0, float("nan"), float("inf")])
 def test_a_rate_that_is_none_is_refused(clock: Any, rate: float) -> None:
     with pytest.raises(ValueError, match="rate_hz"):
-        Scripted(clock, [], rate_hz=rate)
+        scripted(clock, [], rate_hz=rate)
 
 
 def test_figures_of_a_run(clock: Any) -> None:
-    runner = Scripted(clock, [0.01, 0.02, 0.03, 0.04], rate_hz=10)
+    runner, _ = scripted(clock, [0.01, 0.02, 0.03, 0.04], rate_hz=10)
     result = runner.run(max_ticks=4)
     assert result.avg_inference_ms == pytest.approx(25.0)
     assert result.p99_inference_ms == pytest.approx(39.7)
@@ -116,7 +191,7 @@ def test_figures_of_a_run(clock: Any) -> None:
 
 def test_a_second_run_counts_its_own_ticks(clock: Any) -> None:
     """Its result was of both runs; the ticks' indices still go on."""
-    runner = Scripted(clock, [0.0, 0.25, 0.01, 0.01], rate_hz=10)
+    runner, _ = scripted(clock, [0.0, 0.25, 0.01, 0.01], rate_hz=10)
     first = runner.run(max_ticks=2)
     assert (first.n_ticks, first.budget_violations) == (2, 1)
     second = runner.run(max_ticks=2)
@@ -144,12 +219,12 @@ def test_ticks_carry_the_callers_trace(clock: Any) -> None:
     parent = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
     token = context.attach(propagate.extract({"traceparent": parent}))
     try:
-        result = Scripted(clock, []).tick()
+        result = scripted(clock, [])[0].tick()
     finally:
         context.detach(token)
     assert result.trace_context is not None
     assert result.trace_context["traceparent"].split("-")[1] == parent.split("-")[1]
-    assert Scripted(clock, []).tick().trace_context is None
+    assert scripted(clock, [])[0].tick().trace_context is None
 
 
 def test_make_runner_is_a_real_runner(make_runner: Callable[..., Any]) -> None:
@@ -168,8 +243,8 @@ class Oversleeper:
 
 
 def test_how_far_behind_its_slot_a_tick_began_is_kept(clock: Any, tmp_path: Path) -> None:
-    runner = Scripted(clock, [0.01, 0.02], rate_hz=10)
-    runner.clock = Oversleeper(clock, [0.003, 0.0, 0.0])
+    sleeper = Oversleeper(clock, [0.003, 0.0, 0.0])
+    runner, _ = scripted(clock, [0.01, 0.02], rate_hz=10, loop_clock=sleeper)
     result = runner.run(max_ticks=3)
     assert runner.timings.late_ms == pytest.approx([0.0, 3.0, 0.0])
     assert result.metadata["start_late_ms"] == pytest.approx({"p50": 0.0, "p99": 2.94, "max": 3.0})

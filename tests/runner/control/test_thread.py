@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.runner.control.thread import MAILBOX_MAX, ControlThread, Mailbox
+from vram_arbiter.runner.control.mailbox import MAILBOX_MAX, Mailbox
+from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.protocols import Goal, Hold, SkillKey, StepOutcome
-from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.runner.sim.robot import SimRunner, sim_runner
 from vram_arbiter.schemas.errors import BadState, InternalError
 from vram_arbiter.schemas.world import WorldState
 
@@ -53,7 +54,7 @@ def test_a_runner_that_cannot_start_says_why(make_runner: Make, env: Any, run_as
         raise FileNotFoundError("no scene")
 
     async def scenario() -> None:
-        control = ControlThread(SimRunner(broken, cameras=()))
+        control = ControlThread(sim_runner(broken, cameras=()))
         with pytest.raises(FileNotFoundError, match="no scene"):
             await control.__aenter__()
         with pytest.raises(InternalError, match="does not take work"):

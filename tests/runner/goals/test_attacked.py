@@ -16,10 +16,10 @@ from small_robots import FedCamera, Nod, Twin
 from tests.support.paths import SUPPORT
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.control.clock import SystemClock
-from vram_arbiter.runner.control.hardware import HardwareRunner
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
 from vram_arbiter.runner.goals.server import GoalServer
+from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.schemas.errors import EstopRequested
 from vram_arbiter.schemas.manifest import Kind, load_manifest
@@ -37,7 +37,7 @@ async def serving(endpoint: str, manifest: Path) -> AsyncIterator[HardwareRunner
     twin, camera = Twin(clock), FedCamera("front", clock)
     skill = Nod(load_manifest(manifest), steps=20)
     limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
-    runner = HardwareRunner(
+    runner = hardware_runner(
         twin, [(camera, 60_000.0)], lambda _: JointRanges(limits), rate_hz=100.0, clock=clock
     )
     catalogue = Catalogue([skill.manifest], {Kind.ROS_ACTION: lambda _: skill})

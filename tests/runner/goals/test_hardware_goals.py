@@ -15,11 +15,11 @@ from small_robots import FedCamera, Nod, Twin
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.__main__ import main
 from vram_arbiter.runner.control.clock import SystemClock
-from vram_arbiter.runner.control.hardware import HardwareRunner
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
 from vram_arbiter.runner.goals.server import GoalServer
 from vram_arbiter.runner.protocols import Goal
+from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.schemas.errors import (
     EstopRequested,
@@ -76,7 +76,7 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
         limits = {
             joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints
         }
-        runner = HardwareRunner(
+        runner = hardware_runner(
             twin,
             [(camera, 100.0)],
             lambda _: JointRanges(limits),

@@ -19,7 +19,7 @@ from vram_arbiter.runner.goals.catalogue import Catalogue, read_manifests
 from vram_arbiter.runner.goals.one_goal import LISTENERS_MAX
 from vram_arbiter.runner.goals.server import GoalServer
 from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
-from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.runner.sim.robot import SimRunner
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import (

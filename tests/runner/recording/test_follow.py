@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from small_robots import FedCamera, Nod, Twin
 
-from vram_arbiter.runner.control.hardware import HardwareRunner
 from vram_arbiter.runner.protocols import Act, Done, Goal, GoalTick, Hold, SkillEnded
+from vram_arbiter.runner.robots.hardware import hardware_runner
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.skills.base import SkillState
 from vram_arbiter.schemas.control import ControlMode
@@ -72,7 +72,7 @@ def told(*row: float) -> Act:
 @pytest.fixture
 def sim(make_runner: Callable[..., Any]) -> tuple[Any, Follower]:
     runner, follower = make_runner(rate_hz=0), Follower()
-    runner.sink = follower
+    runner.follow(follower)
     runner.activate()
     runner.tick()
     return runner, follower
@@ -145,7 +145,7 @@ def test_a_policy_that_plays_by_itself_is_followed_like_a_goal(
     runner = make_runner(
         rate_hz=0, seed=7, episodes=2, max_steps=3, policy=policy_of("random").play
     )
-    runner.sink = follower
+    runner.follow(follower)
     runner.activate()
     runner.run()
     ticks, ends = [("tick", "seed-7")] * 3, [("end", "seed-7")]
@@ -161,7 +161,7 @@ def test_a_policy_that_plays_by_itself_is_followed_like_a_goal(
 @pytest.mark.heavy  # a simulated camera's pictures: numpy
 def test_a_simulator_that_is_followed_renders_all_cameras(make_runner: Callable[..., Any]) -> None:
     runner, follower = make_runner(rate_hz=0, cameras=("front", "wrist")), Follower()
-    runner.sink = follower
+    runner.follow(follower)
     runner.activate()
     runner.tick()
     runner.begin_skill(Scripted(Hold("a"), Hold("b")), GOAL, lambda _: None)
@@ -174,8 +174,8 @@ def test_a_robot_says_only_what_it_was_told_and_nothing_while_it_sees_nothing(
 ) -> None:
     twin, front, follower = Twin(clock), FedCamera("front", clock), Follower()
     limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
-    runner = HardwareRunner(twin, [(front, 100.0)], lambda _: JointRanges(limits), clock=clock)
-    runner.sink = follower
+    runner = hardware_runner(twin, [(front, 100.0)], lambda _: JointRanges(limits), clock=clock)
+    runner.follow(follower)
     runner.activate()
     skill = Nod(load_manifest(navigate_manifest), cameras=("front",))
     skill.state = SkillState.ACTIVE

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 from vram_arbiter.clients.estop import stop
 from vram_arbiter.runner.__main__ import main
-from vram_arbiter.runner.control.thread import Mailbox
+from vram_arbiter.runner.control.mailbox import Mailbox
 from vram_arbiter.runner.safety.estop import CONNECTIONS_PER_UID, SILENT_S, EstopServer
 from vram_arbiter.schemas.errors import (
     AlreadyRunning,

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vram_arbiter.runner.control.skill_runner import WITHHELD_IN_A_ROW_MAX
+from vram_arbiter.runner.control.skill_slot import WITHHELD_IN_A_ROW_MAX
 from vram_arbiter.runner.protocols import Joint, MobileBase, RobotDescription
 from vram_arbiter.runner.safety.gate import LATE_MAX, MAX_FOLLOWING_ERROR_RAD, RobotGate
 from vram_arbiter.runner.safety.limits import Vector3

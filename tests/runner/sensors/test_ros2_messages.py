@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vram_arbiter.runner.sensors.ros2_messages import (
-    Picture,
+    ImageContent,
     RosCompressedImage,
     RosImage,
     jpeg_size,
@@ -90,7 +90,7 @@ def test_any_bytes_are_a_jpeg_or_refused(noise: bytes) -> None:
 def test_encodings(encoding: str, ours: str, channels: int, per_pixel: int) -> None:
     data = bytes(range(6 * per_pixel))
     picture = picture_of(image(encoding=encoding, step=3 * per_pixel, data=data))
-    assert picture == Picture(FrameEncoding(ours), 3, 2, channels, data)
+    assert picture == ImageContent(FrameEncoding(ours), 3, 2, channels, data)
 
 
 def test_padding_of_rows_is_left_out() -> None:
@@ -153,6 +153,6 @@ def test_frames_become_the_messages_that_they_came_from(encoding: str) -> None:
     message = image(encoding=encoding, step=3 * per_pixel, data=bytes(6 * per_pixel))
     assert message_of(picture_of(message), 5, "cam") == message
     with pytest.raises(ValueError, match="no name in ROS"):
-        message_of(Picture(FrameEncoding.CUDA_NV12, 2, 2, 3, b"123456"), 5, "cam")
+        message_of(ImageContent(FrameEncoding.CUDA_NV12, 2, 2, 3, b"123456"), 5, "cam")
     with pytest.raises(ValueError, match="2038"):
         message_of(picture_of(message), 2**31 * 10**9, "cam")

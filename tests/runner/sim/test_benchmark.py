@@ -21,7 +21,7 @@ from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, PolicyContestant,
 from vram_arbiter.runner.sim.gym_config import GymConfig
 from vram_arbiter.runner.sim.gym_env import GymEnv
 from vram_arbiter.runner.sim.policies import Policy, policy_of
-from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.runner.sim.robot import sim_runner
 from vram_arbiter.schemas.errors import SidecarUnavailable
 
 HERE = Path(__file__).parents[1]
@@ -68,7 +68,7 @@ class Counted:
 
     def __init__(self, **kwargs: Any) -> None:
         self.env = GymEnv(POINT_ID, GymConfig(kwargs=kwargs), render=False)
-        self.runner = SimRunner(lambda: self.env, rate_hz=0, ends_with_skill=True, max_steps=50)
+        self.runner = sim_runner(lambda: self.env, rate_hz=0, ends_with_skill=True, max_steps=50)
         self.bench = Benchmark(self.runner, world="point")
 
     @property
@@ -116,7 +116,7 @@ def test_who_leaves_before_it_costs_anything_has_not_succeeded(
 ) -> None:
     """Rewards of a pendulum are costs: whoever does nothing has the greatest return."""
     config = GymConfig(success=f"return:{least}")
-    runner = SimRunner(
+    runner = sim_runner(
         lambda: GymEnv("Pendulum-v1", config, render=False),
         rate_hz=0,
         ends_with_skill=True,
@@ -151,7 +151,7 @@ def test_an_environment_that_raises_is_no_verdict_and_no_phantom(run_async: Run)
     cell: Cell = run_async(one.bench.run(PolicyContestant(policy_of("random")), range(9)))
     assert [(e.success, e.error) for e in cell.episodes] == [(None, "environment_failed")] * 3
     assert one.resets == [0, 1, 2]
-    assert one.runner.episodes == []
+    assert one.runner.robot.episodes == []
     assert (cell.complete, cell.errors) == (False, 3)
     assert "given up" in cell.why
     assert "ZeroDivisionError" in cell.why
@@ -208,7 +208,7 @@ def test_stopping_within_an_episode_keeps_what_was_played(run_async: Run) -> Non
     ]
     assert (cell.complete, cell.why) == (False, "stopped")
     assert one.resets == [0, 1, 2]
-    assert len(one.runner.episodes) == len(cell.episodes)
+    assert len(one.runner.robot.episodes) == len(cell.episodes)
 
 
 @pytest.mark.heavy

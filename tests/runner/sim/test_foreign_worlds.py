@@ -17,7 +17,7 @@ from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, PolicyContestant 
 from vram_arbiter.runner.sim.gym_config import GymConfig  # noqa: E402
 from vram_arbiter.runner.sim.gym_env import GymEnv  # noqa: E402
 from vram_arbiter.runner.sim.policies import Policy, PolicyPlayer  # noqa: E402
-from vram_arbiter.runner.sim.sim_runner import SimRunner  # noqa: E402
+from vram_arbiter.runner.sim.robot import sim_runner  # noqa: E402
 from vram_arbiter.schemas.errors import ConfigError, EnvironmentFailed  # noqa: E402
 
 Run = Callable[[Any], Any]
@@ -94,7 +94,7 @@ class Plays(PolicyContestant):
 
 
 def play(run_async: Run, env: GymEnv, *actions: int, max_steps: int = 50) -> Cell:
-    runner = SimRunner(lambda: env, rate_hz=0, ends_with_skill=True, max_steps=max_steps)
+    runner = sim_runner(lambda: env, rate_hz=0, ends_with_skill=True, max_steps=max_steps)
     bench = Benchmark(runner, world="odd", episode_s=60)
     cell: Cell = run_async(bench.run(Plays(*actions), range(len(actions))))
     return cell
@@ -182,7 +182,7 @@ def test_a_run_in_which_only_a_success_was_told_is_not_all_successes() -> None:
     """Regression: episodes without a word were left out, which gave 100 % success for one in ten."""
     env = world({2: GOOD}, hold=[0.0])
     policy = Policy("test", lambda env, seed: lambda seen: [0.0])
-    runner = SimRunner(lambda: env, rate_hz=0, episodes=3, max_steps=1, policy=policy.play)
+    runner = sim_runner(lambda: env, rate_hz=0, episodes=3, max_steps=1, policy=policy.play)
     runner.activate()
     assert runner.run().success is False
 
@@ -192,20 +192,20 @@ def test_a_policy_that_is_done_as_its_world_fails_does_not_play_for_ever() -> No
     for ever."""
     env = world({n: ZeroDivisionError("again") for n in range(1, 9)}, hold=[0.0])
     policy = Policy("test", lambda env, seed: lambda seen: None)
-    runner = SimRunner(lambda: env, rate_hz=0, episodes=1, policy=policy.play)
+    runner = sim_runner(lambda: env, rate_hz=0, episodes=1, policy=policy.play)
     runner.activate()
     runner.run(max_ticks=30)
-    assert isinstance(runner.policy_error, EnvironmentFailed)
+    assert isinstance(runner.robot.policy_error, EnvironmentFailed)
     assert env._env.unwrapped.resets == [0]
-    assert runner.episodes == []
+    assert runner.robot.episodes == []
 
 
 def test_pictures_that_change_their_size_do_not_garble_a_video(tmp_path: Path) -> None:
     """Regression: ffmpeg receives bytes, so a picture of another size garbled the rest of the
     video."""
-    from vram_arbiter.runner.recording.video import Recorder
+    from vram_arbiter.runner.recording.video import VideoRecorder
 
-    recorder = Recorder(tmp_path / "v.mp4", fps=30, wait=True)
+    recorder = VideoRecorder(tmp_path / "v.mp4", fps=30, wait=True)
     for size in (64, 64, 96, 64):
         recorder.submit(np.zeros((size, 64, 3), np.uint8), ())
     recorder.close()
@@ -219,11 +219,11 @@ def test_a_video_that_the_disk_had_no_room_for_is_none(tmp_path: Path) -> None:
 import resource, signal, sys
 from pathlib import Path
 import numpy as np
-from vram_arbiter.runner.recording.video import Recorder
+from vram_arbiter.runner.recording.video import VideoRecorder
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 for room in (20_000, 1 << 20):
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
-    recorder = Recorder(Path(sys.argv[1]) / f"{room}.mp4", fps=30, wait=True)
+    recorder = VideoRecorder(Path(sys.argv[1]) / f"{room}.mp4", fps=30, wait=True)
     noise = np.random.default_rng(0)
     for _ in range(12):
         recorder.submit(noise.integers(0, 255, (96, 96, 3), dtype=np.uint8), ())

@@ -15,7 +15,7 @@ from vram_arbiter.runner.protocols import Act, Goal, Hold, SkillEnded, SkillKey 
 from vram_arbiter.runner.sim.gym_config import GymConfig  # noqa: E402
 from vram_arbiter.runner.sim.gym_env import GymEnv  # noqa: E402
 from vram_arbiter.runner.sim.policies import policy_of  # noqa: E402
-from vram_arbiter.runner.sim.sim_runner import SimRunner  # noqa: E402
+from vram_arbiter.runner.sim.robot import sim_runner  # noqa: E402
 from vram_arbiter.schemas.control import ControlMode  # noqa: E402
 from vram_arbiter.schemas.errors import ConfigError, EnvironmentFailed, ModelError  # noqa: E402
 from vram_arbiter.schemas.world import Action, JointState, WorldState  # noqa: E402
@@ -150,7 +150,7 @@ def test_an_aim_at_the_stop_is_clamped_and_said() -> None:
 # -- the loop on it -----------------------------------------------------------------------------------------------------
 def test_one_step_per_tick_and_the_world_waits_without_an_action() -> None:
     env = GymEnv(POINT, NAMED)
-    runner = SimRunner(lambda: env, rate_hz=0, seed=4)
+    runner = sim_runner(lambda: env, rate_hz=0, seed=4)
     ended: list[SkillEnded] = []
     script: list[Any] = [Hold("thinking"), Act(targets(0.95, 0.95)), Hold("thinking")]
 
@@ -181,7 +181,7 @@ def test_one_step_per_tick_and_the_world_waits_without_an_action() -> None:
 
 def test_a_skill_sees_the_observations_picture() -> None:
     env = GymEnv(POINT, NAMED, render=False)
-    runner = SimRunner(lambda: env, rate_hz=0)
+    runner = sim_runner(lambda: env, rate_hz=0)
     seen: list[WorldState] = []
 
     def act(world: WorldState) -> Any:
@@ -200,14 +200,14 @@ def test_a_skill_sees_the_observations_picture() -> None:
 
 
 def test_its_own_time_limit_truncates_an_episode() -> None:
-    runner = SimRunner(lambda: GymEnv(POINT, render=False), rate_hz=0, episodes=2)
+    runner = sim_runner(lambda: GymEnv(POINT, render=False), rate_hz=0, episodes=2)
     runner.activate()
     runner.tick()
     ended: list[SkillEnded] = []
     runner.begin_skill(Policy(lambda world: Act(targets(0.99, 0.99))), Goal("g", "r"), ended.append)
     while not ended:
         runner.tick()
-    assert [(e.steps, e.success, e.truncated) for e in runner.episodes] == [(20, False, True)]
+    assert [(e.steps, e.success, e.truncated) for e in runner.robot.episodes] == [(20, False, True)]
     assert ended[0].error is not None
     assert ended[0].error.code == "limit_exceeded"
 
@@ -244,7 +244,7 @@ def test_a_mujoco_environment_of_gymnasium_is_driven_and_seen() -> None:
         velocities={"cart": 2, "pole": 3},
     )
     env = GymEnv("InvertedPendulum-v5", config)
-    runner = SimRunner(lambda: env, rate_hz=0, episodes=1)
+    runner = sim_runner(lambda: env, rate_hz=0, episodes=1)
     runner.activate()
     runner.tick()
     assert runner.camera_names() == ("render",)
@@ -254,7 +254,7 @@ def test_a_mujoco_environment_of_gymnasium_is_driven_and_seen() -> None:
     result = runner.run(max_ticks=200)
     assert runner.world is not None
     assert runner.world.joint_state.name == ("cart", "pole")
-    assert runner.episodes[0].steps == result.n_ticks < 100
+    assert runner.robot.episodes[0].steps == result.n_ticks < 100
     assert runner.snapshot("render", 0.5).rgb.any()
     runner.deactivate()
 
@@ -263,7 +263,7 @@ def test_a_mujoco_environment_of_gymnasium_is_driven_and_seen() -> None:
     "env_id", ["Acrobot-v1", "Pendulum-v1", "Blackjack-v1", "FrozenLake-v1", "Taxi-v4", "Pusher-v5"]
 )
 def test_gymnasiums_own_environments_of_all_kinds_can_be_played(env_id: str) -> None:
-    runner = SimRunner(
+    runner = sim_runner(
         lambda: GymEnv(env_id, render=False),
         rate_hz=0,
         episodes=2,
@@ -273,10 +273,10 @@ def test_gymnasiums_own_environments_of_all_kinds_can_be_played(env_id: str) -> 
     runner.activate()
     result = runner.run()
     runner.deactivate()
-    assert runner.policy_error is None
-    assert list(runner.violations) == []
-    assert result.n_ticks == 2 + sum(episode.steps for episode in runner.episodes)
-    assert all(episode.total_reward is not None for episode in runner.episodes)
+    assert runner.robot.policy_error is None
+    assert list(runner.slot.violations) == []
+    assert result.n_ticks == 2 + sum(episode.steps for episode in runner.robot.episodes)
+    assert all(episode.total_reward is not None for episode in runner.robot.episodes)
 
 
 # -- refusals -------------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, PolicyContestant 
 from vram_arbiter.runner.sim.gym_config import GymConfig  # noqa: E402
 from vram_arbiter.runner.sim.gym_env import GymEnv  # noqa: E402
 from vram_arbiter.runner.sim.policies import Policy, PolicyPlayer, policy_of  # noqa: E402
-from vram_arbiter.runner.sim.sim_runner import SimRunner  # noqa: E402
+from vram_arbiter.runner.sim.robot import sim_runner  # noqa: E402
 from vram_arbiter.schemas.control import ControlMode  # noqa: E402
 from vram_arbiter.schemas.errors import ConfigError, EnvironmentFailed, ModelError  # noqa: E402
 from vram_arbiter.schemas.world import Action, JointState, WorldState  # noqa: E402
@@ -140,12 +140,12 @@ def test_random_actions_of_every_kind_are_the_spaces_own_and_follow_from_the_see
 ) -> None:
     def play() -> list[Any]:
         env = plain(space)
-        runner = SimRunner(
+        runner = sim_runner(
             lambda: env, rate_hz=0, episodes=2, max_steps=5, policy=policy_of("random").play
         )
         runner.activate()
         runner.run()
-        assert (runner.policy_error, list(runner.violations)) == (None, [])
+        assert (runner.robot.policy_error, list(runner.slot.violations)) == (None, [])
         taken: list[Any] = env._env.unwrapped.taken
         assert len(taken) == 10
         assert all(map(space.contains, taken))
@@ -294,7 +294,7 @@ def seeker() -> Policy:
 
 def test_a_goal_plays_an_episode_of_parts_to_its_success() -> None:
     env = GymEnv(HAND, render=False)
-    runner = SimRunner(lambda: env, rate_hz=0, seed=3)
+    runner = sim_runner(lambda: env, rate_hz=0, seed=3)
     ended: list[SkillEnded] = []
 
     class Skill:
@@ -324,7 +324,7 @@ def test_a_benchmark_of_such_a_world_is_the_same_for_the_same_seeds(
     run_async: Callable[[Any], Any],
 ) -> None:
     def play(policy: Policy) -> Cell:
-        runner = SimRunner(lambda: GymEnv(HAND, render=False), rate_hz=0, ends_with_skill=True)
+        runner = sim_runner(lambda: GymEnv(HAND, render=False), rate_hz=0, ends_with_skill=True)
         cell: Cell = run_async(
             Benchmark(runner, world=HAND).run(PolicyContestant(policy), range(5, 15))
         )

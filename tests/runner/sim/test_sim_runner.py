@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vram_arbiter.runner.control.skill_runner import WITHHELD_IN_A_ROW_MAX
+from vram_arbiter.runner.control.skill_slot import WITHHELD_IN_A_ROW_MAX
 from vram_arbiter.runner.protocols import (
     Act,
     DeadlinePolicy,
@@ -23,7 +23,7 @@ from vram_arbiter.runner.protocols import (
 )
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
 from vram_arbiter.runner.sim.episodes import episodes_of
-from vram_arbiter.runner.sim.sim_runner import SimRunner
+from vram_arbiter.runner.sim.robot import sim_runner
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import (
     ConfigError,
@@ -109,7 +109,7 @@ def test_n_episodes_are_n_resets_and_no_phantom_one(make_runner: Make, env: Any)
     assert env.resets == [3, 4]
     assert len(env.steps) == 8
     assert result.n_ticks == 10
-    assert [(e.index, e.steps, e.truncated) for e in runner.episodes] == [
+    assert [(e.index, e.steps, e.truncated) for e in runner.robot.episodes] == [
         (0, 4, True),
         (1, 4, True),
     ]
@@ -120,7 +120,7 @@ def test_a_judge_ends_an_episode(make_runner: Make, env: Any) -> None:
     runner = make_runner(rate_hz=0, episodes=2, max_steps=5, judge=lambda e: len(e.steps) == 3)
     runner.activate()
     result = runner.run()
-    assert [(e.steps, e.success) for e in runner.episodes] == [(3, True), (5, False)]
+    assert [(e.steps, e.success) for e in runner.robot.episodes] == [(3, True), (5, False)]
     assert result.success is False
 
 
@@ -143,9 +143,9 @@ def test_episodes_are_read_off_the_ticks(make_runner: Make, env: Any) -> None:
     ticks = []
     while not runner._finished():
         ticks.append(runner.tick())
-    assert episodes_of(ticks) == runner.episodes
+    assert episodes_of(ticks) == runner.robot.episodes
     resets = [tick.tick_idx for tick in ticks if tick.step_idx is None]
-    assert [episode.first_tick for episode in runner.episodes] == resets == [0, 5, 8]
+    assert [episode.first_tick for episode in runner.robot.episodes] == resets == [0, 5, 8]
     assert [tick.step_idx for tick in ticks if tick.step_idx is not None] == [
         0,
         1,
@@ -158,12 +158,12 @@ def test_episodes_are_read_off_the_ticks(make_runner: Make, env: Any) -> None:
         2,
         3,
     ]
-    assert [(e.steps, e.success, e.truncated) for e in runner.episodes] == [
+    assert [(e.steps, e.success, e.truncated) for e in runner.robot.episodes] == [
         (4, False, True),
         (2, True, False),
         (4, False, True),
     ]
-    assert episodes_of(ticks[:-1]) == runner.episodes[:-1]
+    assert episodes_of(ticks[:-1]) == runner.robot.episodes[:-1]
 
 
 def test_stopping_within_an_episode_leaves_no_phantom(make_runner: Make, env: Any) -> None:
@@ -172,11 +172,11 @@ def test_stopping_within_an_episode_leaves_no_phantom(make_runner: Make, env: An
     runner.run(max_ticks=8)  # reset, 4 steps, reset, 2 steps
     runner.deactivate()
     assert env.resets == [3, 4]
-    assert [episode.index for episode in runner.episodes] == [0]
+    assert [episode.index for episode in runner.robot.episodes] == [0]
     runner.activate()  # what was broken off is played again, from its reset on, with its own seed
     assert runner.run().n_ticks == 5
     assert env.resets == [3, 4, 4]
-    assert [(e.index, e.steps) for e in runner.episodes] == [(0, 4), (1, 4)]
+    assert [(e.index, e.steps) for e in runner.robot.episodes] == [(0, 4), (1, 4)]
 
 
 @settings(deadline=None)
@@ -201,7 +201,7 @@ def test_every_reset_is_an_episode_that_is_played(
             begun.append(len(robot.steps) - 1)
         return len(robot.steps) - begun[-1] >= lengths[robot.resets[-1]]
 
-    runner = SimRunner(
+    runner = sim_runner(
         lambda: ArmEnvironment(robot, kinematic, judge=judge),
         rate_hz=0,
         episodes=len(lengths),
@@ -210,14 +210,14 @@ def test_every_reset_is_an_episode_that_is_played(
     runner.activate()
     first = runner.run(max_ticks=stop_after)
     runner.deactivate()
-    open_ones = len(robot.resets) - len(runner.episodes)
+    open_ones = len(robot.resets) - len(runner.robot.episodes)
     assert open_ones in (0, 1)
     runner.activate()
     result = runner.run()
     runner.deactivate()
     assert len(robot.resets) == len(lengths) + open_ones
     assert sorted(set(robot.resets)) == list(range(len(lengths)))
-    assert [e.steps for e in runner.episodes] == [min(n, max_steps or n) for n in lengths]
+    assert [e.steps for e in runner.robot.episodes] == [min(n, max_steps or n) for n in lengths]
     assert first.n_ticks + result.n_ticks == len(robot.resets) + len(robot.steps)
 
 
@@ -256,8 +256,8 @@ def test_an_episode_may_end_with_its_skill(make_runner: Make, env: Any) -> None:
     ticks, ended = play(runner, [Act(joints(0.1))], 2)
     assert ended[0].error is None
     assert [tick.truncated for tick in ticks] == [False, True]
-    assert [(e.steps, e.success, e.truncated) for e in runner.episodes] == [(2, False, True)]
-    runner.begin_episode(41)
+    assert [(e.steps, e.success, e.truncated) for e in runner.robot.episodes] == [(2, False, True)]
+    runner.robot.begin_episode(41)
     runner.tick()
     assert env.resets == [0, 41]
     assert runner.tick().truncated is False  # the new episode had no skill yet
@@ -276,7 +276,7 @@ def test_a_world_that_fails_ends_the_goal_and_is_reset(make_runner: Make, env: A
     env.fails = False
     runner.tick()
     assert env.resets == [5, 5]
-    assert runner.episodes == []
+    assert runner.robot.episodes == []
     env.fails = True
     with pytest.raises(EnvironmentFailed):  # nobody asked it for anything: it is broken
         runner.tick()
@@ -339,7 +339,7 @@ def test_an_action_outside_the_envelope_is_withheld_and_recorded(
     assert env.steps[1][0]["shoulder_pan"] == 0.5
     assert [t.action_applied for t in ticks[:2]] == [False, True]
     assert "outside" in ticks[0].safety_violations[0]
-    assert len(runner.violations) == 2
+    assert len(runner.slot.violations) == 2
     assert (ended[0].data["withheld"], ended[0].data["clamped"]) == (1, 1)
 
 
@@ -549,8 +549,8 @@ def test_navigating_the_real_simulator_and_filming_it(
 ) -> None:
     import imageio_ffmpeg
 
-    from vram_arbiter.runner.recording.video import Recorder
-    from vram_arbiter.runner.sim.sim_runner import SimRunner
+    from vram_arbiter.runner.recording.video import VideoRecorder
+    from vram_arbiter.runner.sim.robot import sim_runner
     from vram_arbiter.runner.sim.worlds import so101_world
     from vram_arbiter.runner.skills.navigate import Navigate
     from vram_arbiter.schemas.manifest import load_manifest
@@ -559,8 +559,8 @@ def test_navigating_the_real_simulator_and_filming_it(
     env, scene = world.arm, world.scene
     assert env is not None
     assert scene is not None
-    recorder = Recorder(tmp_path / "episode.mp4", fps=10)
-    runner = SimRunner(world.make, cameras=("front",), seed=1, rate_hz=0, recorder=recorder)
+    recorder = VideoRecorder(tmp_path / "episode.mp4", fps=10)
+    runner = sim_runner(world.make, cameras=("front",), seed=1, rate_hz=0, recorder=recorder)
     skill = Navigate(load_manifest(navigate_manifest), scene, period_s=1 / 30)
     ended: list[SkillEnded] = []
     try:
@@ -608,4 +608,4 @@ def test_a_scene_that_takes_long_to_build_misses_no_deadline(
     runner.activate()
     result = runner.run()
     assert (result.n_ticks, result.budget_violations) == (8, 0)
-    assert [episode.steps for episode in runner.episodes] == [3, 3]
+    assert [episode.steps for episode in runner.robot.episodes] == [3, 3]

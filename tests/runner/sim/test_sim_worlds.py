@@ -285,7 +285,7 @@ def test_a_served_policy_is_started_anew_for_every_seed_and_released(
     tmp_path: Path, run_async: Any
 ) -> None:
     from vram_arbiter.runner.sim.benchmark import Benchmark, SkillContestant
-    from vram_arbiter.runner.sim.sim_runner import SimRunner
+    from vram_arbiter.runner.sim.robot import sim_runner
     from vram_arbiter.runner.sim.worlds import makers_of, world_of
     from vram_arbiter.schemas.manifest import Kind, parse_manifest
 
@@ -294,7 +294,7 @@ def test_a_served_policy_is_started_anew_for_every_seed_and_released(
     world = world_of(POINT, env_config=tmp_path / "world.yaml", render=False)
     makers = makers_of(world, {"test/point-seek": endpoint}, None, period_s=1 / 30, wait_s=60.0)
     manifest = parse_manifest(MANIFEST + 'default_prompt: "go there"\n')
-    runner = SimRunner(world.make, rate_hz=0, ends_with_skill=True)
+    runner = sim_runner(world.make, rate_hz=0, ends_with_skill=True)
 
     async def scenario() -> None:
         sidecar = Sidecar()

@@ -1,0 +1,280 @@
+"""Place for the one skill that has the robot, with the safety gate of its goal.
+
+Everything runs on the control thread. The event loop may read `progress` at any time: it is
+replaced whole. Must not know the robot, the rate or a socket.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from vram_arbiter.runner.control.clock import Clock
+from vram_arbiter.runner.control.follow import GoalFollower
+from vram_arbiter.runner.control.robot import StaleInput
+from vram_arbiter.runner.protocols import (
+    Act,
+    Done,
+    Goal,
+    GoalData,
+    Hold,
+    Progress,
+    SafetyGate,
+    SkillEnded,
+    Stepped,
+)
+from vram_arbiter.schemas.errors import InternalError, LimitExceeded, ModelError, VramError
+from vram_arbiter.schemas.runtime.telemetry import meters
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.schemas.world import Action, WorldState
+
+log = logging.getLogger(__name__)
+
+VIOLATIONS_KEPT = 256
+WITHHELD_IN_A_ROW_MAX = 15  # half a second of refused actions: the policy is lost, the goal fails
+
+
+@dataclass(slots=True)
+class Decision:
+    """Action of one tick, and what was wrong on the way to it."""
+
+    action: Action | None = None
+    inference_ms: float = 0.0
+    safety_ms: float = 0.0
+    chunk_index: int | None = None
+    violations: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts of a goal's actions and chunks, or of a whole run's."""
+
+    withheld: int = 0
+    clamped: int = 0
+    prefetch_hits: int = 0
+    prefetch_misses: int = 0
+
+    def count_chunk(self, in_time: bool) -> None:
+        if in_time:
+            self.prefetch_hits += 1
+        else:
+            self.prefetch_misses += 1
+
+    def as_data(self) -> GoalData:
+        """Return the counts for a result; chunks only where one followed another."""
+        data: GoalData = {"withheld": self.withheld, "clamped": self.clamped}
+        if chunks := self.prefetch_hits + self.prefetch_misses:
+            data["prefetch"] = {
+                "hits": self.prefetch_hits,
+                "misses": self.prefetch_misses,
+                "hit_rate": self.prefetch_hits / chunks,
+            }
+        return data
+
+
+@dataclass(slots=True)
+class _Active:
+    skill: Stepped
+    goal: Goal
+    on_end: Callable[[SkillEnded], None]
+    gate: SafetyGate
+    ticks: int = 0
+    withheld_in_a_row: int = 0
+    late_in_a_row: int = 0
+    was_late: bool = False  # the action before
+    tally: Tally = field(default_factory=Tally)
+    detail: str = ""
+
+    def account(self) -> GoalData:
+        return {"ticks": self.ticks, **self.tally.as_data()}
+
+
+class SkillSlot:
+    """Asks the active skill for an action, checks it, and ends the goal on success or failure."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._active: _Active | None = None
+        self.follower = GoalFollower()
+        self.progress = Progress(0.0, "idle")
+        self.violations: deque[str] = deque(maxlen=VIOLATIONS_KEPT)
+        self.total = Tally()
+        self.goals_by_skill: dict[str, int] = {}
+        self.traceparent: str | None = None  # of the active goal; its ticks join that trace
+        self.labels: dict[str, str] = {}  # of measurements: the active goal's skill
+
+    @property
+    def skill(self) -> Stepped | None:
+        return None if self._active is None else self._active.skill
+
+    @property
+    def busy(self) -> bool:
+        return self._active is not None
+
+    # -- begin and end
+    def begin(
+        self, skill: Stepped, goal: Goal, on_end: Callable[[SkillEnded], None], gate: SafetyGate
+    ) -> None:
+        """Give the robot to a skill."""
+        self._active = _Active(skill, goal, on_end, gate)
+        key = str(skill.key)
+        self.goals_by_skill[key] = self.goals_by_skill.get(key, 0) + 1
+        self.traceparent, self.labels = goal.traceparent, {telemetry.ATTR_SKILL: goal.rskill_id}
+        self.progress = Progress(0.0, "running")
+
+    def take_back(self) -> GoalData:
+        """Take the robot from the skill and return the counts so far. Repeatable."""
+        active = self._vacate()
+        self.progress = Progress(0.0, "idle")
+        if active is None:
+            return {}
+        self.follower.goal_ended(active.goal, None)
+        return active.account()
+
+    def end(self, ended: SkillEnded) -> None:
+        """End the active goal, if there is one, and tell its owner."""
+        if (active := self._vacate()) is None:
+            return
+        fraction = 1.0 if ended.error is None else self.progress.fraction
+        self.progress = Progress(fraction, "ended")
+        full = SkillEnded({**active.account(), **ended.data}, ended.error)
+        self.follower.goal_ended(active.goal, full)
+        active.on_end(full)
+
+    def _vacate(self) -> _Active | None:
+        active, self._active = self._active, None
+        if active is not None:
+            self.traceparent, self.labels = None, {}
+        return active
+
+    def tick_over(self) -> None:
+        """Count the tick that just ended."""
+        if self._active is not None:
+            self._active.ticks += 1
+
+    # -- one tick
+    def decide(self, world: WorldState) -> Decision:
+        """Ask the active skill for this tick's action and pass it through the gate."""
+        decision = Decision()
+        if (active := self._active) is None:
+            return decision
+        limit = active.goal.max_ticks
+        if limit is not None and active.ticks >= limit:
+            problem = f"not done within {limit} ticks"
+            error = LimitExceeded(problem, details={"limit": "max_ticks"})
+            self.end(SkillEnded({"truncated": True}, error))
+            return decision
+        self.follower.goal_asked(active.goal)
+        asked_s = self._clock.now_s()
+        try:
+            with tracing.span(telemetry.SPAN_INFERENCE):
+                outcome = active.skill.step(world)
+        except VramError as error:
+            decision.violations = (f"{error.code}: {error.message}",)
+            self.violations.append(decision.violations[0])
+            self.end(SkillEnded({}, error))
+            return decision
+        except Exception as error:
+            log.exception("skill %s failed", active.goal.rskill_id)
+            problem = f"the skill failed: {type(error).__name__}: {error}"
+            self.end(SkillEnded({}, InternalError(problem)))
+            return decision
+        decision.inference_ms = (self._clock.now_s() - asked_s) * 1e3
+        meters.measure(telemetry.METRIC_INFERENCE, decision.inference_ms, self.labels)
+        match outcome:
+            case Act(action=action, chunk_index=chunk_index, prefetched=prefetched):
+                decision.chunk_index = chunk_index
+                if prefetched is not None:
+                    self._count_chunk(active, prefetched)
+                self._check(active, action, world, decision)
+            case Hold(reason=reason):
+                active.detail = reason
+            case Done(data=data):
+                self.end(SkillEnded(dict(data)))
+        self._show_progress(active)
+        return decision
+
+    def _show_progress(self, active: _Active) -> None:
+        if self._active is active:
+            fraction = min(max(active.skill.fraction, 0.0), 1.0)
+            self.progress = Progress(fraction, "running", active.ticks, active.detail)
+
+    def _count_chunk(self, active: _Active, in_time: bool) -> None:
+        tracing.event(telemetry.EVENT_PREFETCH_HIT if in_time else telemetry.EVENT_PREFETCH_MISS)
+        active.tally.count_chunk(in_time)
+        self.total.count_chunk(in_time)
+
+    def _check(
+        self, active: _Active, action: Action, world: WorldState, decision: Decision
+    ) -> None:
+        checked_s = self._clock.now_s()
+        with tracing.span(telemetry.SPAN_SAFETY):
+            decision.action, problems = active.gate.check(action, world)
+        decision.safety_ms = (self._clock.now_s() - checked_s) * 1e3
+        decision.violations = problems
+        self.violations.extend(problems)
+        if problems:
+            meters.count(telemetry.METRIC_SAFETY_VIOLATIONS, self.labels, len(problems))
+        if decision.action is None:
+            self._refused(active, problems[0])
+        else:
+            self._allowed(active, clamped=bool(problems))
+
+    def _allowed(self, active: _Active, *, clamped: bool) -> None:
+        active.withheld_in_a_row = 0
+        if not active.was_late:
+            active.late_in_a_row = 0
+        active.was_late = False
+        active.tally.clamped += clamped
+        self.total.clamped += clamped
+        active.detail = ""
+
+    def _refused(self, active: _Active, problem: str) -> None:
+        self._withhold(active, problem)
+        active.withheld_in_a_row += 1
+        if active.withheld_in_a_row >= WITHHELD_IN_A_ROW_MAX:
+            error = ModelError(
+                f"{active.withheld_in_a_row} actions in a row were withheld: {problem}",
+                hint="the skill commands what this robot's envelope forbids",
+            )
+            self.end(SkillEnded({}, error))
+
+    # -- actions that never reach the motors
+    def input_stale(self, stale: StaleInput) -> Decision:
+        """Hold instead of asking the skill, and fail the goal once `stale` carries an error."""
+        if (active := self._active) is not None:
+            if stale.first:
+                self.violations.append(stale.problem)
+            self._withhold(active, stale.problem)
+            if stale.error is not None:
+                self.end(SkillEnded({}, stale.error))
+        return Decision(violations=(stale.problem,))
+
+    def came_too_late(self) -> None:
+        """Count an action that the deadline policy withheld.
+
+        A skill does not notice that its actions are not sent: it would play to its end and report
+        success. Too many in a row therefore fail the goal.
+        """
+        if (active := self._active) is None:
+            return
+        active.was_late = True
+        active.late_in_a_row += 1
+        self._withhold(active, "it came too late")
+        if active.late_in_a_row >= WITHHELD_IN_A_ROW_MAX:
+            error = LimitExceeded(
+                f"{active.late_in_a_row} actions in a row came too late and were withheld",
+                hint="lower rate_hz, or look at what makes the ticks long",
+                details={"limit": "deadline"},
+            )
+            self.end(SkillEnded({}, error))
+
+    def _withhold(self, active: _Active, reason: str) -> None:
+        tracing.event(telemetry.EVENT_ACTION_WITHHELD, reason=reason)
+        meters.count(telemetry.METRIC_WITHHELD, self.labels)
+        active.tally.withheld += 1
+        self.total.withheld += 1
+        active.detail = f"withheld: {reason}"
