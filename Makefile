@@ -1,4 +1,4 @@
-# Every target sets up what it needs first; see .ci/setup. `make` alone says what there is.
+# Every target sets up what it needs first; see .ci/setup. `make` alone lists the targets.
 
 SEED ?= 0
 ARBITER ?= on
@@ -8,23 +8,24 @@ PREFIX ?= /opt/vram-arbiter
 DESTDIR ?=
 ARGS ?=
 QUICK ?=
-# How long `make chaos` storms.
+# Seconds of `make chaos`.
 SECONDS ?= 300
-# How many histories `make nightly` walks, of all machines together; one machine alone.
+# Histories of `make nightly`, of all rule machines together; MACHINE: one of them alone.
 HISTORIES ?= 100000
 MACHINE ?=
-# How many mutants `make mutation` tries; 0: all.
+# Mutants of `make mutation`; 0: all.
 SAMPLE ?= 300
 
 BIN := .venv/bin
 CORE := .venv-core/bin
-# The tools of the tests find `tests.support` from here.
+# Test tools import `tests.support` from here.
 TOOL := PYTHONPATH=. $(BIN)/python
-# Two workers: more only make the tests of timing fight for the cores of a small machine.
+# Two workers: with more, tests of timing compete for the cores of a small machine.
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core demo test test-core nightly mutation lint format chaos sim bench schemas install-units clean
+.PHONY: help setup setup-core demo test test-core nightly mutation lint format chaos sim bench \
+	schemas install-units clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -45,13 +46,14 @@ test: setup ## the whole product; ARGS goes to pytest
 test-core: setup-core ## the base install alone, in seconds
 	$(CORE)/pytest -q -n $(WORKERS) --dist loadfile -m "not heavy and not e2e and not gpu" $(ARGS)
 
-nightly: setup ## the engine's rule machines, far and at random, on all cores: HISTORIES=100000 MACHINE=leases SEED=n
-	$(TOOL) tests/nightly/nightly_run.py --histories $(HISTORIES) $(if $(MACHINE),--machine $(MACHINE)) $(if $(filter-out 0,$(SEED)),--seed $(SEED)) $(ARGS)
+nightly: setup ## random histories of the engine: HISTORIES=100000 MACHINE=leases SEED=n
+	$(TOOL) tests/nightly/nightly_run.py --histories $(HISTORIES) \
+		$(if $(MACHINE),--machine $(MACHINE)) $(if $(filter-out 0,$(SEED)),--seed $(SEED)) $(ARGS)
 
-mutation: setup ## small changes in arbiter/core that no test of the core sees: SAMPLE=300 of them by chance, SEED=n
+mutation: setup ## small changes in arbiter/core that no core test notices: SAMPLE=300 SEED=n
 	$(TOOL) tests/mutation/mutation_run.py --sample $(SAMPLE) --seed $(SEED) $(ARGS)
 
-lint: setup ## style, types and who may import whom
+lint: setup ## style, types and import layers
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -61,21 +63,23 @@ format: setup ## rewrite the code in the project's style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-chaos: setup ## kill, stop and starve real processes at every step of a switch: SECONDS=300 SEED=0
+chaos: setup ## kill, stop and starve real processes at each step: SECONDS=300 SEED=0
 	$(TOOL) tests/chaos/storm.py --seconds $(SECONDS) --seed $(SEED) --out out/chaos
 
-sim: setup ## the daemon under simulated faults: SEED=n one run with its story, SEEDS=1000 many on all cores
-	$(TOOL) tests/sim/sim_run.py $(if $(SEEDS),--seeds $(SEEDS) --out out/sim/sums.json,--seed $(SEED)) $(ARGS)
+sim: setup ## the daemon under simulated faults: SEED=n one run, SEEDS=1000 many on all cores
+	$(TOOL) tests/sim/sim_run.py \
+		$(if $(SEEDS),--seeds $(SEEDS) --out out/sim/sums.json,--seed $(SEED)) $(ARGS)
 
-bench: setup ## how fast it is, beside bare ZeroMQ and Redis locks: QUICK=1 takes less of everything
+bench: setup ## latencies beside bare ZeroMQ and Redis locks: QUICK=1 is shorter
 	$(TOOL) tests/bench/run.py $(if $(QUICK),--quick) $(ARGS)
 
-schemas: setup ## write the JSON Schemas anew after a model changed
+schemas: setup ## write the JSON Schemas after a model changed
 	$(BIN)/python -m vram_arbiter.schemas export schemas/json
 
-install-units: ## copy the systemd units into the system (docs/systemd.md): PREFIX=/opt/vram-arbiter DESTDIR=
+install-units: ## copy the systemd units (docs/systemd.md): PREFIX=/opt/vram-arbiter DESTDIR=
 	@bash .ci/install-units "$(PREFIX)" "$(DESTDIR)"
 
 clean: ## remove environments, caches and outputs
-	rm -rf .venv .venv-core build dist out .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage
+	rm -rf .venv .venv-core build dist out .coverage
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

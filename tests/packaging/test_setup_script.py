@@ -56,7 +56,7 @@ def test_without_uv_and_python_it_says_what_to_install(project: Path) -> None:
     )  # a shim that refuses
     result = set_up(project, "core")
     assert result.returncode == 1
-    assert "neither uv nor a Python that runs was found" in result.stderr
+    assert "neither uv nor a working Python was found" in result.stderr
     assert "apt-get install python3" in result.stderr
 
 

@@ -262,7 +262,7 @@ def test_the_prefix_takes_the_place_of_the_usual_one(installed: Path) -> None:
 def test_the_installer_refuses_what_cannot_work(tmp_path: Path) -> None:
     assert install().returncode != 0
     assert "absolute path" in install("relative", str(tmp_path)).stderr
-    assert "install the product there first" in install(str(tmp_path / "nothing")).stderr
+    assert "install the product first" in install(str(tmp_path / "nothing")).stderr
     # A Python of pyenv or uv is below the home folder of its user; systemd said only 203/EXEC.
     programs = tmp_path / "prefix" / "bin"
     programs.mkdir(parents=True)
