@@ -1,9 +1,11 @@
-"""`vramctl demo`: the whole loop, *find → navigate → grab*, with six real processes inside an 8 GiB budget.
+"""`vramctl demo`: the loop *find → navigate → grab* with six real processes inside 8 GiB.
 
-It starts the programs, watches the card, and judges by three witnesses: the simulator's ground truth, the scene VLM, and the reasoner's
-own end. With `--arbiter off` the same programs run without the arbiter and show the out-of-memory that the product exists for.
+It starts the programs, watches the GPU, and judges by three witnesses: the simulator's ground
+truth, the scene VLM, and the reasoner's own end. With `--arbiter off` the same programs run without
+the arbiter and show the out-of-memory that the product exists for.
 """
 
+import argparse
 import asyncio
 import contextlib
 import json
@@ -15,10 +17,9 @@ import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-
+from vram_arbiter.clients.cli import arguments
 from vram_arbiter.clients.cli.demo_display import Display
 from vram_arbiter.clients.cli.demo_programs import Program, Programs
 from vram_arbiter.clients.cli.demo_report import (
@@ -34,12 +35,17 @@ from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient, SceneVlmClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.schemas import fakegpu
-from vram_arbiter.schemas.errors import RunnerUnreachable, SidecarUnavailable, VramError
-from vram_arbiter.schemas.runtime import terminal
+from vram_arbiter.schemas.errors import RunnerUnreachable, SidecarUnavailable
 from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
 from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.units import parse_bytes
 
+DESCRIPTIONS = {
+    "demo": "Run find, navigate, grab on a simulated SO-101 inside an 8 GiB GPU budget. Exits 0 if "
+    "the demo shows what it promises (with the arbiter: completed without any out-of-memory; "
+    "without: an out-of-memory), 1 if not."
+}
+SEED_MAX = 2**31 - 1
 SIDECARS = {"detector": "so101-detector", "scene-vlm": "so101-scene-vlm", "grab": "so101-grab"}
 BUDGET = "8GiB"
 LOAD_BYTES_PER_S = 2_500_000_000  # of the simulated card: about what safetensors' load_file reaches from the page cache
@@ -61,56 +67,52 @@ class Watch:
     capacity_bytes: int = 0
 
 
-def demo(
-    seed: Annotated[int, typer.Option(help="Which episode: objects, places, light.")] = 0,
-    arbiter: Annotated[
-        str, typer.Option(help="on | off: without it the same loop runs out of memory.")
-    ] = "on",
-    gpu: Annotated[
-        str, typer.Option(help="fake:SIZE, or nvml on a machine with an NVIDIA card.")
-    ] = f"fake:{BUDGET}",
-    out: Annotated[
-        Path, typer.Option(help="Folder for summary.json, timeline.png, episode.mp4 and the logs.")
-    ] = Path("out/demo"),
-) -> None:
-    """Run find → navigate → grab on a simulated SO-101 inside an 8 GiB GPU budget.
+def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
+    parser.add_argument(
+        "--seed",
+        type=arguments.count(0, SEED_MAX),
+        default=0,
+        help="which episode: objects, places, light (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--arbiter",
+        choices=("on", "off"),
+        default="on",
+        help="off: without it the same loop runs out of memory (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--gpu",
+        default=f"fake:{BUDGET}",
+        help="fake:SIZE, or nvml on a machine with an NVIDIA GPU (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/demo"),
+        help="folder for summary.json, timeline.png, episode.mp4 and logs (default: %(default)s)",
+    )
 
-    Exit codes: 0 the demo showed what it promises (with the arbiter: completed without any out-of-memory; without: an
-    out-of-memory), 1 it did not, 2 wrong usage.
+
+def run(args: argparse.Namespace) -> int:
+    """Run the demo. Returns 0 if it shows what it promises.
+
+    With the arbiter: completed without an out-of-memory. Without: an out-of-memory.
     """
-    if arbiter not in ("on", "off"):
-        raise typer.BadParameter(f"--arbiter is on or off, not {arbiter!r}")
-    if gpu != "nvml" and not gpu.startswith("fake:"):
-        raise typer.BadParameter(f"--gpu is nvml or fake:SIZE, not {gpu!r}")
-    if gpu == "nvml" and arbiter == "off":
-        raise typer.BadParameter(
-            "without the arbiter nobody reads a real card; use --gpu fake:8GiB with --arbiter off"
+    if args.gpu != "nvml" and not args.gpu.startswith("fake:"):
+        args.parser.error(f"--gpu: expected nvml or fake:SIZE, got {args.gpu!r}")
+    arbiter = args.arbiter == "on"
+    if args.gpu == "nvml" and not arbiter:
+        args.parser.error(
+            "without the arbiter no program reads a real GPU; use --gpu fake:8GiB with --arbiter off"
         )
-    try:
-        need(
-            "the demo",
-            "torch",
-            "lerobot",
-            "transformers",
-            "mujoco",
-            "cv2",
-            "matplotlib",
-            extra="all",
-        )
-        summary = asyncio.run(_demo(seed, arbiter == "on", gpu, out))
-    except VramError as error:
-        terminal.complain("vramctl demo", error)
-        raise typer.Exit(1) from None
-    typer.echo(
-        json.dumps({key: value for key, value in summary.items() if key != "loads"}, indent=2)
-    )
-    typer.echo(f"written: {out}/summary.json, {out}/timeline.png, {out}/episode.mp4")
-    shown = (
-        (summary["completed"] and not summary["oom_events"])
-        if arbiter == "on"
-        else summary["oom_events"] > 0
-    )
-    raise typer.Exit(0 if shown else 1)
+    packages = ("torch", "lerobot", "transformers", "mujoco", "cv2", "matplotlib")
+    need("the demo", *packages, extra="all")
+    out: Path = args.out
+    summary = asyncio.run(_demo(args.seed, arbiter, args.gpu, out))
+    print(json.dumps({key: value for key, value in summary.items() if key != "loads"}, indent=2))
+    print(f"written: {out}/summary.json, {out}/timeline.png, {out}/episode.mp4")
+    oom = summary["oom_events"] > 0
+    return 0 if (summary["completed"] and not oom if arbiter else oom) else 1
 
 
 async def _demo(seed: int, arbiter: bool, gpu: str, out: Path) -> dict[str, Any]:
@@ -201,7 +203,7 @@ async def _boot(
     out: Path,
 ) -> AsyncClient | None:
     """Start everything and wait until each answers. The arbiter's client, if there is an arbiter."""
-    typer.echo(
+    print(
         f"starting {'the arbiter, ' if arbiter else ''}three sidecars and the runner (imports take a while) …"
     )
     without = [] if arbiter else ["--no-arbiter"]

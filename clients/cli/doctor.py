@@ -1,5 +1,6 @@
 """`vramctl doctor`: checks the installation, the daemon and its GPUs, and changes nothing."""
 
+import argparse
 import json
 import os
 from dataclasses import asdict, dataclass
@@ -7,11 +8,28 @@ from pathlib import Path
 from typing import Any
 
 import vram_arbiter
-from vram_arbiter.clients.cli import quick
+from vram_arbiter.clients.cli import arguments
+from vram_arbiter.clients.cli.replies import NO, OK, UNREACHABLE
+from vram_arbiter.clients.net import request
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.runtime.version import version
 from vram_arbiter.schemas.sizes import format_bytes
+
+DESCRIPTIONS = {
+    "doctor": "Check this installation: where it lies, the endpoint, the daemon's health, its "
+    "GPUs. Exits 0 if all is well, 1 on any finding (a journal that cannot be written, a drained "
+    "daemon, a GPU that cannot be read or is under pressure), 3 if the arbiter cannot be reached."
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
+    arguments.add_json(parser)
+    arguments.add_endpoint(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    return doctor(as_json=args.as_json, endpoint=args.endpoint)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +54,8 @@ def doctor(*, as_json: bool, endpoint: str | None) -> int:
         for finding in findings:
             print(printable(f"{marks[finding.ok]} {finding.what:<18} {finding.says}"))
     if not reachable:
-        return quick.UNREACHABLE
-    return quick.NO if any(finding.ok is False for finding in findings) else quick.OK
+        return UNREACHABLE
+    return NO if any(finding.ok is False for finding in findings) else OK
 
 
 def _origin() -> Finding:
@@ -78,8 +96,8 @@ def _memory_of(nvml: Any, card: Any) -> str:
 
 def _arbiter(endpoint: str) -> tuple[bool, list[Finding]]:
     try:
-        status = quick.ask("status", {}, endpoint)
-    except quick.Unreachable as error:
+        status = request.ask("status", {}, endpoint)
+    except request.Unreachable as error:
         return False, [Finding("daemon", False, f"{error} ({error.hint})")]
     if not status.get("ok"):
         return True, [Finding("daemon", False, str(status["error"]["message"]))]

@@ -1,8 +1,9 @@
-"""`vramctl history`: what happened, with its reasons; newest events, from a number or a time on, of some kinds or consumers, or live.
+"""`vramctl history`: events with their reasons, by number, time, kind or consumer, or live.
 
 The daemon filters by kind; consumers and times are filtered here, page by page.
 """
 
+import argparse
 import asyncio
 import contextlib
 import datetime
@@ -13,13 +14,67 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vram_arbiter.clients.cli import quick, text
-from vram_arbiter.clients.cli.quick import ENVELOPE, Message
+from vram_arbiter.clients.cli import arguments, text
+from vram_arbiter.clients.cli.replies import ENVELOPE, answer
+from vram_arbiter.clients.net import request
+from vram_arbiter.clients.net.request import Message
 
 LIMIT = 50
 PAGE = 2000  # events in one reply; more would not fit a message
 GAP_MAX = 4000  # numbers that the daemon may leave out after a crash
 NEVER = 1 << 62  # no event has a number beyond it
+
+DESCRIPTIONS = {
+    "history": "List what happened: grants, evictions, verdicts, with their reasons. With --follow "
+    "--json, one JSON object a line."
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
+    parser.add_argument(
+        "-n",
+        "--limit",
+        type=arguments.count(1, 5000),
+        default=LIMIT,
+        help="at most this many events (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--after",
+        type=arguments.count(0, NEVER),
+        help="the first events after this number (default: the newest)",
+    )
+    parser.add_argument(
+        "--since",
+        type=since,
+        dest="since_wall_s",
+        metavar="TIME",
+        help="since 90s, 10m, 2h or 1d ago, 14:30, or '2026-11-21 14:30'",
+    )
+    parser.add_argument(
+        "-c", "--consumer", action="append", default=[], help="only this consumer; repeatable"
+    )
+    parser.add_argument("--kind", action="append", default=[], help="only this kind; repeatable")
+    parser.add_argument(
+        "-f", "--follow", action="store_true", help="then each further event, until Ctrl-C"
+    )
+    arguments.add_json(parser)
+    arguments.add_endpoint(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    wanted = Wanted(args.kind, args.consumer, args.since_wall_s, args.limit, args.after)
+    if args.follow:
+        return asyncio.run(follow(wanted, as_json=args.as_json, endpoint=args.endpoint))
+    return history(wanted, as_json=args.as_json, endpoint=args.endpoint)
+
+
+def since(written: str) -> float:
+    """Argparse type of `--since`: `parse_since` from this moment."""
+    try:
+        return parse_since(written, time.time())
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
 
 _AGO = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|d)")
 _UNITS = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
@@ -40,7 +95,7 @@ def parse_since(written: str, now_wall_s: float) -> float:
             return at if at <= now_wall_s else at - _UNITS["d"]
     with contextlib.suppress(ValueError):
         return datetime.datetime.fromisoformat(written.strip()).timestamp()
-    raise ValueError(f"{written!r} is no time; write 90s, 10m, 2h, 1d, 14:30 or 2026-11-21 14:30")
+    raise ValueError(f"expected 90s, 10m, 2h, 1d, 14:30 or '2026-11-21 14:30', got {written!r}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +128,7 @@ def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = Non
         return collect(wanted, where)
 
     hidden = ENVELOPE | {"epoch"}
-    return quick.answer(
+    return answer(
         "history",
         {},
         endpoint=endpoint,
@@ -85,7 +140,7 @@ def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = Non
 
 
 def collect(wanted: Wanted, endpoint: str | None) -> Message:
-    """Page forward: to the end, keeping the tail, or (`after`) until there are enough. Raises quick.Unreachable."""
+    """Page forward: to the end, keeping the tail, or (`after`) until there are enough. Raises `Unreachable`."""
     reply = _page(NEVER, 1, (), endpoint)
     if not reply.get("ok"):
         return reply
@@ -117,7 +172,7 @@ def _forward(wanted: Wanted, after: int, endpoint: str | None) -> Message:
 
 
 def _page(after: int, limit: int, kinds: Sequence[str], endpoint: str | None) -> Message:
-    return quick.ask("history", {"after": after, "limit": limit, "kinds": list(kinds)}, endpoint)
+    return request.ask("history", {"after": after, "limit": limit, "kinds": list(kinds)}, endpoint)
 
 
 def _start(wanted: Wanted, last_seq: int, endpoint: str | None) -> int:
@@ -155,7 +210,7 @@ async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None 
             print(json.dumps(event) if as_json else text.event_line(event), flush=True)
 
     client = AsyncClient(
-        endpoint, name="vramctl history", role="observer", connect_timeout_s=quick.TIMEOUT_S
+        endpoint, name="vramctl history", role="observer", connect_timeout_s=request.TIMEOUT_S
     )
     live: asyncio.Queue[Message] = asyncio.Queue()
 
@@ -189,8 +244,3 @@ async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None 
                     tell(event)
         finally:
             listening.cancel()
-
-
-def since_now(written: str) -> float:
-    """`parse_since` from this very moment."""
-    return parse_since(written, time.time())

@@ -6,6 +6,7 @@ nearest ancestor with a lease. A program that leaves the tree (it daemonizes) or
 A program cannot unload, it can only end. So it counts as one long use, and what a revoke does is decided here (`ON_REVOKE`).
 """
 
+import argparse
 import asyncio
 import contextlib
 import os
@@ -16,15 +17,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import ValidationError
+
 from vram_arbiter.clients import cuda
 from vram_arbiter.clients._protocol import traces
+from vram_arbiter.clients.cli import arguments
 from vram_arbiter.clients.cli.signals import Forwarding
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.runtime.printable import printable
-from vram_arbiter.schemas.sizes import format_bytes
+from vram_arbiter.schemas.sizes import format_bytes, parse_bytes
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 PRIORITY = 40
@@ -34,6 +38,14 @@ ON_REVOKE: tuple[OnRevoke, ...] = ("priority", "term", "pin")
 """priority: end the program for a request of a higher priority, or for an operator; others wait until it ends. term: end it for any
 request, and when the arbiter stays away. pin: never."""
 
+DESCRIPTIONS = {
+    "run": "Run a program that knows nothing of the arbiter under a lease: vramctl run --vram 5GiB "
+    "-- python train.py. The program sees VRAM_LEASE_ID, VRAM_LEASE_TOKEN and VRAM_LEASE_GPU, and "
+    "CUDA_VISIBLE_DEVICES unless that was set; signals are passed on. Two programs that do not fit "
+    "together run one after the other. At the end the measured peak is printed. Exits with the "
+    "program's code (128+n if signal n ended it), 1 if no lease was granted, 3 without an arbiter, "
+    "126 or 127 if the program cannot be started."
+}
 PATIENCE_S = 1.0
 FIRST_LOOK_S, LOOK_S = 0.2, 1.0  # the arbiter reads the GPU once a second
 NOT_FOUND, NOT_STARTED = 127, 126  # as shells have it
@@ -57,6 +69,77 @@ class RunSpec:
     def consumer(self) -> str:
         """`--name`, or the program's, which may hold any byte and be of any length."""
         return self.name or printable(Path(self.command[0]).name)[:NAME_MAX_CHARS] or "program"
+
+
+def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
+    parser.add_argument("--vram", required=True, type=_bytes, help="bytes it needs, e.g. 5GiB")
+    parser.add_argument("--name", help="consumer's name (default: the program's)")
+    parser.add_argument("--gpu", default="any", help="uuid, index or any (default: any)")
+    parser.add_argument(
+        "--priority",
+        type=arguments.count(0, 100),
+        default=PRIORITY,
+        help="below the 50 of other leases, so that a robot's models go first (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--wait",
+        type=arguments.at_least(0.0),
+        metavar="SECONDS",
+        help="give up after so many seconds (default: never)",
+    )
+    parser.add_argument("--exclusive", action="store_true", help="no other model on that GPU")
+    parser.add_argument("--pin", action="store_true", help="never end the program to make room")
+    parser.add_argument(
+        "--on-revoke",
+        choices=ON_REVOKE,
+        default="priority",
+        help="priority: end the program for a request of a higher priority or an operator, others "
+        "wait; term: end it for any request; pin: as --pin (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--grace",
+        type=arguments.at_least(0.0),
+        metavar="SECONDS",
+        help="from SIGTERM to SIGKILL (default: as long as the program takes)",
+    )
+    arguments.add_endpoint(parser)
+    parser.add_argument(
+        "command", nargs=argparse.REMAINDER, metavar="COMMAND", help="the program, after `--`"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    command = args.command[1:] if args.command[:1] == ["--"] else args.command
+    if not command:
+        args.parser.error("expected a program to run: vramctl run --vram 5GiB -- COMMAND")
+    if args.pin and args.on_revoke == "term":
+        args.parser.error("--pin and --on-revoke term exclude each other")
+    spec = RunSpec(
+        command,
+        args.name,
+        args.vram,
+        args.gpu,
+        args.priority,
+        args.wait,
+        args.exclusive,
+        "pin" if args.pin else args.on_revoke,
+        args.grace,
+    )
+    try:
+        lease_spec(spec)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        option = "--gpu" if problem["loc"] == ("gpu",) else "--name"
+        args.parser.error(f"{option}: {problem['msg']}, got {problem['input']!r}")
+    return asyncio.run(run_leased(spec, args.endpoint))
+
+
+def _bytes(written: str) -> int:
+    """Argparse type: a byte size such as 5GiB."""
+    try:
+        return parse_bytes(written)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def lease_spec(spec: RunSpec) -> LeaseSpec:

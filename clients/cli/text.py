@@ -1,6 +1,6 @@
 """How `vramctl` says things: replies of the arbiter as lines of text. Pure; sizes in GiB/MiB, times in seconds.
 
-It stands on the fast path: no pydantic, no rich, no typer here. Whatever a reply quotes is escaped (`schemas.runtime.printable`).
+It stands on the fast path: no pydantic, no rich here. Whatever a reply quotes is escaped (`schemas.runtime.printable`).
 """
 
 import time

@@ -1,22 +1,45 @@
 """`vramctl watch`: the status, live, with the newest events below; plain event lines where the output is no terminal."""
 
+import argparse
 import asyncio
 import contextlib
 import sys
 from collections import deque
 from typing import Any
 
-from vram_arbiter.clients.cli import quick, text
+from vram_arbiter.clients.cli import arguments, text
+from vram_arbiter.clients.cli.replies import OK
 from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.net.request import TIMEOUT_S
 
 REFRESH_S = 0.5
 """Between two readings of the status; every event refreshes at once as well."""
 
 
+DESCRIPTIONS = {
+    "watch": "Show leases and events live; plain lines of events where the output is not a "
+    "terminal. Ctrl-C ends it."
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
+    parser.add_argument(
+        "--events",
+        type=arguments.count(0, 200),
+        default=12,
+        help="events shown below the table (default: %(default)s)",
+    )
+    arguments.add_endpoint(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    return asyncio.run(watch(args.endpoint, args.events))
+
+
 async def watch(endpoint: str | None, events_shown: int) -> int:
     """Until Ctrl-C. Raises ArbiterUnreachable if nobody answers at first; later it waits for the arbiter to come back."""
     client = AsyncClient(
-        endpoint, name="vramctl watch", role="observer", connect_timeout_s=quick.TIMEOUT_S
+        endpoint, name="vramctl watch", role="observer", connect_timeout_s=TIMEOUT_S
     )
     async with client:
         with contextlib.suppress(asyncio.CancelledError):
@@ -25,7 +48,7 @@ async def watch(endpoint: str | None, events_shown: int) -> int:
             else:
                 async for event in client.subscribe():
                     print(text.event_line(event), flush=True)
-    return quick.OK
+    return OK
 
 
 async def _live(client: AsyncClient, events_shown: int) -> None:

@@ -21,7 +21,7 @@ import pytest
 
 from tests.support.fakegpu_check import check_log
 from tests.support.process import ArbiterProcess
-from vram_arbiter.clients.cli.quick import UNREACHABLE
+from vram_arbiter.clients.cli.replies import UNREACHABLE
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.runner import Goal as AcceptedGoal
 from vram_arbiter.clients.runner import RunnerClient

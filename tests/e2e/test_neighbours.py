@@ -16,7 +16,7 @@ from tests.support.fakegpu_check import check_log
 from tests.support.forkserver import Child, ForkServer
 from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
-from vram_arbiter.clients.cli.quick import UNREACHABLE
+from vram_arbiter.clients.cli.replies import UNREACHABLE
 from vram_arbiter.schemas import fakegpu
 
 pytestmark = pytest.mark.e2e

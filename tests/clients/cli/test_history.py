@@ -43,7 +43,7 @@ def test_times_as_people_write_them(written: str, ago_s: float) -> None:
 
 @pytest.mark.parametrize("written", ["", "yesterday", "10", "1010", "25:00", "-3s"])
 def test_what_is_no_time_says_what_may_be_written(written: str) -> None:
-    with pytest.raises(ValueError, match="write 90s, 10m"):
+    with pytest.raises(ValueError, match="expected 90s, 10m"):
         parse_since(written, NOON)
 
 
@@ -88,7 +88,7 @@ class Archive:
 @pytest.fixture
 def archive(monkeypatch: pytest.MonkeyPatch) -> Archive:
     made = Archive(9000)
-    monkeypatch.setattr(history.quick, "ask", made.ask)
+    monkeypatch.setattr(history.request, "ask", made.ask)
     return made
 
 

@@ -20,7 +20,7 @@ from rich.text import Text
 from vram_arbiter.arbiter import log as telemetry
 from vram_arbiter.arbiter.lab import text as replay_text
 from vram_arbiter.clients import logs
-from vram_arbiter.clients.cli import demo_display, doctor, quick, text
+from vram_arbiter.clients.cli import demo_display, doctor, replies, text
 from vram_arbiter.schemas.errors import BadState
 from vram_arbiter.schemas.runtime import terminal
 
@@ -260,8 +260,8 @@ def test_a_history_event_in_the_daemons_log() -> None:
 
 def test_errors_on_the_way_out(capsys: pytest.CaptureFixture[str]) -> None:
     terminal.complain("vram-runner", BadState(HOSTILE, hint=HOSTILE))
-    quick.complain({"message": HOSTILE, "hint": HOSTILE}, as_json=False)
-    quick.complain({"message": HOSTILE, "hint": HOSTILE}, as_json=True)
+    replies.complain({"message": HOSTILE, "hint": HOSTILE}, as_json=False)
+    replies.complain({"message": HOSTILE, "hint": HOSTILE}, as_json=True)
     said = capsys.readouterr()
     assert not obeyed(said.err)
     assert not obeyed(said.out)

@@ -30,9 +30,9 @@ EVERY_ACTION = (
 )  # fmt: skip
 STRANGER = """
 import os, sys
-import vram_arbiter.clients.client, vram_arbiter.clients.cli.app, vram_arbiter.clients.cli.history, vram_arbiter.clients.cli.main, msgpack, zmq
+import vram_arbiter.clients.client, vram_arbiter.clients.cli.operators, vram_arbiter.clients.cli.history, vram_arbiter.clients.cli.main, msgpack, zmq
 os.setgroups([]); os.setresgid(65534, 65534, 65534); os.setresuid(65534, 65534, 65534)
-clients.cli.main.main()
+vram_arbiter.clients.cli.main.main()
 """
 
 

@@ -59,7 +59,7 @@ def test_the_path_of_status_imports_nothing_heavy(nowhere: dict[str, str]) -> No
         "try: main()\n"
         "except SystemExit as end: assert end.code == 3, end.code\n"
         "import msgpack, zmq\n"
-        "heavy = {'pydantic', 'asyncio', 'opentelemetry', 'typer', 'rich', 'click', 'yaml', 'numpy'} & set(sys.modules)\n"
+        "heavy = {'pydantic', 'asyncio', 'opentelemetry', 'rich', 'yaml', 'numpy'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
     done = subprocess.run(
@@ -100,7 +100,7 @@ def test_errors_are_json_where_json_was_asked_for(nowhere: dict[str, str]) -> No
 def test_2_for_wrong_usage(command: list[str], nowhere: dict[str, str]) -> None:
     done = vramctl(*command, environ=nowhere)
     assert done.returncode == 2
-    assert "Usage: vramctl" in done.stderr
+    assert "usage: vramctl" in done.stderr
 
 
 def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) -> None:
@@ -161,7 +161,7 @@ def test_every_program_and_command_has_it(flag: str, nowhere: dict[str, str]) ->
     }
     wrong = {
         line: said for line, said in json.loads(done.stdout.splitlines()[-1]).items()
-        if wanted not in said and not (flag == "-h" and line in through_a_program)
+        if wanted not in said and line not in through_a_program
     }  # fmt: skip
     assert wrong == {}
 
@@ -169,7 +169,7 @@ def test_every_program_and_command_has_it(flag: str, nowhere: dict[str, str]) ->
 def test_help_uses_the_width_of_the_terminal(nowhere: dict[str, str]) -> None:
     """It stopped at 80 columns."""
     wide = vramctl("status", "--help", environ={**nowhere, "COLUMNS": "150"}).stdout
-    assert "Where the arbiter serves.  [env var: VRAM_ARBITER_ENDPOINT]" in wide
+    assert "socket of the arbiter (environment: VRAM_ARBITER_ENDPOINT)" in wide
 
 
 @pytest.mark.e2e

@@ -20,8 +20,9 @@ import pytest
 
 from tests.support.paths import SUPPORT
 from tests.support.process import ArbiterProcess
-from vram_arbiter.clients.cli import quick
+from vram_arbiter.clients.cli.replies import UNREACHABLE
 from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.net import request
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient
 from vram_arbiter.clients.sidecar.spawn import SpawnSpec
@@ -131,7 +132,7 @@ def test_vramctl_says_who_serves_there(folder: Path) -> None:
                 capture_output=True,
                 text=True,
             )
-            assert done.returncode == quick.UNREACHABLE, done
+            assert done.returncode == UNREACHABLE, done
             if "--json" in command:
                 assert json.loads(done.stdout)["error"]["code"] == "untrusted_server"
             else:
@@ -143,7 +144,7 @@ def test_vramctl_says_who_serves_there(folder: Path) -> None:
 def test_a_user_that_was_named_is_believed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VRAM_ARBITER_SERVER_USERS", "nobody")
     with false_server(folder, "s") as heard:
-        assert quick.ask("status", {}, f"ipc://{folder}/s")["ok"]
+        assert request.ask("status", {}, f"ipc://{folder}/s")["ok"]
         assert any("'op': 'hello'" in line for line in heard())
 
 
@@ -179,5 +180,5 @@ def test_what_has_no_user_is_not_connected_to(endpoint: str) -> None:
         asyncio.run(ask_runner(endpoint))
     with pytest.raises(ConfigError, match="refused"):
         asyncio.run(ask_arbiter(endpoint))
-    with pytest.raises(quick.Unreachable, match="refused"):
-        quick.ask("status", {}, endpoint)
+    with pytest.raises(request.Unreachable, match="refused"):
+        request.ask("status", {}, endpoint)

@@ -1,4 +1,7 @@
-"""`vramctl replay` and `simulate`: they need the engine, which clients never import, so it is a program of the arbiter's that is started here."""
+"""`vramctl replay` and `vramctl simulate`: start the arbiter's program for them.
+
+They need the engine, which clients never import. That program parses the arguments, `--help` too.
+"""
 
 import os
 import signal
@@ -12,13 +15,14 @@ from vram_arbiter.clients.configs import configs_folder
 PROGRAM = "vram_arbiter.arbiter.lab"
 
 
-def run(arguments: Sequence[str]) -> int:
-    """Start `python -m vram_arbiter.arbiter.lab ARGUMENTS` on this terminal and return its exit code (128+n if signal n ended it)."""
-    # Ctrl-C is the program's; it is waited for in any case
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def run(command: str, arguments: Sequence[str]) -> int:
+    """Start the program on this terminal. Returns its exit code, 128+n if signal n ended it."""
+    if command == "simulate":
+        arguments = with_scenario(arguments)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the program's
     try:
         code = subprocess.run(
-            [sys.executable, "-m", PROGRAM, *arguments],
+            [sys.executable, "-m", PROGRAM, command, *arguments],
             check=False,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         ).returncode
@@ -28,7 +32,7 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def with_scenario(arguments: Sequence[str]) -> list[str]:
-    """A word that is no file but names a shipped scenario becomes its path."""
+    """Replace the name of a shipped scenario by its path, unless a file has that name."""
     folder = configs_folder(os.environ) / "scenarios"
     shipped = {path.stem: str(path) for path in folder.glob("*.yaml")}
     return [

@@ -1,0 +1,71 @@
+"""Arguments that several commands share, and the types that check them."""
+
+import argparse
+import os
+from collections.abc import Callable
+
+from vram_arbiter.schemas.defaults import NAME_MAX_CHARS, REASON_MAX_CHARS
+from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE
+
+
+def add_endpoint(parser: argparse.ArgumentParser) -> None:
+    """Add `--endpoint`; `args.endpoint` is None where neither it nor the environment says one."""
+    parser.add_argument(
+        "--endpoint",
+        default=os.environ.get(ENDPOINT_VARIABLE),
+        help=f"socket of the arbiter (environment: {ENDPOINT_VARIABLE})",
+    )
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Add `--json`."""
+    parser.add_argument(
+        "--json", dest="as_json", action="store_true", help="print the reply as JSON"
+    )
+
+
+def one_line(most: int, *, required: bool) -> Callable[[str], str]:
+    """Return an argparse type: one line of at most `most` characters, as the wire takes it."""
+
+    def check(written: str) -> str:
+        if required and not written.strip():
+            raise argparse.ArgumentTypeError("must not be empty")
+        if len(written) > most or any(char < " " or char == "\x7f" for char in written):
+            raise argparse.ArgumentTypeError(f"expected one line of at most {most} characters")
+        return written
+
+    return check
+
+
+name = one_line(NAME_MAX_CHARS, required=True)
+reason = one_line(REASON_MAX_CHARS, required=True)
+remark = one_line(REASON_MAX_CHARS, required=False)
+
+
+def at_least(low: float, high: float | None = None) -> Callable[[str], float]:
+    """Return an argparse type: a number from `low` to `high`."""
+
+    def check(written: str) -> float:
+        try:
+            value = float(written)
+        except ValueError:
+            value = float("nan")
+        if not low <= value <= (float("inf") if high is None else high):
+            bound = f"at least {low:g}" if high is None else f"{low:g} to {high:g}"
+            raise argparse.ArgumentTypeError(f"expected a number, {bound}, got {written!r}")
+        return value
+
+    return check
+
+
+def count(low: int, high: int) -> Callable[[str], int]:
+    """Return an argparse type: a whole number from `low` to `high`."""
+
+    def check(written: str) -> int:
+        if not written.isdecimal() or not low <= int(written) <= high:
+            raise argparse.ArgumentTypeError(
+                f"expected a whole number, {low} to {high}, got {written!r}"
+            )
+        return int(written)
+
+    return check

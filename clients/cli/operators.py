@@ -1,0 +1,60 @@
+"""Operators' actions: `evict`, `pin`, `unpin`, `drain`, `resume`, `release-dead`."""
+
+import argparse
+from functools import partial
+
+from vram_arbiter.clients.cli import arguments, text
+from vram_arbiter.clients.cli.replies import answer
+from vram_arbiter.clients.net.request import ask
+
+DESCRIPTIONS = {
+    "evict": "Revoke a lease. A use in flight finishes first; a pinned lease is refused. "
+    "Operators only.",
+    "pin": "Protect a lease from eviction until it is unpinned. Operators only.",
+    "unpin": "Undo an operator's pin. Operators only.",
+    "drain": "Grant nothing new until `vramctl resume`; holders keep their leases. Outlives the "
+    "daemon, not the machine. Operators only.",
+    "resume": "Grant again after a drain. Operators only.",
+    "release-dead": "End the lease of a holder that is not heard of before its TTL is over; its "
+    "bytes are still measured gone. Refused for a lease in use and for a holder that is heard "
+    "of. Operators only.",
+}
+_WITH_TARGET = frozenset({"evict", "pin", "unpin", "release-dead"})
+_WITHOUT_REASON = frozenset({"unpin", "resume"})
+
+
+def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
+    if command in _WITH_TARGET:
+        parser.add_argument(
+            "target",
+            metavar="TARGET",
+            type=arguments.name,
+            help="a lease (L3-17), or a consumer that has exactly one",
+        )
+    optional = command in _WITHOUT_REASON
+    parser.add_argument(
+        "-r",
+        "--reason",
+        required=not optional,
+        default="",
+        type=arguments.remark if optional else arguments.reason,
+        help="why; kept in history with your name",
+    )
+    arguments.add_json(parser)
+    arguments.add_endpoint(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    action = args.command_name.replace("-", "_")
+    fields = {"reason": args.reason}
+    if args.command_name in _WITH_TARGET:
+        fields["target"] = args.target
+    code, _ = answer(
+        action,
+        fields,
+        endpoint=args.endpoint,
+        as_json=args.as_json,
+        lines=lambda reply: text.by_hand_lines(action, reply),
+        question=partial(ask, role="operator"),
+    )
+    return code

@@ -1,0 +1,41 @@
+"""`vramctl status`: GPUs, leases and the queue."""
+
+import argparse
+from collections.abc import Mapping
+
+from vram_arbiter.clients.cli import text
+from vram_arbiter.clients.cli.arguments import add_endpoint, add_json
+from vram_arbiter.clients.cli.replies import answer
+from vram_arbiter.clients.net.request import Message, ask
+
+DESCRIPTIONS = {"status": "Show GPUs, leases and the queue."}
+
+
+def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
+    add_json(parser)
+    add_endpoint(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    code, _ = answer(
+        "status",
+        {},
+        endpoint=args.endpoint,
+        as_json=args.as_json,
+        lines=text.status_lines,
+        question=_all_pages,
+    )
+    return code
+
+
+def _all_pages(op: str, fields: Mapping[str, object], endpoint: str | None) -> Message:
+    """Return the whole status; the arbiter sends its leases in pages."""
+    reply = ask(op, fields, endpoint)
+    after = reply.pop("next", None)
+    while after is not None:
+        page = ask(op, {**fields, "after": after}, endpoint)
+        if not page.get("ok"):
+            return page
+        reply["leases"] += page["leases"]
+        after = page.get("next")
+    return reply

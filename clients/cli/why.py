@@ -1,0 +1,34 @@
+"""`vramctl why`: what keeps a consumer from running."""
+
+import argparse
+
+from vram_arbiter.clients.cli import arguments, text
+from vram_arbiter.clients.cli.replies import ENVELOPE, NO, OK, answer
+
+DESCRIPTIONS = {
+    "why": "Explain why CONSUMER is not running: which leases block it, how many bytes, on which "
+    "condition, what happens next and when. Exits 1 if it neither holds nor waits for a lease."
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
+    parser.add_argument(
+        "consumer",
+        metavar="CONSUMER",
+        type=arguments.name,
+        help="a consumer or a lease, as `status` shows it",
+    )
+    arguments.add_json(parser)
+    arguments.add_endpoint(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    code, reply = answer(
+        "why",
+        {"consumer": args.consumer},
+        endpoint=args.endpoint,
+        as_json=args.as_json,
+        lines=text.why_lines,
+        hidden=ENVELOPE | {"epoch"},
+    )
+    return NO if code == OK and not reply["leases"] else code

@@ -1,0 +1,127 @@
+"""One request to the arbiter and its reply, blocking: what a command that only asks needs.
+
+It imports zmq and msgpack and nothing heavier: no pydantic, asyncio, anyio, rich or OpenTelemetry.
+Operators type `vramctl status` often and scripts poll it; a test checks the imports.
+"""
+
+import contextlib
+import os
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from vram_arbiter.clients._protocol.codec import pack
+from vram_arbiter.schemas.defaults import WIRE_VERSION
+from vram_arbiter.schemas.errors import UntrustedServer, VramError
+from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
+
+if TYPE_CHECKING:
+    import zmq
+
+    from vram_arbiter.clients.net.link import Link
+
+TIMEOUT_S = 3.0
+DOUBT_S = 0.2
+"""An arbiter answers within milliseconds; after so long the kernel is asked whether there is one."""
+RETRY_S = 0.02
+HANGS = "something holds the socket and is silent: look at the arbiter's log, or set VRAM_ARBITER_ENDPOINT"
+
+Message = dict[str, Any]
+
+
+class Unreachable(Exception):
+    """No arbiter answers that may be believed; the text says where, `hint` what to do, `code` is that of the typed error."""
+
+    def __init__(self, message: str, hint: str, code: str = "arbiter_unreachable") -> None:
+        super().__init__(message)
+        self.hint = hint
+        self.code = code
+
+
+def ask(
+    op: str,
+    fields: Mapping[str, Any],
+    endpoint: str | None = None,
+    timeout_s: float = TIMEOUT_S,
+    role: str = "observer",
+) -> Message:
+    """Hello, then one request. Returns its reply, error replies too. Raises Unreachable."""
+    import zmq
+
+    deadline = time.monotonic() + timeout_s
+    hello = {
+        "op": "hello",
+        "id": 1,
+        "version": WIRE_VERSION,
+        "name": "vramctl",
+        "instance": f"vramctl-{os.getpid()}",
+        "role": role,
+    }
+    try:
+        where = endpoint or arbiter_endpoint(os.environ, os.getuid())
+        silent = Unreachable(f"no arbiter answers at {where} within {timeout_s:g} s", HANGS)
+        if where.startswith("ipc:///") and not os.path.exists(where.removeprefix("ipc://")):
+            _look(where)
+        with (
+            zmq.Context() as context,
+            contextlib.closing(_link(context, where, deadline, silent)) as link,
+        ):
+            for message in (hello, {"op": op, "id": 2, **fields}):
+                link.send(pack(message))
+            return _reply(link, where, deadline, silent)
+    except VramError as error:
+        code = error.code if isinstance(error, UntrustedServer) else "arbiter_unreachable"
+        raise Unreachable(error.message, error.hint, code) from error
+
+
+def _link(
+    context: "zmq.Context[zmq.Socket[bytes]]", where: str, deadline: float, silent: Unreachable
+) -> "Link":
+    """A link to an arbiter that may be believed. Raises Unreachable, UntrustedServer, ConfigError."""
+    from vram_arbiter.clients.net.link import Link
+
+    while True:
+        link = Link(context, where, "arbiter")
+        try:
+            if link.wait(deadline) == "open":
+                return link
+        except BaseException:
+            link.close()
+            raise
+        link.close()
+        _look(where)
+        if time.monotonic() + RETRY_S >= deadline:
+            raise silent
+        time.sleep(RETRY_S)
+
+
+def _reply(link: "Link", where: str, deadline: float, silent: Unreachable) -> Message:
+    """The reply to the request, or the refusal of the hello. Raises Unreachable, UntrustedServer."""
+    import msgpack
+    import zmq
+
+    from vram_arbiter.clients.net.link import ms_until
+
+    poller = zmq.Poller()
+    poller.register(link.socket, zmq.POLLIN)
+    poller.register(link.monitor, zmq.POLLIN)
+    if not poller.poll(min(int(1000 * DOUBT_S), ms_until(deadline))):
+        _look(where)
+    while poller.poll(ms_until(deadline)):
+        ended = link.advance() == "ended"
+        while (payload := link.receive()) is not None:
+            reply: Message = msgpack.unpackb(payload, strict_map_key=False)
+            if reply.get("re") == 2 or (reply.get("re") == 1 and not reply.get("ok")):
+                return reply
+        if ended:
+            _look(where)
+            raise Unreachable(f"the arbiter at {where} hung up", "try again, or look at its log")
+    raise silent
+
+
+def _look(where: str) -> None:
+    """Raises Unreachable if the kernel knows at once why nobody answers."""
+    from vram_arbiter.clients.net.diagnose import obstacle
+
+    if found := obstacle(where):
+        raise Unreachable(*found)
