@@ -46,7 +46,7 @@ from vram_arbiter.arbiter.core.events import (
     UseYielded,
 )
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import gangs
+from vram_arbiter.arbiter.core.features.gangs import Gangs
 from vram_arbiter.arbiter.core.features.resizing import Resizing
 from vram_arbiter.arbiter.core.inspection import Inspection
 from vram_arbiter.arbiter.core.model.state import Core, Refused
@@ -82,7 +82,8 @@ class Arbiter:
 
     def __init__(self, settings: Settings, now: float) -> None:
         self._resizing = Resizing()
-        self._core = Core(settings, now, features=(self._resizing,))
+        self._gangs = Gangs()
+        self._core = Core(settings, now, features=(self._resizing, self._gangs))
         for gpu_id in self._core.gpus:
             self._core.timers.set(("probe", gpu_id), now)  # the first reading
 
@@ -94,7 +95,8 @@ class Arbiter:
         self._happened(event)  # 1
         recovery.serve_if_accounted(core)  # 2
         deadlock.resolve(core)  # 3
-        gangs.settle(core)
+        for feature in core.features:
+            feature.settle(core)
         grants.schedule(core)
         requests.answer_queued(core)
         self._keep_reading()  # 4
@@ -107,7 +109,7 @@ class Arbiter:
 
     def inspect(self) -> Inspection:
         """Return a read-only view of the records, for tests and offline tools."""
-        return Inspection.of(self._core)
+        return Inspection.of(self._core, self._resizing, self._gangs)
 
     def next_deadline(self) -> float | None:
         """When a Tick is due (monotonic seconds); None: nothing is planned."""
@@ -267,8 +269,6 @@ class Arbiter:
                     measure.on_poll_due(core, subject)
                 case "probe":
                     readings.on_probe_due(core, subject)
-                case "gang":
-                    gangs.on_due(core, subject)
                 case "users":
                     uses.on_users_due(core, subject)
                 case "recover":

@@ -5,8 +5,10 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Self
 
+from vram_arbiter.arbiter.core.features.gangs import Gangs
+from vram_arbiter.arbiter.core.features.resizing import Resizing
 from vram_arbiter.arbiter.core.learning.footprints import Footprints
-from vram_arbiter.arbiter.core.model.lease import Failures, Gang, Lease
+from vram_arbiter.arbiter.core.model.lease import Failures, Lease
 from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Gpu, Refusals, Reuse
 from vram_arbiter.arbiter.core.timers import Timers
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, UseId
@@ -23,7 +25,8 @@ class Inspection:
     nonces: Mapping[tuple[ProcessKey, str], LeaseId]
     clients: Mapping[ClientId, Client]
     users: Mapping[ProcessKey, Mapping[tuple[LeaseId, UseId], Lease]]
-    gangs: Mapping[str, Gang]
+    resizing: Resizing
+    gangs: Gangs
     crashes: Mapping[str, Failures]
     reuse: Mapping[str, Reuse]
     switches: Mapping[tuple[str, str], float]
@@ -32,7 +35,7 @@ class Inspection:
     timers: Timers
 
     @classmethod
-    def of(cls, core: Core) -> Self:
+    def of(cls, core: Core, resizing: Resizing, gangs: Gangs) -> Self:
         return cls(
             gpus=MappingProxyType(core.gpus),
             leases=MappingProxyType(core.leases),
@@ -41,7 +44,8 @@ class Inspection:
             nonces=MappingProxyType(core.nonces),
             clients=MappingProxyType(core.clients),
             users=MappingProxyType(core.users),
-            gangs=MappingProxyType(core.gangs),
+            resizing=resizing,
+            gangs=gangs,
             crashes=MappingProxyType(core.crashes),
             reuse=MappingProxyType(core.reuse),
             switches=MappingProxyType(core.switches),

@@ -8,14 +8,13 @@ Numbers are those of ARCHITECTURE.md:
   1. approved bytes never exceed capacity − reserve, and a grant fits together with stowaways at its moment
   2. nobody is resident beside an exclusive lease, nor comes before its bytes are measured gone; one lease at a time loads on a card
   3. nothing that is in use unloads
-  4. bytes stay charged until a verdict: whoever is resident is charged, whoever is charged is resident, under measurement or of a gang that
-     loads, whoever is away is neither; parked weights never exceed the budget of host RAM
+  4. bytes stay charged until a verdict: whoever is resident is charged, whoever is charged is resident, under measurement or reserved by
+     a feature, whoever is away is neither; parked weights never exceed the budget of host RAM
   5. tokens only grow
   6. every waiter is in a queue, has a timer if it has a bound, and its card has a next reading scheduled
-  7. of a gang, until it is complete or broken, all that wait are charged or none
+  7. of a gang, until it is complete or broken, all waiting members are charged or none (`features.gangs`)
 """
 
-from vram_arbiter.arbiter.core.features import gangs
 from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import NOT_COUNTED, Core, Gpu
 
@@ -45,8 +44,8 @@ def check(core: Core) -> None:
     if core.granted:
         _tokens(core)
     _waiters(core)
-    if core.gangs and (problem := gangs.unsound(core)):
-        raise InvariantViolation(7, problem)
+    for feature in core.features:
+        feature.check(core, everything=False)
     _away(core)
 
 
@@ -61,9 +60,10 @@ def check_all(core: Core) -> None:
         gpu.ledger.touched.update(gpu.ledger.leases(), gpu.residents, gpu.debts)
         for lease in gpu.residents.values():
             _unused(lease)
-    core.settled.update(core.gangs)
     core.counted = NOT_COUNTED
     check(core)
+    for feature in core.features:
+        feature.check(core, everything=True)
 
 
 def _bytes(gpu: Gpu, *, granted: bool) -> None:
@@ -162,11 +162,9 @@ def _tokens(core: Core) -> None:
 
 
 def _counts(core: Core, queued: int) -> None:
-    """Counted only when a number has changed: there may be thousands of gangs."""
-    waiting = len(core.waiting)
-    for gang in core.gangs.values():
-        if gang.phase != "waiting":
-            waiting -= len(gang.waiting())
+    """Counted only when a number has changed: a feature may keep thousands of requests out of the queues."""
+    unqueued = sum(1 for feature in core.features for _ in feature.unqueued())
+    waiting = len(core.waiting) - unqueued
     if queued < waiting or (len(core.gpus) == 1 and queued != waiting):
         raise InvariantViolation(6, f"{waiting} leases wait, {queued} are in queues")
     core.counted = (queued, len(core.waiting))

@@ -1,360 +1,480 @@
-"""Gangs: several leases that are granted together or not at all, over one card or several, of one process or many.
+"""Gangs: several leases that are granted together or not at all, on one GPU or several, to one process or many.
 
-A gang *gathers* until all its members have asked, *waits* as one with the place of its lowest priority aged from its first member, and
-*loads* once there is room for all: every member's steady bytes are charged at that moment, and on each card the largest headroom that one
-of them needs on top while it loads. Members load one after the other per card, and nobody else is granted there meanwhile. When all
-are held the gang is complete, and its members are leases like any other. A member that fails before breaks it: who waits is denied,
-who holds keeps what it has.
+A gang passes through three phases:
+  gathering: until all its members have asked; none of them is in a queue
+  waiting: as one request, with the priority of its lowest member, aged from its first
+  loading: it fits. Every member's steady bytes are charged at once, and on each GPU the largest headroom that one member
+    needs on top while it loads. Members load one after the other per GPU, and nothing else is granted there meanwhile.
+When all members are held the gang is complete, and they are leases like any other. If a member ends before that, the gang
+is broken: waiting members are denied, granted ones keep what they have.
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
+from vram_arbiter.arbiter.core.events import Spec
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.model.lease import EXPIRING, Gang, Lease, LeaseState
+from vram_arbiter.arbiter.core.hooks import Feature
+from vram_arbiter.arbiter.core.invariants import InvariantViolation
+from vram_arbiter.arbiter.core.model.lease import EXPIRING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
-from vram_arbiter.arbiter.core.scheduling import policy
+from vram_arbiter.arbiter.core.report.standing import Standing
+from vram_arbiter.arbiter.core.scheduling import grants, policy
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 
 SEARCH_MAX = 4096
-"""Placements that are looked at; a gang that could be placed in more ways is placed as far as this goes."""
+"""Placements that are examined. A gang with more possible placements may be denied although one exists."""
+
+_STANDING = frozenset({LeaseState.QUEUED, LeaseState.LOADING, LeaseState.HELD})
+"""States of a member that do not break its gang."""
 
 type _Placement = dict[GpuId, list[Lease]]
 
 
-# -- gathering ---------------------------------------------------------------------------------------------------------
-def check(core: Core, name: str, size: int) -> None:
-    """May one more member join? Raises Refused."""
-    gang = core.gangs.get(name)
-    if gang is None:
-        return
-    if gang.size != size:
-        raise Refused(
-            "bad_request",
-            f"gang {name} has {gang.size} members, not {size}",
-            "agree on one size",
-            size=gang.size,
-        )
-    if len(gang.members) >= gang.size:
-        raise Refused(
-            "bad_request",
-            f"all {size} members of gang {name} have come",
-            "use an id of its own for each gang",
-        )
+@dataclass(slots=True)
+class Gang:
+    """One gang, until it is complete or broken."""
+
+    name: str
+    size: int
+    first_at: float
+    phase: str = "gathering"  # → waiting → loading
+    members: list[Lease] = field(default_factory=list)
+    planned: _Placement = field(default_factory=dict)  # where room is being made
+    cards: list[GpuId] = field(default_factory=list)  # loading: where its bytes are charged
+    reserved_bytes: dict[GpuId, int] = field(default_factory=dict)  # admitted there
+    short_since: dict[GpuId, float] = field(default_factory=dict)  # readings show less free
+
+    def waiting(self) -> list[Lease]:
+        """Return the members that are not granted yet."""
+        return [lease for lease in self.members if lease.state is LeaseState.QUEUED]
+
+    def waiting_on(self, gpu: Gpu) -> list[Lease]:
+        """Return the members whose bytes are charged on a GPU and that have not begun to load."""
+        return [lease for lease in self.waiting() if lease.gpu == gpu.info.id]
+
+    @property
+    def priority(self) -> int:
+        """The lowest priority of its members."""
+        return min(lease.spec.priority for lease in self.members)
+
+    @property
+    def headroom_id(self) -> LeaseId:
+        """Ledger entry of the bytes that the next member needs on top of its steady bytes while it loads."""
+        return LeaseId(f"gang:{self.name}")
+
+    def planned_on(self, lease: Lease) -> GpuId | None:
+        """Return the GPU on which room is being made for a member."""
+        return next((gpu_id for gpu_id, some in self.planned.items() if lease in some), None)
 
 
-def join(core: Core, lease: Lease, name: str, size: int) -> None:
-    """A member asks. It stands in no queue before all have come."""
-    gang = _gang(core, name, size)
-    lease.gang = gang
-    gang.members.append(lease)
-    core.hold_back(lease)
-    if len(gang.members) == gang.size:
-        _complete(core, gang)
+@dataclass(slots=True)
+class Gangs(Feature):
+    """Gangs that are neither complete nor broken."""
 
+    by_name: dict[str, Gang] = field(default_factory=dict)
+    of: dict[LeaseId, Gang] = field(default_factory=dict)  # by member
+    loading: dict[GpuId, Gang] = field(default_factory=dict)  # a GPU serves one gang at a time
+    granted: set[str] = field(default_factory=set)  # gangs with a granted member
+    touched: set[str] = field(default_factory=set)  # a member came or ended since `settle`
+    settled: set[str] = field(default_factory=set)  # examined by the last `settle`
 
-def left_out(core: Core, name: str, why: str) -> None:
-    """A member was refused: its gang can never be complete."""
-    gang = core.gangs.get(name)
-    if gang is not None and gang.phase == "gathering":
-        _break(core, gang, why)
+    timers = frozenset({"gang"})
 
+    # -- gathering -------------------------------------------------------------------------------------------------
+    def check_request(self, core: Core, spec: Spec) -> None:
+        """Refuse a member too many, or one that says another size."""
+        gang = None if spec.gang is None else self.by_name.get(spec.gang[0])
+        if spec.gang is None or gang is None:
+            return
+        name, size = spec.gang
+        if gang.size != size:
+            raise Refused(
+                "bad_request",
+                f"gang {name} has {gang.size} members, not {size}",
+                "agree on one size",
+                size=gang.size,
+            )
+        if len(gang.members) >= gang.size:
+            raise Refused(
+                "bad_request",
+                f"all {size} members of gang {name} have come",
+                "use an id of its own for each gang",
+            )
 
-def restore(core: Core, lease: Lease, name: str, size: int) -> None:
-    """A member that was granted before the restart. The others ask again, by their nonces; they are waited for as holders are."""
-    gang = _gang(core, name, size)
-    lease.gang = gang
-    gang.members.append(lease)
-    core.timers.set(("gang", name), core.now + defaults.LEASE_TTL_S + core.settings.fence_grace_s)
+    def on_refused(self, core: Core, spec: Spec, why: str) -> None:
+        """Break the gang of a refused member: it can never be complete."""
+        gang = None if spec.gang is None else self.by_name.get(spec.gang[0])
+        if gang is not None and gang.phase == "gathering":
+            self._break(core, gang, why)
 
+    def hold_back(self, core: Core, request: Lease) -> bool:
+        """Keep a member out of the queues until all have asked."""
+        if request.spec.gang is None:
+            return False
+        gang = self._join(core, request, *request.spec.gang)
+        core.hold_back(request)
+        if len(gang.members) == gang.size:
+            self._complete(core, gang)
+        return True
 
-def on_due(core: Core, name: str) -> None:
-    gang = core.gangs.get(name)
-    if gang is not None and gang.phase == "gathering":
-        _break(core, gang, "not all of it came back after the restart")
+    def _join(self, core: Core, lease: Lease, name: str, size: int) -> Gang:
+        gang = self.by_name.setdefault(name, Gang(name, size, core.now))
+        gang.members.append(lease)
+        self.of[lease.id] = gang
+        self.touched.add(name)
+        return gang
 
-
-def _gang(core: Core, name: str, size: int) -> Gang:
-    core.unsettled.add(name)
-    return core.gangs.setdefault(name, Gang(name, size, core.now, unsettled=core.unsettled))
-
-
-def _complete(core: Core, gang: Gang) -> None:
-    """All have come. What can never fit is said at once, to all; else they stand in the queues as one."""
-    waiting = gang.waiting()
-    if not _place(core, waiting, lambda gpu, some: _ever(core, gpu, some)):
-        needed = sum(_needs(waiting).values())
-        budgets = {gpu.info.id: gpu.ledger.budget_bytes for gpu in core.gpus.values()}
-        _break(
-            core,
-            gang,
-            f"its {len(waiting)} members need {needed} bytes together, more than the cards can ever hold",
-            code="vram_insufficient",
-            needed_bytes=needed,
-            budget_bytes=budgets,
-        )
-        return
-    gang.phase = "waiting"
-    ageing_s = core.settings.ageing_s_per_point if core.settings.scheduling.by_priority else 0.0
-    for lease in waiting:
-        lease.rank = gang.first_at - gang.priority * ageing_s
-        for gpu_id in lease.gpus:
-            core.gpus[gpu_id].queue.add(lease)
-            core.wake(core.gpus[gpu_id])
-
-
-# -- waiting -----------------------------------------------------------------------------------------------------------
-def serve(core: Core, gpu: Gpu, gang: Gang) -> None:
-    """A member is the head of this card: grant all if all fit, else ask whom it takes, if that lets all of them in."""
-    waiting = gang.waiting()
-    fitting = _place(
-        core, waiting, lambda card, some: _is_next(core, card, gang) and _fits(card, gang, some)
-    )
-    if fitting:
-        measured = [
-            _measured(core, card, gang, some) for card, some in _cards(core, fitting)
-        ]  # each asks for its reading
-        if all(measured):
-            _admit(core, gang, fitting)
-        return
-    planned = {card: [one for one in some if one in waiting] for card, some in gang.planned.items()}
-    placement: _Placement | None = planned
-    if not planned or not all(
-        _can_be_made(core, card, gang, some) for card, some in _cards(core, planned)
-    ):
-        placement = _place(core, waiting, lambda card, some: _can_be_made(core, card, gang, some))
-    gang.planned = placement or {}
-    if not placement:
-        _say(waiting, "nobody who could make room for the whole gang may be asked now")
-        policy.wake_when_evictable(core, gpu, _bundle(gang, waiting))
-        return
-    _say(waiting, "room is being made for the whole gang")
-    for card, some in _cards(core, placement):
-        bundle, going = _bundle(gang, some), policy.leaving(card)
-        if policy.fits(card, bundle, going):
-            continue
-        for victim in policy.choose_victims(core, card, bundle, going) or ():
-            eviction.ask(core, card, victim, some[0], f"gang {gang.name} needs the room")
-
-
-def _is_next(core: Core, gpu: Gpu, gang: Gang) -> bool:
-    front = policy.front(core, gpu)
-    return front is not None and front.gang is gang and not policy.blocked(core, gpu)
-
-
-def _fits(gpu: Gpu, gang: Gang, some: list[Lease]) -> bool:
-    return not _clash(some) and policy.fits(gpu, _bundle(gang, some))
-
-
-def _can_be_made(core: Core, gpu: Gpu, gang: Gang, some: list[Lease]) -> bool:
-    if not _is_next(core, gpu, gang) or _clash(some) or policy.residue_under_measurement(gpu):
-        return False
-    going = policy.leaving(gpu)
-    bundle = _bundle(gang, some)
-    return (
-        policy.fits(gpu, bundle, going)
-        or policy.choose_victims(core, gpu, bundle, going) is not None
-    )
-
-
-def _measured(core: Core, gpu: Gpu, gang: Gang, some: list[Lease]) -> bool:
-    """The card's own word, once for all that is loaded on it from here on."""
-    room = policy.measured_room_bytes(core, gpu)
-    need = policy.measured_need_bytes(gpu, _bundle(gang, some))
-    if room is None or (room < need and policy.sample_is_behind(gpu)):
-        _say(some, "waits for a fresh reading of the card")
-        core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
-        return False
-    if room < need:
-        gpu.blocked = "the ledger has room, the card does not: measured memory is not free yet"
-        _say(some, gpu.blocked)
-    return room >= need
-
-
-# -- loading -----------------------------------------------------------------------------------------------------------
-def _admit(core: Core, gang: Gang, placement: _Placement) -> None:
-    """Charge everybody in one breath. From here on all of them have their bytes, whoever loads first."""
-    gang.phase, gang.planned = "loading", {}
-    for gpu, some in _cards(core, placement):
-        gang.cards.append(gpu.info.id)
-        gpu.gang = gang
-        for lease in some:
+    def _complete(self, core: Core, gang: Gang) -> None:
+        """All members have asked: queue them as one, or deny all if they can never fit together."""
+        waiting = gang.waiting()
+        if not _place(core, waiting, lambda gpu, some: self._ever_fits(gang, gpu, some)):
+            needed = sum(_needs(waiting).values())
+            budgets = {gpu.info.id: gpu.ledger.budget_bytes for gpu in core.gpus.values()}
+            self._break(
+                core,
+                gang,
+                f"its {len(waiting)} members need {needed} bytes together, more than the cards can ever hold",
+                code="vram_insufficient",
+                needed_bytes=needed,
+                budget_bytes=budgets,
+            )
+            return
+        gang.phase = "waiting"
+        ageing_s = core.settings.ageing_s_per_point if core.settings.scheduling.by_priority else 0.0
+        for lease in waiting:
+            lease.rank = gang.first_at - gang.priority * ageing_s
             for gpu_id in lease.gpus:
-                core.gpus[gpu_id].queue.discard(lease)
+                core.gpus[gpu_id].queue.add(lease)
                 core.wake(core.gpus[gpu_id])
-            lease.gpus, lease.gpu, lease.reason = (gpu.info.id,), gpu.info.id, ""
-            gpu.ledger.reserve(lease.id, lease.process, lease.steady_bytes, core.now)
-        _set_headroom(core, gpu, gang, _headroom_bytes(some))
-        here = [one.id for one in gang.members if one.gpu == gpu.info.id]
-        gang.reserved_bytes[gpu.info.id] = sum(
-            _approved(gpu, one) for one in [*here, gang.headroom_id]
+
+    def _ever_fits(self, gang: Gang, gpu: Gpu, some: list[Lease]) -> bool:
+        """Return whether members would fit if every lease ended but those of their own gang."""
+        staying = [lease for lease in gpu.residents.values() if self.of.get(lease.id) is gang]
+        alone = any(one.spec.exclusive for one in [*some, *staying])
+        if alone and len(some) + len(staying) > 1:
+            return False
+        fixed = sum(gpu.ledger.charge_bytes(lease.id) for lease in staying)
+        return fixed + sum(_needs(some).values()) <= gpu.ledger.budget_bytes
+
+    # -- waiting ---------------------------------------------------------------------------------------------------
+    def owns(self, request: Lease) -> bool:
+        """Return whether a request is granted by `serve` alone."""
+        return request.id in self.of
+
+    def serve(self, core: Core, gpu: Gpu, head: Lease | None) -> bool:
+        """Grant all members if all fit, else revoke the victims that let all of them in."""
+        gang = None if head is None else self.of.get(head.id)
+        if gang is None:
+            return False
+        waiting = gang.waiting()
+        fitting = _place(core, waiting, lambda card, some: self._fits(core, card, gang, some))
+        if fitting:
+            readings = [_has_room(core, card, gang, some) for card, some in _cards(core, fitting)]
+            if all(readings):
+                self._admit(core, gang, fitting)
+            return True
+        placement = self._plan(core, gang)
+        if placement is None:
+            _say(waiting, "nobody who could make room for the whole gang may be asked now")
+            policy.wake_when_evictable(core, gpu, _bundle(gang, waiting))
+            return True
+        _say(waiting, "room is being made for the whole gang")
+        for card, some in _cards(core, placement):
+            bundle, going = _bundle(gang, some), policy.leaving(card)
+            if policy.fits(card, bundle, going):
+                continue
+            for victim in policy.choose_victims(core, card, bundle, going) or ():
+                eviction.ask(core, card, victim, some[0], f"gang {gang.name} needs the room")
+        return True
+
+    def _plan(self, core: Core, gang: Gang) -> _Placement | None:
+        """Return where room can be made for all waiting members: where it is being made, as long as that is possible."""
+        waiting = gang.waiting()
+
+        def possible(card: Gpu, some: list[Lease]) -> bool:
+            return self._can_be_made(core, card, gang, some)
+
+        planned = {
+            card: [one for one in some if one in waiting] for card, some in gang.planned.items()
+        }
+        if not planned or not all(possible(card, some) for card, some in _cards(core, planned)):
+            planned = _place(core, waiting, possible) or {}
+        gang.planned = planned
+        return planned or None
+
+    def _is_next(self, core: Core, gpu: Gpu, gang: Gang) -> bool:
+        front = policy.front(core, gpu)
+        return front is not None and self.of.get(front.id) is gang and not policy.blocked(core, gpu)
+
+    def _fits(self, core: Core, gpu: Gpu, gang: Gang, some: list[Lease]) -> bool:
+        return (
+            self._is_next(core, gpu, gang)
+            and not _clash(some)
+            and policy.fits(gpu, _bundle(gang, some))
         )
-        core.wake(gpu)
-    core.note(
-        "gang",
-        gang=gang.name,
-        phase="loading",
-        members=[lease.id for lease in gang.members],
-        reason="all fit",
-    )
 
+    def _can_be_made(self, core: Core, gpu: Gpu, gang: Gang, some: list[Lease]) -> bool:
+        if (
+            not self._is_next(core, gpu, gang)
+            or _clash(some)
+            or policy.residue_under_measurement(gpu)
+        ):
+            return False
+        going, bundle = policy.leaving(gpu), _bundle(gang, some)
+        return (
+            policy.fits(gpu, bundle, going)
+            or policy.choose_victims(core, gpu, bundle, going) is not None
+        )
 
-def next_load(core: Core, gpu: Gpu, gang: Gang) -> Lease | None:
-    """The card is a loading gang's: who of it is to be granted now, if the one before is ready."""
-    lease = next((one for one in gang.waiting() if one.gpu == gpu.info.id), None)
-    if (
-        lease is None
-        or gpu.failed_at is not None
-        or gpu.sample is None
-        or gpu.in_state(LeaseState.LOADING)
-    ):
-        return None
-    more = lease.load_peak_bytes - lease.steady_bytes
-    headroom = _approved(gpu, gang.headroom_id)
-    extra = max(0, more - headroom)
-    if gpu.ledger.approved_bytes() + extra > gpu.ledger.budget_bytes:
-        _break(core, gang, "a member holds more than it declared, the rest no longer fits")
-        return None
-    over = gpu.ledger.total_bytes() + extra - gpu.ledger.budget_bytes
-    if over > 0:  # somebody else has grown since it was admitted
+    # -- loading ---------------------------------------------------------------------------------------------------
+    def _admit(self, core: Core, gang: Gang, placement: _Placement) -> None:
+        """Charge all members at once: from now on each has its bytes, whichever loads first."""
+        gang.phase, gang.planned = "loading", {}
+        self.granted.add(gang.name)
+        for gpu, some in _cards(core, placement):
+            gang.cards.append(gpu.info.id)
+            self.loading[gpu.info.id] = gang
+            for lease in some:
+                for gpu_id in lease.gpus:
+                    core.gpus[gpu_id].queue.discard(lease)
+                    core.wake(core.gpus[gpu_id])
+                lease.gpus, lease.gpu, lease.reason = (gpu.info.id,), gpu.info.id, ""
+                gpu.ledger.reserve(lease.id, lease.process, lease.steady_bytes, core.now)
+            _set_headroom(core, gpu, gang, _headroom_bytes(some))
+            here = [one.id for one in gang.members if one.gpu == gpu.info.id]
+            gang.reserved_bytes[gpu.info.id] = sum(
+                _approved(gpu, one) for one in [*here, gang.headroom_id]
+            )
+            core.wake(gpu)
+        _note(core, gang, "loading", "all fit")
+
+    def blocks(self, gpu: Gpu) -> str:
+        """Say which gang loads on a GPU."""
+        gang = self.loading.get(gpu.info.id)
+        return "" if gang is None else f"gang {gang.name} is loading"
+
+    def serve_reserved(self, core: Core, gpu: Gpu) -> bool:
+        """Grant the next member of the gang that loads on a GPU, once the one before is ready."""
+        gang = self.loading.get(gpu.info.id)
+        if gang is None:
+            return False
+        member = None if core.recovering is not None else self._next_load(core, gpu, gang)
+        if member is not None:
+            grants.grant(core, gpu, member)
+        return True
+
+    def _next_load(self, core: Core, gpu: Gpu, gang: Gang) -> Lease | None:
+        lease = next(iter(gang.waiting_on(gpu)), None)
+        if (
+            lease is None
+            or gpu.failed_at is not None
+            or gpu.sample is None
+            or gpu.in_state(LeaseState.LOADING)
+        ):
+            return None
+        more = lease.load_peak_bytes - lease.steady_bytes
+        headroom = _approved(gpu, gang.headroom_id)
+        extra = max(0, more - headroom)
+        if gpu.ledger.approved_bytes() + extra > gpu.ledger.budget_bytes:
+            self._break(core, gang, "a member holds more than it declared, the rest no longer fits")
+            return None
+        over = gpu.ledger.total_bytes() + extra - gpu.ledger.budget_bytes
+        if over > 0:
+            self._relieve(core, gpu, gang, lease, over)
+            return None
+        # the headroom is booked on one member's process, and may cover what that still shows of its load peak
+        moved = min(headroom, more)
+        total = gpu.ledger.total_if_moved(gang.headroom_id, moved, lease.process) if moved else 0
+        crowded = total + extra > gpu.ledger.budget_bytes
+        if not self._is_free(core, gpu, gang, lease, crowded=crowded):
+            return None
+        _set_headroom(core, gpu, gang, max(0, headroom - more))
+        return lease
+
+    def _relieve(self, core: Core, gpu: Gpu, gang: Gang, lease: Lease, over: int) -> None:
+        """Revoke others that have grown since the gang was admitted, or break it if there are none to revoke."""
         going = policy.leaving(gpu)
         victims = [] if going else policy.choose_relief(core, gpu, going, over)
         for victim in victims:
             eviction.ask(core, gpu, victim, lease, f"gang {gang.name} needs the room")
         if not going and not victims:
-            _break(core, gang, "others hold more than they were granted, the rest no longer fits")
-        return None
-    moved = min(
-        headroom, more
-    )  # it is booked on one of them, and may cover what he still shows of his peak
-    total = gpu.ledger.total_if_moved(gang.headroom_id, moved, lease.process) if moved else 0
-    if not _is_free(core, gpu, gang, lease, crowded=total + extra > gpu.ledger.budget_bytes):
-        return None
-    _set_headroom(core, gpu, gang, max(0, headroom - more))
-    return lease
+            self._break(
+                core, gang, "others hold more than they were granted, the rest no longer fits"
+            )
 
+    def _is_free(self, core: Core, gpu: Gpu, gang: Gang, lease: Lease, *, crowded: bool) -> bool:
+        """Return whether readings show a member's bytes as free: the one before needed some of them while it loaded.
 
-def _is_free(core: Core, gpu: Gpu, gang: Gang, lease: Lease, *, crowded: bool) -> bool:
-    """What the member before needed on top of its steady bytes is not free before it is measured, as any bytes.
-
-    Memory that does not come back in time breaks the gang: its other members must not hold a card for ever that nobody else may use.
-    """
-    room = policy.measured_room_bytes(core, gpu)
-    if not crowded and room is not None and room >= policy.measured_need_bytes(gpu, lease):
-        gang.short_since.pop(gpu.info.id, None)
-        return True
-    if room is None or policy.sample_is_behind(gpu):
-        lease.reason = "waits for a fresh reading of the card"
-        core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
+        Memory that does not come back in time breaks the gang, or its other members would keep the GPU from everyone.
+        """
+        room = policy.measured_room_bytes(core, gpu)
+        if not crowded and room is not None and room >= policy.measured_need_bytes(gpu, lease):
+            gang.short_since.pop(gpu.info.id, None)
+            return True
+        if room is None or policy.sample_is_behind(gpu):
+            _want_reading(core, gpu, [lease])
+            return False
+        lease.reason = "its bytes are kept for it, but measured memory is not free yet"
+        since = gang.short_since.setdefault(gpu.info.id, core.now)
+        if core.now - since > core.settings.verify_timeout_s:
+            self._break(core, gang, "measured memory did not come back, the rest no longer fits")
+        else:
+            core.read_again(gpu, core.settings.load_probe_s)
         return False
-    lease.reason = "its bytes are kept for it, but measured memory is not free yet"
-    if (
-        core.now - gang.short_since.setdefault(gpu.info.id, core.now)
-        > core.settings.verify_timeout_s
-    ):
-        _break(core, gang, "measured memory did not come back, the rest no longer fits")
-    else:
-        core.read_again(gpu, core.settings.load_probe_s)
-    return False
 
+    # -- the end ---------------------------------------------------------------------------------------------------
+    def on_ended(self, core: Core, lease: Lease) -> None:
+        """Examine the gang of a member that ended."""
+        gang = self.of.get(lease.id)
+        if gang is not None:
+            self.touched.add(gang.name)
 
-def settle(core: Core) -> None:
-    """After an event: gangs of which a member is over are broken, those of which all are held are complete."""
-    core.settled = set(core.unsettled)
-    core.unsettled.clear()
-    for gang in _concerned(core):
-        fallen = next((one for one in gang.members if one.state not in _STANDING), None)
-        if fallen is not None:
-            ended = core.ended.get(fallen.id)
-            why = "" if ended is None or ended.error is None else f": {ended.error['message']}"
-            _break(core, gang, f"{fallen.spec.consumer} ({fallen.id}) is {fallen.state}{why}")
-        elif len(gang.members) == gang.size and all(
-            one.state is LeaseState.HELD for one in gang.members
-        ):
-            _finish(core, gang)
-        elif gang.phase == "loading":
-            for gpu_id in gang.cards:
-                _trim(core, core.gpus[gpu_id], gang)
+    def settle(self, core: Core) -> None:
+        """Break gangs of which a member ended or leaves, and finish those of which all members are held."""
+        if not self.by_name:
+            return
+        self.settled = self.touched | self.granted
+        self.touched = set()
+        for gang in self._named(self.settled):
+            fallen = next((one for one in gang.members if one.state not in _STANDING), None)
+            if fallen is not None:
+                ended = core.ended.get(fallen.id)
+                why = "" if ended is None or ended.error is None else f": {ended.error['message']}"
+                self._break(
+                    core, gang, f"{fallen.spec.consumer} ({fallen.id}) is {fallen.state}{why}"
+                )
+            elif len(gang.members) == gang.size and all(
+                one.state is LeaseState.HELD for one in gang.members
+            ):
+                self._dissolve(core, gang)
+                _note(core, gang, "complete", "all are held")
+            elif gang.phase == "loading":
+                for gpu_id in gang.cards:
+                    _trim(core, core.gpus[gpu_id], gang)
 
+    def _named(self, names: Iterable[str]) -> list[Gang]:
+        found = [self.by_name[name] for name in names if name in self.by_name]
+        return sorted(found, key=lambda gang: (gang.first_at, gang.name))
 
-def _concerned(core: Core) -> list[Gang]:
-    """Gangs of which a member has moved since the last event, and those that load: thousands may gather that nothing happens to."""
-    names = {
-        *core.settled,
-        *core.unsettled,
-        *(gpu.gang.name for gpu in core.gpus.values() if gpu.gang),
-    }
-    found = [core.gangs[name] for name in names if name in core.gangs]
-    return sorted(found, key=lambda gang: (gang.first_at, gang.name))
+    def _break(
+        self, core: Core, gang: Gang, why: str, code: str = "gang_broken", **details: object
+    ) -> None:
+        waiting = [lease for lease in gang.waiting() if lease.id in core.waiting]
+        self._dissolve(core, gang)
+        _note(core, gang, "broken", why)
+        error = {
+            "code": code,
+            "message": f"gang {gang.name}: {why}",
+            "hint": "ask for all of it again",
+            "details": {"gang": gang.name, "why": why, **details},
+        }
+        for lease in waiting:
+            eviction.deny(core, lease, error)
 
-
-_STANDING = frozenset({LeaseState.QUEUED, LeaseState.LOADING, LeaseState.HELD})
-
-
-def _trim(core: Core, gpu: Gpu, gang: Gang) -> None:
-    """While nobody loads here, keep what the next one needs on top, out of what was admitted and is not held."""
-    if gpu.in_state(LeaseState.LOADING):
-        return
-    here = [one for one in gang.members if one.gpu == gpu.info.id]
-    held = sum(_approved(gpu, one.id) for one in here)
-    spare = gang.reserved_bytes[gpu.info.id] - held
-    wanted = _headroom_bytes([one for one in here if one.state is LeaseState.QUEUED])
-    if _approved(gpu, gang.headroom_id) != max(0, min(spare, wanted)):
-        _set_headroom(core, gpu, gang, max(0, min(spare, wanted)))
-        core.wake(gpu)
-
-
-def _finish(core: Core, gang: Gang) -> None:
-    _dissolve(core, gang)
-    core.note(
-        "gang",
-        gang=gang.name,
-        phase="complete",
-        members=[one.id for one in gang.members],
-        reason="all are held",
-    )
-
-
-def _break(core: Core, gang: Gang, why: str, code: str = "gang_broken", **details: object) -> None:
-    waiting = [lease for lease in gang.waiting() if lease.id in core.waiting]
-    _dissolve(core, gang)
-    core.note(
-        "gang", gang=gang.name, phase="broken", members=[one.id for one in gang.members], reason=why
-    )
-    error = {
-        "code": code,
-        "message": f"gang {gang.name}: {why}",
-        "hint": "ask for all of it again",
-        "details": {"gang": gang.name, "why": why, **details},
-    }
-    for lease in waiting:
-        eviction.deny(core, lease, error)
-
-
-def _dissolve(core: Core, gang: Gang) -> None:
-    """Nobody is bound by it any more, and nothing is kept for it."""
-    core.gangs.pop(gang.name, None)
-    core.timers.clear(("gang", gang.name))
-    for lease in gang.members:
-        lease.gang = None
-    for gpu_id in gang.cards:
-        gpu = core.gpus[gpu_id]
+    def _dissolve(self, core: Core, gang: Gang) -> None:
+        """Forget a gang and withdraw what is reserved for it."""
+        self.by_name.pop(gang.name, None)
+        self.granted.discard(gang.name)
+        core.timers.clear(("gang", gang.name))
         for lease in gang.members:
-            if lease.id in gpu.ledger.reserved:
-                gpu.ledger.withdraw(lease.id, core.now)
-                lease.gpu = None
-        _set_headroom(core, gpu, gang, 0)
-        gpu.gang = None
-        core.wake(gpu)
-    for lease in gang.members:
-        if lease.state in EXPIRING:
-            core.record_lease(lease)  # a restart must not wait for the rest of it
+            self.of.pop(lease.id, None)
+        for gpu_id in gang.cards:
+            gpu = core.gpus[gpu_id]
+            for lease in gang.members:
+                if lease.id in gpu.ledger.reserved:
+                    gpu.ledger.withdraw(lease.id, core.now)
+                    lease.gpu = None
+            _set_headroom(core, gpu, gang, 0)
+            del self.loading[gpu_id]
+            core.wake(gpu)
+        for lease in gang.members:
+            if lease.state in EXPIRING:
+                core.record_lease(lease)  # a restart must not wait for the rest of the gang
+
+    # -- across a restart ------------------------------------------------------------------------------------------
+    def to_record(self, lease: Lease) -> Mapping[str, Any]:
+        """Name the gang of a granted member."""
+        gang = self.of.get(lease.id)
+        return {} if gang is None else {"gang": [gang.name, gang.size]}
+
+    def from_record(self, core: Core, lease: Lease, record: Mapping[str, Any]) -> None:
+        """Take a granted member back. The others ask again, by their nonces, within the time that a holder has to reattach."""
+        if record.get("gang") is None:
+            return
+        name, size = record["gang"]
+        self._join(core, lease, str(name), int(size))
+        self.granted.add(str(name))
+        patience_s = defaults.LEASE_TTL_S + core.settings.fence_grace_s
+        core.timers.set(("gang", str(name)), core.now + patience_s)
+
+    def on_timer(self, core: Core, kind: str, subject: str) -> None:
+        """Break a gang whose other members did not ask again after a restart."""
+        gang = self.by_name.get(subject)
+        if gang is not None and gang.phase == "gathering":
+            self._break(core, gang, "not all of it came back after the restart")
+
+    # -- hooks that only answer ------------------------------------------------------------------------------------
+    def protects(self, lease: Lease) -> str:
+        """A member is not revoked before its gang is complete."""
+        gang = self.of.get(lease.id)
+        return "" if gang is None else f"belongs to gang {gang.name}, which is not complete"
+
+    def unqueued(self) -> Iterator[Lease]:
+        """Members that gather or load are in no queue."""
+        for gang in self.by_name.values():
+            if gang.phase != "waiting":
+                yield from gang.waiting()
+
+    def check(self, core: Core, *, everything: bool) -> None:
+        """Of a gang that is neither complete nor broken, all waiting members are charged or none (invariant 7)."""
+        for gang in self._named(self.by_name if everything else self.settled | self.touched):
+            for lease in gang.waiting():
+                charged = lease.gpu is not None and core.gpus[lease.gpu].ledger.charges(lease.id)
+                if charged != (gang.phase == "loading"):
+                    told = "charged" if charged else "not charged"
+                    raise InvariantViolation(
+                        7, f"gang {gang.name} is {gang.phase}, and {lease.id} is {told}"
+                    )
+
+    def view(self, core: Core, lease: Lease) -> Mapping[str, object]:
+        """Show the gang of a member."""
+        gang = self.of.get(lease.id)
+        if gang is None:
+            return {}
+        return {"gang": f"{gang.name}: {gang.phase}, {len(gang.members)} of {gang.size}"}
+
+    def standing(self, core: Core, lease: Lease) -> Standing | None:
+        """Tell how a member waits with its gang, or what a granted one's gang still lacks."""
+        gang = self.of.get(lease.id)
+        if gang is None:
+            return None
+        gpu = core.gpus[_card_of(gang, lease)]
+        mine = [one for one in gang.members if one.state is not LeaseState.HELD]
+        before = mine[: mine.index(lease) + 1] if lease in mine else []
+        loads = [one for one in before if _card_of(gang, one) == gpu.info.id]
+        queued = gang.phase == "waiting" and lease.state is LeaseState.QUEUED
+        reserved_bytes = 0
+        if lease.id in gpu.ledger.reserved:
+            reserved_bytes = _approved(gpu, lease.id) + _approved(gpu, gang.headroom_id)
+        return Standing(
+            gpu=gpu,
+            request=_as_waiter(gang, gpu, lease) if queued else lease,
+            group=f"gang {gang.name}",
+            fellows=tuple(gang.waiting()) if queued else (lease,),
+            loads=None if gang.phase == "gathering" else tuple(loads),
+            reserved_bytes=reserved_bytes,
+            condition=f"gang {gang.phase}",
+            outlook=_outlook(gang, lease),
+            gives_up=_gives_up(core, gang, gpu),
+        )
 
 
 # -- bytes -------------------------------------------------------------------------------------------------------------
 def _needs(some: Iterable[Lease]) -> dict[ProcessKey, int]:
-    """What an admission charges, by process: everybody's steady bytes and the largest headroom."""
+    """Return what an admission charges, by process: all steady bytes and the largest headroom."""
     some = list(some)
     needs: dict[ProcessKey, int] = {}
     for lease in some:
@@ -368,27 +488,25 @@ def _headroom_bytes(some: Iterable[Lease]) -> int:
 
 
 def _bundle(gang: Gang, some: list[Lease]) -> Lease:
-    """Members on one card as a single waiter, as `policy` asks about."""
+    """Return the members on one GPU as a single request."""
     first = some[0]
-    spec = replace(
-        first.spec, priority=gang.priority, exclusive=any(one.spec.exclusive for one in some)
-    )
+    exclusive = any(one.spec.exclusive for one in some)
+    spec = replace(first.spec, priority=gang.priority, exclusive=exclusive)
     return replace(first, spec=spec, arrived_at=gang.first_at, needs=_needs(some))
+
+
+def _as_waiter(gang: Gang, gpu: Gpu, lease: Lease) -> Lease:
+    """Return the members that are to come to a GPU, or may come to no other, as a single request."""
+    planned = gang.planned.get(gpu.info.id, [])
+    some = [one for one in gang.waiting() if one in planned]
+    only = (gpu.info.id,)
+    return _bundle(
+        gang, some or [one for one in gang.waiting() if one is lease or one.gpus == only]
+    )
 
 
 def _clash(some: list[Lease]) -> bool:
     return len(some) > 1 and any(one.spec.exclusive for one in some)
-
-
-def _ever(core: Core, gpu: Gpu, some: list[Lease]) -> bool:
-    """Would they fit if every lease ended but what their own unfinished gang holds already?"""
-    mine = some[0].gang
-    staying = [lease for lease in gpu.residents.values() if lease.gang is mine]
-    fixed = sum(gpu.ledger.charge_bytes(lease.id) for lease in staying)
-    alone = any(one.spec.exclusive for one in [*some, *staying])
-    if alone and len(some) + len(staying) > 1:
-        return False
-    return fixed + sum(_needs(some).values()) <= gpu.ledger.budget_bytes
 
 
 def _approved(gpu: Gpu, lease_id: LeaseId) -> int:
@@ -396,7 +514,7 @@ def _approved(gpu: Gpu, lease_id: LeaseId) -> int:
 
 
 def _set_headroom(core: Core, gpu: Gpu, gang: Gang, count: int) -> None:
-    """Bytes that are kept for whoever of the gang loads next, in the account of one of its processes here."""
+    """Reserve bytes for the member that loads next, in the account of one of the gang's processes on the GPU."""
     if gpu.ledger.charges(gang.headroom_id):
         gpu.ledger.withdraw(gang.headroom_id, core.now)
     if count:
@@ -404,11 +522,46 @@ def _set_headroom(core: Core, gpu: Gpu, gang: Gang, count: int) -> None:
         gpu.ledger.reserve(gang.headroom_id, owner.process, count, core.now)
 
 
-# -- placing -----------------------------------------------------------------------------------------------------------
+def _trim(core: Core, gpu: Gpu, gang: Gang) -> None:
+    """Between two loads, reserve what the next one needs on top, out of what was admitted and is not held."""
+    if gpu.in_state(LeaseState.LOADING):
+        return
+    here = [one for one in gang.members if one.gpu == gpu.info.id]
+    held = sum(_approved(gpu, one.id) for one in here)
+    spare = gang.reserved_bytes[gpu.info.id] - held
+    wanted = _headroom_bytes([one for one in here if one.state is LeaseState.QUEUED])
+    if _approved(gpu, gang.headroom_id) != max(0, min(spare, wanted)):
+        _set_headroom(core, gpu, gang, max(0, min(spare, wanted)))
+        core.wake(gpu)
+
+
+# -- readings ----------------------------------------------------------------------------------------------------------
+def _has_room(core: Core, gpu: Gpu, gang: Gang, some: list[Lease]) -> bool:
+    """Return whether a reading shows room for all members that are to come to a GPU. Asks for one that can tell."""
+    room = policy.measured_room_bytes(core, gpu)
+    need = policy.measured_need_bytes(gpu, _bundle(gang, some))
+    if room is None or (room < need and policy.sample_is_behind(gpu)):
+        _want_reading(core, gpu, some)
+        return False
+    if room < need:
+        gpu.blocked = "the ledger has room, the card does not: measured memory is not free yet"
+        _say(some, gpu.blocked)
+    return room >= need
+
+
+def _want_reading(core: Core, gpu: Gpu, some: Iterable[Lease]) -> None:
+    _say(some, "waits for a fresh reading of the card")
+    core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
+
+
+# -- placement ---------------------------------------------------------------------------------------------------------
 def _place(
     core: Core, members: list[Lease], may: Callable[[Gpu, list[Lease]], bool]
 ) -> _Placement | None:
-    """A card for everybody, or None. The largest choose first; cards in their order; what does not go together is not tried further."""
+    """Return a GPU for every member, or None. `may` says whether some of them may be on a GPU together.
+
+    Members with the fewest GPUs choose first, then the largest; GPUs are tried in their order.
+    """
     order = sorted(
         members, key=lambda lease: (len(lease.gpus), -lease.load_peak_bytes, lease.arrival)
     )
@@ -442,40 +595,26 @@ def _cards(core: Core, placement: _Placement) -> list[tuple[Gpu, list[Lease]]]:
     ]
 
 
+def _card_of(gang: Gang, lease: Lease) -> GpuId:
+    """Return the GPU of a member: where it is, where room is made for it, or the first where it may be placed."""
+    return lease.gpu or gang.planned_on(lease) or lease.planned_gpu or lease.gpus[0]
+
+
+# -- words -------------------------------------------------------------------------------------------------------------
+def _note(core: Core, gang: Gang, phase: str, reason: str) -> None:
+    members = [lease.id for lease in gang.members]
+    core.note("gang", gang=gang.name, phase=phase, members=members, reason=reason)
+
+
 def _say(some: Iterable[Lease], reason: str) -> None:
     for lease in some:
         lease.reason = reason
 
 
-# -- telling -----------------------------------------------------------------------------------------------------------
-def planned_on(lease: Lease) -> GpuId | None:
-    """The card on which room is being made for this member."""
-    planned = {} if lease.gang is None else lease.gang.planned
-    return next((gpu_id for gpu_id, some in planned.items() if lease in some), None)
-
-
-def as_waiter(gpu: Gpu, lease: Lease) -> Lease:
-    """Itself; of a gang that waits, all that are to come to this card, or may come to no other, as one."""
-    gang = lease.gang
-    if gang is None or gang.phase != "waiting":
-        return lease
-    planned = gang.planned.get(gpu.info.id, [])
-    some = [one for one in gang.waiting() if one in planned]
-    alone = (gpu.info.id,)
-    return _bundle(
-        gang, some or [one for one in gang.waiting() if one is lease or one.gpus == alone]
-    )
-
-
-def kept_bytes(gpu: Gpu, lease: Lease) -> int:
-    """What is charged already for a member that waits for its turn, with the headroom of who loads next."""
-    if lease.gang is None or lease.id not in gpu.ledger.reserved:
-        return 0
-    return _approved(gpu, lease.id) + _approved(gpu, lease.gang.headroom_id)
-
-
-def outlook(gang: Gang, lease: Lease) -> str:
-    """What a member waits for, in words."""
+def _outlook(gang: Gang, lease: Lease) -> str:
+    """Say what a member waits for, or what the gang of a granted one still lacks."""
+    if lease.state is not LeaseState.QUEUED:
+        return _lacks(gang, lease)
     if gang.phase == "gathering":
         return (
             f"waits for the rest of gang {gang.name}: {len(gang.members)} of {gang.size} have come"
@@ -488,8 +627,7 @@ def outlook(gang: Gang, lease: Lease) -> str:
     return f"waits as one of gang {gang.name}: {lease.reason or 'behind others'}"
 
 
-def unfinished(gang: Gang, lease: Lease) -> str:
-    """What a granted member's gang still lacks, in words."""
+def _lacks(gang: Gang, lease: Lease) -> str:
     others = [one for one in gang.members if one is not lease and one.state is not LeaseState.HELD]
     lacks = [f"{one.spec.consumer} ({one.id}) is {one.state}" for one in others]
     missing = gang.size - len(gang.members)
@@ -499,11 +637,12 @@ def unfinished(gang: Gang, lease: Lease) -> str:
     )
 
 
-def unsound(core: Core) -> str:
-    """Where a gang that the event can have changed is neither wholly charged nor wholly not; "" if nowhere. For the invariants."""
-    for gang in _concerned(core):
-        for lease in gang.waiting():
-            charged = lease.gpu is not None and core.gpus[lease.gpu].ledger.charges(lease.id)
-            if charged != (gang.phase == "loading"):
-                return f"gang {gang.name} is {gang.phase}, and {lease.id} is {'charged' if charged else 'not charged'}"
-    return ""
+def _gives_up(core: Core, gang: Gang, gpu: Gpu) -> tuple[float, str] | None:
+    """Return when a gang that gathers or loads is broken, and on which condition."""
+    if gang.phase == "gathering":
+        at = core.timers.due(("gang", gang.name))
+        return None if at is None else (at, "if the rest has not come back")
+    since = gang.short_since.get(gpu.info.id)
+    if gang.phase == "waiting" or since is None:
+        return None
+    return since + core.settings.verify_timeout_s, "if its memory is not free then"

@@ -156,41 +156,6 @@ class Recall:
 
 
 @dataclass(slots=True)
-class Gang:
-    """Leases that are granted together or not at all (`gangs`). Forgotten once all are held, or one has failed."""
-
-    name: str
-    size: int
-    first_at: float
-    phase: str = "gathering"  # → waiting → loading
-    members: list["Lease"] = field(default_factory=list, repr=False)
-    planned: dict[GpuId, list["Lease"]] = field(
-        default_factory=dict, repr=False
-    )  # where room is being made
-    cards: list[GpuId] = field(default_factory=list)  # loading: where its bytes are charged
-    reserved_bytes: dict[GpuId, int] = field(default_factory=dict)  # what was admitted there
-    short_since: dict[GpuId, float] = field(
-        default_factory=dict
-    )  # cards that show less free than is kept
-    unsettled: set[str] = field(
-        default_factory=set, repr=False
-    )  # of the engine: gangs of which a member moved
-
-    def waiting(self) -> list["Lease"]:
-        return [lease for lease in self.members if lease.state is LeaseState.QUEUED]
-
-    @property
-    def priority(self) -> int:
-        """Of the least of its members."""
-        return min(lease.spec.priority for lease in self.members)
-
-    @property
-    def headroom_id(self) -> LeaseId:
-        """Under this name the ledger keeps what one of them needs on top of its steady bytes while it loads."""
-        return LeaseId(f"gang:{self.name}")
-
-
-@dataclass(slots=True)
 class Lease:
     """A live lease. `load_peak_bytes` is the spec's, raised by what was learnt; the spec itself is never changed."""
 
@@ -260,11 +225,8 @@ class Lease:
     story: list[tuple[float, LeaseState, str]] = field(
         default_factory=list
     )  # the last STORY_MAX steps
-    gang: Gang | None = field(
-        default=None, repr=False, compare=False
-    )  # until it is complete or broken
-    rank: float | None = None  # its gang's place in the queues
-    needs: Mapping[ProcessKey, int] | None = None  # of a gang's members on one card together
+    rank: float | None = None  # a place in the queues that a feature gave it
+    needs: Mapping[ProcessKey, int] | None = None  # of a group of requests that count as one
     roster: Roster | None = field(
         default=None, repr=False, compare=False
     )  # of the card that it is on
@@ -279,8 +241,6 @@ class Lease:
         del self.story[:-STORY_MAX]
         if self.roster is not None:
             self.roster.moved(self, before)
-        if self.gang is not None:
-            self.gang.unsettled.add(self.gang.name)
 
     def told(self) -> str:
         """The story in one line."""

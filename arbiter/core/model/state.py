@@ -30,7 +30,6 @@ from vram_arbiter.arbiter.core.model.lease import (
     LEAVING,
     Eviction,
     Failures,
-    Gang,
     Lease,
     LeaseState,
     Order,
@@ -145,7 +144,6 @@ class Gpu:
     dirty: bool = True
     pressed: bool = False  # a pressure note is out
 
-    gang: Gang | None = None  # it is loading here
     debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
 
     def in_state(self, *states: LeaseState) -> list[Lease]:
@@ -206,11 +204,6 @@ class Core:
         self.counted = (
             NOT_COUNTED  # waiters in queues, and all, when the invariants counted them last
         )
-        self.gangs: dict[str, Gang] = {}
-        self.unsettled: set[str] = (
-            set()
-        )  # gangs of which a member moved since they were looked at (`gangs.settle`)
-        self.settled: set[str] = set()  # those that were looked at in this event
         # of the event being handled: who began to use or to wait (`deadlock`), acquires, grants (`invariants`)
         self.suspects: set[ProcessKey] = set()
         self.unanswered: list[Lease] = []
@@ -477,6 +470,11 @@ class Core:
         charge_bytes = 0 if lease.gpu is None else self.gpu_of(lease).ledger.charge_bytes(lease.id)
         assert lease.token is not None, f"{lease.id} is recorded without a token"
         asked = lease.asked_before and lease.state is LeaseState.HELD  # and not by this daemon yet
+        features = {
+            key: value
+            for feature in self.features
+            for key, value in feature.to_record(lease).items()
+        }
         users = [[*astuple(use.process), use.id, use.label] for use in lease.users()]
         self.journal(
             f"lease:{lease.id}",
@@ -493,7 +491,6 @@ class Core:
                 "load_peak_bytes": lease.load_peak_bytes,
                 "measured_bytes": lease.measured_bytes,
                 "exiting": lease.exiting,
-                "gang": None if lease.gang is None else [lease.gang.name, lease.gang.size],
                 "pinned": None if lease.pinned is None else [lease.pinned.by, lease.pinned.reason],
                 "comes_back": lease.comes_back,
                 "parks": lease.parks,
@@ -501,6 +498,7 @@ class Core:
                 "left_for": lease.left_for,
                 "dismissed": lease.dismissed,
                 **({"users": users} if users else {}),
+                **features,
                 "spec": {
                     "consumer": spec.consumer,
                     "model_id": spec.key.model_id,

@@ -1,15 +1,15 @@
 """Who stands in a waiter's way: how many bytes each holds, and on which condition they come free. Reads only; for `explain`.
 
-Whoever is charged on the card is named: holders, members of a gang that wait for their turn, contexts, debts and stowaways.
+Whoever is charged on the card is named: holders, requests with reserved bytes, contexts, debts and stowaways.
 """
 
 from collections.abc import Sequence
 from heapq import nlargest
 from typing import Any
 
-from vram_arbiter.arbiter.core.features import gangs
 from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
+from vram_arbiter.arbiter.core.report.standing import standing_of
 from vram_arbiter.arbiter.core.scheduling import policy
 from vram_arbiter.schemas.ids import ProcessKey
 
@@ -26,7 +26,7 @@ type Blocker = dict[str, Any]
 
 
 def who_blocks(core: Core, gpu: Gpu, waiter: Lease, deficit: int) -> list[Blocker]:
-    """Everybody who holds bytes that the waiter lacks, or holds the card alone. `waiter`: a gang's members on one card count as one."""
+    """Everybody who holds bytes that the waiter lacks, or holds the card alone. `waiter`: the requests of a group count as one."""
     if waiter.id in gpu.ledger.reserved:  # it has its bytes, and waits for its turn
         return [_holder(core, gpu, waiter, lease) for lease in gpu.in_state(LeaseState.LOADING)]
     alone = waiter.spec.exclusive or any(lease.spec.exclusive for lease in gpu.residents.values())
@@ -38,7 +38,7 @@ def who_blocks(core: Core, gpu: Gpu, waiter: Lease, deficit: int) -> list[Blocke
             BLOCKERS_MAX, residents, lambda lease: gpu.ledger.charge_bytes(lease.id)
         )
     holders = [_holder(core, gpu, waiter, lease) for lease in residents]
-    return [*holders, *_members(gpu), *_keepers(core, gpu, waiter)][:BLOCKERS_MAX]
+    return [*holders, *_reserved(core, gpu), *_keepers(core, gpu, waiter)][:BLOCKERS_MAX]
 
 
 def _holder(core: Core, gpu: Gpu, waiter: Lease, lease: Lease) -> Blocker:
@@ -52,23 +52,22 @@ def _holder(core: Core, gpu: Gpu, waiter: Lease, lease: Lease) -> Blocker:
     }
 
 
-def _members(gpu: Gpu) -> list[Blocker]:
-    """Of a gang that loads here: those who wait for their turn. The next one to load has the headroom."""
-    waiting = (
-        [] if gpu.gang is None else [one for one in gpu.gang.waiting() if one.gpu == gpu.info.id]
-    )
+def _reserved(core: Core, gpu: Gpu) -> list[Blocker]:
+    """Requests whose bytes are charged here and that wait for their turn to load. The next one has the headroom too."""
+    if not gpu.ledger.reserved:
+        return []
+    waiting = [lease for lease in core.waiting.values() if lease.id in gpu.ledger.reserved]
+    standings = [standing_of(core, lease) for lease in waiting]
     return [
         {
             "lease_id": lease.id,
             "consumer": lease.spec.consumer,
-            "bytes": gangs.kept_bytes(gpu, lease)
-            if index == 0
-            else gpu.ledger.charge_bytes(lease.id),
+            "bytes": gpu.ledger.charge_bytes(lease.id) if index else standing.reserved_bytes,
             "state": str(lease.state),
             "uses": 0,
-            "condition": f"has its bytes kept for its turn in gang {lease.gang.name if lease.gang else ''}",
+            "condition": f"has its bytes kept for its turn in {standing.group}",
         }
-        for index, lease in enumerate(waiting)
+        for index, (lease, standing) in enumerate(zip(waiting, standings, strict=True))
     ]
 
 
@@ -139,8 +138,8 @@ def _holder_condition(core: Core, waiter: Lease, holder: Lease) -> str:
     if not holder.attached:
         left_s = holder.expires_at - core.now
         return f"has not come back since the restart, is given up in {left_s:.1f} s"
-    if holder.gang is not None:
-        return f"belongs to gang {holder.gang.name}, which is not complete"
+    if protected := next(filter(None, (one.protects(holder) for one in core.features)), ""):
+        return protected
     if not holder.evictable:
         return f"is pinned by {holder.pinned}" if holder.pinned else "is pinned"
     ends_at = policy.residency_ends_at(core, holder, waiter)

@@ -8,7 +8,7 @@ from operator import attrgetter
 from statistics import median
 from typing import Any
 
-from vram_arbiter.arbiter.core.features import gangs, standby
+from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import drift
 from vram_arbiter.arbiter.core.model.lease import AWAY, LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
@@ -21,6 +21,7 @@ from vram_arbiter.arbiter.core.report.blockers import (
     uses,
     who_blocks,
 )
+from vram_arbiter.arbiter.core.report.standing import Standing, standing_of
 from vram_arbiter.arbiter.core.scheduling import policy
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
@@ -84,10 +85,6 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
         shown["granted_s"] = core.now - lease.held_from
     if lease.pinned is not None:
         shown["pinned"] = str(lease.pinned)
-    if lease.gang is not None:
-        shown["gang"] = (
-            f"{lease.gang.name}: {lease.gang.phase}, {len(lease.gang.members)} of {lease.gang.size}"
-        )
     if lease.yielded:
         shown["yielded"] = len(lease.yielded)
     for feature in core.features:
@@ -216,17 +213,13 @@ def _listed(core: Core, after: PageKey | None, limit: int | None) -> Iterator[Le
 
 
 def _in_queues(core: Core, after: tuple[float, int]) -> Iterator[Lease]:
-    """Waiters in the order of the queues, each once. Members of a gang that gathers or loads stand in none, and are listed at their rank."""
+    """Waiters in the order of the queues, each once. Those that a feature keeps out of the queues are listed at their rank."""
 
     def rank(lease: Lease) -> tuple[float, int]:
         return core.gpus[lease.gpus[0]].queue.rank(lease)
 
     unqueued = [
-        lease
-        for gang in core.gangs.values()
-        for lease in gang.waiting()
-        if rank(lease) > after
-        and not any(lease in core.gpus[gpu_id].queue for gpu_id in lease.gpus)
+        lease for feature in core.features for lease in feature.unqueued() if rank(lease) > after
     ]
     queued = [gpu.queue.after(after) for gpu in core.gpus.values()]
     last: Lease | None = None
@@ -237,7 +230,7 @@ def _in_queues(core: Core, after: tuple[float, int]) -> Iterator[Lease]:
 
 
 def _best_position(core: Core, lease: Lease) -> int:
-    """Its best place in a queue; 0: it stands in none, its gang is not complete or loads already."""
+    """Its best place in a queue; 0: it is in none."""
     places = [core.gpus[gpu_id].queue for gpu_id in lease.gpus if lease in core.gpus[gpu_id].queue]
     return min((queue.position(lease) for queue in places), default=0)
 
@@ -266,15 +259,16 @@ def _with_plan(core: Core, lease: Lease) -> dict[str, Any]:
     told = explain_lease(core, lease)
     told["plan"] = []
     if lease.state is LeaseState.QUEUED:
-        told["plan"] = plan = outlook.steps(core, _card(core, lease), lease)
-        if told["eta_s"] is None and (eta := _eta_of_plan(core, lease, plan)) is not None:
+        standing = standing_of(core, lease)
+        told["plan"] = plan = outlook.steps(core, standing, lease)
+        if told["eta_s"] is None and (eta := _eta_of_plan(core, standing, plan)) is not None:
             told["eta_s"], told["eta_source"] = eta, "learnt"
     return told
 
 
-def _eta_of_plan(core: Core, waiter: Lease, plan: Sequence[dict[str, Any]]) -> float | None:
+def _eta_of_plan(core: Core, standing: Standing, plan: Sequence[dict[str, Any]]) -> float | None:
     """Seconds until it is loaded if everybody who is to be asked takes as long as usual. None: never seen, or nothing planned."""
-    load = _load_s(core, _card(core, waiter), waiter)
+    load = _load_s(core, standing)
     ends: list[float] = []
     for step in plan:
         if step["action"] == "ask":
@@ -291,23 +285,19 @@ def _eta_of_plan(core: Core, waiter: Lease, plan: Sequence[dict[str, Any]]) -> f
 
 def explain_lease(core: Core, lease: Lease) -> dict[str, Any]:
     """One lease: what it needs, who stands in its way on which condition, what happens next and when."""
-    gpu = _card(core, lease)
+    standing = standing_of(core, lease)
+    gpu, kept = standing.gpu, standing.reserved_bytes
     free = gpu.ledger.budget_bytes - gpu.ledger.total_bytes()
     if lease.state is not LeaseState.QUEUED:
-        return _explain_resident(core, gpu, lease, free)
-    waiter, kept = gangs.as_waiter(gpu, lease), gangs.kept_bytes(gpu, lease)
+        return _explain_resident(core, standing, lease, free)
     free += kept
-    added = lease.load_peak_bytes if kept else policy.added_bytes(gpu, waiter)
+    added = lease.load_peak_bytes if kept else policy.added_bytes(gpu, standing.request)
     deficit = max(0, added - free)
-    blockers = who_blocks(core, gpu, waiter, deficit)
-    position = _place(core, lease)
-    condition, then = _condition(core, gpu, lease, blockers, position)
-    eta = _eta(core, gpu, lease, waiter)
-    together = (
-        f" with gang {lease.gang.name}"
-        if lease.gang is not None and waiter.needs is not None
-        else ""
-    )
+    blockers = who_blocks(core, gpu, standing.request, deficit)
+    position = _place(core, standing)
+    condition, then = _condition(core, standing, lease, blockers, position)
+    eta = _eta(core, standing, lease)
+    together = f" with {standing.group}" if standing.request.needs is not None else ""
     head = f"{lease.spec.consumer}{together} needs {gib(added)}, {gib(max(0, free))} are free{' or kept for it' if kept else ''}"
     head += f", {gib(deficit)} are missing" if deficit else ""
     if lease.load_peak_bytes > (declared := lease.spec.load_peak_bytes):
@@ -329,36 +319,29 @@ def explain_lease(core: Core, lease: Lease) -> dict[str, Any]:
     }
 
 
-def _card(core: Core, lease: Lease) -> Gpu:
-    """Where it is, where room is made for it, or the first on which it may be placed."""
-    return core.gpus[lease.gpu or gangs.planned_on(lease) or lease.planned_gpu or lease.gpus[0]]
-
-
-def _place(core: Core, lease: Lease) -> int:
-    """Its place in the queue; a gang has the place of its foremost member."""
-    if lease.gang is None or lease.gang.phase != "waiting":
-        return _best_position(core, lease)
-    return min(_best_position(core, member) for member in lease.gang.waiting())
+def _place(core: Core, standing: Standing) -> int:
+    """Its place in the queue; a group has the place of its foremost member."""
+    return min(_best_position(core, member) for member in standing.fellows)
 
 
 def wait_reason(core: Core, lease: Lease) -> str:
     """Why a waiter waits, in words. Short for those who stand behind others: only the head has blockers of its own."""
-    position = _place(core, lease)
+    standing = standing_of(core, lease)
+    position = _place(core, standing)
     if position > 1:
-        return _behind(core, lease, position)
+        return _behind(core, standing, position)
     return str(explain_lease(core, lease)["text"])
 
 
-def _behind(core: Core, lease: Lease, position: int) -> str:
-    foremost, who = lease, "waits"
-    if lease.gang is not None:
-        foremost = min(lease.gang.waiting(), key=lambda member: _best_position(core, member))
-        who = f"waits as one of gang {lease.gang.name}"
-    ahead = _card(core, foremost).queue.ahead_of(foremost)
+def _behind(core: Core, standing: Standing, position: int) -> str:
+    who = f"waits as one of {standing.group}" if standing.group else "waits"
+    foremost = min(standing.fellows, key=lambda member: _best_position(core, member))
+    ahead = standing_of(core, foremost).gpu.queue.ahead_of(foremost)
     return f"{who} behind {core.waiting[ahead].spec.consumer if ahead else 'others'} as number {position}"
 
 
-def _explain_resident(core: Core, gpu: Gpu, lease: Lease, free: int) -> dict[str, Any]:
+def _explain_resident(core: Core, standing: Standing, lease: Lease, free: int) -> dict[str, Any]:
+    gpu = standing.gpu
     says = {
         LeaseState.LOADING: f"it was granted and {loading(core, lease)}",
         LeaseState.HELD: f"it is resident, {uses(lease)}",
@@ -366,8 +349,8 @@ def _explain_resident(core: Core, gpu: Gpu, lease: Lease, free: int) -> dict[str
         LeaseState.UNLOADING: f"it {unloading(core, lease)}",
         LeaseState.VERIFYING: "it let go; its bytes are being measured",
     }.get(lease.state) or standby.outlook(core, lease)
-    if lease.gang is not None:
-        says += f"; {gangs.unfinished(lease.gang, lease)}"
+    if standing.outlook:
+        says += f"; {standing.outlook}"
     if drift.drift_bytes(core, gpu, lease):
         held = drift.held_bytes(gpu, lease)
         says += f"; it holds {gib(held)}, {gib(lease.spec.steady_bytes)} were declared"
@@ -389,14 +372,19 @@ def _explain_resident(core: Core, gpu: Gpu, lease: Lease, free: int) -> dict[str
 
 
 def _condition(
-    core: Core, gpu: Gpu, lease: Lease, blockers: Sequence[dict[str, Any]], position: int
+    core: Core,
+    standing: Standing,
+    lease: Lease,
+    blockers: Sequence[dict[str, Any]],
+    position: int,
 ) -> tuple[str, str]:
     """(short condition, what happens next in words)."""
-    if lease.gang is not None and position <= 1:
-        return f"gang {lease.gang.phase}", gangs.outlook(lease.gang, lease)
+    gpu = standing.gpu
+    if standing.condition and position <= 1:
+        return standing.condition, standing.outlook
     leaving = [other for other in gpu.residents.values() if other.state in LEAVING]
     if position > 1:
-        return "queued", _behind(core, lease, position)
+        return "queued", _behind(core, standing, position)
     if leaving and lease.planned_gpu == gpu.info.id:
         return "room is being made", "; ".join(_leaving_next(core, gpu, other) for other in leaving)
     blocked = policy.blocked(core, gpu)
@@ -438,21 +426,18 @@ def _leaving_next(core: Core, gpu: Gpu, holder: Lease) -> str:
     return f"{charge} of {name} are being verified"
 
 
-def _load_s(core: Core, gpu: Gpu, lease: Lease) -> float | None:
-    """How long its load usually takes; of a gang's member with those who load before it on its card. None: never seen, or not all have come."""
-    first = [lease]
-    if lease.gang is not None:
-        if lease.gang.phase == "gathering":
-            return None
-        mine = [one for one in lease.gang.members if one.state is not LeaseState.HELD]
-        first = [one for one in mine[: mine.index(lease) + 1] if _card(core, one) is gpu]
-    times = [core.learnt_s(one.spec.consumer, "load_s") for one in first]
+def _load_s(core: Core, standing: Standing) -> float | None:
+    """How long its load usually takes, with those of its group that load before it. None: never seen, or not known yet."""
+    if standing.loads is None:
+        return None
+    times = [core.learnt_s(one.spec.consumer, "load_s") for one in standing.loads]
     known = [seconds for seconds in times if seconds is not None]
     return sum(known) if len(known) == len(times) else None
 
 
-def _eta(core: Core, gpu: Gpu, lease: Lease, waiter: Lease) -> float | None:
+def _eta(core: Core, standing: Standing, lease: Lease) -> float | None:
     """Seconds until it is loaded, from learnt medians. None if anything on the way was never seen."""
+    gpu = standing.gpu
     slowest = 0.0
     for holder in gpu.residents.values():
         if holder.state not in LEAVING:
@@ -467,9 +452,9 @@ def _eta(core: Core, gpu: Gpu, lease: Lease, waiter: Lease) -> float | None:
         if len(known) < len(times):
             return None
         slowest = max(slowest, sum(known) - (core.now - holder.since))
-    load = _load_s(core, gpu, lease)
+    load = _load_s(core, standing)
     kept = lease.id in gpu.ledger.reserved
-    if load is None or (not slowest and not kept and not policy.fits(gpu, waiter)):
+    if load is None or (not slowest and not kept and not policy.fits(gpu, standing.request)):
         return None
     return max(0.0, slowest) + load
 

@@ -6,9 +6,9 @@ Not on the path of a decision: looking ahead costs a search for victims per inst
 
 from typing import Any
 
-from vram_arbiter.arbiter.core.features import gangs
-from vram_arbiter.arbiter.core.model.lease import LEAVING, Gang, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
+from vram_arbiter.arbiter.core.report.standing import Standing
 from vram_arbiter.arbiter.core.scheduling import policy
 
 LOOKED_AT_MAX = 16
@@ -19,16 +19,15 @@ LOOKS_AT_HOLDERS_MAX = 400
 type Step = dict[str, Any]
 
 
-def steps(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
+def steps(core: Core, standing: Standing, waiter: Lease) -> list[Step]:
     """For a queued lease, the nearest first; what has no instant comes last."""
-    gang = waiter.gang
-    if gang is not None and gang.phase != "waiting":
-        found = _of_gang(core, gpu, gang)
+    gpu = standing.gpu
+    if not any(waiter in core.gpus[gpu_id].queue for gpu_id in waiter.gpus):
+        found = _of_unqueued(core, gpu, standing, waiter)
     else:
-        foremost = gangs.as_waiter(gpu, waiter)
         first = policy.front(core, gpu)
-        mine = first is not None and (first is waiter or (gang is not None and first.gang is gang))
-        found = _of_head(core, gpu, foremost) if mine else []
+        mine = any(first is one for one in standing.fellows)
+        found = _of_head(core, gpu, standing.request) if mine else []
     if waiter.wait_timeout_s is not None:
         at = waiter.arrived_at + waiter.wait_timeout_s
         found.append(
@@ -37,28 +36,18 @@ def steps(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
     return sorted(found, key=lambda step: float("inf") if step["in_s"] is None else step["in_s"])
 
 
-def _of_gang(core: Core, gpu: Gpu, gang: Gang) -> list[Step]:
-    """While it gathers or loads. Its members wait for each other, and for the memory of the one before."""
-    if gang.phase == "gathering":
-        ends_at = core.timers.due(("gang", gang.name))
-        return (
-            []
-            if ends_at is None
-            else [_given_up(core, gang, ends_at, "if the rest has not come back")]
-        )
-    found = [_load_ends(core, lease) for lease in gpu.in_state(LeaseState.LOADING)]
-    if not found:
-        found.append(
+def _of_unqueued(core: Core, gpu: Gpu, standing: Standing, waiter: Lease) -> list[Step]:
+    """Of a request that waits for the rest of its group, or with its bytes reserved for its turn to load."""
+    found: list[Step] = []
+    if waiter.id in gpu.ledger.reserved:
+        found = [_load_ends(core, lease) for lease in gpu.in_state(LeaseState.LOADING)]
+        found = found or [
             _next_reading(core, gpu, "its bytes are kept for it, the card has to show them")
-        )
-    if (since := gang.short_since.get(gpu.info.id)) is not None:
-        at = since + core.settings.verify_timeout_s
-        found.append(_given_up(core, gang, at, "if its memory is not free then"))
+        ]
+    if standing.gives_up is not None:
+        at, because = standing.gives_up
+        found.append(_step(core, "break", None, at, f"gives {standing.group} up", because))
     return found
-
-
-def _given_up(core: Core, gang: Gang, at: float, because: str) -> Step:
-    return _step(core, "break", None, at, f"gives gang {gang.name} up", because)
 
 
 def _load_ends(core: Core, lease: Lease) -> Step:

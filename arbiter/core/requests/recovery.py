@@ -20,7 +20,7 @@ from vram_arbiter.arbiter.core.events import (
     Spec,
 )
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import gangs, standby
+from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import drift
 from vram_arbiter.arbiter.core.ledger.ledger import process_bytes
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState, Order, Use
@@ -161,8 +161,8 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
     if lease.state is LeaseState.VERIFYING:
         begin_for_lease(core, gpu, lease, alive=True)
         return
-    if record.get("gang") is not None:
-        gangs.restore(core, lease, str(record["gang"][0]), int(record["gang"][1]))
+    for feature in core.features:
+        feature.from_record(core, lease, record)
     lease.expires_at = core.now + spec.ttl_s + core.settings.fence_grace_s
     core.timers.set(("ttl", lease_id), lease.expires_at)
     if lease.state is LeaseState.HELD:

@@ -19,7 +19,7 @@ from vram_arbiter.arbiter.core.events import (
     UnloadStarted,
 )
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import gangs, standby
+from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import costs, crashes, drift
 from vram_arbiter.arbiter.core.model.lease import (
     AWAY,
@@ -126,13 +126,13 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         return
     spec = replace(event.spec, exclusive=True) if core.settings.scheduling.alone else event.spec
     load_peak, steady = drift.expected_bytes(core, spec)
-    if spec.gang is not None:
-        gangs.check(core, *spec.gang)
+    for feature in core.features:
+        feature.check_request(core, spec)
     try:
         gpus = placement.places(core, spec, load_peak)
     except Refused as refused:
-        if spec.gang is not None:
-            gangs.left_out(core, spec.gang[0], refused.message)
+        for feature in core.features:
+            feature.on_refused(core, spec, refused.message)
         raise
     check_waiters(core, client, spec.priority)
     away = (
@@ -147,10 +147,8 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         crashes.check(core, spec, load_peak, gpus)
     lease = new_lease(core, event, client, spec, load_peak, steady, gpus)
     core.unanswered.append(lease)
-    if spec.gang is None:
+    if not any(feature.hold_back(core, lease) for feature in core.features):
         core.enqueue(lease)
-    else:
-        gangs.join(core, lease, *spec.gang)
 
 
 def new_lease(

@@ -69,11 +69,10 @@ class _Reduction:
         self.core = core
         waits = {process: _waits_of(core, process) for process in core.users}
         self.waits = {process: mine for process, mine in waits.items() if _is_looked_at(mine)}
-        # a gang's member that stands in no queue waits for its fellows, not for bytes
-        aside = (
-            one for gang in core.gangs.values() if gang.phase != "waiting" for one in gang.members
-        )
-        self.served: set[LeaseId] = {lease.id for lease in aside}
+        # a request in no queue waits for others of its feature, not for bytes
+        self.served: set[LeaseId] = {
+            lease.id for feature in core.features for lease in feature.unqueued()
+        }
 
     def run(self) -> list[Lease]:
         """Waiters that are left over, by arrival."""

@@ -2,9 +2,10 @@
 
 Per card, in this order (the numbers stand in `_serve`):
   1. under pressure: ask idle holders to leave, grant nothing
-  2. a gang loads here: its next member; blocked (recovering, drained, reading unknown, a load under way): grant nothing, ask nobody
-  3. nobody waits: whoever is on standby and fits may come back, asking nobody to leave
-  4. the head is one of a gang: all of it or nothing, on all its cards (`gangs`); nobody passes it
+  2. a feature keeps the GPU for its own requests: grant what it grants (`Feature.serve_reserved`)
+  3. blocked (recovering, drained, reading unknown, a load under way): grant nothing, ask nobody
+  4. nobody waits: whoever is on standby and fits may come back, asking nobody to leave; a head that a feature owns is served by it
+     alone (`Feature.serve`)
   5. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a head for which another card is
      being emptied is passed over from here on
   6. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out already
@@ -15,7 +16,7 @@ Per card, in this order (the numbers stand in `_serve`):
 from collections.abc import Mapping
 
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import gangs, standby
+from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import costs
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
@@ -43,14 +44,11 @@ def _serve(core: Core, gpu: Gpu) -> None:
     if gpu.pressed and core.recovering is None:  # 1
         _relieve(core, gpu)
         return
-    if gpu.gang is not None:  # 2
-        member = gangs.next_load(core, gpu, gpu.gang) if core.recovering is None else None
-        if member is not None:
-            grant(core, gpu, member)
+    if any(feature.serve_reserved(core, gpu) for feature in core.features):  # 2
         return
-    if gpu.blocked:  # 2
+    if gpu.blocked:  # 3
         return
-    if gpu.queue.head() is None:  # 3
+    if gpu.queue.head() is None:  # 4
         back = standby.next_back(core, gpu)
         if back is not None:
             _grant_if_measured(core, gpu, back)
@@ -58,8 +56,7 @@ def _serve(core: Core, gpu: Gpu) -> None:
     head = policy.front(core, gpu)
     if head is None:
         return
-    if head.gang is not None:  # 4
-        gangs.serve(core, gpu, head.gang)
+    if any(feature.serve(core, gpu, head) for feature in core.features):  # 4
         return
     if policy.fits(gpu, head):  # 5
         _grant_if_measured(core, gpu, head)
@@ -146,11 +143,15 @@ def _backfill(
     for lease in gpu.queue.behind_head():
         if lease.load_peak_bytes > most or (lease.spec.exclusive and not alone):
             continue  # seen at a glance: thousands may wait
-        if lease is head or lease.gang is not None or (stuck and not _may_be_asked(core, lease)):
+        if lease is head or _is_owned(core, lease) or (stuck and not _may_be_asked(core, lease)):
             continue
         if policy.added_bytes(gpu, lease) <= spare and policy.fits(gpu, lease):
             _grant_if_measured(core, gpu, lease)
             return
+
+
+def _is_owned(core: Core, lease: Lease) -> bool:
+    return any(feature.owns(lease) for feature in core.features)
 
 
 def _may_be_asked(core: Core, lease: Lease) -> bool:

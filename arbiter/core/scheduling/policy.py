@@ -39,11 +39,15 @@ def blocked(core: Core, gpu: Gpu) -> str:
         return "the card has not been read yet"
     if loading := gpu.in_state(LeaseState.LOADING):
         return f"{loading[0].spec.consumer} is loading"
-    if gpu.gang is not None:
-        return f"gang {gpu.gang.name} is loading"
+    if reason := _kept_by_feature(core, gpu):
+        return reason
     if gpu.pressed:
         return f"pressure: {gpu.ledger.pressure_bytes()} bytes more than the budget are held"
     return ""
+
+
+def _kept_by_feature(core: Core, gpu: Gpu) -> str:
+    return next(filter(None, (feature.blocks(gpu) for feature in core.features)), "")
 
 
 def _missing(core: Core, missing: Collection[LeaseId]) -> str:
@@ -95,7 +99,7 @@ def residue_under_measurement(gpu: Gpu) -> bool:
 
 
 def joining(lease: Lease) -> Mapping[ProcessKey, int]:
-    """What a grant charges, by process: one lease's load peak, or what a gang's members on one card need together."""
+    """What a grant charges, by process: one lease's load peak, or what the leases of a group need together."""
     return {lease.process: lease.load_peak_bytes} if lease.needs is None else lease.needs
 
 
@@ -197,7 +201,7 @@ def measured_need_bytes(gpu: Gpu, lease: Lease) -> int:
 def _unheld_bytes(gpu: Gpu, process: ProcessKey, count: int) -> int:
     account = gpu.ledger.accounts.get(process)
     if account is not None and any(lease not in gpu.ledger.reserved for lease in account.charges):
-        return count  # what it holds is of leases; bytes that are kept for a gang's members nobody holds
+        return count  # what it holds is of its leases; reserved bytes are not held by anyone yet
     own = None if gpu.sample is None else process_bytes(gpu.sample, process)
     if own is None:
         own = account.residue_bytes if account is not None else 0
@@ -224,7 +228,7 @@ def choose_victims(
     willing = [
         lease
         for lease in gpu.in_state(LeaseState.HELD)
-        if may_ask(lease)
+        if may_ask(core, lease)
         and lease.id != waiter.extends
         and (not lease.in_use or lease.spec.priority <= priority)
     ]
@@ -246,7 +250,9 @@ def choose_relief(
     idle = [
         lease
         for lease in gpu.in_state(LeaseState.HELD)
-        if may_ask(lease) and not lease.in_use and residency_ends_at(core, lease, None) <= core.now
+        if may_ask(core, lease)
+        and not lease.in_use
+        and residency_ends_at(core, lease, None) <= core.now
     ]
     ledger = gpu.ledger
     total = ledger.total_if(going)
@@ -257,12 +263,14 @@ def choose_relief(
     return _search(core, idle, covers, _freed(gpu, going, idle)) if covers(_leave(idle)) else idle
 
 
-def may_ask(lease: Lease) -> bool:
-    """Whether a holder may be revoked: not before its whole gang is held, nor before it reattached after a restart.
+def may_ask(core: Core, lease: Lease) -> bool:
+    """Return whether a holder may be revoked for others: not before it reattached after a restart, nor while a feature protects it.
 
     Processes that use a lease that has not reattached may be on their way back to it.
     """
-    return lease.gang is None and lease.evictable and lease.attached
+    if not (lease.evictable and lease.attached):
+        return False
+    return not any(feature.protects(lease) for feature in core.features)
 
 
 def residency_ends_at(core: Core, lease: Lease, waiter: Lease | None) -> float:
@@ -289,7 +297,7 @@ def ask_times(core: Core, gpu: Gpu, waiter: Lease | None) -> list[float]:
     ageing_s = core.settings.ageing_s_per_point
     times: list[float] = []
     for lease in gpu.in_state(LeaseState.HELD):
-        if not may_ask(lease):
+        if not may_ask(core, lease):
             continue
         times.append(residency_ends_at(core, lease, waiter))
         if waiter is not None and lease.in_use:
@@ -331,7 +339,7 @@ def _load_ends_by(core: Core, gpu: Gpu) -> float:
         not loading
         or gpu.failed_at is not None
         or gpu.sample is None
-        or gpu.gang is not None
+        or _kept_by_feature(core, gpu)
         or gpu.pressed
     ):
         return 0.0

@@ -248,8 +248,10 @@ class Gangs(RuleBasedStateMachine):
         assert self.driver.gpu()["charged_bytes"] == 0, self.driver.arbiter.status(self.driver.now)
         core = self.driver.arbiter.inspect()
         assert not core.users
-        assert not core.gangs
-        assert not any(gpu.ledger.reserved or gpu.gang for gpu in core.gpus.values())
+        assert not core.gangs.by_name
+        assert not core.gangs.of
+        assert not core.gangs.loading
+        assert not any(gpu.ledger.reserved for gpu in core.gpus.values())
 
 
 TestGangs = Gangs.TestCase

@@ -170,12 +170,12 @@ def test_a_gang_that_broke_is_not_waited_for_after_a_restart(asked: bool) -> Non
         a.unloading(first)
     b.die()
     assert driver.state(second) == "over"
-    assert driver.journal[f"lease:{first}"]["gang"] is None
+    assert driver.journal[f"lease:{first}"].get("gang") is None
     token = a.token(first)
     driver.restart()
     a.connect()
     answer(a.reattach(first, token))
-    assert not driver.arbiter.inspect().gangs
+    assert not driver.arbiter.inspect().gangs.by_name
 
 
 def test_bytes_kept_for_the_next_member_hide_no_context_of_the_one_before() -> None:

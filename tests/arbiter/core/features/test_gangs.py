@@ -424,7 +424,7 @@ def test_a_gang_that_was_loading_is_completed_after_a_restart(driver: CoreDriver
     b.who.hold(2 * GIB)
     b.who.ready(lease)
     assert [n["phase"] for n in driver.notes("gang")][-1] == "complete"
-    assert driver.journal[f"lease:{a.lease}"]["gang"] is None
+    assert driver.journal[f"lease:{a.lease}"].get("gang") is None
 
 
 def test_a_gang_of_which_not_all_come_back_is_broken_in_time(driver: CoreDriver) -> None:

@@ -299,7 +299,6 @@ def test_a_record_holds_all_that_was_asked_for() -> None:
         "load_peak_bytes": 3 * GIB,
         "measured_bytes": None,
         "exiting": False,
-        "gang": None,
         "pinned": None,
         "comes_back": False,
         "parks": False,
