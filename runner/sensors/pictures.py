@@ -1,20 +1,30 @@
-"""Frames as arrays that skills and encoders can use: RGB uint8, height × width × 3, whatever the camera speaks.
+"""Camera frames as arrays for skills and encoders: RGB uint8, height × width × 3.
 
-What cannot be turned into colours (depth, a handle on a device, a topic's name) is refused; nothing is filled in.
+A frame without colors (depth, a handle on a device, a topic's name) is refused. Compressed frames
+come from cameras and networks: their bytes and their header are checked before a decoder sees them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
+from vram_arbiter.runner.sensors.image_header import jpeg_header, png_header
+from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import FrameStale, ModelError
 from vram_arbiter.schemas.world import CameraModel, FrameEncoding, SensorFrame
 
+COMPRESSED_MAX_BYTES: Final = IMAGE_MESSAGE_MAX_BYTES
+PIXELS_MAX: Final = 4096 * 4096  # 50 MB as RGB; a robot's cameras have a tenth
+
 
 def as_rgb(frame: SensorFrame) -> Any:
-    """Raises ModelError for a frame that has no colours here, FrameStale for a compressed one that is broken."""
+    """Return a frame's colors.
+
+    Raises ModelError for a frame without colors, FrameStale for a compressed one that is broken,
+    too large, or of another size than its frame says.
+    """
     import numpy as np
 
     if frame.data is None:
@@ -31,21 +41,51 @@ def as_rgb(frame: SensorFrame) -> Any:
         case FrameEncoding.MONO8:
             return np.repeat(data.reshape(frame.height, frame.width, 1), 3, axis=2)
         case FrameEncoding.JPEG | FrameEncoding.PNG:
-            import cv2
-
-            bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)
-            if bgr is None or bgr.shape[:2] != (frame.height, frame.width):
-                raise FrameStale(
-                    f"the {frame.encoding} of camera {frame.sensor_id} is broken",
-                    hint="look at the camera",
-                )
-            return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+            return _decoded(frame, frame.data)
         case encoding:
-            raise ModelError(f"a frame of {encoding} from {frame.sensor_id} has no colours")
+            raise ModelError(f"a frame of {encoding} from {frame.sensor_id} has no colors")
+
+
+def _decoded(frame: SensorFrame, data: bytes) -> Any:
+    import cv2
+    import numpy as np
+
+    if problem := _problem(frame, data):
+        raise _broken(frame, problem)
+    try:
+        bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error as error:
+        raise _broken(frame, f"OpenCV refuses it: {error}") from error
+    if bgr is None or bgr.shape[:2] != (frame.height, frame.width):
+        raise _broken(frame, "it cannot be decoded")
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+def _problem(frame: SensorFrame, data: bytes) -> str:
+    """Return what forbids to decode these bytes: a decoder allocates what their header says."""
+    if len(data) > COMPRESSED_MAX_BYTES:
+        return f"{len(data)} bytes, {COMPRESSED_MAX_BYTES} are accepted"
+    try:
+        header = jpeg_header if frame.encoding is FrameEncoding.JPEG else png_header
+        width, height, *_ = header(data)
+    except ValueError as error:
+        return str(error)
+    if (width, height) != (frame.width, frame.height):
+        return f"{width} × {height} pixels in a frame of {frame.width} × {frame.height}"
+    if width * height > PIXELS_MAX:
+        return f"{width} × {height} pixels, {PIXELS_MAX} are accepted"
+    return ""
+
+
+def _broken(frame: SensorFrame, problem: str) -> FrameStale:
+    return FrameStale(
+        f"the {frame.encoding} of camera {frame.sensor_id} is broken: {problem}",
+        hint="look at the camera",
+    )
 
 
 class FramePicture:
-    """A camera's frame as `runner.goals.frames.Snapshot`; its colours are made where they are first asked for."""
+    """A camera's frame as a `Picture`; its colors are decoded when they are first read."""
 
     model: CameraModel | None = None
 
@@ -61,7 +101,7 @@ class FramePicture:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """One rendered or read picture: RGB uint8 height × width × 3, when it was taken, and where its camera stood then."""
+    """One rendered picture: RGB uint8 height × width × 3, when and from where it was taken."""
 
     camera: str
     rgb: Any

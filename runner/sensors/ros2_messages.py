@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from vram_arbiter.runner.sensors.image_header import jpeg_header
 from vram_arbiter.schemas.world import FrameEncoding
 
 NANOSECONDS = 1_000_000_000
@@ -123,31 +124,9 @@ def message_of(
 
 
 def jpeg_size(data: bytes) -> tuple[int, int, int]:
-    """Width, height and channels, read from the frame header. Raises ValueError if this is no JPEG, or a cut one."""
-    if not data.startswith(b"\xff\xd8"):
-        raise ValueError("the data is no JPEG")
-    at = 2
-    try:
-        while True:
-            if data[at] != 0xFF:
-                raise ValueError("the JPEG is damaged before its frame header")
-            marker = data[at + 1]
-            if marker == 0xFF:  # fill byte
-                at += 1
-                continue
-            if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-                height, width, channels = struct.unpack_from(">HHB", data, at + 5)
-                break
-            if marker in (0xD9, 0xDA):
-                raise ValueError("the JPEG has no frame header")
-            at += (
-                2
-                if marker == 0x01 or 0xD0 <= marker <= 0xD7
-                else 2 + struct.unpack_from(">H", data, at + 2)[0]
-            )
-    except (IndexError, struct.error):
-        raise ValueError("the JPEG ends before its frame header") from None
-    if not (width and height and channels in (1, 3)):
+    """Return width, height and channels of a whole JPEG in color or gray. Raises ValueError."""
+    width, height, channels = jpeg_header(data)
+    if channels not in (1, 3):
         raise ValueError(f"a JPEG of {width} × {height} pixels with {channels} channels")
     if b"\xff\xd9" not in data[-64:]:  # cameras pad after the end mark
         raise ValueError("the JPEG was cut off")

@@ -1,10 +1,11 @@
 """Frames become RGB whatever the camera speaks, and what has no colours is refused."""
 
+import struct
 from typing import Any
 
 import pytest
 
-from vram_arbiter.runner.sensors.pictures import as_rgb
+from vram_arbiter.runner.sensors.pictures import COMPRESSED_MAX_BYTES, as_rgb
 from vram_arbiter.schemas.errors import FrameStale, ModelError
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
@@ -35,6 +36,42 @@ def test_compressed_frames() -> None:
         as_rgb(frame(FrameEncoding.PNG, png, width=3))
     with pytest.raises(FrameStale, match="broken"):
         as_rgb(frame(FrameEncoding.JPEG, b"no picture at all"))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "start"),
+    [
+        (
+            FrameEncoding.PNG,
+            b"\x89PNG\r\n\x1a\n"
+            + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 60_000, 60_000, 8, 2, 0, 0, 0),
+        ),
+        (
+            FrameEncoding.JPEG,
+            b"\xff\xd8\xff\xc0" + struct.pack(">HBHHB", 17, 8, 60_000, 60_000, 3) + bytes(9),
+        ),
+    ],
+)
+def test_a_header_that_asks_for_gigabytes_is_refused_before_it_is_decoded(
+    encoding: FrameEncoding, start: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A camera's or a network's 40 bytes made the decoder allocate 10 GB on the control thread."""
+    import cv2
+
+    def decode(*_: Any) -> None:
+        raise AssertionError("the decoder saw the bytes")
+
+    monkeypatch.setattr(cv2, "imdecode", decode)
+    with pytest.raises(FrameStale, match=r"broken: 60000 × 60000 pixels in a frame of 2 × 1"):
+        as_rgb(frame(encoding, start + bytes(40)))
+    with pytest.raises(FrameStale, match=r"broken: 60000 × 60000 pixels, 16777216 are accepted"):
+        as_rgb(frame(encoding, start + bytes(40), width=60_000, height=60_000))
+
+
+def test_a_frame_of_too_many_bytes_is_refused() -> None:
+    """Decoding time grows with the bytes, and the control loop waits for it."""
+    with pytest.raises(FrameStale, match="16777217 bytes, 16777216 are accepted"):
+        as_rgb(frame(FrameEncoding.JPEG, b"\xff\xd8" + bytes(COMPRESSED_MAX_BYTES - 1)))
 
 
 def test_what_has_no_colours_is_refused() -> None:

@@ -129,7 +129,7 @@ def test_a_jpeg_knows_its_size(form: str) -> None:
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"\x89PNG\r\n", "no JPEG"),
+        (b"\x89PNG\r\n", "not a JPEG"),
         (jpeg()[:-2], "cut off"),
         (jpeg()[:40], "ends before"),
         (b"\xff\xd8\xff\xda\x00\x02\xff\xd9", "no frame header"),
