@@ -1,33 +1,32 @@
-"""How a lease leaves the card: never in the middle of a use, whoever wants it to go: a `revoke`, its holder, or because it is lost.
+"""How a lease leaves the GPU: never inside a use, whether the arbiter revokes it, its holder gives it
+up, or it is lost.
 
-asyncio; one `Leaving` for each lease, made by `clients.lease`. The way out is one task (`_leave`), which waits for the safe point, lets the
-holder free its bytes and tells the arbiter, through the `Driver`. It must not know what a holder may do with its lease meanwhile.
+One `Departure` for each lease, made by `clients.lease`. A background task (`_leave`) waits for the
+safe point, lets the holder free its bytes and tells the arbiter, through the `Driver`. The module
+must not know what a holder may do with its lease meanwhile.
 """
 
-import asyncio
-import inspect
 import logging
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
+
+import anyio
 
 from vram_arbiter.clients._protocol.leases import GONE_CODES
 from vram_arbiter.clients._protocol.protocol import ClientProtocol
 from vram_arbiter.clients._protocol.records import LeaseRecord
+from vram_arbiter.clients.handlers import Handler, call
 from vram_arbiter.schemas.errors import ArbiterUnreachable, BadState, VramError
 from vram_arbiter.schemas.wire.requests import LeaseSpec
 
 log = logging.getLogger(__name__)
 
-Unload = Callable[[], Awaitable[None] | None]
-"""A plain function, or a coroutine function. A plain one runs on the loop, so a long one holds up renewals."""
-
-RETRY_UNLOADING_S = 0.25
-"""Somebody else's use is still on the lease: the arbiter pushes when it ends; this only covers a lost push."""
-ANNOUNCE_TIMEOUT_S = 5.0
-RELEASE_TIMEOUT_S = 5.0
-"""A holder does not wait longer for the arbiter to hear that it let go. Who left for good ends by ttl there; who wants to come back goes
-on telling it (`clients._protocol.leases`)."""
+RETRY_UNLOADING_S: Final = 0.25
+"""While another process uses the lease: the arbiter pushes when that ends; this covers a lost push."""
+ANNOUNCE_TIMEOUT_S: Final = 5.0
+RELEASE_TIMEOUT_S: Final = 5.0
+"""How long a holder waits until the arbiter heard its release. A lease that left for good ends by its
+TTL then; the release of one that is to come back is repeated (`clients._protocol.leases`)."""
 
 
 class Driver(Protocol):
@@ -41,51 +40,42 @@ class Driver(Protocol):
     def now(self) -> float: ...
 
     def new_id(self) -> str:
-        """A name that nobody else uses; short enough for a use id."""
+        """Return a unique name, short enough for a use id."""
         ...
 
     async def reply(self, request_id: int) -> dict[str, Any]:
-        """Send what is to be sent and wait for that answer. Raises its typed error."""
+        """Send what is queued and wait for the answer to a request. Raises its typed error."""
         ...
 
     def pump(self) -> None:
-        """Send what is to be sent; nobody waits."""
+        """Send what is queued, without waiting for an answer."""
         ...
 
-    def spawn(self, work: Awaitable[None], name: str) -> "asyncio.Task[None]":
-        """Run work that outlives the caller; the client waits for it at its end."""
+    def spawn(self, work: Callable[..., Awaitable[None]], *arguments: object, name: str) -> None:
+        """Run work that outlives the caller; the client cancels it at its own end."""
         ...
 
 
-@dataclass(slots=True)
 class Progress:
-    """Wakes whoever waits for a change of a lease."""
+    """Wakes the tasks that wait for a change of a lease."""
 
-    waiters: dict["asyncio.Future[None]", None] = field(
-        default_factory=dict
-    )  # in the order of their coming
+    def __init__(self) -> None:
+        self._event = anyio.Event()
 
     def changed(self) -> None:
-        for waiter in self.waiters:
-            if not waiter.done():
-                waiter.set_result(None)
-        self.waiters.clear()
+        event, self._event = self._event, anyio.Event()
+        event.set()
 
     async def wait(self, timeout_s: float | None = None) -> None:
-        waiter: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self.waiters[waiter] = None
-        try:
-            await asyncio.wait_for(waiter, timeout_s)
-        except TimeoutError:
-            pass
-        finally:
-            self.waiters.pop(waiter, None)
+        """Return at the next change, or after `timeout_s`."""
+        with anyio.move_on_after(timeout_s):
+            await self._event.wait()
 
 
-class Leaving:
-    """What a lease is on its way to, and who waits for it.
+class Departure:
+    """The way of one lease from the GPU, and the tasks that wait for it.
 
-    `unload` frees the bytes, `park` too but keeps the weights in host RAM; `clients.lease.Callbacks` says when which of them runs.
+    `unload` frees the bytes; `park` does too, but keeps the weights in host RAM.
     """
 
     def __init__(
@@ -93,16 +83,16 @@ class Leaving:
         driver: Driver,
         record: LeaseRecord,
         spec: LeaseSpec,
-        unload: Unload | None,
-        park: Unload | None,
+        unload: Handler | None,
+        park: Handler | None,
     ) -> None:
         self.uses: set[str] = set()
-        """Of the holder, under way: there is no safe point before they have ended."""
+        """In-flight uses of the holder; there is no safe point before they have ended."""
         self.asked = False  # to leave: no new uses
         self.own_will = False  # the holder itself leaves, so it is not loading any more
         self.unloading = False
-        self.gone = False  # the lease itself
-        self.over = False  # lease gone and unload done
+        self.gone = False  # the lease has ended
+        self.over = False  # the lease has ended and the unload is done
         self.progress = Progress()
         self._driver = driver
         self._record = record
@@ -111,17 +101,18 @@ class Leaving:
         self._park = park
         self._park_now = False  # the holder itself wants to park
         self._unloaded = False
-        self._task: asyncio.Task[None] | None = None
+        self._left: anyio.Event | None = None  # set when `_leave` returns; None: it was not started
 
-    # -- whoever wants it to go ---------------------------------------------------------------------------------------
+    # -- reasons to leave --------------------------------------------------------------------------
     def start(self) -> None:
-        """No new uses; it leaves at the next safe point."""
+        """Allow no new uses; leave at the next safe point."""
         self.asked = True
-        if self._task is None and not self.gone:
-            self._task = self._driver.spawn(self._leave(), f"leave {self._record.lease_id}")
+        if self._left is None and not self.gone:
+            self._left = anyio.Event()
+            self._driver.spawn(self._leave, self._left, name=f"leave {self._record.lease_id}")
 
     async def park(self) -> None:
-        """Leave of the holder's own will, to come back; returns when the arbiter has said how: it sleeps, or is over."""
+        """Leave on the holder's wish, to come back. Returns when the lease is asleep or over."""
         token, self._park_now = self._record.token, True
         self.start()
         while (
@@ -132,23 +123,22 @@ class Leaving:
             await self.progress.wait()
 
     async def give_up(self) -> None:
-        """Leave of the holder's own will, for good; returns when that is done. Idempotent."""
+        """Leave on the holder's wish, for good. Returns when that is done. Idempotent."""
         while not self.over:
             if self._record.asleep and not self.gone:
                 if not self.unloading:
                     await self._unload_once()
                     await self.release()
                     return
-            elif (
-                not self.own_will
-            ):  # also where it went to sleep, and came back, while we waited for its end
+            elif not self.own_will:  # also where it slept and came back during this wait
                 self.own_will = True
                 self.start()
                 self.progress.changed()
             await self.progress.wait()
 
     async def release(self, *, exiting: bool = False) -> None:
-        """The bytes are freed already. Idempotent; what the arbiter refuses is raised, and the lease over all the same."""
+        """Report bytes that are freed already. Idempotent. Raises what the arbiter refuses with; the
+        lease is over all the same."""
         self.asked = True
         if self.gone:
             return
@@ -165,15 +155,16 @@ class Leaving:
         self.end()
 
     def cut_off(self) -> None:
-        """The lease ended without us; `free_what_was_lost` has to follow."""
+        """Note that the lease ended without the holder; `free_what_was_lost` has to follow."""
         self.gone = self.asked = True
 
     async def free_what_was_lost(self, fenced: bool) -> None:
-        """Its bytes go at the next safe point. `fenced`: we ended it, the arbiter may not know."""
+        """Free the bytes at the next safe point. `fenced`: the client ended the lease, and the
+        arbiter may not know."""
         while self.uses:
             await self.progress.wait()
-        if self.unloading and self._task is not None:
-            await asyncio.wait([self._task])
+        if self.unloading and self._left is not None:
+            await self._left.wait()
         else:
             await self._unload_once()
         if fenced:  # the arbiter may live: tell it as soon as it can be reached
@@ -183,42 +174,47 @@ class Leaving:
             self._driver.pump()
 
     def returned(self) -> None:
-        """It is granted again: nobody has asked it to leave since."""
+        """Begin anew: the lease is granted again, and was not revoked since."""
         self.asked = self.own_will = self.unloading = self._unloaded = self._park_now = False
-        self._task = None
+        self._left = None
 
     def end(self) -> None:
         self.gone = self.over = self.asked = True
         self.progress.changed()
 
-    # -- steps ---------------------------------------------------------------------------------------------------------
-    async def _leave(self) -> None:
-        """1. Wait for the safe point: no local use, not loading. 2. Announce, until no use of others is on it. 3. Unload, or park.
-        4. Release. A lease that may come back sleeps then; any other is over."""
+    # -- steps -------------------------------------------------------------------------------------
+    async def _leave(self, left: anyio.Event) -> None:
+        try:
+            await self._leave_at_safe_point()
+        finally:
+            left.set()
+
+    async def _leave_at_safe_point(self) -> None:
+        """1. Wait for the safe point: no use of the holder, not loading.
+        2. Announce it, until no other process uses the lease. 3. Unload, or park. 4. Release.
+        A lease that may come back is asleep then; any other is over."""
         token = self._record.token
         while not self.gone:
             if self.uses or not (self._record.held or self.own_will):  # 1
                 await self.progress.wait()
             elif not self._record.held or await self._announced():  # 2
                 self.unloading = True
-                asleep = await self._clear_the_card()  # 3
+                asleep = await self._clear_the_gpu()  # 3
                 if not self.gone:
                     try:
                         await self._release(exiting=False, asleep=asleep)  # 4
-                    except (
-                        VramError
-                    ) as error:  # nothing is held any more, and its ttl ends it there
+                    except VramError as error:  # nothing is held; its TTL ends the lease there
                         log.warning("%s: its release was refused: %s", self._record.lease_id, error)
                 if self._record.token != token:
-                    return  # granted again before this task came to hear of its release
+                    return  # granted again before this task saw the answer to its release
                 if self.gone or not self._record.asleep:
                     self.end()
                 self.unloading = False
                 self.progress.changed()
                 return
 
-    async def _clear_the_card(self) -> str:
-        """Free the bytes; says how the lease is to wait for its return ("" if it is over)."""
+    async def _clear_the_gpu(self) -> str:
+        """Free the bytes. Returns how the lease waits for its return ("": it is over)."""
         push = self._record.revoke
         may_park = self._park_now or (push is not None and bool(push.get("park")))
         if may_park and self._park is not None and not self.own_will:
@@ -228,9 +224,9 @@ class Leaving:
         return "standby" if self._spec.standby and push is not None and not self.own_will else ""
 
     async def _announced(self) -> bool:
-        """Say `unloading`. False: not now; somebody else's use is on the lease, or there is no contact."""
+        """Report `unloading`. False: not now; another process uses the lease, or contact is lost."""
         if self.own_will and not self._driver.connected:
-            return True  # nobody can refuse, nobody can be granted: whoever wants to go may go
+            return True  # no arbiter, so no process can begin a use or be granted the room
         request = self._driver.protocol.holdings.unloading(
             self._record, self._driver.now(), ANNOUNCE_TIMEOUT_S
         )
@@ -243,9 +239,9 @@ class Leaving:
         except ArbiterUnreachable:
             return False  # stay resident: back in contact or fenced, whichever comes first
         except VramError as error:
-            if error.code not in GONE_CODES:  # else `lost` is told by the protocol
+            if error.code not in GONE_CODES:  # else the protocol reports the loss
                 log.warning(
-                    "%s: its `unloading` was refused, it is said again: %s",
+                    "%s: its `unloading` was refused and is repeated: %s",
                     self._record.lease_id,
                     error,
                 )
@@ -260,11 +256,9 @@ class Leaving:
         if self._unload is not None:
             await self._guarded(self._unload, "unload")
 
-    async def _guarded(self, work: Unload, what: str) -> None:
+    async def _guarded(self, handler: Handler, what: str) -> None:
         try:
-            result = work()
-            if inspect.isawaitable(result):
-                await result
+            await call(handler)
         except Exception:
             log.exception(
                 "%s of %s failed; the arbiter will measure what is left", what, self._spec.consumer
@@ -277,9 +271,9 @@ class Leaving:
         if not self._driver.connected:
             log.warning("%s is released without contact to the arbiter", self._record.lease_id)
             self._driver.spawn(
-                self._hear_of_release(request), f"release of {self._record.lease_id}"
+                self._hear_of_release, request, name=f"release of {self._record.lease_id}"
             )
-            return  # said when contact comes back soon, else its ttl ends it
+            return  # sent when contact comes back soon, else its TTL ends it
         try:
             await self._driver.reply(request)
         except ArbiterUnreachable:
@@ -295,7 +289,7 @@ class Leaving:
             await self._release(exiting=exiting)
 
     async def _hear_of_release(self, request: int) -> None:
-        """A lease that sleeps without the arbiter's word may turn out to be over."""
+        """Wait for the answer: a lease that sleeps without the arbiter's word may be over."""
         try:
             await self._driver.reply(request)
         except ArbiterUnreachable:
@@ -306,7 +300,7 @@ class Leaving:
 
     def _warn_unheard(self) -> None:
         then = (
-            "it is told until it has, to let it come back"
+            "it is repeated, to let the lease come back"
             if self._record.asleep
             else "it ends by its ttl"
         )

@@ -1,7 +1,6 @@
 """Client of the runner: goals with feedback and result, frames, state. Speaks `schemas.goals`; knows no robot and no GPU."""
 
 import asyncio
-import itertools
 import os
 import uuid
 from collections.abc import AsyncIterator, Mapping
@@ -10,13 +9,11 @@ from typing import Any, Literal, Self, cast
 
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.estop import Stopped, stop
-from vram_arbiter.clients.net.dealer import Transport
-from vram_arbiter.clients.net.timeouts import answered
+from vram_arbiter.clients.net.rpc_client import RpcClient
 from vram_arbiter.schemas.errors import (
     BadState,
     GoalRejected,
     RunnerUnreachable,
-    VramError,
     from_wire,
 )
 from vram_arbiter.schemas.goals import FeedbackPush, FrameReply, ResultPush
@@ -87,10 +84,7 @@ class RunnerClient:
         self.endpoint = endpoint or program_endpoint("runner", os.environ, os.getuid())
         self._timeout_s = timeout_s
         self._connect_timeout_s = connect_timeout_s
-        self._transport: Transport | None = None
-        self._proven = False
-        self._ids = itertools.count(1)
-        self._waiting: dict[int, asyncio.Future[Message]] = {}
+        self._rpc = RpcClient(self.endpoint, program="runner", lost=self._lost, pushed=self._pushed)
         self._goals: dict[str, Goal] = {}
 
     async def __aenter__(self) -> Self:
@@ -101,7 +95,7 @@ class RunnerClient:
 
     async def close(self) -> None:
         """Goals go on without us."""
-        self._drop(self._lost("the client was closed"))
+        self._rpc.drop(self._lost("the client was closed"))
 
     # -- goals -------------------------------------------------------------------------------------------------------
     async def send_goal(
@@ -199,57 +193,32 @@ class RunnerClient:
         self, op: str, fields: Mapping[str, Any] | None = None, *, timeout_s: float | None = None
     ) -> Message:
         """Any op of `schemas.goals`. Raises its typed error, RunnerUnreachable, or UntrustedServer before anything is said."""
-        if not self._proven:
+        if not self._rpc.proven:
             await self._exchange("ping", {}, self._connect_timeout_s)
         return await self._exchange(
             op, fields or {}, self._timeout_s if timeout_s is None else timeout_s
         )
 
-    # -- steps -------------------------------------------------------------------------------------------------------
+    # -- steps -------------------------------------------------------------------------------------
     async def _exchange(self, op: str, fields: Mapping[str, Any], timeout_s: float) -> Message:
-        if self._transport is None:
-            loop = asyncio.get_running_loop()
-            self._transport = Transport(
-                self.endpoint,
-                loop,
-                self._received,
-                lambda: self._drop(self._lost("it hung up")),
-                self._drop,
-                program="runner",
-            )
-        request_id = next(self._ids)
-        answer: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
-        self._waiting[request_id] = answer
         try:
-            if not self._transport.send({"op": op, "id": request_id, **fields}):
-                raise RunnerUnreachable(
-                    f"{self.endpoint} takes no more requests", hint="it hangs; restart it"
-                )
-            return await answered(answer, timeout_s)
+            reply = await self._rpc.exchange({"op": op, **fields}, timeout_s)
         except TimeoutError:
             raise RunnerUnreachable(
                 f"no runner answers {op} at {self.endpoint} within {timeout_s:g} s",
                 hint="start `vram-runner`, or see its log",
             ) from None
-        finally:
-            self._waiting.pop(request_id, None)
+        if not reply.get("ok"):
+            raise from_wire(reply.get("error") or {})
+        return reply
 
-    def _received(self, message: Message) -> None:
-        self._proven = True
-        match message.get("push"):
+    def _pushed(self, message: Message) -> None:
+        match message["push"]:
             case "feedback":
                 if goal := self._goals.get(message["goal_id"]):
                     goal.fed(cast(FeedbackPush, message))
             case "result":
                 self._end(cast(ResultPush, message))
-            case _:
-                answer = self._waiting.get(message.get("re", -1))
-                if answer is None or answer.done():
-                    return
-                if message.get("ok"):
-                    answer.set_result(message)
-                else:
-                    answer.set_exception(from_wire(message.get("error") or {}))
 
     def _end(self, result: ResultPush) -> None:
         if goal := self._goals.pop(result["goal_id"], None):
@@ -259,12 +228,3 @@ class RunnerClient:
         return RunnerUnreachable(
             f"contact to {self.endpoint} lost: {reason}", hint="is the runner alive?"
         )
-
-    def _drop(self, error: VramError) -> None:
-        if self._transport is not None:
-            self._transport.close()
-        self._transport = None
-        self._proven = False
-        for answer in self._waiting.values():
-            if not answer.done():
-                answer.set_exception(error)

@@ -1,52 +1,81 @@
-"""The arbiter's client for programs with threads: the same surface as `clients.client`, blocking, with `with`.
+"""The arbiter's client for programs with threads: `clients.client` with blocking methods.
 
-    with Client(name="detector") as client:
-        with client.lease(spec, unload=model.unload) as lease:
+    with Client("detector") as arbiter:
+        with arbiter.lease(vram="5.3GB", model="owlv2", unload=model.unload) as lease:
             model.load()
             lease.ready(model.allocated_bytes())
             with lease.use("detect"):
                 ...
 
-One background thread runs the asyncio client, so that renewals and revocations are answered whatever the program does. Callbacks
-run in worker threads, never on that loop. Any thread may call; not across a fork.
+An event loop in a background thread (anyio's blocking portal) runs the async client, so renewals and
+revocations are answered whatever the program does. Any thread may call. A client does not survive a
+fork. Every class has the methods of its async twin; a test compares them.
 """
 
-import asyncio
 import os
-import threading
-from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
-from typing import Any, Self, TypeVar
+from types import TracebackType
+from typing import Any, Self
 
-from vram_arbiter.clients import use_context as inside
-from vram_arbiter.clients._protocol.records import Eviction
+from anyio.from_thread import BlockingPortal, start_blocking_portal
+
+from vram_arbiter.clients import use_context
+from vram_arbiter.clients._protocol import records as r
+from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
+from vram_arbiter.clients._spec import Vram
 from vram_arbiter.clients.client import CONNECT_TIMEOUT_S, AsyncClient
-from vram_arbiter.clients.lease import (
-    AsyncForeignUse,
-    AsyncLease,
-    AsyncUse,
-    LeaseState,
-    SafePointEta,
-)
+from vram_arbiter.clients.handlers import Handler, Handlers
+from vram_arbiter.clients.lease import AsyncForeignUse, AsyncLease, AsyncUse, LeaseState
 from vram_arbiter.schemas.errors import BadState, VramError
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
-T = TypeVar("T")
-Message = dict[str, Any]
-SyncUnload = Callable[[], None]
-SyncOnRevoke = Callable[["Lease", Mapping[str, Any]], None]
-SyncOnReturn = Callable[["Lease"], None]
-SyncOnLost = Callable[["Lease", VramError], None]
 
-CLOSE_TIMEOUT_S = 10.0  # the thread's own end, after leases are given up
+class _Portal:
+    """The background thread of one client. Raises BadState where it does not run."""
+
+    def __init__(self) -> None:
+        self._pid = os.getpid()
+        self._portal: BlockingPortal | None = None
+
+    @property
+    def inherited(self) -> bool:
+        """Whether this process is a fork of the one that made the client."""
+        return os.getpid() != self._pid
+
+    @contextmanager
+    def run(self) -> Iterator[BlockingPortal]:
+        with start_blocking_portal(name="vram-arbiter-client") as portal:
+            self._portal = portal
+            try:
+                yield portal
+            finally:
+                self._portal = None
+                portal.call(portal.stop, True)  # calls of other threads end too
+
+    def call[T](self, work: Callable[..., Awaitable[T]], *arguments: Any, **named: Any) -> T:
+        """Run `work` in the background thread and wait for it. Ctrl-C cancels it there too."""
+        if self._portal is None or self.inherited:
+            what = "closed" if self._portal is None else "made before a fork"
+            raise BadState(
+                f"this client was {what}", hint="make one in this process, use it inside `with`"
+            )
+        future: Future[T] = self._portal.start_task_soon(partial(work, *arguments, **named))
+        try:
+            return future.result()
+        except BaseException:
+            future.cancel()
+            raise
 
 
 class Lease:
-    """A granted lease for threads; see `clients.lease.AsyncLease`."""
+    """A granted lease. `give_up` runs the `unload` handler; `release` reports bytes that the holder
+    freed itself."""
 
-    def __init__(self, client: "Client", lease: AsyncLease) -> None:
-        self._client = client
+    def __init__(self, portal: _Portal, lease: AsyncLease) -> None:
+        self._portal = portal
         self._lease = lease
 
     @property
@@ -54,19 +83,18 @@ class Lease:
         return self._lease.lease_id
 
     @property
-    def token(self) -> tuple[int, int]:
+    def token(self) -> r.TokenPair:
+        """Fencing token (epoch, serial). A process that has it and the lease id can mark uses."""
         return self._lease.token
 
     @property
     def spec(self) -> LeaseSpec:
+        """What was asked for; `resize` changes its footprint."""
         return self._lease.spec
 
     @property
-    def view(self) -> Mapping[str, Any]:
-        return self._lease.view
-
-    @property
     def gpu(self) -> str:
+        """UUID of the GPU that was granted."""
         return self._lease.gpu
 
     @property
@@ -74,279 +102,364 @@ class Lease:
         return self._lease.state
 
     @property
+    def uses(self) -> int:
+        """Number of in-flight uses of this holder."""
+        return self._lease.uses
+
+    @property
     def revoking(self) -> bool:
+        """Whether the lease is on its way out, or away."""
         return self._lease.revoking
 
     @property
-    def evicted(self) -> Eviction | None:
-        """Who made it leave, and why; see `clients.lease.AsyncLease.evicted`."""
+    def evicted(self) -> r.Eviction | None:
+        """Why the arbiter revoked the lease; None: it did not."""
         return self._lease.evicted
 
     @property
+    def given_up(self) -> bool:
+        """Whether the holder itself ended the lease (`give_up`)."""
+        return self._lease.given_up
+
+    @property
     def error(self) -> VramError | None:
-        """Why the lease is gone, if it was not we who ended it."""
+        """Why the lease is gone, if its holder did not end it."""
         return self._lease.error
 
     def __repr__(self) -> str:
         return repr(self._lease)
 
     def ready(self, measured_bytes: int | None = None) -> None:
-        self._client.run(self._lease.ready(measured_bytes))
+        """Report that the model is loaded; see `AsyncLease.ready`."""
+        self._portal.call(self._lease.ready, measured_bytes)
 
     @contextmanager
     def use(self, label: str = "") -> Iterator["Use"]:
-        """A busy interval. Raises LeaseRevoking or LeaseLost before it begins."""
+        """Mark a busy interval: the holder is not evicted inside it; see `AsyncLease.use`."""
         interval = self._lease.use(label)
-        use = self._client.run(interval.__aenter__())
-        inside.enter(use.use_id)  # the loop's thread entered it for itself only
+        use = self._portal.call(interval.__aenter__)
+        use_context.enter(use.use_id)  # the background task entered it for itself only
         try:
-            yield Use(self._client, use)
+            yield Use(self._portal, use)
         finally:
-            self._client.run(interval.__aexit__(None, None, None))
+            self._portal.call(interval.__aexit__, None, None, None)
 
     def oom(self, requested_bytes: int, allocated_bytes: int | None = None) -> None:
-        self._client.run(self._lease.oom(requested_bytes, allocated_bytes))
+        """Report an allocation that failed; see `AsyncLease.oom`."""
+        self._portal.call(self._lease.oom, requested_bytes, allocated_bytes)
 
     def resize(self, footprint: Footprint, wait_timeout_s: float | None = None) -> None:
-        self._client.run(self._lease.resize(footprint, wait_timeout_s))
+        """Hold more, or less; see `AsyncLease.resize`."""
+        self._portal.call(self._lease.resize, footprint, wait_timeout_s)
 
     def park(self) -> None:
-        self._client.run(self._lease.park())
+        """Leave the GPU and keep the weights in host RAM; see `AsyncLease.park`."""
+        self._portal.call(self._lease.park)
 
     def reacquire(self, wait_timeout_s: float | None = None) -> None:
-        self._client.run(self._lease.reacquire(wait_timeout_s))
+        """Come back from `standby` or `parked`; see `AsyncLease.reacquire`."""
+        self._portal.call(self._lease.reacquire, wait_timeout_s)
 
     def wait_returned(self) -> None:
-        self._client.run(self._lease.wait_returned())
+        """Wait until an evicted lease is granted again. Raises what ended it."""
+        self._portal.call(self._lease.wait_returned)
 
     def release(self, *, exiting: bool = False) -> None:
-        self._client.run(self._lease.release(exiting=exiting))
+        """Report that the bytes are freed; see `AsyncLease.release`."""
+        self._portal.call(self._lease.release, exiting=exiting)
 
     def give_up(self) -> None:
-        self._client.run(self._lease.give_up())
+        """Wait for uses in flight, then run `unload` and release. Idempotent."""
+        self._portal.call(self._lease.give_up)
+
+    def wait_change(self, seen: LeaseState) -> LeaseState:
+        """Wait until `state` differs from `seen`, and return it; see `AsyncLease.wait_change`."""
+        return self._portal.call(self._lease.wait_change, seen)
 
     def wait_gone(self) -> None:
-        self._client.run(self._lease.wait_gone())
+        """Wait until the lease has ended and its `unload`, if any, is done."""
+        self._portal.call(self._lease.wait_gone)
 
 
 class Use:
-    """A use on one's own lease; see `clients.lease.AsyncUse`."""
+    """A use on the holder's own lease; made by `Lease.use`."""
 
-    def __init__(self, client: "Client", use: AsyncUse) -> None:
-        self._client = client
+    def __init__(self, portal: _Portal, use: AsyncUse) -> None:
+        self._portal = portal
         self._use = use
+
+    @property
+    def use_id(self) -> str:
+        return self._use.use_id
 
     @contextmanager
     def yielded(self) -> Iterator[None]:
-        """Inside, the use does not keep the lease. Raises LeaseRevoking or LeaseLost at the end if it has left meanwhile."""
-        interval = self._use.yielded()
-        self._client.run(interval.__aenter__())
+        """Pause the use: inside the block the holder may be evicted; see `AsyncUse.yielded`."""
+        pause = self._use.yielded()
+        self._portal.call(pause.__aenter__)
         try:
             yield
         finally:
-            self._client.run(interval.__aexit__(None, None, None))
-            inside.enter(self._use.use_id)
+            self._portal.call(pause.__aexit__, None, None, None)
+            use_context.enter(self.use_id)
+
+
+class ForeignUse:
+    """A use on the lease of another process; see `AsyncForeignUse`."""
+
+    def __init__(self, portal: _Portal, use: AsyncForeignUse) -> None:
+        self._portal = portal
+        self._use = use
+
+    @property
+    def lease_id(self) -> str:
+        return self._use.lease_id
+
+    @property
+    def token(self) -> r.TokenPair:
+        return self._use.token
+
+    @property
+    def use_id(self) -> str:
+        return self._use.use_id
+
+    @property
+    def lost(self) -> VramError | None:
+        """Why the use ended early, or None."""
+        return self._use.lost
+
+    def end(self) -> None:
+        """End the use. Idempotent."""
+        self._portal.call(self._use.end)
 
 
 class Client:
-    """`with`, or `connect` and `close`. Raises as `clients.client.AsyncClient`."""
+    """One connection to the arbiter, open inside `with`. Raises as `clients.client.AsyncClient`.
+
+    In a forked child it raises BadState, and leaving the block only forgets: the parent owns it.
+    """
 
     def __init__(
         self,
-        endpoint: str | None = None,
-        *,
         name: str,
+        *,
+        endpoint: str | None = None,
         role: str = "client",
         connect_timeout_s: float = CONNECT_TIMEOUT_S,
     ) -> None:
         self._client = AsyncClient(
-            endpoint, name=name, role=role, connect_timeout_s=connect_timeout_s
+            name, endpoint=endpoint, role=role, connect_timeout_s=connect_timeout_s
         )
-        self._pid = os.getpid()
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._thread: threading.Thread | None = None
+        self._portal = _Portal()
+        self._stack = ExitStack()
 
-    # -- connection ------------------------------------------------------------------------------------------------
+    # -- connection --------------------------------------------------------------------------------
     def __enter__(self) -> Self:
-        self.connect()
+        with ExitStack() as stack:
+            portal = stack.enter_context(self._portal.run())
+            connection: AbstractContextManager[Any] = portal.wrap_async_context_manager(
+                self._client
+            )
+            stack.enter_context(connection)
+            self._stack = stack.pop_all()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if not self._portal.inherited:
+            self._stack.__exit__(None, None, None)
 
     @property
-    def connected(self) -> bool:
-        return self._client.connected
-
-    @property
-    def epoch(self) -> int | None:
-        return self._client.epoch
+    def name(self) -> str:
+        return self._client.name
 
     @property
     def endpoint(self) -> str:
         return self._client.endpoint
 
-    def connect(self) -> None:
-        if self._loop is not None:
-            return
-        loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(
-            target=_serve, args=(loop,), name="vram-arbiter-client", daemon=True
-        )
-        self._thread.start()
-        self._loop = loop
-        try:
-            self.run(self._client.connect())
-        except BaseException:
-            self._end_thread()
-            raise
+    @property
+    def connected(self) -> bool:
+        """Whether the arbiter answered this connection's hello."""
+        return self._client.connected
 
-    def close(self) -> None:
-        """Give up all leases and end the background thread. In a forked child: only forget (the parent owns the socket)."""
-        if self._loop is None or os.getpid() != self._pid:
-            return
-        try:
-            self.run(self._client.close())
-        finally:
-            self._end_thread()
+    @property
+    def epoch(self) -> int | None:
+        """Number of the daemon's start; None before the first answer."""
+        return self._client.epoch
 
-    def run(self, work: Coroutine[Any, Any, T]) -> T:
-        """Run a coroutine on the client's loop and wait for it. Ctrl-C cancels it there too."""
-        if self._loop is None or os.getpid() != self._pid:
-            work.close()
-            what = "closed" if self._loop is None else "made before a fork"
-            raise BadState(
-                f"this client was {what}", hint="make one in this process, use it inside `with`"
-            )
-        future = asyncio.run_coroutine_threadsafe(work, self._loop)
-        try:
-            return future.result()
-        except BaseException:
-            future.cancel()
-            raise
+    @property
+    def leases(self) -> Sequence[Lease]:
+        """Leases that this client holds now."""
+        return tuple(Lease(self._portal, lease) for lease in self._client.leases)
 
-    # -- leases ------------------------------------------------------------------------------------------------------
+    # -- leases ------------------------------------------------------------------------------------
     def acquire(
         self,
-        spec: LeaseSpec,
+        spec: LeaseSpec | None = None,
         wait_timeout_s: float | None = None,
         *,
-        unload: SyncUnload | None = None,
-        park: SyncUnload | None = None,
-        on_return: SyncOnReturn | None = None,
-        on_revoke: SyncOnRevoke | None = None,
-        on_lost: SyncOnLost | None = None,
-        safe_point_eta_s: SafePointEta | None = None,
+        vram: Vram | None = None,
+        model: str | None = None,
+        handlers: Handlers[Lease] | None = None,
+        unload: Handler | None = None,
+        park: Handler | None = None,
+        restore: Callable[[Lease], object] | None = None,
+        on_revoke: Callable[[Lease, r.Eviction], object] | None = None,
+        on_lost: Callable[[Lease, VramError], object] | None = None,
+        safe_point_eta_s: Callable[[], float | None] | None = None,
+        traceparent: str | None = None,
+        **fields: Any,
     ) -> Lease:
-        """Block until granted. Raises WaitTimeout, VramInsufficient, UnknownGpu, HolderBusy, LimitExceeded."""
-
-        async def revoked(lease: AsyncLease, push: Mapping[str, Any]) -> None:
-            if on_revoke is not None:
-                await asyncio.to_thread(on_revoke, Lease(self, lease), push)
-
-        async def lost(lease: AsyncLease, error: VramError) -> None:
-            if on_lost is not None:
-                await asyncio.to_thread(on_lost, Lease(self, lease), error)
-
-        async def returned(lease: AsyncLease) -> None:
-            if on_return is not None:
-                await asyncio.to_thread(on_return, Lease(self, lease))
-
-        granted = self._client.acquire(
-            spec,
-            wait_timeout_s,
-            unload=None if unload is None else partial(asyncio.to_thread, unload),
-            park=None if park is None else partial(asyncio.to_thread, park),
-            on_return=returned,
-            on_revoke=revoked,
-            on_lost=lost,
+        """Block until granted; see `AsyncClient.acquire`."""
+        merged = (handlers or Handlers[Lease]()).merged(
+            unload=unload,
+            park=park,
+            restore=restore,
+            on_revoke=on_revoke,
+            on_lost=on_lost,
             safe_point_eta_s=safe_point_eta_s,
         )
-        return Lease(self, self.run(granted))
+        granted = self._portal.call(
+            self._client.acquire,
+            spec,
+            wait_timeout_s,
+            vram=vram,
+            model=model,
+            handlers=self._adapted(merged),
+            traceparent=traceparent,
+            **fields,
+        )
+        return Lease(self._portal, granted)
 
     @contextmanager
     def lease(
         self,
-        spec: LeaseSpec,
+        spec: LeaseSpec | None = None,
         wait_timeout_s: float | None = None,
         *,
-        unload: SyncUnload | None = None,
-        park: SyncUnload | None = None,
-        on_return: SyncOnReturn | None = None,
-        on_revoke: SyncOnRevoke | None = None,
-        on_lost: SyncOnLost | None = None,
-        safe_point_eta_s: SafePointEta | None = None,
+        vram: Vram | None = None,
+        model: str | None = None,
+        handlers: Handlers[Lease] | None = None,
+        unload: Handler | None = None,
+        park: Handler | None = None,
+        restore: Callable[[Lease], object] | None = None,
+        on_revoke: Callable[[Lease, r.Eviction], object] | None = None,
+        on_lost: Callable[[Lease, VramError], object] | None = None,
+        safe_point_eta_s: Callable[[], float | None] | None = None,
+        traceparent: str | None = None,
+        **fields: Any,
     ) -> Iterator[Lease]:
-        """`acquire`, and at the end of the block: unload and release, also when the block raises."""
+        """`acquire` as a block; at its end, also when it raises: unload and release."""
         lease = self.acquire(
             spec,
             wait_timeout_s,
+            vram=vram,
+            model=model,
+            handlers=handlers,
             unload=unload,
             park=park,
-            on_return=on_return,
+            restore=restore,
             on_revoke=on_revoke,
             on_lost=on_lost,
             safe_point_eta_s=safe_point_eta_s,
+            traceparent=traceparent,
+            **fields,
         )
         try:
             yield lease
         finally:
             lease.give_up()
 
+    def gang(
+        self, specs: Sequence[LeaseSpec], wait_timeout_s: float | None = None
+    ) -> Iterator[tuple[int, Lease]]:
+        """Acquire all of these leases or none of them; see `AsyncClient.gang`."""
+        for index, lease in self._iterate(self._client.gang(specs, wait_timeout_s)):
+            yield index, Lease(self._portal, lease)
+
+    def begin_use(
+        self,
+        lease_id: str,
+        token: Sequence[int],
+        label: str = "",
+        *,
+        timeout_s: float = REQUEST_TIMEOUT_S,
+    ) -> ForeignUse:
+        """Begin a use on the lease of another process, by its token; `end` it."""
+        use = self._portal.call(self._client.begin_use, lease_id, token, label, timeout_s=timeout_s)
+        use_context.enter(use.use_id)
+        return ForeignUse(self._portal, use)
+
     @contextmanager
-    def use(
-        self, lease_id: str, token: Sequence[int], label: str = ""
-    ) -> Iterator[AsyncForeignUse]:
-        """A use on a lease of another process, by its token."""
-        use = self.run(self._client.begin_use(lease_id, token, label))
-        inside.enter(use.use_id)
+    def use(self, lease_id: str, token: Sequence[int], label: str = "") -> Iterator[ForeignUse]:
+        """`begin_use` as a block: the lease's holder is not evicted inside it."""
+        use = self.begin_use(lease_id, token, label)
         try:
             yield use
         finally:
-            self.run(use.end())
+            use.end()
 
-    # -- questions ---------------------------------------------------------------------------------------------------
-    def status(self) -> Message:
-        return self.run(self._client.status())
+    # -- questions ---------------------------------------------------------------------------------
+    def ask(
+        self,
+        op: str,
+        fields: Mapping[str, Any] | None = None,
+        *,
+        timeout_s: float = REQUEST_TIMEOUT_S,
+    ) -> r.Message:
+        """Send any request of `schemas.wire.requests` that has no method here."""
+        return self._portal.call(self._client.ask, op, fields, timeout_s=timeout_s)
 
-    def why(self, consumer: str) -> Message:
-        return self.run(self._client.why(consumer))
+    def status(self) -> r.Message:
+        """Return the state of everything; see `AsyncClient.status`."""
+        return self._portal.call(self._client.status)
 
-    def history(self, after: int = 0, limit: int = 500, kinds: Sequence[str] = ()) -> Message:
-        return self.run(self._client.history(after, limit, kinds))
+    def why(self, consumer: str) -> r.Message:
+        """Return what blocks this consumer; see `AsyncClient.why`."""
+        return self._portal.call(self._client.why, consumer)
 
-    def ping(self) -> Message:
-        return self.run(self._client.ping())
+    def history(self, after: int = 0, limit: int = 500, kinds: Sequence[str] = ()) -> r.Message:
+        """Return events after sequence number `after`, oldest first."""
+        return self._portal.call(self._client.history, after, limit, kinds)
 
-    def subscribe(self) -> Iterator[Message]:
-        """History events from now on; blocks for the next one. Close the iterator to stop."""
-        events = self._client.subscribe()
+    def ping(self, *, timeout_s: float = 2.0) -> r.Message:
+        return self._portal.call(self._client.ping, timeout_s=timeout_s)
+
+    def subscribe(self) -> Iterator[r.Message]:
+        """Yield history events from now on; blocks for the next one. Close the iterator to stop."""
+        return self._iterate(self._client.subscribe())
+
+    # -- steps -------------------------------------------------------------------------------------
+    def _iterate[T](self, found: AsyncIterator[T]) -> Iterator[T]:
+        async def step() -> tuple[T] | None:
+            try:
+                return (await anext(found),)
+            except StopAsyncIteration:
+                return None
+
         try:
-            while True:
-                yield self.run(_next(events.__anext__))
+            while (item := self._portal.call(step)) is not None:
+                yield item[0]
         finally:
-            self.run(_next(events.aclose))  # type: ignore[attr-defined]  # an async generator
+            self._portal.call(found.aclose)  # type: ignore[attr-defined]  # an async generator
 
-    # -- steps -------------------------------------------------------------------------------------------------------
-    def _end_thread(self) -> None:
-        assert self._loop is not None
-        assert self._thread is not None
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(CLOSE_TIMEOUT_S)
-        self._loop = self._thread = None
+    def _adapted(self, handlers: Handlers[Lease]) -> Handlers[AsyncLease]:
+        """Return the same handlers for the async client: they are given a `Lease`."""
 
+        def adapt(handler: Callable[..., object] | None) -> Callable[..., object] | None:
+            if handler is None:
+                return None
+            return lambda lease, *rest: handler(Lease(self._portal, lease), *rest)
 
-async def _next(step: Callable[[], Any]) -> Any:
-    return await step()
-
-
-def _serve(loop: asyncio.AbstractEventLoop) -> None:
-    asyncio.set_event_loop(loop)
-    try:
-        loop.run_forever()
-    finally:
-        for task in asyncio.all_tasks(loop):
-            task.cancel()
-        loop.run_until_complete(loop.shutdown_asyncgens())
-        loop.run_until_complete(loop.shutdown_default_executor())
-        loop.close()
+        return Handlers(
+            unload=handlers.unload,
+            park=handlers.park,
+            restore=adapt(handlers.restore),
+            on_revoke=adapt(handlers.on_revoke),
+            on_lost=adapt(handlers.on_lost),
+            safe_point_eta_s=handlers.safe_point_eta_s,
+        )

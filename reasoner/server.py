@@ -11,9 +11,8 @@ from typing import Any, Self
 
 from pydantic import ValidationError
 
-from vram_arbiter.clients.net.dealer import Transport
+from vram_arbiter.clients.net.rpc_client import RpcClient
 from vram_arbiter.clients.net.server import Message, Peer, RouterServer, reason_of
-from vram_arbiter.clients.net.timeouts import answered
 from vram_arbiter.reasoner.inbox import Cancel, Inbox, Said
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import (
@@ -98,33 +97,21 @@ def _refusal(request_id: int | None, error: VramError) -> Message:
 
 async def send(endpoint: str, request: Mapping[str, Any], *, timeout_s: float = SEND_S) -> Message:
     """One request to a running reasoner. Raises ReasonerUnreachable, UntrustedServer, or the typed error of its answer."""
-    answer: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
 
-    def received(message: Message) -> None:
-        if not answer.done():
-            answer.set_result(message)
+    def lost(reason: str) -> VramError:
+        return ReasonerUnreachable(
+            f"contact to {endpoint} lost: {reason}", hint="has the episode ended?"
+        )
 
-    def hung_up() -> None:
-        if not answer.done():
-            answer.set_exception(
-                ReasonerUnreachable(f"{endpoint} hung up", hint="has the episode ended?")
-            )
-
-    def refused(error: VramError) -> None:
-        if not answer.done():
-            answer.set_exception(error)
-
-    loop = asyncio.get_running_loop()
-    transport = Transport(endpoint, loop, received, hung_up, refused, program="reasoner")
+    client = RpcClient(endpoint, program="reasoner", lost=lost)
     try:
-        transport.send({"id": 1, **request})
-        reply = await answered(answer, timeout_s)
+        reply = await client.exchange(request, timeout_s)
     except TimeoutError:
         raise ReasonerUnreachable(
             f"no reasoner answers at {endpoint} within {timeout_s:g} s", hint="does an episode run?"
         ) from None
     finally:
-        transport.close()
+        client.drop(lost("the client was closed"))
     if not reply.get("ok"):
         raise from_wire(reply.get("error") or {})
     return reply

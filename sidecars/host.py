@@ -53,7 +53,7 @@ class SidecarHost:
             client = None
             if settings.arbiter is not None:
                 client = await stack.enter_async_context(
-                    AsyncClient(settings.arbiter, name=settings.name)
+                    AsyncClient(settings.name, endpoint=settings.arbiter)
                 )
             server = await stack.enter_async_context(
                 RouterServer(settings.endpoint, error_reply, work_share=WORK_SHARE)

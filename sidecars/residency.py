@@ -2,7 +2,7 @@
 
 States: unloaded → waiting (for the lease) → loading → resident → unloading → unloaded. One model, one lease at a time. The
 lease's own protocol (revoke, drain, release, fencing) is the client library's, which calls `_unload` when the bytes must go. A lease on
-standby is unloaded and not over: the arbiter grants it again when there is room (`_on_return` loads then), and a request calls it back
+standby is unloaded and not over: the arbiter grants it again when there is room (`_restore` loads then), and a request calls it back
 as a waiter like any other. Knows no sockets and no wire.
 """
 
@@ -299,7 +299,7 @@ class Residency:
         the model was wanted, and comes back as soon as it may.
         """
         while (seen := lease.state) not in ("held", "gone"):
-            if seen == "loading":  # `_on_return` is at it, which takes as long as it takes
+            if seen == "loading":  # `_restore` is at it, which takes as long as it takes
                 await lease.wait_change(seen)
                 continue
             try:
@@ -342,7 +342,7 @@ class Residency:
                 return error
         return None
 
-    async def _on_return(self, lease: AsyncLease) -> None:
+    async def _restore(self, lease: AsyncLease) -> None:
         """Granted again, by itself or because it was called back. A load that fails ends the lease; the next request starts anew."""
         if self._worker.stopping.is_set():
             return  # `leave` gives it back
@@ -379,7 +379,7 @@ class Residency:
             spec,
             wait_s,
             unload=self._unload,
-            on_return=self._on_return,
+            restore=self._restore,
             on_lost=self._on_lost,
         )
 
@@ -497,7 +497,7 @@ class Residency:
             self._memory.free(block)
         self._memory.empty_cache()
 
-    def _on_lost(self, lease: AsyncLease, error: VramError) -> None:
+    async def _on_lost(self, lease: AsyncLease, error: VramError) -> None:
         self.last_error = error
         _log.warning("lease %s is lost: %s", lease.lease_id, error)
 

@@ -21,11 +21,16 @@ def token_of(message: Message) -> TokenPair:
 
 @dataclass(frozen=True, slots=True)
 class Eviction:
-    """Who made a lease leave, and why, by the arbiter's word."""
+    """Why the arbiter revokes a lease."""
 
-    cause: str  # waiter, pressure, operator; "": an arbiter that does not say
-    by: str  # the consumer that the room is for, or an operator with uid and pid; "" where there is neither
-    reason: str  # in words
+    cause: str
+    """`waiter`, `pressure` or `operator`; "" where the arbiter does not say."""
+    by: str
+    """The consumer that needs the room, or the operator with uid and pid; "" where there is neither."""
+    reason: str
+    """The same in words."""
+    priority: int | None = None
+    """Of the request that needs the room; None where there is none."""
 
     @classmethod
     def of(cls, push: Message) -> "Eviction":
@@ -34,6 +39,7 @@ class Eviction:
             push.get("cause", ""),
             order.get("by") or push.get("wanted_by", ""),
             push.get("reason", ""),
+            push.get("priority"),
         )
 
 

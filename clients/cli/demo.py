@@ -239,7 +239,7 @@ async def _boot(
 
 def _arbiter_client(runtime: Path) -> AsyncClient:
     return AsyncClient(
-        f"ipc://{runtime}/arbiter.sock", name="demo", role="observer", connect_timeout_s=30.0
+        "demo", endpoint=f"ipc://{runtime}/arbiter.sock", role="observer", connect_timeout_s=30.0
     )
 
 

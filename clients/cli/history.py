@@ -210,7 +210,7 @@ async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None 
             print(json.dumps(event) if as_json else text.event_line(event), flush=True)
 
     client = AsyncClient(
-        endpoint, name="vramctl history", role="observer", connect_timeout_s=request.TIMEOUT_S
+        "vramctl history", endpoint=endpoint, role="observer", connect_timeout_s=request.TIMEOUT_S
     )
     live: asyncio.Queue[Message] = asyncio.Queue()
 

@@ -9,6 +9,7 @@ A program cannot unload, it can only end. So it counts as one long use, and what
 import argparse
 import asyncio
 import contextlib
+import logging
 import os
 import shutil
 import sys
@@ -21,6 +22,7 @@ from pydantic import ValidationError
 
 from vram_arbiter.clients import cuda
 from vram_arbiter.clients._protocol import traces
+from vram_arbiter.clients._protocol.records import Eviction
 from vram_arbiter.clients.cli import arguments
 from vram_arbiter.clients.cli.signals import Forwarding
 from vram_arbiter.clients.client import AsyncClient
@@ -30,6 +32,8 @@ from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes, parse_bytes
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+
+log = logging.getLogger(__name__)
 
 PRIORITY = 40
 """Below that of other leases: programs make room for a robot's models, and queue among themselves."""
@@ -165,7 +169,7 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
         _say(f"{spec.command[0]}: {problem}")
         return code
     async with AsyncClient(
-        endpoint, name=f"vramctl run {spec.consumer}"[:NAME_MAX_CHARS]
+        f"vramctl run {spec.consumer}"[:NAME_MAX_CHARS], endpoint=endpoint
     ) as client:
         run = _Run(spec, client)
         acquiring = client.acquire(
@@ -201,17 +205,22 @@ class _Run:
         self.peak_bytes = 0
         self._wake = asyncio.Event()
         self._ending = False
+        self._last: asyncio.Task[None] | None = None  # ends the program
         self._reason = "its lease is over"  # said when the program is made to end
         self._told: set[str] = set()  # whom the program keeps waiting
 
     async def until_ended(self, child: asyncio.subprocess.Process, lease: AsyncLease) -> int:
         self._child = child
-        held = self._client.spawn(self._hold(lease), f"use of {lease.lease_id}")
-        watched = self._client.spawn(self._watch(lease), f"watch of {lease.lease_id}")
+        background = [
+            asyncio.create_task(self._hold(lease)),
+            asyncio.create_task(self._watch(lease)),
+        ]
         code = await child.wait()
-        for task in (held, watched):
+        for task in background:
             task.cancel()
-        await asyncio.wait({held, watched})
+        for outcome in await asyncio.gather(*background, return_exceptions=True):
+            if isinstance(outcome, VramError):
+                log.warning("%s: %s", lease.lease_id, outcome)
         if self.peak_bytes:
             asked = self._spec.vram_bytes
             more = ", more than was asked for" if self.peak_bytes > asked else ""
@@ -255,30 +264,31 @@ class _Run:
         self.peak_bytes = max(self.peak_bytes, used)
 
     # -- revoke ------------------------------------------------------------------------------------------------------
-    def revoke_asked(self, lease: AsyncLease, push: Mapping[str, Any]) -> None:
-        self._reason = push["reason"]
+    async def revoke_asked(self, lease: AsyncLease, eviction: Eviction) -> None:
+        self._reason = eviction.reason
         self._wake.set()
 
-    def lost(self, lease: AsyncLease, error: VramError) -> None:
+    async def lost(self, lease: AsyncLease, error: VramError) -> None:
         _say(f"{lease.lease_id} was lost: {error}")
 
     def _decide(self, lease: AsyncLease, status: Mapping[str, Any]) -> None:
         """End the program where a revoke is for a higher priority. A request that came after the revoke is seen in `status`."""
-        push = lease.revoke
-        if push is None or self._ending or self._spec.on_revoke != "priority":
+        eviction = lease.evicted
+        if eviction is None or self._ending or self._spec.on_revoke != "priority":
             return
         waiting = [
             (view["consumer"], view["priority"])
             for view in status.get("leases", ())
             if view["state"] == "queued" and view["gpu"] in (None, lease.gpu)
         ]
-        waiting.append((push["wanted_by"], push.get("priority", self._spec.priority + 1)))
+        asked_by = self._spec.priority + 1 if eviction.priority is None else eviction.priority
+        waiting.append((eviction.by, asked_by))
         consumer, priority = max(waiting, key=lambda one: one[1])
         if priority > self._spec.priority:
             self._reason = (
-                push["reason"] if consumer == push["wanted_by"] else f"{consumer} needs the room"
+                eviction.reason if consumer == eviction.by else f"{consumer} needs the room"
             )
-            self._client.spawn(self.end(), f"end of {lease.lease_id}")
+            self._last = asyncio.create_task(self.end())
         elif consumer not in self._told:
             self._told.add(consumer)
             _say(

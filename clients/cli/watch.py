@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
 async def watch(endpoint: str | None, events_shown: int) -> int:
     """Until Ctrl-C. Raises ArbiterUnreachable if nobody answers at first; later it waits for the arbiter to come back."""
     client = AsyncClient(
-        endpoint, name="vramctl watch", role="observer", connect_timeout_s=TIMEOUT_S
+        "vramctl watch", endpoint=endpoint, role="observer", connect_timeout_s=TIMEOUT_S
     )
     async with client:
         with contextlib.suppress(asyncio.CancelledError):

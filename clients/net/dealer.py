@@ -1,15 +1,17 @@
-"""A DEALER socket on an asyncio loop: messages in and out as maps, and a word when the other side hangs up.
+"""A DEALER socket on anyio: messages in and out as maps, and a call when the server hangs up.
 
-libzmq's file descriptor is edge-triggered: after every send the socket is drained too, or a wake-up would be lost. The monitor
-tells of a hang-up at once, where heartbeats would take seconds. It knows nothing of what the messages mean.
+libzmq's file descriptor is edge-triggered: the socket is drained after every wake-up, and a send
+that found something to read wakes the reader. The socket's monitor tells of a hang-up at once, where
+heartbeats would take seconds. The module must not know what messages mean.
 """
 
-import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
+import anyio
+import anyio.lowlevel
 import msgpack
 import zmq
 
@@ -20,24 +22,23 @@ from vram_arbiter.schemas.runtime.trust import Program
 
 log = logging.getLogger(__name__)
 
-DRAIN_MAX = 256  # messages in one go, then the loop's other work gets its turn
-RETRY_S = 0.02  # the first pause before another connection is tried …
-RETRY_MAX_S = 0.5  # … and the longest
-UNSENT_MAX = 1000  # messages kept until there is a connection
+DRAIN_MAX: Final = 256  # messages in one go, then other tasks get their turn
+RETRY_S: Final = 0.02  # the first pause before another connection is tried …
+RETRY_MAX_S: Final = 0.5  # … and the longest
+UNSENT_MAX: Final = 1000  # messages kept until there is a connection
 
 
-class Transport:
-    """Open from construction to `close`. `received(message)`, `hung_up()` and `refused(error)` are called on the loop.
+class Dealer:
+    """One connection, made and served by `run`, which its owner starts as a task.
 
-    It tries until a server of a trusted user listens (`clients.net.link`), and sends then what was to be sent. It connects once: after
-    `hung_up` or `refused` (UntrustedServer) the owner closes it.
-    Raises ConfigError for a text that is not an endpoint; whether a server is there shows only later.
+    `run` tries until a server of a trusted user listens (`clients.net.link`), sends what was queued
+    by then, and calls `received(message)` for each message. It ends after `hung_up()` or
+    `refused(error)` (UntrustedServer), and where its task is canceled.
     """
 
     def __init__(
         self,
         endpoint: str,
-        loop: asyncio.AbstractEventLoop,
         received: Callable[[dict[str, Any]], None],
         hung_up: Callable[[], None],
         refused: Callable[[VramError], None],
@@ -46,19 +47,15 @@ class Transport:
     ) -> None:
         self._endpoint = endpoint
         self._program: Program = program
-        self._loop = loop
         self._received = received
         self._hung_up = hung_up
         self._refused = refused
         self._unsent: deque[bytes] = deque()
-        self._drain_scheduled = False
-        self._pause_s = RETRY_S
-        self._retry: asyncio.TimerHandle | None = None
-        self._link: Link | None = None
-        self._connect()
+        self._link: Link | None = None  # while it is open
+        self._reading: anyio.CancelScope | None = None  # while the reader waits
 
     def send(self, message: dict[str, Any]) -> bool:
-        """Queue one message. False: the queue is full, the other side does not read."""
+        """Queue one message. False: the queue is full, the server does not read."""
         payload = pack(message)
         if self._link is None or self._link.state != "open":
             if len(self._unsent) >= UNSENT_MAX:
@@ -66,82 +63,91 @@ class Transport:
             self._unsent.append(payload)
             return True
         sent = self._link.send(payload)
-        self._schedule_drain()
+        if self._reading is not None and self._link.readable:
+            self._reading.cancel()  # sending took the reader's wake-up
         return sent
 
-    def close(self) -> None:
-        """Idempotent. What was not sent is dropped."""
-        self._unsent.clear()
-        if self._retry is not None:
-            self._retry.cancel()
-        self._disconnect()
-
-    # -- the connection ----------------------------------------------------------------------------------------------
-    def _connect(self) -> None:
-        self._retry = None
-        link = self._link = Link(zmq.Context.instance(), self._endpoint, self._program)
-        self._loop.add_reader(link.socket.fileno(), self._drain)
-        self._loop.add_reader(link.monitor.fileno(), self._advance)
-        self._loop.call_soon(self._advance)  # libzmq only signals a reader that found nothing once
-
-    def _disconnect(self) -> None:
-        if self._link is not None:
-            self._loop.remove_reader(self._link.socket.fileno())
-            self._loop.remove_reader(self._link.monitor.fileno())
-            self._link.close()
-            self._link = None
-
-    def _advance(self) -> None:
-        link = self._link
-        if link is None:
-            return
-        before = link.state
+    async def run(self) -> None:
+        """Serve one connection to its end. Raises ConfigError for a text that is not an endpoint."""
         try:
-            state = link.advance()
-        except VramError as error:
-            self._refuse(error)
-            return
-        if before == "connecting" and state == "open":
-            while self._unsent:
-                link.send(self._unsent.popleft())
-            self._schedule_drain()
-        elif state == "ended" and before == "connecting":
-            self._disconnect()
-            self._retry = self._loop.call_later(self._pause_s, self._connect)
-            self._pause_s = min(2 * self._pause_s, RETRY_MAX_S)
-        elif state == "ended":
-            self._drain()  # its last words
-            if self._link is link:
-                self._disconnect()
-                self._hung_up()
-
-    def _refuse(self, error: VramError) -> None:
-        self._disconnect()
-        self._refused(error)
-
-    # -- messages ----------------------------------------------------------------------------------------------------
-    def _schedule_drain(self) -> None:
-        if not self._drain_scheduled:
-            self._drain_scheduled = True
-            self._loop.call_soon(self._drain)
-
-    def _drain(self) -> None:
-        self._drain_scheduled = False
-        for _ in range(DRAIN_MAX):
-            if self._link is None:
-                return
+            link = await self._connect()
             try:
-                payload = self._link.receive()
+                await self._serve(link)
+            finally:
+                self._link = None
+                link.close()
+        except VramError as error:
+            self._refused(error)
+        else:
+            self._hung_up()
+
+    # -- steps -------------------------------------------------------------------------------------
+    async def _connect(self) -> Link:
+        """Return an open link. Raises UntrustedServer."""
+        pause_s = RETRY_S
+        while True:
+            link = Link(zmq.Context.instance(), self._endpoint, self._program)
+            try:
+                while link.advance() == "connecting":
+                    await anyio.wait_readable(link.monitor.fileno())
+            except BaseException:
+                link.close()
+                raise
+            if link.state == "open":
+                return link
+            link.close()
+            await anyio.sleep(pause_s)
+            pause_s = min(2 * pause_s, RETRY_MAX_S)
+
+    async def _serve(self, link: Link) -> None:
+        """Send what was queued, then hand on messages until the server hangs up."""
+        self._link = link
+        while self._unsent:
+            link.send(self._unsent.popleft())
+        refusal: VramError | None = None
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(self._watch, link, tasks.cancel_scope)
+            try:
+                await self._read(link)
             except VramError as error:
-                self._refuse(error)
-                return
+                refusal = error
+                tasks.cancel_scope.cancel()
+        if refusal is not None:
+            raise refusal
+        while self._drain(link):  # its last words
+            pass
+
+    async def _watch(self, link: Link, reading: anyio.CancelScope) -> None:
+        while link.advance() == "open":
+            await anyio.wait_readable(link.monitor.fileno())
+        reading.cancel()
+
+    async def _read(self, link: Link) -> None:
+        while True:
+            if self._drain(link):
+                await anyio.lowlevel.checkpoint()
+                continue
+            with anyio.CancelScope() as self._reading:
+                await anyio.wait_readable(link.socket.fileno())
+            self._reading = None
+
+    def _drain(self, link: Link) -> bool:
+        """Hand on what is there. True: there may be more."""
+        for _ in range(DRAIN_MAX):
+            payload = link.receive()
             if payload is None:
-                return
+                return False
             try:
                 message = msgpack.unpackb(payload, raw=False, strict_map_key=False)
             except (ValueError, msgpack.UnpackException) as error:
-                log.warning("a frame that is no msgpack was dropped: %s", error)
+                log.warning("dropped a frame that is not msgpack: %s", error)
                 continue
             if isinstance(message, dict):
-                self._received(message)
-        self._schedule_drain()
+                self._hand_on(message)
+        return True
+
+    def _hand_on(self, message: dict[str, Any]) -> None:
+        try:
+            self._received(message)
+        except Exception:
+            log.exception("a message from %s was not understood", self._endpoint)

@@ -7,15 +7,13 @@ as an answer: *evicted* or *unavailable* is never "not found". It knows nothing 
 
 import asyncio
 import contextlib
-import itertools
 import socket
 from collections.abc import Mapping, Sequence
 from time import monotonic
 from typing import Any, Self, cast
 
 from vram_arbiter.clients._protocol import traces
-from vram_arbiter.clients.net.dealer import Transport
-from vram_arbiter.clients.net.timeouts import answered
+from vram_arbiter.clients.net.rpc_client import RpcClient
 from vram_arbiter.clients.sidecar.spawn import Child, SpawnSpec
 from vram_arbiter.schemas.errors import ModelError, SidecarUnavailable, VramError, from_wire
 from vram_arbiter.schemas.sidecar import LoadResult, PingResult
@@ -53,11 +51,8 @@ class SidecarClient:
         self._spawn = spawn
         self._timeout_s = timeout_s
         self._connect_timeout_s = connect_timeout_s
-        self._transport: Transport | None = None
-        self._ids = itertools.count(1)
-        self._waiting: dict[int, asyncio.Future[Message]] = {}
+        self._rpc = RpcClient(endpoint, program="sidecar", lost=self._lost)
         self._connecting = asyncio.Lock()
-        self._proven = False  # the present socket was answered once
 
     async def __aenter__(self) -> Self:
         return self
@@ -119,7 +114,7 @@ class SidecarClient:
             child, self.child = self.child, None
             try:
                 if child is not None:
-                    serves = self._proven and child.alive
+                    serves = self._rpc.proven and child.alive
                     if serves:
                         with contextlib.suppress(VramError):
                             await self.shutdown()
@@ -131,12 +126,12 @@ class SidecarClient:
     async def _ensure(self) -> None:
         """1. Proven already, child alive. 2. Somebody answers: adopt. 3. Start a child, or wait for somebody else's start."""
         async with self._connecting:
-            if self.child is not None and not self._proven:
+            if self.child is not None and not self._rpc.proven:
                 await self.child.wait(REBIRTH_S)  # it may have hung up because it is dying
             if self.child is not None and not self.child.alive:
                 self._drop("the sidecar ended")
                 await self._bury()
-            if self._proven:  # 1
+            if self._rpc.proven:  # 1
                 return
             if self._spawn is not None:
                 if self._somebody_listens() and await self._answers():  # 2
@@ -224,58 +219,25 @@ class SidecarClient:
 
     # -- steps: one exchange -------------------------------------------------------------------------------------------
     async def _exchange(self, op: str, fields: Mapping[str, Any], timeout_s: float) -> Any:
-        transport = self._transport
-        if transport is None:
-            loop = asyncio.get_running_loop()
-            transport = self._transport = Transport(
-                self.endpoint, loop, self._received, self._hung_up, self._fail, program="sidecar"
-            )
-        request_id = next(self._ids)
-        answer: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
-        self._waiting[request_id] = answer
         try:
-            if not transport.send({self.family: op, "id": request_id, **fields}):
-                raise SidecarUnavailable(
-                    f"{self.endpoint} takes no more requests", hint="it hangs; restart it"
-                )
-            reply = await answered(answer, timeout_s)
+            reply = await self._rpc.exchange({self.family: op, **fields}, timeout_s)
         except TimeoutError:
-            if transport is self._transport and op != "ping":
+            if op != "ping":
                 self._drop(f"{op} was not answered")  # a fresh socket never sees the late answer
             raise SidecarUnavailable(
                 f"no answer to {op} within {timeout_s:g} s from {self.endpoint}",
                 hint="is it running? it may be loading a model or hang",
                 details={"endpoint": self.endpoint, "op": op},
             ) from None
-        finally:
-            self._waiting.pop(request_id, None)
         return _result(reply)
 
-    def _received(self, message: Message) -> None:
-        self._proven = True
-        answer = self._waiting.get(message.get("re", -1))
-        if answer is not None and not answer.done():
-            answer.set_result(message)
-
-    def _hung_up(self) -> None:
-        """The process ended or was ended. Whoever waits hears it now, not after minutes."""
-        self._drop("it hung up")
-
     def _drop(self, reason: str) -> None:
-        self._fail(
-            SidecarUnavailable(
-                f"contact to {self.endpoint} lost: {reason}", hint="the next call tries again"
-            )
-        )
+        self._rpc.drop(self._lost(reason))
 
-    def _fail(self, error: VramError) -> None:
-        if self._transport is not None:
-            self._transport.close()
-        self._transport = None
-        self._proven = False
-        for answer in self._waiting.values():
-            if not answer.done():
-                answer.set_exception(error)
+    def _lost(self, reason: str) -> SidecarUnavailable:
+        return SidecarUnavailable(
+            f"contact to {self.endpoint} lost: {reason}", hint="the next call tries again"
+        )
 
 
 def _result(reply: Message) -> Any:

@@ -136,7 +136,7 @@ async def connect_arbiter(endpoint: str | None, stack: contextlib.AsyncExitStack
     from vram_arbiter.clients.client import AsyncClient
 
     try:
-        return await stack.enter_async_context(AsyncClient(endpoint, name="runner"))
+        return await stack.enter_async_context(AsyncClient("runner", endpoint=endpoint))
     except ArbiterUnreachable as error:
         raise ArbiterUnreachable(
             error.message,

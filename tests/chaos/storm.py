@@ -193,7 +193,7 @@ class Storm:
     # -- following the arbiter -----------------------------------------------------------------------------------------
     async def _watch(self) -> None:
         async with AsyncClient(
-            self._arbiter.endpoint, name="watch", role="operator", connect_timeout_s=60.0
+            "watch", endpoint=self._arbiter.endpoint, role="operator", connect_timeout_s=60.0
         ) as client:
             async for event in client.subscribe():
                 self._heard(event)
@@ -495,7 +495,7 @@ class Storm:
             )
 
         async with AsyncClient(
-            self._arbiter.endpoint, name="settled", connect_timeout_s=30.0
+            "settled", endpoint=self._arbiter.endpoint, connect_timeout_s=30.0
         ) as client:
             if not await _eventually(lambda: clean(client), CALM_S):
                 self._finding(

@@ -100,7 +100,7 @@ class Consumer:
             await self._free(blocks)
             say("unloaded", lease_id=lease_id)
 
-        def lost(lease: AsyncLease, error: VramError) -> None:
+        async def lost(lease: AsyncLease, error: VramError) -> None:
             say("lost", lease_id=lease.lease_id, code=error.code)
 
         lease_id = ""

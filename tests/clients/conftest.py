@@ -1,10 +1,10 @@
 """What the tests of the clients share: a scripted arbiter, a way to write specs, and waiting for a condition with a deadline."""
 
-import asyncio
 import sys
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
+import anyio
 import pytest
 
 from vram_arbiter.schemas.defaults import GIB
@@ -12,6 +12,7 @@ from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 sys.path.insert(0, str(Path(__file__).parent))  # for the helpers beside it
 
+from tests.support.beside import Beside, Start
 from tests.support.protocol_wire import Wire
 
 DEADLINE_S = 60.0
@@ -23,6 +24,14 @@ TTL_S = 120.0
 def anyio_backend() -> str:
     """The clients are asyncio programs."""
     return "asyncio"
+
+
+@pytest.fixture
+async def beside() -> AsyncIterator[Start]:
+    """`beside(work())` runs a coroutine beside the test; what still runs at its end is canceled."""
+    async with anyio.create_task_group() as tasks:
+        yield lambda work: Beside(tasks, work)
+        tasks.cancel_scope.cancel()
 
 
 @pytest.fixture
@@ -59,8 +68,8 @@ def until() -> Callable[..., object]:
     """`await until(lambda: …)`: poll on the loop until it is true; fails after a minute."""
 
     async def wait(condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(DEADLINE_S):
+        with anyio.fail_after(DEADLINE_S):
             while not condition():
-                await asyncio.sleep(0.01)
+                await anyio.sleep(0.01)
 
     return wait

@@ -1,17 +1,19 @@
-"""The asyncio client against a real daemon with a simulated card."""
+"""The async client against a real daemon with a simulated GPU, on asyncio and on trio."""
 
-import asyncio
 import contextlib
 import json
 import signal
-import subprocess
 import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
+import anyio
+import anyio.to_thread
 import pytest
+from anyio.streams.buffered import BufferedByteReceiveStream
 
+from tests.support.beside import Canceled, Start, within
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
 from vram_arbiter.clients._protocol.records import Eviction
@@ -38,12 +40,18 @@ Until = Callable[[Callable[[], bool]], Awaitable[None]]
 WAIT_S = 60.0
 
 
+@pytest.fixture(params=["asyncio", "trio"])
+def anyio_backend(request: pytest.FixtureRequest) -> str:
+    """The client runs on both."""
+    return str(request.param)
+
+
 async def states(client: AsyncClient) -> dict[str, str]:
     return {lease["consumer"]: lease["state"] for lease in (await client.status())["leases"]}
 
 
 async def test_acquire_ready_use_release(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = await client.acquire(spec("a", 5))
         assert (lease.state, lease.token[0]) == ("loading", client.epoch)
         await lease.ready(5 << 30)
@@ -63,20 +71,20 @@ async def test_an_evicted_holder_hears_by_whom_and_why(
 ) -> None:
     """After an eviction every call on the lease said that it "was released", as if its holder had wanted that."""
     async with (
-        AsyncClient(arbiter_daemon.endpoint, name="t") as client,
-        AsyncClient(arbiter_daemon.endpoint, name="ops", role="operator") as ops,
+        AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client,
+        AsyncClient("ops", endpoint=arbiter_daemon.endpoint, role="operator") as ops,
     ):
         first = await client.acquire(spec("a", 5))
         await first.ready()
         assert first.evicted is None
         second = await ops.acquire(spec("b", 5), WAIT_S)
-        assert first.evicted == Eviction("waiter", "b", "b needs the room")
+        assert first.evicted == Eviction("waiter", "b", "b needs the room", 50)
         with pytest.raises(LeaseLost, match="was evicted: b needs the room"):
             await first.ready()
         await second.ready()
         await ops.ask("evict", {"target": "b", "reason": "lunch"})
         while second.state != "gone":
-            await asyncio.sleep(0.01)
+            await anyio.sleep(0.01)
         assert second.evicted is not None
         assert (second.evicted.cause, second.evicted.by.split()[0]) == ("operator", "ops")
         assert second.evicted.reason.endswith(": lunch")
@@ -89,7 +97,7 @@ async def test_status_is_whole_though_it_comes_in_pages(
     waiters = STATUS_PAGE + 40
     async with contextlib.AsyncExitStack() as stack:
         clients = [
-            await stack.enter_async_context(AsyncClient(arbiter_daemon.endpoint, name="t"))
+            await stack.enter_async_context(AsyncClient("t", endpoint=arbiter_daemon.endpoint))
             for _ in range(5)
         ]
         await clients[0].acquire(spec("holder", 5))
@@ -109,7 +117,7 @@ async def test_status_is_whole_though_it_comes_in_pages(
         assert "next" not in whole
         vramctl = str(Path(sys.executable).with_name("vramctl"))
         command = [vramctl, "status", "--json", "--endpoint", arbiter_daemon.endpoint]
-        told = await asyncio.to_thread(subprocess.run, command, capture_output=True, check=True)
+        told = await anyio.run_process(command)
         assert len(json.loads(told.stdout)["leases"]) == waiters + 1
 
 
@@ -121,7 +129,7 @@ async def test_a_block_unloads_and_releases_also_when_it_raises(
     async def unload() -> None:
         unloaded.append("a")
 
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         with pytest.raises(ZeroDivisionError):
             async with client.lease(spec("a", 5), unload=unload) as lease:  # fails while loading
                 raise ZeroDivisionError
@@ -137,7 +145,7 @@ async def test_a_plain_function_may_unload(
     """The README's example does it so: its end was a traceback, and a lease whose bytes nobody had freed."""
     unloaded: list[str] = []
     async with (
-        AsyncClient(arbiter_daemon.endpoint, name="t") as client,
+        AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client,
         client.lease(spec("a", 5), unload=lambda: unloaded.append("a")) as lease,
     ):
         await lease.ready()
@@ -147,13 +155,13 @@ async def test_a_plain_function_may_unload(
 async def test_closing_the_client_gives_up_its_leases(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    unloaded = asyncio.Event()
+    unloaded = anyio.Event()
 
     async def unload() -> None:
         unloaded.set()
 
-    async with AsyncClient(arbiter_daemon.endpoint, name="other") as other:
-        async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("other", endpoint=arbiter_daemon.endpoint) as other:
+        async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
             lease = await client.acquire(spec("a", 5), unload=unload)
             await lease.ready()
         assert unloaded.is_set()
@@ -163,13 +171,13 @@ async def test_closing_the_client_gives_up_its_leases(
 async def test_leaving_does_not_wait_for_an_arbiter_that_is_away(
     make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
 ) -> None:
-    unloaded = asyncio.Event()
+    unloaded = anyio.Event()
 
     async def unload() -> None:
         unloaded.set()
 
     arbiter = make_arbiter().start()
-    async with asyncio.timeout(WAIT_S), AsyncClient(arbiter.endpoint, name="t") as client:
+    async with within(WAIT_S), AsyncClient("t", endpoint=arbiter.endpoint) as client:
         lease = await client.acquire(spec("a", 5, ttl_s=3600), unload=unload)
         await lease.ready()
         process = arbiter.process
@@ -177,34 +185,34 @@ async def test_leaving_does_not_wait_for_an_arbiter_that_is_away(
         process.kill()
         process.wait()
         await until(lambda: not client.connected)
-        async with asyncio.timeout(REQUEST_TIMEOUT_S / 3):  # for a request it would wait that long
+        async with within(REQUEST_TIMEOUT_S / 3):  # for a request it would wait that long
             await lease.give_up()
         assert unloaded.is_set()
 
 
 async def test_revoked_at_the_safe_point_and_not_before(
-    arbiter_daemon: ArbiterProcess, spec: Spec
+    arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
 ) -> None:
     story: list[str] = []
 
     async def unload() -> None:
         story.append("unload")
 
-    def revoked(_: object, push: Any) -> None:
-        story.append(f"revoke for {push['wanted_by']}")
+    def revoked(_: object, eviction: Eviction) -> None:
+        story.append(f"revoke for {eviction.by}")
 
     async with (
-        AsyncClient(arbiter_daemon.endpoint, name="holder") as holder,
-        AsyncClient(arbiter_daemon.endpoint, name="waiter") as waiter,
+        AsyncClient("holder", endpoint=arbiter_daemon.endpoint) as holder,
+        AsyncClient("waiter", endpoint=arbiter_daemon.endpoint) as waiter,
     ):
         lease = await holder.acquire(
             spec("a", 5), unload=unload, on_revoke=revoked, safe_point_eta_s=lambda: 0.5
         )
         await lease.ready()
         async with lease.use("first"):
-            wanted = asyncio.create_task(waiter.acquire(spec("b", 5, independent=True)))
+            wanted = beside(waiter.acquire(spec("b", 5, independent=True)))
             while not lease.revoking:
-                await asyncio.sleep(0.01)
+                await anyio.sleep(0.01)
             with pytest.raises(LeaseRevoking):
                 async with lease.use("second"):
                     pytest.fail("a use began on a lease that is asked to leave")
@@ -219,27 +227,28 @@ async def test_revoked_at_the_safe_point_and_not_before(
 
 
 async def test_a_use_of_somebody_else_keeps_the_holder_in_place(
-    arbiter_daemon: ArbiterProcess, spec: Spec
+    arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
 ) -> None:
-    unloaded = asyncio.Event()
+    unloaded = anyio.Event()
 
     async def unload() -> None:
         unloaded.set()
 
     async with (
-        AsyncClient(arbiter_daemon.endpoint, name="sidecar") as sidecar,
-        AsyncClient(arbiter_daemon.endpoint, name="runner") as runner,
+        AsyncClient("sidecar", endpoint=arbiter_daemon.endpoint) as sidecar,
+        AsyncClient("runner", endpoint=arbiter_daemon.endpoint) as runner,
     ):
         lease = await sidecar.acquire(spec("a", 5), unload=unload)
         await lease.ready()
         async with runner.use(lease.lease_id, lease.token, "goal"):
-            wanted = asyncio.create_task(runner.acquire(spec("b", 5, independent=True)))
+            wanted = beside(runner.acquire(spec("b", 5, independent=True)))
             while not lease.revoking:
-                await asyncio.sleep(0.01)
+                await anyio.sleep(0.01)
             while (await states(runner))["a"] != "revoking":
-                await asyncio.sleep(0.01)
-            with pytest.raises(TimeoutError):
-                await asyncio.wait_for(unloaded.wait(), 0.6)  # longer than the holder's own retries
+                await anyio.sleep(0.01)
+            with anyio.move_on_after(0.6):  # longer than the holder's own retries
+                await unloaded.wait()
+            assert not unloaded.is_set()
             with pytest.raises(LeaseRevoking):
                 await runner.begin_use(lease.lease_id, lease.token, "another goal")
         await wanted
@@ -247,7 +256,7 @@ async def test_a_use_of_somebody_else_keeps_the_holder_in_place(
 
 
 async def test_a_use_needs_the_right_token(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = await client.acquire(spec("a", 1))
         await lease.ready()
         with pytest.raises(StaleToken):
@@ -256,7 +265,7 @@ async def test_a_use_needs_the_right_token(arbiter_daemon: ArbiterProcess, spec:
 
 
 async def test_typed_refusals(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         with pytest.raises(VramInsufficient) as never:
             await client.acquire(spec("a", 9))
         assert never.value.details["capacity_bytes"] == 8 << 30
@@ -269,7 +278,7 @@ async def test_typed_refusals(arbiter_daemon: ArbiterProcess, spec: Spec) -> Non
 
 
 async def test_wait_timeout_says_who_blocked(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
         async with lease.use():
@@ -279,38 +288,38 @@ async def test_wait_timeout_says_who_blocked(arbiter_daemon: ArbiterProcess, spe
 
 
 async def test_a_cancelled_acquire_leaves_the_queue(
-    arbiter_daemon: ArbiterProcess, spec: Spec
+    arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
 ) -> None:
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
         async with lease.use():
-            waiting = asyncio.create_task(client.acquire(spec("b", 5, independent=True)))
+            waiting = beside(client.acquire(spec("b", 5, independent=True)))
             while "b" not in await states(client):
-                await asyncio.sleep(0.01)
+                await anyio.sleep(0.01)
             waiting.cancel()
-            with pytest.raises(asyncio.CancelledError):
+            with pytest.raises(Canceled):
                 await waiting
             while "b" in await states(client):
-                await asyncio.sleep(0.01)
+                await anyio.sleep(0.01)
 
 
 async def test_an_acquire_cancelled_at_any_moment_leaks_nothing(
-    arbiter_daemon: ArbiterProcess, spec: Spec
+    arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
 ) -> None:
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         for steps in range(12):  # of the loop, between asking and turning away
-            waiting = asyncio.create_task(client.acquire(spec(f"c{steps}", 5)))
+            waiting = beside(client.acquire(spec(f"c{steps}", 5)))
             for _ in range(steps * 3):
-                await asyncio.sleep(0)
+                await anyio.sleep(0)
             waiting.cancel()
             try:
                 await (await waiting).release()  # it was faster
-            except asyncio.CancelledError:
+            except Canceled:
                 pass
-        async with asyncio.timeout(WAIT_S):
+        async with within(WAIT_S):
             while await states(client):
-                await asyncio.sleep(0.01)
+                await anyio.sleep(0.01)
         whole = await client.acquire(spec("whole", 5), WAIT_S)
         assert (whole.state, await states(client)) == ("loading", {"whole": "loading"})
 
@@ -324,18 +333,19 @@ async def test_callbacks_that_raise_do_not_keep_the_lease(
     def revoked(*_: object) -> None:
         raise ValueError("another")
 
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = await client.acquire(spec("a", 5), unload=unload, on_revoke=revoked)
         await lease.ready()
         second = await client.acquire(spec("b", 5), WAIT_S)
-        assert (lease.state, second.state) == ("gone", "loading")
+        await lease.wait_gone()
+        assert second.state == "loading"
 
 
 async def test_a_word_that_the_arbiter_refuses_is_said_again(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: one `unloading` beyond the client's rate ended the task that leaves, and the holder stayed until it was killed for it."""
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
         said: list[int] = []
@@ -354,8 +364,8 @@ async def test_a_word_that_the_arbiter_refuses_is_said_again(
         monkeypatch.setattr(client.protocol.holdings, "unloading", counted)
         monkeypatch.setattr(client, "reply", refused_once)
         async with (
-            AsyncClient(arbiter_daemon.endpoint, name="other") as other,
-            asyncio.timeout(WAIT_S),
+            AsyncClient("other", endpoint=arbiter_daemon.endpoint) as other,
+            within(WAIT_S),
         ):
             await (await other.acquire(spec("b", 5))).release()
             await lease.wait_gone()
@@ -366,7 +376,7 @@ async def test_a_release_that_is_refused_ends_the_lease_all_the_same(
     arbiter_daemon: ArbiterProcess, spec: Spec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: its holder renewed nothing any more, and waited for ever for a lease that was neither held nor over."""
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = await client.acquire(spec("a", 5))
         reply = client.reply
 
@@ -379,14 +389,14 @@ async def test_a_release_that_is_refused_ends_the_lease_all_the_same(
             await lease.release()
         monkeypatch.undo()
         assert lease.state == "gone"
-        async with asyncio.timeout(WAIT_S):
+        async with within(WAIT_S):
             await lease.wait_gone()
 
 
 async def test_nobody_at_the_endpoint(tmp_path: Path) -> None:
-    client = AsyncClient(f"ipc://{tmp_path}/none.sock", name="t", connect_timeout_s=0.2)
+    client = AsyncClient("t", endpoint=f"ipc://{tmp_path}/none.sock", connect_timeout_s=0.2)
     with pytest.raises(ArbiterUnreachable) as unreachable:
-        await client.connect()
+        await client.__aenter__()
     assert "VRAM_ARBITER_ENDPOINT" in unreachable.value.hint
     with pytest.raises(ArbiterUnreachable):
         await client.status()
@@ -395,18 +405,24 @@ async def test_nobody_at_the_endpoint(tmp_path: Path) -> None:
 async def test_an_observer_may_look_but_not_acquire(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    async with AsyncClient(arbiter_daemon.endpoint, name="t", role="observer") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint, role="observer") as client:
         assert (await client.status())["clients"] == 1
         with pytest.raises(VramError, match="observer"):
             await client.acquire(spec("a", 1))
 
 
-async def test_subscribers_see_events_in_order(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+async def one(events: AsyncIterator[Any]) -> Any:
+    return await anext(events)
+
+
+async def test_subscribers_see_events_in_order(
+    arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
+) -> None:
     kinds: list[str] = []
 
-    async def follow(client: AsyncClient, started: asyncio.Event) -> None:
+    async def follow(client: AsyncClient, started: anyio.Event) -> None:
         events = client.subscribe()
-        first = asyncio.ensure_future(anext(events))
+        first = beside(one(events))
         await client.ping(timeout_s=WAIT_S)
         started.set()
         kinds.append((await first)["kind"])
@@ -415,14 +431,15 @@ async def test_subscribers_see_events_in_order(arbiter_daemon: ArbiterProcess, s
             if event["kind"] == "released":
                 return
 
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
-        started = asyncio.Event()
-        following = asyncio.create_task(follow(client, started))
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
+        started = anyio.Event()
+        following = beside(follow(client, started))
         await started.wait()
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
         await lease.release()
-        await asyncio.wait_for(following, WAIT_S)
+        async with within(WAIT_S):
+            await following
         kinds = [
             kind for kind in kinds if kind != "queued"
         ]  # where the first reading of the card is still under way
@@ -433,14 +450,14 @@ async def test_subscribers_see_events_in_order(arbiter_daemon: ArbiterProcess, s
 
 
 async def test_a_restart_of_the_daemon_is_ridden_out(
-    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
+    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until, beside: Start
 ) -> None:
     arbiter = make_arbiter().start()
-    async with AsyncClient(arbiter.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter.endpoint) as client:
         pinned = await client.acquire(spec("a", 5))
-        waiting = asyncio.create_task(client.acquire(spec("b", 2), WAIT_S))
+        waiting = beside(client.acquire(spec("b", 2), WAIT_S))
         while "b" not in await states(client):
-            await asyncio.sleep(0.01)
+            await anyio.sleep(0.01)
         process = arbiter.process
         assert process is not None
         process.kill()
@@ -448,8 +465,8 @@ async def test_a_restart_of_the_daemon_is_ridden_out(
         await until(
             lambda: not client.connected
         )  # the socket's monitor says so, no heartbeat has to run out
-        asked = asyncio.create_task(client.status())
-        await asyncio.to_thread(arbiter.start)
+        asked = beside(client.status())
+        await anyio.to_thread.run_sync(arbiter.start)
         await until(lambda: client.connected and client.epoch > pinned.token[0])
         assert (await asked)["epoch"] == client.epoch
         # the card is empty in this test: whatever the daemon decides about the old lease, the waiter's place was renewed
@@ -464,13 +481,13 @@ async def test_self_fencing(
     make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
 ) -> None:
     lost: list[VramError] = []
-    unloaded = asyncio.Event()
+    unloaded = anyio.Event()
 
     async def unload() -> None:
         unloaded.set()
 
     arbiter = make_arbiter().start()
-    async with AsyncClient(arbiter.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter.endpoint) as client:
         lease = await client.acquire(
             spec("a", 5), unload=unload, on_lost=lambda _, error: lost.append(error)
         )
@@ -481,7 +498,7 @@ async def test_self_fencing(
         process.wait()
         # without an arbiter only: a busy machine may take longer over a short ttl than it lasts
         client.protocol.connection.grace_s = -lease.spec.ttl_s
-        async with asyncio.timeout(WAIT_S):
+        async with within(WAIT_S):
             await lease.wait_gone()
         assert unloaded.is_set()
         assert [type(error) for error in lost] == [LeaseLost]
@@ -495,7 +512,7 @@ async def test_a_hung_daemon_is_noticed_by_silence(
     make_arbiter: Callable[..., ArbiterProcess], until: Until
 ) -> None:
     arbiter = make_arbiter().start()
-    async with AsyncClient(arbiter.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter.endpoint) as client:
         client.protocol.connection.heartbeat_s = 0.1
         process = arbiter.process
         assert process is not None
@@ -518,50 +535,52 @@ with Client(name="runner") as client, client.use(sys.argv[1], (int(sys.argv[2]),
 
 
 async def test_leases_and_uses_survive_a_kill_of_the_daemon(
-    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
+    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until, beside: Start
 ) -> None:
     arbiter = make_arbiter().start()
     memory = FakeMemory(arbiter.card, "a", 0)
-    unloaded = asyncio.Event()
+    unloaded = anyio.Event()
 
     async def unload() -> None:
         memory.free(block)
         memory.empty_cache()
         unloaded.set()
 
-    async with AsyncClient(arbiter.endpoint, name="sidecar") as client:
+    async with AsyncClient("sidecar", endpoint=arbiter.endpoint) as client:
         lease = await client.acquire(spec("a", 5), unload=unload)
         block = memory.allocate("a", 5 << 30)
         await lease.ready(memory.used_bytes())
-        runner = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", RUNNER, lease.lease_id, *map(str, lease.token),
-            env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        runner = await anyio.open_process(
+            [sys.executable, "-c", RUNNER, lease.lease_id, *map(str, lease.token)],
+            env=arbiter.environ, stderr=None,
         )  # fmt: skip
         assert runner.stdout is not None
+        assert runner.stdin is not None
+        said = BufferedByteReceiveStream(runner.stdout)
         try:
-            assert await runner.stdout.readline() == b"in use\n"
+            assert await said.receive_until(b"\n", 100) == b"in use"
             process = arbiter.process
             assert process is not None
             async with lease.use("request"):
                 process.kill()
                 process.wait()
                 await until(lambda: not client.connected)
-                await asyncio.to_thread(arbiter.start)
+                await anyio.to_thread.run_sync(arbiter.start)
                 await until(lambda: client.connected)
-                async with asyncio.timeout(WAIT_S):
+                async with within(WAIT_S):
                     while (shown := (await client.status())["leases"][0])["uses"] != 2:
-                        await asyncio.sleep(0.01)
+                        await anyio.sleep(0.01)
             assert (shown["lease_id"], shown["state"]) == (lease.lease_id, "held")
             assert client.epoch > lease.token[0]
-            wanted = asyncio.create_task(client.acquire(spec("b", 5), WAIT_S))
+            wanted = beside(client.acquire(spec("b", 5), WAIT_S))
             await until(lambda: lease.revoking)
             assert not unloaded.is_set()  # the runner's goal goes on
-            assert (await runner.communicate(b"end\n"))[0] == b"None\n"
+            await runner.stdin.send(b"end\n")
+            assert await said.receive_until(b"\n", 100) == b"None"
             second = await wanted
         finally:
-            if runner.returncode is None:
-                runner.kill()
-                await runner.wait()
+            await runner.aclose()
         assert unloaded.is_set()
-        assert (lease.state, lease.error) == ("gone", None)
+        await lease.wait_gone()
+        assert lease.error is None
         assert second.token > lease.token

@@ -1,10 +1,13 @@
-"""Leases that leave and come back, pause, park and lend: the asyncio client against a real daemon."""
+"""Leases that leave and come back, pause, park and lend: the async client against a real daemon, on asyncio
+and on trio.
+"""
 
-import asyncio
 from collections.abc import Awaitable, Callable
 
+import anyio
 import pytest
 
+from tests.support.beside import Start, within
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease, AsyncUse, LeaseState
@@ -25,6 +28,12 @@ GIB = 1 << 30
 WAIT_S = 60.0
 Spec = Callable[..., LeaseSpec]
 Until = Callable[[Callable[[], bool]], Awaitable[None]]
+
+
+@pytest.fixture(params=["asyncio", "trio"])
+def anyio_backend(request: pytest.FixtureRequest) -> str:
+    """The client runs on both."""
+    return str(request.param)
 
 
 class Model:
@@ -53,7 +62,7 @@ async def lend(use: AsyncUse, work: Awaitable[object]) -> None:
 async def on_standby(client: AsyncClient, spec: Spec, model: Model) -> AsyncLease:
     """A detector that is resident, and comes back when it was sent away."""
     detector = await client.acquire(
-        spec("detector", 5, standby=True), unload=model.unload, on_return=model.load
+        spec("detector", 5, standby=True), unload=model.unload, restore=model.load
     )
     await detector.ready()
     return detector
@@ -65,7 +74,7 @@ async def parkable(client: AsyncClient, spec: Spec, model: Model) -> AsyncLease:
         spec("detector", 5, park_bytes=5 * GIB),
         unload=model.unload,
         park=model.park,
-        on_return=model.load,
+        restore=model.load,
     )
     await detector.ready()
     return detector
@@ -79,7 +88,7 @@ async def test_a_standby_lease_returns_by_itself_when_there_is_room(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
 ) -> None:
     model = Model()
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         detector = await on_standby(client, spec, model)
         first = detector.token
         policy = await client.acquire(spec("policy", 4), WAIT_S)
@@ -106,27 +115,29 @@ async def followed(lease: AsyncLease, last: LeaseState) -> list[LeaseState]:
     return seen
 
 
-async def test_whoever_follows_a_lease_hears_where_it_went(
-    arbiter_daemon: ArbiterProcess, spec: Spec
+async def test_a_task_that_follows_a_lease_sees_where_it_goes(
+    arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
 ) -> None:
     model = Model()
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client, asyncio.timeout(WAIT_S):
+    async with (
+        AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client,
+        within(WAIT_S),
+    ):
         detector = await on_standby(client, spec, model)
         assert (detector.state, detector.given_up) == ("held", False)
         policy = await client.acquire(spec("policy", 4), WAIT_S)
         await policy.ready()
-        async with asyncio.TaskGroup() as group:
-            returning = group.create_task(followed(detector, "held"))
-            await asyncio.sleep(0)  # it follows
-            await policy.give_up()
+        returning = beside(followed(detector, "held"))
+        await anyio.wait_all_tasks_blocked()  # it follows
+        await policy.give_up()
         assert policy.given_up
-        assert returning.result() == ["standby", "loading", "held"]
-        async with asyncio.TaskGroup() as group:
-            leaving = group.create_task(followed(detector, "gone"))
-            await asyncio.sleep(0)
-            await detector.give_up()
-        assert leaving.result()[0] == "held"
-        assert set(leaving.result()[1:-1]) <= {"revoking", "unloading"}
+        assert await returning == ["standby", "loading", "held"]
+        leaving = beside(followed(detector, "gone"))
+        await anyio.wait_all_tasks_blocked()
+        await detector.give_up()
+        went = await leaving
+        assert went[0] == "held"
+        assert set(went[1:-1]) <= {"revoking", "unloading"}
         assert await detector.wait_change("gone") == "gone", "nothing changes any more"
         assert await detector.wait_change("held") == "gone", "the caller had not seen it"
         assert detector.given_up
@@ -136,7 +147,7 @@ async def test_a_standby_lease_survives_the_daemon(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
 ) -> None:
     model = Model()
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         detector = await on_standby(client, spec, model)
         memory = FakeMemory(arbiter_daemon.card, "t", 0)
         policy = await client.acquire(spec("policy", 4), WAIT_S)
@@ -156,14 +167,15 @@ async def test_a_standby_lease_can_ask_to_come_back_or_be_given_up(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
 ) -> None:
     model = Model()
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         detector = await on_standby(client, spec, model)
         other = Model()
         policy = await client.acquire(spec("policy", 4), WAIT_S, unload=other.unload)
         await policy.ready()
         await detector.reacquire(WAIT_S)
         await until(lambda: detector.state == "held")
-        assert (other.did, policy.state) == (["unload"], "gone")
+        await policy.wait_gone()
+        assert other.did == ["unload"]
         policy = await client.acquire(spec("policy", 4), WAIT_S)
         assert detector.state == "standby"
         await detector.give_up()
@@ -176,7 +188,7 @@ async def test_weights_are_parked_where_the_budget_has_room(
 ) -> None:
     arbiter = make_arbiter(config="host:\n  park_budget_bytes: 6GiB\n").start()
     model = Model()
-    async with AsyncClient(arbiter.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter.endpoint) as client:
         detector = await parkable(client, spec, model)
         policy = await client.acquire(
             spec("policy", 4, park_bytes=5 * GIB), WAIT_S, unload=model.unload
@@ -195,19 +207,19 @@ async def test_weights_are_parked_where_the_budget_has_room(
 
 
 async def test_who_parks_hears_how_it_ended_not_how_it_was_meant(
-    make_arbiter: Callable[..., ArbiterProcess], spec: Spec
+    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, beside: Start
 ) -> None:
     """Regression: whatever happened on the lease while the arbiter was asked ended the wait, and it was `parked`, and gone a moment later."""
     arbiter = make_arbiter(config="host:\n  park_budget_bytes: 0\n").start()
     model = Model()
-    async with AsyncClient(arbiter.endpoint, name="t") as client, asyncio.timeout(WAIT_S):
+    async with AsyncClient("t", endpoint=arbiter.endpoint) as client, within(WAIT_S):
         detector = await parkable(client, spec, model)
-        parking = asyncio.create_task(detector.park())
-        while not parking.done():
-            detector.revoke_asked(
+        parking = beside(detector.park())
+        while not parking.done:
+            detector._revoke_asked(
                 {}, False
             )  # as the arbiter says it again and again while somebody waits
-            await asyncio.sleep(0)
+            await anyio.sleep(0)
         await parking
         assert (detector.state, model.did) == ("gone", ["park", "unload"])
 
@@ -216,7 +228,7 @@ async def test_a_yielded_use_lets_the_holder_go_and_says_so_at_its_end(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     model = Model()
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         job = await client.acquire(spec("job", 5), unload=model.unload)
         await job.ready()
         async with job.use("render") as use:
@@ -231,7 +243,7 @@ async def test_a_yielded_use_lets_the_holder_go_and_says_so_at_its_end(
 async def test_a_gang_is_granted_together_one_load_after_the_other(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         held: list[AsyncLease] = []
         async for _, lease in client.gang([spec("policy", 4), spec("reward", 3)], WAIT_S):
             assert [other.state for other in held] == ["held"] * len(held)
@@ -250,7 +262,7 @@ async def test_a_lease_grows_and_shrinks(arbiter_daemon: ArbiterProcess, spec: S
     async def charged(client: AsyncClient) -> int:
         return int((await client.status())["leases"][0]["charge_bytes"])
 
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         cache = await client.acquire(spec("cache", 2))
         await cache.ready()
         await cache.resize(size(4), WAIT_S)
@@ -267,16 +279,16 @@ def five_gib() -> Footprint:
 
 
 async def test_a_resize_ends_with_the_stay_on_the_card(
-    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
+    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, beside: Start
 ) -> None:
     """Regression: what a lease that was asked to leave had waited for was dropped, and its `resize` never returned."""
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         cache = await client.acquire(spec("cache", 2, standby=True))
         await cache.ready()
         busy = await client.acquire(spec("busy", 3, priority=90), WAIT_S)
         await busy.ready()
-        async with AsyncClient(arbiter_daemon.endpoint, name="u") as other, busy.use():
-            growing = asyncio.create_task(cache.resize(five_gib()))
+        async with AsyncClient("u", endpoint=arbiter_daemon.endpoint) as other, busy.use():
+            growing = beside(cache.resize(five_gib()))
             await until_growing(client)
             policy = await other.acquire(spec("policy", 4, priority=95), WAIT_S)
             with pytest.raises(LeaseRevoking):
@@ -286,9 +298,9 @@ async def test_a_resize_ends_with_the_stay_on_the_card(
 
 
 async def test_a_resize_that_waits_outlives_the_daemon(
-    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
+    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, beside: Start
 ) -> None:
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         cache = await client.acquire(spec("cache", 2))
         memory = FakeMemory(arbiter_daemon.card, "t", 0)
         memory.allocate("cache", 2 * GIB)
@@ -297,7 +309,7 @@ async def test_a_resize_that_waits_outlives_the_daemon(
         block = memory.allocate("busy", 3 * GIB)
         await busy.ready()
         async with busy.use():
-            growing = asyncio.create_task(cache.resize(five_gib()))
+            growing = beside(cache.resize(five_gib()))
             await until_growing(client)
             arbiter_daemon.kill()
             arbiter_daemon.start()
@@ -306,40 +318,39 @@ async def test_a_resize_that_waits_outlives_the_daemon(
         memory.free(block)
         memory.empty_cache()
         await busy.give_up()
-        await asyncio.wait_for(growing, WAIT_S)
+        async with within(WAIT_S):
+            await growing
         assert cache.spec.footprint.steady_bytes == 5 * GIB
 
 
 async def until_growing(client: AsyncClient) -> None:
-    async with asyncio.timeout(WAIT_S):
+    async with within(WAIT_S):
         while not any(lease.get("resizing") for lease in (await client.status())["leases"]):
-            await asyncio.sleep(0.02)
+            await anyio.sleep(0.02)
 
 
 async def test_a_job_that_waits_for_its_own_room_is_told(
-    arbiter_daemon: ArbiterProcess, spec: Spec
+    arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
 ) -> None:
     """It holds in use what it would itself have to give up: that would never end. Another task of the process may wait."""
-    async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         job = await client.acquire(spec("job", 5))
         await job.ready()
-        inside = asyncio.Event()
-        beside = asyncio.ensure_future(asked_when(inside, client, spec("another request", 5)))
+        inside = anyio.Event()
+        another = beside(asked_when(inside, client, spec("another request", 5)))
         async with job.use():
             inside.set()
             with pytest.raises(WouldDeadlock) as told:
                 await client.acquire(spec("llm", 5))
             assert [link["consumer"] for link in told.value.details["cycle"]] == ["llm"]
             assert "job" in str(told.value)
-            prefetch = asyncio.ensure_future(
-                client.acquire(spec("next", 5, independent=True), WAIT_S)
-            )
+            prefetch = beside(client.acquire(spec("next", 5, independent=True), WAIT_S))
         await job.give_up()
-        assert (await beside).state == "loading"
-        await (await beside).give_up()
+        assert (await another).state == "loading"
+        await (await another).give_up()
         assert (await prefetch).state == "loading"
 
 
-async def asked_when(happens: asyncio.Event, client: AsyncClient, spec: LeaseSpec) -> AsyncLease:
+async def asked_when(happens: anyio.Event, client: AsyncClient, spec: LeaseSpec) -> AsyncLease:
     await happens.wait()
     return await client.acquire(spec, WAIT_S)

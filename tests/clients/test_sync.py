@@ -26,7 +26,7 @@ PATIENCE_S = 60.0
 
 @pytest.fixture
 def client(arbiter_daemon: ArbiterProcess) -> Iterator[Client]:
-    with Client(arbiter_daemon.endpoint, name="t") as client:
+    with Client("t", endpoint=arbiter_daemon.endpoint) as client:
         yield client
 
 
@@ -79,7 +79,7 @@ def test_a_use_on_anothers_lease(
 ) -> None:
     lease = client.acquire(spec("a", 5))
     lease.ready()
-    with Client(arbiter_daemon.endpoint, name="runner") as runner:
+    with Client("runner", endpoint=arbiter_daemon.endpoint) as runner:
         with runner.use(lease.lease_id, lease.token, "goal"):
             assert runner.status()["leases"][0]["uses"] == 1
         assert runner.status()["leases"][0]["uses"] == 0
@@ -109,7 +109,7 @@ def test_not_across_a_fork(client: Client, spec: Spec) -> None:
     pid = os.fork()
     if pid == 0:
         try:
-            client.close()  # only forgets
+            client.__exit__(None, None, None)  # only forgets
             lease.ready()
         except BadState:
             os._exit(0)
@@ -120,9 +120,8 @@ def test_not_across_a_fork(client: Client, spec: Spec) -> None:
 
 
 def test_closed_or_unreachable(tmp_path: Path) -> None:
-    client = Client(f"ipc://{tmp_path}/none.sock", name="t", connect_timeout_s=0.2)
+    client = Client("t", endpoint=f"ipc://{tmp_path}/none.sock", connect_timeout_s=0.2)
     with pytest.raises(ArbiterUnreachable):
-        client.connect()
+        client.__enter__()
     with pytest.raises(BadState):
         client.status()
-    client.close()

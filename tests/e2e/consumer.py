@@ -50,7 +50,7 @@ async def main(name: str, size: int, card: Path, residue: int) -> None:
         blocks.clear()
         memory.empty_cache()
 
-    def lost(_: AsyncLease, error: Exception) -> None:
+    async def lost(_: AsyncLease, error: Exception) -> None:
         say("lost", error=str(error))
 
     spec = LeaseSpec(

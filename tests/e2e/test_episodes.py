@@ -174,7 +174,10 @@ class Stage:
         stage, where = cls(programs), f"ipc://{programs.runtime}"
         stage.arbiter = await stack.enter_async_context(
             AsyncClient(
-                programs.arbiter.endpoint, name="witness", role="operator", connect_timeout_s=WAIT_S
+                "witness",
+                endpoint=programs.arbiter.endpoint,
+                role="operator",
+                connect_timeout_s=WAIT_S,
             )
         )
         stage.runner = await stack.enter_async_context(

@@ -103,8 +103,8 @@ class Box:
     @contextlib.asynccontextmanager
     async def client(self) -> AsyncIterator[AsyncClient]:
         async with AsyncClient(
-            f"ipc://{self.runtime}/arbiter.sock",
-            name="test",
+            "test",
+            endpoint=f"ipc://{self.runtime}/arbiter.sock",
             role="operator",
             connect_timeout_s=PATIENCE_S,
         ) as client:

@@ -115,7 +115,7 @@ def test_the_example_runs_as_printed(arbiter_daemon: ArbiterProcess, tmp_path: P
         timeout=LIMIT_S,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "detecting\n", "")
-    with Client(arbiter_daemon.endpoint, name="t") as client:
+    with Client("t", endpoint=arbiter_daemon.endpoint) as client:
         kinds = [
             event["kind"]
             for event in client.history()["events"]

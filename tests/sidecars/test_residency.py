@@ -67,7 +67,7 @@ class Client(AsyncClient):
     """Does something in the very moment in which a lease is granted, before whoever waits for it goes on."""
 
     def __init__(self, endpoint):
-        super().__init__(endpoint, name="eye")
+        super().__init__("eye", endpoint=endpoint)
         self.at_the_grant = None
         self.done = None
 
@@ -117,7 +117,7 @@ async def test_a_process_that_cannot_change_its_gpu_asks_for_that_one(arbiter_da
     """A sidecar loaded on the first GPU whichever was granted."""
     daemon = arbiter_daemon
     worker = Worker()
-    async with AsyncClient(daemon.endpoint, name="eye") as client, asyncio.timeout(WAIT_S):
+    async with AsyncClient("eye", endpoint=daemon.endpoint) as client, asyncio.timeout(WAIT_S):
         memory = OneGpu(daemon.card, "eye", GB // 10)
         residency = Residency(settings(daemon), Model(), memory, worker, client)
         await residency.load()

@@ -8,6 +8,7 @@ wait is remembered, so that in the end nobody may still be waiting.
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Iterator
+from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +18,7 @@ from tests.support.simulation.world import Entitlement, SimProcess, World
 from vram_arbiter.clients._protocol.protocol import ClientProtocol
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
-from vram_arbiter.clients.net.dealer import Transport
+from vram_arbiter.clients.net.dealer import Dealer
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VramError
 from vram_arbiter.schemas.ids import GpuId
@@ -34,7 +35,7 @@ class SimClient(AsyncClient):
     """The real client with simulated time, names and transport."""
 
     def __init__(self, world: World, process: SimProcess, role: str = "client") -> None:
-        super().__init__("ipc://simulated", name=process.name, role=role)
+        super().__init__(process.name, endpoint="ipc://simulated", role=role)
         self._world, self._process = world, process
         self.protocol = ClientProtocol(
             name=process.name, instance=world.clock.new_id("i"), role=role
@@ -61,11 +62,11 @@ class SimClient(AsyncClient):
         record = self.protocol.holdings.held.get(lease.lease_id)
         return record is not None and self.now() < self.protocol.holdings.fence_at(record)
 
-    def _new_transport(self, loop: asyncio.AbstractEventLoop) -> Transport:
+    def _new_dealer(self) -> Dealer:
         return self._world.open_link(self._process, self._received, self._hung_up)  # type: ignore[return-value]
 
     def _killed(self) -> None:
-        self._transport = None  # what is still on the stack of a dead process must not speak
+        self._open = False  # what is still on the stack of a dead process must not speak
 
 
 @dataclass(slots=True)
@@ -198,14 +199,13 @@ class Program(ABC):
     async def _live(self) -> None:
         self.client = SimClient(self.world, self.process, self.role)
         self.cast.clients.append(self.client)
-        while True:
-            try:
-                await self.client.connect()
-                break
-            except ArbiterUnreachable:
-                await asyncio.sleep(CONNECT_PAUSE_S)
-        await self.life()
-        await self.client.close()
+        async with AsyncExitStack() as connection:
+            while not self.client.connected:
+                try:
+                    await connection.enter_async_context(self.client)
+                except ArbiterUnreachable:
+                    await asyncio.sleep(CONNECT_PAUSE_S)
+            await self.life()
         self.done = True
         self.world.clock.after(0.001, lambda: self.world.kill(self.process))
 
@@ -272,14 +272,19 @@ class Consumer(Program):
         ask = Ask(self.process.name, self.world.clock.now, timeout_s, self.process, spec)
         self.cast.asks.append(ask)
         holding: list[Holding] = []
+
+        async def unload() -> None:
+            await self._watched(self._unload(holding[0]))
+
+        async def restore(_: AsyncLease) -> None:
+            await self._watched(self._come_back(holding[0]))
+
+        async def lost(_: AsyncLease, error: VramError) -> None:
+            self.cast.count_refusal(error)
+
         work = self.loop.create_task(
             self.client.acquire(
-                spec,
-                timeout_s,
-                unload=lambda: self._watched(self._unload(holding[0])),
-                park=lambda: self._watched(self._unload(holding[0])),
-                on_return=lambda lease: self._watched(self._come_back(holding[0])),
-                on_lost=lambda lease, error: self.cast.count_refusal(error),
+                spec, timeout_s, unload=unload, park=unload, restore=restore, on_lost=lost
             )
         )
         if self.world.clock.chance(self.character.gives_up_waiting):

@@ -161,9 +161,9 @@ def run_client(
     done: list[bool] = []
 
     async def run() -> None:
-        await client.connect()
-        await life(client)
-        done.append(True)
+        async with client:
+            await life(client)
+            done.append(True)
 
     process.loop.enter(lambda: process.loop.create_task(run()))
     made.run(seconds, lambda: bool(done))

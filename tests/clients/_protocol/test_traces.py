@@ -71,7 +71,7 @@ def test_the_arbiter_hears_of_the_trace_of_an_acquire(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     async def story() -> None:
-        async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+        async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
             with tracing.joined(PARENT):
                 present = await client.acquire(spec("present", 1))
                 await present.ready()
@@ -89,7 +89,7 @@ def test_the_arbiter_hears_of_the_trace_of_an_acquire(
         assert traced_in(history, "nobody") == {None}
 
     asyncio.run(story())
-    with Client(arbiter_daemon.endpoint, name="threads") as client:
+    with Client("threads", endpoint=arbiter_daemon.endpoint) as client:
         with tracing.joined(PARENT):
             lease = client.acquire(spec("sync", 1))
         assert PARENT in traced_in(client.history(), "sync")
@@ -111,10 +111,10 @@ def test_a_model_that_is_called_back_is_loaded_in_the_trace_of_who_wants_it(
         async def unload() -> None:
             pass
 
-        async with AsyncClient(arbiter_daemon.endpoint, name="t") as client:
+        async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
             with tracing.joined(PARENT):
                 model = await client.acquire(
-                    spec("model", 5, standby=True), unload=unload, on_return=load
+                    spec("model", 5, standby=True), unload=unload, restore=load
                 )
                 await model.ready()
                 big = await client.acquire(spec("big", 5), unload=unload)

@@ -133,7 +133,7 @@ def vramctl(arbiter: ArbiterProcess, *arguments: str) -> "subprocess.CompletedPr
 def test_following_shows_the_past_and_then_the_present(
     arbiter_daemon: ArbiterProcess, spec: Callable[..., LeaseSpec]
 ) -> None:
-    with Client(arbiter_daemon.endpoint, name="t") as client:
+    with Client("t", endpoint=arbiter_daemon.endpoint) as client:
         client.acquire(spec("early", 1)).ready()
         shown = vramctl(arbiter_daemon, "history", "--since", "1h", "-c", "early", "--json")
         kinds = [event["kind"] for event in json.loads(shown.stdout)["events"]]

@@ -67,7 +67,7 @@ def typed(done: Finished) -> str:
 
 @pytest.fixture
 def client(arbiter_daemon: ArbiterProcess) -> Iterator[Client]:
-    with Client(arbiter_daemon.endpoint, name="t") as client:
+    with Client("t", endpoint=arbiter_daemon.endpoint) as client:
         yield client
 
 

@@ -85,7 +85,7 @@ def running(
 
 @pytest.fixture
 def client(arbiter_daemon: ArbiterProcess) -> Iterator[Client]:
-    with Client(arbiter_daemon.endpoint, name="t") as client:
+    with Client("t", endpoint=arbiter_daemon.endpoint) as client:
         yield client
 
 
@@ -334,7 +334,7 @@ async def test_the_peak_is_what_the_arbiter_measured_of_the_program(
     spec = RunSpec(["job"], None, 1 << 30, "any", 40, None, False, "priority", None)
     async with (
         asyncio.timeout(PATIENCE_S),
-        AsyncClient(arbiter_daemon.endpoint, name="t") as client,
+        AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client,
     ):
         run = _Run(spec, client)
         lease: AsyncLease = await client.acquire(lease_spec(spec))

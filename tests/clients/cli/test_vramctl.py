@@ -47,7 +47,7 @@ def nowhere(tmp_path: Path) -> dict[str, str]:
 
 @pytest.fixture
 def client(arbiter_daemon: ArbiterProcess) -> Iterator[Client]:
-    with Client(arbiter_daemon.endpoint, name="t") as client:
+    with Client("t", endpoint=arbiter_daemon.endpoint) as client:
         yield client
 
 

@@ -74,7 +74,7 @@ def folder() -> Iterator[Path]:
 
 
 async def ask_arbiter(endpoint: str) -> None:
-    async with AsyncClient(endpoint, name="t"):
+    async with AsyncClient("t", endpoint=endpoint):
         pass
 
 
@@ -153,7 +153,7 @@ def test_a_lease_is_not_told_to_a_server_that_took_the_arbiters_place(
     arbiter_daemon: ArbiterProcess, spec: Callable[..., object], caplog: pytest.LogCaptureFixture
 ) -> None:
     """libzmq reconnects by itself, to whatever listens then; the re-attachment holds every token."""
-    with Client(arbiter_daemon.endpoint, name="t") as client:
+    with Client("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = client.acquire(spec("detector", 1))  # type: ignore[arg-type]
         lease.ready()
         assert arbiter_daemon.stop() == 0

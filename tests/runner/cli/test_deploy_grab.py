@@ -68,7 +68,7 @@ def uses(status: dict[str, Any]) -> list[int]:
 async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
     async with (
         RunnerClient(f"ipc://{arbiter.runtime}/runner.sock", connect_timeout_s=60.0) as runner,
-        AsyncClient(arbiter.endpoint, name="watcher") as watcher,
+        AsyncClient("watcher", endpoint=arbiter.endpoint) as watcher,
     ):
         assert (await runner.call("ping"))["arbiter"] is True
         begun = await runner.state()

@@ -50,7 +50,7 @@ def programs(
 async def scenario(daemon: ArbiterProcess, sidecar: "subprocess.Popen[bytes]") -> None:
     async with (
         RunnerClient(f"ipc://{daemon.runtime}/runner.sock", connect_timeout_s=120.0) as runner,
-        AsyncClient(daemon.endpoint, name="watcher", role="observer") as watcher,
+        AsyncClient("watcher", endpoint=daemon.endpoint, role="observer") as watcher,
     ):
         before = (await runner.state())["world"]["joint_state"]["position"]
         goal = await runner.send_goal(SKILL, deadline_s=120.0)

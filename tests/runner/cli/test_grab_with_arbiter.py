@@ -42,7 +42,7 @@ def leases(status: dict[str, Any], consumer: str) -> list[tuple[str, int]]:
 async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
     async with (
         RunnerClient(f"ipc://{arbiter.runtime}/runner.sock", connect_timeout_s=60.0) as runner,
-        AsyncClient(arbiter.endpoint, name="rival") as rival,
+        AsyncClient("rival", endpoint=arbiter.endpoint) as rival,
     ):
         await runner.ping(timeout_s=60.0)
         truth = await runner.ground_truth()

@@ -198,6 +198,9 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         self._tasks.append(task)
         return task
 
+    def get_task_factory(self) -> None:
+        """None: tasks are asyncio's own."""
+
     def call_exception_handler(self, context: dict[str, Any]) -> None:
         error = context.get("exception")
         if not self.dead and error is not None and self.on_failure is not None:

@@ -5,6 +5,8 @@ end behind all that arrived on it, perhaps after the same client's next connecti
 and go through the real codec on both sides.
 """
 
+import asyncio
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -61,7 +63,7 @@ class Line:
 
 
 class Link:
-    """One DEALER socket of a process, from its opening to its closing; the shape of `clients.net.dealer.Transport`."""
+    """One DEALER socket of a process, from its opening to its closing; the shape of `clients.net.dealer.Dealer`."""
 
     def __init__(
         self,
@@ -83,6 +85,8 @@ class Link:
         self._unsent: list[bytes] = []  # waiting for a connection
         self._up_at = self._down_at = 0.0  # when the newest message of a direction arrives
         self._in_flight_down = 0
+        self._inbox: deque[bytes | None] = deque()  # None: the connection broke
+        self._arrived = asyncio.Event()
         wire.opened(self)
 
     # -- the process's side ----------------------------------------------------------------------------------------
@@ -95,6 +99,21 @@ class Link:
         else:
             self._go_up(payload)
         return True
+
+    async def run(self) -> None:
+        """Hand on what arrives, as a task of the client does."""
+        try:
+            while True:
+                while self._inbox:
+                    payload = self._inbox.popleft()
+                    if payload is None:
+                        self._hung_up()
+                        return
+                    self._received(msgpack.unpackb(payload, raw=False, strict_map_key=False))
+                self._arrived.clear()
+                await self._arrived.wait()
+        finally:
+            self.close()
 
     def close(self) -> None:
         """LINGER 0: what the kernel does not have yet is lost; what it has arrives, perhaps after a newer connection's first word."""
@@ -173,11 +192,13 @@ class Link:
         if self.closed or generation != self._generation:
             return
         self._in_flight_down -= 1
-        self._received(msgpack.unpackb(payload, raw=False, strict_map_key=False))
+        self._inbox.append(payload)
+        self._arrived.set()
 
     def _tell_hung_up(self) -> None:
         if not self.closed:
-            self._hung_up()
+            self._inbox.append(None)
+            self._arrived.set()
 
 
 class SimWire:

@@ -15,8 +15,8 @@ import pytest
 
 from tests.support.paths import ROOT
 from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.net.answer import Answer
 from vram_arbiter.clients.net.server import Message, Peer, RouterServer
-from vram_arbiter.clients.net.timeouts import answered
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.reasoner import server as reasoner
@@ -94,7 +94,7 @@ def serve() -> Iterator[Callable[..., str]]:
 
 
 async def connect(endpoint: str) -> None:
-    async with AsyncClient(endpoint, name="t", connect_timeout_s=LIMIT_S):
+    async with AsyncClient("t", endpoint=endpoint, connect_timeout_s=LIMIT_S):
         pass
 
 
@@ -191,26 +191,22 @@ def test_an_answer_that_came_while_the_process_was_stopped_counts(
 
 def test_silence_is_silence() -> None:
     async def run() -> None:
-        never: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         with pytest.raises(TimeoutError):
-            await answered(never, 0.05)
-        assert never.cancelled()
-        failing: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        failing.set_exception(ZeroDivisionError())
+            await Answer[None]().within(0.05)
+        failing = Answer[None]()
+        failing.fail(ZeroDivisionError())
         with pytest.raises(ZeroDivisionError):
-            await answered(failing, 60.0)
+            await failing.within(60.0)
 
     asyncio.run(run())
 
 
-def test_who_turns_away_leaves_nothing_open() -> None:
+def test_the_first_end_of_an_answer_counts() -> None:
     async def run() -> None:
-        never: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        asking = asyncio.create_task(answered(never, PATIENCE_S))
-        await asyncio.sleep(0)
-        asking.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await asking
-        assert never.cancelled()
+        answer = Answer[int]()
+        answer.set(1)
+        answer.fail(ZeroDivisionError())
+        answer.set(2)
+        assert (await answer.within(60.0), answer.failed) == (1, False)
 
     asyncio.run(run())
