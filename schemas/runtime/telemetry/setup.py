@@ -1,9 +1,11 @@
-"""Installs an OpenTelemetry SDK when a person asked for one: standard OTEL_* variables, or what a program's configuration says.
+"""Installs the OpenTelemetry SDK where the environment or a program's configuration asks for it.
 
-Not asked for, nothing of OpenTelemetry is imported and nothing runs. Must not know any span or metric of a program; the names are in
-`schemas.runtime.telemetry.names`, the calls in `schemas.runtime.telemetry.spans` and with the programs. OTLP goes over HTTP with protobuf; the Prometheus endpoint
-listens on loopback alone, because it asks nobody who he is. What is not named here (headers, certificates, OTEL_BSP_*,
-OTEL_METRIC_EXPORT_INTERVAL, OTEL_RESOURCE_ATTRIBUTES) the SDK reads from the process's environment by itself.
+Nothing of OpenTelemetry is imported, and nothing runs, unless it is asked for. The SDK and its
+exporters read the OTEL_* variables themselves; this module reads only those that say whether and
+where to export. Exporters are the installed entry points of the specification's names
+(`otlp`, `console`, ...); only `prometheus` is our own server, which limits what a local process
+may cost it and listens on loopback alone, because it does not authenticate.
+Names of spans and metrics are in `names`, the calls in `spans`.
 """
 
 import atexit
@@ -16,8 +18,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
-from urllib.parse import urlsplit
+from typing import Any, Literal
 
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.telemetry import exported
@@ -25,26 +26,19 @@ from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 log = logging.getLogger(__name__)
 
+type Signal = Literal["traces", "metrics"]
+SIGNALS: tuple[Signal, ...] = ("traces", "metrics")
 EXTRA = "vram-arbiter[telemetry]"
-OTLP_DEFAULT = "http://localhost:4318"
 PROMETHEUS_PORT = 9464
-"""The port that OpenTelemetry's specification gives to a Prometheus endpoint."""
+"""Port that OpenTelemetry's specification gives to a Prometheus endpoint."""
 FLUSH_S = 5.0
-"""A program that ends waits at most so long for its collector."""
+"""Longest wait for a collector at a program's end."""
 EXPORT_S = 3.0
-"""Time limit of one export, retries included, unless OTEL_EXPORTER_OTLP_TIMEOUT or the signal's own says otherwise. The SDK's own 10 s outlasts FLUSH_S."""
-EXPORT_MAX_S = 86_400.0
+"""Time limit of one OTLP export unless a variable sets it; the SDK's 10 s outlast FLUSH_S."""
 SAY_AGAIN_S = 300.0
-"""A collector that is away is complained of this often, not with every batch."""
+"""Interval between two complaints about a collector that is away."""
+_PROTOCOLS = {"": "http", "http/protobuf": "http", "grpc": "grpc"}
 
-_SAMPLERS = (
-    "always_on",
-    "always_off",
-    "traceidratio",
-    "parentbased_always_on",
-    "parentbased_always_off",
-    "parentbased_traceidratio",
-)
 _BOUNDS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
 _BOUNDS_WRITE_S = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.05, 0.25, 1.0, 5.0)
 _BOUNDS_MS = (0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 33.0, 40.0, 50.0, 100.0, 250.0, 500.0, 1000.0, 5000.0)  # fmt: skip
@@ -61,23 +55,24 @@ _BOUNDS: Mapping[str, Sequence[float]] = {
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What to export and where to. All None: telemetry is off."""
+    """What is exported, by names of exporters. All empty: telemetry is off."""
 
-    traces: str | None = None  # whole URL
-    metrics: str | None = None  # whole URL
-    prometheus: tuple[str, int] | None = None  # loopback address, port; 0: any free one
-    sampler: str = "parentbased_traceidratio"
-    ratio: float = 1.0  # 0..1, of the traces that begin here
-    traces_timeout_s: float = EXPORT_S
-    metrics_timeout_s: float = EXPORT_S
+    traces: tuple[str, ...] = ()
+    metrics: tuple[str, ...] = ()
+    endpoint: str | None = None
+    """Base URL of the OTLP collector, from a configuration; None: the SDK reads the variables."""
+    prometheus: tuple[str, int] | None = None
+    """Loopback address and port; port 0 chooses a free one."""
+    ratio: float | None = None
+    """Share of traces that begin here; None: the SDK reads the variables."""
 
     @property
     def on(self) -> bool:
-        return self.traces is not None or self.metrics is not None or self.prometheus is not None
+        return bool(self.traces or self.metrics) or self.prometheus is not None
 
 
 class Telemetry:
-    """What `set_up` gives back: call it at the program's end, at most FLUSH_S; again is nothing. `on`: an SDK is installed."""
+    """Result of `set_up`: call it at the program's end to send what is left. `on`: the SDK runs."""
 
     def __init__(
         self, ends: Sequence[Callable[[], object]] = (), prometheus_port: int | None = None
@@ -85,8 +80,8 @@ class Telemetry:
         self.on = bool(ends)
         self.prometheus_port = prometheus_port
         self._over = threading.Event()
-        # In threads of their own, because an exporter does not look at the clock while it waits for a collector that does not answer;
-        # made now, because none can be made any more while the interpreter ends.
+        # One thread each: an exporter that waits for a silent collector does not look at the clock.
+        # Started now: no thread can start while the interpreter ends.
         self._threads = [
             threading.Thread(target=self._end, args=(end,), name="telemetry-end", daemon=True)
             for end in ends
@@ -106,13 +101,11 @@ class Telemetry:
         self._over.wait()
         try:
             end()
-        except Exception as error:  # noqa: BLE001 - a thread's outermost call: what telemetry cannot say ends no program badly
+        except Exception as error:  # noqa: BLE001 - a failed export must not fail the program
             log.warning("telemetry ended badly: %s", error)
 
 
-_installed: Telemetry | None = (
-    None  # OpenTelemetry's providers are one per process and can be set once
-)
+_installed: Telemetry | None = None  # the SDK's providers can be set once per process
 
 
 def set_up(
@@ -124,11 +117,21 @@ def set_up(
     sample_ratio: float | None = None,
     attributes: Mapping[str, str] | None = None,
 ) -> Telemetry:
-    """Install the SDK if anything was asked for; the result ends it. Arguments (a program's configuration) win over `environ`.
+    """Install the SDK if it is asked for. Returns what ends it.
 
-    `endpoint`: OTLP collector, the base without /v1/traces. `sample_ratio`: share of the traces that begin in this process; one that began
-    elsewhere is kept if it was kept there. `attributes`: more of the resource's. A second call in a process gives the first one's result.
-    Raises ConfigError: the extra `telemetry` is not installed, a value makes no sense, the port is taken.
+    Args:
+        service: name of the service on every span and metric.
+        endpoint: base URL of an OTLP collector, without /v1/traces; wins over `environ`.
+        prometheus_port: port on loopback; wins over `environ`.
+        sample_ratio: share (0 to 1) of the traces that begin in this process. A trace that began
+            elsewhere is kept if it was kept there.
+        attributes: further attributes of the resource.
+
+    A second call in a process returns the first one's result.
+
+    Raises:
+        ConfigError: the extra `telemetry` is not installed, an exporter is unknown, the SDK refuses
+            a variable, or the port is taken.
     """
     global _installed
     planned = plan(
@@ -149,124 +152,41 @@ def plan(
     prometheus_port: int | None = None,
     sample_ratio: float | None = None,
 ) -> Plan:
-    """What was asked for; nothing is imported or opened. Raises ConfigError that names the variable."""
+    """Return what is asked for; import and open nothing. Raises ConfigError."""
     if environ.get("OTEL_SDK_DISABLED", "").strip().lower() == "true":
         return Plan()
-    ways = {
-        "TRACES": _exporters(environ, "OTEL_TRACES_EXPORTER", ("otlp", "none")),
-        "METRICS": _exporters(environ, "OTEL_METRICS_EXPORTER", ("otlp", "prometheus", "none")),
-    }
-    urls = {signal: _url(environ, signal, ways[signal], endpoint) for signal in ways}
+    wanted = {signal: _exporters(environ, signal, endpoint) for signal in SIGNALS}
     prometheus = None
-    if prometheus_port is not None or "prometheus" in (ways["METRICS"] or ()):
+    if prometheus_port is not None or "prometheus" in wanted["metrics"]:
         prometheus = _prometheus(environ, prometheus_port)
-    if not (urls["TRACES"] or urls["METRICS"] or prometheus):
-        return Plan()
-    if urls["TRACES"] or urls["METRICS"]:
-        _check_protocol(environ)
-    sampler, ratio = _sampling(environ, sample_ratio)
-    limits_s = {
-        signal: _timeout_s(environ, signal) if url else EXPORT_S for signal, url in urls.items()
-    }
-    return Plan(
-        urls["TRACES"],
-        urls["METRICS"],
-        prometheus,
-        sampler,
-        ratio,
-        limits_s["TRACES"],
-        limits_s["METRICS"],
-    )
+    metrics = tuple(name for name in wanted["metrics"] if name != "prometheus")
+    return Plan(wanted["traces"], metrics, endpoint, prometheus, sample_ratio)
 
 
-def _exporters(
-    environ: Mapping[str, str], name: str, known: Sequence[str]
-) -> tuple[str, ...] | None:
-    """None: the variable does not say."""
-    given = tuple(part.strip().lower() for part in environ.get(name, "").split(",") if part.strip())
-    for part in given:
-        if part not in known:
-            raise ConfigError(
-                f"{name}: {part!r} is no exporter here", hint=f"one of {', '.join(known)}"
-            )
-    return given or None
-
-
-def _url(
-    environ: Mapping[str, str], signal: str, ways: tuple[str, ...] | None, endpoint: str | None
-) -> str | None:
-    if ways is not None and "otlp" not in ways:
-        return None
-    path = f"/v1/{signal.lower()}"
-    own = f"OTEL_EXPORTER_OTLP_{signal}_ENDPOINT"
-    if endpoint is not None:
-        return checked_url(endpoint, "the telemetry endpoint").rstrip("/") + path
-    if given := environ.get(own, "").strip():
-        return checked_url(given, own)
-    if base := environ.get("OTEL_EXPORTER_OTLP_ENDPOINT", "").strip():
-        return checked_url(base, "OTEL_EXPORTER_OTLP_ENDPOINT").rstrip("/") + path
-    return None if ways is None else OTLP_DEFAULT + path
-
-
-def checked_url(text: str, name: str) -> str:
-    """`text` itself. Raises ConfigError unless it is http://HOST… or https://HOST…."""
-    try:
-        parts = urlsplit(text)
-        good = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
-    except ValueError:
-        good = False
-    if not good:
-        shown = text.rpartition("@")[2].partition("?")[0]  # no password, no token
-        raise ConfigError(
-            f"{name}: {shown!r} is no URL of a collector", hint=f"write {OTLP_DEFAULT}"
-        )
-    return text
-
-
-def _timeout_s(environ: Mapping[str, str], signal: str) -> float:
-    """Of one export, as the SDK reads it: the signal's own variable before the common one, and in seconds."""
-    for name in (f"OTEL_EXPORTER_OTLP_{signal}_TIMEOUT", "OTEL_EXPORTER_OTLP_TIMEOUT"):
-        if not (text := environ.get(name, "").strip()):
-            continue
-        try:
-            value = float(text)
-        except ValueError:
-            value = 0.0
-        if not 0.0 < value <= EXPORT_MAX_S:
-            raise ConfigError(
-                f"{name}: {text!r} is no number of seconds for an export",
-                hint=f"more than 0 and at most {EXPORT_MAX_S:g}, e.g. 10",
-            )
-        return value
-    return EXPORT_S
-
-
-def _check_protocol(environ: Mapping[str, str]) -> None:
-    for name in (
-        "OTEL_EXPORTER_OTLP_PROTOCOL",
-        "OTEL_EXPORTER_OTLP_TRACES_PROTOCOL",
-        "OTEL_EXPORTER_OTLP_METRICS_PROTOCOL",
-    ):
-        given = environ.get(name, "").strip().lower()
-        if given not in ("", "http/protobuf"):
-            raise ConfigError(
-                f"{name}: {given!r} is not spoken here",
-                hint="http/protobuf is; collectors take it on port 4318",
-            )
+def _exporters(environ: Mapping[str, str], signal: Signal, endpoint: str | None) -> tuple[str, ...]:
+    """Return the exporters' names. An OTLP endpoint alone asks for `otlp`."""
+    given = environ.get(f"OTEL_{signal.upper()}_EXPORTER", "").lower().split(",")
+    names = tuple(name.strip() for name in given if name.strip())
+    if names:
+        return tuple(name for name in names if name != "none")
+    own = environ.get(f"OTEL_EXPORTER_OTLP_{signal.upper()}_ENDPOINT", "").strip()
+    common = environ.get("OTEL_EXPORTER_OTLP_ENDPOINT", "").strip()
+    return ("otlp",) if endpoint or own or common else ()
 
 
 def _prometheus(environ: Mapping[str, str], port: int | None) -> tuple[str, int]:
     host = environ.get("OTEL_EXPORTER_PROMETHEUS_HOST", "").strip() or "127.0.0.1"
     if not _is_loopback(host):
         raise ConfigError(
-            f"OTEL_EXPORTER_PROMETHEUS_HOST: {host} is no loopback address, and the endpoint asks nobody who he is",
-            hint="write 127.0.0.1 and let a collector or a proxy on this machine pass it on",
+            f"OTEL_EXPORTER_PROMETHEUS_HOST: expected a loopback address, got {host}; the endpoint"
+            " does not authenticate",
+            hint="write 127.0.0.1 and let a collector or proxy on this machine forward it",
         )
     if port is None:
         text = environ.get("OTEL_EXPORTER_PROMETHEUS_PORT", "").strip() or str(PROMETHEUS_PORT)
         if not text.isascii() or not text.isdigit() or int(text) > 65_535:
             raise ConfigError(
-                f"OTEL_EXPORTER_PROMETHEUS_PORT: {text!r} is no port", hint="0 to 65535"
+                f"OTEL_EXPORTER_PROMETHEUS_PORT: expected a port, got {text!r}", hint="0 to 65535"
             )
         port = int(text)
     return host, port
@@ -281,31 +201,9 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def _sampling(environ: Mapping[str, str], ratio: float | None) -> tuple[str, float]:
-    if ratio is not None:
-        return "parentbased_traceidratio", _ratio(str(ratio), "the sample ratio")
-    name = environ.get("OTEL_TRACES_SAMPLER", "").strip().lower() or "parentbased_traceidratio"
-    if name not in _SAMPLERS:
-        raise ConfigError(
-            f"OTEL_TRACES_SAMPLER: {name!r} is unknown", hint=f"one of {', '.join(_SAMPLERS)}"
-        )
-    text = environ.get("OTEL_TRACES_SAMPLER_ARG", "").strip() or "1.0"
-    return name, _ratio(text, "OTEL_TRACES_SAMPLER_ARG") if name.endswith("ratio") else 1.0
-
-
-def _ratio(text: str, name: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 <= value <= 1.0:
-        raise ConfigError(f"{name}: {text!r} is no share", hint="0 (no trace) to 1 (all)")
-    return value
-
-
-# -- the SDK: nothing above this line imports it ------------------------------------------------------------------------
+# -- the SDK: nothing above this line imports it ---------------------------------------------------
 def _install(service: str, planned: Plan, attributes: Mapping[str, str]) -> Telemetry:
-    """Everything that can fail comes first: a program whose telemetry is refused has no half of it."""
+    """Install all of `planned`, or nothing."""
     ends: list[Callable[[], object]] = []
     try:
         port = _make(service, planned, attributes, ends)
@@ -313,10 +211,11 @@ def _install(service: str, planned: Plan, attributes: Mapping[str, str]) -> Tele
         for end in ends:
             end()
         if isinstance(error, ImportError):
-            raise _not_installed(error) from error
-        if isinstance(
-            error, ValueError
-        ):  # the SDK read the rest of the environment, and says what is wrong there
+            raise ConfigError(
+                f"telemetry is asked for, but its packages are not installed: {error}",
+                hint=f"pip install '{EXTRA}', or unset the OTEL_ variables and the telemetry section",
+            ) from error
+        if isinstance(error, ValueError):
             raise ConfigError(
                 f"OpenTelemetry refuses its settings: {error}",
                 hint="see the OTEL_ variables that are set",
@@ -331,36 +230,25 @@ def _make(
     attributes: Mapping[str, str],
     ends: list[Callable[[], object]],
 ) -> int | None:
-    """Prometheus's port. What was begun is in `ends` as soon as it has; nothing of it is the process's own before all of it is there."""
+    """Return Prometheus's port. What was started is in `ends` at once; providers are set last."""
     from opentelemetry import metrics, trace
     from opentelemetry.sdk.metrics import MeterProvider
-    from opentelemetry.sdk.resources import OTELResourceDetector, Resource
     from opentelemetry.sdk.trace import TracerProvider
     from opentelemetry.sdk.trace.export import BatchSpanProcessor
+    from opentelemetry.sdk.trace.sampling import ParentBasedTraceIdRatio
 
-    if planned.prometheus is not None:  # what is missing is found before any thread runs
+    if planned.prometheus is not None:  # a missing package is found before any thread runs
         import_module("opentelemetry.exporter.prometheus")
-    own = {
-        "service.name": service,
-        "service.namespace": telemetry.TRACER,
-        "service.instance.id": f"{socket.gethostname()}:{os.getpid()}",
-        **attributes,
-    }
     _quieten()
-    named = Resource.create(own).merge(
-        OTELResourceDetector().detect()
-    )  # what the environment says wins
-    resource = Resource(exported.attributes(named.attributes), named.schema_url)
+    resource = _resource(service, attributes)
     tracers = meters = None
-    if planned.traces is not None:
-        from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
-
-        tracers = TracerProvider(
-            sampler=_sampler(planned), resource=resource, shutdown_on_exit=False
-        )
+    if planned.traces:
+        exporters = [_exporter("traces", name, planned) for name in planned.traces]
+        sampler = None if planned.ratio is None else ParentBasedTraceIdRatio(planned.ratio)
+        tracers = TracerProvider(sampler=sampler, resource=resource, shutdown_on_exit=False)
         ends.append(tracers.shutdown)
-        exporter = OTLPSpanExporter(endpoint=planned.traces, timeout=planned.traces_timeout_s)
-        tracers.add_span_processor(BatchSpanProcessor(exported.Legible(exporter)))
+        for exporter in exporters:
+            tracers.add_span_processor(BatchSpanProcessor(exported.Legible(exporter)))
     readers, port = _readers(planned, ends)
     if readers:
         meters = MeterProvider(readers, resource=resource, shutdown_on_exit=False, views=_views())
@@ -372,55 +260,85 @@ def _make(
     return port
 
 
-def _not_installed(error: ImportError) -> ConfigError:
-    return ConfigError(
-        f"telemetry is asked for, but its packages are not installed: {error}",
-        hint=f"pip install '{EXTRA}', or unset the OTEL_ variables and the telemetry section",
-    )
+def _resource(service: str, attributes: Mapping[str, str]) -> Any:
+    """Return the resource: ours, then what the environment says, which wins."""
+    from opentelemetry.sdk.resources import OTELResourceDetector, Resource
+
+    own = {
+        "service.name": service,
+        "service.namespace": telemetry.TRACER,
+        "service.instance.id": f"{socket.gethostname()}:{os.getpid()}",
+        **attributes,
+    }
+    named = Resource.create(own).merge(OTELResourceDetector().detect())
+    return Resource(exported.attributes(named.attributes), named.schema_url)
 
 
-def _sampler(planned: Plan) -> Any:
-    from opentelemetry.sdk.trace import sampling
+def _exporter(signal: Signal, name: str, planned: Plan) -> Any:
+    """Return an exporter by its name in the specification, from the installed entry points."""
+    from importlib.metadata import entry_points
 
-    name = planned.sampler.removeprefix("parentbased_")
-    root = {
-        "always_on": sampling.ALWAYS_ON,
-        "always_off": sampling.ALWAYS_OFF,
-        "traceidratio": sampling.TraceIdRatioBased(planned.ratio),
-    }[name]
-    return sampling.ParentBased(root) if planned.sampler.startswith("parentbased_") else root
+    options: dict[str, object] = {}
+    entry = name
+    if name == "otlp":
+        entry = f"otlp_proto_{_protocol(signal)}"
+        limits = ("OTEL_EXPORTER_OTLP_TIMEOUT", f"OTEL_EXPORTER_OTLP_{signal.upper()}_TIMEOUT")
+        if not any(os.environ.get(limit, "").strip() for limit in limits):
+            options["timeout"] = EXPORT_S
+        if planned.endpoint is not None:
+            options["endpoint"] = f"{planned.endpoint.rstrip('/')}/v1/{signal}"
+    found = tuple(entry_points(group=f"opentelemetry_{signal}_exporter", name=entry))
+    if not found:
+        if name == "otlp":
+            raise ImportError(f"no exporter {entry!r} is installed")
+        raise ConfigError(
+            f"OTEL_{signal.upper()}_EXPORTER: no exporter {name!r} is installed",
+            hint="write otlp, prometheus (metrics only) or none, or install its package",
+        )
+    return found[0].load()(**options)
+
+
+def _protocol(signal: Signal) -> str:
+    for variable in (
+        f"OTEL_EXPORTER_OTLP_{signal.upper()}_PROTOCOL",
+        "OTEL_EXPORTER_OTLP_PROTOCOL",
+    ):
+        if given := os.environ.get(variable, "").strip().lower():
+            if given not in _PROTOCOLS:
+                raise ConfigError(
+                    f"{variable}: expected http/protobuf or grpc, got {given!r}",
+                    hint="collectors take http/protobuf on port 4318",
+                )
+            return _PROTOCOLS[given]
+    return _PROTOCOLS[""]
 
 
 def _readers(planned: Plan, ends: list[Callable[[], object]]) -> tuple[list[Any], int | None]:
-    """(readers of metrics, Prometheus's port)."""
-    readers: list[Any] = []
-    port: int | None = None
-    if planned.metrics is not None:
-        from opentelemetry.exporter.otlp.proto.http.metric_exporter import OTLPMetricExporter
-        from opentelemetry.sdk.metrics.export import PeriodicExportingMetricReader
+    """Return the readers of metrics and Prometheus's port."""
+    from opentelemetry.sdk.metrics.export import PeriodicExportingMetricReader
 
-        exporter = OTLPMetricExporter(endpoint=planned.metrics, timeout=planned.metrics_timeout_s)
-        readers.append(PeriodicExportingMetricReader(exporter))
-    if planned.prometheus is not None:
-        from opentelemetry.exporter.prometheus import PrometheusMetricReader
-        from prometheus_client import CollectorRegistry
+    exporters = [_exporter("metrics", name, planned) for name in planned.metrics]
+    readers: list[Any] = [PeriodicExportingMetricReader(exporter) for exporter in exporters]
+    if planned.prometheus is None:
+        return readers, None
+    from opentelemetry.exporter.prometheus import PrometheusMetricReader
+    from prometheus_client import CollectorRegistry
 
-        from vram_arbiter.schemas.runtime.telemetry import scrapes
+    from vram_arbiter.schemas.runtime.telemetry import scrapes
 
-        registry = CollectorRegistry()
-        host, wanted = planned.prometheus
-        try:
-            server = scrapes.ScrapeServer(host, wanted, scrapes.page_of(registry))
-        except OSError as error:
-            raise ConfigError(
-                f"no Prometheus endpoint on {host}:{wanted}: {error}",
-                hint="another program has the port; OTEL_EXPORTER_PROMETHEUS_PORT or the configuration names another one",
-            ) from error
-        ends.append(server.close)
-        server.start()
-        port = server.port
-        readers.append(PrometheusMetricReader(scope_info_enabled=False, registry=registry))
-    return readers, port
+    registry = CollectorRegistry()
+    host, wanted = planned.prometheus
+    try:
+        server = scrapes.ScrapeServer(host, wanted, scrapes.page_of(registry))
+    except OSError as error:
+        raise ConfigError(
+            f"no Prometheus endpoint on {host}:{wanted}: {error}",
+            hint="another program has the port; set OTEL_EXPORTER_PROMETHEUS_PORT or the configuration",
+        ) from error
+    ends.append(server.close)
+    server.start()
+    readers.append(PrometheusMetricReader(scope_info_enabled=False, registry=registry))
+    return readers, server.port
 
 
 def _views() -> list[Any]:
@@ -433,7 +351,7 @@ def _views() -> list[Any]:
 
 
 def _quieten() -> None:
-    """What the SDK and its exporters say of a collector comes seldom, and what they say of headers without the headers: those are secrets."""
+    """Log complaints about a collector seldom, and about headers without them: they are secrets."""
     for name in (
         "opentelemetry.exporter.otlp.proto.http.trace_exporter",
         "opentelemetry.exporter.otlp.proto.http.metric_exporter",
@@ -450,7 +368,7 @@ def _without_header(record: logging.LogRecord) -> bool:
 
 
 class _SeldomFilter(logging.Filter):
-    """Lets an exporter's complaint through once in SAY_AGAIN_S, not with every batch that nobody takes."""
+    """Pass a complaint once in SAY_AGAIN_S, not with every batch that fails."""
 
     def __init__(self) -> None:
         super().__init__()
