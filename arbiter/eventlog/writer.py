@@ -1,20 +1,17 @@
-"""The event log's writer: what the engine was told and a digest of what it decided, in files that rotate and never exceed a bound.
+"""Event log writer: the engine's events and digests of its decisions, in files within a bound.
 
-`record` costs the decision path an append; a thread encodes and writes every 0.2 s, in small pieces so that it never keeps the loop
-waiting for the interpreter. A crash loses that tail at most. A disk that fails stops the recording with a note, never the daemon; it
-begins again, with the state of that moment, when the disk does. Must not know what events mean.
+`record` costs the decision path an append; the disk writer's thread encodes and writes, in small
+pieces so that the loop never waits long for the interpreter. A crash loses the tail at most.
+A disk that fails stops the recording with a note, never the daemon; it begins again, with the state
+of that moment, when the disk works. Must not know what events mean.
 """
 
 import asyncio
 import logging
 import os
-import queue
-import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,18 +29,20 @@ from vram_arbiter.arbiter.eventlog.logfile import (
     header_line,
 )
 from vram_arbiter.arbiter.eventlog.snapshot import freeze, thaw, to_plain
+from vram_arbiter.arbiter.host.disk_writer import DiskFailed, DiskWriter
 
 log = logging.getLogger(__name__)
 
-FLUSH_S = 0.2
-BUFFER_MAX = 50_000
-"""Events waiting for a disk that does not answer; beyond this they are dropped, and the log goes on with a new beginning."""
+BUFFER_MAX = 25_000
+"""Events with the writer, and again as many waiting for it, while a disk does not answer.
+
+Beyond this they are dropped, and the log begins anew later.
+"""
 RETRY_S = 30.0
 """After a failed write."""
 PIECE = 16
 """Events encoded before the thread lets others run."""
 PAUSE_S = 0.0002
-CLOSE_S = 5.0
 
 type Told = Callable[[str, Mapping[str, Any]], object]
 """Where notes go: kind and facts, as `History.append`."""
@@ -51,7 +50,7 @@ type Told = Callable[[str, Mapping[str, Any]], object]
 
 @dataclass(frozen=True, slots=True)
 class _Begin:
-    """From here on a new file: its first line, with the state as `freeze` left it (None: the engine is empty)."""
+    """A new file from here on: its first line, with the state as `freeze` left it (None: empty)."""
 
     segment: int
     cause: str
@@ -64,7 +63,10 @@ type _Item = _Begin | tuple[float, Event, Sequence[Effect] | None]
 
 
 class Recorder:
-    """`start` inside the loop, `record` after every event, `close` at the end (writes what is left)."""
+    """Writes the event log.
+
+    `start` inside the loop, `record` after every event, `close` at the end (writes what is left).
+    """
 
     def __init__(
         self,
@@ -83,121 +85,81 @@ class Recorder:
         self._told = told
         self._clock = clock
         self._wall = wall
-        self._buffer: deque[_Item] = deque()
-        self._work: queue.SimpleQueue[Sequence[_Item] | None] = queue.SimpleQueue()
-        self._handed = 0  # events given to the thread; the loop alone counts
-        self._written = 0  # of those, done with; the thread alone counts
         self._segment = 0
         self._retry_at: float | None = None  # recording has stopped until then
-        self._troubled = False  # and that was said
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._timer: asyncio.TimerHandle | None = None
-        self._thread: threading.Thread | None = None
+        self._troubled = False  # and a note said so
         self._files = _Files(state_dir / FOLDER, wall(), settings, version, max_bytes, file_bytes)
+        self._disk: DiskWriter[_Item] = DiskWriter(
+            "recorder", self._files, self._disk_told, items_max=BUFFER_MAX
+        )
 
     @property
     def behind(self) -> int:
         """Events that were handed to the thread and are not on the disk yet."""
-        return self._handed - self._written
+        return self._disk.behind
 
     def start(self, loop: asyncio.AbstractEventLoop, made_at: float) -> None:
-        """The engine was made at this (monotonic) moment and has handled nothing yet."""
-        self._loop = loop
+        """Begin the first file; the engine was made at this (monotonic) time and is still empty."""
+        self._disk.start(loop)
         self._begin("start", None, made_at)
-        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
-        self._thread.start()
 
     def record(self, now: float, event: Event, effects: Sequence[Effect] | None) -> None:
-        """What was just handled; None: the engine raised. Called on the loop's thread, with the engine between two events."""
+        """Keep an event that was just handled; `effects` None: the engine raised.
+
+        Called on the loop's thread, with the engine between two events.
+        """
         if self._retry_at is not None:
             if effects is not None and now >= self._retry_at:
                 self._retry_at = None
                 self._begin_anew("resumed", now)
+                self._disk.confirm()
             return
-        if len(self._buffer) + self.behind >= BUFFER_MAX:
-            self._buffer.clear()
+        if self._disk.full:
             self._stopped(f"more than {BUFFER_MAX} events wait for the disk")
             return
-        self._buffer.append((now, event, effects))
-        if self._files.full_segment == self._segment - 1 and effects is not None:
+        self._disk.put((now, event, effects))
+        rotate = self._files.full_segment == self._segment - 1 and effects is not None
+        if rotate and not self._disk.full:
             self._begin_anew("size", now)
-        if self._timer is None and self._loop is not None:
-            self._timer = self._loop.call_later(FLUSH_S, self._flush)
+
+    def flush(self) -> None:
+        """Hand what was recorded so far to the disk."""
+        self._disk.flush()
 
     def close(self) -> None:
-        self._flush()
-        if self._timer is not None:
-            self._timer.cancel()
-        if self._thread is not None:
-            self._work.put(None)
-            self._thread.join(CLOSE_S)
-            self._thread = None
-        self._loop = None
+        self._disk.close()
 
     def _begin_anew(self, cause: str, now: float) -> None:
         try:
             frozen = self._freeze()
-        except Exception as error:  # noqa: BLE001 - a state that cannot be copied ends the recording, never the daemon
+        except Exception as error:  # noqa: BLE001 - it ends the recording, never the daemon
             self._stopped(f"the engine's state cannot be copied: {type(error).__name__}: {error}")
         else:
             self._begin(cause, frozen, now)
 
     def _begin(self, cause: str, frozen: bytes | None, now: float) -> None:
-        self._buffer.append(_Begin(self._segment, cause, now, self._wall(), frozen))
+        self._disk.put(_Begin(self._segment, cause, now, self._wall(), frozen))
         self._segment += 1
 
-    def _flush(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-        if self._buffer:
-            items = tuple(self._buffer)
-            self._buffer.clear()
-            self._handed += len(items)
-            self._work.put(items)
+    def _disk_told(self, failure: DiskFailed | None) -> None:
+        if failure is not None:
+            self._stopped(str(failure))
+        elif self._troubled and self._retry_at is None:
+            self._troubled = False
+            self._told("record_resumed", {"reason": "the event log goes on, with a gap"})
 
     def _stopped(self, reason: str) -> None:
-        """On the loop. Said once per trouble, tried again in a while."""
+        """Stop recording until RETRY_S have passed; one note for each trouble."""
+        self._disk.clear()
         self._retry_at = self._clock() + RETRY_S
         if not self._troubled:
             self._troubled = True
             log.error("event log: %s; recording stops until that ends", reason)
             self._told("record_stopped", {"reason": reason, "folder": str(self._files.folder)})
 
-    def _resumed(self) -> None:
-        self._troubled = False
-        self._told("record_resumed", {"reason": "the event log goes on, with a gap"})
-
-    # -- the thread --------------------------------------------------------------------------------------------------
-    def _run(self) -> None:
-        failed = False
-        while (items := self._work.get()) is not None:
-            begins = [item for item in items if isinstance(item, _Begin)]
-            try:
-                if failed and not begins:
-                    continue  # the loop has not heard of the failure yet
-                self._files.write(items)
-                failed = False
-                if any(begin.cause == "resumed" for begin in begins):
-                    self._on_loop(self._resumed)
-            except Exception as error:  # noqa: BLE001 - the thread's outermost loop: whatever it is, it is told
-                failed = True
-                self._files.close()
-                self._on_loop(partial(self._stopped, f"{type(error).__name__}: {error}"))
-            finally:
-                self._written += len(items)
-        self._files.close()
-
-    def _on_loop(self, call: Callable[[], None]) -> None:
-        if (loop := self._loop) is not None:
-            try:
-                loop.call_soon_threadsafe(call)
-            except RuntimeError:
-                pass  # the loop closed meanwhile: nobody is left to tell
-
 
 class _Files:
-    """The folder. Made by the main thread, used by the recorder's thread alone, but for `full_segment`."""
+    """Folder of the log. Used by the disk writer's thread alone, but for `full_segment`."""
 
     def __init__(
         self,
@@ -209,19 +171,39 @@ class _Files:
         file_bytes: int,
     ) -> None:
         self.folder = folder
-        self.full_segment: int | None = None  # the thread says so, the loop begins the next file
+        self.full_segment: int | None = None  # set by the thread; the loop begins the next file
         self._started_wall_s = started_wall_s
         self._settings = settings
         self._version = version
         self._max_bytes = max_bytes
         self._file_bytes = min(file_bytes, max_bytes // 2)
         self._file: int | None = None
-        self._full_bytes = self._file_bytes  # the file that is written is full then
+        self._full_bytes = self._file_bytes  # size at which the present file is full
         self._size = 0
         self._segment = 0
+        self._failure: Exception | None = None  # until the next beginning
 
     def write(self, items: Sequence[_Item]) -> None:
-        """Raises OSError for a disk that does not take it."""
+        """Write a batch. After a failure only a batch with a beginning is taken.
+
+        Raises OSError for a disk that does not take it.
+        """
+        if self._failure is not None and not any(isinstance(item, _Begin) for item in items):
+            raise self._failure  # the loop has not heard of it yet
+        try:
+            self._write(items)
+        except Exception as error:
+            self.close()
+            self._failure = error
+            raise
+        self._failure = None
+
+    def close(self) -> None:
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+
+    def _write(self, items: Sequence[_Item]) -> None:
         lines: list[str] = []
         for count, item in enumerate(items):
             if isinstance(item, _Begin):
@@ -233,12 +215,8 @@ class _Files:
                 time.sleep(PAUSE_S)
         self._put(lines)
 
-    def close(self) -> None:
-        if self._file is not None:
-            os.close(self._file)
-            self._file = None
-
     def _next(self, begin: _Begin) -> str:
+        """Begin the next file. Returns its first line."""
         self.close()
         self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         header = Header(
@@ -257,9 +235,10 @@ class _Files:
         half_bytes = self._max_bytes // 2
         if len(line) > half_bytes:
             raise ValueError(
-                f"the engine's state alone takes {len(line)} bytes, more than half of record.max_bytes ({self._max_bytes})"
+                f"the engine's state alone takes {len(line)} bytes, "
+                f"more than half of record.max_bytes ({self._max_bytes})"
             )
-        # A state is copied while everybody waits: as much as it takes must be written before it is copied again.
+        # Copying the state holds up the loop: write as much as it takes before the next copy.
         self._full_bytes = max(self._file_bytes, min(2 * len(line), half_bytes))
         self._make_room(self._full_bytes)
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
@@ -267,7 +246,7 @@ class _Files:
         return line
 
     def _make_room(self, file_bytes: int) -> None:
-        """Oldest files go until a whole new one fits the bound."""
+        """Remove the oldest files until a whole new one fits the bound."""
         files = [(path, path.stat().st_size) for path in sorted(self.folder.glob(f"*{SUFFIX}"))]
         total = sum(size for _, size in files)
         for path, size in files:
@@ -285,7 +264,7 @@ class _Files:
             while written < len(data):
                 written += os.write(self._file, memoryview(data)[written:])
         except OSError:
-            os.ftruncate(self._file, self._size)  # what is there stays whole
+            os.ftruncate(self._file, self._size)  # earlier lines stay whole
             raise
         self._size += len(data)
         if self._size >= self._full_bytes:
@@ -293,5 +272,5 @@ class _Files:
 
 
 def freezer(engine: Arbiter) -> Callable[[], bytes]:
-    """What a recorder copies the engine with."""
+    """Return what a recorder copies the engine with."""
     return lambda: freeze(engine)

@@ -1,45 +1,44 @@
-"""What happened: every fact of the core as an event with number and wall time, the newest in memory, all of them in SQLite.
+"""History: every fact of the engine as an event with a number and a wall time.
 
-`append` costs the loop one dict; a thread writes them every 0.2 s and answers questions about events that memory no longer
-holds. Losing the last moment in a crash loses explanations, never leases. A broken database is put aside and reported; without a
-writable one the history lives in memory only. Must not know what the events mean.
+The newest events are in memory, all of them in SQLite. `append` costs the loop one dict; a thread
+writes them and answers questions about events that memory no longer holds. A crash loses the last
+moment, which loses explanations, never leases. A broken database is put aside and reported; without
+a writable one the history lives in memory only. Must not know what the events mean.
 """
 
 import asyncio
 import contextlib
 import json
 import logging
-import queue
 import sqlite3
 import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from vram_arbiter.arbiter.host.disk_writer import DiskBehind, DiskFailed, DiskWriter
 from vram_arbiter.arbiter.host.journal_files import is_corruption, put_aside
 from vram_arbiter.schemas import strictjson
 
 log = logging.getLogger(__name__)
 
 RING_EVENTS = 2000
-FLUSH_S = 0.2
 SKIPPED_AFTER_CRASH = 2000
-"""Numbers left out after a start that no stop preceded: those of the last, unwritten events may be known to subscribers."""
+"""Numbers left out after a crash: subscribers may know those of the last, unwritten events."""
 BUFFER_MAX = 20_000
-"""Events with the thread, and again as many waiting for it, while a disk does not answer; beyond this the oldest are dropped. The gap in
-their numbers shows it."""
+"""Events with the writer, and again as many waiting for it, while a disk does not answer.
+
+Beyond this the oldest are dropped. The gap in their numbers shows it.
+"""
 QUESTIONS_MAX = 256
-"""Questions about older events that wait for the thread; who asks beyond this hears at once that the disk does not answer."""
+"""Questions about older events that wait for the disk; the next one is answered with a problem."""
 PRUNE_EVERY_EVENTS = 2000
 SEQ_MAX = 1 << 52
 EVENT_MAX_CHARS = 1 << 25
-CLOSE_S = 5.0
 AT_ONCE = frozenset({"operator"})
-"""Kinds that do not wait for the next batch: who did what by hand is to survive a crash that follows at once."""
+"""Kinds that do not wait for the next batch: an order must survive a crash that follows at once."""
 CLEAN_END = "stopped"
 """Kind of the last event of an orderly stop."""
 
@@ -47,24 +46,22 @@ Done = Callable[[Mapping[str, Any]], None]
 Event = Mapping[str, Any]
 
 _SCHEMA = """
-CREATE TABLE IF NOT EXISTS events (seq INTEGER PRIMARY KEY, at_wall_s REAL NOT NULL, kind TEXT NOT NULL, json TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS events
+    (seq INTEGER PRIMARY KEY, at_wall_s REAL NOT NULL, kind TEXT NOT NULL, json TEXT NOT NULL);
 CREATE INDEX IF NOT EXISTS events_by_time ON events (at_wall_s);
 """
 _QUESTION = """
-SELECT seq, at_wall_s, json FROM events WHERE seq > ? AND (? = '[]' OR kind IN (SELECT value FROM json_each(?))) ORDER BY seq LIMIT ?
+SELECT seq, at_wall_s, json FROM events
+    WHERE seq > ? AND (? = '[]' OR kind IN (SELECT value FROM json_each(?)))
+    ORDER BY seq LIMIT ?
 """
 
 
-@dataclass(frozen=True, slots=True)
-class _Question:
-    after: int
-    limit: int
-    kinds: tuple[str, ...]
-    done: Done
-
-
 class History:
-    """Numbers and keeps events. `open` before the loop runs, `start` inside it, `close` at the end (writes what is left)."""
+    """Numbers and keeps events.
+
+    `open` before the loop runs, `start` inside it, `close` at the end (writes what is left).
+    """
 
     def __init__(
         self, store: "_Store | None", last_seq: int, wall: Callable[[], float] = time.time
@@ -73,23 +70,23 @@ class History:
         self._wall = wall
         self._last_seq = last_seq
         self._ring: deque[Event] = deque(maxlen=RING_EVENTS)
-        self._buffer: deque[Event] = deque(maxlen=BUFFER_MAX)
-        self._work: queue.SimpleQueue[Sequence[Event] | _Question | None] = queue.SimpleQueue()
-        self._handed = 0  # events given to the thread; the loop alone counts
-        self._taken = 0  # of those, by the thread; it alone counts
-        self._asked = self._answered = 0  # questions, counted in the same way
-        self._thread: threading.Thread | None = None
-        self._timer: asyncio.TimerHandle | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self.problem = (
-            "" if store is not None else "history is kept in memory only: its file cannot be used"
-        )
+        self._disk: DiskWriter[Event] | None = None
+        self.problem = "history is kept in memory only: its file cannot be used"
+        if store is not None:
+            self.problem = ""
+            self._disk = DiskWriter(
+                "history",
+                _Owed(store),
+                self._told,
+                items_max=BUFFER_MAX,
+                questions_max=QUESTIONS_MAX,
+            )
 
     @classmethod
     def open(
         cls, folder: Path, max_events: int, days: float, wall: Callable[[], float] = time.time
     ) -> Self:
-        """Open or make `history.sqlite`; numbering goes on where it ended. Never fails: without a disk it is memory only."""
+        """Open or make `history.sqlite`; numbering continues. Without a disk: memory only."""
         path = folder / "history.sqlite"
         for attempt in (1, 2):
             try:
@@ -105,12 +102,8 @@ class History:
         return cls(None, 0, wall)
 
     def start(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop = loop
-        if self._store is not None:
-            self._thread = threading.Thread(
-                target=self._run, args=(self._store,), name="history", daemon=True
-            )
-            self._thread.start()
+        if self._disk is not None:
+            self._disk.start(loop)
 
     @property
     def last_seq(self) -> int:
@@ -121,105 +114,74 @@ class History:
         self._last_seq += 1
         event = {"seq": self._last_seq, "at_wall_s": self._wall(), "kind": kind, **data}
         self._ring.append(event)
-        if self._store is not None:
-            self._buffer.append(event)
+        if self._disk is not None:
+            self._disk.put(event)
             if kind in AT_ONCE:
-                self._flush()
-            elif self._timer is None and self._loop is not None:
-                self._timer = self._loop.call_later(FLUSH_S, self._flush)
+                self._disk.flush()
         return event
 
     def read(self, after: int, limit: int, kinds: tuple[str, ...], done: Done) -> None:
-        """Events after a number, oldest first: `done({"events", "last_seq"})`, at once or later on the loop's thread."""
+        """Find the events after a number, oldest first.
+
+        Calls `done({"events", "last_seq"})` at once, or later on the loop's thread.
+        """
         first = self._ring[0]["seq"] if self._ring else self._last_seq + 1
-        if self._thread is None or after + 1 >= first:
+        store, disk = self._store, self._disk
+        if store is None or disk is None or not disk.running or after + 1 >= first:
             wanted = frozenset(kinds)
             found = [
                 e for e in self._ring if e["seq"] > after and (not wanted or e["kind"] in wanted)
             ]
             done({"events": found[:limit], "last_seq": self._last_seq})
             return
-        self._flush()
-        if self._asked - self._answered >= QUESTIONS_MAX:
-            done(
-                {
-                    "events": [],
-                    "last_seq": self._last_seq,
-                    "problem": "the disk of the history does not answer",
-                }
-            )
-            return
-        self._asked += 1
-        self._work.put(_Question(after, limit, kinds, done))
+
+        def answer(found: list[Event] | DiskFailed) -> None:
+            if isinstance(found, DiskFailed):
+                done({"events": [], "last_seq": self._last_seq, "problem": str(found)})
+            else:
+                done({"events": found, "last_seq": self._last_seq})
+
+        try:
+            disk.ask(lambda: store.find(after, limit, kinds), answer)
+        except DiskBehind:
+            problem = "the disk of the history does not answer"
+            done({"events": [], "last_seq": self._last_seq, "problem": problem})
 
     def close(self) -> None:
-        """Write what is left and end the thread."""
-        self._flush(last=True)
-        if self._timer is not None:
-            self._timer.cancel()
-        if self._thread is not None:
-            self._work.put(None)
-            self._thread.join(CLOSE_S)
-            self._thread = None
-        self._loop = None
+        """Write what is left and end the writer."""
+        if self._disk is not None:
+            self._disk.close()
 
-    def _flush(self, *, last: bool = False) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-        if not self._buffer or self._thread is None:
-            return
-        if last or self._handed - self._taken + len(self._buffer) <= BUFFER_MAX:
-            self._handed += len(self._buffer)
-            self._work.put(tuple(self._buffer))
-            self._buffer.clear()
-        elif self._loop is not None:  # the thread hangs in a write
-            self.problem = (
-                self.problem
-                or "the disk of the history does not answer: what does not fit in memory is lost"
-            )
-            self._timer = self._loop.call_later(FLUSH_S, self._flush)
+    def _told(self, failure: DiskFailed | None) -> None:
+        if failure is None:
+            self.problem = ""
+        elif isinstance(failure, DiskBehind):
+            lost = "events that do not fit in memory are lost"
+            self.problem = self.problem or f"the disk of the history does not answer: {lost}"
+        else:
+            if not self.problem:  # a full disk is worth one line, not five a second
+                log.error("history: %s; events are in memory only until that ends", failure)
+            self.problem = f"history cannot be written ({failure}): events are in memory only"
 
-    # -- the thread ----------------------------------------------------------------------------------------------
-    def _run(self, store: "_Store") -> None:
-        owed: deque[Event] = deque(maxlen=BUFFER_MAX)  # what the disk did not take
-        while (work := self._work.get()) is not None:
-            try:
-                if isinstance(work, _Question):
-                    self._answered += 1
-                    body = {
-                        "events": store.find(work.after, work.limit, work.kinds),
-                        "last_seq": self._last_seq,
-                    }
-                    self._answer(work.done, body)
-                else:
-                    self._taken += len(work)
-                    owed.extend(work)
-                    store.add(tuple(owed))
-                    owed.clear()
-                    self.problem = ""
-            except sqlite3.Error as error:
-                if not self.problem:  # a full disk is worth one line, not five a second
-                    log.error("history: %s; events are kept in memory only until that ends", error)
-                self.problem = (
-                    f"history cannot be written ({error}): events are kept in memory only"
-                )
-                if isinstance(work, _Question):
-                    self._answer(
-                        work.done, {"events": [], "last_seq": self._last_seq, "problem": str(error)}
-                    )
-        store.close()
 
-    def _answer(self, done: Done, body: Mapping[str, Any]) -> None:
-        if (loop := self._loop) is not None:
-            try:
-                loop.call_soon_threadsafe(done, body)
-            except RuntimeError:
-                pass  # the loop closed meanwhile: nobody waits for the answer
+class _Owed:
+    """The table behind the writer's thread. Events of a failed write are written with the next."""
+
+    def __init__(self, store: "_Store") -> None:
+        self._store = store
+        self._owed: deque[Event] = deque(maxlen=BUFFER_MAX)
+
+    def write(self, items: Sequence[Event]) -> None:
+        self._owed.extend(items)
+        self._store.add(tuple(self._owed))
+        self._owed.clear()
+
+    def close(self) -> None:
+        self._store.close()
 
 
 def _event(seq: int, at_wall_s: object, text: str) -> Event:
-    """One row. A damaged one keeps its number, so that a reader goes on behind it."""
+    """Return the event of one row; a damaged one keeps its number, so that paging goes on."""
     with contextlib.suppress(ValueError, TypeError):
         event = strictjson.loads(text, max_chars=EVENT_MAX_CHARS)
         if (
@@ -236,14 +198,14 @@ def _event(seq: int, at_wall_s: object, text: str) -> Event:
 
 
 def _is_damage(error: sqlite3.DatabaseError | OSError) -> bool:
-    """The file's fault, not the machine's."""
+    """Whether the file is damaged, as opposed to a disk that is full, locked or read-only."""
     if isinstance(error, sqlite3.OperationalError):
         return is_corruption(error)
     return isinstance(error, sqlite3.DatabaseError)
 
 
 class _Store:
-    """The table. Made by the main thread, used by the history thread alone."""
+    """The table. Made by the main thread, then used by the writer's thread alone."""
 
     def __init__(self, path: Path, max_events: int, days: float, wall: Callable[[], float]) -> None:
         self._wall = wall
@@ -266,7 +228,10 @@ class _Store:
             raise
 
     def last_seq(self) -> int:
-        """The number after which numbering goes on: never one that was given out before. Raises sqlite3.DatabaseError."""
+        """Return the number after which numbering continues: none is given out twice.
+
+        Raises sqlite3.DatabaseError.
+        """
         try:
             row = self._db.execute(
                 "SELECT seq, kind FROM events ORDER BY seq DESC LIMIT 1"
@@ -295,8 +260,11 @@ class _Store:
                 self.prune(self._wall())
 
     def prune(self, wall_s: float) -> None:
-        """Drop what is beyond the number or the age. The wall clock may be set meanwhile, by decades on a machine without a battery: an
-        event of this run is old only when the run itself is."""
+        """Drop events beyond the number or the age.
+
+        The wall clock may jump by decades on a machine without a battery: an event of this run is
+        old only when the run itself is.
+        """
         self._since_prune = 0
         self._db.execute(
             "DELETE FROM events WHERE seq <= (SELECT MAX(seq) FROM events) - ?", (self._max_events,)

@@ -14,6 +14,7 @@ from vram_arbiter.arbiter.eventlog import replay as runner
 from vram_arbiter.arbiter.eventlog import writer as module
 from vram_arbiter.arbiter.eventlog.logfile import FOLDER, LogError, header_line
 from vram_arbiter.arbiter.eventlog.writer import Recorder, freezer
+from vram_arbiter.arbiter.host.disk_writer import FLUSH_S
 from vram_arbiter.schemas import defaults as d
 
 PATIENCE_S = 60.0
@@ -55,7 +56,7 @@ class Recorded:
 
     async def written(self) -> None:
         """Everything recorded so far is on the disk, or was given up."""
-        self.recorder._flush()
+        self.recorder.flush()
         async with asyncio.timeout(PATIENCE_S):
             while self.recorder.behind:
                 await asyncio.sleep(0)
@@ -94,7 +95,7 @@ def test_events_reach_the_disk_by_themselves(busy: CoreDriver, tmp_path: Path) -
         recorded.go(3)
         async with asyncio.timeout(PATIENCE_S):
             while sum(len(path.read_text().splitlines()) for path in recorded.folder.glob("*")) < 4:
-                await asyncio.sleep(module.FLUSH_S / 4)
+                await asyncio.sleep(FLUSH_S / 4)
         recorded.recorder.close()
         found = recorded.replayed()
         assert (found.identical, found.events) == (True, 3)
@@ -195,7 +196,7 @@ def test_a_disk_that_fails_stops_the_recording_with_a_note_and_it_begins_again(
         (tmp_path / FOLDER).write_text("in the way")
         recorded = Recorded(busy, tmp_path)
         recorded.go(100)
-        recorded.recorder._flush()
+        recorded.recorder.flush()
         async with asyncio.timeout(PATIENCE_S):
             await recorded.noted.wait()
         assert [kind for kind, _ in recorded.notes] == ["record_stopped"]
@@ -207,7 +208,7 @@ def test_a_disk_that_fails_stops_the_recording_with_a_note_and_it_begins_again(
         (tmp_path / FOLDER).unlink()
         recorded.noted.clear()
         recorded.go(100, later_s=3 * module.RETRY_S)
-        recorded.recorder._flush()
+        recorded.recorder.flush()
         async with asyncio.timeout(PATIENCE_S):
             await recorded.noted.wait()
         assert [kind for kind, _ in recorded.notes] == ["record_stopped", "record_resumed"]
