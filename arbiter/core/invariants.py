@@ -107,7 +107,7 @@ def _residents(gpu: Gpu, *, granted: bool) -> None:
 
 
 def _unused(lease: Lease) -> None:
-    if (lease.uses or lease.yielded) and lease.state in _UNUSED:
+    if (lease.uses or lease.uses.paused) and lease.state in _UNUSED:
         raise InvariantViolation(
             3, f"{lease.id} is {lease.state} with {len(lease.all_uses())} uses"
         )
@@ -184,11 +184,11 @@ def _waiters(core: Core) -> None:
             raise InvariantViolation(
                 6, f"{head.id} is {head.state}, yet it is the head of {gpu.info.id}"
             )
-        if head.extends is not None and head.extends not in gpu.residents:
+        if head.request.extends is not None and head.request.extends not in gpu.residents:
             raise InvariantViolation(
-                6, f"{head.id} waits to extend {head.extends}, which is not there"
+                6, f"{head.id} waits to extend {head.request.extends}, which is not there"
             )
-        if head.wait_timeout_s is not None and ("wait", head.id) not in core.timers:
+        if head.request.wait_timeout_s is not None and ("wait", head.id) not in core.timers:
             raise InvariantViolation(6, f"{head.id} has a bound and no timer")
         if ("probe", gpu.info.id) not in core.timers:
             raise InvariantViolation(

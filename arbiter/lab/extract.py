@@ -144,7 +144,7 @@ class _Reader:
         known = self._stories[lease.id] = _Story(lease.process, lease.spec, now, inherited=True)
         if lease.ready_at:
             known.granted_at = known.ready_at = now
-            known.measured_bytes = lease.measured_bytes
+            known.measured_bytes = lease.observed.reported_bytes
 
     def _hear(self, lease: LeaseId, kind: str, data: Mapping[str, Any], now: float) -> None:
         if kind == "granted" and lease in self._away:

@@ -29,7 +29,7 @@ def ask(
     cause: Cause = "operator" if order else "waiter" if waiter else "pressure"
     holder.move(LeaseState.REVOKING, core.now, reason)
     holder.left_for = "" if waiter is None else waiter.spec.consumer
-    eviction = holder.eviction = Eviction(
+    eviction = holder.departure.eviction = Eviction(
         lease=holder.id,
         consumer=holder.spec.consumer,
         charge_bytes=gpu.ledger.charge_bytes(holder.id),
@@ -40,7 +40,7 @@ def ask(
         order=order,
         asked_at=core.now,
         next_push_at=core.now + core.settings.revoke_resend_s,
-        traceparent=None if waiter is None else waiter.traceparent,
+        traceparent=None if waiter is None else waiter.request.traceparent,
     )
     gpu.evictions.append(eviction)
     parks = core.host.book(holder.id, holder.spec.park_bytes)
@@ -91,7 +91,7 @@ def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
 
 def acknowledge(core: Core, holder: Lease, eta_s: float | None) -> None:
     """The holder heard. Said once; a repeat only renews the estimate."""
-    eviction = holder.eviction
+    eviction = holder.departure.eviction
     if eviction is None:
         return
     eviction.safe_point_eta_s = eta_s
@@ -102,8 +102,12 @@ def acknowledge(core: Core, holder: Lease, eta_s: float | None) -> None:
 
 def reached_safe_point(core: Core, holder: Lease) -> None:
     """Tell a revoked holder that the last use has ended: other processes may have marked uses."""
-    if holder.eviction is not None and holder.state is LeaseState.REVOKING and not holder.uses:
-        _push_now(core, holder, holder.eviction)
+    if (
+        holder.departure.eviction is not None
+        and holder.state is LeaseState.REVOKING
+        and not holder.uses
+    ):
+        _push_now(core, holder, holder.departure.eviction)
 
 
 def _push_now(core: Core, holder: Lease, eviction: Eviction) -> None:
@@ -114,15 +118,15 @@ def _push_now(core: Core, holder: Lease, eviction: Eviction) -> None:
 
 def ask_again(core: Core, holder: Lease) -> None:
     """The holder came back on another connection: what it heard on the old one does not count."""
-    if holder.eviction is not None and holder.state is LeaseState.REVOKING:
-        holder.eviction.acked_at = None
-        _push_now(core, holder, holder.eviction)
+    if holder.departure.eviction is not None and holder.state is LeaseState.REVOKING:
+        holder.departure.eviction.acked_at = None
+        _push_now(core, holder, holder.departure.eviction)
 
 
 def on_ladder_due(core: Core, lease_id: str) -> None:
     """A step of the ladder. Who has begun to unload is asked nothing more, and has a whole deadline for it."""
     holder = core.leases[LeaseId(lease_id)]
-    eviction = holder.eviction
+    eviction = holder.departure.eviction
     if holder.state is LeaseState.UNLOADING:
         _unload_hangs(core, holder)
         return
@@ -144,10 +148,10 @@ def on_ladder_due(core: Core, lease_id: str) -> None:
 
 def _unload_hangs(core: Core, holder: Lease) -> None:
     """It unloads, and has not ended within a deadline. Others are asked in its place, and the card is not kept free for its bytes."""
-    holder.hangs = True
-    if holder.eviction is not None:
-        holder.eviction.overdue = True
-    _deadline(core, holder, holder.eviction)
+    holder.departure.hangs = True
+    if holder.departure.eviction is not None:
+        holder.departure.eviction.overdue = True
+    _deadline(core, holder, holder.departure.eviction)
 
 
 def _deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None:
@@ -156,7 +160,7 @@ def _deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None:
     core.note("deadline_passed", holder, uses=len(holder.uses), wanted_by=consumer)
     core.wake(core.gpu_of(holder))
     waiter = core.waiting.get(wanted_by) if wanted_by is not None else None
-    for gpu_id in () if waiter is None else waiter.gpus:
+    for gpu_id in () if waiter is None else waiter.request.gpus:
         core.wake(core.gpus[gpu_id])  # it may be served on another card now
     if waiter is None or not waiter.spec.deny_on_deadline:
         return
@@ -183,7 +187,7 @@ def on_overstay_due(core: Core, lease_id: str) -> None:
     Nothing is done to a process that uses any lease, its own or another's: that is looked at again later.
     """
     holder = core.leases[LeaseId(lease_id)]
-    eviction = holder.eviction
+    eviction = holder.departure.eviction
     if eviction is None or holder.state not in (LeaseState.REVOKING, LeaseState.UNLOADING):
         return
     due_at = _overstays_at(core, holder, eviction)
@@ -212,7 +216,7 @@ def _overstays_at(core: Core, holder: Lease, eviction: Eviction) -> float:
     if eviction.signalled:
         return core.now
     return (
-        max(eviction.asked_at, holder.last_used_at, holder.since) + core.settings.revoke_deadline_s
+        max(eviction.asked_at, holder.uses.last_at, holder.since) + core.settings.revoke_deadline_s
     )
 
 
@@ -226,13 +230,14 @@ def deny(core: Core, waiter: Lease, error: Mapping[str, Any]) -> None:
     """End a waiter's wait with a typed error."""
     waiter.move(LeaseState.DENIED, core.now, str(error["message"]))
     core.dequeue(waiter)
-    if waiter.answered or waiter.request is None:
+    if waiter.request.answered or waiter.request.id is None:
         core.push(
-            waiter, {"push": "denied", "lease_id": waiter.extends or waiter.id, "error": error}
+            waiter,
+            {"push": "denied", "lease_id": waiter.request.extends or waiter.id, "error": error},
         )
     else:  # it has only just asked
         refused = Refused(error["code"], error["message"], error["hint"], **error["details"])
-        core.refuse(waiter.client, waiter.request, refused)
+        core.refuse(waiter.client, waiter.request.id, refused)
     core.note("denied", waiter, code=error["code"], reason=error["message"])
     core.end(waiter, error)
 

@@ -145,8 +145,8 @@ class Gangs(Feature):
         gang.phase = "waiting"
         ageing_s = core.settings.ageing_s_per_point if core.settings.scheduling.by_priority else 0.0
         for lease in waiting:
-            lease.rank = gang.first_at - gang.priority * ageing_s
-            for gpu_id in lease.gpus:
+            lease.request.rank = gang.first_at - gang.priority * ageing_s
+            for gpu_id in lease.request.gpus:
                 core.gpus[gpu_id].queue.add(lease)
                 core.wake(core.gpus[gpu_id])
 
@@ -238,11 +238,15 @@ class Gangs(Feature):
             gang.cards.append(gpu.info.id)
             self.loading[gpu.info.id] = gang
             for lease in some:
-                for gpu_id in lease.gpus:
+                for gpu_id in lease.request.gpus:
                     core.gpus[gpu_id].queue.discard(lease)
                     core.wake(core.gpus[gpu_id])
-                lease.gpus, lease.gpu, lease.reason = (gpu.info.id,), gpu.info.id, ""
-                gpu.ledger.reserve(lease.id, lease.process, lease.steady_bytes, core.now)
+                lease.request.gpus, lease.gpu, lease.request.reason = (
+                    (gpu.info.id,),
+                    gpu.info.id,
+                    "",
+                )
+                gpu.ledger.reserve(lease.id, lease.process, lease.request.steady_bytes, core.now)
             _set_headroom(core, gpu, gang, _headroom_bytes(some))
             here = [one.id for one in gang.members if one.gpu == gpu.info.id]
             gang.reserved_bytes[gpu.info.id] = sum(
@@ -275,7 +279,7 @@ class Gangs(Feature):
             or gpu.in_state(LeaseState.LOADING)
         ):
             return None
-        more = lease.load_peak_bytes - lease.steady_bytes
+        more = lease.request.load_peak_bytes - lease.request.steady_bytes
         headroom = _approved(gpu, gang.headroom_id)
         extra = max(0, more - headroom)
         if gpu.ledger.approved_bytes() + extra > gpu.ledger.budget_bytes:
@@ -317,7 +321,7 @@ class Gangs(Feature):
         if room is None or policy.sample_is_behind(gpu):
             _want_reading(core, gpu, [lease])
             return False
-        lease.reason = "its bytes are kept for it, but measured memory is not free yet"
+        lease.request.reason = "its bytes are kept for it, but measured memory is not free yet"
         since = gang.short_since.setdefault(gpu.info.id, core.now)
         if core.now - since > core.settings.verify_timeout_s:
             self._break(core, gang, "measured memory did not come back, the rest no longer fits")
@@ -478,13 +482,15 @@ def _needs(some: Iterable[Lease]) -> dict[ProcessKey, int]:
     some = list(some)
     needs: dict[ProcessKey, int] = {}
     for lease in some:
-        needs[lease.process] = needs.get(lease.process, 0) + lease.steady_bytes
+        needs[lease.process] = needs.get(lease.process, 0) + lease.request.steady_bytes
     needs[some[0].process] += _headroom_bytes(some)
     return needs
 
 
 def _headroom_bytes(some: Iterable[Lease]) -> int:
-    return max((lease.load_peak_bytes - lease.steady_bytes for lease in some), default=0)
+    return max(
+        (lease.request.load_peak_bytes - lease.request.steady_bytes for lease in some), default=0
+    )
 
 
 def _bundle(gang: Gang, some: list[Lease]) -> Lease:
@@ -492,7 +498,8 @@ def _bundle(gang: Gang, some: list[Lease]) -> Lease:
     first = some[0]
     exclusive = any(one.spec.exclusive for one in some)
     spec = replace(first.spec, priority=gang.priority, exclusive=exclusive)
-    return replace(first, spec=spec, arrived_at=gang.first_at, needs=_needs(some))
+    request = replace(first.request, arrived_at=gang.first_at, needs=_needs(some))
+    return replace(first, spec=spec, request=request)
 
 
 def _as_waiter(gang: Gang, gpu: Gpu, lease: Lease) -> Lease:
@@ -501,7 +508,7 @@ def _as_waiter(gang: Gang, gpu: Gpu, lease: Lease) -> Lease:
     some = [one for one in gang.waiting() if one in planned]
     only = (gpu.info.id,)
     return _bundle(
-        gang, some or [one for one in gang.waiting() if one is lease or one.gpus == only]
+        gang, some or [one for one in gang.waiting() if one is lease or one.request.gpus == only]
     )
 
 
@@ -563,7 +570,12 @@ def _place(
     Members with the fewest GPUs choose first, then the largest; GPUs are tried in their order.
     """
     order = sorted(
-        members, key=lambda lease: (len(lease.gpus), -lease.load_peak_bytes, lease.arrival)
+        members,
+        key=lambda lease: (
+            len(lease.request.gpus),
+            -lease.request.load_peak_bytes,
+            lease.request.arrival,
+        ),
     )
     placement: _Placement = {}
     budget = SEARCH_MAX
@@ -573,7 +585,7 @@ def _place(
         if index == len(order):
             return True
         lease = order[index]
-        for gpu_id in lease.gpus:
+        for gpu_id in lease.request.gpus:
             if budget <= 0:
                 return False
             budget -= 1
@@ -597,7 +609,7 @@ def _cards(core: Core, placement: _Placement) -> list[tuple[Gpu, list[Lease]]]:
 
 def _card_of(gang: Gang, lease: Lease) -> GpuId:
     """Return the GPU of a member: where it is, where room is made for it, or the first where it may be placed."""
-    return lease.gpu or gang.planned_on(lease) or lease.planned_gpu or lease.gpus[0]
+    return lease.gpu or gang.planned_on(lease) or lease.request.planned_gpu or lease.request.gpus[0]
 
 
 # -- words -------------------------------------------------------------------------------------------------------------
@@ -608,7 +620,7 @@ def _note(core: Core, gang: Gang, phase: str, reason: str) -> None:
 
 def _say(some: Iterable[Lease], reason: str) -> None:
     for lease in some:
-        lease.reason = reason
+        lease.request.reason = reason
 
 
 def _outlook(gang: Gang, lease: Lease) -> str:
@@ -621,10 +633,10 @@ def _outlook(gang: Gang, lease: Lease) -> str:
         )
     if gang.phase == "loading":
         return (
-            lease.reason
+            lease.request.reason
             or f"its bytes are kept for it; it loads when those of gang {gang.name} before it are ready"
         )
-    return f"waits as one of gang {gang.name}: {lease.reason or 'behind others'}"
+    return f"waits as one of gang {gang.name}: {lease.request.reason or 'behind others'}"
 
 
 def _lacks(gang: Gang, lease: Lease) -> str:

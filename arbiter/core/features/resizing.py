@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from vram_arbiter.arbiter.core.events import MemorySampled, ResizeAsked
 from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.ledger.ledger import process_bytes
-from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState, Request
 from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
 from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.requests.limits import check_waiters
@@ -72,7 +72,7 @@ class Resizing(Feature):
         if growth is None:
             return None
         charge = core.gpu_of(lease).ledger.charge_bytes(lease.id)
-        return charge + core.leases[growth].load_peak_bytes
+        return charge + core.leases[growth].request.load_peak_bytes
 
     def _shrink_target(self, lease: Lease) -> int | None:
         shrink = self.shrinks.get(lease.id)
@@ -111,20 +111,21 @@ class Resizing(Feature):
         )
         growth = Lease(
             id=core.next_lease_id(),
-            nonce=f"growth of {lease.id}",
             spec=spec,
             process=lease.process,
             client=event.client,
-            uid=lease.uid,
-            arrived_at=core.now,
-            arrival=core.next_arrival(),
-            load_peak_bytes=more_bytes,
-            steady_bytes=more_bytes,
-            gpus=(gpu.info.id,),
-            since=core.now,
-            wait_timeout_s=event.wait_timeout_s,
-            answered=True,
-            extends=lease.id,
+            request=Request(
+                nonce=f"growth of {lease.id}",
+                arrived_at=core.now,
+                arrival=core.next_arrival(),
+                load_peak_bytes=more_bytes,
+                steady_bytes=more_bytes,
+                gpus=(gpu.info.id,),
+                uid=lease.request.uid,
+                answered=True,
+                wait_timeout_s=event.wait_timeout_s,
+                extends=lease.id,
+            ),
             story=[(core.now, LeaseState.QUEUED, f"growth of {lease.id}")],
         )
         core.add(growth)
@@ -136,9 +137,9 @@ class Resizing(Feature):
 
     def grant(self, core: Core, gpu: Gpu, request: Lease) -> bool:
         """Add the bytes of a growth to its lease. The record is written before the holder hears of it."""
-        if request.extends is None:
+        if request.request.extends is None:
             return False
-        lease, more_bytes = core.leases[request.extends], request.load_peak_bytes
+        lease, more_bytes = core.leases[request.request.extends], request.request.load_peak_bytes
         core.dequeue(request)
         request.move(LeaseState.RELEASED, core.now, f"merged into {lease.id}")
         core.end(request, None)
@@ -155,7 +156,7 @@ class Resizing(Feature):
         """Wait for readings that begin from now on: the holder says that the bytes are freed already."""
         deadline_at = core.now + core.settings.verify_timeout_s
         self.shrinks[lease.id] = Shrink(target_bytes, core.now, deadline_at)
-        lease.steady_seen_bytes = 0  # seen under another declaration: no drift from the new one
+        lease.observed.steady_bytes = 0  # seen under another declaration: no drift from the new one
         core.timers.set(("shrink", lease.id), core.now + core.settings.verify_poll_s[0])
         core.want_sample(gpu, core.now)
 
@@ -165,7 +166,7 @@ class Resizing(Feature):
         gpu = core.gpu_of(lease)
         if core.now >= self.shrinks[lease.id].deadline_at:
             self._end_shrink(core, lease)
-            lease.steady_bytes = gpu.ledger.charge_bytes(lease.id)
+            lease.request.steady_bytes = gpu.ledger.charge_bytes(lease.id)
             _tell(core, gpu, lease, 0)
             return
         core.want_sample(gpu, core.now)
@@ -201,8 +202,8 @@ class Resizing(Feature):
     def on_ended(self, core: Core, lease: Lease) -> None:
         """Forget a lease's shrink, and a growth however it ended."""
         self._end_shrink(core, lease)
-        if lease.extends is not None:
-            del self.growths[lease.extends]
+        if lease.request.extends is not None:
+            del self.growths[lease.request.extends]
 
     def size_changes(self, lease: Lease) -> bool:
         """Return whether the lease may show bytes that its holder has freed already."""
@@ -210,8 +211,8 @@ class Resizing(Feature):
 
     def view(self, core: Core, lease: Lease) -> Mapping[str, object]:
         """Show a growth as one, and the direction of a lease's resize."""
-        if lease.extends is not None:
-            return {"grows": lease.extends}
+        if lease.request.extends is not None:
+            return {"grows": lease.request.extends}
         resizing = self._resizing(lease)
         return {"resizing": resizing} if resizing else {}
 
@@ -251,7 +252,10 @@ def _declare(lease: Lease, event: ResizeAsked, target: int) -> None:
         steady_bytes=event.steady_bytes,
         residue_bytes=event.residue_bytes,
     )
-    lease.load_peak_bytes, lease.steady_bytes = max(lease.load_peak_bytes, peak), target
+    lease.request.load_peak_bytes, lease.request.steady_bytes = (
+        max(lease.request.load_peak_bytes, peak),
+        target,
+    )
 
 
 def _is_freed(core: Core, gpu: Gpu, lease: Lease, shrink: Shrink, sample: MemorySampled) -> bool:
@@ -268,8 +272,8 @@ def _is_freed(core: Core, gpu: Gpu, lease: Lease, shrink: Shrink, sample: Memory
 def _tell(core: Core, gpu: Gpu, lease: Lease, changed_bytes: int) -> None:
     """Record the charge of a lease, and push it to its holder."""
     charge = gpu.ledger.charge_bytes(lease.id)
-    if lease.measured_bytes is not None:  # measured by the holder before the resize
-        lease.measured_bytes = max(0, lease.measured_bytes + changed_bytes)
+    if lease.observed.reported_bytes is not None:  # measured by the holder before the resize
+        lease.observed.reported_bytes = max(0, lease.observed.reported_bytes + changed_bytes)
     core.record_lease(lease)
     token = lease.token
     assert token is not None, f"{lease.id} is resident without a token"

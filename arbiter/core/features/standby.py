@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from functools import partial
 
 from vram_arbiter.arbiter.core.learning import drift
-from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.lease import AWAY, Departure, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.scheduling import placement, policy
 from vram_arbiter.schemas.ids import ClientId, ModelKey, ProcessKey, RequestId
@@ -24,7 +24,7 @@ def stays_on(lease: Lease) -> bool:
 
     A holder that releases by itself does not want it back, and an operator who evicts it does not either.
     """
-    asked = lease.eviction is not None or lease.asked_before
+    asked = lease.departure.eviction is not None or lease.departure.revoked_before
     return lease.spec.standby and asked and not lease.dismissed
 
 
@@ -48,11 +48,14 @@ def settle(core: Core, lease: Lease, verdict: str) -> None:
     core.timers.clear(("overstay", lease.id))
     core.wake(gpu)
     lease.move(next_state(lease), core.now, verdict)
-    lease.gpu = lease.baseline = lease.eviction = lease.measured_bytes = lease.request = None
-    lease.load_peak_bytes, lease.steady_bytes = drift.expected_bytes(core, lease.spec)
-    lease.gpus = tuple(gpu.info.id for gpu in placement.selected(core, lease.spec))
-    lease.evicted = []
-    lease.answered = True
+    lease.departure = Departure()
+    lease.gpu = lease.observed.reported_bytes = lease.request.id = None
+    lease.request.load_peak_bytes, lease.request.steady_bytes = drift.expected_bytes(
+        core, lease.spec
+    )
+    lease.request.gpus = tuple(gpu.info.id for gpu in placement.selected(core, lease.spec))
+    lease.request.evicted = []
+    lease.request.answered = True
     enter(core, lease)
     core.note(
         str(lease.state),
@@ -144,21 +147,21 @@ def queue_again(
     core.timers.clear(("ttl", lease.id))  # after a restart: whoever asks has come back
     lease.attached = True
     core.hand_to(lease, client)
-    lease.request = request
-    lease.answered = request is None
-    lease.arrived_at = asked_at
-    lease.arrival = core.next_arrival()
-    lease.wait_timeout_s = wait_timeout_s
-    lease.planned_gpu = None
+    lease.request.id = request
+    lease.request.answered = request is None
+    lease.request.arrived_at = asked_at
+    lease.request.arrival = core.next_arrival()
+    lease.request.wait_timeout_s = wait_timeout_s
+    lease.request.planned_gpu = None
     core.enqueue(lease)
 
 
 def taken_back(core: Core, lease: Lease) -> bool:
     """The lease is being granted. Did it come back by itself? Then it has waited for nothing, and has no claim to stay yet."""
-    lease.comes_back = lease.parks = lease.asked_before = lease.dismissed = False
+    lease.comes_back = lease.parks = lease.departure.revoked_before = lease.dismissed = False
     lease.uncalled = lease.returned = core.away.pop(lease.id, None) is not None
     if lease.uncalled:
-        lease.arrived_at = core.now
+        lease.request.arrived_at = core.now
     return lease.uncalled
 
 
@@ -200,7 +203,7 @@ def _outlook(core: Core, lease: Lease) -> str:
         return f", but {NOT_BACK}"
     if not lease.comes_back:
         return " in host RAM until its holder asks for it"
-    gpu = core.gpus[lease.gpus[0]]
+    gpu = core.gpus[lease.request.gpus[0]]
     blocked = policy.blocked(core, gpu)
     head = gpu.queue.head()
     if head is not None:
@@ -218,14 +221,14 @@ def _outlook(core: Core, lease: Lease) -> str:
 
 
 def wake_all(core: Core, lease: Lease) -> None:
-    for gpu_id in lease.gpus:
+    for gpu_id in lease.request.gpus:
         core.wake(core.gpus[gpu_id])
 
 
 def _by_turn(core: Core, gpu: Gpu) -> list[Lease]:
     return sorted(
         _returning(core, gpu),
-        key=lambda lease: (-lease.spec.priority, lease.away_since, lease.arrival),
+        key=lambda lease: (-lease.spec.priority, lease.away_since, lease.request.arrival),
     )
 
 
@@ -235,8 +238,8 @@ def _returning(core: Core, gpu: Gpu) -> Iterator[Lease]:
         for lease in core.away.values()
         if lease.comes_back
         and lease.attached
-        and gpu.info.id in lease.gpus
-        and lease.load_peak_bytes <= gpu.ledger.budget_bytes
+        and gpu.info.id in lease.request.gpus
+        and lease.request.load_peak_bytes <= gpu.ledger.budget_bytes
         and not _left_for_is_here(gpu, lease)
     )
 

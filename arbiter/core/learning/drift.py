@@ -44,20 +44,20 @@ def on_evidence(core: Core, gpu: Gpu) -> None:
         if lease is None or not (held := measured_bytes(gpu, lease)):
             continue
         if lease.state is LeaseState.LOADING:
-            if held > lease.peak_seen_bytes:
-                lease.peak_seen_bytes, lease.grew_at = held, core.now
+            if held > lease.observed.peak_bytes:
+                lease.observed.peak_bytes, lease.observed.grew_at = held, core.now
         elif lease.state in _RESIDENT and not _size_changes(
             core, lease
         ):  # else its bytes may still be on the way back
-            lease.steady_seen_bytes = max(lease.steady_seen_bytes, held)
+            lease.observed.steady_bytes = max(lease.observed.steady_bytes, held)
             if held > lease.spec.steady_bytes:
                 _note_drift(core, lease, "steady", held)
 
 
 def on_ready(core: Core, lease: Lease, measured: int | None) -> None:
     """Loaded. `measured` is the holder's own word, as good as a reading."""
-    lease.steady_seen_bytes = measured or 0
-    peak = max(lease.peak_seen_bytes, measured or 0)
+    lease.observed.steady_bytes = measured or 0
+    peak = max(lease.observed.peak_bytes, measured or 0)
     if peak:
         core.footprints.measured(model_name(lease.spec), "load_peak", peak)
     if peak > lease.spec.load_peak_bytes:
@@ -68,13 +68,13 @@ def on_ready(core: Core, lease: Lease, measured: int | None) -> None:
 
 def on_leaving(core: Core, lease: Lease) -> None:
     """It lets go, was lost, or expired: what it took at most is one life's figure. A load that was cut off says only if it was too much."""
-    if lease.steady_seen_bytes:
-        core.footprints.measured(model_name(lease.spec), "steady", lease.steady_seen_bytes)
-        _note_drift(core, lease, "steady", lease.steady_seen_bytes)
-    elif lease.peak_seen_bytes > lease.load_peak_bytes:
-        core.footprints.measured(model_name(lease.spec), "load_peak", lease.peak_seen_bytes)
-        _note_drift(core, lease, "load_peak", lease.peak_seen_bytes)
-    lease.peak_seen_bytes = lease.steady_seen_bytes = (
+    if lease.observed.steady_bytes:
+        core.footprints.measured(model_name(lease.spec), "steady", lease.observed.steady_bytes)
+        _note_drift(core, lease, "steady", lease.observed.steady_bytes)
+    elif lease.observed.peak_bytes > lease.request.load_peak_bytes:
+        core.footprints.measured(model_name(lease.spec), "load_peak", lease.observed.peak_bytes)
+        _note_drift(core, lease, "load_peak", lease.observed.peak_bytes)
+    lease.observed.peak_bytes = lease.observed.steady_bytes = (
         0  # it may come back from standby and load again
     )
 
@@ -102,7 +102,7 @@ def _size_changes(core: Core, lease: Lease) -> bool:
 
 def held_bytes(gpu: Gpu, lease: Lease) -> int:
     """The newest reading, else the holder's own word; 0: nobody can say."""
-    return measured_bytes(gpu, lease) or lease.measured_bytes or 0
+    return measured_bytes(gpu, lease) or lease.observed.reported_bytes or 0
 
 
 def drift_bytes(core: Core, gpu: Gpu, lease: Lease) -> int:
@@ -130,9 +130,9 @@ def _note_drift(core: Core, lease: Lease, part: Part, measured: int) -> None:
     """Said once per lease and part."""
     declared = lease.spec.load_peak_bytes if part == "load_peak" else lease.spec.steady_bytes
     drift = measured - declared
-    if part in lease.drifted or abs(drift) <= core.settings.verify_tolerance_bytes:
+    if part in lease.observed.drifted or abs(drift) <= core.settings.verify_tolerance_bytes:
         return
-    lease.drifted.add(part)
+    lease.observed.drifted.add(part)
     core.note(
         "drift",
         lease,

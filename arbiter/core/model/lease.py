@@ -156,91 +156,132 @@ class Recall:
 
 
 @dataclass(slots=True)
+class Request:
+    """How a lease was last asked for, and how that waits. A reacquire replaces what it changes."""
+
+    nonce: str  # of the acquire; a repeat with the same nonce is the same request
+    arrived_at: float
+    arrival: int  # strictly increasing, breaks ties
+    load_peak_bytes: int  # of the spec, or more where more was learned
+    steady_bytes: int
+    gpus: tuple[GpuId, ...] = ()  # candidates
+    uid: int = -1  # of the process; -1: recovered, and not asked again since
+    id: RequestId | None = None  # of the message that is not answered yet
+    answered: bool = False  # the end of the wait is told by push
+    wait_timeout_s: float | None = None
+    traceparent: str | None = None
+    reason: str = ""  # why it waits, in words
+    planned_gpu: GpuId | None = None  # where holders were revoked for it
+    extends: LeaseId | None = None  # a request for more bytes of that resident lease
+    rank: float | None = None  # a place in the queues that a feature gave it
+    needs: Mapping[ProcessKey, int] | None = None  # of a group of requests that count as one
+    evicted: list[Eviction] = field(default_factory=list)  # made room for it
+    earlier_nonces: deque[str] = field(default_factory=lambda: deque(maxlen=NONCES_MAX))
+
+
+@dataclass(slots=True)
+class Departure:
+    """How a lease leaves its GPU. Empty while it stays."""
+
+    eviction: Eviction | None = None  # None: it was not revoked
+    revoked_before: bool = False  # by a daemon that ended since; the holder may act on it
+    baseline: MemorySampled | None = None  # the GPU when the unloading began
+    hangs: bool = False  # the unloading has taken a whole deadline, its bytes are not counted on
+    exiting: bool = False  # its process ends, so it keeps nothing
+
+
+@dataclass(slots=True)
+class Observed:
+    """Bytes of a lease by its holder's word and by readings (`learning.drift`)."""
+
+    reported_bytes: int | None = None  # by the holder
+    peak_bytes: int = 0  # largest reading while it loaded
+    grew_at: float = 0.0  # when that last rose
+    steady_bytes: int = 0  # largest reading or report since it is ready
+    drifted: set[str] = field(default_factory=set)  # parts of the footprint that were noted
+
+
+class Uses(dict[tuple[ProcessKey, UseId], Use]):
+    """Uses in flight of one lease, oldest first."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.paused: dict[tuple[ProcessKey, UseId], Use] = {}
+        """Uses that yielded: no departure waits for their end."""
+        self.last_at = 0.0
+        """When a use last began, ended or paused, or the lease became ready."""
+
+
+RECOVERED = frozenset({_S.LOADING, _S.HELD, _S.UNLOADING, _S.VERIFYING, *AWAY})
+"""States in which a restart may find a lease, by the journal or by its holder's word."""
+
+
+@dataclass(slots=True)
 class Lease:
-    """A live lease. `load_peak_bytes` is the spec's, raised by what was learnt; the spec itself is never changed."""
+    """A lease from its request to its end. The spec is what was asked for; a resize replaces it."""
 
     id: LeaseId
-    nonce: str  # of the acquire that it answers to; a lease that is taken over has had others
     spec: Spec
     process: ProcessKey
     client: ClientId
-    arrived_at: float
-    arrival: int  # strictly increasing, breaks ties
-    load_peak_bytes: int
-    steady_bytes: int
-    gpus: tuple[GpuId, ...]  # where it may be placed
+    request: Request
     state: LeaseState = LeaseState.QUEUED
-    since: float = 0.0
-    uid: int = (
-        -1
-    )  # of its process when it asked; -1: it came from the journal, and has not asked since
     token: Token | None = None
     gpu: GpuId | None = None
-    measured_bytes: int | None = None
-    peak_seen_bytes: int = 0  # largest reading while it loaded
-    grew_at: float = 0.0  # when that last rose
-    steady_seen_bytes: int = 0  # largest reading, or the holder's word, since it is ready
-    drifted: set[str] = field(
-        default_factory=set
-    )  # parts of the footprint that a note was said about
-    uses: dict[tuple[ProcessKey, UseId], Use] = field(default_factory=dict)  # busy ones
-    yielded: dict[tuple[ProcessKey, UseId], Use] = field(
-        default_factory=dict
-    )  # pausing: nobody waits
+    uses: Uses = field(default_factory=Uses)
     granted_at: float = 0.0
-    held_from: float = (
-        0.0  # the grant as people count it: a restart of the daemon does not change it
-    )
+    held_from: float = 0.0  # the grant by the clock of people: a restart does not change it
     ready_at: float = 0.0
-    last_used_at: float = 0.0
     expires_at: float = 0.0
-    wait_timeout_s: float | None = None
-    request: RequestId | None = (
-        None  # the acquire that is not answered yet, or was answered `loading`
-    )
-    answered: bool = False
-    exiting: bool = False
-    attached: bool = True  # False after a restart until its holder has come back
-    traceparent: str | None = None
-    baseline: MemorySampled | None = None  # the card as it was when the unloading began
-    earlier_nonces: deque[str] = field(default_factory=lambda: deque(maxlen=NONCES_MAX))
-    reason: str = ""  # why it waits, in words; for people
-    planned_gpu: GpuId | None = None  # a card where somebody was asked to leave for it
+    attached: bool = True  # False after a restart until its holder reattached
     pinned: Order | None = None  # by an operator
+    departure: Departure = field(default_factory=Departure)
+    observed: Observed = field(default_factory=Observed)
+    story: list[tuple[float, LeaseState, str]] = field(default_factory=list)  # last STORY_MAX steps
+    roster: Roster | None = field(default=None, repr=False, compare=False)  # of its GPU
     parks: bool = False  # it let go with its weights kept in host RAM
     comes_back: bool = False  # by itself, once its bytes are measured gone and there is room
-    hangs: bool = False  # its unloading has taken a whole deadline: nobody counts on it any more
-    asked_before: bool = (
-        False  # to leave, by a daemon that has ended since; its holder may be acting on it
-    )
     dismissed: bool = False  # an operator sent it away: it does not come back by itself
     left_for: str = ""  # the consumer that it left for last; it does not come back beside that one
     away_since: float = 0.0
     uncalled: bool = False  # it came back by itself and nobody has used it since
     returned: bool = False  # it was granted because it came back by itself
     recalled: Recall | None = None  # its holder wants it back before it is gone
-    extends: LeaseId | None = None  # a request for more bytes of that resident lease
-    eviction: Eviction | None = None
-    evicted: list[Eviction] = field(default_factory=list)  # who left for it
-    story: list[tuple[float, LeaseState, str]] = field(
-        default_factory=list
-    )  # the last STORY_MAX steps
-    rank: float | None = None  # a place in the queues that a feature gave it
-    needs: Mapping[ProcessKey, int] | None = None  # of a group of requests that count as one
-    roster: Roster | None = field(
-        default=None, repr=False, compare=False
-    )  # of the card that it is on
+
+    @classmethod
+    def recovered(
+        cls,
+        lease_id: LeaseId,
+        spec: Spec,
+        process: ProcessKey,
+        request: Request,
+        token: Token,
+        state: LeaseState,
+        now: float,
+        why: str,
+    ) -> "Lease":
+        """Return a lease that a restart found in one of the states RECOVERED; no other way leads past the table."""
+        assert state in RECOVERED, f"{lease_id} cannot be found {state}"
+        lease = cls(lease_id, spec, process, ClientId(""), request, state, token)
+        lease.story.append((now, state, why))
+        lease.granted_at = lease.held_from = lease.ready_at = lease.uses.last_at = now
+        request.answered = True
+        return lease
 
     def move(self, to: LeaseState, now: float, why: str) -> None:
         """Go to another state. Raises IllegalTransition, and then nothing has changed."""
         if to not in TRANSITIONS[self.state]:
             raise IllegalTransition(self, to)
         before, self.state = self.state, to
-        self.since = now
         self.story.append((now, to, why))
         del self.story[:-STORY_MAX]
         if self.roster is not None:
             self.roster.moved(self, before)
+
+    @property
+    def since(self) -> float:
+        """When it came to its state."""
+        return self.story[-1][0] if self.story else self.request.arrived_at
 
     def told(self) -> str:
         """The story in one line."""
@@ -248,7 +289,9 @@ class Lease:
 
     def priority_at(self, now: float, ageing_s_per_point: float) -> int:
         """Priority with one point for every `ageing_s_per_point` waited."""
-        return self.spec.priority + int(max(0.0, now - self.arrived_at) / ageing_s_per_point)
+        return self.spec.priority + int(
+            max(0.0, now - self.request.arrived_at) / ageing_s_per_point
+        )
 
     @property
     def in_use(self) -> bool:
@@ -268,7 +311,7 @@ class Lease:
 
     def all_uses(self) -> list[Use]:
         """Busy and pausing ones."""
-        return [*self.uses.values(), *self.yielded.values()]
+        return [*self.uses.values(), *self.uses.paused.values()]
 
     @property
     def evictable(self) -> bool:
@@ -278,4 +321,4 @@ class Lease:
     @property
     def residue_bytes(self) -> int:
         """What its process is expected to keep after unloading."""
-        return 0 if self.exiting else self.spec.residue_bytes
+        return 0 if self.departure.exiting else self.spec.residue_bytes

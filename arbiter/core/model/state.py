@@ -239,8 +239,8 @@ class Core:
         facts: dict[str, Any] = {}
         if lease is not None:
             facts = {"lease_id": lease.id, "consumer": lease.spec.consumer, "gpu": lease.gpu}
-            if lease.traceparent is not None:
-                facts["traceparent"] = lease.traceparent
+            if lease.request.traceparent is not None:
+                facts["traceparent"] = lease.request.traceparent
         self.out.append(Note(kind, {**facts, **data}))
 
     def journal(self, key: str, record: Mapping[str, Any], *, gates: bool = False) -> None:
@@ -355,7 +355,7 @@ class Core:
         }:
             return f"{sorted(odd)}: uses are listed otherwise than they are"
         owners = Counter(
-            owner for lease in self.waiting.values() for owner in (lease.process, lease.uid)
+            owner for lease in self.waiting.values() for owner in (lease.process, lease.request.uid)
         )
         if owners != self._waiting_by:
             return f"waiters are {owners}, kept as {self._waiting_by}"
@@ -372,7 +372,7 @@ class Core:
 
     def mark(self, lease: Lease, use: Use) -> None:
         """A use is busy from now on."""
-        lease.yielded.pop((use.process, use.id), None)
+        lease.uses.paused.pop((use.process, use.id), None)
         lease.uses[use.process, use.id] = use
         lease.uncalled = False
         self.users.setdefault(use.process, {})[lease.id, use.id] = lease
@@ -389,27 +389,29 @@ class Core:
     def enqueue(self, lease: Lease) -> None:
         """A lease begins to wait, on every card that it may be placed on."""
         self.hold_back(lease)
-        for gpu_id in lease.gpus:
+        for gpu_id in lease.request.gpus:
             self.gpus[gpu_id].queue.add(lease)
             self.wake(self.gpus[gpu_id])
 
     def hold_back(self, lease: Lease) -> None:
         """It waits, but in no queue yet."""
         self.waiting[lease.id] = lease
-        for owner in (lease.process, lease.uid):
+        for owner in (lease.process, lease.request.uid):
             self._waiting_by[owner] = self._waiting_by.get(owner, 0) + 1
         self.suspects.add(lease.process)
-        if lease.wait_timeout_s is not None:
-            self.timers.set(("wait", lease.id), lease.arrived_at + lease.wait_timeout_s)
+        if lease.request.wait_timeout_s is not None:
+            self.timers.set(
+                ("wait", lease.id), lease.request.arrived_at + lease.request.wait_timeout_s
+            )
 
     def dequeue(self, lease: Lease) -> None:
         if self.waiting.pop(lease.id, None) is not None:
-            for owner in (lease.process, lease.uid):
+            for owner in (lease.process, lease.request.uid):
                 self._waiting_by[owner] -= 1
                 if not self._waiting_by[owner]:
                     del self._waiting_by[owner]
         self.timers.clear(("wait", lease.id))
-        for gpu_id in lease.gpus:
+        for gpu_id in lease.request.gpus:
             self.gpus[gpu_id].queue.discard(lease)
             self.wake(self.gpus[gpu_id])
 
@@ -430,10 +432,17 @@ class Core:
             self.wake(gpu)
         elif lease.token is not None:  # it was resident once: the journal knows it as away
             self.forget(f"lease:{lease.id}")
-        earlier = tuple(lease.earlier_nonces)
-        evicted = "" if lease.eviction is None else lease.eviction.reason
+        earlier = tuple(lease.request.earlier_nonces)
+        evicted = "" if lease.departure.eviction is None else lease.departure.eviction.reason
         ended = Ended(
-            lease.id, lease.process, lease.nonce, lease.token, lease.state, error, earlier, evicted
+            lease.id,
+            lease.process,
+            lease.request.nonce,
+            lease.token,
+            lease.state,
+            error,
+            earlier,
+            evicted,
         )
         self.remember(ended)
 
@@ -469,7 +478,9 @@ class Core:
         spec = lease.spec
         charge_bytes = 0 if lease.gpu is None else self.gpu_of(lease).ledger.charge_bytes(lease.id)
         assert lease.token is not None, f"{lease.id} is recorded without a token"
-        asked = lease.asked_before and lease.state is LeaseState.HELD  # and not by this daemon yet
+        asked = (
+            lease.departure.revoked_before and lease.state is LeaseState.HELD
+        )  # and not by this daemon yet
         features = {
             key: value
             for feature in self.features
@@ -485,12 +496,12 @@ class Core:
                 "gpu": lease.gpu,
                 "pid": lease.process.pid,
                 "start_ticks": lease.process.start_ticks,
-                "nonce": lease.nonce,
+                "nonce": lease.request.nonce,
                 "held_from": lease.held_from,
                 "charge_bytes": charge_bytes,
-                "load_peak_bytes": lease.load_peak_bytes,
-                "measured_bytes": lease.measured_bytes,
-                "exiting": lease.exiting,
+                "load_peak_bytes": lease.request.load_peak_bytes,
+                "measured_bytes": lease.observed.reported_bytes,
+                "exiting": lease.departure.exiting,
                 "pinned": None if lease.pinned is None else [lease.pinned.by, lease.pinned.reason],
                 "comes_back": lease.comes_back,
                 "parks": lease.parks,

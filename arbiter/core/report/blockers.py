@@ -166,20 +166,20 @@ def loading(core: Core, lease: Lease) -> str:
     took_s = core.now - lease.granted_at
     if took_s < LONG_LOAD_S:
         return "is loading"
-    told = f"is loading for {took_s:.0f} s, {gib(lease.peak_seen_bytes)} so far"
-    quiet_s = core.now - max(lease.grew_at, lease.granted_at)
+    told = f"is loading for {took_s:.0f} s, {gib(lease.observed.peak_bytes)} so far"
+    quiet_s = core.now - max(lease.observed.grew_at, lease.granted_at)
     return told if quiet_s < LONG_LOAD_S else f"{told}, nothing new for {quiet_s:.0f} s"
 
 
 def unloading(core: Core, lease: Lease) -> str:
     """One that hangs is nobody's hope any more, but its bytes are charged until they are gone or its process is."""
-    if not lease.hangs:
+    if not lease.departure.hangs:
         return "is unloading"
     return f"is unloading for {core.now - lease.since:.0f} s and may hang: end its process (pid {lease.process.pid})"
 
 
 def uses(lease: Lease) -> str:
-    paused = f", {len(lease.yielded)} paused" if lease.yielded else ""
+    paused = f", {len(lease.uses.paused)} paused" if lease.uses.paused else ""
     running = (
         f"{len(lease.uses)} use{'' if len(lease.uses) == 1 else 's'} running"
         if lease.uses
@@ -189,7 +189,7 @@ def uses(lease: Lease) -> str:
 
 
 def ago(core: Core, holder: Lease) -> str:
-    asked_at = holder.eviction.asked_at if holder.eviction else holder.since
+    asked_at = holder.departure.eviction.asked_at if holder.departure.eviction else holder.since
     return f"{core.now - asked_at:.1f} s ago"
 
 

@@ -79,14 +79,14 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
         "pid": lease.process.pid,
         "since_s": core.now - lease.since,
         "waited_s": (core.now if lease.state is LeaseState.QUEUED else lease.granted_at)
-        - lease.arrived_at,
+        - lease.request.arrived_at,
     }
     if lease.token is not None:
         shown["granted_s"] = core.now - lease.held_from
     if lease.pinned is not None:
         shown["pinned"] = str(lease.pinned)
-    if lease.yielded:
-        shown["yielded"] = len(lease.yielded)
+    if lease.uses.paused:
+        shown["yielded"] = len(lease.uses.paused)
     for feature in core.features:
         shown.update(feature.view(core, lease))
     if lease.spec.standby:
@@ -106,7 +106,7 @@ def _charge_bytes(lease: Lease, gpu: Gpu | None) -> int:
     """What is charged, or will be; nothing for a lease that is away."""
     if gpu is not None:
         return gpu.ledger.charge_bytes(lease.id)
-    return 0 if lease.state in AWAY else lease.load_peak_bytes
+    return 0 if lease.state in AWAY else lease.request.load_peak_bytes
 
 
 def gpu_view(core: Core, gpu: Gpu) -> dict[str, Any]:
@@ -193,8 +193,8 @@ def status(
 
 def _page_key(core: Core, lease: Lease) -> PageKey:
     if lease.state is not LeaseState.QUEUED:
-        return (0, 0.0, lease.arrival)
-    return (1, *core.gpus[lease.gpus[0]].queue.rank(lease))
+        return (0, 0.0, lease.request.arrival)
+    return (1, *core.gpus[lease.request.gpus[0]].queue.rank(lease))
 
 
 def _listed(core: Core, after: PageKey | None, limit: int | None) -> Iterator[Lease]:
@@ -202,8 +202,8 @@ def _listed(core: Core, after: PageKey | None, limit: int | None) -> Iterator[Le
     section, rank, arrival = after or (0, 0.0, 0)
     if section == 0:
         granted = chain(*(gpu.residents.values() for gpu in core.gpus.values()), core.away.values())
-        rest = (lease for lease in granted if lease.arrival > arrival)
-        by_arrival = attrgetter("arrival")
+        rest = (lease for lease in granted if lease.request.arrival > arrival)
+        by_arrival = attrgetter("request.arrival")
         yield from (
             sorted(rest, key=by_arrival)
             if limit is None
@@ -216,7 +216,7 @@ def _in_queues(core: Core, after: tuple[float, int]) -> Iterator[Lease]:
     """Waiters in the order of the queues, each once. Those that a feature keeps out of the queues are listed at their rank."""
 
     def rank(lease: Lease) -> tuple[float, int]:
-        return core.gpus[lease.gpus[0]].queue.rank(lease)
+        return core.gpus[lease.request.gpus[0]].queue.rank(lease)
 
     unqueued = [
         lease for feature in core.features for lease in feature.unqueued() if rank(lease) > after
@@ -231,7 +231,9 @@ def _in_queues(core: Core, after: tuple[float, int]) -> Iterator[Lease]:
 
 def _best_position(core: Core, lease: Lease) -> int:
     """Its best place in a queue; 0: it is in none."""
-    places = [core.gpus[gpu_id].queue for gpu_id in lease.gpus if lease in core.gpus[gpu_id].queue]
+    places = [
+        core.gpus[gpu_id].queue for gpu_id in lease.request.gpus if lease in core.gpus[gpu_id].queue
+    ]
     return min((queue.position(lease) for queue in places), default=0)
 
 
@@ -291,17 +293,17 @@ def explain_lease(core: Core, lease: Lease) -> dict[str, Any]:
     if lease.state is not LeaseState.QUEUED:
         return _explain_resident(core, standing, lease, free)
     free += kept
-    added = lease.load_peak_bytes if kept else policy.added_bytes(gpu, standing.request)
+    added = lease.request.load_peak_bytes if kept else policy.added_bytes(gpu, standing.request)
     deficit = max(0, added - free)
     blockers = who_blocks(core, gpu, standing.request, deficit)
     position = _place(core, standing)
     condition, then = _condition(core, standing, lease, blockers, position)
     eta = _eta(core, standing, lease)
-    together = f" with {standing.group}" if standing.request.needs is not None else ""
+    together = f" with {standing.group}" if standing.request.request.needs is not None else ""
     head = f"{lease.spec.consumer}{together} needs {gib(added)}, {gib(max(0, free))} are free{' or kept for it' if kept else ''}"
     head += f", {gib(deficit)} are missing" if deficit else ""
-    if lease.load_peak_bytes > (declared := lease.spec.load_peak_bytes):
-        head += f" ({gib(declared)} declared, {gib(lease.load_peak_bytes)} learnt)"
+    if lease.request.load_peak_bytes > (declared := lease.spec.load_peak_bytes):
+        head += f" ({gib(declared)} declared, {gib(lease.request.load_peak_bytes)} learnt)"
     return {
         "lease_id": lease.id,
         "state": str(lease.state),
@@ -385,7 +387,7 @@ def _condition(
     leaving = [other for other in gpu.residents.values() if other.state in LEAVING]
     if position > 1:
         return "queued", _behind(core, standing, position)
-    if leaving and lease.planned_gpu == gpu.info.id:
+    if leaving and lease.request.planned_gpu == gpu.info.id:
         return "room is being made", "; ".join(_leaving_next(core, gpu, other) for other in leaving)
     blocked = policy.blocked(core, gpu)
     if blocked:
@@ -406,7 +408,7 @@ def _condition(
         return "no room", "waits for " + ", ".join(
             f"{b['consumer']} ({b['condition']})" for b in blockers
         )
-    return "measuring", lease.reason or "waits for a reading of the card"
+    return "measuring", lease.request.reason or "waits for a reading of the card"
 
 
 def _leaving_next(core: Core, gpu: Gpu, holder: Lease) -> str:
@@ -422,7 +424,7 @@ def _leaving_next(core: Core, gpu: Gpu, holder: Lease) -> str:
     if holder.state is LeaseState.REVOKING:
         return f"waits for {name} to unload (asked {ago(core, holder)}), then {charge} are verified"
     if holder.state is LeaseState.UNLOADING:
-        return f"{name} {unloading(core, holder) if holder.hangs else 'unloads'}, then {charge} are verified"
+        return f"{name} {unloading(core, holder) if holder.departure.hangs else 'unloads'}, then {charge} are verified"
     return f"{charge} of {name} are being verified"
 
 
@@ -468,13 +470,15 @@ def medians(core: Core) -> dict[str, dict[str, float]]:
 
 
 def _wanted_by(lease: Lease) -> str:
-    return (lease.eviction.wanted_consumer if lease.eviction else "") or "relief of pressure"
+    return (
+        lease.departure.eviction.wanted_consumer if lease.departure.eviction else ""
+    ) or "relief of pressure"
 
 
 # -- switch --------------------------------------------------------------------------------------------------------------
 def switch_record(core: Core, lease: Lease) -> dict[str, Any]:
     """Milliseconds of a grant from the acquire to `ready`, split by phase; of several victims the slowest counts."""
-    gone = lease.evicted
+    gone = lease.request.evicted
     first_asked = min((e.asked_at for e in gone), default=lease.granted_at)
     return {
         "switched": bool(gone),
@@ -488,12 +492,12 @@ def switch_record(core: Core, lease: Lease) -> dict[str, Any]:
             for e in gone
         ],
         "verified": all(e.verdict == "verified" for e in gone),
-        "wait_ms": max(0.0, first_asked - lease.arrived_at) * 1e3,
+        "wait_ms": max(0.0, first_asked - lease.request.arrived_at) * 1e3,
         "drain_ms": max((_span(e.asked_at, e.unloading_at) for e in gone), default=0.0),
         "unload_ms": max((_span(e.unloading_at, e.released_at) for e in gone), default=0.0),
         "verify_ms": max((_span(e.released_at, e.verdict_at) for e in gone), default=0.0),
         "load_ms": (core.now - lease.granted_at) * 1e3,
-        "total_ms": (core.now - lease.arrived_at) * 1e3,
+        "total_ms": (core.now - lease.request.arrived_at) * 1e3,
     }
 
 

@@ -22,14 +22,14 @@ type Step = dict[str, Any]
 def steps(core: Core, standing: Standing, waiter: Lease) -> list[Step]:
     """For a queued lease, the nearest first; what has no instant comes last."""
     gpu = standing.gpu
-    if not any(waiter in core.gpus[gpu_id].queue for gpu_id in waiter.gpus):
+    if not any(waiter in core.gpus[gpu_id].queue for gpu_id in waiter.request.gpus):
         found = _of_unqueued(core, gpu, standing, waiter)
     else:
         first = policy.front(core, gpu)
         mine = any(first is one for one in standing.fellows)
         found = _of_head(core, gpu, standing.request) if mine else []
-    if waiter.wait_timeout_s is not None:
-        at = waiter.arrived_at + waiter.wait_timeout_s
+    if waiter.request.wait_timeout_s is not None:
+        at = waiter.request.arrived_at + waiter.request.wait_timeout_s
         found.append(
             _step(core, "give_up", waiter, at, "gives up", "when its wait timeout is over")
         )
@@ -146,9 +146,9 @@ def _leaving(core: Core, gpu: Gpu, waiter: Lease, holder: Lease) -> Step:
             f"measures {name}'s bytes again",
             because,
         )
-    eviction = holder.eviction
+    eviction = holder.departure.eviction
     if eviction is None or eviction.overdue:
-        because = "its unloading may hang" if holder.hangs else "it is on its way out"
+        because = "its unloading may hang" if holder.departure.hangs else "it is on its way out"
         return _step(core, "wait", holder, None, f"waits for {name} to let go", because)
     at = (
         holder.since if holder.state is LeaseState.UNLOADING else eviction.asked_at

@@ -27,5 +27,5 @@ def standing_of(core: Core, lease: Lease) -> Standing:
         told = feature.standing(core, lease)
         if told is not None:
             return told
-    gpu = core.gpus[lease.gpu or lease.planned_gpu or lease.gpus[0]]
+    gpu = core.gpus[lease.gpu or lease.request.planned_gpu or lease.request.gpus[0]]
     return Standing(gpu, lease, (lease,), (lease,))

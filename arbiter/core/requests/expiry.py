@@ -76,14 +76,14 @@ def lose(
     crashes.failed(core, lease, str(error["message"]))
     for use in list(lease.uses.values()):
         core.unmark(lease, use)
-    lease.yielded.clear()
+    lease.uses.paused.clear()
     for feature in core.features:
         feature.on_unloading(core, lease, "the lease is over")
     gpu.ledger.to_debt(lease.id)
     core.record_lease(lease, debt=True)
-    if lease.eviction is not None:
-        lease.eviction.released_at = core.now
-        lease.eviction.unloading_at = lease.eviction.unloading_at or core.now
+    if lease.departure.eviction is not None:
+        lease.departure.eviction.released_at = core.now
+        lease.departure.eviction.unloading_at = lease.departure.eviction.unloading_at or core.now
     measure.begin_for_lease(core, gpu, lease, alive=alive, grace_s=grace_s, fenced_at=fenced_at)
     lease.move(to, core.now, str(error["message"]))
     core.end(lease, error)

@@ -86,9 +86,9 @@ def evict(core: Core, lease: Lease, order: Order) -> None:
         lease.comes_back = False
         lease.recalled = None
         _ordered(core, lease, order)
-        if lease.state is LeaseState.REVOKING and lease.eviction is not None:
+        if lease.state is LeaseState.REVOKING and lease.departure.eviction is not None:
             # A holder may let a waiter wait that it would not keep an operator waiting for.
-            eviction.push_revoke(core, lease, lease.eviction)
+            eviction.push_revoke(core, lease, lease.departure.eviction)
         _note(core, "evict", order, lease, repeated=True)
         return
     if lease.state is not LeaseState.HELD:
@@ -114,8 +114,8 @@ def evict(core: Core, lease: Lease, order: Order) -> None:
 
 def _ordered(core: Core, lease: Lease, order: Order) -> None:
     lease.dismissed = True
-    if lease.eviction is not None:
-        lease.eviction.order = order
+    if lease.departure.eviction is not None:
+        lease.departure.eviction.order = order
     if lease.spec.standby:
         core.record_lease(lease)
 

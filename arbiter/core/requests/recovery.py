@@ -23,7 +23,15 @@ from vram_arbiter.arbiter.core.eviction import eviction
 from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import drift
 from vram_arbiter.arbiter.core.ledger.ledger import process_bytes
-from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState, Order, Use
+from vram_arbiter.arbiter.core.model.lease import (
+    AWAY,
+    EXPIRING,
+    Lease,
+    LeaseState,
+    Order,
+    Request,
+    Use,
+)
 from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Gpu, Refused
 from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.requests import operators, uses
@@ -37,7 +45,7 @@ from vram_arbiter.arbiter.core.requests.requests import (
 from vram_arbiter.arbiter.core.scheduling import placement
 from vram_arbiter.arbiter.core.verification.measure import begin_for_lease
 from vram_arbiter.schemas import defaults
-from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ModelKey, ProcessKey, Token
+from vram_arbiter.schemas.ids import GpuId, LeaseId, ModelKey, ProcessKey, Token
 
 EMPTY_JOURNAL = LeaseId("journal")
 """Stands for the holders that an empty, lost or doubted journal does not name; given up after a TTL and the fence grace."""
@@ -89,12 +97,12 @@ def await_unnamed(core: Core) -> None:
 def _restore_away(core: Core, record: Mapping[str, Any]) -> None:
     """A lease that is away holds nothing on a card: nobody waits for its holder, but it does not come back before him either."""
     lease = _remembered(core, record, LeaseState(str(record["state"])))
-    lease.gpus = tuple(gpu.info.id for gpu in placement.selected(core, lease.spec))
-    if not lease.gpus:  # the only card that it may come back to is gone
+    lease.request.gpus = tuple(gpu.info.id for gpu in placement.selected(core, lease.spec))
+    if not lease.request.gpus:  # the only card that it may come back to is gone
         core.forget(f"lease:{lease.id}")
         return
     core.add(lease)
-    core.nonces[lease.process, lease.nonce] = lease.id
+    core.nonces[lease.process, lease.request.nonce] = lease.id
     lease.away_since = core.now
     core.away[lease.id] = lease
     core.host.find(lease.id, int(record.get("parked_bytes", 0)))
@@ -104,35 +112,33 @@ def _restore_away(core: Core, record: Mapping[str, Any]) -> None:
 def _remembered(core: Core, record: Mapping[str, Any], state: LeaseState) -> Lease:
     """The lease of a record, on no card yet."""
     spec = spec_from_record(record["spec"])
-    return Lease(
-        id=LeaseId(str(record["lease_id"])),
+    request = Request(
         nonce=str(record["nonce"]),
-        spec=spec,
-        process=ProcessKey(int(record["pid"]), int(record["start_ticks"])),
-        client=ClientId(""),
         arrived_at=core.now,
         arrival=core.next_arrival(),
         load_peak_bytes=int(record["load_peak_bytes"]),
         steady_bytes=max(spec.steady_bytes, spec.residue_bytes),
-        gpus=(),
-        state=state,
-        since=core.now,
-        token=Token(int(record["token"][0]), int(record["token"][1])),
-        measured_bytes=record["measured_bytes"],
-        granted_at=core.now,
-        held_from=min(core.now, float(record.get("held_from", core.now))),
-        ready_at=core.now,
-        last_used_at=core.now,
-        answered=True,
-        exiting=bool(record["exiting"]),
-        pinned=None if record.get("pinned") is None else Order(*record["pinned"]),
-        attached=False,
-        dismissed=bool(record.get("dismissed", False)),
-        parks=bool(record.get("parks", False)),
-        comes_back=bool(record.get("comes_back", False)),
-        left_for=str(record.get("left_for", "")),
-        story=[(core.now, state, "recovered from the journal")],
     )
+    lease = Lease.recovered(
+        LeaseId(str(record["lease_id"])),
+        spec,
+        ProcessKey(int(record["pid"]), int(record["start_ticks"])),
+        request,
+        Token(*record["token"]),
+        state,
+        core.now,
+        "recovered from the journal",
+    )
+    lease.attached = False
+    lease.held_from = min(core.now, float(record.get("held_from", core.now)))
+    lease.observed.reported_bytes = record["measured_bytes"]
+    lease.departure.exiting = bool(record["exiting"])
+    lease.pinned = None if record.get("pinned") is None else Order(*record["pinned"])
+    lease.dismissed = bool(record.get("dismissed", False))
+    lease.parks = bool(record.get("parks", False))
+    lease.comes_back = bool(record.get("comes_back", False))
+    lease.left_for = str(record.get("left_for", ""))
+    return lease
 
 
 def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
@@ -141,18 +147,20 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
     lease = _remembered(
         core, record, LeaseState.HELD if asked or state == "debt" else LeaseState(state)
     )
-    lease.asked_before = asked
+    lease.departure.revoked_before = asked
     lease_id, process, token, spec = lease.id, lease.process, lease.token, lease.spec
-    lease.gpu, lease.gpus = gpu.info.id, (gpu.info.id,)
+    lease.gpu, lease.request.gpus = gpu.info.id, (gpu.info.id,)
     _place(core, gpu, lease, int(record["charge_bytes"]))
-    core.nonces[process, lease.nonce] = lease_id
+    core.nonces[process, lease.request.nonce] = lease_id
     if state == "debt":
         gpu.ledger.to_debt(lease_id)
         grace_s = core.settings.fence_grace_s
         fenced_at = core.now + spec.ttl_s + grace_s
         begin_for_lease(core, gpu, lease, alive=True, grace_s=grace_s, fenced_at=fenced_at)
         core.remember(
-            Ended(lease_id, process, lease.nonce, token, LeaseState.LOST, lost_error(lease_id))
+            Ended(
+                lease_id, process, lease.request.nonce, token, LeaseState.LOST, lost_error(lease_id)
+            )
         )
         return
     core.add(lease)
@@ -175,7 +183,9 @@ def _place(core: Core, gpu: Gpu, lease: Lease, charge_bytes: int) -> None:
     """Charge what is there anyway. What the budget does not hold was never approved: it is pressure."""
     approved_bytes = min(charge_bytes, _room_bytes(gpu))
     gpu.ledger.charge(lease.id, lease.process, charge_bytes, approved_bytes, core.now)
-    gpu.returning.give_up(lease.process, max(0, lease.load_peak_bytes - charge_bytes), core.now)
+    gpu.returning.give_up(
+        lease.process, max(0, lease.request.load_peak_bytes - charge_bytes), core.now
+    )
     gpu.changed_at = core.now
 
 
@@ -333,7 +343,7 @@ def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLeas
     if lease.state in (LeaseState.HELD, LeaseState.REVOKING):
         for use_id in item.uses:
             key = (client.process, use_id)
-            known = lease.uses.get(key) or lease.yielded.get(key)
+            known = lease.uses.get(key) or lease.uses.paused.get(key)
             began = Use(use_id, client.id, client.process, "", core.now)
             core.mark(lease, began if known is None else replace(known, client=client.id))
     eviction.ask_again(core, lease)
@@ -354,55 +364,53 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
         raise Refused(
             "unknown_gpu", f"there is no GPU {item.spec.gpu!r}", "unload, then acquire again"
         )
-    gpu = max(gpus, key=lambda gpu: (_seen_bytes(gpu, client.process), -gpu.info.index))
     spec = item.spec
     peak, steady = drift.expected_bytes(core, spec)
+    request = Request(
+        nonce=f"adopted {item.lease}",
+        arrived_at=core.now,
+        arrival=core.next_arrival(),
+        load_peak_bytes=peak,
+        steady_bytes=steady,
+    )
+    lease = Lease.recovered(
+        item.lease,
+        spec,
+        client.process,
+        request,
+        item.token,
+        _adopted_state(item),
+        core.now,
+        "adopted: the journal did not know it",
+    )
+    lease.client = client.id
+    lease.observed.reported_bytes = item.measured_bytes
+    core.add(lease)
+    core.nonces[lease.process, request.nonce] = lease.id
+    if item.away:
+        lease.comes_back, lease.parks = spec.standby or not item.parked, item.parked
+        if item.parked:
+            core.host.find(lease.id, spec.park_bytes)
+        request.gpus = tuple(gpu.info.id for gpu in gpus)
+        standby.enter(core, lease)
+        return lease
+    gpu = max(gpus, key=lambda gpu: (_seen_bytes(gpu, client.process), -gpu.info.index))
+    lease.gpu, request.gpus = gpu.info.id, (gpu.info.id,)
     charge = peak
     if item.held:
         charge = (
             steady if item.measured_bytes is None else max(item.measured_bytes, spec.residue_bytes)
         )
-    lease = Lease(
-        id=item.lease,
-        nonce=f"adopted {item.lease}",
-        spec=spec,
-        process=client.process,
-        client=client.id,
-        arrived_at=core.now,
-        arrival=core.next_arrival(),
-        load_peak_bytes=peak,
-        steady_bytes=steady,
-        gpus=(gpu.info.id,),
-        state=LeaseState.HELD if item.held else LeaseState.LOADING,
-        since=core.now,
-        token=item.token,
-        gpu=gpu.info.id,
-        measured_bytes=item.measured_bytes,
-        granted_at=core.now,
-        held_from=core.now,
-        ready_at=core.now,
-        last_used_at=core.now,
-        answered=True,
-        story=[(core.now, LeaseState.HELD, "adopted: the journal did not know it")],
-    )
-    core.add(lease)
-    core.nonces[lease.process, lease.nonce] = lease.id
-    if item.away:
-        lease.state = LeaseState.PARKED if item.parked else LeaseState.STANDBY
-        lease.gpu, lease.comes_back, lease.parks = (
-            None,
-            spec.standby or not item.parked,
-            item.parked,
-        )
-        if item.parked:
-            core.host.find(lease.id, spec.park_bytes)
-        lease.gpus = tuple(gpu.info.id for gpu in gpus)
-        standby.enter(core, lease)
-        return lease
     _place(core, gpu, lease, charge)
     gpu.residents[lease.id] = lease
     core.record_lease(lease)
     return lease
+
+
+def _adopted_state(item: ReattachedLease) -> LeaseState:
+    if item.away:
+        return LeaseState.PARKED if item.parked else LeaseState.STANDBY
+    return LeaseState.HELD if item.held else LeaseState.LOADING
 
 
 # -- coming to an end --------------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from vram_arbiter.arbiter.core.model.lease import (
     Lease,
     LeaseState,
     Recall,
+    Request,
     Use,
 )
 from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Refused
@@ -164,20 +165,21 @@ def new_lease(
     check_leases(core, client)
     lease = Lease(
         id=core.next_lease_id(),
-        nonce=event.nonce,
         spec=spec,
         process=client.process,
         client=client.id,
-        uid=client.uid,
-        arrived_at=core.now,
-        arrival=core.next_arrival(),
-        load_peak_bytes=load_peak,
-        steady_bytes=steady,
-        gpus=gpus,
-        since=core.now,
-        wait_timeout_s=event.wait_timeout_s,
-        request=event.request,
-        traceparent=event.traceparent,
+        request=Request(
+            nonce=event.nonce,
+            arrived_at=core.now,
+            arrival=core.next_arrival(),
+            load_peak_bytes=load_peak,
+            steady_bytes=steady,
+            gpus=gpus,
+            uid=client.uid,
+            id=event.request,
+            wait_timeout_s=event.wait_timeout_s,
+            traceparent=event.traceparent,
+        ),
         story=[(core.now, LeaseState.QUEUED, "acquired")],
     )
     core.add(lease)
@@ -190,15 +192,15 @@ def _take_over(
     core: Core, event: AcquireRequested, lease: Lease, spec: Spec, gpus: tuple[GpuId, ...]
 ) -> None:
     """The process has a lease for this model, away: the acquire means that one, as it is asked for now."""
-    if len(lease.earlier_nonces) == NONCES_MAX:
-        core.nonces.pop((lease.process, lease.earlier_nonces[0]), None)
-    lease.earlier_nonces.append(lease.nonce)
-    lease.nonce = event.nonce
+    if len(lease.request.earlier_nonces) == NONCES_MAX:
+        core.nonces.pop((lease.process, lease.request.earlier_nonces[0]), None)
+    lease.request.earlier_nonces.append(lease.request.nonce)
+    lease.request.nonce = event.nonce
     core.nonces[lease.process, event.nonce] = lease.id
     lease.spec = spec
-    lease.load_peak_bytes, lease.steady_bytes = drift.expected_bytes(core, spec)
+    lease.request.load_peak_bytes, lease.request.steady_bytes = drift.expected_bytes(core, spec)
     core.record_lease(lease)  # still away: if a restart ends the wait, it is this that comes back
-    lease.traceparent = event.traceparent
+    lease.request.traceparent = event.traceparent
     _call_back(core, lease, event.client, event.request, event.wait_timeout_s, gpus)
 
 
@@ -219,9 +221,11 @@ def _call_back(
     wait_timeout_s: float | None,
     gpus: tuple[GpuId, ...],
 ) -> None:
-    lease.gpus = gpus
-    lease.uid = client_of(core, client).uid
-    lease.load_peak_bytes, lease.steady_bytes = drift.expected_bytes(core, lease.spec)
+    lease.request.gpus = gpus
+    lease.request.uid = client_of(core, client).uid
+    lease.request.load_peak_bytes, lease.request.steady_bytes = drift.expected_bytes(
+        core, lease.spec
+    )
     standby.queue_again(core, lease, client, request, core.now, wait_timeout_s)
     costs.wanted(core, lease.spec.consumer)
     core.unanswered.append(lease)
@@ -238,11 +242,11 @@ def reacquire(core: Core, event: Reacquired) -> None:
             "ask as its holder",
         )
     if lease.state in AWAY:
-        lease.traceparent = event.traceparent
+        lease.request.traceparent = event.traceparent
         _want_back(core, lease, event.client, event.request, event.wait_timeout_s)
         return
     if lease.state is LeaseState.VERIFYING and (lease.comes_back or lease.parks):
-        lease.traceparent = event.traceparent
+        lease.request.traceparent = event.traceparent
         lease.recalled = lease.recalled or Recall(core.now, event.wait_timeout_s)
     elif lease.state is not LeaseState.QUEUED:
         raise bad_state(
@@ -255,13 +259,17 @@ def reacquire(core: Core, event: Reacquired) -> None:
 def answer_queued(core: Core) -> None:
     """After the scheduling: whoever was not granted at once is told that it waits, and why."""
     for lease in core.unanswered:
-        if lease.state is LeaseState.QUEUED and not lease.answered and lease.request is not None:
-            lease.answered = True
+        if (
+            lease.state is LeaseState.QUEUED
+            and not lease.request.answered
+            and lease.request.id is not None
+        ):
+            lease.request.answered = True
             view = explain.view(core, lease)
             core.note(
                 "queued", lease, position=view["position"], reason=explain.wait_reason(core, lease)
             )
-            core.reply(lease.client, lease.request, {"state": "queued", "lease": view})
+            core.reply(lease.client, lease.request.id, {"state": "queued", "lease": view})
     core.unanswered.clear()
 
 
@@ -274,7 +282,7 @@ def find_again(core: Core, event: AcquireRequested, client: Client) -> bool:
     if lease is None:
         raise ended_error(core.ended[lease_id])
     if lease.state in AWAY and _still_waits(lease, event):
-        lease.traceparent = event.traceparent
+        lease.request.traceparent = event.traceparent
         _want_back(core, lease, event.client, event.request, event.wait_timeout_s)
         return True
     core.hand_to(
@@ -288,7 +296,7 @@ def find_again(core: Core, event: AcquireRequested, client: Client) -> bool:
 def _still_waits(lease: Lease, event: AcquireRequested) -> bool:
     """Does the newest acquire of a lease that is away wait still? A restart ended its wait: what came back from the journal was, as far as
     anybody knows, not granted since it was asked for. A late repeat of one that waited and was granted means nothing."""
-    return event.nonce == lease.nonce and lease.granted_at <= lease.arrived_at
+    return event.nonce == lease.request.nonce and lease.granted_at <= lease.request.arrived_at
 
 
 def cancel(core: Core, event: CancelRequested) -> None:
@@ -349,7 +357,7 @@ def on_wait_timeout(core: Core, lease_id: str) -> None:
     why = explain.explain_lease(core, lease)
     error = {
         "code": "wait_timeout",
-        "message": f"{lease.spec.consumer} waited {core.now - lease.arrived_at:.1f} s: {why['text']}",
+        "message": f"{lease.spec.consumer} waited {core.now - lease.request.arrived_at:.1f} s: {why['text']}",
         "hint": "wait longer, or make room",
         "details": {"why": why},
     }
@@ -373,8 +381,8 @@ def ready(core: Core, event: ReadyReported) -> None:
         "ready",
         lease,
         charge_bytes=core.gpu_of(lease).ledger.charge_bytes(lease.id),
-        declared_bytes=lease.steady_bytes,
-        measured_bytes=lease.measured_bytes,
+        declared_bytes=lease.request.steady_bytes,
+        measured_bytes=lease.observed.reported_bytes,
         load_ms=(core.now - lease.granted_at) * 1e3,
     )
     core.note("switch", lease, **explain.switch_record(core, lease))
@@ -383,22 +391,22 @@ def ready(core: Core, event: ReadyReported) -> None:
 def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     """Mark the lease held."""
     lease.move(LeaseState.HELD, core.now, "ready")
-    lease.ready_at = lease.last_used_at = core.now
+    lease.ready_at = lease.uses.last_at = core.now
     _charge_held(core, lease, measured_bytes)
     core.host.drop(lease.id)
 
 
 def _charge_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     gpu = core.gpu_of(lease)
-    lease.measured_bytes = measured_bytes
+    lease.observed.reported_bytes = measured_bytes
     drift.on_ready(core, lease, measured_bytes)
     crashes.succeeded(core, lease)
     steady = (
-        lease.steady_bytes
+        lease.request.steady_bytes
         if measured_bytes is None
         else max(measured_bytes, lease.spec.residue_bytes)
     )
-    peak = max(lease.load_peak_bytes, lease.peak_seen_bytes)
+    peak = max(lease.request.load_peak_bytes, lease.observed.peak_bytes)
     gpu.returning.give_up(lease.process, max(0, peak - steady), core.now)
     gpu.ledger.recharge(lease.id, steady, core.now)
     gpu.changed_at = core.now
@@ -450,14 +458,14 @@ def unloading(core: Core, event: UnloadStarted) -> None:
     for feature in core.features:
         feature.on_unloading(core, lease, "it unloads")
     lease.move(LeaseState.UNLOADING, core.now, "at its safe point")
-    lease.hangs = False
+    lease.departure.hangs = False
     core.timers.set(("revoke", lease.id), core.now + core.settings.revoke_deadline_s)
-    lease.baseline = gpu.sample
-    if lease.eviction is not None:
-        lease.eviction.unloading_at = core.now
-        core.learn(lease.spec.consumer, "drain_s", core.now - lease.eviction.asked_at)
+    lease.departure.baseline = gpu.sample
+    if lease.departure.eviction is not None:
+        lease.departure.eviction.unloading_at = core.now
+        core.learn(lease.spec.consumer, "drain_s", core.now - lease.departure.eviction.asked_at)
     core.reply(event.client, event.request, {"state": str(lease.state)})
-    core.note("unloading", lease, asked=lease.eviction is not None)
+    core.note("unloading", lease, asked=lease.departure.eviction is not None)
     core.wake(gpu)
 
 
@@ -492,7 +500,7 @@ def end_uses(core: Core, lease: Lease, why: str) -> None:
         if (use.process, use.id) in lease.uses:
             core.unmark(lease, use)
         note_ended(core, lease, use, why)
-    lease.yielded.clear()
+    lease.uses.paused.clear()
 
 
 def note_ended(core: Core, lease: Lease, use: Use, why: str) -> None:
@@ -540,7 +548,7 @@ def let_go(
     gpu = core.gpu_of(lease)
     end_uses(core, lease, why)
     before = lease.state
-    lease.exiting = exiting
+    lease.departure.exiting = exiting
     for feature in core.features:
         feature.on_unloading(core, lease, "it let go")
     lease.comes_back = comes_back
@@ -549,10 +557,12 @@ def let_go(
         core.host.drop(lease.id)
     lease.move(LeaseState.VERIFYING, core.now, why)
     core.timers.clear(("ttl", lease.id))
-    if lease.eviction is not None:
-        lease.eviction.unloading_at = lease.eviction.unloading_at or core.now
-        lease.eviction.released_at = core.now
-        core.learn(lease.spec.consumer, "unload_s", core.now - lease.eviction.unloading_at)
+    if lease.departure.eviction is not None:
+        lease.departure.eviction.unloading_at = lease.departure.eviction.unloading_at or core.now
+        lease.departure.eviction.released_at = core.now
+        core.learn(
+            lease.spec.consumer, "unload_s", core.now - lease.departure.eviction.unloading_at
+        )
     begin_for_lease(core, gpu, lease, alive=True)
     core.record_lease(lease)
     core.note("released", lease, exiting=exiting, was=str(before), reason=why)

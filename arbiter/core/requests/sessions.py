@@ -39,7 +39,7 @@ def _take_over(core: Core, earlier: ClientId, client: ClientId) -> None:
     core.part(earlier)
     mine = core.leases_of_client(earlier)
     for lease in _concerned(core, mine):
-        for table in (lease.uses, lease.yielded):
+        for table in (lease.uses, lease.uses.paused):
             for key, use in table.items():
                 if use.client == earlier:
                     table[key] = replace(use, client=client)
@@ -89,10 +89,11 @@ def _concerned(core: Core, own: list[Lease]) -> list[Lease]:
         lease
         for gpu in core.gpus.values()
         for lease in gpu.in_state(LeaseState.HELD, LeaseState.REVOKING)
-        if lease.uses or lease.yielded
+        if lease.uses or lease.uses.paused
     )
     return sorted(
-        {lease.id: lease for lease in (*own, *used)}.values(), key=lambda lease: lease.arrival
+        {lease.id: lease for lease in (*own, *used)}.values(),
+        key=lambda lease: lease.request.arrival,
     )
 
 
@@ -156,7 +157,7 @@ def on_journal_failed(core: Core, event: JournalFailed) -> None:
         key=event.key,
     )
     lease.move(LeaseState.DENIED, core.now, refused.message)
-    if lease.request is None:  # else: whoever held the reply back has refused the request
+    if lease.request.id is None:  # else: whoever held the reply back has refused the request
         core.push(lease, {"push": "denied", "lease_id": lease.id, "error": refused.wire()})
     core.note("denied", lease, code=refused.code, reason=refused.message)
     core.end(lease, refused.wire())

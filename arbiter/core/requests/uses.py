@@ -38,7 +38,7 @@ def begin(core: Core, event: UseBegan) -> None:
             _note_begun(core, lease, known, resumed=True)
         return
     if lease.state in LEAVING:
-        told = "" if lease.eviction is None else f": {lease.eviction.reason}"
+        told = "" if lease.departure.eviction is None else f": {lease.departure.eviction.reason}"
         raise Refused(
             "lease_revoking",
             f"{lease.spec.consumer} was asked to leave{told}",
@@ -47,12 +47,12 @@ def begin(core: Core, event: UseBegan) -> None:
         )
     if lease.state is not LeaseState.HELD:
         raise bad_state(lease, "only a held lease can be used")
-    paused = lease.yielded.get(key)
+    paused = lease.uses.paused.get(key)
     if paused is None:
         check_uses(core, lease, client)
     core.mark(lease, paused or Use(event.use, client.id, client.process, event.label, core.now))
     use = lease.uses[key] = replace(lease.uses[key], client=client.id)
-    lease.last_used_at = core.now
+    lease.uses.last_at = core.now
     if _is_kept(lease, use):
         core.record_lease(lease)  # before the reply: from then on its user counts on it
     core.reply(event.client, event.request, {"uses": len(lease.uses)})
@@ -78,11 +78,11 @@ def yield_(core: Core, event: UseYielded) -> None:
     use = lease.uses.get(key)
     if use is not None:
         _unmark(core, lease, use)
-        lease.yielded[key] = replace(use, client=client.id)
-        lease.last_used_at = core.now
+        lease.uses.paused[key] = replace(use, client=client.id)
+        lease.uses.last_at = core.now
         core.note("use_yielded", lease, use_id=use.id, label=use.label, uses=len(lease.uses))
         _safe_point(core, lease)
-    elif key not in lease.yielded:
+    elif key not in lease.uses.paused:
         raise bad_state(lease, f"it has no use {event.use} of yours to yield")
     core.reply(event.client, event.request, {"uses": len(lease.uses)})
 
@@ -92,7 +92,7 @@ def end(core: Core, event: UseEnded) -> None:
     client = client_of(core, event.client)
     lease = lease_for(core, event.lease, event.token)
     key = (client.process, event.use)
-    use = lease.uses.get(key) or lease.yielded.get(key)
+    use = lease.uses.get(key) or lease.uses.paused.get(key)
     if use is not None:
         end_use(core, lease, use, "ended")
     core.reply(event.client, event.request, {"uses": len(lease.uses)})
@@ -104,9 +104,9 @@ def end_use(core: Core, lease: Lease, use: Use, why: str) -> None:
     busy = key in lease.uses
     if busy:
         _unmark(core, lease, use)
-        lease.last_used_at = core.now
+        lease.uses.last_at = core.now
     else:
-        del lease.yielded[key]
+        del lease.uses.paused[key]
     note_ended(core, lease, use, why)
     if busy:
         _safe_point(core, lease)

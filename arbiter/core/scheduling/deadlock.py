@@ -35,7 +35,7 @@ def resolve(core: Core) -> None:
         if not cycle:
             return
         users = [waiter for waiter in cycle if waiter.process in core.users]
-        _deny(core, max(users, key=lambda waiter: waiter.arrival), cycle)
+        _deny(core, max(users, key=lambda waiter: waiter.request.arrival), cycle)
 
 
 def find(core: Core) -> list[Lease]:
@@ -43,7 +43,7 @@ def find(core: Core) -> list[Lease]:
     state = _Reduction(core)
     left = state.run()
     candidates = [w for w in left if w.process in state.waits and not w.spec.independent]
-    for waiter in sorted(candidates, key=lambda waiter: -waiter.arrival):
+    for waiter in sorted(candidates, key=lambda waiter: -waiter.request.arrival):
         cycle = _way_back(waiter, state.waits_for)
         if cycle:
             return cycle
@@ -82,12 +82,12 @@ class _Reduction:
             for gpu in self.core.gpus.values():
                 self._serve(gpu)
         left = [lease for lease in self.core.waiting.values() if lease.id not in self.served]
-        return sorted(left, key=lambda lease: lease.arrival)
+        return sorted(left, key=lambda lease: lease.request.arrival)
 
     def waits_for(self, waiter: Lease) -> list[Lease]:
         """Other waiters (or itself) without which it cannot be served: those before it, and those whose processes use what is in its way."""
         found: dict[LeaseId, Lease] = {}
-        for gpu_id in waiter.gpus:
+        for gpu_id in waiter.request.gpus:
             gpu = self.core.gpus[gpu_id]
             head = next((lease for lease in gpu.queue if lease.id not in self.served), None)
             if head is not None and head is not waiter:
@@ -105,7 +105,7 @@ class _Reduction:
         for waiter in gpu.queue:
             if waiter.id in self.served or (head is not None and waiter.process not in self.waits):
                 continue  # no wait depends on a request behind a head that uses nothing
-            wish = (waiter.load_peak_bytes, waiter.spec.exclusive)
+            wish = (waiter.request.load_peak_bytes, waiter.spec.exclusive)
             alike = waiter.process not in gpu.ledger.accounts and not gpu.ledger.strangers
             possible = known.get(wish) if alike else None
             if possible is None:
@@ -203,7 +203,7 @@ def _deny(core: Core, waiter: Lease, cycle: list[Lease]) -> None:
 
 def _link(core: Core, waiter: Lease, following: Lease) -> dict[str, Any]:
     used = core.users.get(following.process, {}).values()
-    theirs = {lease.id: lease for lease in used if lease.gpu in waiter.gpus}
+    theirs = {lease.id: lease for lease in used if lease.gpu in waiter.request.gpus}
     held = {lease.id: lease for lease in core.users.get(waiter.process, {}).values()}
     return {
         "pid": waiter.process.pid,

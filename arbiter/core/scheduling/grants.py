@@ -64,7 +64,7 @@ def _serve(core: Core, gpu: Gpu) -> None:
     leaving = policy.leaving(gpu)
     planned = policy.fits(gpu, head, leaving)
     if planned:
-        head.reason = "room is being made"
+        head.request.reason = "room is being made"
     elif _ask_victims(core, gpu, head, leaving):  # 6
         leaving, planned = policy.leaving(gpu), True
     _backfill(core, gpu, head, leaving, planned=planned)  # 7
@@ -84,32 +84,34 @@ def _grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> None:
     room = policy.measured_room_bytes(core, gpu)
     need = policy.measured_need_bytes(gpu, lease)
     if room is None or (room < need and policy.sample_is_behind(gpu)):
-        lease.reason = "waits for a fresh reading of the card"
+        lease.request.reason = "waits for a fresh reading of the card"
         core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
         return
     if room < need:
-        lease.reason = "the ledger has room, the card does not: measured memory is not free yet"
-        gpu.blocked = lease.reason
+        lease.request.reason = (
+            "the ledger has room, the card does not: measured memory is not free yet"
+        )
+        gpu.blocked = lease.request.reason
         return
     grant(core, gpu, lease)
 
 
 def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int]) -> bool:
     if policy.residue_under_measurement(gpu):
-        head.reason = "a dead process's memory is being measured"
+        head.request.reason = "a dead process's memory is being measured"
         return False
     plan = policy.choose_victims(core, gpu, head, leaving)
     if plan is None:
-        head.reason = "nobody who could make room may be asked now"
+        head.request.reason = "nobody who could make room may be asked now"
         policy.wake_when_evictable(core, gpu, head)
         return False
-    if len(head.gpus) > 1 and not policy.is_best_place(core, gpu, head, plan):
+    if len(head.request.gpus) > 1 and not policy.is_best_place(core, gpu, head, plan):
         return False
-    head.planned_gpu = gpu.info.id
-    head.reason = "room is being made"
+    head.request.planned_gpu = gpu.info.id
+    head.request.reason = "room is being made"
     for victim in plan:
         eviction.ask(core, gpu, victim, head, f"{head.spec.consumer} needs the room")
-    for gpu_id in head.gpus:
+    for gpu_id in head.request.gpus:
         core.wake(core.gpus[gpu_id])  # those behind it there are no longer behind it
     return True
 
@@ -141,7 +143,7 @@ def _backfill(
     most = min(free, spare) + fold
     alone = not gpu.ledger.leases()
     for lease in gpu.queue.behind_head():
-        if lease.load_peak_bytes > most or (lease.spec.exclusive and not alone):
+        if lease.request.load_peak_bytes > most or (lease.spec.exclusive and not alone):
             continue  # seen at a glance: thousands may wait
         if lease is head or _is_owned(core, lease) or (stuck and not _may_be_asked(core, lease)):
             continue
@@ -156,7 +158,9 @@ def _is_owned(core: Core, lease: Lease) -> bool:
 
 def _may_be_asked(core: Core, lease: Lease) -> bool:
     """Could it be asked to leave once it is resident? If a stowaway gives back a part, the head may need what this one took."""
-    return (lease if lease.extends is None else core.leases[lease.extends]).evictable
+    return (
+        lease if lease.request.extends is None else core.leases[lease.request.extends]
+    ).evictable
 
 
 def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
@@ -171,31 +175,35 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     lease.gpu = gpu.info.id
     lease.move(LeaseState.LOADING, core.now, "came back by itself" if by_itself else "granted")
     lease.granted_at = lease.held_from = core.now
-    lease.reason = ""
+    lease.request.reason = ""
     gpu.residents[lease.id] = lease
     gpu.ledger.charge(
-        lease.id, lease.process, lease.load_peak_bytes, lease.load_peak_bytes, core.now
+        lease.id,
+        lease.process,
+        lease.request.load_peak_bytes,
+        lease.request.load_peak_bytes,
+        core.now,
     )
     gpu.changed_at = core.now
     core.granted.append((token, gpu.info.id))
     lease.expires_at = core.now + lease.spec.ttl_s
     core.timers.set(("ttl", lease.id), lease.expires_at)
     core.record_lease(lease, gates=True)
-    if lease.answered:
+    if lease.request.answered:
         core.push(lease, {"push": "granted", "lease": explain.view(core, lease)})
-        lease.request = None
+        lease.request.id = None
     else:
-        assert lease.request is not None, f"{lease.id} was never asked for"
+        assert lease.request.id is not None, f"{lease.id} was never asked for"
         core.reply(
-            lease.client, lease.request, {"state": "loading", "lease": explain.view(core, lease)}
+            lease.client, lease.request.id, {"state": "loading", "lease": explain.view(core, lease)}
         )
-        lease.answered = True
+        lease.request.answered = True
     core.note(
         "granted",
         lease,
-        charge_bytes=lease.load_peak_bytes,
-        waited_ms=(core.now - lease.arrived_at) * 1e3,
-        evicted=[e.consumer for e in lease.evicted],
+        charge_bytes=lease.request.load_peak_bytes,
+        waited_ms=(core.now - lease.request.arrived_at) * 1e3,
+        evicted=[e.consumer for e in lease.request.evicted],
         **({"by_itself": True} if by_itself else {}),
         reason=_why_now(lease, by_itself=by_itself),
     )
@@ -205,8 +213,8 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
 def _why_now(lease: Lease, *, by_itself: bool) -> str:
     if by_itself:
         return "back from standby: there is room and nobody waits"
-    if lease.evicted:
-        return "fits after " + ", ".join(e.consumer for e in lease.evicted) + " left"
+    if lease.request.evicted:
+        return "fits after " + ", ".join(e.consumer for e in lease.request.evicted) + " left"
     return "fits"
 
 
@@ -218,7 +226,7 @@ def _collect_evictions(core: Core, gpu: Gpu, lease: Lease) -> None:
         if e.wanted_by == lease.id
         or (e.verdict and (e.wanted_by is None or e.wanted_by not in core.waiting))
     ]
-    lease.evicted = [e for e in mine if e.verdict]
+    lease.request.evicted = [e for e in mine if e.verdict]
     gpu.evictions = [e for e in gpu.evictions if e not in mine]
-    for gone in lease.evicted:
+    for gone in lease.request.evicted:
         costs.switched(core, gone.consumer, lease.spec.consumer)

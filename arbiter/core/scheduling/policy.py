@@ -70,7 +70,9 @@ def leaving(gpu: Gpu) -> dict[LeaseId, int]:
     going: dict[LeaseId, int] = {}
     for lease in gpu.in_state(*_LEAVING):
         verification = gpu.verifications.get(lease.id)
-        overdue = lease.hangs or bool(lease.eviction and lease.eviction.overdue)
+        overdue = lease.departure.hangs or bool(
+            lease.departure.eviction and lease.departure.eviction.overdue
+        )
         late = verification.overdue if verification else overdue
         if not late:
             going[lease.id] = lease.residue_bytes
@@ -88,7 +90,7 @@ def room_is_coming(gpu: Gpu) -> bool:
     """Does anybody unload, or is anybody measured, who is not late with it?"""
     for lease in gpu.in_state(LeaseState.UNLOADING, LeaseState.VERIFYING):
         verification = gpu.verifications.get(lease.id)
-        if not (verification.overdue if verification else lease.hangs):
+        if not (verification.overdue if verification else lease.departure.hangs):
             return True
     return False
 
@@ -100,7 +102,11 @@ def residue_under_measurement(gpu: Gpu) -> bool:
 
 def joining(lease: Lease) -> Mapping[ProcessKey, int]:
     """What a grant charges, by process: one lease's load peak, or what the leases of a group need together."""
-    return {lease.process: lease.load_peak_bytes} if lease.needs is None else lease.needs
+    return (
+        {lease.process: lease.request.load_peak_bytes}
+        if lease.request.needs is None
+        else lease.request.needs
+    )
 
 
 def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool:
@@ -109,7 +115,7 @@ def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool
         if any(other not in going for other in gpu.ledger.leases()):
             return False
     elif gpu.residents.exclusive and any(
-        other not in going and other != lease.extends for other in gpu.residents.exclusive
+        other not in going and other != lease.request.extends for other in gpu.residents.exclusive
     ):
         return False
     elif gpu.verifications and any(
@@ -148,7 +154,7 @@ def placed_elsewhere(core: Core, gpu: Gpu, lease: Lease) -> bool:
 
     Not once a holder there has outstayed the deadline, or has left and it was not enough.
     """
-    there = lease.planned_gpu
+    there = lease.request.planned_gpu
     if there is None or there == gpu.info.id:
         return False
     return any(
@@ -185,7 +191,7 @@ def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
     ):
         return None  # who came and died since may still be on the card, with its load peak
     unseen = sum(
-        max(gpu.ledger.charge_bytes(lease.id), lease.load_peak_bytes)
+        max(gpu.ledger.charge_bytes(lease.id), lease.request.load_peak_bytes)
         for lease in gpu.residents.unseen(sample.taken_at)
     )
     return min(gpu.info.capacity_bytes, sample.total_bytes) - sample.used_bytes - unseen
@@ -193,9 +199,9 @@ def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
 
 def measured_need_bytes(gpu: Gpu, lease: Lease) -> int:
     """What the reading must have free: what a grant charges, less what the processes already hold (their contexts)."""
-    if lease.needs is None:
-        return _unheld_bytes(gpu, lease.process, lease.load_peak_bytes)
-    return sum(_unheld_bytes(gpu, process, count) for process, count in lease.needs.items())
+    if lease.request.needs is None:
+        return _unheld_bytes(gpu, lease.process, lease.request.load_peak_bytes)
+    return sum(_unheld_bytes(gpu, process, count) for process, count in lease.request.needs.items())
 
 
 def _unheld_bytes(gpu: Gpu, process: ProcessKey, count: int) -> int:
@@ -229,7 +235,7 @@ def choose_victims(
         lease
         for lease in gpu.in_state(LeaseState.HELD)
         if may_ask(core, lease)
-        and lease.id != waiter.extends
+        and lease.id != waiter.request.extends
         and (not lease.in_use or lease.spec.priority <= priority)
     ]
     search = _oldest if core.settings.scheduling.least_recent else _search
@@ -302,14 +308,14 @@ def ask_times(core: Core, gpu: Gpu, waiter: Lease | None) -> list[float]:
         times.append(residency_ends_at(core, lease, waiter))
         if waiter is not None and lease.in_use:
             gap = lease.spec.priority - waiter.spec.priority
-            times.append(waiter.arrived_at + gap * ageing_s + _WAKE_SLACK_S)
+            times.append(waiter.request.arrived_at + gap * ageing_s + _WAKE_SLACK_S)
     return [at for at in times if at > core.now]
 
 
 def is_best_place(core: Core, gpu: Gpu, waiter: Lease, plan: Sequence[Lease]) -> bool:
     """Of several cards that a waiter could be placed on, is emptying this one the cheapest? Wakes the better one."""
     best, best_cost = gpu, _cost(plan, gpu.info.index)
-    for gpu_id in waiter.gpus:
+    for gpu_id in waiter.request.gpus:
         other = core.gpus[gpu_id]
         if other is gpu or other.queue.head() is not waiter:
             continue
@@ -351,7 +357,7 @@ def _cost(plan: Sequence[Lease], index: int) -> tuple[int, int, int, int, int]:
         _in_use(plan),
         max((lease.spec.priority for lease in plan), default=0),
         len(plan),
-        sum(lease.steady_bytes for lease in plan),
+        sum(lease.request.steady_bytes for lease in plan),
         index,
     )
 
@@ -435,7 +441,12 @@ def _oldest(
     """Idle ones first, then least recent use alone, until it is enough; all candidates together are."""
     order = sorted(
         candidates,
-        key=lambda lease: (lease.in_use, not freed[lease.id], lease.last_used_at, lease.arrival),
+        key=lambda lease: (
+            lease.in_use,
+            not freed[lease.id],
+            lease.uses.last_at,
+            lease.request.arrival,
+        ),
     )
     return order[: next(n for n in range(1, len(order) + 1) if covers(_leave(order[:n])))]
 
@@ -447,8 +458,8 @@ def _fineness(
         sum(1 for lease in plan if not costs.can_park(core, lease)),
         sum(costs.reload_s(core, lease) for lease in plan),
         sum(freed[lease.id] for lease in plan),
-        max(lease.last_used_at for lease in plan),
-        tuple(lease.arrival for lease in plan),
+        max(lease.uses.last_at for lease in plan),
+        tuple(lease.request.arrival for lease in plan),
     )
 
 
@@ -463,8 +474,8 @@ def _greedy(
             lease.spec.priority,
             not costs.can_park(core, lease),
             -freed[lease.id],
-            lease.last_used_at,
-            lease.arrival,
+            lease.uses.last_at,
+            lease.request.arrival,
         ),
     )
     size = 1 + bisect_left(range(1, len(order)), True, key=lambda n: covers(_leave(order[:n])))
@@ -504,8 +515,8 @@ def spare_unplanned_bytes(
 
 def passed(gpu: Gpu, lease: Lease, head: Lease) -> bool:
     """Was it granted, or did it grow, while this waiter stood before it?"""
-    overtook = lease.granted_at >= head.arrived_at and gpu.queue.precedes(head, lease)
-    return overtook or gpu.residents.enlarged.get(lease.id, -inf) >= head.arrived_at
+    overtook = lease.granted_at >= head.request.arrived_at and gpu.queue.precedes(head, lease)
+    return overtook or gpu.residents.enlarged.get(lease.id, -inf) >= head.request.arrived_at
 
 
 def _ever_freed(
@@ -515,6 +526,6 @@ def _ever_freed(
     leave = [
         lease
         for lease in gpu.residents.values()
-        if lease.id != head.extends and not (stays and stays(lease))
+        if lease.id != head.request.extends and not (stays and stays(lease))
     ]
     return {**_leave(leave), **going}

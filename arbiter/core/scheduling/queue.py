@@ -31,20 +31,20 @@ class WaitQueue:
         return (self._leases[arrival] for _, arrival in self._ranks)
 
     def __contains__(self, lease: Lease) -> bool:
-        return lease.arrival in self._leases
+        return lease.request.arrival in self._leases
 
     def add(self, lease: Lease) -> None:
         insort(self._ranks, self.rank(lease))
-        insort(self._needs, lease.load_peak_bytes)
-        self._leases[lease.arrival] = lease
+        insort(self._needs, lease.request.load_peak_bytes)
+        self._leases[lease.request.arrival] = lease
 
     def discard(self, lease: Lease) -> None:
         """Take a waiter out; one that is not here is fine."""
-        if lease.arrival not in self._leases:
+        if lease.request.arrival not in self._leases:
             return
-        del self._leases[lease.arrival]
+        del self._leases[lease.request.arrival]
         del self._ranks[bisect_left(self._ranks, self.rank(lease))]
-        del self._needs[bisect_left(self._needs, lease.load_peak_bytes)]
+        del self._needs[bisect_left(self._needs, lease.request.load_peak_bytes)]
 
     def head(self) -> Lease | None:
         return self._leases[self._ranks[0][1]] if self._ranks else None
@@ -77,6 +77,9 @@ class WaitQueue:
 
     def rank(self, lease: Lease) -> Rank:
         """Its place in the order of any queue."""
-        if lease.rank is not None:
-            return (lease.rank, lease.arrival)
-        return (lease.arrived_at - lease.spec.priority * self._ageing_s, lease.arrival)
+        if lease.request.rank is not None:
+            return (lease.request.rank, lease.request.arrival)
+        return (
+            lease.request.arrived_at - lease.spec.priority * self._ageing_s,
+            lease.request.arrival,
+        )

@@ -20,7 +20,7 @@ def begin_for_lease(
     core: Core, gpu: Gpu, lease: Lease, *, alive: bool, grace_s: float = 0.0, fenced_at: float = 0.0
 ) -> None:
     """Measure a lease's bytes away. Its charge is in the ledger and stays there until the verdict."""
-    baseline = lease.baseline or gpu.sample or gpu.before_sleep
+    baseline = lease.departure.baseline or gpu.sample or gpu.before_sleep
     drift.on_leaving(core, lease)
     comparable = baseline is not None and 0.0 < lease.ready_at <= baseline.taken_at
     verification = Verification(
@@ -38,7 +38,7 @@ def begin_for_lease(
         fenced_at=fenced_at,
         paced_from=core.now + grace_s,
         alive=alive,
-        exiting=lease.exiting,
+        exiting=lease.departure.exiting,
         exclusive=lease.spec.exclusive,
     )
     _begin(core, gpu, verification)
@@ -245,7 +245,7 @@ def _close_eviction(core: Core, gpu: Gpu, verification: Verification, judgement:
         if way_out.lease == verification.lease:
             way_out.verdict, way_out.verdict_at = str(judgement.verdict), core.now
             waiter = core.waiting.get(way_out.wanted_by) if way_out.wanted_by is not None else None
-            for gpu_id in () if waiter is None else waiter.gpus:
+            for gpu_id in () if waiter is None else waiter.request.gpus:
                 core.wake(
                     core.gpus[gpu_id]
                 )  # if this was not enough, it may be served on another card

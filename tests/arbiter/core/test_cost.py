@@ -94,7 +94,7 @@ class Counted:
         """One client's lease from acquire to the verdict, and a quiet reading."""
         client = ClientId("busy")
         found = {"acquire": self.counted(self.asking(client))}
-        lease = max(self.core.inspect().leases.values(), key=lambda lease: lease.arrival)
+        lease = max(self.core.inspect().leases.values(), key=lambda lease: lease.request.arrival)
         assert lease.token is not None
         one = (lease.id, lease.token)
         found["ready"] = self.counted(ev.ReadyReported(client, self.request(), *one, None))

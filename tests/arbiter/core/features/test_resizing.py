@@ -135,11 +135,16 @@ def test_the_holders_own_word_follows_its_size(residue: int) -> None:
     vlm.load(lease, GIB if residue else 2 * GIB)
     driver.advance(2.0)
     assert answer(vlm.resize(lease, 3 * GIB))["state"] == "growing"
-    assert driver.arbiter.inspect().leases[lease].measured_bytes == (2 if residue else 3) * GIB
+    assert (
+        driver.arbiter.inspect().leases[lease].observed.reported_bytes
+        == (2 if residue else 3) * GIB
+    )
     vlm.hold(GIB // 2)
     vlm.resize(lease, GIB // 2)
     driver.until(lambda: charge(driver, lease) == GIB // 2, limit_s=2.0)
-    assert driver.arbiter.inspect().leases[lease].measured_bytes == (0 if residue else GIB // 2)
+    assert driver.arbiter.inspect().leases[lease].observed.reported_bytes == (
+        0 if residue else GIB // 2
+    )
 
 
 def test_one_reading_that_agrees_is_not_enough() -> None:
@@ -349,7 +354,7 @@ def test_the_invariant_of_a_growth() -> None:
     vlm.resize(lease, 6 * GIB)
     core = state_of(driver.arbiter)
     growth = core.leases[driver.arbiter.inspect().resizing.growths[lease]]
-    growth.extends = LeaseId("gone")
+    growth.request.extends = LeaseId("gone")
     with pytest.raises(InvariantViolation, match="which is not there"):
         invariants.check(core)
 

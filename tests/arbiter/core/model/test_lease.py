@@ -10,6 +10,7 @@ from vram_arbiter.arbiter.core.model.lease import (
     IllegalTransition,
     Lease,
     LeaseState,
+    Request,
 )
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey
 
@@ -18,7 +19,8 @@ def lease(priority: int = 50, residue_bytes: int = 7) -> Lease:
     spec = Spec(
         "det", ModelKey("m"), "any", False, 10, 10, residue_bytes, priority, True, 10.0, 2.0, False
     )
-    return Lease(LeaseId("L1-1"), "n", spec, ProcessKey(1, 1), ClientId("c"), 100.0, 1, 10, 10, ())
+    request = Request("n", 100.0, 1, 10, 10)
+    return Lease(LeaseId("L1-1"), spec, ProcessKey(1, 1), ClientId("c"), request)
 
 
 def test_every_state_is_in_the_table_and_terminal_ones_lead_nowhere() -> None:
@@ -64,7 +66,7 @@ def test_an_illegal_move_changes_nothing_and_carries_the_story(to: LeaseState) -
     ) as caught:
         one.move(to, 101.0, "no")
     assert caught.value.lease_id == one.id
-    assert (one.state, one.since, one.story) == (LeaseState.QUEUED, 0.0, [])
+    assert (one.state, one.since, one.story) == (LeaseState.QUEUED, 100.0, [])
 
 
 def test_priority_grows_by_a_point_for_every_five_seconds_waited() -> None:
@@ -81,5 +83,5 @@ def test_priority_grows_by_a_point_for_every_five_seconds_waited() -> None:
 def test_a_process_that_exits_keeps_nothing() -> None:
     one = lease(residue_bytes=7)
     assert one.residue_bytes == 7
-    one.exiting = True
+    one.departure.exiting = True
     assert one.residue_bytes == 0

@@ -362,7 +362,9 @@ def test_the_head_says_what_keeps_the_engine_from_asking() -> None:
     det, lease = held(driver, "det", 5)
     det.use_begin(lease)
     waiting = driver.consumer("vlm").acquire(5 * GIB, priority=d.PRIORITY - 10)
-    assert core_lease(driver, waiting).reason == "nobody who could make room may be asked now"
+    assert (
+        core_lease(driver, waiting).request.reason == "nobody who could make room may be asked now"
+    )
 
 
 def test_nobody_is_asked_while_a_dead_process_may_still_make_room() -> None:
@@ -374,7 +376,7 @@ def test_nobody_is_asked_while_a_dead_process_may_still_make_room() -> None:
     _, lease = held(driver, "det", 5)
     gone.die()
     waiting = driver.consumer("vlm").acquire(3 * GIB)
-    assert core_lease(driver, waiting).reason == "a dead process's memory is being measured"
+    assert core_lease(driver, waiting).request.reason == "a dead process's memory is being measured"
     assert driver.state(lease) == "held"
 
 

@@ -66,7 +66,7 @@ def test_whoever_names_another_card_or_is_too_large_waits_only_where_it_may_be(
     named = driver.consumer("named").acquire(5 * GIB, gpu="0")
     any_card = driver.consumer("any").acquire(7 * GIB)
     waiting = driver.arbiter.inspect().waiting
-    assert (waiting[named].gpus, waiting[any_card].gpus) == ((ZERO,), (ZERO, ONE))
+    assert (waiting[named].request.gpus, waiting[any_card].request.gpus) == ((ZERO,), (ZERO, ONE))
 
 
 def test_a_growth_stays_on_its_card(driver: CoreDriver) -> None:
@@ -79,7 +79,7 @@ def test_a_growth_stays_on_its_card(driver: CoreDriver) -> None:
     driver.until(lambda: driver.state(pinned) == "over")
     driver.advance(1.0)
     (growth,) = driver.arbiter.inspect().waiting.values()
-    assert growth.gpus == (ZERO,)
+    assert growth.request.gpus == (ZERO,)
 
 
 # -- away ------------------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Order of waiters: priority, arrival, and ageing that never reorders equals."""
 
 from vram_arbiter.arbiter.core.events import Spec
-from vram_arbiter.arbiter.core.model.lease import Lease
+from vram_arbiter.arbiter.core.model.lease import Lease, Request
 from vram_arbiter.arbiter.core.scheduling.queue import WaitQueue
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey
 
@@ -10,20 +10,15 @@ def waiter(arrival: int, at: float, priority: int = 50, need: int = 10) -> Lease
     spec = Spec("c", ModelKey("m"), "any", False, need, need, 0, priority, True, 10.0, 0.0, False)
     return Lease(
         LeaseId(f"L1-{arrival}"),
-        "n",
         spec,
         ProcessKey(1, 1),
         ClientId("c"),
-        at,
-        arrival,
-        need,
-        need,
-        (),
+        Request("n", at, arrival, need, need),
     )
 
 
 def order(queue: WaitQueue) -> list[int]:
-    return [lease.arrival for lease in queue]
+    return [lease.request.arrival for lease in queue]
 
 
 def test_priority_then_arrival() -> None:
@@ -36,7 +31,7 @@ def test_priority_then_arrival() -> None:
     ):
         queue.add(lease)
     assert order(queue) == [3, 1, 2, 4]
-    assert [lease.arrival for lease in queue.behind_head()] == [1, 2, 4]
+    assert [lease.request.arrival for lease in queue.behind_head()] == [1, 2, 4]
 
 
 def test_ageing_bounds_the_wait_behind_higher_priorities() -> None:
