@@ -1,6 +1,7 @@
-"""`python -m vram_arbiter.arbiter.lab`: what `vramctl replay` and `vramctl simulate` start. Parse, call, print.
+"""`python -m vram_arbiter.arbiter.lab`: policies compared offline.
 
-Exit codes: 0 identical or done, 1 a divergence or an input that cannot be read, 2 wrong usage; 130 Ctrl-C, 141 the reader of the output left.
+`vramctl simulate` starts it, and `vramctl replay --policy`. Exit codes: 0 done, 1 an input that
+cannot be read, 2 wrong usage; 130 Ctrl-C, 141 the reader of the output left.
 """
 
 import argparse
@@ -11,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from vram_arbiter.arbiter.core.scheduling.policies import DEFAULT, SCHEDULING
-from vram_arbiter.arbiter.eventlog import replay as runner
+from vram_arbiter.arbiter.eventlog import text as replay_text
 from vram_arbiter.arbiter.eventlog.codec import to_json
+from vram_arbiter.arbiter.eventlog.replay import load
 from vram_arbiter.arbiter.lab import compare, text
 from vram_arbiter.arbiter.lab.outcome import Outcome, as_plain
 from vram_arbiter.schemas.errors import VramError
@@ -25,30 +27,33 @@ TIMELINE_LINES = 40
 _POLICIES = (
     "engine policies: "
     + "; ".join(f"{name}: {rules.summary}" for name, rules in SCHEDULING.items())
-    + ". For comparison, rules of other programs: unmanaged (everybody loads at once), ollama_rules, llama_swap_rules."
+    + ". For comparison, rules of other programs: unmanaged (every model loads at once), "
+    "ollama_rules, llama_swap_rules."
 )
-_WHAT_TO_SIMULATE = "name a readable YAML file, or one that is shipped: desktop, find-navigate-grab, small-behind-large, two-thrashing"
-_EXIT = "exit codes: 0 identical or done \u00b7 1 a divergence, or an input that cannot be read \u00b7 2 wrong usage"
+_WHAT_TO_SIMULATE = (
+    "name a readable YAML file, or one that is shipped: "
+    "desktop, find-navigate-grab, small-behind-large, two-thrashing"
+)
+_EXIT = "exit codes: 0 done · 1 an input that cannot be read · 2 wrong usage"
 
 
 def parser() -> argparse.ArgumentParser:
-    made = argparse.ArgumentParser(
-        prog="vramctl", description="Logs and scenarios, through the engine."
-    )
+    made = argparse.ArgumentParser(prog="vramctl", description="Policies, compared offline.")
     commands = made.add_subparsers(dest="command", required=True)
     again = commands.add_parser(
         "replay",
-        help="the same decisions, byte for byte?",
-        description="Feeds a log to the engine again and compares every decision: identical, or the first one that is another. "
-        "LOG is a file, or the state folder of a daemon (its newest start). With --policy: simulates what other policies would have done.",
+        help="a recorded log under other policies",
+        description="Simulate what other policies would have decided, with the arrivals, uses and "
+        "loads of a log. LOG is a file, or the state folder of a daemon (its newest start).",
         epilog=f"{_POLICIES} {_EXIT}",
     )
     again.add_argument("log", metavar="LOG", type=Path)
     what = commands.add_parser(
         "simulate",
         help="a scenario under one or more policies",
-        description="Runs a scenario (YAML: cards, consumers, arrivals) through the engine and prints the decisions, waits, switches and peak "
-        "bytes; with several policies, side by side. SCENARIO is a file, or the name of one that is shipped in configs/scenarios.",
+        description="Run a scenario (YAML: GPUs, consumers, arrivals) through the engine and print "
+        "the decisions, waits, switches and peak bytes; with several policies, side by side. "
+        "SCENARIO is a file, or the name of one that is shipped in configs/scenarios.",
         epilog=f"{_POLICIES} {_EXIT}",
     )
     what.add_argument("scenario", metavar="SCENARIO", type=Path)
@@ -57,7 +62,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="N",
         type=_count,
         default=None,
-        help=f"so many lines of decisions (default: {TIMELINE_LINES} for one policy, else 0)",
+        help=f"print N decisions (default: {TIMELINE_LINES} for one policy, else 0)",
     )
     add_version(made)
     for command in (again, what):
@@ -67,6 +72,7 @@ def parser() -> argparse.ArgumentParser:
             metavar="NAME",
             action="append",
             default=[],
+            required=command is again,
             choices=(*compare.POLICIES, "all"),
             help="may be given several times; all: every one",
         )
@@ -76,45 +82,34 @@ def parser() -> argparse.ArgumentParser:
 
 def _count(written: str) -> int:
     if not written.isdecimal():
-        raise argparse.ArgumentTypeError(f"{written!r} is no number of lines")
+        raise argparse.ArgumentTypeError(f"expected a line count, got {written!r}")
     return int(written)
 
 
 @terminal.program
 def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command. Returns the exit code."""
     flags = parser().parse_args(argv)
-    policies = (
-        list(compare.POLICIES) if "all" in flags.policy else list(dict.fromkeys(flags.policy))
-    )
+    policies = list(compare.POLICIES if "all" in flags.policy else dict.fromkeys(flags.policy))
     try:
         if flags.command == "simulate":
-            return simulate(
-                flags.scenario, policies or [DEFAULT], flags.timeline, as_json=flags.as_json
-            )
-        if policies:
-            return what_if(flags.log, policies, as_json=flags.as_json)
-        return replay(flags.log, as_json=flags.as_json)
+            simulate(flags.scenario, policies or [DEFAULT], flags.timeline, as_json=flags.as_json)
+        else:
+            what_if(flags.log, policies, as_json=flags.as_json)
     except VramError as error:
         if flags.as_json:
             print(json.dumps({"error": error.to_wire()}, indent=2))
         else:
             terminal.complain("vramctl", error)
         return NO
+    return DONE
 
 
-def replay(log: Path, *, as_json: bool) -> int:
-    found = runner.replay(runner.load(log))
-    if as_json:
-        _print_json(runner.report(found))
-    else:
-        print("\n".join(text.replay_lines(found)))
-    return DONE if found.identical else NO
-
-
-def what_if(log: Path, policies: Sequence[str], *, as_json: bool) -> int:
+def what_if(log: Path, policies: Sequence[str], *, as_json: bool) -> None:
+    """Print what the log says beside what each policy would have decided."""
     from vram_arbiter.arbiter.lab.extract import extract
 
-    found = extract(runner.load(log))
+    found = extract(load(log))
     again = compare.under(found.workload, found.settings, found.settings.policy)
     outcomes = [
         again
@@ -133,9 +128,9 @@ def what_if(log: Path, policies: Sequence[str], *, as_json: bool) -> int:
                 "approximations": found.workload.approximations,
             }
         )
-        return DONE
+        return
     logged.policy = f"{logged.policy} (logged)"
-    notices = text.notices(found.replayed) + [
+    notices = replay_text.notices(found.replayed) + [
         f"note: {line}" for line in found.workload.approximations
     ]
     logged_and_all = [logged, *outcomes]
@@ -148,10 +143,10 @@ def what_if(log: Path, policies: Sequence[str], *, as_json: bool) -> int:
     ]
     logged.policy = found.settings.policy
     print("\n".join([*lines, *compare.check_lines(logged, again)]))
-    return DONE
 
 
-def simulate(path: Path, policies: Sequence[str], timeline: int | None, *, as_json: bool) -> int:
+def simulate(path: Path, policies: Sequence[str], timeline: int | None, *, as_json: bool) -> None:
+    """Print a scenario's decisions and tables under each policy."""
     from vram_arbiter.arbiter.lab.scenarios import settings_of, workload_of
     from vram_arbiter.schemas.config.scenario import load_scenario
     from vram_arbiter.schemas.yamltext import read_text
@@ -170,13 +165,12 @@ def simulate(path: Path, policies: Sequence[str], timeline: int | None, *, as_js
                 ],
             }
         )
-        return DONE
+        return
     print(f"{scenario.about} ({scenario.seconds:g} s, seed {scenario.seed})")
     for outcome in outcomes:
         if shown:
             print("\n".join(["", *text.timeline_lines(outcome.policy, outcome.timeline, shown)]))
     print("\n".join(["", *compare.total_lines(outcomes), "", *compare.consumer_lines(outcomes)]))
-    return DONE
 
 
 def _timeline(outcome: Outcome, limit: int) -> dict[str, Any]:

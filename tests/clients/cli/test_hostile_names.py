@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.text import Text
 
 from vram_arbiter.arbiter import log as telemetry
-from vram_arbiter.arbiter.lab import text as replay_text
+from vram_arbiter.arbiter.lab import text as lab_text
 from vram_arbiter.clients import logs
 from vram_arbiter.clients.cli import demo_display, doctor, replies, text
 from vram_arbiter.schemas.errors import BadState
@@ -155,8 +155,8 @@ SAID: dict[str, Callable[[str], list[str]]] = {
     "event, new field": lambda name: [text.event_line({**EVENT, name: name})],
     "error": lambda name: [text.error_line({"message": name, "hint": name})],
     "table": lambda name: text.table(["LEASE", "CONSUMER"], [["L1", name], [name, "x"]]),
-    "replay's table": lambda name: replay_text.table(["consumer", "waits"], [[name, 1]]),
-    "timeline": lambda name: replay_text.timeline_lines(
+    "table of the laboratory": lambda name: lab_text.table(["consumer", "waits"], [[name, 1]]),
+    "timeline": lambda name: lab_text.timeline_lines(
         name, [(1.0, "queued", {"consumer": name, "reason": name})], 5
     ),
 }

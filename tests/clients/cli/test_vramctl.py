@@ -149,7 +149,11 @@ def test_every_program_and_command_has_it(flag: str, nowhere: dict[str, str]) ->
     lines += [
         [f"vram_arbiter.{name}", flag] for name in ("arbiter", "sidecars", "reasoner", "schemas")
     ]
-    lines += [["vram_arbiter.schemas", "check", flag], ["vram_arbiter.arbiter.lab", "replay", flag]]
+    lines += [
+        ["vram_arbiter.schemas", "check", flag],
+        ["vram_arbiter.arbiter.lab", "replay", flag],
+        ["vram_arbiter.arbiter.eventlog", flag],
+    ]
     done = subprocess.run(
         [sys.executable, "-c", program, json.dumps(lines)],
         env=nowhere, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
