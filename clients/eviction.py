@@ -51,7 +51,7 @@ class Driver(Protocol):
         """Send what is queued, without waiting for an answer."""
         ...
 
-    def spawn(self, work: Callable[..., Awaitable[None]], *arguments: object, name: str) -> None:
+    def spawn(self, work: Callable[..., Awaitable[None]], *arguments: object, name: str) -> object:
         """Run work that outlives the caller; the client cancels it at its own end."""
         ...
 

@@ -349,7 +349,7 @@ async def test_a_word_that_the_arbiter_refuses_is_said_again(
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
         said: list[int] = []
-        unloading, reply = client.protocol.holdings.unloading, client.reply
+        unloading, reply = client._session.protocol.holdings.unloading, client._session.reply
 
         def counted(*arguments: Any) -> int:
             said.append(unloading(*arguments))
@@ -361,8 +361,8 @@ async def test_a_word_that_the_arbiter_refuses_is_said_again(
                 raise LimitExceeded("too many messages", hint="wait")
             return answer
 
-        monkeypatch.setattr(client.protocol.holdings, "unloading", counted)
-        monkeypatch.setattr(client, "reply", refused_once)
+        monkeypatch.setattr(client._session.protocol.holdings, "unloading", counted)
+        monkeypatch.setattr(client._session, "reply", refused_once)
         async with (
             AsyncClient("other", endpoint=arbiter_daemon.endpoint) as other,
             within(WAIT_S),
@@ -378,13 +378,13 @@ async def test_a_release_that_is_refused_ends_the_lease_all_the_same(
     """Regression: its holder renewed nothing any more, and waited for ever for a lease that was neither held nor over."""
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = await client.acquire(spec("a", 5))
-        reply = client.reply
+        reply = client._session.reply
 
         async def refused(number: int) -> dict[str, Any]:
             await reply(number)
             raise LimitExceeded("too many messages", hint="wait")
 
-        monkeypatch.setattr(client, "reply", refused)
+        monkeypatch.setattr(client._session, "reply", refused)
         with pytest.raises(LimitExceeded):
             await lease.release()
         monkeypatch.undo()
@@ -497,7 +497,7 @@ async def test_self_fencing(
         process.kill()
         process.wait()
         # without an arbiter only: a busy machine may take longer over a short ttl than it lasts
-        client.protocol.connection.grace_s = -lease.spec.ttl_s
+        client._session.protocol.connection.grace_s = -lease.spec.ttl_s
         async with within(WAIT_S):
             await lease.wait_gone()
         assert unloaded.is_set()
@@ -513,7 +513,7 @@ async def test_a_hung_daemon_is_noticed_by_silence(
 ) -> None:
     arbiter = make_arbiter().start()
     async with AsyncClient("t", endpoint=arbiter.endpoint) as client:
-        client.protocol.connection.heartbeat_s = 0.1
+        client._session.protocol.connection.heartbeat_s = 0.1
         process = arbiter.process
         assert process is not None
         process.send_signal(signal.SIGSTOP)

@@ -16,7 +16,8 @@ from tests.support.simulation.card import SimOutOfMemory
 from tests.support.simulation.clock import ProcessLoop
 from tests.support.simulation.world import Entitlement, SimProcess, World
 from vram_arbiter.clients._protocol.protocol import ClientProtocol
-from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients._session import Session
+from vram_arbiter.clients.client import CONNECT_TIMEOUT_S, AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.clients.net.dealer import Dealer
 from vram_arbiter.schemas import defaults as d
@@ -31,20 +32,16 @@ CONNECT_PAUSE_S = 0.3
 LOAD_STEPS = 3
 
 
-class SimClient(AsyncClient):
-    """The real client with simulated time, names and transport."""
+class SimSession(Session):
+    """The real client's connection with simulated time, names and sockets."""
 
-    def __init__(self, world: World, process: SimProcess, role: str = "client") -> None:
-        super().__init__(process.name, endpoint="ipc://simulated", role=role)
+    def __init__(self, world: World, process: SimProcess, role: str) -> None:
+        super().__init__(process.name, "ipc://simulated", role, CONNECT_TIMEOUT_S)
         self._world, self._process = world, process
         self.protocol = ClientProtocol(
             name=process.name, instance=world.clock.new_id("i"), role=role
         )
         process.on_kill.append(self._killed)
-
-    @property
-    def process(self) -> SimProcess:
-        return self._process
 
     def now(self) -> float:
         return self._world.clock.now
@@ -57,16 +54,32 @@ class SimClient(AsyncClient):
             super().pump()
             self._world.touch()
 
-    def may_load(self, lease: AsyncLease) -> bool:
-        """What a careful holder asks before it puts more on the card: is the lease still mine, by my own clock too?"""
-        record = self.protocol.holdings.held.get(lease.lease_id)
-        return record is not None and self.now() < self.protocol.holdings.fence_at(record)
-
     def _new_dealer(self) -> Dealer:
         return self._world.open_link(self._process, self._received, self._hung_up)  # type: ignore[return-value]
 
     def _killed(self) -> None:
         self._open = False  # what is still on the stack of a dead process must not speak
+
+
+class SimClient(AsyncClient):
+    """The real client on a simulated connection."""
+
+    def __init__(self, world: World, process: SimProcess, role: str = "client") -> None:
+        super().__init__(process.name, endpoint="ipc://simulated", role=role)
+        self._session = SimSession(world, process, role)
+        self.process = process
+
+    @property
+    def protocol(self) -> ClientProtocol:
+        return self._session.protocol
+
+    def now(self) -> float:
+        return self._session.now()
+
+    def may_load(self, lease: AsyncLease) -> bool:
+        """What a careful holder asks before it puts more on the card: is the lease still mine, by my own clock too?"""
+        record = self.protocol.holdings.held.get(lease.lease_id)
+        return record is not None and self.now() < self.protocol.holdings.fence_at(record)
 
 
 @dataclass(slots=True)
