@@ -1,6 +1,7 @@
 """`vram-sidecar`: serve one model. Reads the flags, puts a host together, runs it.
 
-Exit codes: 0 ended in order; 1 could not start or failed, another try may succeed; 2 flags, files or environment are wrong: a person has to act.
+Exit codes: 0 ended in order; 1 could not start or failed, a retry may succeed; 2 flags, files or
+environment are wrong: a person has to act.
 """
 
 import argparse
@@ -43,7 +44,8 @@ from vram_arbiter.sidecars.settings import (
 from vram_arbiter.sidecars.weights import Weights, cached
 
 FOOTPRINTS = "models/footprints.yaml"
-_ENVIRONMENT = {  # of the model libraries, before they are imported: what they write and whom they tell
+# settings of the model libraries, before they are imported: progress bars, telemetry
+_ENVIRONMENT = {
     "HF_HUB_DISABLE_PROGRESS_BARS": "1",
     "HF_HUB_DISABLE_TELEMETRY": "1",
     "TOKENIZERS_PARALLELISM": "false",
@@ -55,10 +57,14 @@ AdapterFor = Callable[[RSkillManifest, Weights], ModelAdapter]
 
 @terminal.program
 def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adapter) -> int:
-    """Entry point of `vram-sidecar` and `python -m vram_arbiter.sidecars`. `adapter_for` lets a program serve a model of its own."""
+    """Run `vram-sidecar` (also `python -m vram_arbiter.sidecars`).
+
+    `adapter_for` lets a program serve a model of its own.
+    """
     flags = _parser().parse_args(arguments)
     service = (
-        f"vram-sidecar-{flags.name}"  # each a service of its own: a trace shows which model it was
+        # one service per model, so that a trace shows which one it was
+        f"vram-sidecar-{flags.name}"
     )
     human = f"%(asctime)s {flags.name} %(levelname)s %(message)s"
     logs.set_up(service, flags.log_level, flags.log_format, human)
@@ -70,7 +76,8 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
         if flags.check:
             found = compare_weights(settings.manifest, settings.weights, adapter_for)
             print(
-                f"ok: {settings.manifest.name} from {settings.weights.source} as {adapter.kind}; {found}"
+                f"ok: {settings.manifest.name} from {settings.weights.source} as {adapter.kind}; "
+                f"{found}"
             )
             return 0
         if adapter_for is make_adapter:
@@ -85,7 +92,9 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
             logging.shutdown()
             os._exit(
                 0
-            )  # the interpreter would wait for an import of many seconds that nobody needs any more
+                # the interpreter would wait for an import of many seconds that is not needed any
+                # more
+            )
     except (VramError, ManifestError) as error:
         terminal.complain("vram-sidecar", error)
         wrong = (
@@ -98,18 +107,19 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
 
 
 def _need_packages(manifest: RSkillManifest) -> None:
-    """Raises ConfigError where the model's libraries are not installed: better now than at the first request."""
+    """Raise ConfigError where the model's libraries are not installed, before the first request."""
     if not is_passthrough(manifest):
         library = "lerobot" if manifest.kind is Kind.VLA else "transformers"
         need(f"a model of kind {manifest.kind.value}", "torch", library, extra="sidecars")
 
 
 def settings_from(flags: argparse.Namespace) -> Settings:
-    """Flags, files and environment as settings. Raises ConfigError or ManifestError."""
+    """Return flags, files and environment as settings. Raises ConfigError or ManifestError."""
     if flags.standby and flags.idle_release_s is not None:
         raise ConfigError(
-            "--standby comes back by itself and --idle-release-s leaves by itself",
-            hint="choose one: --standby for what shall be there between goals, --idle-release-s for what makes room for it",
+            "--standby returns by itself and --idle-release-s leaves by itself",
+            hint="choose one: --standby for the model that is resident between goals, "
+            "--idle-release-s for the models that make room for it",
         )
     configs = flags.configs or configs_folder(os.environ)
     manifest, weights = read_model(shipped(flags.rskill, "rskills", configs), configs)
@@ -149,8 +159,10 @@ def settings_from(flags: argparse.Namespace) -> Settings:
 
 
 def compare_weights(manifest: RSkillManifest, weights: Weights, adapter_for: AdapterFor) -> str:
-    """Compare the checkpoint with the model that its config describes, on no device. Returns what
-    was done, in words. Raises ModelError."""
+    """Compare the checkpoint with the model that its config describes, on no device.
+
+    Returns what was done, in words. Raises ModelError.
+    """
     if is_passthrough(manifest):
         return "it has no weights"
     if importlib.util.find_spec("torch") is None:
@@ -159,7 +171,7 @@ def compare_weights(manifest: RSkillManifest, weights: Weights, adapter_for: Ada
     if place is None:
         return "weights not compared with the model: they are not in the hub's cache"
     adapter = adapter_for(manifest, place)
-    with contextlib.redirect_stdout(sys.stderr):  # what the loaders print is not our answer
+    with contextlib.redirect_stdout(sys.stderr):  # the loaders' own output is not the answer
         try:
             adapter.prepare()
             adapter.load("meta")
@@ -169,7 +181,7 @@ def compare_weights(manifest: RSkillManifest, weights: Weights, adapter_for: Ada
 
 
 def open_memory(settings: Settings) -> DeviceMemory:
-    """The device of the settings. Raises NoGpu or ConfigError."""
+    """Open the device of the settings. Raises NoGpu or ConfigError."""
     if settings.device == "none":
         return NoDevice()
     if settings.device.startswith("fake:"):
@@ -184,7 +196,10 @@ def open_memory(settings: Settings) -> DeviceMemory:
 
 
 def _device(text: str | None) -> str:
-    """`--device`, else the simulated card that the environment names, else the first CUDA card. Raises ConfigError."""
+    """Return `--device`, else the simulated GPU of the environment, else the first CUDA GPU.
+
+    Raises ConfigError.
+    """
     if text is None:
         folder = os.environ.get(FOLDER_VARIABLE)
         return f"fake:{folder}" if folder else "cuda"
@@ -196,19 +211,22 @@ def _device(text: str | None) -> str:
     ):
         return text
     raise ConfigError(
-        f"--device {text} is not known", hint="write fake:FOLDER, cuda, cuda:1 or none"
+        f"--device {text} is not a device", hint="write fake:FOLDER, cuda, cuda:1 or none"
     )
 
 
 def _gpu_of(device: str) -> str:
-    """Which GPU to lease: the one that the device names, so that lease and bytes cannot differ. Raises NoGpu."""
+    """Return the GPU to lease: the device's own, so that lease and bytes cannot differ.
+
+    Raises NoGpu.
+    """
     if not device.startswith("fake:"):
         return device.partition(":")[2] or "any" if cuda.VISIBLE not in os.environ else "any"
     path = Path(device.removeprefix("fake:")) / CARD_FILE
     try:
         return parse_config(path.read_text()).uuid
     except OSError as error:
-        raise NoGpu(  # it may come: the arbiter makes the card when it starts
+        raise NoGpu(  # a retry may succeed: the arbiter creates the GPU's folder at its start
             f"{path} cannot be read: {error.strerror}",
             hint="start the arbiter with --gpu fake:8GiB",
         ) from error
@@ -218,7 +236,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="vram-sidecar",
         description="Serve one model, under a lease of the VRAM arbiter.",
-        epilog="exit codes: 0 ended in order \u00b7 1 could not start or failed, another try may succeed \u00b7 2 flags, files or environment are wrong",
+        epilog="exit codes: 0 ended in order \u00b7 1 could not start or failed, a retry may "
+        "succeed \u00b7 2 flags, files or environment are wrong",
     )
     add_version(parser)
     add = parser.add_argument
@@ -235,9 +254,9 @@ def _parser() -> argparse.ArgumentParser:
         metavar="fake:FOLDER|cuda[:N]|none",
         help=f"default: fake:${FOLDER_VARIABLE} if set, else cuda",
     )
-    add("--endpoint", metavar="EP", help="where to serve; default: <runtime folder>/<name>.sock")
-    add("--arbiter", metavar="EP", help="default: the arbiter's usual place")
-    add("--no-arbiter", action="store_true", help="load at once, stay resident, ask nobody")
+    add("--endpoint", metavar="EP", help="endpoint to serve; default: <runtime folder>/<name>.sock")
+    add("--arbiter", metavar="EP", help="default: the arbiter's usual endpoint")
+    add("--no-arbiter", action="store_true", help="load at once and stay resident, without a lease")
     add("--configs", type=Path, metavar="DIR", help="folder that local:// weights are looked up in")
     add(
         "--footprints",
@@ -253,7 +272,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--gpu",
         metavar="UUID|INDEX|any",
-        help="which card to lease; default: the simulated one, else any",
+        help="GPU to lease; default: the simulated one, else any",
     )
     add(
         "--priority",
@@ -272,43 +291,46 @@ def _parser() -> argparse.ArgumentParser:
         "--wait-timeout-s",
         type=_number(float, 0.1, 86_400),
         default=WAIT_TIMEOUT_S,
-        help="of a request for the lease; default %(default)s",
+        help="limit of a request's wait for the lease; default %(default)s",
     )
     add(
         "--request-timeout-s",
         type=_number(float, 0.1, 86_400),
         default=REQUEST_TIMEOUT_S,
-        help="of one request's work in the model: one that lasts longer is stuck, and the sidecar ends with 1; default %(default)s",
+        help="limit of one request's work in the model: longer work is stuck, and the sidecar ends "
+        "with 1; default %(default)s",
     )
     add(
         "--idle-release-s",
         type=_number(float, 0.1, 86_400),
-        help="let go of a model that no request and no goal used for so long, so that one on standby comes back; default: never",
+        help="release a model that no request and no goal used for so long, so that one on standby "
+        "returns; default: never",
     )
     add(
         "--standby",
         action="store_true",
-        help="once evicted, load again by itself when there is room and nobody waits; it asks nobody to leave, so give what it leaves for "
+        help="once evicted, load again when there is room and no request waits; its return "
+        "evicts no model, so give the model that it leaves for "
         "(a policy) --idle-release-s",
     )
     add(
         "--nice",
         type=_number(int, 0, 19),
         default=NICE,
-        help="of the thread that loads and runs the model; default %(default)s",
+        help="nice value of the thread that loads and runs the model; default %(default)s",
     )
     add("--log-level", choices=("debug", "info", "warning", "error"), default="info")
     add("--log-format", choices=logs.FORMS, default="human", help="json: one object a line")
     add(
         "--check",
         action="store_true",
-        help="check manifest, footprint, flags and whether the weights hold the whole model, then end",
+        help="check manifest, footprint, flags and completeness of the weights, then end",
     )
     return parser
 
 
 def _name(text: str) -> str:
-    """What the arbiter takes as a consumer, and the runtime folder as a file in it."""
+    """Return a valid name: a consumer for the arbiter, and a file name in the runtime folder."""
     if not text or not text.isprintable() or "/" in text or len(text) > d.NAME_MAX_CHARS:
         raise argparse.ArgumentTypeError(
             f"must be 1 to {d.NAME_MAX_CHARS} characters that can be printed, without /"
@@ -321,7 +343,7 @@ def _number[T: (int, float)](kind: type[T], low: float, high: float) -> Callable
         try:
             value = kind(text)
         except ValueError:
-            raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
         if not low <= value <= high:
             raise argparse.ArgumentTypeError(f"must be {low:g} to {high:g}")
         return value

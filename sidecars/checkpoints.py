@@ -1,9 +1,9 @@
-"""Load a model only from a checkpoint that holds all of it: every parameter and persistent buffer,
-in its shape, and nothing else.
+"""Complete checkpoints: load a model only from a checkpoint that holds all of it.
 
-The libraries' own loaders fill what a checkpoint lacks with random numbers and go on: such a model
-answers, and a robot moves on the answers. On the device `meta` nothing is put anywhere: the model
-is built without bytes and compared, which is what `vram-sidecar --check` does.
+Every parameter and persistent buffer has to be there in its shape, and nothing else. The libraries'
+own loaders fill gaps with random numbers and go on: such a model answers, and a robot moves on the
+answers. On the device `meta` the model is built without bytes and compared, which is what
+`vram-sidecar --check` does.
 """
 
 import contextlib
@@ -21,14 +21,14 @@ NAMES_SHOWN = 4
 
 @dataclass(slots=True)
 class Differences:
-    """Between a model and its checkpoint, by the model's names."""
+    """Differences between a model and its checkpoint, by the model's names."""
 
     missing: set[str] = field(default_factory=set)
     foreign: set[str] = field(default_factory=set)
     misshapen: dict[str, str] = field(default_factory=dict)
 
     def refuse(self, source: str) -> None:
-        """Raises ModelError when there are any, with counts and the first names."""
+        """Raise ModelError if there are any, with counts and the first names."""
         kinds = {
             "missing from it": sorted(self.missing),
             "unknown to the model": sorted(self.foreign),
@@ -40,7 +40,7 @@ class Differences:
         if parts:
             raise ModelError(
                 f"{source} does not hold this model: of the parameters {', '.join(parts)}",
-                hint="get the whole checkpoint, of the class that its config names; nothing was served from it",
+                hint="get the whole checkpoint, of the class that its config names",
                 details={
                     "missing": len(self.missing),
                     "foreign": len(self.foreign),
@@ -50,14 +50,15 @@ class Differences:
 
 
 def load_transformers(cls: Any, weights: Weights, **options: Any) -> Any:
-    """`cls.from_pretrained` of transformers. Raises ModelError if the checkpoint does not fit the
-    class or does not hold the whole model.
+    """Call `cls.from_pretrained` of transformers.
 
-    transformers knows best which names are renamed, tied, quantized or known leftovers: its own
-    account of the load is what counts.
+    transformers knows which names are renamed, tied, quantized or known leftovers, so its own
+    account of the load is compared.
+
+    Raises: ModelError if the checkpoint does not fit the class or does not hold the whole model.
     """
     if options.get("device_map") == {"": META} and is_quantized(weights):
-        options["device_map"] = {"": "cpu"}  # what belongs to a quantized weight is in its bytes
+        options["device_map"] = {"": "cpu"}  # the statistics of a quantized weight are in its bytes
     model, account = from_pretrained(
         cls, weights, output_loading_info=True, ignore_mismatched_sizes=True, **options
     )
@@ -72,18 +73,19 @@ def load_transformers(cls: Any, weights: Weights, **options: Any) -> Any:
     try:
         found.refuse(weights.source)
     except ModelError:
-        del model  # the error is kept for `ping`, and with it this frame
+        del model  # the error is kept for `ping`, and this frame with it
         raise
     return model.eval()
 
 
 def load_lerobot(cls: Any, weights: Weights, config: Any) -> Any:
-    """`cls.from_pretrained` of lerobot onto `config.device`. Raises ModelError if the checkpoint
-    does not fit the class or does not hold the whole model.
+    """Call `cls.from_pretrained` of lerobot onto `config.device`.
 
     lerobot's loaders differ from policy to policy: they rename, drop, and some swallow what they
     could not read. All of them end in the policy's own `load_state_dict`, so that is where the
-    checkpoint is compared, and a loader that never gets there has read nothing.
+    checkpoint is compared; a loader that never gets there has read nothing.
+
+    Raises: ModelError if the checkpoint does not fit the class or does not hold the whole model.
     """
     record = _Record(weights.source)
     try:
@@ -104,7 +106,7 @@ def _load_recorded(cls: Any, weights: Weights, config: Any, record: "_Record") -
             _recording(cls, record, config.device == META), weights, config=config
         )
     except ModelError:
-        record.refuse_differences()  # the reason, where the loader told something vague
+        record.refuse_differences()  # the reason, where the loader's own message is vague
         raise
     try:
         record.refuse()
@@ -116,8 +118,10 @@ def _load_recorded(cls: Any, weights: Weights, config: Any, record: "_Record") -
 
 
 def need_statistics(pipeline: Any, features: Mapping[str, Any], source: str) -> None:
-    """Raises ModelError if a processor lacks the numbers that it normalizes one of `features` by:
-    lerobot's then leaves it as it is, in other units."""
+    """Raise ModelError if a processor lacks the statistics of one of `features`.
+
+    lerobot's processor then leaves the feature unchanged, in other units.
+    """
     for step in pipeline.steps:
         if not hasattr(step, "norm_map"):
             continue
@@ -133,13 +137,13 @@ def need_statistics(pipeline: Any, features: Mapping[str, Any], source: str) -> 
         if lacking:
             raise ModelError(
                 f"{source}: its {type(step).__name__} has no statistics of {_first(lacking)}",
-                hint="get the whole checkpoint: the numbers would be in other units than the robot's",
+                hint="get the whole checkpoint: values would be in other units than the robot's",
                 details={"missing": len(lacking)},
             )
 
 
 class _Record:
-    """What `load_state_dict` was given while one model was loaded."""
+    """Record of what `load_state_dict` was given while one model was loaded."""
 
     def __init__(self, source: str) -> None:
         self._source = source
@@ -151,13 +155,14 @@ class _Record:
 
     @property
     def conclusive(self) -> bool:
-        """A load that failed says something about the checkpoint, not only about building without
-        bytes."""
+        """Note a failed load, which concerns the checkpoint and not only building without bytes."""
         return self.built and (not self._compared or self._found != Differences())
 
     def compare(self, own: Mapping[str, Any], given: Mapping[str, Any]) -> None:
-        """Before it is copied. Raises ModelError for what cannot be made good by a further part of
-        the checkpoint."""
+        """Compare a state dict before it is copied.
+
+        Raises ModelError for defects that no further part of the checkpoint can repair.
+        """
         self._compared = True
         for name, tensor in given.items():
             if name not in own:
@@ -180,18 +185,18 @@ class _Record:
         self._found.refuse(self._source)
 
     def refuse(self) -> None:
-        """Raises ModelError unless everything was loaded."""
+        """Raise ModelError unless everything was loaded."""
         self.refuse_differences()
         if not self._copied:
             raise ModelError(
                 f"{self._source}: the loader read no weights from it",
-                hint="is model.safetensors there and whole? see the sidecar's log for what the loader said",
+                hint="check that model.safetensors is complete; the sidecar's log has the loader's "
+                "messages",
             )
 
 
 def _recording(cls: Any, record: _Record, without_bytes: bool) -> Any:
-    """A subclass that records, and that builds its modules without bytes where nothing is to be put
-    anywhere."""
+    """Return a subclass that records, and that builds its modules without bytes for `meta`."""
     import torch
 
     class Recording(cls):  # type: ignore[misc]
@@ -221,15 +226,17 @@ def _recording(cls: Any, record: _Record, without_bytes: bool) -> Any:
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Of torch about copies to `meta` that do nothing, a line a parameter."""
+    """Silence torch's warnings about copies to `meta` that do nothing, one per parameter."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*is a no-op.*")
         yield
 
 
 def _identity(tensor: Any) -> Any:
-    """The same for tied parameters, which a checkpoint holds once. A tensor without bytes has no
-    address of its own."""
+    """Return one key for tied parameters, which a checkpoint holds once.
+
+    A tensor without bytes has no address of its own.
+    """
     return (
         (tensor.data_ptr(), tensor.shape)
         if tensor.numel() and tensor.device.type != META

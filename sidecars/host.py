@@ -1,7 +1,8 @@
-"""One sidecar: a socket, a model, a lease. Puts the real parts together and takes them down in order.
+"""Host of one sidecar: a socket, a model, a lease. Starts the parts and stops them in order.
 
-`prepare` runs from the start; `load` waits for the first request (or runs at once without an arbiter); everything that blocks runs in
-the worker's thread, so `ping` and `revoke` are answered meanwhile.
+`prepare` runs from the start; `load` waits for the first request (or runs at once without an
+arbiter). Everything that blocks runs in the worker's thread, so `ping` and `revoke` are answered
+meanwhile.
 """
 
 import asyncio
@@ -23,14 +24,18 @@ from vram_arbiter.sidecars.settings import Settings
 from vram_arbiter.sidecars.wires import Wire, error_reply
 from vram_arbiter.sidecars.worker import Worker
 
-LAST_WORDS_S = 0.5  # until the answers that say so are with the kernel
+LAST_WORDS_S = 0.5  # until the last answers are with the kernel
 _log = logging.getLogger("sidecars")
 
-WORK_SHARE = 0.5  # of the time, for the socket: a flood leaves the model's thread the interpreter
+# share of the time for the socket: a flood leaves the model's thread the interpreter
+WORK_SHARE = 0.5
 
 
 class SidecarHost:
-    """Serves until `stop`, SIGTERM or SIGINT; then finishes the op that runs, unloads, releases and returns."""
+    """Server of one model until `stop`, SIGTERM or SIGINT.
+
+    Then it finishes the op in progress, unloads, releases and returns.
+    """
 
     def __init__(self, settings: Settings, adapter: ModelAdapter, memory: DeviceMemory) -> None:
         self._settings = settings
@@ -41,9 +46,12 @@ class SidecarHost:
         self._boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
     async def serve(self) -> bool:
-        """Serve until the end. False if the worker's thread is still importing: the process should not wait for that.
+        """Serve until the end.
 
-        Raises AlreadyRunning, ConfigError, ArbiterUnreachable at the start; later trouble is answered on the wire."""
+        Returns False if the worker's thread is still importing: the process should not wait for
+        that. Raises AlreadyRunning, ConfigError, ArbiterUnreachable at the start; later trouble is
+        answered on the wire.
+        """
         settings, worker = self._settings, Worker(self._settings.nice)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -100,10 +108,12 @@ class SidecarHost:
 
     @staticmethod
     async def _end_at_once() -> NoReturn:
-        """The model's thread hangs: it can neither be ended nor asked to unload. Only the end of
-        the process gives the lease and its bytes back; systemd, or the next request, starts
-        another."""
-        _log.critical("the model is stuck: ending, so that its lease and its memory come back")
+        """End a sidecar whose model thread hangs: it can neither be ended nor asked to unload.
+
+        Only the end of the process frees the lease and its bytes; systemd, or the next request,
+        starts another.
+        """
+        _log.critical("the model is stuck: ending, so that its lease and its memory are freed")
         await asyncio.sleep(LAST_WORDS_S)
         logging.shutdown()
         os._exit(1)
@@ -112,10 +122,10 @@ class SidecarHost:
     async def _load_at_start(residency: Residency) -> None:
         with contextlib.suppress(
             VramError
-        ):  # logged, kept as last_error, and tried again by the next request
+        ):  # logged, kept as last_error, and retried by the next request
             await residency.load()
 
-    # -- what the wire asks (`wires.Host`) ----------------------------------------------------------------------------
+    # -- what the wire asks (`wires.Host`)
     @property
     def model_ops(self) -> frozenset[str]:
         return self._adapter.ops
@@ -169,7 +179,7 @@ class SidecarHost:
         if name == "reset" and call.token is None and residency.state != "resident":
             return {
                 "ok": True
-            }  # a model that is not there has nothing to forget, and no reason to load
+            }  # a model that is not resident has nothing to forget, and no reason to load
         fresh_s = None if isinstance(call, EndpointCall) else call.fresh_s
         return await residency.run(
             name, call.token, lambda: self._adapter.run(call), fresh_s=fresh_s

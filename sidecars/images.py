@@ -1,7 +1,7 @@
 """Pictures from the wire: PNG or JPEG bytes to a bounded RGB picture.
 
-What a decoder will have to do is read from the bytes before it starts: pixels, scans of a JPEG,
-chunks of a PNG. A few kilobytes can ask for minutes. Knows no model and no wire.
+The decoder's work is read from the bytes before it starts (pixels, scans of a JPEG, chunks of a
+PNG), because a few kilobytes can ask for minutes. Must not know models or wires.
 """
 
 import io
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 PIXELS_MAX = 4096 * 4096  # 50 MB as RGB; a robot's cameras have a tenth
 SIDE_MAX = 16_384
-SCANS_MAX = 12  # of a JPEG: progressive encoders write 6 to 10, and each is a pass over all pixels
-SEGMENTS_MAX = 1_000  # before a JPEG's picture; cameras and editors write a few dozen
-CHUNKS_MAX = 8_192  # of a PNG: 16 MiB in the 8 KiB chunks that libpng writes are 2,048
+SCANS_MAX = 12  # scans of a JPEG: progressive encoders write 6 to 10, each a pass over all pixels
+SEGMENTS_MAX = 1_000  # segments before a JPEG's picture; cameras and editors write a few dozen
+CHUNKS_MAX = 8_192  # chunks of a PNG: 16 MiB in the 8 KiB chunks of libpng are 2,048
 FORMATS = ("PNG", "JPEG")
 
 _HINT = "send PNG (or JPEG) bytes of an RGB picture"
@@ -38,7 +38,7 @@ _JPEG_SEGMENTS = {0xC4, 0xDB, 0xDD, 0xFE, *range(0xE0, 0xF0)}  # tables, comment
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What a picture's bytes say of it."""
+    """Size and work of a picture, as its bytes declare them."""
 
     width: int
     height: int
@@ -46,8 +46,11 @@ class Header:
 
 
 def header(data: bytes) -> Header:
-    """Read size and work of one picture, decoding nothing. Raises BadRequest for what is not a PNG
-    or JPEG, or asks for more work than its pixels are worth."""
+    """Read size and work of one picture without decoding it.
+
+    Raises BadRequest for bytes that are not PNG or JPEG, or that ask for more work than their
+    pixels justify.
+    """
     try:
         if data.startswith(_PNG):
             found = _png(data)
@@ -112,7 +115,7 @@ def _jpeg(data: bytes) -> Header:
         at += 2 + length
     else:
         raise BadRequest(f"a JPEG of more than {SEGMENTS_MAX} segments", hint=_HINT)
-    # Coded pixels never hold this pair of bytes, so no decoder can find more scans than this.
+    # Coded pixels never contain this pair of bytes, so no decoder can find more scans.
     scans = data.count(b"\xff\xda", at)
     if scans > SCANS_MAX:
         raise BadRequest(
@@ -123,14 +126,18 @@ def _jpeg(data: bytes) -> Header:
 
 
 def decode(data: bytes) -> "Image.Image":
-    """Decode one picture. Raises BadRequest for anything but a PNG or JPEG of `PIXELS_MAX`
-    pixels."""
+    """Decode one picture.
+
+    Raises BadRequest for anything but a PNG or JPEG of `PIXELS_MAX` pixels.
+    """
     return decode_all([data])[0]
 
 
 def decode_all(images: Sequence[bytes]) -> list["Image.Image"]:
-    """Decode pictures that have at most `PIXELS_MAX` pixels together. All headers are read before
-    any picture is. Raises BadRequest as `decode`."""
+    """Decode pictures that have at most `PIXELS_MAX` pixels together.
+
+    All headers are read before any picture is decoded. Raises BadRequest as `decode`.
+    """
     from PIL import Image
 
     headers = [header(data) for data in images]
@@ -144,16 +151,16 @@ def decode_all(images: Sequence[bytes]) -> list["Image.Image"]:
     for data, said in zip(images, headers, strict=True):
         try:
             picture = Image.open(io.BytesIO(data), formats=FORMATS)
-            if picture.size != (said.width, said.height):  # then the count was of something else
+            if picture.size != (said.width, said.height):  # the header was of another picture
                 raise ValueError(f"{picture.size} is not the size in its header")
             decoded.append(picture.convert("RGB"))
-        except Exception as error:  # noqa: BLE001  a decoder meets bytes that nobody foresaw
+        except Exception as error:  # noqa: BLE001  a decoder meets unforeseen bytes
             raise BadRequest(f"the image cannot be decoded: {error}", hint=_HINT) from None
     return decoded
 
 
 def within(picture: "Image.Image", max_side: int) -> "Image.Image":
-    """The picture with its longest side at most `max_side` pixels, shrunk if it has to be."""
+    """Return the picture with its longest side at most `max_side` pixels."""
     from PIL import Image
 
     scale = max_side / max(picture.size)

@@ -1,9 +1,10 @@
-"""Whether the model is on the card: acquire, load, use, unload, in step with the lease.
+"""Residency of one model: acquire, load, use, unload, in step with the lease.
 
-States: unloaded → waiting (for the lease) → loading → resident → unloading → unloaded. One model, one lease at a time. The
-lease's own protocol (revoke, drain, release, fencing) is the client library's, which calls `_unload` when the bytes must go. A lease on
-standby is unloaded and not over: the arbiter grants it again when there is room (`_restore` loads then), and a request calls it back
-as a waiter like any other. Knows no sockets and no wire.
+States: unloaded → waiting (for the lease) → loading → resident → unloading → unloaded. One model,
+one lease at a time. The lease's own protocol (revoke, quiesce, release, fencing) is the client
+library's, which calls `_unload` when the bytes must go. A lease on standby is unloaded and not
+over: the arbiter grants it again when there is room (`_restore` loads then), and a request calls
+it back as a waiter. Must not know sockets or wires.
 """
 
 import asyncio
@@ -48,7 +49,10 @@ _log = logging.getLogger("sidecars")
 
 
 class Residency:
-    """Keeps one model on or off one card. `client` None: no arbiter, so the model is loaded without a lease and stays."""
+    """One model on or off one GPU.
+
+    `client` None: no arbiter, so the model is loaded without a lease and stays.
+    """
 
     def __init__(
         self,
@@ -67,22 +71,24 @@ class Residency:
         self._prepared: asyncio.Task[None] | None = None
         self._bound: str | None = None  # the only GPU that this process can use
         self._blocks: list[Block] = []
-        self._loads = 0  # counts loads and unloads, in the worker: an op that was queued before an unload must not run after it
+        # number of loads and unloads, in the worker: an op that was queued before an unload must
+        # not run after it
+        self._loads = 0
         self._running = 0
         self._last_use_s = time.monotonic()
         self._resident_since_s = self._last_use_s
         self._obtaining: asyncio.Task[AsyncLease | None] | None = None
-        self._unloads = (
-            0  # times that somebody said so: whoever waited for the model then waits no longer
-        )
-        self._calling: asyncio.Task[VramError | None] | None = None  # a lease on standby back
+        self._unloads = 0  # number of unload requests: earlier waits for the model end
+        # the call that brings a standby lease back
+        self._calling: asyncio.Task[VramError | None] | None = None
         self.lease: AsyncLease | None = None
         self.state: State = "unloaded"
         self.last_error: VramError | None = None
 
-    # -- what the wire asks -------------------------------------------------------------------------------------------
+    # -- what the wire asks
     def prepare(self) -> None:
-        """Begin the host work (imports, processors) that needs no lease. Repeats only after a failure."""
+        """Begin the host work (imports, processors) that needs no lease. Repeats only after a
+        failure."""
         if self._prepared is None or (
             self._prepared.done() and self._prepared.exception() is not None
         ):
@@ -91,9 +97,10 @@ class Residency:
             )
 
     async def load(self, timeout_s: float | None = None) -> bool:
-        """Make the model resident; False if it was. `timeout_s` bounds the wait for the lease, not imports and loading.
+        """Make the model resident; return False if it was.
 
-        Raises what the arbiter denies with (WaitTimeout, VramInsufficient …), OutOfMemory, ModelError.
+        `timeout_s` bounds the wait for the lease, not imports and loading. Raises the arbiter's
+        refusal (WaitTimeout, VramInsufficient …), OutOfMemory, ModelError.
         """
         self._refuse_if_ending()
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
@@ -113,14 +120,18 @@ class Residency:
             self._turn.release()
 
     async def unload(self) -> None:
-        """Give the lease up at the next safe point, or the wait for it: whoever waits hears NotResident. Else nothing happens."""
+        """Give up the lease at the next safe point, or the wait for it: its waiters get
+        NotResident.
+
+        Otherwise do nothing.
+        """
         self._unloads += 1
         if self._obtaining is not None and not self._obtaining.done():
             self._obtaining.cancel()
         elif self.lease is not None:
             await self.lease.give_up()
         elif self._client is None:
-            async with self._turn:  # a load that is under way takes itself back
+            async with self._turn:  # a load in progress undoes itself
                 if self.state == "resident":
                     await self._unload()
 
@@ -134,13 +145,14 @@ class Residency:
     ) -> dict[str, Any]:
         """Run one op of the model as a use of the lease.
 
-        With a `token` the caller holds the lease by a use of its own: anything but the current one raises Evicted. Without, the model is made
-        resident first, also if it was evicted a moment ago. Raises FrameStale when the work could not begin within `fresh_s`: the model is
-        there by then, for a request with a newer picture.
+        With a `token` the caller protects the lease by a use of its own: any other token than the
+        current one raises Evicted. Without, the model is made resident first, also if it was
+        evicted a moment ago. Raises FrameStale when the work could not begin within `fresh_s`: the
+        model is resident by then, for a request with a newer picture.
 
         The use does not outlive the request's time. Work that has not begun by then never does, and
-        its use ends (WaitTimeout). Work that does not end keeps the lease in use, because it is:
-        the caller hears ModelError, and the host ends the process.
+        its use ends (WaitTimeout). Work that does not end keeps the lease in use: the caller gets
+        ModelError, and the host ends the process.
         """
         came_s = time.monotonic()
         deadline = came_s + self._settings.wait_timeout_s
@@ -153,7 +165,7 @@ class Residency:
             try:
                 async with self._use(lease, label, handed=token is not None):
                     return await self._worker.run_for(
-                        lambda: self._guarded(loads, came_s, fresh_s, work),  # noqa: B023  awaited in this very pass
+                        lambda: self._guarded(loads, came_s, fresh_s, work),  # noqa: B023
                         begin_s=max(0.0, deadline - time.monotonic()),
                         end_s=self._settings.request_timeout_s,
                     )
@@ -171,18 +183,20 @@ class Residency:
 
     @property
     def on_standby(self) -> bool:
-        """Evicted, and it comes back by itself."""
+        """Whether the model is evicted and returns by itself."""
         return self.lease is not None and self.lease.state == "standby"
 
     @property
     def wanted(self) -> bool:
-        """Somebody waits for the model, or its lease is called back for somebody who did; `unload` ends both."""
+        """Whether a request waits for the model, or its lease is being called back; `unload` ends
+        both."""
         return self._turn.locked() or (self._calling is not None and not self._calling.done())
 
     async def leave(self) -> bool:
-        """End of the process: after the op that runs, everything goes, the context included.
+        """End of the process: after the op in progress, free everything, the context included.
 
-        False if imports still run in the worker's thread: nothing was loaded then, and nothing can stop them.
+        Returns False if imports still run in the worker's thread: nothing was loaded then, and
+        nothing can stop them.
         """
         self._worker.stopping.set()
         if self._prepared is not None and not self._prepared.done():
@@ -193,20 +207,19 @@ class Residency:
             if self.state != "unloaded":
                 await self._unload()
             await self._worker.run(self._memory.close)
-        except (
-            VramError
-        ) as error:  # e.g. the card's folder is gone: there is nothing left to give back
+        except VramError as error:  # e.g. the fake GPU's folder is gone: nothing is left to free
             _log.warning("leaving: %s", error)
         if lease is not None:
             await lease.release(exiting=True)
         return True
 
     async def release_when_idle(self, idle_s: float) -> None:
-        """Runs beside the host: lets go of a model that nobody used for `idle_s`, at the latest after twice as long; never within its minimum
-        residency, in which whoever had it loaded begins to use it.
+        """Release a model that was not used for `idle_s`, at the latest after twice as long.
 
-        A goal is a use that somebody else marks at the arbiter, and it may ask us for nothing for a while (its arm goes to the start pose):
-        the arbiter is asked before anything is let go. One that cannot be reached cannot say, and the model stays.
+        Runs beside the host. It never releases within the minimum residency, in which the request
+        that had the model loaded begins to use it. A goal is a use that another process marks at
+        the arbiter, and it may send no request for a while (its arm goes to the start pose): the
+        arbiter is asked before the release. If it cannot be reached, the model stays.
         """
         while True:
             stays_until = max(
@@ -215,7 +228,7 @@ class Residency:
             left = stays_until - time.monotonic()
             if self.state == "resident" and not self._running and left <= 0:
                 if await self._used_by_others():
-                    _log.debug("in use by somebody else: not idle")
+                    _log.debug("in use by another process: not idle")
                     self._last_use_s = time.monotonic()
                 else:
                     _log.info("idle for %.1f s: releasing", idle_s)
@@ -228,7 +241,7 @@ class Residency:
         try:
             status = await self._client.status()
         except VramError as error:
-            _log.info("whether anybody uses the lease is not known (%s): staying", error.code)
+            _log.info("uses of the lease are unknown (%s): staying", error.code)
             return True
         return any(
             view["lease_id"] == self.lease.lease_id and view["uses"] for view in status["leases"]
@@ -237,9 +250,11 @@ class Residency:
     def _prepare_blocking(self) -> None:
         self._adapter.prepare()
         gc.collect()
-        gc.freeze()  # a million objects of imported code: every later collection, at each unload, would walk them
+        # a million objects of imported code: each later collection, at every unload, would walk
+        # them
+        gc.freeze()
 
-    # -- loading ------------------------------------------------------------------------------------------------------
+    # -- loading
     async def _load_in_turn(self, deadline: float | None) -> bool:
         if self.state == "resident" and (self.lease is None or self.lease.state == "held"):
             return False
@@ -255,7 +270,7 @@ class Residency:
         try:
             lease = await self._obtaining
             self.state, self.lease = "loading", lease
-            if unloads != self._unloads:  # told so in the moment of the grant
+            if unloads != self._unloads:  # an unload came in the moment of the grant
                 if lease is not None:
                     await lease.release()
                 raise self._unwanted()
@@ -279,7 +294,10 @@ class Residency:
             raise SidecarUnavailable(f"{self._settings.name} is ending", hint="start it again")
 
     async def _until_left(self, lease: AsyncLease, deadline: float | None) -> None:
-        """Wait until a lease that is leaving has left, its bytes unloaded. Raises Loading when the time is over."""
+        """Wait until a lease that is leaving has left, its bytes unloaded.
+
+        Raises Loading when the time is over.
+        """
         try:
             async with asyncio.timeout(_left_s(deadline)):
                 while (leaving := lease.state) in _LEAVING:
@@ -291,15 +309,16 @@ class Residency:
                 f"{self._settings.name} is still {self.state}", hint="ask again, or wait longer"
             ) from None
 
-    # -- coming back from standby -----------------------------------------------------------------------------------------
+    # -- coming back from standby
     async def _brought_back(self, lease: AsyncLease, deadline: float | None) -> bool:
-        """Follow a lease that leaves until it is resident again, calling it back from standby. False: it ended, its bytes are unloaded.
+        """Follow a leaving lease until it is resident again, calling it back from standby.
 
-        Raises Loading or WaitTimeout when the time is over, or what the arbiter refuses with. A wait that ends so goes on in the background:
-        the model was wanted, and comes back as soon as it may.
+        Returns False if it ended, its bytes unloaded. Raises Loading or WaitTimeout when the time
+        is over, or the arbiter's refusal. A wait that ends so goes on in the background: the model
+        was wanted, and returns as soon as it may.
         """
         while (seen := lease.state) not in ("held", "gone"):
-            if seen == "loading":  # `_restore` is at it, which takes as long as it takes
+            if seen == "loading":  # `_restore` loads, without a limit
                 await lease.wait_change(seen)
                 continue
             try:
@@ -311,8 +330,10 @@ class Residency:
             except TimeoutError:
                 if lease.state == "standby":
                     raise WaitTimeout(
-                        f"{self._settings.name} is on standby and there was no room for it in time",
-                        hint=f"`vramctl why {self._settings.name}` says who has it; it comes back as soon as it may",
+                        f"{self._settings.name} is on standby, and there was no room for it in "
+                        "time",
+                        hint=f"`vramctl why {self._settings.name}` names the holder; it returns as "
+                        "soon as it may",
                     ) from None
                 if lease.state in _LEAVING:
                     raise Loading(
@@ -325,17 +346,23 @@ class Residency:
         return False
 
     def _called_back(self, lease: AsyncLease) -> asyncio.Task[VramError | None]:
-        """Ask for it as a waiter, once for all who want it, and without a limit: their own limits are shorter than a goal may be."""
+        """Ask for the lease as a waiter, once for all requests, and without a limit.
+
+        Their own limits are shorter than a goal may be.
+        """
         if self._calling is None or self._calling.done():
             self._calling = asyncio.create_task(self._call_back(lease), name="call back")
         return self._calling
 
     async def _call_back(self, lease: AsyncLease) -> VramError | None:
-        """Until it is granted again or over. Says why the arbiter does not even let it wait."""
-        _log.info("wanted: calling the lease back from standby")
+        """Wait until the lease is granted again or over.
+
+        Returns the reason why the arbiter refuses even the wait.
+        """
+        _log.info("requested: calling the lease back from standby")
         try:
             await lease.reacquire()
-        except BadState:  # it comes back by itself in this very moment
+        except BadState:  # it returns by itself in this moment
             await lease.wait_change("standby")
         except VramError as error:
             if lease.state == "standby":
@@ -343,9 +370,12 @@ class Residency:
         return None
 
     async def _restore(self, lease: AsyncLease) -> None:
-        """Granted again, by itself or because it was called back. A load that fails ends the lease; the next request starts anew."""
+        """Load after a grant, by itself or because it was called back.
+
+        A load that fails ends the lease; the next request starts a new one.
+        """
         if self._worker.stopping.is_set():
-            return  # `leave` gives it back
+            return  # `leave` releases it
         _log.info("back from standby: loading")
         self.state = "loading"
         try:
@@ -359,9 +389,10 @@ class Residency:
             self.last_error = None
 
     async def _obtain(self, deadline: float | None) -> AsyncLease | None:
-        """The host work done, and a lease granted. `unload` cancels it, which gives the place in the queue back.
+        """Finish the host work, and wait for a lease; `unload` cancels it and leaves the queue.
 
-        Imports take half a minute and more on a busy machine; the lease is waited for from then on, for as long as was left before.
+        Imports take half a minute and more on a busy machine; the lease is waited for from then on,
+        for the time that was left before.
         """
         assert self._prepared is not None
         wait_s = _left_s(deadline)
@@ -390,7 +421,8 @@ class Residency:
         )
 
     async def _load(self, lease: AsyncLease | None) -> None:
-        """Put the model on the card; on failure everything is taken back before the lease is."""
+        """Load the model onto the GPU; on failure everything is undone before the lease is
+        released."""
         attributes = self._labels() | (
             {telemetry.ATTR_LEASE: lease.lease_id} if lease is not None else {}
         )
@@ -411,11 +443,11 @@ class Residency:
             if lease is not None:
                 await lease.ready(measured)
             if loads != self._loads or given_up() or (lease is not None and lease.state == "gone"):
-                raise self._unwanted()  # it was unloaded while the arbiter was told of it
+                raise self._unwanted()  # it was unloaded while `ready` was sent
         except BaseException as error:
             await self._take_back(lease, error)
             if given_up():
-                _log.info("the load was taken back")
+                _log.info("the load was undone")
                 raise self._unwanted() from None
             _log.error("loading failed: %s", error)
             raise
@@ -425,10 +457,11 @@ class Residency:
             tracing.note({telemetry.ATTR_BYTES: measured})
         self._last_use_s = self._resident_since_s = time.monotonic()
         self.state = "resident"
-        _log.info("resident after %.2f s: %s bytes on the card", time.monotonic() - began, measured)
+        _log.info("resident after %.2f s: %s bytes on the GPU", time.monotonic() - began, measured)
 
     async def _take_back(self, lease: AsyncLease | None, error: BaseException) -> None:
-        """After a load that failed. Whatever else fails in it, the lease ends: it would be renewed for ever, for nothing."""
+        """Undo a failed load. Whatever else fails in it, the lease ends: it would be renewed for
+        ever."""
         try:
             await self._worker.run(self._unload_blocking)
             if lease is not None and isinstance(error, OutOfMemory) and not lease.given_up:
@@ -436,8 +469,8 @@ class Residency:
                     error.details.get("requested_bytes") or self._settings.footprint.load_peak_bytes
                 )
                 await lease.oom(requested, error.details.get("allocated_bytes"))
-        except VramError as failed:  # what is left on the card the arbiter will measure
-            _log.error("a load that failed was not taken back in order: %s", failed)
+        except VramError as failed:  # the arbiter measures what is left on the GPU
+            _log.error("a failed load was not undone in order: %s", failed)
         finally:
             if lease is not None:
                 try:
@@ -446,9 +479,10 @@ class Residency:
                     _log.warning("the release of %s was refused: %s", lease.lease_id, refused)
 
     def _load_blocking(self) -> int:
-        """In the worker: real weights first, then what is missing to the footprint that they stand for, at the pace of a real load.
+        """Load in the worker: real weights, then ballast up to the footprint, at the pace of a real
+        load.
 
-        Returns which of the loads and unloads it is.
+        Returns the number of this load or unload.
         """
         self._loads += 1
         loads = self._loads
@@ -458,7 +492,7 @@ class Residency:
         self._adapter.load(memory.torch_device)
         used = memory.used_bytes()
         if used is None or not (settings.device.startswith("fake:") or settings.stands_for):
-            return loads  # a real model weighs what it weighs
+            return loads  # a real model has its own bytes
         paces = [
             pace for pace in (settings.throttle_bytes_per_s, memory.throttle_bytes_per_s()) if pace
         ]
@@ -477,9 +511,9 @@ class Residency:
             memory.empty_cache()
         return loads
 
-    # -- unloading ----------------------------------------------------------------------------------------------------
+    # -- unloading
     async def _unload(self) -> None:
-        """Called when the bytes must go: by the lease (revoked, lost, given up) or at the end of the process."""
+        """Unload: called by the lease (revoked, lost, given up) or at the end of the process."""
         began, self.state = time.monotonic(), "unloading"
         try:
             with tracing.span(telemetry.SPAN_SIDECAR_UNLOAD, attributes=self._labels()):
@@ -507,7 +541,7 @@ class Residency:
             telemetry.ATTR_MODEL: self._settings.manifest.name,
         }
 
-    # -- uses -------------------------------------------------------------------------------------------------------------
+    # -- uses
     def _check(self, token: Token) -> None:
         if self.token() != tuple(token):
             raise self._evicted()
@@ -515,7 +549,7 @@ class Residency:
     def _evicted(self) -> Evicted:
         return Evicted(
             f"{self._settings.name} is not resident under this token (it is {self.state})",
-            hint="load again and use the new token, or leave the token out",
+            hint="load again and use the new token, or omit the token",
             details={"state": self.state},
         )
 
@@ -523,10 +557,11 @@ class Residency:
     async def _use(
         self, lease: AsyncLease | None, label: str, *, handed: bool
     ) -> AsyncIterator[None]:
-        """Mark a use. Under a handed-over token the caller's own use protects the model, also while it is asked to leave.
+        """Mark a use. Under a handed-over token the caller's own use protects the model, also while
+        revoked.
 
-        Without contact to the arbiter nothing is marked: nobody can be granted anything then, and an unload waits for the op
-        in the worker's queue in any case.
+        Without contact to the arbiter nothing is marked: no lease can be granted then, and an
+        unload waits for the op in the worker's queue in any case.
         """
         self._running += 1
         try:
@@ -545,13 +580,14 @@ class Residency:
     def _guarded(
         self, loads: int, came_s: float, fresh_s: float | None, work: Callable[[], dict[str, Any]]
     ) -> dict[str, Any]:
-        """In the worker: an unload may have come between the check and this moment, and what is to be looked at may have become old."""
+        """Check in the worker that no unload came between, and that the picture is not too old."""
         if loads != self._loads:
             raise self._evicted()
         waited_s = time.monotonic() - came_s
         if fresh_s is not None and waited_s > fresh_s:
             raise FrameStale(
-                f"the picture waited {waited_s:.1f} s for {self._settings.name}, {fresh_s:.1f} s are accepted",
+                f"the picture waited {waited_s:.1f} s for {self._settings.name}, {fresh_s:.1f} s "
+                "are accepted",
                 hint="ask again about a new one: the model is there now",
                 details={"waited_s": waited_s},
             )
@@ -564,5 +600,5 @@ def _being_cancelled() -> bool:
 
 
 def _left_s(deadline: float | None) -> float | None:
-    """Seconds until a moment of the monotonic clock; None: no limit."""
+    """Return the seconds until a moment of the monotonic clock; None: no limit."""
     return None if deadline is None else max(0.0, deadline - time.monotonic())

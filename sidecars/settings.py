@@ -1,4 +1,7 @@
-"""What one sidecar is: its model, its bytes, its place. Put together from a manifest, the footprint file and flags."""
+"""Settings of one sidecar: its model, its bytes, its endpoints.
+
+Put together from a manifest, the footprint file and flags.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,9 +18,10 @@ from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.schemas.yamltext import read_yaml
 from vram_arbiter.sidecars.weights import Weights, resolve
 
-NICE = 5  # a third of the cores' time beside one ordinary program, all of it when nobody else wants them
-WAIT_TIMEOUT_S = 120.0  # how long a request without a time limit of its own waits for the lease
-REQUEST_TIMEOUT_S = 180.0  # of work in the model; the field's clients wait as long for an answer
+NICE = 5  # a third of the cores' time beside one ordinary program, all of it on idle cores
+WAIT_TIMEOUT_S = 120.0  # wait for the lease of a request without a time limit of its own
+# limit of work in the model; the field's clients wait as long for an answer
+REQUEST_TIMEOUT_S = 180.0
 GB = 10**9  # manifests count in 1000s
 
 
@@ -46,7 +50,7 @@ class FootprintEntry(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """All that a sidecar's host has to know. `arbiter` None: without one, resident from the start."""
+    """Settings of a sidecar's host. `arbiter` None: without one, resident from the start."""
 
     name: str
     manifest: RSkillManifest
@@ -55,7 +59,7 @@ class Settings:
     endpoint: str
     device: str  # fake:FOLDER | cuda[:N] | none
     arbiter: str | None
-    stands_for: str = ""  # the model whose weight is simulated by filling up to the footprint
+    stands_for: str = ""  # the production model whose footprint is simulated
     throttle_bytes_per_s: int | None = None
     gpu: str = "any"
     priority: int = d.PRIORITY
@@ -66,8 +70,8 @@ class Settings:
         REQUEST_TIMEOUT_S  # a model that works longer is stuck, and the process ends
     )
     nice: int = NICE
-    idle_release_s: float | None = None  # None: resident until somebody else needs the room
-    standby: bool = False  # once evicted, it comes back by itself when there is room
+    idle_release_s: float | None = None  # None: resident until another request needs the room
+    standby: bool = False  # once evicted, it returns when there is room
 
     @property
     def revision(self) -> str:
@@ -88,7 +92,7 @@ class Settings:
 
 
 def read_model(rskill: Path, configs: Path) -> tuple[RSkillManifest, Weights]:
-    """The manifest and its weights. Raises ManifestError or ConfigError."""
+    """Return the manifest and its weights. Raises ManifestError or ConfigError."""
     manifest = load_manifest(rskill)
     if manifest.weights_uri is None:
         raise ConfigError(
@@ -99,7 +103,7 @@ def read_model(rskill: Path, configs: Path) -> tuple[RSkillManifest, Weights]:
 
 
 def read_footprints(path: Path) -> dict[str, FootprintEntry]:
-    """All entries of a footprint file. Raises ConfigError naming file, line and problem."""
+    """Read all entries of a footprint file. Raises ConfigError naming file, line and problem."""
     document = read_yaml(path)
     if not isinstance(document.data, Mapping):
         raise ConfigError(f"{path}: must be a map from manifest names to footprints")
@@ -111,13 +115,14 @@ def read_footprints(path: Path) -> dict[str, FootprintEntry]:
             problem = error.errors()[0]
             where = (name, *problem["loc"])
             raise ConfigError(
-                f"{path}:{document.line(where)}: {'.'.join(str(part) for part in where)}: {problem['msg']}"
+                f"{path}:{document.line(where)}: {'.'.join(str(part) for part in where)}: "
+                f"{problem['msg']}"
             ) from None
     return entries
 
 
 def parse_footprint(text: str) -> FootprintEntry:
-    """`PEAK[,STEADY[,RESIDUE]]`, each a size: the flag `--footprint`. Raises ConfigError."""
+    """Parse the flag `--footprint`: `PEAK[,STEADY[,RESIDUE]]`, each a size. Raises ConfigError."""
     hint = "write PEAK,STEADY,RESIDUE, e.g. 5.3GB,5.3GB,450MiB"
     try:
         peak, *rest = [parse_bytes(part) for part in text.split(",")]
@@ -134,13 +139,17 @@ def parse_footprint(text: str) -> FootprintEntry:
 def footprint_for(
     manifest: RSkillManifest, entries: Mapping[str, FootprintEntry]
 ) -> FootprintEntry:
-    """The entry of a manifest, else what it declares for its number format. Raises ConfigError if nobody says anything."""
+    """Return the entry of a manifest, else the bytes that it declares for its number format.
+
+    Raises ConfigError if neither exists.
+    """
     if entry := entries.get(manifest.name):
         return entry
     if manifest.declared_vram_gb is None:
         raise ConfigError(
-            f"nobody says how many bytes {manifest.name} needs",
-            hint="add it to configs/models/footprints.yaml, declare min_vram_gb for its dtype, or pass --footprint",
+            f"no footprint is known for {manifest.name}",
+            hint="add it to configs/models/footprints.yaml, declare min_vram_gb for its dtype, or "
+            "pass --footprint",
         )
     declared = round(manifest.declared_vram_gb * GB)
     return FootprintEntry(

@@ -1,6 +1,7 @@
-"""Where weights come from, and the one call that loads them: a hub id and a local folder take the same path.
+"""Source of weights, and the one call that loads them: hub id and local folder alike.
 
-`local://models/x` is CONFIGS/models/x; `hf://owner/repo[@revision]` is a repository of the hub. Knows nothing of devices' bytes or leases.
+`local://models/x` is CONFIGS/models/x; `hf://owner/repo[@revision]` is a repository of the hub.
+Must not know devices' bytes or leases.
 """
 
 import os
@@ -16,7 +17,7 @@ from vram_arbiter.schemas.manifest.vocabulary import Dtype
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """`source` is what `from_pretrained` takes: a folder or `owner/repo`."""
+    """Source of weights; `source` is what `from_pretrained` takes: a folder or `owner/repo`."""
 
     source: str
     revision: str | None = None
@@ -24,7 +25,10 @@ class Weights:
 
 
 def resolve(uri: str, configs: Path) -> Weights:
-    """Read a manifest's `weights_uri`. Raises ConfigError if it leads nowhere or out of the configs folder."""
+    """Parse a manifest's `weights_uri`.
+
+    Raises ConfigError if it leads nowhere or out of the configs folder.
+    """
     scheme, _, rest = uri.partition("://")
     if scheme == "hf":
         source, _, revision = rest.partition("@")
@@ -32,7 +36,7 @@ def resolve(uri: str, configs: Path) -> Weights:
     folder = (configs / rest).resolve()
     if scheme != "local" or not folder.is_relative_to(configs.resolve()):
         raise ConfigError(
-            f"weights_uri {uri!r} is not a place for weights",
+            f"weights_uri {uri!r} is not a source of weights",
             hint="write hf://OWNER/REPO or local://models/NAME",
         )
     if not folder.is_dir():
@@ -44,8 +48,7 @@ def resolve(uri: str, configs: Path) -> Weights:
 
 
 def cached(weights: Weights) -> Weights | None:
-    """A hub repository as the local folder that the hub's cache keeps it in; None if its weights
-    were never fetched."""
+    """Return the local folder of a hub repository in the hub's cache; None if never fetched."""
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import LocalEntryNotFoundError
 
@@ -59,7 +62,10 @@ def cached(weights: Weights) -> Weights | None:
 
 
 def from_pretrained(cls: Any, weights: Weights, **options: Any) -> Any:
-    """`cls.from_pretrained` for any class of transformers or lerobot. Raises ModelError if the checkpoint does not fit the class."""
+    """Call `cls.from_pretrained` of any class of transformers or lerobot.
+
+    Raises ModelError if the checkpoint does not fit the class.
+    """
     if weights.local:
         options["local_files_only"] = True
     elif weights.revision:
@@ -71,19 +77,20 @@ def from_pretrained(cls: Any, weights: Weights, **options: Any) -> Any:
     except Exception as error:
         if (
             type(error).__name__ == "OutOfMemoryError"
-        ):  # torch's, which says more than that the weights are bad
+        ):  # torch's error, which says more than that the weights are bad
             raise
         raise ModelError(
             f"{cls.__name__} cannot load {weights.source}: {type(error).__name__}: {error}",
-            hint="is it complete, and of the kind that the manifest says?",
+            hint="check that it is complete and of the manifest's kind",
         ) from error
 
 
 def model_options(manifest: RSkillManifest, weights: Weights, device: str) -> dict[str, Any]:
-    """Options for loading a transformers model onto `device` as in production.
+    """Return options for loading a transformers model onto `device` as in production.
 
-    On the CPU: nothing, float32 as saved. On CUDA: shards go straight to the card, one after the other (never the whole model twice), in the
-    manifest's number format; `int4` is NF4 through bitsandbytes, unless the checkpoint is quantized already and says so itself.
+    On the CPU: none, float32 as saved. On CUDA: shards go straight to the GPU, one after the other
+    (never the whole model twice), in the manifest's number format; `int4` is NF4 through
+    bitsandbytes, unless the checkpoint is quantized already.
     """
     os.environ.setdefault(
         "HF_DEACTIVATE_ASYNC_LOAD", "1"
@@ -114,7 +121,7 @@ def model_options(manifest: RSkillManifest, weights: Weights, device: str) -> di
 
 
 def is_quantized(weights: Weights) -> bool:
-    """Whether the checkpoint's own configuration says how it is quantized."""
+    """Return whether the checkpoint's own configuration says how it is quantized."""
     from transformers import AutoConfig
 
     return getattr(from_pretrained(AutoConfig, weights), "quantization_config", None) is not None

@@ -1,6 +1,7 @@
-"""The sidecars' two wire families: messages in, replies out. Shapes are in `schemas.sidecar`; what they do is the host's.
+"""The sidecars' two wire families: messages in, replies out.
 
-Every bad message gets a typed error; none ends the sidecar. Both families can be spoken at once: `op` or `endpoint` decides.
+Shapes are in `schemas.sidecar`; the host performs them. Every bad message gets a typed error; none
+ends the sidecar. Both families can be spoken at once: `op` or `endpoint` decides.
 """
 
 import logging
@@ -33,14 +34,14 @@ from vram_arbiter.schemas.sidecar import (
     ScoreOp,
 )
 
-PENDING_MAX = 32  # model requests that wait or run; beyond this, `ping` would have to wait too
+PENDING_MAX = 32  # model requests that wait or run; with more, `ping` would have to wait too
 Call = OpRequest | EndpointCall
 Send = Callable[[Peer, Message], Awaitable[None]]
 _log = logging.getLogger("sidecars")
 
 
 class Host(Protocol):
-    """What the wire needs of its host."""
+    """Interface of the host as the wire needs it."""
 
     @property
     def model_ops(self) -> frozenset[str]: ...
@@ -59,7 +60,7 @@ class Host(Protocol):
 
 
 class Wire:
-    """Answers messages for one host: give `handle` to `RouterServer.serve`."""
+    """Message handler of one host: give `handle` to `RouterServer.serve`."""
 
     def __init__(self, host: Host, send: Send) -> None:
         self._host = host
@@ -72,7 +73,7 @@ class Wire:
             reply = await self._answer(call)
         except VramError as error:
             reply = error_reply(error)
-        except Exception as error:  # noqa: BLE001  the outermost loop of a server: a defect of ours must not end it
+        except Exception as error:  # noqa: BLE001  the outermost loop of a server
             _log.exception("internal error while answering")
             reply = error_reply(
                 InternalError(
@@ -113,7 +114,7 @@ class Wire:
             return {"ok": True}
         if self._pending >= PENDING_MAX:
             raise LimitExceeded(
-                f"{PENDING_MAX} requests wait already",
+                f"{PENDING_MAX} requests are waiting",
                 hint="wait for answers",
                 details={"limit": "pending requests"},
             )
@@ -122,7 +123,7 @@ class Wire:
             if name == "load":
                 return await self._host.load(_timeout_s(call))
             assert isinstance(call, DetectOp | QueryOp | ScoreOp | EndpointCall), (
-                "what is left is for the model"
+                "the model's own requests"
             )
             answer: dict[str, Any] = npy.pack(await self._host.run(name, call))
             return answer
@@ -131,13 +132,13 @@ class Wire:
 
 
 def parse(message: Message, model_ops: frozenset[str]) -> Call:
-    """A request from a decoded message. Raises UnknownOp (details.known) or BadRequest (details.fields)."""
+    """Parse a decoded message. Raises UnknownOp (details.known) or BadRequest (details.fields)."""
     known = sorted({"ping", "load", "unload", "shutdown"} | model_ops)
     family = "endpoint" if "endpoint" in message else "op"
     name = message.get(family)
     if not isinstance(name, str):
         raise BadRequest(
-            "a message names its op or endpoint",
+            "a message needs an op or endpoint",
             hint='e.g. {"op": "ping"}',
             details={"known": known},
         )
@@ -168,7 +169,8 @@ def name_of(call: Call) -> str:
 
 
 def error_reply(error: VramError) -> Message:
-    """The field's `{"ok": false, "error": "Type: message"}`, with our code, hint and numbers beside it."""
+    """Return the field's `{"ok": false, "error": "Type: message"}` with code, hint and details
+    added."""
     wire = error.to_wire()
     return {"ok": False, **wire, "error": f"{type(error).__name__}: {error.message}"}
 
@@ -183,7 +185,7 @@ def _unpack(data: Any) -> Any:
 
 
 def _timeout_s(call: Call) -> float | None:
-    """Of `load`, in either family. Raises BadRequest."""
+    """Return the time limit of a `load` of either family. Raises BadRequest."""
     if isinstance(call, LoadOp):
         return call.timeout_s
     if isinstance(call, EndpointCall) and call.endpoint == "load" and call.data:

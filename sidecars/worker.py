@@ -1,4 +1,7 @@
-"""The one thread that touches model and device. The event loop hands it work and stays free for `ping` and `revoke`."""
+"""The one thread that touches model and device.
+
+The event loop hands it work and stays free for `ping` and `revoke`.
+"""
 
 import asyncio
 import contextvars
@@ -13,10 +16,11 @@ from vram_arbiter.schemas.errors import ModelError, OutOfMemory, VramError, Wait
 
 
 class Worker:
-    """Runs one piece of work after the other, in the order given. `stopping` ends waits inside the work (throttled loads).
+    """Thread that runs one piece of work after the other, in the order given.
 
-    `nice` (0 to 19) is how far the thread, and those that a model library starts from it, stand behind other programs: imports and loads
-    take all cores for seconds, and beside them somebody controls a robot.
+    `stopping` ends waits inside the work (throttled loads). `nice` (0 to 19) lowers the thread, and
+    those that a model library starts from it, below other programs: imports and loads take all
+    cores for seconds, beside a robot's control loop.
     """
 
     def __init__(self, nice: int = 0) -> None:
@@ -25,15 +29,15 @@ class Worker:
         )
         self.stopping = threading.Event()
         self.stuck = asyncio.Event()
-        """Work did not end within its time. No thread can be ended from outside: only the process
-        can."""
+        """Set when work did not end within its time. No thread can be ended from outside, only the
+        process."""
 
     async def run_for[T](self, work: Callable[[], T], *, begin_s: float, end_s: float) -> T:
         """Do the work as `run` does, within limits.
 
-        Raises: WaitTimeout when it could not begin within `begin_s`, because other work is under
-        way: it never will. ModelError when it has not ended `end_s` after that: it still runs, and
-        `stuck` is set.
+        Raises: WaitTimeout when it could not begin within `begin_s`, because other work is in
+        progress: it never will. ModelError when it has not ended `end_s` after that: it still runs,
+        and `stuck` is set.
         """
         loop, context = asyncio.get_running_loop(), contextvars.copy_context()
         begun: asyncio.Future[None] = loop.create_future()
@@ -54,7 +58,7 @@ class Worker:
             await asyncio.wait(waited, timeout=begin_s, return_when=asyncio.FIRST_COMPLETED)
             if submitted.cancel():
                 raise WaitTimeout(
-                    f"the model was busy for {begin_s:.0f} s with requests that came before",
+                    f"the model was busy for {begin_s:.0f} s with earlier requests",
                     hint="ask less often, or wait longer",
                 )
             await self._until(done, end_s)
@@ -75,10 +79,12 @@ class Worker:
             self.stuck.set()
 
     async def run[T](self, work: Callable[[], T], *, abandon: bool = False) -> T:
-        """Do the work and wait for it, also if the caller is cancelled meanwhile: a model is never left half loaded.
+        """Do the work and wait for it, also if the caller is canceled: a model is never left half
+        loaded.
 
-        `abandon`: do not wait then, for work that holds nothing (imports). Raises the work's own typed error; any other failure
-        comes as ModelError, a full card as OutOfMemory. The work runs in the caller's context: its spans are the present span's children.
+        `abandon`: do not wait then, for work that holds nothing (imports). Raises the work's own
+        typed error; any other failure comes as ModelError, a full GPU as OutOfMemory. The work runs
+        in the caller's context: its spans are the present span's children.
         """
         context = contextvars.copy_context()
         future = asyncio.get_running_loop().run_in_executor(
@@ -90,11 +96,11 @@ class Worker:
             if not abandon:
                 await asyncio.wait([future])
                 if not future.cancelled():
-                    future.exception()  # was seen: asyncio need not complain
+                    future.exception()  # the failure was seen: asyncio need not log it
             raise
 
     def close(self) -> None:
-        """Refuse further work; what runs now ends by itself."""
+        """Refuse further work; work in progress ends by itself."""
         self.stopping.set()
         self._pool.shutdown(wait=False, cancel_futures=True)
 
@@ -105,11 +111,12 @@ class Worker:
         except VramError as error:
             _forget_locals(error)
             raise
-        except Exception as error:  # any failure inside a model is an answer to the caller, not the end of the sidecar
+        # any failure inside a model is an answer to the caller, not the end of the sidecar
+        except Exception as error:
             _forget_locals(error)
             if (
                 type(error).__name__ == "OutOfMemoryError"
-            ):  # torch's; importing torch to say so would cost seconds
+            ):  # torch's class; importing torch to compare it would cost seconds
                 raise OutOfMemory(str(error)) from error
             if isinstance(error, ImportError):
                 raise ModelError(str(error), hint="pip install 'vram-arbiter[sidecars]'") from error
@@ -119,19 +126,19 @@ class Worker:
 
 
 def _seen(done: asyncio.Future[Any]) -> None:
-    """Keep asyncio from complaining about a failure whose caller is gone."""
+    """Keep asyncio from logging a failure whose caller is gone."""
     if not done.cancelled():
         done.exception()
 
 
 def _forget_locals(error: BaseException | None) -> None:
-    """Of the frames that a failure came through: the error is kept for `ping`, and half a loaded
-    model would stay on the GPU with it."""
+    """Clear the frames of a failure: the error is kept for `ping`, and half a loaded model would
+    stay on the GPU with it."""
     while error is not None:
         traceback.clear_frames(error.__traceback__)
         error = error.__cause__ or error.__context__
 
 
 def _stand_back(nice: int) -> None:
-    """Of the calling thread alone: on Linux a nice value is a thread's."""
+    """Lower the calling thread alone: on Linux a nice value belongs to a thread."""
     os.setpriority(os.PRIO_PROCESS, 0, max(nice, os.getpriority(os.PRIO_PROCESS, 0)))

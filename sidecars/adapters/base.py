@@ -1,4 +1,7 @@
-"""What the host asks of a model: prepare, load, run, unload. An adapter knows its model and nothing of leases, sockets or bytes."""
+"""Interface of a model: prepare, load, run, unload.
+
+An adapter knows its model and nothing of leases, sockets or bytes.
+"""
 
 from typing import Any, Literal, Protocol
 
@@ -10,11 +13,12 @@ ModelCall = DetectOp | QueryOp | ScoreOp | EndpointCall
 class ModelAdapter(Protocol):
     """One model. All methods block and are called from one worker thread, never two at a time.
 
-    `ops` are the ops or endpoints that `run` answers. `prepare` does what needs no device (imports, processors). `load` puts
-    the weights onto `device` (`cpu`, `cuda:0`) and `unload` drops every reference to them; both may
-    be repeated. A load onto `meta` puts nothing anywhere: it finds out whether the checkpoint holds
-    the whole model, as every load does. `run` raises a `schemas.errors` type for what the caller
-    did wrong; anything else that it raises is the model's own failure.
+    `ops` are the ops or endpoints that `run` answers. `prepare` does what needs no device (imports,
+    processors). `load` puts the weights onto `device` (`cpu`, `cuda:0`) and `unload` drops every
+    reference to them; both may be repeated. A load onto `meta` allocates nothing: it finds out
+    whether the checkpoint holds the whole model, as every load does. `run` raises a
+    `schemas.errors` type for the caller's mistakes; anything else that it raises is the model's own
+    failure.
     """
 
     @property

@@ -1,4 +1,4 @@
-"""Which adapter drives a manifest's model."""
+"""Choice of the adapter for a manifest's model."""
 
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
@@ -13,7 +13,10 @@ from vram_arbiter.sidecars.weights import Weights
 
 
 def make_adapter(manifest: RSkillManifest, weights: Weights) -> ModelAdapter:
-    """The adapter of a manifest. Raises ConfigError for kinds, engines and runtimes that no sidecar of ours serves."""
+    """Return the adapter of a manifest.
+
+    Raises ConfigError for kinds, engines and runtimes that no sidecar serves.
+    """
     if manifest.runtime is not Runtime.PYTORCH:
         raise ConfigError(
             f"{manifest.name}: runtime {manifest.runtime.value!r} is not served",

@@ -1,4 +1,7 @@
-"""Open-vocabulary detection through transformers' zero-shot classes (OWL-ViT, OWLv2, Grounding DINO, OmDet-Turbo)."""
+"""Open-vocabulary detection through transformers' zero-shot classes.
+
+These are OWL-ViT, OWLv2, Grounding DINO and OmDet-Turbo.
+"""
 
 import inspect
 import math
@@ -14,18 +17,18 @@ from vram_arbiter.sidecars.checkpoints import load_transformers
 from vram_arbiter.sidecars.images import decode, within
 from vram_arbiter.sidecars.weights import Weights, from_pretrained, model_options
 
-NORM = 1000  # the field's grounding answers count boxes in thousandths of the image
-_SEPARATOR = re.compile(r"\s*(?:</c>|,|\s\.(?:\s|$))\s*")  # </c> is how the field joins its labels
+NORM = 1000  # the field's grounding answers give boxes in thousandths of the image
+_SEPARATOR = re.compile(r"\s*(?:</c>|,|\s\.(?:\s|$))\s*")  # the field joins its labels by </c>
 
 
 class DetectorAdapter:
-    """`detect`: texts and a picture in, boxes in the sent picture's pixels out. Deterministic."""
+    """The op `detect`: texts and a picture in, boxes in the picture's pixels out. Deterministic."""
 
     kind: Literal["detector"] = "detector"
     ops = frozenset({"detect"})
 
     def __init__(self, manifest: RSkillManifest, weights: Weights) -> None:
-        assert manifest.detector is not None, "the kind's rules demand the block"
+        assert manifest.detector is not None, "the kind requires the block"
         self._manifest = manifest
         self._contract = manifest.detector
         self._weights = weights
@@ -43,7 +46,7 @@ class DetectorAdapter:
         config = from_pretrained(AutoConfig, self._weights)
         MODEL_FOR_ZERO_SHOT_OBJECT_DETECTION_MAPPING.get(
             type(config), None
-        )  # imports the model's code: seconds less under the lease
+        )  # imports the model's code, which saves seconds under the lease
 
     def load(self, device: str) -> None:
         from transformers import AutoModelForZeroShotObjectDetection
@@ -114,14 +117,15 @@ def split_query(query: str | Sequence[str]) -> list[str]:
     labels = list(dict.fromkeys(label for label in labels if label))
     if not labels or len(labels) > QUERIES_MAX:
         raise BadRequest(
-            f"a query names 1 to {QUERIES_MAX} things, not {len(labels)}",
+            f"expected a query of 1 to {QUERIES_MAX} objects, got {len(labels)}",
             hint="separate them by </c>, ' . ' or commas",
         )
     return labels
 
 
 def grounding_answer(found: list[DetectionResult], width: int, height: int) -> str:
-    """The field's format: `<ref>label</ref><box><x1><y1><x2><y2></box>` for each detection, in thousandths."""
+    """Return the field's format, in thousandths: `<ref>label</ref><box><x1><y1><x2><y2></box>`
+    each."""
     parts = []
     for one in found:
         x0, y0, x1, y1 = one["box"]
@@ -134,9 +138,12 @@ def grounding_answer(found: list[DetectionResult], width: int, height: int) -> s
 def _detection(
     label: str, score: float, box: list[float], size: tuple[int, int]
 ) -> DetectionResult | None:
-    """Cut to the picture; None if nothing is left of it. Raises ModelError for what is no number: cutting would put the picture's edge there."""
+    """Clip a box to the picture; None if nothing is left of it.
+
+    Raises ModelError for values that are not numbers: clipping would put the picture's edge there.
+    """
     if not all(map(math.isfinite, (score, *box))):
-        raise ModelError("the detector's box is no number", hint="its weights are broken")
+        raise ModelError("the detector's box is not a number", hint="check its weights")
     height, width = size
     x0, x1 = (min(float(width), max(0.0, x)) for x in (box[0], box[2]))
     y0, y1 = (min(float(height), max(0.0, y)) for y in (box[1], box[3]))

@@ -1,7 +1,8 @@
-"""Camera frames to the card and back, the arm where it was: a check of a machine that has no model yet. Never on the CPU instead.
+"""Camera frames to the GPU and back, the arm at rest: a check of a machine without a model.
 
-It moves nothing and makes nothing up: a picture that is missing, of another shape or too small is refused, and so is a state that is not
-finite numbers. On a simulated card (`fake:FOLDER`) the bytes are simulated like every model's.
+It moves nothing and invents nothing: a picture that is missing, of another shape or too small is
+refused, and so is a state that is not finite numbers. It never computes on the CPU instead. On a
+simulated GPU (`fake:FOLDER`) the bytes are simulated like every model's.
 """
 
 from collections.abc import Mapping
@@ -15,25 +16,29 @@ from vram_arbiter.sidecars.adapters.base import ModelCall
 
 ADAPTER = "gpu_passthrough"
 STATE_KEY = "observation.state"
-SIDE_MAX = 64  # pixels a side that are taken to the card: every n-th, as a preview would
+SIDE_MAX = 64  # pixels a side that are sent to the GPU: every n-th, as a preview would
 
 
 def is_passthrough(manifest: RSkillManifest) -> bool:
-    """Whether a manifest asks for it (`policy_extras.adapter`)."""
+    """Return whether a manifest asks for it (`policy_extras.adapter`)."""
     return manifest.policy_extras.get("adapter") == ADAPTER
 
 
 def need_card(manifest: RSkillManifest, device: str) -> None:
-    """Raises NoGpu for a device that is none. A CUDA card that is not there is refused where the device is opened."""
+    """Raise NoGpu for `--device none`. A missing CUDA GPU is refused where the device is opened."""
     if is_passthrough(manifest) and device == "none":
         raise NoGpu(
-            f"{manifest.name} takes frames through a card, and --device none is none",
-            hint="use --device cuda, or fake:FOLDER for a simulated card",
+            f"{manifest.name} takes frames through a GPU, and --device none has none",
+            hint="use --device cuda, or fake:FOLDER for a simulated GPU",
         )
 
 
 class GpuPassthroughAdapter:
-    """`get_action` answers `action` (1, D), the joints as they were at the first call since `reset`, and `brightness` (0..1) by picture."""
+    """The endpoint `get_action`.
+
+    It answers `action` (1, D), the joints as they were at the first call since `reset`, and
+    `brightness` (0..1) by picture.
+    """
 
     kind: Literal["vla"] = "vla"
     ops = frozenset({"get_action", "reset"})
@@ -53,7 +58,7 @@ class GpuPassthroughAdapter:
         self._pose: Any = None
 
     def prepare(self) -> None:
-        import torch  # noqa: F401  the wait for it belongs here
+        import torch  # noqa: F401  its import time belongs here
 
     def load(self, device: str) -> None:
         self._device = device
@@ -62,7 +67,7 @@ class GpuPassthroughAdapter:
         self._device = self._pose = None
 
     def run(self, call: ModelCall) -> dict[str, Any]:
-        """Raises BadRequest for an observation that is not whole."""
+        """Check an observation. Raises BadRequest for one that is incomplete."""
         assert isinstance(call, EndpointCall)
         if call.endpoint == "reset":
             self._pose = None
@@ -80,7 +85,7 @@ class GpuPassthroughAdapter:
         return {"action": self._pose[None], "brightness": brightness}
 
     def _brightness(self, pixels: Any) -> float:
-        """Mean of all channels, 0..1, computed on the card and waited for."""
+        """Return the mean of all channels, 0..1, computed on the GPU and awaited."""
         import numpy as np
         import torch
 
@@ -115,9 +120,7 @@ def _pixels(observation: Mapping[str, Any], name: str, height: int, width: int) 
     if pixels is None:
         raise BadRequest(f"the observation lacks {name}", hint=f"it has {sorted(observation)}")
     if not isinstance(pixels, np.ndarray) or pixels.dtype != np.uint8 or pixels.ndim != 3:
-        raise BadRequest(
-            f"{name} must be uint8 (H, W, 3)", hint="nothing is put in the place of a picture"
-        )
+        raise BadRequest(f"{name} must be uint8 (H, W, 3)", hint="send the camera's picture")
     if pixels.shape[2] != 3 or pixels.shape[0] < height or pixels.shape[1] < width:
         raise BadRequest(f"{name} must be at least ({height}, {width}, 3), not {pixels.shape}")
     return pixels

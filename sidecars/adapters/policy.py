@@ -1,4 +1,4 @@
-"""Robot policies through lerobot's classes and processors: an observation in, a chunk of actions out."""
+"""Robot policies through lerobot's classes and processors: observation in, chunk of actions out."""
 
 import importlib
 from collections.abc import Mapping
@@ -15,14 +15,16 @@ from vram_arbiter.sidecars.weights import Weights, from_pretrained
 IMAGE_PREFIX = "observation.images."
 _OWN_POLICIES = (
     "vram_arbiter.sidecars.models.compact_act",
-)  # policy types of ours, by lerobot's naming convention
+)  # own policy types, by lerobot's naming convention
 
 
 class PolicyAdapter:
-    """`get_action` and `reset`. A checkpoint brings its own pre- and postprocessor, so units are the checkpoint's.
+    """The endpoints `get_action` and `reset`.
 
-    Observation: `observation.state` (D,), `observation.images.CAMERA` uint8 (H, W, 3) RGB or PNG/JPEG bytes, `task` text; a leading
-    dimension of 1 is accepted. Camera names go through the manifest's `image_preprocessing.aliases`. Answer: `action` float32 (T, D).
+    A checkpoint brings its own pre- and postprocessor, so units are the checkpoint's. Observation:
+    `observation.state` (D,), `observation.images.CAMERA` uint8 (H, W, 3) RGB or PNG/JPEG bytes,
+    `task` text; a leading dimension of 1 is accepted. Camera names go through the manifest's
+    `image_preprocessing.aliases`. Answer: `action` float32 (T, D).
     """
 
     kind: Literal["vla"] = "vla"
@@ -63,8 +65,9 @@ class PolicyAdapter:
             )
         except (OSError, ValueError, KeyError, ImportError) as error:
             raise ModelError(
-                f"{self._weights.source}: its processors cannot be read: {type(error).__name__}: {error}",
-                hint="is the checkpoint complete?",
+                f"{self._weights.source}: its processors cannot be read: {type(error).__name__}: "
+                f"{error}",
+                hint="check that the checkpoint is complete",
             ) from error
         need_statistics(self._before, self._config.input_features, self._weights.source)
         need_statistics(self._after, self._config.output_features, self._weights.source)
@@ -101,7 +104,10 @@ class PolicyAdapter:
         return actions.numpy()
 
     def _batch(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """The observation as lerobot's preprocessor takes it. Raises BadRequest naming what is missing or has the wrong shape."""
+        """Return the observation as lerobot's preprocessor takes it.
+
+        Raises BadRequest naming what is missing or has the wrong shape.
+        """
         batch: dict[str, Any] = {"task": _task(observation.get("task"))}
         given = {self._feature_name(name): (name, value) for name, value in observation.items()}
         for feature, spec in self._config.input_features.items():
@@ -117,7 +123,7 @@ class PolicyAdapter:
         return batch
 
     def _feature_name(self, name: str) -> str:
-        """What the checkpoint calls an input: the manifest maps the robot's camera names to its own."""
+        """Return the checkpoint's name of an input: the manifest maps the robot's camera names."""
         rules = self._manifest.image_preprocessing
         if rules is None or not name.startswith(IMAGE_PREFIX):
             return name
@@ -125,7 +131,7 @@ class PolicyAdapter:
         return rules.input_template.format(cam=rules.aliases.get(camera, camera))
 
     def _image(self, name: str, value: Any) -> Any:
-        """uint8 HWC to float (3, H, W) in 0..1, turned and resized as in training."""
+        """Convert uint8 HWC to float (3, H, W) in 0..1, turned and resized as in training."""
         import numpy as np
         import torch
 

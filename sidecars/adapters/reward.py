@@ -1,4 +1,7 @@
-"""Reward models through lerobot's classes and processors: pictures of a robot at work and its task in, progress and success out."""
+"""Reward models through lerobot's classes and processors.
+
+Pictures of a robot at work and its task in, progress and success out.
+"""
 
 import importlib
 import math
@@ -14,23 +17,24 @@ from vram_arbiter.sidecars.weights import Weights, from_pretrained
 
 _OWN_MODELS = (
     "vram_arbiter.sidecars.models.compact_progress",
-)  # reward types of ours, by lerobot's naming convention
+)  # own reward types, by lerobot's naming convention
 BYTES_A_PIXEL = 3
 
 
 class RewardAdapter:
-    """`score`. A model that judges every picture (`score(batch)`: progress and success, each (B, T)) answers a value a picture; any other
-    reward model of lerobot's answers one, that of the newest picture, and says nothing of success.
+    """The op `score`.
 
-    What goes in: (1, T, 3, H, W) floats in 0..1 under the checkpoint's own picture key, and `task`. Progress comes out in 0..1, whatever range the
-    manifest's model speaks in.
+    A model that judges every picture (`score(batch)`: progress and success, each (B, T)) answers a
+    value a picture; any other reward model of lerobot's answers one, that of the newest picture,
+    and no success. Input: (1, T, 3, H, W) floats in 0..1 under the checkpoint's own picture key,
+    and `task`. Progress comes out in 0..1, whatever the range of the manifest's model.
     """
 
     kind: Literal["reward"] = "reward"
     ops = frozenset({"score"})
 
     def __init__(self, manifest: RSkillManifest, weights: Weights) -> None:
-        assert manifest.reward is not None, "the kind's rules demand the block"
+        assert manifest.reward is not None, "the kind requires the block"
         self._contract = manifest.reward
         self._weights = weights
         self._config: Any = None
@@ -57,8 +61,9 @@ class RewardAdapter:
             self._before, _ = make_reward_pre_post_processors(self._config)
         except (ValueError, ImportError, OSError) as error:
             raise ModelError(
-                f"{self._weights.source}: no processors for {self._config.type}: {error.__cause__ or error}",
-                hint="is everything installed that this reward model needs?",
+                f"{self._weights.source}: no processors for {self._config.type}: "
+                f"{error.__cause__ or error}",
+                hint="install the packages that this reward model needs",
             ) from error
 
     def unload(self) -> None:
@@ -67,9 +72,7 @@ class RewardAdapter:
     def run(self, call: ModelCall) -> dict[str, Any]:
         assert isinstance(call, ScoreOp)
         if self._contract.instruction_required and not call.task.strip():
-            raise BadRequest(
-                "score needs a task: progress towards what?", hint="say the instruction"
-            )
+            raise BadRequest("score needs a task", hint="add the instruction as `task`")
         progress, success = self._score(_pictures(call), call.task)
         low, high = self._contract.progress_range
         return {
@@ -84,9 +87,9 @@ class RewardAdapter:
 
         try:
             batch = self._before({self._picture_key(): pictures, "task": [task]})
-        except ValueError as error:  # what the checkpoint's own processor cannot read
+        except ValueError as error:  # the checkpoint's own processor cannot read it
             raise BadRequest(
-                f"task: {error}", hint="say it in the words that this model was made for"
+                f"task: {error}", hint="use the words that this model was trained on"
             ) from error
         with torch.inference_mode():
             if hasattr(self._model, "score"):
@@ -109,7 +112,10 @@ class RewardAdapter:
 
 
 def _pictures(call: ScoreOp) -> Any:
-    """All pictures, oldest first, as one tensor. Raises BadRequest when they are none, too many pixels, or of different sizes."""
+    """Return all pictures, oldest first, as one tensor.
+
+    Raises BadRequest for none, too many pixels, or different sizes.
+    """
     import numpy as np
     import torch
 
@@ -133,9 +139,9 @@ def _pictures(call: ScoreOp) -> Any:
 
 
 def _shares(values: list[float], what: str) -> list[float]:
-    """Cut to 0..1 like lerobot does; a number that is none is no opinion."""
+    """Clip to 0..1 as lerobot does. Raises ModelError for values that are not numbers."""
     if not all(math.isfinite(value) for value in values):
         raise ModelError(
-            f"the reward model's {what} is no number", hint="it says nothing about the task"
+            f"the reward model's {what} is not a number", hint="it gives no opinion about the task"
         )
     return [min(1.0, max(0.0, value)) for value in values]

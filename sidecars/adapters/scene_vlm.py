@@ -1,4 +1,7 @@
-"""Questions about a picture through transformers' image-text-to-text classes (Qwen3.5 and its like)."""
+"""Questions about a picture through transformers' image-text-to-text classes.
+
+These are Qwen3.5 and others.
+"""
 
 from typing import Any, Literal
 
@@ -10,12 +13,15 @@ from vram_arbiter.sidecars.images import decode, within
 from vram_arbiter.sidecars.weights import Weights, from_pretrained, model_options
 
 ANSWER_MAX_S = (
-    120.0  # then it is cut off, as by max_new_tokens: below the time that counts as stuck
+    120.0  # limit of one answer, as by max_new_tokens: below the time that counts as stuck
 )
 
 
 class SceneVlmAdapter:
-    """`query`: a picture and a question in, the answer out. Greedy, so the same question gets the same answer."""
+    """The op `query`: a picture and a question in, the answer out.
+
+    Greedy, so the same question gets the same answer.
+    """
 
     kind: Literal["vlm"] = "vlm"
     ops = frozenset({"query"})
@@ -33,7 +39,7 @@ class SceneVlmAdapter:
         config = from_pretrained(AutoConfig, self._weights)
         MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING.get(
             type(config), None
-        )  # imports the model's code: seconds less under the lease
+        )  # imports the model's code, which saves seconds under the lease
 
     def load(self, device: str) -> None:
         from transformers import AutoModelForImageTextToText
@@ -57,7 +63,8 @@ class SceneVlmAdapter:
             [{"role": "user", "content": content}],
             add_generation_prompt=True,
             tokenize=False,
-            enable_thinking=False,  # of templates that know it; it would eat the tokens of the answer
+            # for templates that know it; thinking would use up the tokens of the answer
+            enable_thinking=False,
         )
         inputs = self._processor(text=[prompt], images=[picture], return_tensors="pt").to(
             self._model.device
@@ -71,5 +78,5 @@ class SceneVlmAdapter:
 
 
 def after_thinking(text: str) -> str:
-    """The answer proper: what follows the last `</think>`, if the model thought aloud."""
+    """Return the answer proper: the text after the last `</think>`, if there is one."""
     return text.rpartition("</think>")[2].strip()

@@ -1,4 +1,7 @@
-"""Memory of a real NVIDIA card through torch. Blocks are ballast: they make a small model weigh what the one it stands for weighs."""
+"""Memory of a real NVIDIA GPU through torch.
+
+Blocks are ballast: they give a small model the footprint of the production model.
+"""
 
 import os
 from typing import Any
@@ -13,18 +16,19 @@ _CHECK_VARIABLE = "PYTORCH_NVML_BASED_CUDA_CHECK"
 
 
 class CudaMemory:
-    """`DeviceMemory` on GPU `index`, or on the first one that is granted. Raises NoGpu if torch sees no such GPU.
+    """`DeviceMemory` on GPU `index`, or on the first one that is granted.
 
-    CUDA reads which GPUs it may use when it is initialized, so a process stays on the GPU that it was granted first.
-    `context_bytes` is the guess for what the process's context costs where the driver does not list it.
+    Raises NoGpu if torch sees no such GPU. CUDA reads its visible GPUs when it is initialized, so a
+    process stays on the GPU that it was granted first. `context_bytes` is the assumed cost of the
+    process's context where the driver does not list it.
     """
 
     def __init__(self, index: int | None = None, context_bytes: int = RESIDUE_BYTES) -> None:
-        # segments that can grow and shrink: without them a fragmented cache keeps far more than is in use
+        # segments that grow and shrink: otherwise a fragmented cache keeps far more than is in use
         os.environ.setdefault(_ALLOCATOR_VARIABLE, "expandable_segments:True")
         os.environ.setdefault(
             _CHECK_VARIABLE, "1"
-        )  # is_available() asks NVML then, and does not initialize CUDA
+        )  # with it is_available() asks NVML and does not initialize CUDA
         if cuda.VISIBLE not in os.environ:
             os.environ.setdefault(cuda.ORDER, cuda.PCI)  # GPU N of CUDA is the arbiter's GPU N
         import torch
@@ -86,7 +90,8 @@ class CudaMemory:
             self._torch.cuda.empty_cache()
 
     def used_bytes(self) -> int | None:
-        """What the driver lists for this process, else the allocator's segments plus the guess for the context."""
+        """Return the driver's figure for this process, else the allocator's segments plus the
+        assumed context."""
         if not self._touched:
             return 0
         listed = self._listed_bytes()
@@ -98,12 +103,12 @@ class CudaMemory:
         return None
 
     def close(self) -> None:
-        """A CUDA context goes with its process; what can go before, goes."""
+        """Free what can be freed before the process ends; its CUDA context goes with it."""
         self._ballast.clear()
         self.empty_cache()
 
     def out_of_memory(self, error: BaseException, requested_bytes: int = 0) -> OutOfMemory:
-        """torch's error as ours, with the numbers that the arbiter learns from."""
+        """Return torch's error as OutOfMemory, with the numbers that the arbiter learns from."""
         free_bytes, capacity_bytes = self._torch.cuda.mem_get_info(self._index)
         return OutOfMemory(
             str(error),
@@ -116,7 +121,8 @@ class CudaMemory:
         )
 
     def _listed_bytes(self) -> int | None:
-        """This process in NVML's list; None where it is not listed (another pid namespace, no permission)."""
+        """Return this process in NVML's list; None where it is not listed (another PID namespace,
+        no permission)."""
         import pynvml
 
         try:

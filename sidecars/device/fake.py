@@ -1,7 +1,7 @@
-"""Writer on a simulated card (`schemas.fakegpu`): this process's bytes, changed under the card's lock.
+"""Writer on a simulated GPU (`schemas.fakegpu`): this process's bytes, changed under its lock.
 
-Thread-safe; knows nothing of leases or models. The reader on the daemon's side is written apart: programs meet in files, as
-they meet on sockets.
+Thread-safe. Must not know leases or models. The daemon's reader is separate code: programs meet in
+files, as they meet on sockets.
 """
 
 import contextlib
@@ -20,10 +20,10 @@ from vram_arbiter.sidecars.device.memory import Block
 
 
 class FakeMemory:
-    """`DeviceMemory` on the card in `folder`. Raises NoGpu if there is none.
+    """`DeviceMemory` on the simulated GPU in `folder`. Raises NoGpu if there is none.
 
-    The weights themselves stay in host memory; what the card is charged is the footprint that the model stands for.
-    `context_bytes` is what the first touch costs (a CUDA context with its libraries).
+    The weights themselves stay in host memory; the GPU is charged the footprint of the production
+    model. `context_bytes` is the cost of the first touch (a CUDA context with its libraries).
     """
 
     torch_device = "cpu"
@@ -35,24 +35,24 @@ class FakeMemory:
         self._key = ProcessKey(os.getpid(), _start_ticks(os.getpid()) or 0)
         self._thread_lock = (
             threading.Lock()
-        )  # flock guards against other processes, not against our own threads
+        )  # flock guards against other processes, not against threads of this one
         self._number = 0
         if not (folder / fakegpu.CARD_FILE).exists():
             raise NoGpu(
-                f"no simulated card in {folder}", hint="start the arbiter with --gpu fake:8GiB"
+                f"no simulated GPU in {folder}", hint="start the arbiter with --gpu fake:8GiB"
             )
 
     def bind(self, gpu: str) -> str | None:
         return None  # the lease names the GPU of this folder
 
     def touch(self) -> None:
-        """Raises SimulatedOutOfMemory if not even the context fits."""
+        """Create the context. Raises SimulatedOutOfMemory if it does not fit."""
         self._do(
             lambda card, now: fakegpu.touch(card, self._key, self._name, self._context_bytes, now)
         )
 
     def allocate(self, label: str, size_bytes: int) -> Block:
-        """Raises SimulatedOutOfMemory."""
+        """Allocate bytes. Raises SimulatedOutOfMemory."""
 
         def change(card: fakegpu.Card, now: float) -> fakegpu.Change:
             touched = fakegpu.touch(card, self._key, self._name, self._context_bytes, now)
@@ -82,12 +82,15 @@ class FakeMemory:
         ).throttle_bytes_per_s
 
     def close(self) -> None:
-        """Destroy the context and all that is left, as an orderly exit does."""
+        """Destroy the context and all allocations, as an orderly exit does."""
         if (self._folder / fakegpu.CARD_FILE).exists():
             self._do(lambda card, now: fakegpu.leave(card, self._key, now))
 
     def _do(self, transition: Callable[[fakegpu.Card, float], fakegpu.Change]) -> fakegpu.Card:
-        """One change under the lock: read, let time pass, change, write. A refusal is written down and raised."""
+        """Make one change under the lock: read, let time pass, change, write.
+
+        A refusal is recorded and raised.
+        """
         with self._thread_lock, self._locked():
             now = time.monotonic()
             change = (
@@ -141,7 +144,7 @@ class FakeMemory:
 
 
 def _start_ticks(pid: int) -> int | None:
-    """Start time of a living process; None if it is dead."""
+    """Return the start time of a live process; None if it is dead."""
     try:
         alive, start_ticks = fakegpu.parse_stat(Path(f"/proc/{pid}/stat").read_bytes())
     except (FileNotFoundError, ProcessLookupError):

@@ -1,6 +1,6 @@
-"""The device memory that a model lives in, as the sidecar's host sees it: real, simulated, or none.
+"""Device memory of a model, as the sidecar's host sees it: real, simulated, or none.
 
-Calls block and belong to the host's worker thread. Nothing here knows of leases.
+Calls block and belong to the host's worker thread. Must not know leases.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from typing import Protocol
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """One allocation of `size_bytes`; hand it back to `free` exactly once."""
+    """One allocation of `size_bytes`; pass it to `free` exactly once."""
 
     label: str
     size_bytes: int
@@ -18,22 +18,24 @@ class Block:
 
 
 class DeviceMemory(Protocol):
-    """Bytes on one card for this process.
+    """Bytes on one GPU for this process.
 
-    `allocate` raises `schemas.errors.OutOfMemory` when the card is full, and nothing is allocated then. As in every caching
-    framework, `free` gives nothing back to the card: `empty_cache` does. The context that `touch` makes stays until the process
-    ends (or `close`). `used_bytes` is what this process has on the card, context and caches included; None if that cannot be told.
+    `allocate` raises `schemas.errors.OutOfMemory` when the GPU is full, and nothing is allocated
+    then. As in every caching framework, `free` returns nothing to the GPU: `empty_cache` does. The
+    context that `touch` makes stays until the process ends (or `close`). `used_bytes` is what this
+    process has on the GPU, context and caches included; None if unknown.
     """
 
     @property
     def torch_device(self) -> str:
-        """Where the model's weights go: `cpu` or `cuda:N`."""
+        """Device of the model's weights: `cpu` or `cuda:N`."""
         ...
 
     def bind(self, gpu: str) -> str | None:
-        """Put what follows on the granted GPU. Returns the only GPU that this process can use from now on, None for any.
+        """Put further allocations on the granted GPU.
 
-        Raises BadState where it is another one.
+        Returns the only GPU that this process can use from now on, None for any. Raises BadState
+        where it is another one.
         """
         ...
 
@@ -53,7 +55,7 @@ class DeviceMemory(Protocol):
 
 
 class NoDevice:
-    """A process that puts nothing on any card: every allocation is free and nothing is measured."""
+    """A process without a GPU: every allocation is free and nothing is measured."""
 
     torch_device = "cpu"
 
@@ -95,10 +97,11 @@ def fill(
     wait: Callable[[float], bool],
     piece_bytes: int = 128 * 1024 * 1024,
 ) -> list[Block]:
-    """Allocate `size_bytes` piece by piece, as a loader does shard by shard, no faster than `bytes_per_s`.
+    """Allocate `size_bytes` piece by piece, as a loader does by shards, no faster than
+    `bytes_per_s`.
 
-    `wait(seconds)` sleeps and says whether to stop early (the rest then stays unallocated). On OutOfMemory every piece is freed
-    before the error goes on.
+    `wait(seconds)` sleeps and returns whether to stop early (the rest then stays unallocated). On
+    OutOfMemory every piece is freed before the error goes on.
     """
     blocks: list[Block] = []
     left = size_bytes

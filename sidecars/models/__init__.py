@@ -1,1 +1,1 @@
-"""Model classes of our own small checkpoints."""
+"""Model classes of the small shipped checkpoints."""

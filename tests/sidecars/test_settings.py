@@ -89,7 +89,7 @@ def test_without_an_entry_the_manifest_counts_and_without_both_nobody_guesses():
     assert footprint_for(declared, {}).on_wire().load_peak_bytes == 2_500_000_000
     own = FootprintEntry(load_peak=5, steady=4, residue=3)
     assert footprint_for(declared, {"test/model": own}) is own
-    with pytest.raises(ConfigError, match="nobody says how many bytes"):
+    with pytest.raises(ConfigError, match="no footprint is known"):
         footprint_for(parse_manifest(DETECTOR), {})
 
 

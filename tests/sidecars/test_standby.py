@@ -147,7 +147,7 @@ def test_a_model_that_a_goal_uses_is_not_idle(box, arbiter):
     held = policy.ask("load")
     goal = {"lease_id": held["lease_id"], "token": held["token"], "use_id": "goal-1"}
     assert arbiter.ask("use_begin", **goal)["ok"]
-    until(lambda: policy.log.count("in use by somebody else: not idle") >= 3)
+    until(lambda: policy.log.count("in use by another process: not idle") >= 3)
     assert policy.state() == "resident"
     arbiter.ask("use_end", **goal)
     until(lambda: policy.state() == "unloaded")

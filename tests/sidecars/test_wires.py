@@ -94,8 +94,8 @@ def test_both_families_reach_the_host():
 @pytest.mark.parametrize(
     ("message", "code", "told"),
     [
-        ({}, "bad_request", "names its op or endpoint"),
-        ({"op": 5}, "bad_request", "names its op or endpoint"),
+        ({}, "bad_request", "needs an op or endpoint"),
+        ({"op": 5}, "bad_request", "needs an op or endpoint"),
         ({"op": "dance"}, "unknown_op", "dance"),
         ({"op": "query", "image": PNG, "question": "?"}, "unknown_op", "query"),
         ({"endpoint": "detect", "data": {}}, "bad_request", "detect: endpoint"),

@@ -1,4 +1,7 @@
-"""Configuration of the compact action-chunking policy: sizes, crops, chunk length. Knows no weights."""
+"""Configuration of the compact action-chunking policy: sizes, crops, chunk length.
+
+Must not know weights.
+"""
 
 from dataclasses import dataclass, field
 
@@ -9,11 +12,13 @@ from lerobot.optim import AdamWConfig
 @PreTrainedConfig.register_subclass("compact_act")
 @dataclass
 class CompactActConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untyped here
-    """Convolutions with a spatial softmax per camera, the joint state, and a chunk of joint targets.
+    """Convolutions with a spatial softmax per camera, the joint state, and a chunk of joint
+    targets.
 
-    `views` says per image feature which crop (x0, y0, x1, y1 as fractions) is looked at and the size (width, height) in
-    pixels it is averaged down to; an image may therefore come in any size with the camera's aspect ratio. `aux_point_dim`
-    is the size of an auxiliary output (where the thing to grab is) that is trained along and fed to the action head.
+    `views` has per image feature the crop (x0, y0, x1, y1 as fractions) and the size (width,
+    height) in pixels that it is averaged to; an image may therefore have any size with the camera's
+    aspect ratio. `aux_point_dim` is the size of an auxiliary output (the position of the object to
+    grab) that is trained along and fed to the action head.
     """
 
     n_obs_steps: int = 1
@@ -41,7 +46,8 @@ class CompactActConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
         super().__post_init__()
         if not 1 <= self.n_action_steps <= self.chunk_size:
             raise ValueError(
-                f"n_action_steps must lie in 1..chunk_size ({self.chunk_size}), not {self.n_action_steps}"
+                f"n_action_steps must lie in 1..chunk_size ({self.chunk_size}), not "
+                f"{self.n_action_steps}"
             )
         if self.n_obs_steps != 1:
             raise ValueError(
@@ -49,14 +55,14 @@ class CompactActConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
             )
 
     def get_optimizer_preset(self) -> AdamWConfig:
-        """AdamW with the configured rate and decay."""
+        """Return AdamW with the configured rate and decay."""
         return AdamWConfig(lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay)
 
     def get_scheduler_preset(self) -> None:
-        """The training script schedules by itself."""
+        """Return None: the training script has its own schedule."""
 
     def validate_features(self) -> None:
-        """Raises ValueError unless there are images with a view each, a state and an action."""
+        """Raise ValueError unless there are images with a view each, a state and an action."""
         if (
             not self.image_features
             or self.robot_state_feature is None
@@ -69,13 +75,13 @@ class CompactActConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
 
     @property
     def observation_delta_indices(self) -> None:
-        """Only the present observation."""
+        """Use only the present observation."""
 
     @property
     def action_delta_indices(self) -> list[int]:
-        """The chunk starts at the present step."""
+        """Start the chunk at the present step."""
         return list(range(self.chunk_size))
 
     @property
     def reward_delta_indices(self) -> None:
-        """No rewards."""
+        """Use no rewards."""

@@ -1,8 +1,8 @@
-"""The compact action-chunking policy: about half a million weights, a chunk of joint targets in a few milliseconds.
+"""The compact action-chunking policy: half a million weights, a chunk of targets in milliseconds.
 
-Each camera has its own small convolution stack and a spatial softmax that says where its features are; an auxiliary head
-says where the thing to grab is in the robot's frame, and the action head reads all of it together with the joint state.
-Training code and simulators are not known here.
+Each camera has its own small convolution stack and a spatial softmax that locates its features. An
+auxiliary head predicts the position of the object to grab in the robot's frame, and the action head
+reads all of it together with the joint state. Must not know training code or simulators.
 """
 
 from collections import deque
@@ -17,11 +17,11 @@ from torch.nn import functional as F
 from vram_arbiter.sidecars.models.compact_act.configuration_compact_act import CompactActConfig
 
 POINT_KEY = "observation.point"
-"""(B, 3) metres in the base frame; present in training batches only."""
+"""(B, 3) meters in the base frame; present in training batches only."""
 
 
 class SpatialSoftmax(nn.Module):  # type: ignore[misc]
-    """Expected image coordinates, in -1..1, of each feature map, and how strongly it fires there."""
+    """Expected image coordinates (-1..1) of each feature map, and its strength there."""
 
     def __init__(self, channels: int, keypoints: int) -> None:
         super().__init__()
@@ -44,7 +44,10 @@ class SpatialSoftmax(nn.Module):  # type: ignore[misc]
 
 
 class Eye(nn.Module):  # type: ignore[misc]
-    """Convolutions over one camera's view: stride 4 in all, group norm so that batch and single frame agree."""
+    """Convolutions over one camera's view.
+
+    Stride 4 in all, and group norm, so that batch and single frame agree.
+    """
 
     def __init__(self, channels: list[int], keypoints: int) -> None:
         super().__init__()
@@ -96,13 +99,14 @@ class CompactActPolicy(PreTrainedPolicy):  # type: ignore[misc]
             nn.Dropout(config.dropout),
             nn.Linear(config.hidden_dim, config.chunk_size * self._action_dim),
         )
-        # targets are mostly "where the joints are, and a little on": a straight path spares the network learning that
+        # targets are mostly close to the present joints: a straight path spares the network
+        # learning that
         self.carry_on = nn.Linear(state_dim, config.chunk_size * self._action_dim)
         self.register_buffer("point_centre", torch.zeros(config.aux_point_dim))
         self.reset()
 
     def get_optim_params(self) -> Any:
-        """All weights with one rate."""
+        """Return all weights with one rate."""
         return self.parameters()
 
     def reset(self) -> None:
@@ -110,7 +114,7 @@ class CompactActPolicy(PreTrainedPolicy):  # type: ignore[misc]
         self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
 
     def view(self, key: str, image: Tensor) -> Tensor:
-        """The crop of a (B, 3, H, W) image that the policy looks at, averaged down to its size."""
+        """Return the crop of a (B, 3, H, W) image for the policy, averaged to its size."""
         (x0, y0, x1, y1), (width, height) = self.config.views[key]
         rows, columns = image.shape[-2:]
         if (rows, columns) != (int(height), int(width)):
@@ -133,20 +137,20 @@ class CompactActPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """(B, chunk_size, action_dim), normalised as the postprocessor expects."""
+        """Return (B, chunk_size, action_dim), normalized as the postprocessor expects."""
         self.eval()
         return self._run(batch)[0]
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """The next action; a new chunk is predicted when `n_action_steps` of the last are used up."""
+        """Return the next action; a new chunk is predicted after `n_action_steps` of the last."""
         if not self._queue:
             chunk = self.predict_action_chunk(batch)[:, : self.config.n_action_steps]
             self._queue.extend(chunk.transpose(0, 1))
         return self._queue.popleft()
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """Loss over the unpadded part of the chunk, plus the auxiliary one where the batch says where the thing is."""
+        """Return the loss over the unpadded chunk, plus the auxiliary one if labeled."""
         chunk, point = self._run(batch)
         error = F.smooth_l1_loss(chunk, batch[ACTION], reduction="none", beta=0.1)
         valid = (~batch["action_is_pad"]).unsqueeze(-1).expand_as(error)

@@ -1,4 +1,7 @@
-"""Pre- and postprocessing of the compact policy: lerobot's default pipelines (batch, device, normalise, unnormalise)."""
+"""Pre- and postprocessing of the compact policy: lerobot's default pipelines.
+
+These batch, move to the device, normalize and unnormalize.
+"""
 
 from typing import Any
 
@@ -17,5 +20,7 @@ def make_compact_act_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """Both pipelines for a fresh policy; lerobot's factory finds this function by its name."""
-    return make_default_pre_post_processors(config, dataset_stats, normalizer_device=config.device)  # type: ignore[no-any-return]
+    """Return both pipelines for a new policy; lerobot's factory finds this function by its name."""
+    return make_default_pre_post_processors(  # type: ignore[no-any-return]
+        config, dataset_stats, normalizer_device=config.device
+    )

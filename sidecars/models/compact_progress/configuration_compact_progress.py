@@ -1,4 +1,7 @@
-"""Configuration of the compact progress model: its picture, its words, its sizes. Knows no weights."""
+"""Configuration of the compact progress model: its picture, its words, its sizes.
+
+Must not know weights.
+"""
 
 from dataclasses import dataclass, field
 
@@ -10,9 +13,10 @@ from lerobot.utils.constants import OBS_IMAGES
 @RewardModelConfig.register_subclass("compact_progress")
 @dataclass
 class CompactProgressConfig(RewardModelConfig):  # type: ignore[misc]  # lerobot is untyped here
-    """One camera's pictures and an instruction that names one thing: a colour of `colours` and a shape of `shapes`.
+    """One camera's pictures, and an instruction that names one object by color and shape.
 
-    `size_px` (width, height) is what pictures are averaged down to; they may come in any size with that aspect ratio.
+    The words are those of `colours` and `shapes`. `size_px` (width, height) is what pictures are
+    averaged to; they may have any size with that aspect ratio.
     """
 
     image_key: str = OBS_IMAGES + ".wrist"
@@ -35,8 +39,8 @@ class CompactProgressConfig(RewardModelConfig):  # type: ignore[misc]  # lerobot
         }
 
     def validate_features(self) -> None:
-        """Raises ValueError without words: an instruction could name nothing."""
+        """Raise ValueError without words: an instruction could not name an object."""
         if not self.colours or not self.shapes:
             raise ValueError(
-                "compact_progress needs colours and shapes: the words that instructions name things by"
+                "compact_progress needs `colours` and `shapes`: the words of instructions"
             )

@@ -1,7 +1,7 @@
-"""The compact progress model: about a hundred thousand weights that judge each picture by itself, for the thing that is named.
+"""The compact progress model: a hundred thousand weights that judge each picture by itself.
 
-The words steer every layer of the picture's convolutions, so that another instruction for the same picture is another question. Training code and
-simulators are not known here.
+The words steer every layer of the picture's convolutions, so that another instruction for the same
+picture is another question. Must not know training code or simulators.
 """
 
 from typing import Any
@@ -16,14 +16,14 @@ from vram_arbiter.sidecars.models.compact_progress.configuration_compact_progres
 )
 
 WORDS_KEY = "observation.words"
-"""(B, colours + shapes) ones where the instruction says the word."""
+"""(B, colors + shapes) ones where the instruction has the word."""
 PROGRESS_KEY = "progress"
 SUCCESS_KEY = "success"
 """(B, T) labels; present in training batches only."""
 
 
 class Steered(nn.Module):  # type: ignore[misc]
-    """A convolution whose feature maps the words scale and shift."""
+    """Convolution with feature maps that the words scale and shift."""
 
     def __init__(self, inward: int, outward: int, stride: int, word_dim: int) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class CompactProgressRewardModel(PreTrainedRewardModel):  # type: ignore[misc]
         )
 
     def logits(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Of progress and success, (B, T) each, for pictures (B, T, 3, H, W) in 0..1."""
+        """Return logits of progress and success, (B, T) each; pictures (B, T, 3, H, W) in 0..1."""
         pictures = batch[self.config.image_key]
         if pictures.ndim == 4:
             pictures = pictures[:, None]
@@ -84,17 +84,17 @@ class CompactProgressRewardModel(PreTrainedRewardModel):  # type: ignore[misc]
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def score(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Progress and probability of success, each (B, T) in 0..1: one value a picture."""
+        """Return progress and probability of success, each (B, T) in 0..1: one value a picture."""
         self.eval()
         progress, success = self.logits(batch)
         return progress.sigmoid(), success.sigmoid()
 
     def compute_reward(self, batch: dict[str, Tensor]) -> Tensor:
-        """lerobot's question: the progress at the newest picture, (B,)."""
+        """Return the progress at the newest picture, (B,), as lerobot asks for it."""
         return self.score(batch)[0][:, -1]
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """Loss against the labels."""
+        """Return the loss against the labels."""
         progress, success = self.logits(batch)
         far = F.smooth_l1_loss(progress.sigmoid(), batch[PROGRESS_KEY], beta=0.1)
         held = F.binary_cross_entropy_with_logits(success, batch[SUCCESS_KEY])
@@ -102,7 +102,7 @@ class CompactProgressRewardModel(PreTrainedRewardModel):  # type: ignore[misc]
 
 
 def _places(maps: Tensor) -> Tensor:
-    """Expected image coordinates (-1..1) of each map, and how strongly it fires there."""
+    """Return expected image coordinates (-1..1) of each map, and its strength there."""
     flat = maps.flatten(2)
     weight = flat.softmax(-1).view(maps.shape)
     ys = torch.linspace(-1, 1, maps.shape[2], device=maps.device)

@@ -1,4 +1,4 @@
-"""Pre- and postprocessing of the compact progress model: the instruction's words, and the device."""
+"""Pre- and postprocessing of the compact progress model: the instruction's words, the device."""
 
 import re
 from dataclasses import dataclass, field
@@ -22,12 +22,16 @@ from vram_arbiter.sidecars.models.compact_progress.modeling_compact_progress imp
 
 
 def words_of(task: str, colours: list[str], shapes: list[str]) -> list[float]:
-    """Ones where the instruction says the word. Raises ValueError unless it names one thing by one colour and one shape."""
+    """Return ones where the instruction has the word.
+
+    Raises ValueError unless it names one object by one color and one shape.
+    """
     said = set(re.findall(r"[a-z]+", task.lower()))
     found = [[word for word in known if word in said] for known in (colours, shapes)]
     if any(len(words) != 1 for words in found):
         raise ValueError(
-            f"{task!r} does not name one thing by colour and shape; the colours are {', '.join(colours)}, the shapes {', '.join(shapes)}"
+            f"{task!r} does not name one object by color and shape; the colors are "
+            f"{', '.join(colours)}, the shapes {', '.join(shapes)}"
         )
     return [float(word in said) for word in (*colours, *shapes)]
 
@@ -35,7 +39,7 @@ def words_of(task: str, colours: list[str], shapes: list[str]) -> list[float]:
 @dataclass
 @ProcessorStepRegistry.register(name="compact_progress_words")
 class WordsStep(ProcessorStep):  # type: ignore[misc]
-    """Reads `task` (a text or a list of them) and adds what it names to the observation."""
+    """Reader of `task` (a text or a list of them) that adds the named object to the observation."""
 
     colours: list[str] = field(default_factory=list)
     shapes: list[str] = field(default_factory=list)
@@ -64,7 +68,10 @@ def make_compact_progress_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """Both pipelines; lerobot's factory finds this function by its name. There is nothing to normalise."""
+    """Return both pipelines; lerobot's factory finds this function by its name.
+
+    Nothing is normalized.
+    """
     del dataset_stats
     before = PolicyProcessorPipeline(
         steps=[WordsStep(config.colours, config.shapes), DeviceProcessorStep(device=config.device)],

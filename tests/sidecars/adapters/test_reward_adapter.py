@@ -195,5 +195,5 @@ def test_a_number_that_is_none_is_no_opinion(mean_red: Any, tmp_path: Path, png:
     adapter = RewardAdapter(reward_manifest(), Weights(str(tmp_path), local=True))
     adapter.prepare()
     adapter.load("cpu")
-    with pytest.raises(ModelError, match="progress is no number"):
+    with pytest.raises(ModelError, match="progress is not a number"):
         score(adapter, png(8, 8))
