@@ -47,7 +47,7 @@ from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint, runtime_dir, socket_path
 from vram_arbiter.schemas.runtime.folders import LockFile, private_folder, socket_folder
-from vram_arbiter.schemas.runtime.peercred import start_ticks
+from vram_arbiter.schemas.runtime.procfs import boot_id, start_ticks
 from vram_arbiter.schemas.runtime.router import Limits, Router
 from vram_arbiter.schemas.runtime.telemetry import setup as otel
 from vram_arbiter.schemas.runtime.telemetry.commands import TRACEPARENT_VARIABLE
@@ -522,11 +522,6 @@ def status_text(gpus: Sequence[GpuInfo]) -> str:
 def problems(journal: Journal, history: History) -> list[str]:
     """What an operator should know of the daemon's own files, in words."""
     return [problem for problem in (*journal.problems, history.problem) if problem]
-
-
-def boot_id() -> str:
-    """Changes with every boot of the machine, and only then."""
-    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def try_records(journal: Journal, settings: Settings) -> None:

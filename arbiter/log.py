@@ -2,12 +2,11 @@
 
 import json
 import logging
-import sys
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any
 
-from vram_arbiter.schemas.runtime.logtext import PrintableFormatter
+from vram_arbiter.schemas.runtime.logging import Form, PrintableFormatter, set_up
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.units import format_bytes
 
@@ -62,15 +61,9 @@ class RefusalLog:
         refusals_log.info("refused %s: %s: %s%s", who, code, message, more)
 
 
-def set_up_logging(form: Literal["human", "json"], level: str) -> None:
-    """Configure the root logger once, at the start of the program."""
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_Json() if form == "json" else _Human())
-    root = logging.getLogger()
-    for old in list(root.handlers):
-        root.removeHandler(old)
-    root.addHandler(handler)
-    root.setLevel(level.upper())
+def set_up_logging(form: Form, level: str) -> None:
+    """Configure the root logger once, at the start of the daemon."""
+    set_up(None, level, form, _Human())
 
 
 def level_of(kind: str) -> int:
@@ -118,19 +111,3 @@ class _Human(PrintableFormatter):
         return printable(line) + (
             "\n" + self.formatException(record.exc_info) if record.exc_info else ""
         )
-
-
-class _Json(logging.Formatter):
-    def format(self, record: logging.LogRecord) -> str:
-        line: dict[str, Any] = {
-            "at_wall_s": round(record.created, 6),
-            "level": record.levelname.lower(),
-            "logger": record.name,
-            "message": record.getMessage(),
-        }
-        if (event := getattr(record, "event", None)) is not None:
-            line["event"] = event
-        line.update(getattr(record, "trace", None) or {})
-        if record.exc_info:
-            line["exception"] = self.formatException(record.exc_info)
-        return json.dumps(line, default=str)  # everything beyond ASCII is escaped

@@ -12,7 +12,6 @@ import signal
 import sys
 from pathlib import Path
 
-from vram_arbiter.clients import logs
 from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient, RewardClient, SceneVlmClient
@@ -39,6 +38,7 @@ from vram_arbiter.schemas.errors import (
     VramError,
 )
 from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint
 from vram_arbiter.schemas.runtime.telemetry.commands import command

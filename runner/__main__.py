@@ -13,8 +13,8 @@ import sys
 from contextlib import nullcontext
 from importlib import import_module
 
-from vram_arbiter.clients import logs
 from vram_arbiter.schemas.errors import ConfigError, EstopRequested, ManifestInvalid, VramError
+from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.runtime.telemetry.commands import Command, command
 from vram_arbiter.schemas.runtime.version import add_version

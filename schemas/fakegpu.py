@@ -260,15 +260,6 @@ def _first(error: ValidationError) -> str:
     return f"{'.'.join(str(part) for part in problem['loc']) or 'the text'}: {problem['msg']}"
 
 
-def parse_stat(stat: bytes) -> tuple[bool, int]:
-    """(alive, start_ticks) of /proc/PID/stat. A zombie is dead: the kernel has taken its memory already.
-
-    Bytes, because the name in it is cut after 15 of them, perhaps in the middle of a letter.
-    """
-    fields = stat.rpartition(b")")[2].split()
-    return fields[0] not in b"ZXx", int(fields[19])
-
-
 # -- transitions -----------------------------------------------------------------------------------------------------
 def settle(card: Card, now: float, alive: Alive) -> Change:
     """Let time pass: notice edits by hand and deaths, and let what is due come back. Comes before every other transition."""

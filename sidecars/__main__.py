@@ -14,13 +14,14 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from vram_arbiter.clients import cuda, logs
+from vram_arbiter.clients import cuda
 from vram_arbiter.clients.configs import configs_folder, shipped
 from vram_arbiter.clients.net.server import path_of
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import ConfigError, ModelError, NoGpu, VramError
 from vram_arbiter.schemas.fakegpu import CARD_FILE, FOLDER_VARIABLE, parse_config
 from vram_arbiter.schemas.manifest import Kind, ManifestError, RSkillManifest
+from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint, program_endpoint
 from vram_arbiter.schemas.runtime.extras import need

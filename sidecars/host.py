@@ -10,12 +10,12 @@ import contextlib
 import logging
 import os
 import signal
-from pathlib import Path
 from typing import Any, NoReturn
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.server import RouterServer
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.base import ModelAdapter, ModelCall
 from vram_arbiter.sidecars.device.memory import DeviceMemory
@@ -43,7 +43,7 @@ class SidecarHost:
         self._memory = memory
         self._stopping = asyncio.Event()
         self._residency: Residency | None = None
-        self._boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        self._boot_id = procfs.boot_id()
 
     async def serve(self) -> bool:
         """Serve until the end.

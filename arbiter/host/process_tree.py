@@ -6,11 +6,10 @@ moment (the loop's thread). Must not decide anything about leases: it only says 
 
 from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from vram_arbiter.arbiter.core.events import ProcessUse
-from vram_arbiter.schemas.fakegpu import parse_stat
 from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime import procfs
 
 DEPTH_MAX = 64
 """Ancestors looked at; deeper trees are broken or hostile."""
@@ -48,17 +47,11 @@ class Known:
 
 
 def read_kin(pid: int) -> Kin | None:
-    """From /proc/PID/stat; None if there is no such process or it cannot be seen from here."""
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_bytes()
-        name, _, rest = stat.partition(b"(")[2].rpartition(b")")
-        return Kin(
-            ProcessKey(pid, parse_stat(stat)[1]),
-            int(rest.split()[1]),
-            name.decode(errors="replace"),
-        )
-    except (OSError, IndexError, ValueError):
+    """Return a process and its parent; None if it has ended or cannot be seen from here."""
+    stat = procfs.read_stat(pid)
+    if stat is None:
         return None
+    return Kin(ProcessKey(pid, stat.start_ticks), stat.parent_pid, stat.name)
 
 
 class Lineages:

@@ -36,6 +36,7 @@ from vram_arbiter.clients.sidecar.perception import DetectorClient, SceneVlmClie
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.errors import RunnerUnreachable, SidecarUnavailable
+from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
 from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.units import parse_bytes
@@ -180,7 +181,7 @@ async def _episode(
 
 def _make_card(folder: Path, capacity_bytes: int) -> None:
     """The simulated card, made before anybody needs it: without an arbiter nobody else would."""
-    boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    boot_id = procfs.boot_id()
     folder.mkdir()
     config = fakegpu.CardConfig(
         uuid=f"GPU-fake-{uuid.uuid4()}",

@@ -18,7 +18,6 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from vram_arbiter.clients import logs
 from vram_arbiter.runner.recording import commit, wire
 from vram_arbiter.runner.recording.lerobot_files import (
     SUCCESS,
@@ -35,6 +34,7 @@ from vram_arbiter.schemas.errors import (
     ModelError,
     VramError,
 )
+from vram_arbiter.schemas.runtime import logging as logs
 
 log = logging.getLogger("vram_arbiter.runner.recording")
 

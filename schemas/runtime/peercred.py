@@ -12,6 +12,7 @@ import struct
 from dataclasses import dataclass
 
 from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime import procfs
 
 SO_PEERPIDFD = 77
 """Linux ≥ 6.5, asm-generic/socket.h; the socket module of Python 3.12 does not name it."""
@@ -63,28 +64,16 @@ def identify(sock: socket.socket) -> Peer:
         pidfd, certain = _open(pid), False
     try:
         os.set_inheritable(pidfd, False)
-        ticks = start_ticks(pid)
+        stat = procfs.read_stat(pid)
         # alive now: /proc/PID was its own until here, not that of a process with the same pid
-        if ticks is None or _ended(pidfd):
+        if stat is None or _ended(pidfd):
             raise PeerGone(f"process {pid} has ended")
         if not certain and uid not in _uids(pid):
             raise PeerGone(f"pid {pid} belongs to another process now")
     except BaseException:
         os.close(pidfd)
         raise
-    return Peer(ProcessKey(pid, ticks), uid, gid, pidfd)
-
-
-def start_ticks(pid: int) -> int | None:
-    """Field 22 of /proc/PID/stat; None if there is no such process. Field 2 may hold spaces and
-    parentheses.
-    """
-    try:
-        with open(f"/proc/{pid}/stat", "rb") as file:
-            stat = file.read()
-    except (FileNotFoundError, ProcessLookupError):
-        return None
-    return int(stat[stat.rindex(b")") + 2 :].split()[19])
+    return Peer(ProcessKey(pid, stat.start_ticks), uid, gid, pidfd)
 
 
 def _open(pid: int) -> int:

@@ -1,21 +1,19 @@
 """Writer on a simulated GPU (`schemas.fakegpu`): this process's bytes, changed under its lock.
 
-Thread-safe. Must not know leases or models. The daemon's reader is separate code: programs meet in
-files, as they meet on sockets.
+Thread-safe; knows nothing of leases or models.
 """
 
-import contextlib
-import fcntl
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.defaults import RESIDUE_BYTES
 from vram_arbiter.schemas.errors import NoGpu
 from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime import fakegpu_folder, procfs
 from vram_arbiter.sidecars.device.memory import Block
 
 
@@ -32,7 +30,7 @@ class FakeMemory:
         self._folder = folder
         self._name = name
         self._context_bytes = context_bytes
-        self._key = ProcessKey(os.getpid(), _start_ticks(os.getpid()) or 0)
+        self._key = ProcessKey(os.getpid(), procfs.start_ticks(os.getpid()) or 0)
         self._thread_lock = (
             threading.Lock()
         )  # flock guards against other processes, not against threads of this one
@@ -87,71 +85,8 @@ class FakeMemory:
             self._do(lambda card, now: fakegpu.leave(card, self._key, now))
 
     def _do(self, transition: Callable[[fakegpu.Card, float], fakegpu.Change]) -> fakegpu.Card:
-        """Make one change under the lock: read, let time pass, change, write.
-
-        A refusal is recorded and raised.
-        """
-        with self._thread_lock, self._locked():
-            now = time.monotonic()
-            change = (
-                fakegpu.read_card(self._texts(), self._log_tail())
-                .then(lambda card: fakegpu.settle(card, now, _alive))
-                .then(lambda card: transition(card, now))
+        """Apply one change under the lock. A refusal is written down and raised."""
+        with self._thread_lock, fakegpu_folder.locked(self._folder):
+            return fakegpu_folder.change(
+                self._folder, lambda card: transition(card, time.monotonic())
             )
-            for step in change.steps:
-                self._perform(step)
-        if change.error is not None:
-            raise change.error
-        return change.card
-
-    @contextlib.contextmanager
-    def _locked(self) -> Iterator[None]:
-        lock = os.open(
-            self._folder / fakegpu.LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660
-        )
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            yield
-        finally:
-            os.close(lock)
-
-    def _texts(self) -> dict[str, str]:
-        names = os.listdir(self._folder)
-        return {
-            n: (self._folder / n).read_text()
-            for n in names
-            if n == fakegpu.CARD_FILE or fakegpu.is_process_file(n)
-        }
-
-    def _log_tail(self) -> str:
-        try:
-            with (self._folder / fakegpu.LOG_FILE).open("rb") as log:
-                log.seek(max(0, log.seek(0, os.SEEK_END) - fakegpu.LOG_TAIL_BYTES))
-                return log.read().decode(errors="replace")
-        except FileNotFoundError:
-            return ""
-
-    def _perform(self, step: fakegpu.Step) -> None:
-        if step.text is not None:
-            temporary = self._folder / f".{step.name}.tmp"
-            temporary.write_text(step.text)
-            temporary.rename(self._folder / step.name)
-        elif step.name:
-            (self._folder / step.name).unlink(missing_ok=True)
-        if step.line:
-            with (self._folder / fakegpu.LOG_FILE).open("ab", buffering=0) as log:
-                log.write(step.line.encode())
-
-
-def _start_ticks(pid: int) -> int | None:
-    """Return the start time of a live process; None if it is dead."""
-    try:
-        alive, start_ticks = fakegpu.parse_stat(Path(f"/proc/{pid}/stat").read_bytes())
-    except (FileNotFoundError, ProcessLookupError):
-        return None
-    return start_ticks if alive else None
-
-
-def _alive(key: ProcessKey) -> bool:
-    start_ticks = _start_ticks(key.pid)
-    return start_ticks is not None and key.start_ticks in (0, start_ticks)

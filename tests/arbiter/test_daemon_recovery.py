@@ -15,11 +15,10 @@ import pytest
 
 from tests.support.process import ArbiterProcess
 from tests.support.wire import TTL_S, WireClient
-from vram_arbiter.arbiter.daemon import boot_id
 from vram_arbiter.arbiter.host.journal import Journal
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.ids import ProcessKey
-from vram_arbiter.schemas.runtime.peercred import start_ticks
+from vram_arbiter.schemas.runtime.procfs import boot_id, start_ticks
 
 pytestmark = pytest.mark.e2e
 GIB = 1 << 30

@@ -12,9 +12,10 @@ from pathlib import Path
 from harness import GIB, WIDE, Peer, Suite, arbiter
 
 from tests.support.process import ArbiterProcess
-from vram_arbiter.arbiter.host.gpu.fake import locked
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime import procfs
+from vram_arbiter.schemas.runtime.fakegpu_folder import locked
 
 LAG_S = 0.15
 NO_HOLD = "scheduling:\n  thrash_hold_max_s: 0\n"
@@ -81,7 +82,7 @@ def give_back(card: Path, lag_s: float) -> float:
 
 
 def _me() -> dict[str, object]:
-    _, ticks = fakegpu.parse_stat(Path("/proc/self/stat").read_bytes())
+    ticks = procfs.start_ticks(os.getpid()) or 0
     return {"pid": os.getpid(), "start_ticks": ticks, "name": "bench"}
 
 

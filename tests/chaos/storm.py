@@ -31,10 +31,10 @@ from tests.support.fakegpu_check import check_log
 from tests.support.forkserver import Child, ForkServer
 from tests.support.lease_check import Finding, Hindrance, Story, check_leases, read_lines
 from tests.support.process import ArbiterProcess
-from vram_arbiter.arbiter.host.gpu.fake import locked
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.runtime.fakegpu_folder import locked
 
 STEPS = {
     "queued": "waiting",

@@ -209,12 +209,6 @@ def test_a_card_survives_the_daemon_but_not_the_boot():
     )
 
 
-def test_the_stat_line_of_a_process_with_an_odd_name_is_read():
-    tail = " ".join(["S", *["0"] * 18, "4711"])
-    assert fakegpu.parse_stat(f"7 (a) Z (b)) {tail}".encode()) == (True, 4711)
-    assert fakegpu.parse_stat(f"7 (x) Z{tail[1:]}".encode()) == (False, 4711)
-
-
 @pytest.mark.parametrize("kill_at", range(8))
 def test_a_kill_at_any_instant_leaves_a_card_whose_log_still_adds_up(kill_at):
     folder = Folder()

@@ -6,7 +6,8 @@ from typing import Any
 import msgpack
 
 from vram_arbiter.schemas.ids import ProcessKey
-from vram_arbiter.schemas.runtime.peercred import Peer, start_ticks
+from vram_arbiter.schemas.runtime.peercred import Peer
+from vram_arbiter.schemas.runtime.procfs import start_ticks
 
 
 def peer_of(pid: int, uid: int | None = None, gid: int | None = None) -> Peer:

@@ -3,20 +3,19 @@
 Reading lets time pass on the card: a death is noticed, and what is due comes back. It never allocates.
 """
 
-import contextlib
-import fcntl
 import os
 import threading
-import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from vram_arbiter.arbiter.core.events import ProcessUse
 from vram_arbiter.arbiter.host.gpu.probe import Card, Reading
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
-from vram_arbiter.schemas.ids import GpuId, ProcessKey
+from vram_arbiter.schemas.ids import GpuId
+from vram_arbiter.schemas.runtime import procfs
+from vram_arbiter.schemas.runtime.fakegpu_folder import locked, replace, settled
 from vram_arbiter.schemas.units import parse_bytes
 
 _HANG_POLL_S = 0.05  # how soon a simulated hang notices that it was switched off
@@ -56,7 +55,7 @@ class FakeProbe:
         try:
             self._suffer(folder)
             with locked(folder):
-                card = _settled(folder)
+                card = settled(folder)
         except (ConfigError, OSError, UnicodeDecodeError) as error:
             raise ProbeFailed(f"the simulated card in {folder} cannot be read: {error}") from error
         processes = None
@@ -123,7 +122,7 @@ def make_card(
     release_lag_s: float = fakegpu.RELEASE_LAG_S,
 ) -> None:
     """Make a card in `folder`, or keep the one there. Raises ConfigError if that one is in use with another capacity."""
-    boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    boot_id = procfs.boot_id()
     wanted = fakegpu.CardConfig(
         uuid=f"GPU-fake-{uuid.uuid4()}",
         name="Simulated GPU",
@@ -137,7 +136,7 @@ def make_card(
         path = folder / fakegpu.CARD_FILE
         existing = path.read_text() if path.exists() else None
         if existing is not None and fakegpu.parse_config(existing).boot_id == boot_id:
-            _settled(folder)  # so that processes which died since do not count as using it
+            settled(folder)  # so that processes which died since do not count as using it
         names = [name for name in os.listdir(folder) if fakegpu.is_process_file(name)]
         plan = fakegpu.plan_folder(wanted, existing, names)
         for name in plan.remove:
@@ -145,69 +144,4 @@ def make_card(
         if plan.fresh_log:
             (folder / fakegpu.LOG_FILE).unlink(missing_ok=True)
         for name, text in plan.write.items():
-            _replace(folder / name, text)
-
-
-@contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Hold the card's lock. Blocks as long as somebody else has it; the kernel frees it when its holder dies."""
-    lock = os.open(folder / fakegpu.LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(lock)
-
-
-def _settled(folder: Path) -> fakegpu.Card:
-    """The card now; the lock is held. Deaths and returns since the last reading are written down."""
-    names = [
-        name
-        for name in os.listdir(folder)
-        if name == fakegpu.CARD_FILE or fakegpu.is_process_file(name)
-    ]
-    texts = {name: (folder / name).read_text() for name in names}
-    change = fakegpu.read_card(texts, _tail(folder / fakegpu.LOG_FILE))
-    change = change.then(lambda card: fakegpu.settle(card, time.monotonic(), _alive))
-    for step in change.steps:
-        _perform(folder, step)
-    return change.card
-
-
-def _perform(folder: Path, step: fakegpu.Step) -> None:
-    if step.name and step.text is None:
-        (folder / step.name).unlink(missing_ok=True)
-    elif step.text is not None:
-        _replace(folder / step.name, step.text)
-    if step.line:
-        log = os.open(
-            folder / fakegpu.LOG_FILE, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o660
-        )
-        try:
-            os.write(log, step.line.encode())
-        finally:
-            os.close(log)
-
-
-def _replace(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(text)
-    temporary.rename(path)
-
-
-def _tail(log: Path) -> str:
-    try:
-        with log.open("rb") as file:
-            end = file.seek(0, os.SEEK_END)
-            file.seek(max(0, end - fakegpu.LOG_TAIL_BYTES))
-            return file.read().decode(errors="replace")
-    except FileNotFoundError:
-        return ""
-
-
-def _alive(key: ProcessKey) -> bool:
-    try:
-        alive, start_ticks = fakegpu.parse_stat(Path(f"/proc/{key.pid}/stat").read_bytes())
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-    return alive and key.start_ticks in (0, start_ticks)
+            replace(folder / name, text)

@@ -10,8 +10,8 @@ import os
 from pathlib import Path
 from typing import Literal
 
-from vram_arbiter.schemas.fakegpu import parse_stat
 from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime import procfs
 
 log = logging.getLogger(__name__)
 
@@ -69,11 +69,9 @@ class PidMap:
 
 
 def process_key(proc: Path, pid: int) -> ProcessKey:
-    """With the start time if the process can be seen from here."""
-    try:
-        return ProcessKey(pid, parse_stat((proc / str(pid) / "stat").read_bytes())[1])
-    except (OSError, IndexError, ValueError):
-        return ProcessKey(pid, 0)
+    """Return the process, with its start time if it can be seen from here."""
+    stat = procfs.read_stat(pid, proc)
+    return ProcessKey(pid, 0 if stat is None else stat.start_ticks)
 
 
 def process_name(proc: Path, pid: int) -> str:

@@ -12,7 +12,7 @@ import pytest
 
 from vram_arbiter.arbiter.host.process_watch import ProcessWatch
 from vram_arbiter.schemas.ids import ProcessKey
-from vram_arbiter.schemas.runtime.peercred import start_ticks
+from vram_arbiter.schemas.runtime.procfs import start_ticks
 
 PATIENCE_S = 60.0
 

@@ -19,9 +19,9 @@ from rich.text import Text
 
 from vram_arbiter.arbiter import log as telemetry
 from vram_arbiter.arbiter.lab import text as lab_text
-from vram_arbiter.clients import logs
 from vram_arbiter.clients.cli import demo_display, doctor, replies, text
 from vram_arbiter.schemas.errors import BadState
+from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
 
 GIB = 1 << 30

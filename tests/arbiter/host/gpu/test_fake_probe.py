@@ -6,10 +6,11 @@ import threading
 
 import pytest
 
-from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, locked, make_card, open_cards
+from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card, open_cards
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
 from vram_arbiter.schemas.ids import GpuId
+from vram_arbiter.schemas.runtime.fakegpu_folder import locked
 
 GIB = 2**30
 PATIENCE_S = 60.0

@@ -9,7 +9,7 @@ import pytest
 
 from vram_arbiter.arbiter.host.gpu.pids import INITIAL_NAMESPACE, PidMap
 from vram_arbiter.schemas.ids import ProcessKey
-from vram_arbiter.schemas.runtime.peercred import start_ticks
+from vram_arbiter.schemas.runtime.procfs import start_ticks
 
 
 def process(proc: Path, pid: int, ticks: int, name: str, nspid: Sequence[int]) -> None:
