@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from tests.support.busy import busy_driver
 from tests.support.core_driver import CoreDriver
-from tests.support.scenes import Tree, sent_away
+from tests.support.scenes import held, sent_away
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import JournalPut
 from vram_arbiter.arbiter.core.events import DOUBT_KEY, MemorySampled, Recovered, Tick
@@ -36,12 +36,16 @@ STARTED_S = 1000.0
 
 @cache
 def written() -> tuple[tuple[Settings, Records], ...]:
-    """What three engines wrote, the last of each key: a bit of everything, a tree of leases in use by another process, a lease away."""
-    tree, alone = Tree(residue_bytes=450 * d.MIB).held(), CoreDriver(8 * d.GIB)
-    tree.policy.use_begin(tree.leaf, "goal", label="grab")
+    """Return what three engines wrote, the last of each key.
+
+    A bit of everything, a lease in use by another process, a lease on standby.
+    """
+    used, alone = CoreDriver(8 * d.GIB), CoreDriver(8 * d.GIB)
+    holder, lease = held(used, "policy", 3, residue_bytes=450 * d.MIB)
+    used.consumer("runner").use_begin(lease, "goal", label="grab", token=holder.token(lease))
     sent_away(alone)
     found = []
-    for driver in (busy_driver(7), tree.driver, alone):
+    for driver in (busy_driver(7), used, alone):
         records = {e.key: dict(e.record) for e in driver.effects if isinstance(e, JournalPut)}
         records["drain"] = {"by": "operator", "reason": "service"}
         found.append((driver.settings, records))
