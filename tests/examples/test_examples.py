@@ -1,0 +1,118 @@
+"""Each program of `examples/` against a real daemon with a simulated GPU."""
+
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from tests.support.process import ArbiterProcess
+from vram_arbiter import Client
+
+pytestmark = pytest.mark.e2e
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+LIMIT_S = 120.0
+
+
+def environ(daemon: ArbiterProcess) -> dict[str, str]:
+    return {**daemon.environ, "VRAM_ARBITER_ENDPOINT": daemon.endpoint}
+
+
+def run(daemon: ArbiterProcess, name: str, *arguments: str, by: str = sys.executable) -> str:
+    """Return what an example prints; it must end well and warn of nothing."""
+    done = subprocess.run(
+        [by, str(EXAMPLES / name), *arguments],
+        env=environ(daemon), capture_output=True, text=True, timeout=LIMIT_S,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
+    return done.stdout
+
+
+def kinds(daemon: ArbiterProcess, consumer: str) -> list[str]:
+    """Kinds of the history events of a consumer, in order."""
+    with Client("test", endpoint=daemon.endpoint) as arbiter:
+        events = arbiter.history()["events"]
+    return [event["kind"] for event in events if event.get("consumer") == consumer]
+
+
+def in_order(wanted: Sequence[str], said: Sequence[str]) -> bool:
+    rest = iter(said)
+    return all(word in rest for word in wanted)
+
+
+def test_every_example_has_a_test() -> None:
+    programs = {path.name for path in EXAMPLES.iterdir() if path.is_file()}
+    assert programs == set(re.findall(r'"(\w+\.(?:py|pl))"', Path(__file__).read_text()))
+
+
+def test_a_consumer(arbiter_daemon: ArbiterProcess) -> None:
+    said = run(arbiter_daemon, "consumer.py").splitlines()
+    assert said[0].startswith("detecting on GPU-")
+    assert said[1] == "released: gone, 0 weights left"
+    story = ["granted", "ready", "use_began", "use_ended", "released"]
+    assert in_order(story, kinds(arbiter_daemon, "detector"))
+
+
+def test_two_models_take_turns(arbiter_daemon: ArbiterProcess) -> None:
+    said = run(arbiter_daemon, "taking_turns.py").splitlines()
+    loaded: list[str] = []
+    for line in said:
+        model, what = line.split(": ")
+        match what:
+            case "load":
+                assert not loaded, f"{model} was loaded beside {loaded}"
+                loaded.append(model)
+            case "unload":
+                loaded.remove(model)
+            case _:
+                assert loaded == [model], f"{line}, but {loaded} is loaded"
+    assert loaded == []
+    jobs = sorted(line for line in said if "job" in line)
+    assert jobs == [f"{model}: job {job}" for model in ("detector", "policy") for job in range(3)]
+
+
+def test_standby(arbiter_daemon: ArbiterProcess) -> None:
+    assert run(arbiter_daemon, "standby.py").splitlines() == [
+        "detector: loaded",
+        "detector: unloaded",
+        "training is loading, detector is standby",
+        "detector: loaded",
+        "detector is held again, with 1 weights",
+        "detector: unloaded",
+    ]
+
+
+def test_a_wrapped_program_runs_to_its_end(arbiter_daemon: ArbiterProcess) -> None:
+    said = run(arbiter_daemon, "wrap_program.py", "5GB", "sh", "-c", "echo working")
+    assert said == "working\n"
+    assert in_order(["granted", "ready", "released"], kinds(arbiter_daemon, "sh"))
+
+
+def test_a_wrapped_program_is_ended_for_another(arbiter_daemon: ArbiterProcess) -> None:
+    wrapper = subprocess.Popen(
+        [sys.executable, str(EXAMPLES / "wrap_program.py"), "5GB", "sh", "-c", "echo up; exec sleep 600"],
+        env=environ(arbiter_daemon), stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert wrapper.stdout is not None
+        assert wrapper.stdout.readline() == "up\n"
+        with Client("detector", endpoint=arbiter_daemon.endpoint) as arbiter:
+            arbiter.acquire(wait_timeout_s=LIMIT_S, vram="5GB").release()
+        assert wrapper.communicate(timeout=LIMIT_S)[0].startswith("the room is needed")
+        assert wrapper.returncode == 128 + 15
+    finally:
+        wrapper.kill()
+        wrapper.wait()
+
+
+@pytest.mark.skipif(shutil.which("perl") is None, reason="Perl is not installed")
+def test_a_client_in_another_language(arbiter_daemon: ArbiterProcess) -> None:
+    said = run(arbiter_daemon, "raw_wire.pl", by="perl").splitlines()
+    assert said[0].startswith("granted L")
+    assert said[1:] == ["working", "released"]
+    story = ["granted", "ready", "use_began", "use_ended", "released"]
+    assert in_order(story, kinds(arbiter_daemon, "sorter"))
