@@ -69,7 +69,7 @@ from vram_arbiter.arbiter.core.requests.sessions import (
 )
 from vram_arbiter.arbiter.core.scheduling import deadlock, grants
 from vram_arbiter.arbiter.core.settings import Settings
-from vram_arbiter.arbiter.core.verification import measure, readings
+from vram_arbiter.arbiter.core.verification import evidence, schedule
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
 
 DUE_MAX = 64
@@ -132,9 +132,9 @@ class Arbiter:
         return explain.why(self._core, consumer)
 
     def stale(self, now: float) -> list[GpuId]:
-        """GPUs that have to be read before their state can be shown (`readings.stale`)."""
+        """GPUs that have to be read before their state can be shown (`evidence.stale`)."""
         self._core.now = max(self._core.now, now)
-        return readings.stale(self._core)
+        return evidence.stale(self._core)
 
     def figures(self) -> dict[str, Any]:
         """The present in numbers (`figures.figures`)."""
@@ -176,10 +176,10 @@ class Arbiter:
                 on_died(core, event.process)
             # 1.3 the machine
             case MemorySampled():
-                readings.on_sample(core, event)
+                evidence.on_sample(core, event)
                 recovery.account_for_the_empty(core, event)
             case ProbeFailed():
-                readings.on_probe_failed(core, event)
+                evidence.on_probe_failed(core, event)
             case JournalFailed():
                 on_journal_failed(core, event)
             case Recovered():
@@ -266,9 +266,9 @@ class Arbiter:
                 case "overstay":
                     eviction.on_overstay_due(core, subject)
                 case "verify":
-                    measure.on_poll_due(core, subject)
+                    schedule.on_poll_due(core, subject)
                 case "probe":
-                    readings.on_probe_due(core, subject)
+                    evidence.on_probe_due(core, subject)
                 case "users":
                     uses.on_users_due(core, subject)
                 case "recover":

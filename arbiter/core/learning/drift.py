@@ -12,7 +12,7 @@ from vram_arbiter.arbiter.core.learning.footprints import PARTS, Part
 from vram_arbiter.arbiter.core.ledger.ledger import process_bytes
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
-from vram_arbiter.arbiter.core.verification.verify import Verification
+from vram_arbiter.arbiter.core.verification.judge import Verification
 from vram_arbiter.schemas.ids import LeaseId
 
 _RESIDENT = frozenset({LeaseState.HELD, LeaseState.REVOKING})

@@ -25,7 +25,7 @@ from vram_arbiter.arbiter.core.features.parking import HostRam
 from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.learning.footprints import Footprints
 from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger
-from vram_arbiter.arbiter.core.ledger.returning import Returning
+from vram_arbiter.arbiter.core.ledger.pending_free import PendingFree
 from vram_arbiter.arbiter.core.model.lease import (
     LEAVING,
     Eviction,
@@ -39,7 +39,7 @@ from vram_arbiter.arbiter.core.model.residents import Residents
 from vram_arbiter.arbiter.core.scheduling.queue import WaitQueue
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.arbiter.core.timers import Timers
-from vram_arbiter.arbiter.core.verification.verify import Verification
+from vram_arbiter.arbiter.core.verification.judge import Verification
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 
 ENDED_REMEMBERED = 1024
@@ -129,7 +129,7 @@ class Gpu:
     residents: Residents = field(default_factory=Residents)
     verifications: dict[str, Verification] = field(default_factory=dict)
     evictions: list[Eviction] = field(default_factory=list)  # not yet counted to a grant
-    returning: Returning = field(default_factory=Returning)
+    pending_free: PendingFree = field(default_factory=PendingFree)
     # when the newest verdicts fell, and how many bytes left by each
     left: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=LEFT_KEPT))
     sample: MemorySampled | None = None

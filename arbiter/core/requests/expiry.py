@@ -10,7 +10,7 @@ from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import crashes
 from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
-from vram_arbiter.arbiter.core.verification import measure
+from vram_arbiter.arbiter.core.verification import schedule
 from vram_arbiter.schemas.ids import LeaseId
 
 
@@ -84,6 +84,6 @@ def lose(
     if lease.departure.eviction is not None:
         lease.departure.eviction.released_at = core.now
         lease.departure.eviction.unloading_at = lease.departure.eviction.unloading_at or core.now
-    measure.begin_for_lease(core, gpu, lease, alive=alive, grace_s=grace_s, fenced_at=fenced_at)
+    schedule.begin_for_lease(core, gpu, lease, alive=alive, grace_s=grace_s, fenced_at=fenced_at)
     lease.move(to, core.now, str(error["message"]))
     core.end(lease, error)

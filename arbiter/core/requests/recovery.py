@@ -43,7 +43,7 @@ from vram_arbiter.arbiter.core.requests.requests import (
     touch,
 )
 from vram_arbiter.arbiter.core.scheduling import placement
-from vram_arbiter.arbiter.core.verification.measure import begin_for_lease
+from vram_arbiter.arbiter.core.verification.schedule import begin_for_lease
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ModelKey, ProcessKey, Token
 
@@ -183,7 +183,7 @@ def _place(core: Core, gpu: Gpu, lease: Lease, charge_bytes: int) -> None:
     """Charge what is there anyway. What the budget does not hold was never approved: it is pressure."""
     approved_bytes = min(charge_bytes, _room_bytes(gpu))
     gpu.ledger.charge(lease.id, lease.process, charge_bytes, approved_bytes, core.now)
-    gpu.returning.give_up(
+    gpu.pending_free.give_up(
         lease.process, max(0, lease.request.load_peak_bytes - charge_bytes), core.now
     )
     gpu.changed_at = core.now
@@ -434,7 +434,7 @@ def account_for_the_empty(core: Core, sample: MemorySampled) -> None:
     """
     gpu = core.gpus.get(sample.gpu)
     if gpu is None or gpu.sample is not sample:
-        return  # it does not count (`readings.on_sample`)
+        return  # it does not count (`evidence.on_sample`)
     if core.recovering is None or sample.taken_at < core.started_at:
         return
     noise_bytes = gpu.info.reserve_bytes + core.settings.verify_tolerance_bytes

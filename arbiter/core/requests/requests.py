@@ -35,7 +35,7 @@ from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Refused
 from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.requests.limits import check_leases, check_waiters
 from vram_arbiter.arbiter.core.scheduling import placement
-from vram_arbiter.arbiter.core.verification.measure import begin_for_lease
+from vram_arbiter.arbiter.core.verification.schedule import begin_for_lease
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, RequestId, Token
 
 _HINT_ACQUIRE = "unload, then acquire again"
@@ -407,7 +407,7 @@ def _charge_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
         else max(measured_bytes, lease.spec.residue_bytes)
     )
     peak = max(lease.request.load_peak_bytes, lease.observed.peak_bytes)
-    gpu.returning.give_up(lease.process, max(0, peak - steady), core.now)
+    gpu.pending_free.give_up(lease.process, max(0, peak - steady), core.now)
     gpu.ledger.recharge(lease.id, steady, core.now)
     gpu.changed_at = core.now
     core.want_sample(gpu, core.now)  # what it holds now is what has to come back one day

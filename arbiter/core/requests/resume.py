@@ -9,7 +9,7 @@ from vram_arbiter.arbiter.core.model.lease import EXPIRING
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.requests.recovery import EMPTY_JOURNAL, await_unnamed
 from vram_arbiter.arbiter.core.requests.uses import await_users
-from vram_arbiter.arbiter.core.verification import measure
+from vram_arbiter.arbiter.core.verification import schedule
 
 
 def on_resumed(core: Core, event: Resumed) -> None:
@@ -34,5 +34,5 @@ def _measure_anew(core: Core, gpu: Gpu) -> None:
     gpu.read_from = core.now
     core.want_sample(gpu, core.now)
     for verification in gpu.verifications.values():
-        measure.begin_again(core, gpu, verification)
+        schedule.begin_again(core, gpu, verification)
     core.wake(gpu)

@@ -14,7 +14,7 @@ from vram_arbiter.arbiter.core.requests.expiry import lose
 from vram_arbiter.arbiter.core.requests.recovery import account_for
 from vram_arbiter.arbiter.core.requests.requests import cancel_waiter, let_go
 from vram_arbiter.arbiter.core.requests.uses import end_use
-from vram_arbiter.arbiter.core.verification.measure import begin_for_residue, bereave
+from vram_arbiter.arbiter.core.verification.schedule import begin_for_residue, bereave
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey
 
 

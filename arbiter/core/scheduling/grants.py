@@ -22,7 +22,7 @@ from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.scheduling import policy
-from vram_arbiter.arbiter.core.verification.readings import note_pressure
+from vram_arbiter.arbiter.core.verification.evidence import note_pressure
 from vram_arbiter.schemas.ids import LeaseId
 
 

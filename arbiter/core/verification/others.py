@@ -8,7 +8,7 @@ from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.arbiter.core.ledger.ledger import process_bytes
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.arbiter.core.model.state import Gpu
-from vram_arbiter.arbiter.core.verification.verify import Others, Verification
+from vram_arbiter.arbiter.core.verification.judge import Others, Verification
 from vram_arbiter.schemas.ids import ProcessKey
 
 
@@ -60,7 +60,7 @@ def _left_bytes(
     leaving = {other.process for other in gpu.verifications.values()} - {verification.process}
     count = sum(gpu.ledger.filled_bytes(process) for process in leaving)
     count += sum(left for at, left in gpu.left if at > baseline.taken_at)
-    count += gpu.returning.since(baseline.taken_at - returns_s)
+    count += gpu.pending_free.since(baseline.taken_at - returns_s)
     if baseline.processes is not None and sample.processes is not None:
         now = {use.process: use.used_bytes or 0 for use in sample.processes}
         count += sum(

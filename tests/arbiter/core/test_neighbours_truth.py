@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.core_driver import READING_S, Consumer, CoreDriver
 from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed
-from vram_arbiter.arbiter.core.verification.verify import DYING_S
+from vram_arbiter.arbiter.core.verification.judge import DYING_S
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 

@@ -9,7 +9,7 @@ from vram_arbiter.arbiter.core.learning import drift
 from vram_arbiter.arbiter.core.ledger.ledger import is_hidden, process_bytes
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
-from vram_arbiter.arbiter.core.verification import measure
+from vram_arbiter.arbiter.core.verification import schedule
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 
 
@@ -38,13 +38,13 @@ def on_sample(core: Core, sample: MemorySampled) -> None:
     gpu.ledger.observe(
         sample,
         quiet=gpu.quiet() and sample.taken_at > gpu.changed_at,
-        returning_bytes=gpu.returning.since(sample.taken_at - core.settings.verify_timeout_s),
+        returning_bytes=gpu.pending_free.since(sample.taken_at - core.settings.verify_timeout_s),
     )
     if sample.processes is not None:
         drift.on_evidence(core, gpu)
         _note_stowaways(core, gpu, known)
     _shrink_residues(core, gpu, sample)
-    measure.on_reading(core, gpu, sample, answers_again=answers_again)
+    schedule.on_reading(core, gpu, sample, answers_again=answers_again)
     note_pressure(core, gpu)
     core.wake(gpu)
     for feature in core.features:
@@ -123,7 +123,7 @@ def _watch_returning(gpu: Gpu, sample: MemorySampled) -> None:
     leaving = {verification.process for verification in gpu.verifications.values()}
     leaving.update(lease.process for lease in gpu.in_state(LeaseState.UNLOADING))
     accounts = gpu.ledger.accounts
-    gpu.returning.watch(
+    gpu.pending_free.watch(
         gpu.sample,
         sample,
         leaving,

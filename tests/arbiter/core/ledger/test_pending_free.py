@@ -6,7 +6,7 @@ from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.scenes import held, hidden_card
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
 from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger
-from vram_arbiter.arbiter.core.ledger.returning import Returning
+from vram_arbiter.arbiter.core.ledger.pending_free import PendingFree
 from vram_arbiter.arbiter.core.settings import GpuInfo
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
@@ -24,7 +24,7 @@ def reading(at: float, used: int, *uses: tuple[ProcessKey, int | None]) -> Memor
 
 # -- what is watched -----------------------------------------------------------------------------------------------------
 def test_what_was_given_up_counts_for_as_long_as_it_is_asked_for() -> None:
-    returning = Returning()
+    returning = PendingFree()
     returning.give_up(A, 300, 10.0)
     returning.give_up(B, 50, 12.0)
     assert returning.since(9.0) == 350
@@ -33,7 +33,7 @@ def test_what_was_given_up_counts_for_as_long_as_it_is_asked_for() -> None:
 
 
 def test_what_a_process_takes_again_is_not_on_its_way() -> None:
-    returning = Returning()
+    returning = PendingFree()
     returning.give_up(A, 300, 10.0)
     returning.give_up(A, -100, 11.0)
     returning.give_up(B, -100, 11.0)
@@ -45,7 +45,7 @@ def test_what_a_process_takes_again_is_not_on_its_way() -> None:
 
 
 def test_two_readings_say_what_was_given_up_between_them() -> None:
-    returning = Returning()
+    returning = PendingFree()
     before = reading(1.0, 900, (A, 500), (B, 300), (STRANGER, 100))
     returning.watch(None, before, (), lambda _: 0)
     returning.watch(before, reading(2.0, 900, (A, 400), (B, 200)), {B}, lambda _: 0)
@@ -57,7 +57,7 @@ def test_two_readings_say_what_was_given_up_between_them() -> None:
 
 
 def test_a_holder_that_leaves_the_list_still_explains_what_it_is_booked() -> None:
-    returning = Returning()
+    returning = PendingFree()
     returning.watch(reading(1.0, 500, (A, 500)), reading(2.0, 500), (), {A: 450}.__getitem__)
     assert returning.since(1.0) == 50
 

@@ -10,7 +10,7 @@ from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.schemas.ids import ProcessKey
 
 
-class Returning:
+class PendingFree:
     """What processes gave up on one card lately."""
 
     def __init__(self) -> None:

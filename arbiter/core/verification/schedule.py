@@ -10,7 +10,7 @@ from vram_arbiter.arbiter.core.learning import costs, drift
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.verification import others
-from vram_arbiter.arbiter.core.verification.verify import Judgement, Verdict, Verification, judge
+from vram_arbiter.arbiter.core.verification.judge import Judgement, Verdict, Verification, judge
 from vram_arbiter.schemas.defaults import VERIFY_READING_SHARE
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 
