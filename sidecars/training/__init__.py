@@ -1,1 +1,1 @@
-"""Scripts that make the small models which the demo ships; nothing at run time imports this folder."""
+"""Scripts that train the demo's small models; nothing at run time imports this folder."""

@@ -1,7 +1,8 @@
-"""What both training scripts share: labelled frames on disk, words for objects, seeding, small-tokenizer BPE.
+"""Shared by the training scripts: labeled frames on disk, words for objects, seeding, small BPE.
 
-A data set is a folder with `labels.jsonl`, one JSON object per frame, and the PNGs it names. This module must not know
-the simulator that made the frames (it reads files only) nor either model. torch and friends are imported late.
+A data set is a folder with `labels.jsonl`, one JSON object per frame, and the PNGs it names. Must
+not know the simulator that made the frames (it reads files only) nor either model. torch and its
+like are imported late.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ from pathlib import Path
 from typing import Any, Final
 
 LABELS_FILE: Final = "labels.jsonl"
-# Below this many visible pixels (at the frame's own size) a thing is too hidden for a fair yes or no.
+# Below this many visible pixels (at the frame's own size) an object is too hidden for a yes or no.
 MIN_VISIBLE_PIXELS: Final = 100
 
 
 class BadDataset(ValueError):
-    """The folder is no data set of labelled frames; the message says which line or file is at fault."""
+    """The folder is not a data set of labeled frames; the message names line or file."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SeenObject:
-    """One thing that shows in a frame. `box` is (x0, y0, x1, y1) in pixels, of its visible part."""
+    """One visible object of a frame. `box` is (x0, y0, x1, y1) in pixels, of its visible part."""
 
     name: str
     box: tuple[float, float, float, float]
@@ -36,7 +37,7 @@ class SeenObject:
 
     @property
     def clear(self) -> bool:
-        """Visible enough that a detector must find it; otherwise finding it is neither right nor wrong."""
+        """Whether a detector must find it; otherwise finding it is neither right nor wrong."""
         return self.pixels >= MIN_VISIBLE_PIXELS
 
     @property
@@ -46,13 +47,13 @@ class SeenObject:
 
     @property
     def shape(self) -> str:
-        """The rest of the name."""
+        """Rest of the name."""
         return self.name.split(" ", 1)[1]
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Frame:
-    """One labelled image. `scene` groups frames of the same episode: a split never parts them.
+    """One labeled image. `scene` groups frames of the same episode: a split never separates them.
 
     `objects` are those that show in the image, `present` names all that exist in the scene.
     """
@@ -67,11 +68,12 @@ class Frame:
 
 
 def read_frames(folder: Path, cameras: Sequence[str] | None = None) -> list[Frame]:
-    """All frames of a data set (of these cameras), in file order. Raises BadDataset."""
+    """Return all frames of a data set (of these cameras), in file order. Raises BadDataset."""
     labels = folder / LABELS_FILE
     if not labels.is_file():
         raise BadDataset(
-            f"{labels} is missing: make a data set with `python -m vram_arbiter.runner.sim.training.dataset scenes`"
+            f"{labels} is missing: make a data set with `python -m "
+            "vram_arbiter.runner.sim.training.dataset scenes`"
         )
     frames: list[Frame] = []
     for number, line in enumerate(labels.read_text(encoding="utf-8").splitlines(), start=1):
@@ -116,14 +118,14 @@ def _frame(folder: Path, raw: Mapping[str, Any]) -> Frame:
 
 
 def visible_names(frame: Frame) -> list[str]:
-    """Names of what clearly shows, from left to right."""
+    """Return names of the clearly visible objects, from left to right."""
     return [o.name for o in sorted(frame.objects, key=lambda o: o.box[0] + o.box[2]) if o.clear]
 
 
 def split_by_scene(
     frames: Sequence[Frame], held_out: float, seed: int
 ) -> tuple[list[Frame], list[Frame]]:
-    """(training, held-out) frames; whole scenes go to one side, at least one scene to each."""
+    """Return (training, held-out) frames; whole scenes go to one side, at least one each."""
     scenes = sorted({frame.scene for frame in frames})
     if len(scenes) < 2:
         raise BadDataset("a data set needs at least two scenes, or nothing can be held out")
@@ -134,7 +136,7 @@ def split_by_scene(
 
 
 def seed_everything(seed: int, threads: int) -> None:
-    """Same seed, same thread count, same library versions: same checkpoint."""
+    """Seed everything: same seed, thread count and library versions give the same checkpoint."""
     import numpy as np
     import torch
 
@@ -146,7 +148,7 @@ def seed_everything(seed: int, threads: int) -> None:
 
 
 def load_pixels(frames: Sequence[Frame], size: tuple[int, int]) -> Any:
-    """uint8 tensor (frames, 3, height, width); every image resized to `size` = (width, height)."""
+    """Return a uint8 tensor (frames, 3, height, width), resized to `size` = (width, height)."""
     import numpy as np
     import torch
     from PIL import Image
@@ -162,7 +164,10 @@ def load_pixels(frames: Sequence[Frame], size: tuple[int, int]) -> Any:
 
 
 def jitter_colours(images: Any, generator: Any, strength: float) -> Any:
-    """Float images (n, 3, h, w) in 0..1 under random exposure, white balance and noise; hue names stay true."""
+    """Return float images (n, 3, h, w) in 0..1 under random exposure, white balance and noise.
+
+    Hue names stay true.
+    """
     import torch
 
     count = images.shape[0]
@@ -174,7 +179,8 @@ def jitter_colours(images: Any, generator: Any, strength: float) -> Any:
 
 
 def cosine_with_warmup(step: int, total: int, warmup: int) -> float:
-    """Factor on the learning rate: linear to 1 over `warmup` steps, then a cosine down to 0.02."""
+    """Return the learning rate's factor: linear to 1 over `warmup` steps, then a cosine down to
+    0.02."""
     if step < warmup:
         return (step + 1) / warmup
     done = min(1.0, (step - warmup) / max(1, total - warmup))
@@ -182,17 +188,18 @@ def cosine_with_warmup(step: int, total: int, warmup: int) -> float:
 
 
 def byte_alphabet() -> list[str]:
-    """The 256 printable stand-ins for bytes that byte-level BPE works on, in a fixed order."""
+    """Return the 256 printable stand-ins for bytes of byte-level BPE, in a fixed order."""
     from tokenizers.pre_tokenizers import ByteLevel
 
     return sorted(ByteLevel.alphabet())
 
 
 def learn_merges(words: Iterable[str], *, suffix: str) -> tuple[list[str], list[tuple[str, str]]]:
-    """(tokens, merges) of a BPE that makes each word one token, pieces shared where they can be.
+    """Return (tokens, merges) of a BPE that makes each word one token, pieces shared where
+    possible.
 
-    `words` are already in byte-level form; `suffix` closes a word (CLIP: `</w>`, Qwen: none). Ties are broken by
-    the alphabet, so that the same words give the same tokenizer on every machine.
+    `words` are already in byte-level form; `suffix` closes a word (CLIP: `</w>`, Qwen: none). Ties
+    are broken by the alphabet, so that the same words give the same tokenizer on every machine.
     """
     pieces = {word: [*word[:-1], word[-1] + suffix] for word in sorted(set(words)) if word}
     tokens: list[str] = []
@@ -215,7 +222,7 @@ def learn_merges(words: Iterable[str], *, suffix: str) -> tuple[list[str], list[
 
 
 def batches(count: int, size: int, seed: int) -> Iterator[list[int]]:
-    """Endless shuffled batches of indices; the last batch of a pass is filled from the next."""
+    """Yield endless shuffled batches of indices; a pass's last batch is filled from the next."""
     rng = random.Random(f"batches-{seed}")
     queue: list[int] = []
     while True:
@@ -228,10 +235,10 @@ def batches(count: int, size: int, seed: int) -> Iterator[list[int]]:
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Stable, readable JSON with a newline at the end."""
+    """Write stable, readable JSON with a newline at the end."""
     path.write_text(json.dumps(value, indent=2, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def folder_bytes(folder: Path) -> int:
-    """Size of all files under a folder."""
+    """Return the size of all files under a folder."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

@@ -1,11 +1,13 @@
-"""Trains the demo's open-vocabulary detector: a small OwlViT from scratch, saved as any zero-shot hub checkpoint.
+"""Training of the demo's open-vocabulary detector: a small OwlViT, saved as a zero-shot checkpoint.
 
-`python -m vram_arbiter.sidecars.training.detector --data DIR --out DIR [--smoke]`. DIR holds `labels.jsonl` and PNGs. The result is
-read by `AutoProcessor` and `AutoModelForZeroShotObjectDetection` like google/owlvit-base-patch32. This script must not
-know the simulator or the sidecar that will serve the model.
+`python -m vram_arbiter.sidecars.training.detector --data DIR --out DIR [--smoke]`. DIR holds
+`labels.jsonl` and PNGs. The result is read by `AutoProcessor` and
+`AutoModelForZeroShotObjectDetection` like google/owlvit-base-patch32. Must not know the simulator
+or the sidecar that will serve the model.
 
-Loss: each patch whose centre lies in the middle of a thing (or the patch nearest to it) must say yes to the queries that
-name it and no to all others; its box is fitted by L1 and GIoU. Patches that only touch the thing are left out.
+Loss: each patch with its center in the middle of an object (or the patch nearest to it) must say
+yes to the queries that name it and no to all others; its box is fitted by L1 and GIoU. Patches that
+only touch the object are left out.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ MAX_TOKENS: Final = 16
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Recipe:
-    """Everything a run depends on beside its data."""
+    """Parameters of a run beside its data."""
 
     seed: int = 7
     threads: int = 1
@@ -57,20 +59,23 @@ class Recipe:
     max_steps: int = 3000
     held_out: float = 0.12
     split_seed: int = (
-        7  # not the seed of the run: a run that goes on from another keeps its held-out scenes
+        7  # not the seed of the run: a run that continues another keeps its held-out scenes
     )
     strange_queries: int = 10
     word_steps: int = 250
 
 
 SMOKE: Final = Recipe(
-    image_px=128, patch_px=16, width=48, layers=2, text_width=32, text_layers=1, batch=8, budget_s=8.0, max_steps=30,
-    held_out=0.25, strange_queries=4, word_steps=40,
+    image_px=128, patch_px=16, width=48, layers=2, text_width=32, text_layers=1, batch=8,
+    budget_s=8.0, max_steps=30, held_out=0.25, strange_queries=4, word_steps=40,
 )  # fmt: skip
 
 
 def build_tokenizer(folder: Path, words: Sequence[str]) -> None:
-    """Write a CLIP-format BPE tokenizer. Pad is id 0 (OWL masks queries that start with it), end the greatest id."""
+    """Write a CLIP-format BPE tokenizer.
+
+    Pad is id 0 (OWL masks queries that start with it), end the greatest id.
+    """
     from transformers import CLIPTokenizer
 
     alphabet = common.byte_alphabet()
@@ -96,7 +101,7 @@ def build_tokenizer(folder: Path, words: Sequence[str]) -> None:
 
 
 def build_processor(folder: Path, image_px: int, words: Sequence[str]) -> Any:
-    """The processor as `AutoProcessor` will read it back from `folder`."""
+    """Return the processor as `AutoProcessor` will read it back from `folder`."""
     from transformers import CLIPTokenizer, OwlViTImageProcessor, OwlViTProcessor
 
     build_tokenizer(folder, words)
@@ -110,7 +115,7 @@ def build_processor(folder: Path, image_px: int, words: Sequence[str]) -> Any:
 
 
 def build_model(recipe: Recipe, tokenizer: Any) -> Any:
-    """A fresh OwlViT; its position tables start as sines, which spares it learning what is next to what."""
+    """Return a new OwlViT. Its position tables start as sines, so it need not learn adjacency."""
     import torch
     from transformers import OwlViTConfig, OwlViTForObjectDetection
 
@@ -136,12 +141,13 @@ def build_model(recipe: Recipe, tokenizer: Any) -> Any:
         },
         projection_dim=recipe.text_width,
     )
-    # eager attention in bfloat16 is twice as fast as the fused one on CPUs that multiply bfloat16
+    # eager attention in bfloat16 is twice as fast as fused attention on CPUs with bfloat16
     model = OwlViTForObjectDetection._from_config(config, attn_implementation="eager")
     vision = model.owlvit.vision_model.embeddings
     side = recipe.image_px // recipe.patch_px
     with torch.no_grad():
-        # transformers draws every Linear of an OwlViT with a deviation of 1, which only a loaded checkpoint survives
+        # transformers draws every Linear of an OwlViT with a deviation of 1, fit for a loaded
+        # checkpoint only
         for name, module in model.named_modules():
             if isinstance(module, torch.nn.Linear):
                 inner = name.endswith(("out_proj", "fc2"))
@@ -176,10 +182,12 @@ def _sine_table(side: int, width: int) -> Any:
 def teach_words(
     model: Any, tokenizer: Any, recipe: Recipe, colours: Sequence[str], shapes: Sequence[str]
 ) -> float:
-    """Fit the text tower alone: a query's vector is its colour's code plus its shape's, or the code of `nothing`.
+    """Fit the text tower alone: a query's vector is the codes of its color and shape, or of
+    `nothing`.
 
-    The codes are random orthogonal directions; the image side then has fixed targets from its first step, where
-    learning both towers at once spends minutes on a plateau. Returns the mean cosine that was reached.
+    The codes are random orthogonal directions; the image side then has fixed targets from its first
+    step, where learning both towers at once spends minutes on a plateau. Returns the mean cosine
+    that was reached.
     """
     import torch
 
@@ -227,16 +235,17 @@ def teach_words(
 
 @dataclasses.dataclass(slots=True)
 class Targets:
-    """Labels of a batch on the patch grid: which thing a patch stands for, and which it only touches."""
+    """Labels of a batch on the patch grid: the object that a patch stands for, and those it
+    touches."""
 
     names: list[list[str]]
     boxes: Any  # (batch, things, 4) centre-size in 0..1, zero where padded
-    owner: Any  # (batch, patches) index of the thing, -1 for none
+    owner: Any  # (batch, patches) index of the object, -1 for none
     touched: Any  # (batch, patches, things) bool: neither yes nor no
 
 
 def make_targets(things: Sequence[Sequence[tuple[str, Any, bool]]], side: int) -> Targets:
-    """`things`: per image (name, box x0 y0 x1 y1 in 0..1, clear)."""
+    """Label a batch. `things`: per image (name, box x0 y0 x1 y1 in 0..1, clear)."""
     import torch
 
     most = max(1, max(len(row) for row in things))
@@ -247,7 +256,7 @@ def make_targets(things: Sequence[Sequence[tuple[str, Any, bool]]], side: int) -
     my, mx = (grid.reshape(-1) for grid in torch.meshgrid(middle, middle, indexing="ij"))
     half = 0.5 / side
     for b, row in enumerate(things):
-        # the smallest last: where two things share a patch, it goes to the smaller
+        # the smallest last: a patch shared by two objects goes to the smaller
         for t, (_, box, clear) in sorted(enumerate(row), key=lambda item: -area(item[1][1])):
             x0, y0, x1, y1 = (float(v) for v in box)
             cx, cy, w, h = (x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0
@@ -265,7 +274,7 @@ def make_targets(things: Sequence[Sequence[tuple[str, Any, bool]]], side: int) -
 def loss_of(
     model: Any, pixels: Any, targets: Targets, asked: Sequence[queries.Query], ids: Any, mask: Any
 ) -> Any:
-    """Focal classification over (patch, query) plus box loss over owning patches."""
+    """Return focal classification over (patch, query) plus box loss over owning patches."""
     import torch
     from torch.nn import functional
     from torchvision.ops import generalized_box_iou_loss
@@ -273,7 +282,7 @@ def loss_of(
     batch = pixels.shape[0]
     with torch.autocast("cpu", dtype=torch.bfloat16):
         grid, _ = model.image_embedder(pixels)
-    # the text tower has been taught already and stays as it is: fixed targets, and a tenth less work
+    # the text tower is trained already and frozen: fixed targets, and a tenth less work
     with torch.no_grad():
         words = model.owlvit.text_projection(
             model.owlvit.text_model(input_ids=ids, attention_mask=mask).pooler_output
@@ -295,10 +304,10 @@ def loss_of(
     wanted = (
         torch.gather(answers, 1, owner[..., None].expand(-1, -1, len(asked))) * owned[..., None]
     )
-    # a patch that touches a thing without owning it may say either to the thing's own queries
+    # a patch that touches an object without owning it may answer its queries either way
     unsure = torch.einsum("bpt,btq->bpq", targets.touched.float(), answers) > 0
     weight = 1.0 - (unsure & (wanted == 0)).float()
-    # right colour and wrong shape, or the reverse, is the mistake to unlearn: things weigh more than background
+    # right color and wrong shape, or the reverse, is the mistake to unlearn: objects weigh more
     weight = weight * (1.0 + 2.0 * owned[..., None])
     chance = logits.sigmoid()
     raw = functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
@@ -319,7 +328,10 @@ def loss_of(
 def augment(
     rng: random.Random, generator: Any, images: Any, frames: Sequence[Frame], size_px: int
 ) -> tuple[Any, list[list[tuple[str, Any, bool]]]]:
-    """Random zoom, shift, mirror and light; boxes follow. Returns float images in 0..1 and their things."""
+    """Apply random zoom, shift, mirror and light; boxes follow.
+
+    Returns float images in 0..1 and their objects.
+    """
     import torch
     from torch.nn import functional
 
@@ -353,7 +365,7 @@ def augment(
 
 
 def take_over(model: Any, start: Path) -> None:
-    """Copy the weights of an earlier checkpoint; its patch filters are scaled if the patches have another size."""
+    """Copy the weights of an earlier checkpoint; patch filters are scaled to another patch size."""
     import torch
     from transformers import OwlViTForObjectDetection
 
@@ -374,7 +386,10 @@ def train(
     out: Path,
     start: Path | None = None,
 ) -> tuple[Any, Any, dict[str, Any]]:
-    """Train on `frames`, from the weights of `start` if given; returns (processor, model, figures of the run)."""
+    """Train on `frames`, from the weights of `start` if given.
+
+    Returns (processor, model, figures of the run).
+    """
     import torch
 
     common.seed_everything(recipe.seed, recipe.threads)
@@ -453,7 +468,10 @@ def train(
 
 
 def run(recipe: Recipe, data: Path, out: Path, start: Path | None = None) -> dict[str, Any]:
-    """Train, save, evaluate the saved checkpoint as a user would load it, write the model card. Returns the figures."""
+    """Train, save, evaluate the saved checkpoint as a user would load it, write the model card.
+
+    Returns the figures.
+    """
     from transformers import AutoModelForZeroShotObjectDetection, AutoProcessor
 
     frames = common.read_frames(data, [recipe.camera])
@@ -488,7 +506,7 @@ def run(recipe: Recipe, data: Path, out: Path, start: Path | None = None) -> dic
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; 2 for a folder that is no data set."""
+    """Run the command line; 2 for a folder that is not a data set."""
     parser = argparse.ArgumentParser(
         prog="python -m vram_arbiter.sidecars.training.detector", description=__doc__
     )
@@ -496,15 +514,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--data", type=Path, required=True, help="folder with labels.jsonl and images"
     )
     parser.add_argument("--out", type=Path, required=True, help="folder for the checkpoint")
+    parser.add_argument("--start-from", type=Path, help="checkpoint of this script to continue")
+    parser.add_argument("--steps", type=int, help="steps; default: the recipe's")
     parser.add_argument(
-        "--start-from", type=Path, help="checkpoint of this script whose training is to go on"
-    )
-    parser.add_argument("--steps", type=int, help="steps, if not the recipe's")
-    parser.add_argument(
-        "--budget-s", type=float, help="seconds after which to end, learning rate and all"
+        "--budget-s", type=float, help="time limit in seconds; the learning rate follows it"
     )
     parser.add_argument(
-        "--smoke", action="store_true", help="a toy size, seconds, only to see that all runs"
+        "--smoke", action="store_true", help="toy size, a few seconds: checks that all code runs"
     )
     parser.add_argument("--seed", type=int, default=Recipe().seed)
     parser.add_argument("--threads", type=int, default=Recipe().threads)

@@ -1,6 +1,6 @@
-"""Judges a trained detector on held-out frames and writes its model card.
+"""Evaluation of a trained detector on held-out frames, and its model card.
 
-It uses the checkpoint as anybody would, through its processor; it must not know how the checkpoint was trained.
+It uses the checkpoint through its processor, as any user; it must not know the training.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from vram_arbiter.sidecars.training.common import Frame
 
 
 def area(box: Sequence[float]) -> float:
-    """Of a box (x0, y0, x1, y1)."""
+    """Return the center of a box (x0, y0, x1, y1)."""
     return float((box[2] - box[0]) * (box[3] - box[1]))
 
 
 def corners(boxes: Any) -> Any:
-    """(n, 4) boxes as centre and size, turned into corners."""
+    """Convert (n, 4) boxes of center and size to corners."""
     import torch
 
     return torch.cat([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2], dim=1)
@@ -29,7 +29,7 @@ def corners(boxes: Any) -> Any:
 
 @dataclasses.dataclass(slots=True)
 class Trial:
-    """One (frame, query): what should be found, and the best box with its score."""
+    """One (frame, query): the expected object, and the best box with its score."""
 
     stage: str
     known: bool
@@ -38,7 +38,7 @@ class Trial:
     box: tuple[float, float, float, float]
 
     def right_place(self) -> bool:
-        """Whether the best box is on the thing: IoU of 0.4 or centres within 8 pixels."""
+        """Whether the best box is on the object: IoU of 0.4 or centers within 8 pixels."""
         if self.truth is None:
             return False
         a, b = self.truth, self.box
@@ -48,7 +48,7 @@ class Trial:
         return wide * high >= 0.4 * union or self.centre_error_px() <= 8.0
 
     def centre_error_px(self) -> float:
-        """Distance of the box centres in pixels of the frame."""
+        """Distance of the box centers in pixels of the frame."""
         assert self.truth is not None
         a, b = self.truth, self.box
         return float(
@@ -57,7 +57,7 @@ class Trial:
 
 
 def run_trials(processor: Any, model: Any, frames: Sequence[Frame], seed: int) -> list[Trial]:
-    """Ask every frame for all names there are, in random words, and for things that exist nowhere.
+    """Ask every frame for all names, in random words, and for objects that exist nowhere.
 
     A query's scores do not depend on the queries beside it, so one call asks them all.
     """
@@ -99,7 +99,7 @@ def run_trials(processor: Any, model: Any, frames: Sequence[Frame], seed: int) -
 
 
 def choose_threshold(trials: Sequence[Trial]) -> float:
-    """The score that loses least: misses of what is there plus alarms for what is not, both as rates."""
+    """Return the score that loses least: misses plus false alarms, both as rates."""
 
     def cost(threshold: float) -> float:
         found = rates(trials, threshold)
@@ -112,7 +112,7 @@ def choose_threshold(trials: Sequence[Trial]) -> float:
 
 
 def rates(trials: Sequence[Trial], threshold: float) -> dict[str, float]:
-    """Found and false-alarm rates at a threshold, with the counts they stand on."""
+    """Return found and false-alarm rates at a threshold, with their counts."""
     there = [t for t in trials if t.truth is not None]
     absent = [t for t in trials if t.truth is None and t.known]
     strange = [t for t in trials if not t.known]
@@ -130,7 +130,7 @@ def rates(trials: Sequence[Trial], threshold: float) -> dict[str, float]:
 
 
 def inference_ms(processor: Any, model: Any, frame: Frame) -> float:
-    """Median milliseconds of one query on one image, pre- and post-processing included."""
+    """Return median milliseconds of one query on one image, pre- and post-processing included."""
     import torch
     from PIL import Image
 
@@ -159,33 +159,43 @@ pipeline_tag: zero-shot-object-detection
 ---
 # so101-detector
 
-The demo's open-vocabulary detector: an OwlViT of {parameters} parameters, trained from scratch on frames of the simulated
-tabletop by `python -m vram_arbiter.sidecars.training.detector` (no pretrained weights). It stands in for a production detector, is read by
-`AutoProcessor` / `AutoModelForZeroShotObjectDetection` like one, and knows coloured cubes, balls and cylinders only.
+The demo's open-vocabulary detector: an OwlViT of {parameters} parameters, trained from scratch on
+frames of the simulated tabletop by `python -m vram_arbiter.sidecars.training.detector`, without
+pretrained weights.
+It stands in for a production detector, is read by `AutoProcessor` /
+`AutoModelForZeroShotObjectDetection` like one, and knows colored cubes, balls and cylinders only.
 
-- Camera `{camera}`; frames are scaled to {image_px} x {image_px} by the processor. Recommended `score_threshold`: {threshold}.
-- Query with free text (`red cube`, `a photo of a blue ball`, `green object`). Several boxes may lie on one thing: take the best.
-- Data: `python -m vram_arbiter.runner.sim.training.dataset scenes --count 8000 --seed 1`; {train_frames} frames to train, {test_frames} held out by scene.
-- Training: seed {seed}, {steps} steps of {batch}, {train_s} s on {threads} thread(s), bfloat16 autocast; checkpoint float32, {bytes} bytes.
+- Camera `{camera}`; the processor scales frames to {image_px} x {image_px}.
+- Recommended `score_threshold`: {threshold}.
+- Query with free text (`red cube`, `a photo of a blue ball`, `green object`).
+  Several boxes may lie on one object: take the best.
+- Data: `python -m vram_arbiter.runner.sim.training.dataset scenes --count 8000 --seed 1`;
+  {train_frames} frames to train, {test_frames} held out by scene.
+- Training: seed {seed}, {steps} steps of {batch}, {train_s} s on {threads} thread(s), bfloat16
+  autocast; checkpoint float32, {bytes} bytes.
 - One query on one image: {inference_ms} ms on one core, pre- and post-processing included.
 
-Held out, at the threshold, which was chosen on these same frames (found: best box above it with IoU >= 0.4 or centre within 8 px; false alarm: any box above it for a
-(colour, shape) that the scene lacks; strange: the same for words that training never saw; things with fewer than
-{min_pixels} visible pixels are not asked for):
+Held out, at the threshold, which was chosen on these same frames.
 
-| frames | asked | found | centre error p95 (px) | absent asked | false alarm | strange asked | strange alarm |
+- *found*: the best box above it has IoU >= 0.4 or its center within 8 px.
+- *false alarm*: any box above it for a (color, shape) that the scene lacks.
+- *strange*: the same for words that training never saw.
+- Objects with fewer than {min_pixels} visible pixels are not asked for.
+
+| frames | asked | found | center error p95 (px) | absent asked | false alarm | strange asked | strange alarm |
 | --- | --- | --- | --- | --- | --- | --- | --- |
 {rows}
 """
 
 
 def card_rows(trials: Sequence[Trial], threshold: float) -> str:
-    """One table row over everything, then one per stage of the episode."""
+    """Return one table row over everything, then one per stage of the episode."""
     rows = []
     for stage in ("all", *sorted({t.stage for t in trials})):
         r = rates([t for t in trials if stage in ("all", t.stage)], threshold)
         rows.append(
-            f"| {stage} | {r['asked']} | {r['found']:.2%} | {r['centre_error_px_p95']} | {r['absent']} | "
+            f"| {stage} | {r['asked']} | {r['found']:.2%} | {r['centre_error_px_p95']} | "
+            f"{r['absent']} | "
             f"{r['false_alarm']:.2%} | {r['strange']} | {r['strange_alarm']:.2%} |"
         )
     return "\n".join(rows)

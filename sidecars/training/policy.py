@@ -1,7 +1,9 @@
-"""Trains the small grab policy on recorded demonstrations: `python -m vram_arbiter.sidecars.training.policy --data DIR --out DIR`.
+"""Training of the small grab policy on recorded demonstrations.
 
-Reads a folder written by `python -m vram_arbiter.runner.sim.training.dataset grab`; writes a lerobot checkpoint (config, weights, processors).
-Seeded; about ten minutes on two cores. `--smoke` runs a few seconds of the same code. Must not know the simulator.
+`python -m vram_arbiter.sidecars.training.policy --data DIR --out DIR` reads a folder written by
+`python -m vram_arbiter.runner.sim.training.dataset grab` and writes a lerobot checkpoint (config,
+weights, processors). Seeded; about ten minutes on two cores. `--smoke` runs a few seconds of the
+same code. Must not know the simulator.
 """
 
 from __future__ import annotations
@@ -30,7 +32,10 @@ class BadDemonstrations(ValueError):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Demonstrations:
-    """All steps of all episodes, one after another, as numpy arrays; `episode_end[i]` is one past step i's episode."""
+    """All steps of all episodes in order, as numpy arrays.
+
+    `episode_end[i]` is one past step i's episode.
+    """
 
     images: dict[str, Any]
     state: Any
@@ -41,7 +46,7 @@ class Demonstrations:
 
 
 def load_demonstrations(*folders: Path) -> Demonstrations:
-    """Read data folders, one after another. Raises BadDemonstrations."""
+    """Read data folders in order. Raises BadDemonstrations."""
     import numpy as np
 
     parts = [_load_folder(folder) for folder in folders]
@@ -63,7 +68,8 @@ def _load_folder(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     path = folder / "info.json"
     if not path.is_file():
         raise BadDemonstrations(
-            f"{path} is missing: record with `python -m vram_arbiter.runner.sim.training.dataset grab --out {folder}`"
+            f"{path} is missing: record with `python -m vram_arbiter.runner.sim.training.dataset "
+            f"grab --out {folder}`"
         )
     info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     if info.get("format") != FORMAT:
@@ -84,7 +90,7 @@ def _load_folder(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def make_config(info: dict[str, Any], *, action_steps: int) -> Any:
-    """The policy's configuration for this data: cameras at their full size, crops from the data's own description."""
+    """Return the policy's configuration: cameras at full size, crops as the data describes."""
     from lerobot.configs import FeatureType, PolicyFeature
 
     from vram_arbiter.sidecars.models.compact_act import CompactActConfig
@@ -114,7 +120,7 @@ def make_config(info: dict[str, Any], *, action_steps: int) -> Any:
 
 
 def make_stats(data: Demonstrations) -> dict[str, dict[str, Any]]:
-    """Mean and spread of state and action, per joint, as the normalising processors take them."""
+    """Return mean and spread of state and action, per joint, for the normalizing processors."""
     import torch
 
     stats = {}
@@ -125,7 +131,7 @@ def make_stats(data: Demonstrations) -> dict[str, dict[str, Any]]:
 
 
 def load_stats(checkpoint: Path) -> dict[str, dict[str, Any]]:
-    """The normalisation that a checkpoint was trained with, from its preprocessor."""
+    """Return the normalization that a checkpoint was trained with, from its preprocessor."""
     from safetensors.torch import load_file
 
     stats: dict[str, dict[str, Any]] = {}
@@ -135,12 +141,12 @@ def load_stats(checkpoint: Path) -> dict[str, dict[str, Any]]:
             if which in ("mean", "std"):
                 stats.setdefault(key, {})[which] = value
     if not {"observation.state", "action"} <= set(stats):
-        raise BadDemonstrations(f"{checkpoint} has no normalisation of state and action")
+        raise BadDemonstrations(f"{checkpoint} has no normalization of state and action")
     return stats
 
 
 class Batches:
-    """Random training batches with light augmentation: shifts, brightness, tint, noise on the joints."""
+    """Random training batches with light augmentation: shifts, brightness, tint, joint noise."""
 
     def __init__(
         self, data: Demonstrations, config: Any, stats: dict[str, dict[str, Any]], seed: int
@@ -156,13 +162,13 @@ class Batches:
         self._point, self._end = torch.from_numpy(data.point), torch.from_numpy(data.episode_end)
 
     def draw(self, size: int) -> dict[str, Any]:
-        """A batch of `size` random steps."""
+        """Return a batch of `size` random steps."""
         import torch
 
         pick = torch.randint(len(self._state), (size,), generator=self._generator)
         ahead = pick[:, None] + torch.arange(self._config.chunk_size)[None, :]
         last = (self._end[pick] - 1)[:, None]
-        # past the end the arm just stays: the last target goes on for a while and is worth learning
+        # past the end the arm stays: the last target continues for a while and is worth learning
         pad = ahead > last + AFTER_END_STEPS
         state, action = self._stats["observation.state"], self._stats["action"]
         noisy = self._state[pick] + 0.004 * torch.randn(
@@ -208,8 +214,8 @@ def train(
 ) -> dict[str, float]:
     """Train, write the checkpoint, return the last running losses.
 
-    Ends early (and well: the rate follows time) at the limit. `init` goes on from an earlier checkpoint, whose normalisation
-    is kept because its weights mean nothing without it.
+    Ends early (and well: the rate follows time) at the limit. `init` continues an earlier
+    checkpoint, with its normalization, since its weights depend on it.
     """
     import torch
     from lerobot.policies.factory import make_pre_post_processors
@@ -262,7 +268,7 @@ def train(
         if done % 200 == 0:
             line = {"step": done, "s": round(time.monotonic() - began, 1)}
             print(json.dumps(line | {k: round(v, 5) for k, v in running.items()}), flush=True)
-    # short runs have not left the start behind: their average would still hold the untrained weights
+    # the average of short runs would still contain the untrained weights
     best = averaged.module if done >= 1000 else policy
     best.save_pretrained(out)
     before, after = make_pre_post_processors(config, dataset_stats=stats)
@@ -272,7 +278,7 @@ def train(
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Command line of the policy trainer."""
+    """Run the command line of the policy trainer."""
     parser = argparse.ArgumentParser(
         prog="python -m vram_arbiter.sidecars.training.policy", description=__doc__
     )
@@ -281,20 +287,22 @@ def main(argv: list[str] | None = None) -> int:
         type=Path,
         required=True,
         nargs="+",
-        help="folders written by runner.sim.training.dataset grab",
+        help="folders written by vram_arbiter.runner.sim.training.dataset grab",
     )
-    parser.add_argument("--init", type=Path, help="checkpoint to go on from")
+    parser.add_argument("--init", type=Path, help="checkpoint to continue")
     parser.add_argument("--out", type=Path, required=True, help="checkpoint folder")
     parser.add_argument("--steps", type=int, default=7000)
     parser.add_argument("--batch-size", type=int, default=32)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
-        "--action-steps", type=int, default=6, help="how many of a chunk's targets are executed"
+        "--action-steps", type=int, default=6, help="number of a chunk's targets that are executed"
     )
     parser.add_argument("--threads", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument("--time-limit-s", type=float, default=720.0)
     parser.add_argument(
-        "--smoke", action="store_true", help="a few seconds: does the code run, does the loss fall"
+        "--smoke",
+        action="store_true",
+        help="a few seconds: checks that the code runs and the loss falls",
     )
     args = parser.parse_args(argv)
     import torch

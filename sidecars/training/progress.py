@@ -1,7 +1,9 @@
-"""Trains the small progress model: `python -m vram_arbiter.sidecars.training.progress --data DIR --out DIR`.
+"""Training of the small progress model.
 
-Reads a folder written by `python -m vram_arbiter.runner.sim.training.progress`; writes a lerobot reward model (config, weights) and its model card with the held-out
-figures. Seeded; under three minutes on two cores. `--smoke` runs a few seconds of the same code. Must not know the simulator.
+`python -m vram_arbiter.sidecars.training.progress --data DIR --out DIR` reads a folder written by
+`python -m vram_arbiter.runner.sim.training.progress` and writes a lerobot reward model (config,
+weights) and its model card with the held-out figures. Seeded; under three minutes on two cores.
+`--smoke` runs a few seconds of the same code. Must not know the simulator.
 """
 
 from __future__ import annotations
@@ -18,19 +20,24 @@ from pathlib import Path
 from typing import Any, Final
 
 FORMAT: Final = "grab-progress/1"
-HELD_OUT: Final = 0.12  # of the tries, the last ones: a try is never parted
-ABOUT_WORK: Final = 0.55  # of the training questions ask for the thing that the grab is about; the others for anything else
-ABSENT: Final = 0.1  # ask for what is not on the table
+HELD_OUT: Final = 0.12  # share of the tries, the last ones: a try is never split
+# share of the training questions for the object of the grab; the others ask for anything else
+ABOUT_WORK: Final = 0.55
+ABSENT: Final = 0.1  # share that asks for an absent object
 SURE: Final = 0.5
 
 
 class BadProgressData(ValueError):
-    """The folder does not hold labelled grabs; the message says what is wrong."""
+    """The folder does not hold labeled grabs; the message says what is wrong."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Pictures:
-    """uint8 (N, H, W, 3); per picture the things on its table with their progress and whether they are held, and its try."""
+    """Pictures, uint8 (N, H, W, 3).
+
+    Per picture: the objects on its table with their progress and whether they are held, and its
+    try.
+    """
 
     images: Any
     progress: list[dict[str, float]]
@@ -40,11 +47,11 @@ class Pictures:
 
     @property
     def names(self) -> list[str]:
-        """All things that were ever on a table."""
+        """Names of all objects that were ever on a table."""
         return sorted({name for row in self.progress for name in row})
 
     def about(self, index: int) -> str:
-        """The thing that is nearest to being held."""
+        """Return the object that is nearest to being held."""
         row = self.progress[index]
         return max(row, key=lambda name: (row[name], name))
 
@@ -56,7 +63,8 @@ def load(folder: Path) -> Pictures:
     path = folder / "info.json"
     if not path.is_file():
         raise BadProgressData(
-            f"{path} is missing: record with `python -m vram_arbiter.runner.sim.training.progress --out {folder}`"
+            f"{path} is missing: record with `python -m vram_arbiter.runner.sim.training.progress "
+            f"--out {folder}`"
         )
     info = json.loads(path.read_text(encoding="utf-8"))
     if info.get("format") != FORMAT:
@@ -78,7 +86,7 @@ def load(folder: Path) -> Pictures:
 
 
 def make_config(data: Pictures) -> Any:
-    """The model's configuration for this data."""
+    """Return the model's configuration for this data."""
     from vram_arbiter.sidecars.models.compact_progress import CompactProgressConfig
 
     height, width = data.images.shape[1:3]
@@ -93,7 +101,7 @@ def make_config(data: Pictures) -> Any:
 
 
 def split(data: Pictures) -> tuple[list[int], list[int]]:
-    """Indices to train on, and held out."""
+    """Return indices to train on, and held out."""
     last = max(data.episode) + 1
     border = last - max(1, round(last * HELD_OUT))
     return (
@@ -103,7 +111,7 @@ def split(data: Pictures) -> tuple[list[int], list[int]]:
 
 
 def ask(data: Pictures, index: int, rng: random.Random) -> str:
-    """A thing to ask a picture for."""
+    """Return an object to ask a picture for."""
     draw = rng.random()
     here = data.progress[index]
     if draw < ABOUT_WORK:
@@ -117,7 +125,8 @@ def ask(data: Pictures, index: int, rng: random.Random) -> str:
 def batch_of(
     data: Pictures, config: Any, questions: list[tuple[int, str]], rng: Any | None
 ) -> dict[str, Any]:
-    """Tensors for so many (picture, thing) pairs; `rng` (a torch generator) adds tint, light and noise."""
+    """Return tensors for (picture, object) pairs; `rng` (a torch generator) adds tint, light and
+    noise."""
     import torch
 
     from vram_arbiter.sidecars.models.compact_progress.modeling_compact_progress import (
@@ -153,7 +162,10 @@ def batch_of(
 def train(
     data: Pictures, out: Path, *, steps: int, batch_size: int, seed: int, time_limit_s: float
 ) -> dict[str, float]:
-    """Train, write the checkpoint, return the last running losses. Ends early, and well, at the limit: the rate follows time."""
+    """Train, write the checkpoint, return the last running losses.
+
+    Ends early, and well, at the limit: the rate follows time.
+    """
     import torch
 
     from vram_arbiter.sidecars.models.compact_progress.modeling_compact_progress import (
@@ -203,15 +215,18 @@ def train(
             )
     best = (
         averaged.module if done >= 500 else model
-    )  # a short run's average still holds the untrained weights
+    )  # a short run's average still contains the untrained weights
     best.eval()
     best.save_pretrained(out)
     return running | {"steps": float(done), "seconds": time.monotonic() - began}
 
 
 def judge(data: Pictures, checkpoint: Path) -> dict[str, float]:
-    """Held-out figures: how often success is said rightly, for what is held, for the others beside it, and for an empty gripper; and the
-    mean error of progress for the thing the grab is about."""
+    """Return held-out figures.
+
+    How often success is right, for the held object, for others beside it, and for an empty gripper;
+    and the mean error of progress for the object of the grab.
+    """
     import torch
     from lerobot.configs.rewards import RewardModelConfig
     from lerobot.rewards.factory import get_reward_model_class
@@ -262,25 +277,31 @@ library_name: lerobot
 ---
 # so101-progress
 
-The demo's reward model: lerobot type `compact_progress`, trained from scratch by `python -m vram_arbiter.sidecars.training.progress` on
-`python -m vram_arbiter.runner.sim.training.progress` (wrist camera, two grabs in five miss on purpose). It stands in for Robometer-4B, judges each picture by itself, and knows
-the tabletop's colours and shapes only: an instruction has to name one thing by both.
+The demo's reward model: lerobot type `compact_progress`, trained from scratch by
+`python -m vram_arbiter.sidecars.training.progress` on
+`python -m vram_arbiter.runner.sim.training.progress` (wrist camera, two grabs in five miss on
+purpose).
+It stands in for Robometer-4B, judges each picture by itself, and knows the tabletop's colors and
+shapes only: an instruction has to name one object by both.
 
-Progress is the simulator's truth, not time: nearing the named thing up to 0.5, both fingers on it 0.6, held from 0.7, carried 1. The policy's own grabs look
-a little different from the expert's it was trained on. Its word is advice: nothing ends or begins by it.
+Progress is the simulator's truth, not time: nearing the named object up to 0.5, both fingers on it
+0.6, held from 0.7, carried 1.
+The policy's own grabs look slightly different from the expert's in the training data.
+Its answer is advice: no goal begins or ends by it.
 
 Held out by try ({held_out} pictures):
 
-| success said rightly when | asked | right |
+| success is right when | asked | right |
 | --- | --- | --- |
 {rows}
 
-Mean error of progress for the thing that the grab is about: {error}. Trained {steps} steps in {seconds} s.
+Mean error of progress for the object of the grab: {error}.
+Trained {steps} steps in {seconds} s.
 """
 
 
 def card(figures: dict[str, float], trained: dict[str, float]) -> str:
-    """The model card."""
+    """Return the model card."""
     groups = [name for name in figures if f"{name}: asked" in figures]
     rows = "\n".join(
         f"| {name} | {figures[f'{name}: asked']:.0f} | {figures[name]:.2%} |" for name in groups
@@ -292,12 +313,15 @@ def card(figures: dict[str, float], trained: dict[str, float]) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Command line of the trainer."""
+    """Run the command line of the trainer."""
     parser = argparse.ArgumentParser(
         prog="python -m vram_arbiter.sidecars.training.progress", description=__doc__
     )
     parser.add_argument(
-        "--data", type=Path, required=True, help="folder written by runner.sim.training.progress"
+        "--data",
+        type=Path,
+        required=True,
+        help="folder written by vram_arbiter.runner.sim.training.progress",
     )
     parser.add_argument("--out", type=Path, required=True, help="checkpoint folder")
     parser.add_argument("--steps", type=int, default=4000)
@@ -305,7 +329,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument("--time-limit-s", type=float, default=165.0)
-    parser.add_argument("--smoke", action="store_true", help="a few seconds: does the code run")
+    parser.add_argument(
+        "--smoke", action="store_true", help="a few seconds: checks that the code runs"
+    )
     args = parser.parse_args(argv)
     import torch
 

@@ -1,4 +1,4 @@
-"""Free-text queries for things on a table, and what each of them matches: words only, no model, no images."""
+"""Free-text queries for objects on a table, and their matches: words only, no model, no images."""
 
 from __future__ import annotations
 
@@ -14,21 +14,26 @@ SHAPE_WORDS: Final = {
 }
 OTHER_COLOURS: Final = ("white", "black", "pink", "brown", "grey", "cyan", "silver", "golden")
 OTHER_THINGS: Final = (
-    "mug", "banana", "spoon", "bottle", "apple", "person", "chair", "screwdriver", "plate", "book", "phone", "dog",
-    "scissors", "bowl", "pen", "shoe", "lamp", "key", "hammer", "tomato", "cone", "ring", "pyramid", "duck",
+    "mug", "banana", "spoon", "bottle", "apple", "person", "chair", "screwdriver", "plate",
+    "book", "phone", "dog", "scissors", "bowl", "pen", "shoe", "lamp", "key", "hammer", "tomato",
+    "cone", "ring", "pyramid", "duck",
 )  # fmt: skip
-# Never trained on: they tell in the evaluation whether a word nobody taught it is turned down.
+# Never trained on: the evaluation uses them to test that unknown words are rejected.
 UNTAUGHT_THINGS: Final = ("carrot", "wrench", "teapot", "notebook", "lemon", "kettle")
 THING_WORDS: Final = ("object", "thing", "item")
 PHRASES: Final = (
-    "{}", "{}", "{}", "a {}", "the {}", "one {}", "a photo of a {}", "find the {}", "the {} on the table", "{}.",
+    "{}", "{}", "{}", "a {}", "the {}", "one {}", "a photo of a {}", "find the {}", "the {} on the "
+                                                                                    "table", "{}.",
     "a small {}", "where is the {}",
 )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Query:
-    """A text and what it asks for; None means any. `known` is False where nothing in the vocabulary can match."""
+    """A text and what it asks for; None means any.
+
+    `known` is False where nothing in the vocabulary can match.
+    """
 
     text: str
     colour: str | None
@@ -36,12 +41,12 @@ class Query:
     known: bool = True
 
     def matches(self, colour: str, shape: str) -> bool:
-        """Whether a thing of this colour and shape answers the query."""
+        """Return whether an object of this color and shape answers the query."""
         return self.known and self.colour in (None, colour) and self.shape in (None, shape)
 
 
 def every_word(colours: Sequence[str], shapes: Sequence[str]) -> list[str]:
-    """The words that a tokenizer should know as one piece, sorted."""
+    """Return the words that a tokenizer should know as one piece, sorted."""
     words = {
         *colours,
         *OTHER_COLOURS,
@@ -64,7 +69,10 @@ def every_word(colours: Sequence[str], shapes: Sequence[str]) -> list[str]:
 def sample_queries(
     rng: random.Random, colours: Sequence[str], shapes: Sequence[str], strange: int
 ) -> list[Query]:
-    """Every (colour, shape), every colour, every shape in random words, and `strange` that nothing can answer."""
+    """Return every (color, shape), every color, every shape in random words, and `strange` ones.
+
+    Nothing can answer a strange query.
+    """
     out: list[Query] = []
     for colour in colours:
         for shape in shapes:

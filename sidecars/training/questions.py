@@ -1,4 +1,4 @@
-"""Questions about what a camera of the robot sees, and the true answers: words only, no model, no images."""
+"""Questions about a camera's picture, and the true answers: words only, no model, no images."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ NOTHING: Final = "nothing"
 
 
 def with_article(name: str) -> str:
-    """`a red cube`, `an orange ball`."""
+    """Return the name with its article: `a red cube`, `an orange ball`."""
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
 
 def said(rng: random.Random, template: str, name: str) -> str:
-    """The question about a name, the shape now and then by a synonym."""
+    """Return the question about a name, the shape sometimes by a synonym."""
     colour, shape = name.split(" ", 1)
     word = shape if rng.random() < 0.85 else rng.choice(SYNONYMS.get(shape, (shape,)))
     text = template.format(f"{colour} {word}")
@@ -67,7 +67,7 @@ def said(rng: random.Random, template: str, name: str) -> str:
 def grasped(
     rng: random.Random, name: str, held: str | None, template: str | None = None
 ) -> tuple[str, str]:
-    """(question, answer) whether a named thing is held."""
+    """Return (question, answer): is a named object held?"""
     question = said(rng, template or rng.choice(GRASPED), name)
     if held == name:
         return question, f"Yes, the gripper holds the {held}."
@@ -75,7 +75,7 @@ def grasped(
 
 
 def holding(rng: random.Random, held: str | None) -> tuple[str, str]:
-    """(question, answer) what, if anything, is held."""
+    """Return (question, answer): which object, if any, is held?"""
     kind = rng.random()
     if kind < 0.6:
         return rng.choice(HOLDING), _state(held).capitalize()
@@ -85,7 +85,7 @@ def holding(rng: random.Random, held: str | None) -> tuple[str, str]:
 
 
 def present(rng: random.Random, name: str, seen: Sequence[str]) -> tuple[str, str]:
-    """(question, answer) whether a named thing is to be seen."""
+    """Return (question, answer): is a named object in view?"""
     question = said(rng, rng.choice(PRESENT), name)
     if name in seen:
         return question, f"Yes, I see {with_article(name)}."
@@ -93,7 +93,7 @@ def present(rng: random.Random, name: str, seen: Sequence[str]) -> tuple[str, st
 
 
 def listing(rng: random.Random, seen: Sequence[str]) -> tuple[str, str]:
-    """(question, answer) naming all that is to be seen, in the order given."""
+    """Return (question, answer) naming all objects in view, in the order given."""
     text = ", ".join(with_article(name) for name in seen)
     return rng.choice(LIST), f"{text[0].upper()}{text[1:]}." if text else "No objects."
 
@@ -103,7 +103,7 @@ def _state(held: str | None) -> str:
 
 
 def corpus(names: Sequence[str]) -> list[str]:
-    """Every text that questions and answers are made of: what a tokenizer should know."""
+    """Return every text that questions and answers are made of, for the tokenizer."""
     rng = random.Random("corpus")
     texts = [*HOLDING, *ANYTHING, *EMPTY, *LIST, "user assistant system", "No objects."]
     for name in names:

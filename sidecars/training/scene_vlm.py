@@ -1,11 +1,13 @@
-"""Trains the demo's scene VLM: a small Qwen3.5 from scratch, saved as any image-text-to-text hub checkpoint.
+"""Training of the demo's scene VLM: a small Qwen3.5, saved as an image-text-to-text checkpoint.
 
-`python -m vram_arbiter.sidecars.training.scene_vlm --data DIR --out DIR [--smoke]`. DIR holds `labels.jsonl` and PNGs. The result is read
-by `AutoProcessor` and `AutoModelForImageTextToText` like Qwen/Qwen3.5-4B: chat template, `generate`. This script must not know
-the simulator or the sidecar that will serve the model.
+`python -m vram_arbiter.sidecars.training.scene_vlm --data DIR --out DIR [--smoke]`. DIR holds
+`labels.jsonl` and PNGs. The result is read by `AutoProcessor` and `AutoModelForImageTextToText`
+like Qwen/Qwen3.5-4B: chat template, `generate`. Must not know the simulator or the sidecar that
+will serve the model.
 
-Three stages. The vision tower first learns, through throw-away linear heads on its mean output token, what is held and what
-shows; then the language model learns to answer from the tower's tokens; at last both are fitted together for a while.
+Three stages: the vision tower learns, through throw-away linear heads on its mean output token,
+what is held and what shows; then the language model learns to answer from the tower's tokens; at
+last both are fitted together.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ from vram_arbiter.sidecars.training.scene_vlm_report import (
 )
 
 SPECIALS: Final = (
-    "<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>",
+    "<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>",
+    "<|image_pad|>", "<|video_pad|>",
 )  # fmt: skip
 CHAT_TEMPLATE: Final = (
     "{%- for message in messages -%}"
@@ -54,7 +57,7 @@ CHAT_TEMPLATE: Final = (
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Recipe:
-    """Everything a run depends on beside its data."""
+    """Parameters of a run beside its data."""
 
     seed: int = 7
     threads: int = 1
@@ -82,7 +85,7 @@ class Recipe:
     learning_rate: float = 1.0e-3
     held_out: float = 0.12
     split_seed: int = (
-        0  # not the seed of the run: a run that goes on from another keeps its held-out scenes
+        0  # not the seed of the run: a run that continues another keeps its held-out scenes
     )
 
     @property
@@ -92,13 +95,16 @@ class Recipe:
 
 
 SMOKE: Final = Recipe(
-    grid=(8, 6), vision_width=32, vision_layers=1, width=32, batch=6, vision_steps=6, language_steps=6,
-    steps=4, held_out=0.25,
+    grid=(8, 6), vision_width=32, vision_layers=1, width=32, batch=6,
+    vision_steps=6, language_steps=6, steps=4, held_out=0.25,
 )  # fmt: skip
 
 
 def build_processor(folder: Path, recipe: Recipe, names: Sequence[str]) -> Any:
-    """Tokenizer (byte-level BPE of Qwen's kind), image processor and chat template, as `AutoProcessor` reads them back."""
+    """Write tokenizer (byte-level BPE of Qwen's kind), image processor and chat template.
+
+    `AutoProcessor` reads them back.
+    """
     from transformers import (
         Qwen2TokenizerFast,
         Qwen2VLImageProcessor,
@@ -141,7 +147,7 @@ def build_processor(folder: Path, recipe: Recipe, names: Sequence[str]) -> Any:
 
 
 def build_model(recipe: Recipe, processor: Any) -> Any:
-    """A fresh Qwen3.5 with this tokenizer's ids."""
+    """Return a new Qwen3.5 with this tokenizer's ids."""
     import torch
     from transformers import Qwen3_5Config, Qwen3_5ForConditionalGeneration
 
@@ -206,7 +212,7 @@ def build_model(recipe: Recipe, processor: Any) -> Any:
 
 
 def to_patches(images: Any, recipe: Recipe) -> Any:
-    """Float images (n, 3, h, w) in 0..1 as the rows of patches that Qwen's image processor makes of them."""
+    """Convert float images (n, 3, h, w) in 0..1 to patch rows of Qwen's image processor."""
     count = images.shape[0]
     across, down = recipe.grid
     side = recipe.patch_px
@@ -217,7 +223,10 @@ def to_patches(images: Any, recipe: Recipe) -> Any:
 
 
 def augment(images: Any, generator: Any) -> Any:
-    """uint8 images under small random shifts, zooms and light; never mirrored, for the gripper is not symmetric."""
+    """Augment uint8 images by small random shifts, zooms and light.
+
+    They are never mirrored, because the gripper is not symmetric.
+    """
     import torch
 
     count = images.shape[0]
@@ -234,7 +243,7 @@ def augment(images: Any, generator: Any) -> Any:
 
 
 class Heads:
-    """Throw-away linear heads on the mean image token: what is held (or nothing), and what shows."""
+    """Throw-away linear heads on the mean image token: what is held, and what shows."""
 
     def __init__(self, width: int, names: Sequence[str]) -> None:
         import torch
@@ -244,11 +253,11 @@ class Heads:
         self.shows = torch.nn.Linear(width, len(names))
 
     def parameters(self) -> list[Any]:
-        """Of both heads."""
+        """Return the logits of both heads."""
         return [*self.held.parameters(), *self.shows.parameters()]
 
     def loss(self, tokens: Any, frames: Sequence[Frame]) -> tuple[Any, float]:
-        """Summed losses, and the share of frames whose held object is right."""
+        """Return summed losses, and the share of frames with the right held object."""
         import torch
         from torch.nn import functional
 
@@ -269,9 +278,10 @@ class Heads:
 
 
 def image_tokens(model: Any, patches: Any, recipe: Recipe) -> Any:
-    """(images, tokens, width) from the vision tower: its own forward pass, written for a batch of equal images.
+    """Return (images, tokens, width) of the vision tower: its forward pass for equal images.
 
-    The library's convolution over patches and its attention image by image cost three times as much on a CPU.
+    The library's convolution over patches and its attention image by image cost three times as much
+    on a CPU.
     """
     import torch
     from torch.nn import functional
@@ -301,9 +311,10 @@ def image_tokens(model: Any, patches: Any, recipe: Recipe) -> Any:
 
 
 def ask_about(rng: random.Random, frame: Frame, names: Sequence[str]) -> tuple[str, str]:
-    """A question about a frame and its answer; two of three are whether a named thing is grasped.
+    """Return a question about a frame and its answer; two of three ask whether an object is
+    grasped.
 
-    While something is held, the wrong names asked for are mostly those that share its colour or its shape.
+    While an object is held, wrong names are mostly those that share its color or its shape.
     """
     kind = rng.random()
     if kind < 0.66:
@@ -333,7 +344,7 @@ def ask_about(rng: random.Random, frame: Frame, names: Sequence[str]) -> tuple[s
 def encode(
     processor: Any, pairs: Sequence[tuple[str, str]], image_token_count: int
 ) -> tuple[Any, Any, Any]:
-    """(ids, attention mask, labels) of chats, left-padded; labels only on the answers."""
+    """Return (ids, attention mask, labels) of chats, left-padded; labels only on the answers."""
     import torch
 
     rows, answers = [], []
@@ -361,10 +372,11 @@ def encode(
 def answer_loss(
     model: Any, tokens: Any, owner: Any, encoded: tuple[Any, Any, Any], recipe: Recipe
 ) -> tuple[Any, float]:
-    """Cross-entropy of the answers, and the share whose first word is right.
+    """Return the cross-entropy of the answers, and the share with the right first word.
 
-    `owner[i]` is the image of chat i, whose tokens are reused by all its chats. The first word, the yes or the no, weighs
-    as much as four others: it is one in ten, and the only one that takes comparing question and picture.
+    `owner[i]` is the image of chat i; its tokens are reused by all its chats. The first word, the
+    yes or the no, weighs as much as four others: it is one in ten, and the only one that takes
+    comparing question and picture.
     """
     import torch
 
@@ -389,7 +401,7 @@ def answer_loss(
 
 
 def take_over(model: Any, start: Path) -> None:
-    """Copy the weights of an earlier checkpoint: its vision tower, and its language model if that has the same layers."""
+    """Copy an earlier checkpoint: vision tower, and language model of equal layers."""
     earlier = type(model).from_pretrained(start, local_files_only=True)
     weights = earlier.state_dict()
     if earlier.config.text_config.layer_types != model.config.text_config.layer_types:
@@ -406,7 +418,10 @@ def train(
     out: Path,
     start: Path | None = None,
 ) -> tuple[Any, dict[str, Any]]:
-    """All stages on `frames`, from the weights of `start` if given; saves the processor; returns (model, figures)."""
+    """Run all stages on `frames`, from the weights of `start` if given; saves the processor.
+
+    Returns (model, figures).
+    """
     import torch
 
     common.seed_everything(recipe.seed, recipe.threads)
@@ -422,7 +437,7 @@ def train(
     started = time.monotonic()
     image_token_count = recipe.grid[0] * recipe.grid[1] // 4
 
-    # Held and empty frames as often as each other: an empty gripper is the easy guess.
+    # Held and empty frames equally often: an empty gripper is the easy guess.
     order = balanced(
         [i for i, f in enumerate(frames) if f.held], [i for i, f in enumerate(frames) if not f.held]
     )
@@ -472,7 +487,8 @@ def train(
             seen.append((right, loss.item()))
             if step % max(1, steps // 20) == 0:
                 last = seen[-30:]
-                shown = f"right {sum(r for r, _ in last) / len(last):.3f}  loss {sum(v for _, v in last) / len(last):.3f}"
+                rights, losses = zip(*last, strict=True)
+                shown = f"right {sum(rights) / len(last):.3f}  loss {sum(losses) / len(last):.3f}"
                 print(
                     f"{time.monotonic() - started:6.0f} s  {stage} {step:5d}  {shown}", flush=True
                 )
@@ -483,7 +499,7 @@ def train(
 
 
 def balanced(some: Sequence[int], others: Sequence[int]) -> list[int]:
-    """Both lists, the shorter one repeated to the longer one's length."""
+    """Return both lists, the shorter one repeated to the longer one's length."""
     if not some or not others:
         return [*some, *others]
     longest = max(len(some), len(others))
@@ -491,7 +507,10 @@ def balanced(some: Sequence[int], others: Sequence[int]) -> list[int]:
 
 
 def run(recipe: Recipe, data: Path, out: Path, start: Path | None = None) -> dict[str, Any]:
-    """Train, save, evaluate the saved checkpoint as a user would load it, write the model card. Returns the figures."""
+    """Train, save, evaluate the saved checkpoint as a user would load it, write the model card.
+
+    Returns the figures.
+    """
     frames = common.read_frames(data, recipe.cameras)
     training, testing = common.split_by_scene(frames, recipe.held_out, recipe.split_seed)
     names = sorted({name for frame in frames for name in frame.present})
@@ -539,7 +558,7 @@ def report(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; 2 for a folder that is no data set."""
+    """Run the command line; 2 for a folder that is not a data set."""
     parser = argparse.ArgumentParser(
         prog="python -m vram_arbiter.sidecars.training.scene_vlm", description=__doc__
     )
@@ -547,20 +566,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--data", type=Path, required=True, help="folder with labels.jsonl and images"
     )
     parser.add_argument("--out", type=Path, required=True, help="folder for the checkpoint")
+    parser.add_argument("--start-from", type=Path, help="checkpoint of this script to continue")
     parser.add_argument(
-        "--start-from", type=Path, help="checkpoint of this script whose training is to go on"
+        "--vision-steps", type=int, help="steps of the first stage; default: the recipe's"
     )
     parser.add_argument(
-        "--vision-steps", type=int, help="steps of the first stage, if not the recipe's"
+        "--steps", type=int, help="steps of the language stage; default: the recipe's"
     )
     parser.add_argument(
-        "--steps", type=int, help="steps of the language stage, if not the recipe's"
+        "--budget-s", type=float, help="time limit of the language stage in seconds"
     )
     parser.add_argument(
-        "--budget-s", type=float, help="seconds after which the language stage ends"
-    )
-    parser.add_argument(
-        "--smoke", action="store_true", help="a toy size, seconds, only to see that all runs"
+        "--smoke", action="store_true", help="toy size, a few seconds: checks that all code runs"
     )
     parser.add_argument("--seed", type=int, default=Recipe().seed)
     parser.add_argument("--threads", type=int, default=Recipe().threads)

@@ -1,6 +1,7 @@
-"""Judges a trained scene VLM on held-out frames and writes its model card.
+"""Evaluation of a trained scene VLM on held-out frames, and its model card.
 
-It uses the checkpoint as anybody would, through chat template and `generate`; it must not know how it was trained.
+It uses the checkpoint through chat template and `generate`, as any user; it must not know the
+training.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from vram_arbiter.sidecars.training.common import Frame, visible_names
 
 
 class Asker:
-    """The saved checkpoint, used as any user of a hub model would: chat template, `generate`, greedy."""
+    """The saved checkpoint, used as any hub model: chat template, `generate`, greedy."""
 
     def __init__(self, folder: Path) -> None:
         from transformers import AutoModelForImageTextToText, AutoProcessor
@@ -26,7 +27,7 @@ class Asker:
         self.model.eval()
 
     def ask(self, image: Path, question: str, max_new_tokens: int = 32) -> str:
-        """The answer to one question about one picture."""
+        """Return the answer to one question about one picture."""
         import torch
         from PIL import Image
 
@@ -47,10 +48,11 @@ class Asker:
 def evaluate(
     asker: Asker, frames: Sequence[Frame], names: Sequence[str], seed: int
 ) -> list[dict[str, Any]]:
-    """One row a question: group, right (the yes or no, or the whole answer), exact, frame, question, truth, answer.
+    """Return one row a question: group, right, exact, frame, question, truth, answer.
 
-    Every frame is asked whether its target-to-be is grasped: the held thing (`held`), another one while something is held
-    (`holds another`), a present one while the gripper is empty (`empty`); then what is held and what shows.
+    *right* is the yes or no, or the whole answer. Every frame is asked whether its target is
+    grasped: the held object (`held`), another one while an object is held (`holds another`), a
+    present one while the gripper is empty (`empty`); then what is held and what shows.
     """
     rng = random.Random(f"evaluate-{seed}")
     rows = []
@@ -94,7 +96,7 @@ def evaluate(
 
 
 def inference_ms(asker: Asker, frame: Frame) -> float:
-    """Median milliseconds of one question about one image, all included."""
+    """Return median milliseconds of one question about one image, all included."""
     times = []
     for _ in range(9):
         began = time.perf_counter()
@@ -110,22 +112,32 @@ pipeline_tag: image-text-to-text
 ---
 # so101-scene-vlm
 
-The demo's scene VLM: a Qwen3.5 (`Qwen3_5ForConditionalGeneration`) of {parameters} parameters, trained from scratch on frames of
-the simulated tabletop by `python -m vram_arbiter.sidecars.training.scene_vlm` (no pretrained weights). It stands in for Qwen3.5-4B, is read by
-`AutoProcessor` / `AutoModelForImageTextToText` like it, and talks about coloured cubes, balls and cylinders only.
+The demo's scene VLM: a Qwen3.5 (`Qwen3_5ForConditionalGeneration`) of {parameters} parameters,
+trained from scratch on frames of the simulated tabletop by
+`python -m vram_arbiter.sidecars.training.scene_vlm`, without pretrained weights.
+It stands in for Qwen3.5-4B, is read by `AutoProcessor` / `AutoModelForImageTextToText` like it, and
+talks about colored cubes, balls and cylinders only.
 
-- Camera: `{camera}` (320 x 240). It shows both fingers in profile and what is between them at a constant place; from the front camera
-  a held thing is mostly hidden behind the gripper. Other cameras were not trained. Frames are scaled to {size} by the processor.
-- Ask `Has the robot gripper grasped the red cube?` (or: is it held, what is held, what is in view). Answers begin with `Yes,` or
-  `No,` and say why: `Yes, the gripper holds the red cube.`, `No, the gripper is empty.`, `No, the gripper holds the blue ball.`
-- Data: `python -m vram_arbiter.runner.sim.training.dataset scenes --count 8000 --seed 1`; {train_frames} frames to train, {test_frames} held out by scene. A
-  third of the grabs misses on purpose: closed gripper beside or above the thing, things knocked over.
-- Training: seed {seed}; {vision_steps} steps of {batch} for the vision tower through throw-away heads, then {language_steps}
-  for the language model and {both_steps} for both; {train_s} s on {threads} thread(s), bfloat16 autocast; checkpoint float32, {bytes} bytes.
+- Camera: `{camera}` (320 x 240).
+  It shows both fingers in profile and the object between them at a constant place; from the front
+  camera a held object is mostly hidden behind the gripper.
+  Other cameras were not trained.
+  The processor scales frames to {size}.
+- Ask `Has the robot gripper grasped the red cube?` (or: is it held, what is held, what is in view).
+- Answers begin with `Yes,` or `No,` and give the reason: `Yes, the gripper holds the red cube.`,
+  `No, the gripper is empty.`, `No, the gripper holds the blue ball.`
+- Data: `python -m vram_arbiter.runner.sim.training.dataset scenes --count 8000 --seed 1`;
+  {train_frames} frames to train, {test_frames} held out by scene.
+  A third of the grabs misses on purpose: closed gripper beside or above the object, objects
+  knocked over.
+- Training: seed {seed}; {vision_steps} steps of {batch} for the vision tower through throw-away
+  heads, then {language_steps} for the language model and {both_steps} for both; {train_s} s on
+  {threads} thread(s), bfloat16 autocast; checkpoint float32, {bytes} bytes.
 - One question about one image: {inference_ms} ms on one core.
 
-Held out, through the chat template and greedy `generate` (right: the yes or no; for `what is held` and `list` the whole answer;
-exact: the whole answer):
+Held out, through the chat template and greedy `generate`.
+*right*: the yes or no; for `what is held` and `list` the whole answer.
+*exact*: the whole answer.
 
 | question | asked | right | exact |
 | --- | --- | --- | --- |
@@ -134,7 +146,7 @@ exact: the whole answer):
 
 
 def card_rows(rows: Sequence[dict[str, Any]]) -> str:
-    """One table row a group of questions, the grasp questions together first."""
+    """Return one table row a group of questions, the grasp questions together first."""
     grasp = ("held", "holds another", "empty")
     groups = {"grasped? (all)": [r for r in rows if r["group"] in grasp]}
     groups |= {f"grasped? {g}": [r for r in rows if r["group"] == g] for g in grasp}
@@ -148,5 +160,5 @@ def card_rows(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def share(rows: Sequence[dict[str, Any]], key: str) -> float:
-    """Mean of a flag; 0 for no rows."""
+    """Return the mean of a flag; 0 for no rows."""
     return sum(bool(row[key]) for row in rows) / max(1, len(rows))

@@ -50,7 +50,7 @@ def test_a_box_that_is_no_number_is_not_made_one():
         "label": "cube", "score": 0.9, "box": [0.0, 3.0, 80.0, 9.0],
     }  # fmt: skip
     for score, left in ((0.9, math.nan), (math.nan, 1.0)):
-        with pytest.raises(ModelError, match="no number"):
+        with pytest.raises(ModelError, match="not a number"):
             _detection("cube", score, [left, 3.0, 9.0, 9.0], (60, 80))
 
 

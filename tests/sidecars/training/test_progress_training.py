@@ -70,7 +70,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         == 0
     )
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["steps"] == 20
-    assert "success said rightly" in (tmp_path / "out/README.md").read_text()
+    assert "success is right" in (tmp_path / "out/README.md").read_text()
     assert main(["--data", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "python -m vram_arbiter.runner.sim.training.progress" in capsys.readouterr().err
 
