@@ -47,7 +47,9 @@ from vram_arbiter.arbiter.core.events import (
 )
 from vram_arbiter.arbiter.core.eviction import eviction
 from vram_arbiter.arbiter.core.features.gangs import Gangs
+from vram_arbiter.arbiter.core.features.parking import HostRam
 from vram_arbiter.arbiter.core.features.resizing import Resizing
+from vram_arbiter.arbiter.core.features.standby import Standby
 from vram_arbiter.arbiter.core.inspection import Inspection
 from vram_arbiter.arbiter.core.model.state import Core, Refused
 from vram_arbiter.arbiter.core.report import explain, figures
@@ -83,7 +85,9 @@ class Arbiter:
     def __init__(self, settings: Settings, now: float) -> None:
         self._resizing = Resizing()
         self._gangs = Gangs()
-        self._core = Core(settings, now, features=(self._resizing, self._gangs))
+        self._standby = Standby(HostRam(settings.host_ram_budget_bytes))
+        features = (self._resizing, self._gangs, self._standby)
+        self._core = Core(settings, now, features)
         for gpu_id in self._core.gpus:
             self._core.timers.set(("probe", gpu_id), now)  # the first reading
 
@@ -109,7 +113,7 @@ class Arbiter:
 
     def inspect(self) -> Inspection:
         """Return a read-only view of the records, for tests and offline tools."""
-        return Inspection.of(self._core, self._resizing, self._gangs)
+        return Inspection.of(self._core, self._resizing, self._gangs, self._standby)
 
     def next_deadline(self) -> float | None:
         """When a Tick is due (monotonic seconds); None: nothing is planned."""
@@ -124,7 +128,7 @@ class Arbiter:
     ) -> dict[str, Any]:
         """Return the shape of `schemas.wire.StatusReply`. `reader`: the process that asks; None: an operator, for all tokens."""
         self._core.now = max(self._core.now, now)
-        return explain.status(self._core, reader, after, limit)
+        return explain.status(self._core, self._standby.host.status(), reader, after, limit)
 
     def why(self, consumer: str, now: float) -> dict[str, Any]:
         """Shape of `schemas.wire.WhyReply`."""
@@ -243,7 +247,7 @@ class Arbiter:
             case ResizeAsked():
                 self._resizing.resize(core, event)
             case Reacquired():
-                requests.reacquire(core, event)
+                self._standby.reacquire(core, event)
             case Reattached():
                 recovery.on_reattached(core, event)
             case _:  # OperatorAsked
@@ -273,9 +277,7 @@ class Arbiter:
                     uses.on_users_due(core, subject)
                 case "recover":
                     recovery.on_recover_due(core, subject)
-                case (
-                    "plan" | "return"
-                ):  # a residency ended, or a waiter has aged; the GPU has been quiet
+                case "plan":  # a residency ended, or a waiter has aged
                     core.wake(core.gpus[GpuId(subject)])
                 case _:
                     owner = next(one for one in core.features if kind in one.timers)

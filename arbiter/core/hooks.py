@@ -7,8 +7,14 @@ A feature owns its records, keyed by lease id; `Arbiter` registers it. Without f
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from vram_arbiter.arbiter.core.events import MemorySampled, Spec
-from vram_arbiter.arbiter.core.model.lease import Lease
+from vram_arbiter.arbiter.core.events import (
+    AcquireRequested,
+    MemorySampled,
+    ReattachedLease,
+    ReleaseReported,
+    Spec,
+)
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 
 if TYPE_CHECKING:
     from vram_arbiter.arbiter.core.model.state import Core, Gpu
@@ -22,8 +28,9 @@ class Feature:
     """Kinds of timers that are due to this feature."""
 
     # -- requests --------------------------------------------------------------------------------------------------
-    def check_request(self, core: "Core", spec: Spec) -> None:
-        """A lease is asked for. Raise Refused to refuse it."""
+    def on_acquire(self, core: "Core", event: AcquireRequested, known: Lease | None) -> bool:
+        """A lease is acquired; `known`: by a repeat of an acquire. Return whether this feature answers. May raise Refused."""
+        return False
 
     def on_refused(self, core: "Core", spec: Spec, why: str) -> None:
         """A request was refused: no GPU can ever hold it."""
@@ -32,65 +39,85 @@ class Feature:
         """Keep a new request out of the queues. Return whether it is kept."""
         return False
 
-    def unqueued(self) -> Iterable[Lease]:
-        """Return the requests that this feature keeps out of the queues."""
+    def unplaced(self) -> Iterable[Lease]:
+        """Return the leases of this feature that are on no GPU and in no queue."""
         return ()
+
+    def on_release(self, core: "Core", event: ReleaseReported, lease: Lease) -> None:
+        """A resident lease is about to be released. May raise Refused."""
+
+    def give_up(self, core: "Core", lease: Lease, to: LeaseState, code: str, why: str) -> bool:
+        """End a lease that outlives its release, for its holder is gone or wants it no more. Return whether it was one."""
+        return False
+
+    def on_dismissed(self, core: "Core", lease: Lease, why: str) -> None:
+        """An operator evicted a lease."""
 
     # -- scheduling ------------------------------------------------------------------------------------------------
     def blocks(self, gpu: "Gpu") -> str:
-        """Say why this feature keeps a GPU from every other request; "" if it does not."""
+        """Say why this feature keeps a GPU from the requests of all others; "" if it does not."""
         return ""
 
-    def serve_reserved(self, core: "Core", gpu: "Gpu") -> bool:
-        """Serve a GPU that this feature keeps from every other request. Return whether it does."""
-        return False
-
     def owns(self, request: Lease) -> bool:
-        """Return whether only `serve` grants this request; it is not backfilled."""
+        """Return whether a request is granted by `serve` alone."""
         return False
 
-    def serve(self, core: "Core", gpu: "Gpu", head: Lease | None) -> bool:
-        """Serve a GPU whose queue has this head, None if it is empty. Return whether the head is this feature's own."""
+    def serve(self, core: "Core", gpu: "Gpu", head: Lease | None) -> None:
+        """Serve a GPU that this feature blocks, whose head it owns, or for which nothing waits (no head)."""
+
+    def grant(self, core: "Core", gpu: "Gpu", request: Lease) -> bool:
+        """Grant a request in this feature's own way. Return whether it was granted."""
         return False
 
     def protects(self, lease: Lease) -> str:
         """Say why a holder must not be revoked for others now; "" if it may be."""
         return ""
 
-    def grant(self, core: "Core", gpu: "Gpu", request: Lease) -> bool:
-        """Grant a request that is this feature's own. Return whether it was."""
+    def unclaimed(self, lease: Lease) -> bool:
+        """Return whether a resident has no minimum residency."""
+        return False
+
+    def can_park(self, lease: Lease) -> bool:
+        """Return whether the holder of a lease may keep its weights in host RAM when it is revoked."""
         return False
 
     # -- the life of a lease ---------------------------------------------------------------------------------------
-    def on_unloading(self, core: "Core", lease: Lease, why: str) -> None:
-        """A resident lease begins to unload, is released, expires or is lost. Its state has not changed yet."""
+    def on_moved(self, core: "Core", lease: Lease, before: LeaseState) -> None:
+        """A lease came to another state."""
 
-    def on_ended(self, core: "Core", lease: Lease) -> None:
-        """A lease or a request is over: drop what is kept of it."""
+    def on_used(self, lease: Lease) -> None:
+        """A use of a lease begins."""
+
+    def next_state(self, lease: Lease) -> LeaseState | None:
+        """Return where a released lease goes once its bytes are measured gone; None: it is over then."""
+        return None
 
     def size_changes(self, lease: Lease) -> bool:
         """Return whether the declared size of a resident lease is not to be compared with readings now."""
         return False
 
+    # -- readings and time -----------------------------------------------------------------------------------------
     def settle(self, core: "Core") -> None:
         """An event was handled; the GPUs are scheduled next."""
 
-    # -- readings and time -----------------------------------------------------------------------------------------
     def on_sample(self, core: "Core", gpu: "Gpu", sample: MemorySampled) -> None:
         """A reading counts; the ledger and the verifications have taken it."""
 
     def on_timer(self, core: "Core", kind: str, subject: str) -> None:
         """A timer of one of `timers` is due."""
 
-    # -- the journal -----------------------------------------------------------------------------------------------
+    # -- across a restart ------------------------------------------------------------------------------------------
     def to_record(self, lease: Lease) -> Mapping[str, Any]:
         """Return what the journal's record of a lease keeps of this feature."""
         return {}
 
     def from_record(self, core: "Core", lease: Lease, record: Mapping[str, Any]) -> None:
-        """A resident lease is restored from its record after a restart."""
+        """A lease was restored from its record."""
 
-    # -- reports ---------------------------------------------------------------------------------------------------
+    def on_reattached(self, core: "Core", lease: Lease, item: ReattachedLease) -> None:
+        """A holder reattached, and tells how it knows its lease."""
+
+    # -- reports and invariants ------------------------------------------------------------------------------------
     def view(self, core: "Core", lease: Lease) -> Mapping[str, object]:
         """Return the fields of `schemas.wire.LeaseView` that this feature adds."""
         return {}
@@ -99,6 +126,5 @@ class Feature:
         """Tell how a request, or the group of a granted lease, waits; None: as any other."""
         return None
 
-    # -- invariants ------------------------------------------------------------------------------------------------
     def check(self, core: "Core", *, everything: bool) -> None:
         """Raise InvariantViolation if a record that the last event can have changed, or any of them, is unsound."""

@@ -7,6 +7,7 @@ from typing import Self
 
 from vram_arbiter.arbiter.core.features.gangs import Gangs
 from vram_arbiter.arbiter.core.features.resizing import Resizing
+from vram_arbiter.arbiter.core.features.standby import Standby
 from vram_arbiter.arbiter.core.learning.footprints import Footprints
 from vram_arbiter.arbiter.core.model.lease import Failures, Lease
 from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Gpu, Refusals, Reuse
@@ -27,6 +28,7 @@ class Inspection:
     users: Mapping[ProcessKey, Mapping[tuple[LeaseId, UseId], Lease]]
     resizing: Resizing
     gangs: Gangs
+    standby: Standby
     crashes: Mapping[str, Failures]
     reuse: Mapping[str, Reuse]
     switches: Mapping[tuple[str, str], float]
@@ -35,7 +37,7 @@ class Inspection:
     timers: Timers
 
     @classmethod
-    def of(cls, core: Core, resizing: Resizing, gangs: Gangs) -> Self:
+    def of(cls, core: Core, resizing: Resizing, gangs: Gangs, standby: Standby) -> Self:
         return cls(
             gpus=MappingProxyType(core.gpus),
             leases=MappingProxyType(core.leases),
@@ -46,6 +48,7 @@ class Inspection:
             users=MappingProxyType(core.users),
             resizing=resizing,
             gangs=gangs,
+            standby=standby,
             crashes=MappingProxyType(core.crashes),
             reuse=MappingProxyType(core.reuse),
             switches=MappingProxyType(core.switches),

@@ -9,13 +9,13 @@ Numbers are those of ARCHITECTURE.md:
   2. nobody is resident beside an exclusive lease, nor comes before its bytes are measured gone; one lease at a time loads on a card
   3. nothing that is in use unloads
   4. bytes stay charged until a verdict: whoever is resident is charged, whoever is charged is resident, under measurement or reserved by
-     a feature, whoever is away is neither; parked weights never exceed the budget of host RAM
+     a feature; a lease that is away is neither, and parked weights never exceed the budget of host RAM (`features.standby`)
   5. tokens only grow
   6. every waiter is in a queue, has a timer if it has a bound, and its card has a next reading scheduled
   7. of a gang, until it is complete or broken, all waiting members are charged or none (`features.gangs`)
 """
 
-from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import NOT_COUNTED, Core, Gpu
 
 _UNUSED = tuple(
@@ -46,7 +46,6 @@ def check(core: Core) -> None:
     _waiters(core)
     for feature in core.features:
         feature.check(core, everything=False)
-    _away(core)
 
 
 def check_all(core: Core) -> None:
@@ -138,21 +137,6 @@ def _charges(gpu: Gpu) -> None:
             raise InvariantViolation(4, f"{lease.id} waits for a verdict that nobody works on")
 
 
-def _away(core: Core) -> None:
-    parked = core.host.granted_bytes() if core.host.booked else 0
-    if parked > core.host.budget_bytes:
-        raise InvariantViolation(
-            4, f"{parked} bytes are parked, the budget is {core.host.budget_bytes}"
-        )
-    for lease in core.away.values():
-        if lease.state not in AWAY or lease.id not in core.leases:
-            raise InvariantViolation(4, f"{lease.id} is {lease.state}, yet it counts as away")
-        if lease.gpu is not None or lease.id in core.waiting:
-            raise InvariantViolation(
-                4, f"{lease.id} is {lease.state}, yet it has a card or waits for one"
-            )
-
-
 def _tokens(core: Core) -> None:
     for token, _ in core.granted:
         if token <= core.last_token:
@@ -163,8 +147,8 @@ def _tokens(core: Core) -> None:
 
 def _counts(core: Core, queued: int) -> None:
     """Counted only when a number has changed: a feature may keep thousands of requests out of the queues."""
-    unqueued = sum(1 for feature in core.features for _ in feature.unqueued())
-    waiting = len(core.waiting) - unqueued
+    unqueued = (lease for feature in core.features for lease in feature.unplaced())
+    waiting = len(core.waiting) - sum(lease.state is LeaseState.QUEUED for lease in unqueued)
     if queued < waiting or (len(core.gpus) == 1 and queued != waiting):
         raise InvariantViolation(6, f"{waiting} leases wait, {queued} are in queues")
     core.counted = (queued, len(core.waiting))

@@ -27,14 +27,12 @@ def ask(
     A fresh reading is taken, so that the verification has something to compare with.
     """
     cause: Cause = "operator" if order else "waiter" if waiter else "pressure"
-    holder.move(LeaseState.REVOKING, core.now, reason)
-    holder.left_for = "" if waiter is None else waiter.spec.consumer
     eviction = holder.departure.eviction = Eviction(
         lease=holder.id,
         consumer=holder.spec.consumer,
         charge_bytes=gpu.ledger.charge_bytes(holder.id),
         wanted_by=None if waiter is None else waiter.id,
-        wanted_consumer=holder.left_for,
+        wanted_consumer="" if waiter is None else waiter.spec.consumer,
         reason=reason,
         cause=cause,
         order=order,
@@ -43,10 +41,7 @@ def ask(
         traceparent=None if waiter is None else waiter.request.traceparent,
     )
     gpu.evictions.append(eviction)
-    parks = core.host.book(holder.id, holder.spec.park_bytes)
-    if holder.spec.standby or parks:
-        # a restart must not take a release that was asked for as one that was wished for
-        core.record_lease(holder)
+    core.move(holder, LeaseState.REVOKING, reason)
     core.want_sample(gpu, core.now)
     _push_now(core, holder, eviction)
     if holder.spec.on_overstay != "wait":
@@ -83,7 +78,7 @@ def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
                 0.0, eviction.asked_at + core.settings.revoke_deadline_s - core.now
             ),
             "uses": len(holder.uses),
-            "park": holder.id in core.host.booked,
+            "park": any(feature.can_park(holder) for feature in core.features),
             **({"traceparent": eviction.traceparent} if eviction.traceparent else {}),
         },
     )
@@ -228,7 +223,7 @@ def _process_in_use(core: Core, holder: Lease) -> bool:
 
 def deny(core: Core, waiter: Lease, error: Mapping[str, Any]) -> None:
     """End a waiter's wait with a typed error."""
-    waiter.move(LeaseState.DENIED, core.now, str(error["message"]))
+    core.move(waiter, LeaseState.DENIED, str(error["message"]))
     core.dequeue(waiter)
     if waiter.request.answered or waiter.request.id is None:
         core.push(

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from vram_arbiter.arbiter.core.events import Spec
+from vram_arbiter.arbiter.core.events import AcquireRequested, Spec
 from vram_arbiter.arbiter.core.eviction import eviction
 from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
@@ -77,19 +77,20 @@ class Gangs(Feature):
     by_name: dict[str, Gang] = field(default_factory=dict)
     of: dict[LeaseId, Gang] = field(default_factory=dict)  # by member
     loading: dict[GpuId, Gang] = field(default_factory=dict)  # a GPU serves one gang at a time
-    granted: set[str] = field(default_factory=set)  # gangs with a granted member
-    touched: set[str] = field(default_factory=set)  # a member came or ended since `settle`
+    touched: set[str] = field(default_factory=set)  # a member came or moved since `settle`
     settled: set[str] = field(default_factory=set)  # examined by the last `settle`
 
     timers = frozenset({"gang"})
 
     # -- gathering -------------------------------------------------------------------------------------------------
-    def check_request(self, core: Core, spec: Spec) -> None:
+    def on_acquire(self, core: Core, event: AcquireRequested, known: Lease | None) -> bool:
         """Refuse a member too many, or one that says another size."""
-        gang = None if spec.gang is None else self.by_name.get(spec.gang[0])
-        if spec.gang is None or gang is None:
-            return
-        name, size = spec.gang
+        if known is not None or event.spec.gang is None:
+            return False
+        name, size = event.spec.gang
+        gang = self.by_name.get(name)
+        if gang is None:
+            return False
         if gang.size != size:
             raise Refused(
                 "bad_request",
@@ -103,6 +104,7 @@ class Gangs(Feature):
                 f"all {size} members of gang {name} have come",
                 "use an id of its own for each gang",
             )
+        return False
 
     def on_refused(self, core: Core, spec: Spec, why: str) -> None:
         """Break the gang of a refused member: it can never be complete."""
@@ -164,23 +166,30 @@ class Gangs(Feature):
         """Return whether a request is granted by `serve` alone."""
         return request.id in self.of
 
-    def serve(self, core: Core, gpu: Gpu, head: Lease | None) -> bool:
+    def serve(self, core: Core, gpu: Gpu, head: Lease | None) -> None:
+        """Grant the next member of the gang that loads on a GPU, or serve the gang of its head."""
+        loading = self.loading.get(gpu.info.id)
+        if loading is not None:
+            member = None if core.recovering is not None else self._next_load(core, gpu, loading)
+            if member is not None:
+                grants.grant(core, gpu, member)
+        elif head is not None:
+            self._serve_waiting(core, gpu, self.of[head.id])
+
+    def _serve_waiting(self, core: Core, gpu: Gpu, gang: Gang) -> None:
         """Grant all members if all fit, else revoke the victims that let all of them in."""
-        gang = None if head is None else self.of.get(head.id)
-        if gang is None:
-            return False
         waiting = gang.waiting()
         fitting = _place(core, waiting, lambda card, some: self._fits(core, card, gang, some))
         if fitting:
             readings = [_has_room(core, card, gang, some) for card, some in _cards(core, fitting)]
             if all(readings):
                 self._admit(core, gang, fitting)
-            return True
+            return
         placement = self._plan(core, gang)
         if placement is None:
             _say(waiting, "nobody who could make room for the whole gang may be asked now")
             policy.wake_when_evictable(core, gpu, _bundle(gang, waiting))
-            return True
+            return
         _say(waiting, "room is being made for the whole gang")
         for card, some in _cards(core, placement):
             bundle, going = _bundle(gang, some), policy.leaving(card)
@@ -188,7 +197,6 @@ class Gangs(Feature):
                 continue
             for victim in policy.choose_victims(core, card, bundle, going) or ():
                 eviction.ask(core, card, victim, some[0], f"gang {gang.name} needs the room")
-        return True
 
     def _plan(self, core: Core, gang: Gang) -> _Placement | None:
         """Return where room can be made for all waiting members: where it is being made, as long as that is possible."""
@@ -233,7 +241,6 @@ class Gangs(Feature):
     def _admit(self, core: Core, gang: Gang, placement: _Placement) -> None:
         """Charge all members at once: from now on each has its bytes, whichever loads first."""
         gang.phase, gang.planned = "loading", {}
-        self.granted.add(gang.name)
         for gpu, some in _cards(core, placement):
             gang.cards.append(gpu.info.id)
             self.loading[gpu.info.id] = gang
@@ -259,16 +266,6 @@ class Gangs(Feature):
         """Say which gang loads on a GPU."""
         gang = self.loading.get(gpu.info.id)
         return "" if gang is None else f"gang {gang.name} is loading"
-
-    def serve_reserved(self, core: Core, gpu: Gpu) -> bool:
-        """Grant the next member of the gang that loads on a GPU, once the one before is ready."""
-        gang = self.loading.get(gpu.info.id)
-        if gang is None:
-            return False
-        member = None if core.recovering is not None else self._next_load(core, gpu, gang)
-        if member is not None:
-            grants.grant(core, gpu, member)
-        return True
 
     def _next_load(self, core: Core, gpu: Gpu, gang: Gang) -> Lease | None:
         lease = next(iter(gang.waiting_on(gpu)), None)
@@ -330,8 +327,8 @@ class Gangs(Feature):
         return False
 
     # -- the end ---------------------------------------------------------------------------------------------------
-    def on_ended(self, core: Core, lease: Lease) -> None:
-        """Examine the gang of a member that ended."""
+    def on_moved(self, core: Core, lease: Lease, before: LeaseState) -> None:
+        """Examine the gang of a member that came to another state."""
         gang = self.of.get(lease.id)
         if gang is not None:
             self.touched.add(gang.name)
@@ -340,7 +337,7 @@ class Gangs(Feature):
         """Break gangs of which a member ended or leaves, and finish those of which all members are held."""
         if not self.by_name:
             return
-        self.settled = self.touched | self.granted
+        self.settled = self.touched | {gang.name for gang in self.loading.values()}
         self.touched = set()
         for gang in self._named(self.settled):
             fallen = next((one for one in gang.members if one.state not in _STANDING), None)
@@ -381,7 +378,6 @@ class Gangs(Feature):
     def _dissolve(self, core: Core, gang: Gang) -> None:
         """Forget a gang and withdraw what is reserved for it."""
         self.by_name.pop(gang.name, None)
-        self.granted.discard(gang.name)
         core.timers.clear(("gang", gang.name))
         for lease in gang.members:
             self.of.pop(lease.id, None)
@@ -406,11 +402,10 @@ class Gangs(Feature):
 
     def from_record(self, core: Core, lease: Lease, record: Mapping[str, Any]) -> None:
         """Take a granted member back. The others ask again, by their nonces, within the time that a holder has to reattach."""
-        if record.get("gang") is None:
+        if record.get("gang") is None or lease.state not in EXPIRING:
             return
         name, size = record["gang"]
         self._join(core, lease, str(name), int(size))
-        self.granted.add(str(name))
         patience_s = defaults.LEASE_TTL_S + core.settings.fence_grace_s
         core.timers.set(("gang", str(name)), core.now + patience_s)
 
@@ -420,13 +415,13 @@ class Gangs(Feature):
         if gang is not None and gang.phase == "gathering":
             self._break(core, gang, "not all of it came back after the restart")
 
-    # -- hooks that only answer ------------------------------------------------------------------------------------
+    # -- answers ------------------------------------------------------------------------------------
     def protects(self, lease: Lease) -> str:
         """A member is not revoked before its gang is complete."""
         gang = self.of.get(lease.id)
         return "" if gang is None else f"belongs to gang {gang.name}, which is not complete"
 
-    def unqueued(self) -> Iterator[Lease]:
+    def unplaced(self) -> Iterator[Lease]:
         """Members that gather or load are in no queue."""
         for gang in self.by_name.values():
             if gang.phase != "waiting":

@@ -44,6 +44,10 @@ class HostRam:
         self.booked.pop(lease, None)
         self.found.discard(lease)
 
+    def status(self) -> dict[str, int]:
+        """Return `schemas.wire.HostRamView`."""
+        return {"budget_bytes": self.budget_bytes, "parked_bytes": self.used_bytes()}
+
     def granted_bytes(self) -> int:
         """What was booked because it fitted: never more than the budget."""
         return sum(count for lease, count in self.booked.items() if lease not in self.found)

@@ -89,7 +89,7 @@ class Resizing(Feature):
         growth_id = self.growths.get(lease.id)
         if growth_id is not None:
             growth = core.leases[growth_id]
-            growth.move(LeaseState.CANCELLED, core.now, why)
+            core.move(growth, LeaseState.CANCELLED, why)
             core.dequeue(growth)
             core.note("cancelled", growth, reason=why)
             core.end(growth, None)
@@ -141,7 +141,7 @@ class Resizing(Feature):
             return False
         lease, more_bytes = core.leases[request.request.extends], request.request.load_peak_bytes
         core.dequeue(request)
-        request.move(LeaseState.RELEASED, core.now, f"merged into {lease.id}")
+        core.move(request, LeaseState.RELEASED, f"merged into {lease.id}")
         core.end(request, None)
         charge = gpu.ledger.charge_of(lease.id)
         booked, approved = charge.booked_bytes + more_bytes, charge.approved_bytes + more_bytes
@@ -195,15 +195,16 @@ class Resizing(Feature):
             core.timers.clear(("shrink", lease.id))
 
     # -- hooks -----------------------------------------------------------------------------------------------------
-    def on_unloading(self, core: Core, lease: Lease, why: str) -> None:
-        """A lease that gives everything back needs no other size."""
-        self._abandon(core, lease, why)
-
-    def on_ended(self, core: Core, lease: Lease) -> None:
-        """Forget a lease's shrink, and a growth however it ended."""
-        self._end_shrink(core, lease)
+    def on_moved(self, core: Core, lease: Lease, before: LeaseState) -> None:
+        """Forget a growth however it ended, and end the resize of a lease that gives everything back."""
         if lease.request.extends is not None:
             del self.growths[lease.request.extends]
+        elif lease.state is LeaseState.UNLOADING:
+            self._abandon(core, lease, "it unloads")
+        elif lease.state is LeaseState.VERIFYING:
+            self._abandon(core, lease, "it let go")
+        elif lease.state in (LeaseState.EXPIRED, LeaseState.LOST):
+            self._abandon(core, lease, "the lease is over")
 
     def size_changes(self, lease: Lease) -> bool:
         """Return whether the lease may show bytes that its holder has freed already."""

@@ -1,259 +1,600 @@
-"""Leases that live on without bytes on a card: on standby they come back by themselves when there is room, parked they keep their
-weights in host RAM meanwhile (and come back by themselves only if they are on standby too).
+"""Standby and parking: leases that live on without bytes on a GPU.
 
-Coming back is a favour, never a claim: nobody is asked to leave for it, nobody who waits is passed by, and it stays away while the
-consumer that it left for is on the card. A holder that needs its lease *now* says so (`reacquire`) and is a waiter like any other.
-Chooses who comes back; the grant itself is in `grants`. Must not know clients or requests beyond their ids.
+A lease on standby comes back by itself when there is room. A parked lease keeps its weights in host RAM, and comes back
+by itself only if it is on standby too. Coming back is a favor, never a claim: no holder is revoked for it, no waiter is
+passed by, and the lease stays away while the consumer that it left for is on the GPU. A holder that needs its lease now
+acquires or reacquires it, and waits in the queues like any other.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
-from vram_arbiter.arbiter.core.learning import drift
-from vram_arbiter.arbiter.core.model.lease import AWAY, Departure, Lease, LeaseState
-from vram_arbiter.arbiter.core.model.state import Core, Gpu
-from vram_arbiter.arbiter.core.scheduling import placement, policy
-from vram_arbiter.schemas.ids import ClientId, ModelKey, ProcessKey, RequestId
+from vram_arbiter.arbiter.core.events import (
+    AcquireRequested,
+    Reacquired,
+    ReattachedLease,
+    ReleaseReported,
+    Spec,
+)
+from vram_arbiter.arbiter.core.features.parking import HostRam
+from vram_arbiter.arbiter.core.hooks import Feature
+from vram_arbiter.arbiter.core.invariants import InvariantViolation
+from vram_arbiter.arbiter.core.learning import costs, drift
+from vram_arbiter.arbiter.core.model.lease import (
+    AWAY,
+    EXPIRING,
+    NONCES_MAX,
+    Departure,
+    Lease,
+    LeaseState,
+)
+from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
+from vram_arbiter.arbiter.core.report import explain
+from vram_arbiter.arbiter.core.report.standing import Standing
+from vram_arbiter.arbiter.core.requests.limits import check_waiters
+from vram_arbiter.arbiter.core.requests.requests import (
+    bad_state,
+    client_of,
+    lease_for,
+    let_go,
+    spec_of,
+)
+from vram_arbiter.arbiter.core.scheduling import grants, placement, policy
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId
 
 NOT_BACK = "its holder did not come back after the restart"
 
 
-# -- going away ------------------------------------------------------------------------------------------------------
-def stays_on(lease: Lease) -> bool:
-    """Whether a lease goes on standby when it releases now: only one that the engine revoked.
+@dataclass(frozen=True, slots=True)
+class Recall:
+    """A wait that begins once the lease is measured away."""
 
-    A holder that releases by itself does not want it back, and an operator who evicts it does not either.
-    """
-    asked = lease.departure.eviction is not None or lease.departure.revoked_before
-    return lease.spec.standby and asked and not lease.dismissed
+    asked_at: float
+    wait_timeout_s: float | None
 
 
-def next_state(lease: Lease) -> LeaseState:
-    """Where a lease that let go is, or goes after its verdict."""
-    if lease.state in AWAY:
-        return lease.state
-    if lease.parks:
-        return LeaseState.PARKED
-    return LeaseState.STANDBY if lease.comes_back else LeaseState.RELEASED
+@dataclass(slots=True)
+class Absence:
+    """How a lease leaves its GPU, and how it comes back."""
+
+    left_for: str = ""  # consumer that it was last revoked for
+    dismissed: bool = False  # an operator evicted it: it does not come back by itself
+    comes_back: bool = False  # by itself, once its bytes are measured gone and there is room
+    parks: bool = False  # its weights stay in host RAM
+    since: float = 0.0  # when it was measured away
+    recall: Recall | None = None  # its holder wants it back before it is away
+    returned: bool = False  # it came back by itself the last time
+    unused: bool = False  # and was not used since
 
 
-def settle(core: Core, lease: Lease, verdict: str) -> None:
-    """Its bytes are measured gone: the end, or away."""
-    if not (lease.comes_back or lease.parks):
-        lease.move(LeaseState.RELEASED, core.now, verdict)
-        core.end(lease, None)
-        return
-    gpu = core.gpu_of(lease)
-    del gpu.residents[lease.id]
-    core.timers.clear(("overstay", lease.id))
-    core.wake(gpu)
-    lease.move(next_state(lease), core.now, verdict)
-    lease.departure = Departure()
-    lease.gpu = lease.observed.reported_bytes = lease.request.id = None
-    lease.request.load_peak_bytes, lease.request.steady_bytes = drift.expected_bytes(
-        core, lease.spec
-    )
-    lease.request.gpus = tuple(gpu.info.id for gpu in placement.selected(core, lease.spec))
-    lease.request.evicted = []
-    lease.request.answered = True
-    enter(core, lease)
-    core.note(
-        str(lease.state),
-        lease,
-        left_for=lease.left_for,
-        parked_bytes=core.host.booked.get(lease.id, 0),
-        reason=f"comes back {'by itself when there is room' if lease.comes_back else 'when its holder asks'}",
-    )
-    if lease.recalled is not None:
-        recall, lease.recalled = lease.recalled, None
-        queue_again(core, lease, lease.client, None, recall.asked_at, recall.wait_timeout_s)
+@dataclass(slots=True)
+class Standby(Feature):
+    """Leases that are away, and what is known of those that were or may soon be."""
 
+    host: HostRam
+    absences: dict[LeaseId, Absence] = field(default_factory=dict)
+    away: dict[LeaseId, Lease] = field(default_factory=dict)  # in the order of their leaving
 
-def enter(core: Core, lease: Lease) -> None:
-    """It is away from now on, in the journal too."""
-    lease.away_since = core.now
-    core.away[lease.id] = lease
-    core.record_lease(lease)
-    wake_all(core, lease)
+    timers = frozenset({"away", "return"})
 
+    def _of(self, lease: Lease) -> Absence:
+        return self.absences.setdefault(lease.id, Absence())
 
-def renounce(core: Core, lease: Lease) -> None:
-    """A lease under measurement whose holder does not want it back, nor keeps anything of it."""
-    lease.comes_back = lease.parks = False
-    lease.recalled = None
-    core.host.drop(lease.id)
+    # -- leaving ---------------------------------------------------------------------------------------------------
+    def on_release(self, core: Core, event: ReleaseReported, lease: Lease) -> None:
+        """Decide whether a lease goes on standby or is parked. Raises Refused if it cannot be parked."""
+        if not (event.parked or lease.spec.standby):
+            return
+        if event.parked:
+            self._book(lease, exiting=event.exiting)
+        absence = self._of(lease)
+        absence.parks = event.parked
+        absence.comes_back = self._stays(lease, absence) and not event.exiting
 
+    def _stays(self, lease: Lease, absence: Absence) -> bool:
+        """Return whether a released lease goes on standby: only if the engine revoked it, and no operator did.
 
-def send_off(core: Core, lease: Lease, why: str) -> None:
-    """An operator does not want it back. On standby it ends, and its holder is told; parked it stays until its holder asks."""
-    if lease.state is LeaseState.PARKED:
-        lease.comes_back = False
+        A holder that releases by itself does not want it back.
+        """
+        revoked = lease.departure.eviction is not None or lease.departure.revoked_before
+        return lease.spec.standby and revoked and not absence.dismissed
+
+    def _book(self, lease: Lease, *, exiting: bool) -> None:
+        """Book host RAM for the weights that a holder says it keeps there."""
+        count = lease.spec.park_bytes
+        if exiting or not count:
+            what = "a process that exits keeps nothing" if exiting else "its spec has no park_bytes"
+            raise bad_state(lease, f"it cannot be parked: {what}")
+        if lease.id in self.host.booked or self.host.book(lease.id, count):
+            return
+        budget, booked = self.host.budget_bytes, self.host.used_bytes()
+        raise Refused(
+            "host_ram_insufficient",
+            f"{count} bytes of host RAM are asked for; of a budget of {budget} {booked} are booked",
+            "release without parking, or raise host.park_budget_bytes",
+            needed_bytes=count,
+            budget_bytes=budget,
+            booked_bytes=booked,
+        )
+
+    def next_state(self, lease: Lease) -> LeaseState | None:
+        """Return where a released lease is, or goes after its verdict, if it lives on."""
+        if lease.state in AWAY:
+            return lease.state
+        absence = self.absences.get(lease.id)
+        if absence is None or not (absence.parks or absence.comes_back):
+            return None
+        return LeaseState.PARKED if absence.parks else LeaseState.STANDBY
+
+    def on_moved(self, core: Core, lease: Lease, before: LeaseState) -> None:
+        """Follow a lease on its way: revoked, released, away, granted, ready, over."""
+        match lease.state:
+            case LeaseState.REVOKING:
+                self._on_revoked(core, lease)
+            case LeaseState.VERIFYING:
+                absence = self.absences.get(lease.id)
+                if absence is None or not absence.parks:
+                    self.host.drop(lease.id)
+            case LeaseState.PARKED | LeaseState.STANDBY:
+                self._on_away(core, lease)
+            case LeaseState.LOADING:
+                self._on_granted(core, lease)
+            case LeaseState.HELD:
+                self.host.drop(lease.id)
+            case LeaseState.QUEUED | LeaseState.UNLOADING:
+                pass
+            case _:
+                self.absences.pop(lease.id, None)
+                self.away.pop(lease.id, None)
+                self.host.drop(lease.id)
+                core.timers.clear(("away", lease.id))
+
+    def _on_revoked(self, core: Core, lease: Lease) -> None:
+        """Book host RAM for its weights from now on, so that the holder can count on it."""
+        eviction = lease.departure.eviction
+        self._of(lease).left_for = "" if eviction is None else eviction.wanted_consumer
+        parks = self.host.book(lease.id, lease.spec.park_bytes)
+        if lease.spec.standby or parks:
+            # a restart must not take a release that was asked for as one that was wished for
+            core.record_lease(lease)
+
+    def _on_away(self, core: Core, lease: Lease) -> None:
+        """Its bytes are measured gone."""
+        gpu, absence = core.gpu_of(lease), self._of(lease)
+        del gpu.residents[lease.id]
+        core.timers.clear(("overstay", lease.id))
+        core.wake(gpu)
+        lease.departure = Departure()
+        lease.gpu = lease.observed.reported_bytes = lease.request.id = None
+        lease.request.gpus = tuple(gpu.info.id for gpu in placement.selected(core, lease.spec))
+        lease.request.evicted = []
+        lease.request.answered = True
+        _expect(core, lease)
+        self._enter(core, lease)
+        how = "by itself when there is room" if absence.comes_back else "when its holder asks"
+        core.note(
+            str(lease.state),
+            lease,
+            left_for=absence.left_for,
+            parked_bytes=self.host.booked.get(lease.id, 0),
+            reason=f"comes back {how}",
+        )
+        if absence.recall is not None:
+            recall, absence.recall = absence.recall, None
+            self._queue(core, lease, lease.client, None, recall.asked_at, recall.wait_timeout_s)
+
+    def _enter(self, core: Core, lease: Lease) -> None:
+        """The lease is away from now on, in the journal too."""
+        self._of(lease).since = core.now
+        self.away[lease.id] = lease
         core.record_lease(lease)
-        return
+        _wake(core, lease)
+
+    def on_dismissed(self, core: Core, lease: Lease, why: str) -> None:
+        """Do not bring back what an operator evicts. On standby it ends; parked it stays until its holder asks."""
+        absence = self._of(lease)
+        absence.comes_back, absence.recall = False, None
+        if lease.state is LeaseState.STANDBY:
+            _push_lost(core, lease, why)
+            _end(core, lease, LeaseState.CANCELLED, "lease_lost", why)
+            return
+        absence.dismissed = lease.state is not LeaseState.PARKED
+        if lease.spec.standby or lease.state is LeaseState.PARKED:
+            core.record_lease(lease)
+
+    def give_up(self, core: Core, lease: Lease, to: LeaseState, code: str, why: str) -> bool:
+        """End a lease that is away. One that is on its way there ends with its verdict."""
+        if lease.state in AWAY:
+            _end(core, lease, to, code, why)
+            return True
+        absence = self.absences.get(lease.id)
+        if lease.state is not LeaseState.VERIFYING or absence is None:
+            return False
+        leaves = absence.comes_back or absence.parks
+        absence.comes_back = absence.parks = False
+        absence.recall = None
+        self.host.drop(lease.id)
+        return leaves
+
+    # -- wanted by the holder --------------------------------------------------------------------------------------
+    def on_acquire(self, core: Core, event: AcquireRequested, known: Lease | None) -> bool:
+        """Take an acquire for the lease of its process and model that is away, or for a repeat of what that one asked."""
+        if known is not None:
+            if known.state not in AWAY or not _still_waits(known, event):
+                return False
+            self._want_back(core, known, event)
+            return True
+        process = client_of(core, event.client).process
+        lease = None if event.spec.gang is not None else self._find(core, process, event.spec)
+        if lease is None:
+            return False
+        spec = spec_of(core, event)
+        gpus = _places(core, event, spec)
+        _rename(core, lease, event.nonce)
+        lease.spec = spec
+        _expect(core, lease)
+        core.record_lease(
+            lease
+        )  # still away: if a restart ends the wait, it is this that comes back
+        self._call_back(core, lease, event, gpus)
+        return True
+
+    def reacquire(self, core: Core, event: Reacquired) -> None:
+        """Queue a lease that is away, or on its way there. Raises Refused."""
+        client = client_of(core, event.client)
+        lease = lease_for(core, event.lease, event.token)
+        if lease.process != client.process:
+            raise Refused(
+                "not_permitted",
+                f"{lease.id} belongs to process {lease.process.pid}",
+                "ask as its holder",
+            )
+        if lease.state in AWAY:
+            self._want_back(core, lease, event)
+            return
+        if lease.state is LeaseState.VERIFYING and self.next_state(lease) is not None:
+            absence = self._of(lease)
+            lease.request.traceparent = event.traceparent
+            absence.recall = absence.recall or Recall(core.now, event.wait_timeout_s)
+        elif lease.state is not LeaseState.QUEUED:
+            raise bad_state(
+                lease,
+                "only a lease that is away, or being measured on its way there, is called back",
+            )
+        core.hand_to(lease, client.id)
+        core.reply(
+            event.client, event.request, {"state": "queued", "lease": explain.view(core, lease)}
+        )
+
+    def _find(self, core: Core, process: ProcessKey, spec: Spec) -> Lease | None:
+        if not self.away:
+            return None
+        return next(
+            (
+                lease
+                for lease in core.leases_of(process)
+                if lease.state in AWAY
+                and (lease.spec.consumer, lease.spec.key) == (spec.consumer, spec.key)
+            ),
+            None,
+        )
+
+    def _want_back(self, core: Core, lease: Lease, event: AcquireRequested | Reacquired) -> None:
+        """Queue a lease that is away, as it was last asked for."""
+        self._call_back(core, lease, event, _places(core, event, lease.spec))
+
+    def _call_back(
+        self,
+        core: Core,
+        lease: Lease,
+        event: AcquireRequested | Reacquired,
+        gpus: tuple[GpuId, ...],
+    ) -> None:
+        lease.request.traceparent = event.traceparent
+        lease.request.gpus = gpus
+        lease.request.uid = client_of(core, event.client).uid
+        _expect(core, lease)
+        self._queue(core, lease, event.client, event.request, core.now, event.wait_timeout_s)
+        costs.wanted(core, lease.spec.consumer)
+        core.unanswered.append(lease)
+
+    def _queue(
+        self,
+        core: Core,
+        lease: Lease,
+        client: ClientId,
+        request: RequestId | None,
+        asked_at: float,
+        wait_timeout_s: float | None,
+    ) -> None:
+        """Make a waiter of a lease that is away, as of `asked_at`. Without a request its grant is pushed."""
+        del self.away[lease.id]
+        core.move(lease, LeaseState.QUEUED, "wanted again")
+        core.timers.clear(("away", lease.id))  # after a restart: its holder reattached
+        lease.attached = True
+        core.hand_to(lease, client)
+        lease.request.id = request
+        lease.request.answered = request is None
+        lease.request.arrived_at = asked_at
+        lease.request.arrival = core.next_arrival()
+        lease.request.wait_timeout_s = wait_timeout_s
+        lease.request.planned_gpu = None
+        core.enqueue(lease)
+
+    # -- coming back by itself -------------------------------------------------------------------------------------
+    def serve(self, core: Core, gpu: Gpu, head: Lease | None) -> None:
+        """Grant the lease that comes back to a GPU for which nothing waits."""
+        back = None if head is not None else self._next_back(core, gpu)
+        if back is not None:
+            grants.grant_if_measured(core, gpu, back)
+
+    def _on_granted(self, core: Core, lease: Lease) -> None:
+        """A grant ends the absence. A lease that came back by itself has not waited."""
+        absence = self.absences.get(lease.id)
+        if absence is None:
+            return
+        absence.comes_back = absence.parks = absence.dismissed = False
+        absence.returned = absence.unused = self.away.pop(lease.id, None) is not None
+        if absence.returned:
+            lease.request.arrived_at = core.now
+
+    def on_used(self, lease: Lease) -> None:
+        """A lease that came back by itself was wanted."""
+        absence = self.absences.get(lease.id)
+        if absence is not None:
+            absence.unused = False
+
+    def unclaimed(self, lease: Lease) -> bool:
+        """Return whether a lease came back by itself and was not used since: it has no minimum residency."""
+        absence = self.absences.get(lease.id)
+        return absence is not None and absence.unused
+
+    def _next_back(self, core: Core, gpu: Gpu) -> Lease | None:
+        """Return the lease that comes back now: by priority, then in the order of their leaving.
+
+        One that does not fit yet keeps its turn: others pass it only where it would still fit beside them. The GPU has to
+        be quiet for the lease's own minimum residency first: between two goals a policy is away for a moment only.
+        """
+        ahead: Lease | None = None
+        spare_bytes = 0
+        for lease in self._by_turn(gpu):
+            if ahead is not None and (
+                ahead.spec.exclusive or policy.added_bytes(gpu, lease) > spare_bytes
+            ):
+                continue
+            if policy.fits(gpu, lease):
+                due_at = self._quiet_at(gpu, lease)
+                if due_at <= core.now:
+                    return lease
+                core.timers.set(("return", gpu.info.id), due_at)
+                return None
+            if ahead is None:
+                ahead = lease
+                passed = partial(self._returned_since, self.absences[lease.id].since)
+                spare_bytes, _ = policy.spare_unplanned_bytes(gpu, lease, {}, passed)
+        return None
+
+    def _by_turn(self, gpu: Gpu) -> list[Lease]:
+        return sorted(
+            (lease for lease in self.away.values() if self._may_return(gpu, lease)),
+            key=lambda lease: (
+                -lease.spec.priority,
+                self.absences[lease.id].since,
+                lease.request.arrival,
+            ),
+        )
+
+    def _may_return(self, gpu: Gpu, lease: Lease) -> bool:
+        return (
+            self.absences[lease.id].comes_back
+            and lease.attached
+            and gpu.info.id in lease.request.gpus
+            and lease.request.load_peak_bytes <= gpu.ledger.budget_bytes
+            and not self._left_for_is_here(gpu, lease)
+        )
+
+    def _returned_since(self, since: float, other: Lease) -> bool:
+        """Return whether a resident came back by itself after that moment: it would not be revoked for another that does."""
+        absence = self.absences.get(other.id)
+        return absence is not None and absence.returned and other.granted_at >= since
+
+    def _left_for_is_here(self, gpu: Gpu, lease: Lease) -> bool:
+        left_for = self.absences[lease.id].left_for
+        return bool(left_for) and any(
+            other.spec.consumer == left_for for other in gpu.residents.values()
+        )
+
+    def _quiet_at(self, gpu: Gpu, lease: Lease) -> float:
+        return max(gpu.changed_at, self.absences[lease.id].since) + lease.spec.min_residency_s
+
+    def on_timer(self, core: Core, kind: str, subject: str) -> None:
+        """The GPU was quiet for long enough, or the holder of a lease that is away did not reattach after a restart."""
+        if kind == "return":
+            core.wake(core.gpus[GpuId(subject)])
+            return
+        lease = core.leases[LeaseId(subject)]
+        _end(core, lease, LeaseState.CANCELLED, "lease_lost", NOT_BACK)
+
+    # -- across a restart ------------------------------------------------------------------------------------------
+    def to_record(self, lease: Lease) -> Mapping[str, Any]:
+        """Write down where a lease goes, or how it is away."""
+        absence = self.absences.get(lease.id)
+        if absence is None:
+            return {}
+        return {
+            "comes_back": absence.comes_back,
+            "parks": absence.parks,
+            "parked_bytes": self.host.booked.get(lease.id, 0),
+            "left_for": absence.left_for,
+            "dismissed": absence.dismissed,
+        }
+
+    def from_record(self, core: Core, lease: Lease, record: Mapping[str, Any]) -> None:
+        """Restore an absence. A lease that is away does not come back before its holder reattached."""
+        self.absences[lease.id] = Absence(
+            left_for=str(record.get("left_for", "")),
+            dismissed=bool(record.get("dismissed", False)),
+            comes_back=bool(record.get("comes_back", False)),
+            parks=bool(record.get("parks", False)),
+            since=core.now,
+        )
+        self.host.find(lease.id, int(record.get("parked_bytes", 0)))
+        if lease.state in AWAY:
+            self.away[lease.id] = lease
+            patience_s = lease.spec.ttl_s + core.settings.fence_grace_s
+            core.timers.set(("away", lease.id), core.now + patience_s)
+
+    def on_reattached(self, core: Core, lease: Lease, item: ReattachedLease) -> None:
+        """Believe a holder that says that its lease is away. What was lost on the way is made up for: its release, or its grant."""
+        if not item.away:
+            return
+        if lease.state in AWAY:
+            if lease.id not in self.away:  # adopted: the journal did not know it
+                comes_back = lease.spec.standby or not item.parked
+                self.absences[lease.id] = Absence(comes_back=comes_back, parks=item.parked)
+                if item.parked:
+                    self.host.find(lease.id, lease.spec.park_bytes)
+                self._enter(core, lease)
+            core.timers.clear(("away", lease.id))
+            _wake(core, lease)
+        elif lease.token != item.token:
+            core.push(lease, {"push": "granted", "lease": explain.view(core, lease)})
+        elif lease.state in EXPIRING:
+            absence = self._of(lease)
+            absence.comes_back = lease.spec.standby and not absence.dismissed
+            absence.parks = item.parked
+            if item.parked:
+                self.host.find(lease.id, lease.spec.park_bytes)
+            let_go(core, lease, exiting=False, why="let go, says its holder")
+
+    # -- answers ------------------------------------------------------------------------------------
+    def can_park(self, lease: Lease) -> bool:
+        """Return whether host RAM is booked for the weights of a revoked lease, or has room for those of another."""
+        if lease.departure.eviction is not None:
+            return lease.id in self.host.booked
+        return lease.spec.park_bytes > 0 and self.host.fits(lease.id, lease.spec.park_bytes)
+
+    def unplaced(self) -> Iterable[Lease]:
+        """Leases that are away are on no GPU and in no queue."""
+        return self.away.values()
+
+    def check(self, core: Core, *, everything: bool) -> None:
+        """A lease that is away has no GPU and does not wait; parked weights stay within their budget (invariant 4)."""
+        parked = self.host.granted_bytes() if self.host.booked else 0
+        if parked > self.host.budget_bytes:
+            raise InvariantViolation(
+                4, f"{parked} bytes are parked, the budget is {self.host.budget_bytes}"
+            )
+        for lease in self.away.values():
+            if lease.state not in AWAY or lease.id not in core.leases:
+                raise InvariantViolation(4, f"{lease.id} is {lease.state}, yet it counts as away")
+            if lease.gpu is not None or lease.id in core.waiting:
+                raise InvariantViolation(
+                    4, f"{lease.id} is {lease.state}, yet it has a card or waits for one"
+                )
+
+    def view(self, core: Core, lease: Lease) -> Mapping[str, object]:
+        """Show that a lease comes back by itself, and its bytes in host RAM."""
+        shown: dict[str, object] = {"standby": True} if lease.spec.standby else {}
+        if lease.id in self.host.booked:
+            shown["parked_bytes"] = self.host.booked[lease.id]
+        return shown
+
+    def standing(self, core: Core, lease: Lease) -> Standing | None:
+        """Tell what a lease that is away waits for; of several GPUs the first that it may return to."""
+        if lease.state not in AWAY:
+            return None
+        gpu = core.gpus[lease.request.planned_gpu or lease.request.gpus[0]]
+        where = "parked" if lease.state is LeaseState.PARKED else "on standby"
+        outlook = where + self._outlook(core, lease)
+        return Standing(gpu, lease, (lease,), (lease,), outlook=outlook)
+
+    def _outlook(self, core: Core, lease: Lease) -> str:
+        absence = self.absences[lease.id]
+        if not lease.attached:
+            return f", but {NOT_BACK}"
+        if not absence.comes_back:
+            return " in host RAM until its holder asks for it"
+        gpu = core.gpus[lease.request.gpus[0]]
+        blocked = policy.blocked(core, gpu)
+        head = gpu.queue.head()
+        if head is not None:
+            return f": {head.spec.consumer} waits, and goes first"
+        if blocked:
+            return f": {blocked}"
+        if self._left_for_is_here(gpu, lease):
+            return f" until {absence.left_for} has left"
+        if not policy.fits(gpu, lease):
+            return " until there is room; it asks nobody to leave"
+        due_at = self._quiet_at(gpu, lease)
+        if due_at > core.now:
+            return f": comes back in {due_at - core.now:.1f} s if the card stays quiet"
+        return ": comes back with the next reading of the card, or after those before it"
+
+
+def _still_waits(lease: Lease, event: AcquireRequested) -> bool:
+    """Return whether the newest acquire of a lease that is away still waits.
+
+    A restart ended its wait: what came back from the journal was, as far as known, not granted since it was asked for. A
+    late repeat of one that waited and was granted means nothing.
+    """
+    return event.nonce == lease.request.nonce and lease.granted_at <= lease.request.arrived_at
+
+
+def _places(core: Core, event: AcquireRequested | Reacquired, spec: Spec) -> tuple[GpuId, ...]:
+    """Return the GPUs that a lease may come back to on request. Raises Refused."""
+    gpus = placement.places(core, spec, drift.expected_bytes(core, spec)[0])
+    check_waiters(core, client_of(core, event.client), spec.priority)
+    return gpus
+
+
+def _rename(core: Core, lease: Lease, nonce: str) -> None:
+    """Another acquire asks for a lease. The earlier ones are remembered, for their repeats."""
+    request = lease.request
+    if len(request.earlier_nonces) == NONCES_MAX:
+        core.nonces.pop((lease.process, request.earlier_nonces[0]), None)
+    request.earlier_nonces.append(request.nonce)
+    request.nonce = nonce
+    core.nonces[lease.process, nonce] = lease.id
+
+
+def _expect(core: Core, lease: Lease) -> None:
+    request = lease.request
+    request.load_peak_bytes, request.steady_bytes = drift.expected_bytes(core, lease.spec)
+
+
+def _end(core: Core, lease: Lease, to: LeaseState, code: str, why: str) -> None:
+    """End a lease that is away: nothing has to be measured."""
+    core.move(lease, to, why)
+    core.note(str(to), lease, reason=why)
+    core.end(lease, _error(lease, code, why))
+
+
+def _push_lost(core: Core, lease: Lease, why: str) -> None:
     token = lease.token
     assert token is not None, f"{lease.id} is away and was never granted"
-    error = {
-        "code": "lease_lost",
+    core.push(
+        lease,
+        {
+            "push": "lost",
+            "lease_id": lease.id,
+            "token": [token.epoch, token.serial],
+            "error": _error(lease, "lease_lost", why),
+        },
+    )
+
+
+def _error(lease: Lease, code: str, why: str) -> dict[str, Any]:
+    return {
+        "code": code,
         "message": f"{lease.id}: {why}",
         "hint": "acquire again",
         "details": {},
     }
-    told = {
-        "push": "lost",
-        "lease_id": lease.id,
-        "token": [token.epoch, token.serial],
-        "error": error,
-    }
-    core.push(lease, told)
-    give_up(core, lease, LeaseState.CANCELLED, "lease_lost", why)
 
 
-def give_up(core: Core, lease: Lease, to: LeaseState, code: str, why: str) -> None:
-    """A lease that is away ends; nothing has to be measured."""
-    lease.move(to, core.now, why)
-    core.note(str(to), lease, reason=why)
-    core.end(
-        lease,
-        {"code": code, "message": f"{lease.id}: {why}", "hint": "acquire again", "details": {}},
-    )
-
-
-# -- coming back -----------------------------------------------------------------------------------------------------
-def find(core: Core, process: ProcessKey, consumer: str, key: ModelKey) -> Lease | None:
-    """The lease of this process for this model that is away: a new acquire takes it over."""
-    if not core.away:
-        return None
-    return next(
-        (
-            lease
-            for lease in core.leases_of(process)
-            if lease.state in AWAY and (lease.spec.consumer, lease.spec.key) == (consumer, key)
-        ),
-        None,
-    )
-
-
-def queue_again(
-    core: Core,
-    lease: Lease,
-    client: ClientId,
-    request: RequestId | None,
-    asked_at: float,
-    wait_timeout_s: float | None,
-) -> None:
-    """From away into the queues, as somebody who came at `asked_at`. Without a request it is told by push."""
-    del core.away[lease.id]
-    lease.move(LeaseState.QUEUED, core.now, "wanted again")
-    core.timers.clear(("ttl", lease.id))  # after a restart: whoever asks has come back
-    lease.attached = True
-    core.hand_to(lease, client)
-    lease.request.id = request
-    lease.request.answered = request is None
-    lease.request.arrived_at = asked_at
-    lease.request.arrival = core.next_arrival()
-    lease.request.wait_timeout_s = wait_timeout_s
-    lease.request.planned_gpu = None
-    core.enqueue(lease)
-
-
-def taken_back(core: Core, lease: Lease) -> bool:
-    """The lease is being granted. Did it come back by itself? Then it has waited for nothing, and has no claim to stay yet."""
-    lease.comes_back = lease.parks = lease.departure.revoked_before = lease.dismissed = False
-    lease.uncalled = lease.returned = core.away.pop(lease.id, None) is not None
-    if lease.uncalled:
-        lease.request.arrived_at = core.now
-    return lease.uncalled
-
-
-def next_back(core: Core, gpu: Gpu) -> Lease | None:
-    """Who comes back to this card, on which nobody waits: by priority, then who left first.
-
-    One that does not fit yet keeps its turn: others pass it only where it would still fit beside them. The card has to be quiet
-    for the lease's own minimum residency first: between two goals a policy is away for a moment only.
-    """
-    ahead: Lease | None = None
-    spare_bytes = 0
-    for lease in _by_turn(core, gpu):
-        if ahead is not None and (
-            ahead.spec.exclusive or policy.added_bytes(gpu, lease) > spare_bytes
-        ):
-            continue
-        if policy.fits(gpu, lease):
-            due_at = _quiet_at(gpu, lease)
-            if due_at <= core.now:
-                return lease
-            core.timers.set(("return", gpu.info.id), due_at)
-            return None
-        if ahead is None:
-            ahead = lease
-            spare_bytes, _ = policy.spare_unplanned_bytes(
-                gpu, lease, {}, partial(_returned_since, lease)
-            )
-    return None
-
-
-def outlook(core: Core, lease: Lease) -> str:
-    """What it waits for, in words; of several cards the first that it may return to."""
-    where = "parked" if lease.state is LeaseState.PARKED else "on standby"
-    return f"{where}{_outlook(core, lease)}"
-
-
-def _outlook(core: Core, lease: Lease) -> str:
-    if not lease.attached:
-        return f", but {NOT_BACK}"
-    if not lease.comes_back:
-        return " in host RAM until its holder asks for it"
-    gpu = core.gpus[lease.request.gpus[0]]
-    blocked = policy.blocked(core, gpu)
-    head = gpu.queue.head()
-    if head is not None:
-        return f": {head.spec.consumer} waits, and goes first"
-    if blocked:
-        return f": {blocked}"
-    if _left_for_is_here(gpu, lease):
-        return f" until {lease.left_for} has left"
-    if not policy.fits(gpu, lease):
-        return " until there is room; it asks nobody to leave"
-    due_at = _quiet_at(gpu, lease)
-    if due_at > core.now:
-        return f": comes back in {due_at - core.now:.1f} s if the card stays quiet"
-    return ": comes back with the next reading of the card, or after those before it"
-
-
-def wake_all(core: Core, lease: Lease) -> None:
+def _wake(core: Core, lease: Lease) -> None:
     for gpu_id in lease.request.gpus:
         core.wake(core.gpus[gpu_id])
-
-
-def _by_turn(core: Core, gpu: Gpu) -> list[Lease]:
-    return sorted(
-        _returning(core, gpu),
-        key=lambda lease: (-lease.spec.priority, lease.away_since, lease.request.arrival),
-    )
-
-
-def _returning(core: Core, gpu: Gpu) -> Iterator[Lease]:
-    return (
-        lease
-        for lease in core.away.values()
-        if lease.comes_back
-        and lease.attached
-        and gpu.info.id in lease.request.gpus
-        and lease.request.load_peak_bytes <= gpu.ledger.budget_bytes
-        and not _left_for_is_here(gpu, lease)
-    )
-
-
-def _returned_since(ahead: Lease, other: Lease) -> bool:
-    """Has it come back while this one was away? It would not be asked to make room for it."""
-    return other.returned and other.granted_at >= ahead.away_since
-
-
-def _left_for_is_here(gpu: Gpu, lease: Lease) -> bool:
-    return bool(lease.left_for) and any(
-        other.spec.consumer == lease.left_for for other in gpu.residents.values()
-    )
-
-
-def _quiet_at(gpu: Gpu, lease: Lease) -> float:
-    return max(gpu.changed_at, lease.away_since) + lease.spec.min_residency_s

@@ -32,7 +32,7 @@ def reload_s(core: Core, lease: Lease) -> float:
 
 def can_park(core: Core, lease: Lease) -> bool:
     """Would its weights find room in host RAM?"""
-    return lease.spec.park_bytes > 0 and core.host.fits(lease.id, lease.spec.park_bytes)
+    return any(feature.can_park(lease) for feature in core.features)
 
 
 # -- thrash ------------------------------------------------------------------------------------------------------------

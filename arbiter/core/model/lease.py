@@ -147,14 +147,6 @@ class Roster(Protocol):
     def moved(self, lease: "Lease", before: LeaseState) -> None: ...
 
 
-@dataclass(frozen=True, slots=True)
-class Recall:
-    """A wait that begins when the lease is measured away."""
-
-    asked_at: float
-    wait_timeout_s: float | None
-
-
 @dataclass(slots=True)
 class Request:
     """How a lease was last asked for, and how that waits. A reacquire replaces what it changes."""
@@ -239,14 +231,6 @@ class Lease:
     observed: Observed = field(default_factory=Observed)
     story: list[tuple[float, LeaseState, str]] = field(default_factory=list)  # last STORY_MAX steps
     roster: Roster | None = field(default=None, repr=False, compare=False)  # of its GPU
-    parks: bool = False  # it let go with its weights kept in host RAM
-    comes_back: bool = False  # by itself, once its bytes are measured gone and there is room
-    dismissed: bool = False  # an operator sent it away: it does not come back by itself
-    left_for: str = ""  # the consumer that it left for last; it does not come back beside that one
-    away_since: float = 0.0
-    uncalled: bool = False  # it came back by itself and nobody has used it since
-    returned: bool = False  # it was granted because it came back by itself
-    recalled: Recall | None = None  # its holder wants it back before it is gone
 
     @classmethod
     def recovered(

@@ -21,7 +21,6 @@ from vram_arbiter.arbiter.core.effects import (
     Sample,
 )
 from vram_arbiter.arbiter.core.events import MemorySampled
-from vram_arbiter.arbiter.core.features.parking import HostRam
 from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.learning.footprints import Footprints
 from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger
@@ -182,10 +181,6 @@ class Core:
         self._waiting_by: dict[
             ProcessKey | int, int
         ] = {}  # waiters of each process and of each uid
-        self.away: dict[
-            LeaseId, Lease
-        ] = {}  # without bytes on a card, in the order of their leaving
-        self.host = HostRam(settings.host_ram_budget_bytes)
         self.nonces: dict[tuple[ProcessKey, str], LeaseId] = {}
         self.clients: dict[ClientId, Client] = {}
         self.connected: dict[ProcessKey, int] = {}  # connections of each process
@@ -374,9 +369,10 @@ class Core:
         """A use is busy from now on."""
         lease.uses.paused.pop((use.process, use.id), None)
         lease.uses[use.process, use.id] = use
-        lease.uncalled = False
         self.users.setdefault(use.process, {})[lease.id, use.id] = lease
         self.suspects.add(use.process)
+        for feature in self.features:
+            feature.on_used(lease)
 
     def unmark(self, lease: Lease, use: Use) -> None:
         """A busy use ends or pauses."""
@@ -385,6 +381,20 @@ class Core:
         del mine[lease.id, use.id]
         if not mine:
             del self.users[use.process]
+
+    def move(self, lease: Lease, to: LeaseState, why: str) -> None:
+        """Move a lease to another state and tell the features. Raises IllegalTransition."""
+        before = lease.state
+        lease.move(to, self.now, why)
+        for feature in self.features:
+            feature.on_moved(self, lease, before)
+
+    def next_state(self, lease: Lease) -> LeaseState | None:
+        """Where a released lease goes once its bytes are measured gone; None: it is over then."""
+        for feature in self.features:
+            if (state := feature.next_state(lease)) is not None:
+                return state
+        return None
 
     def enqueue(self, lease: Lease) -> None:
         """A lease begins to wait, on every card that it may be placed on."""
@@ -422,10 +432,6 @@ class Core:
         _take_out(self._of_client, lease.client, lease.id)
         for kind in ("ttl", "revoke", "overstay", "users"):
             self.timers.clear((kind, lease.id))
-        for feature in self.features:
-            feature.on_ended(self, lease)
-        self.away.pop(lease.id, None)
-        self.host.drop(lease.id)
         if lease.gpu is not None:
             gpu = self.gpus[lease.gpu]
             gpu.residents.pop(lease.id, None)
@@ -503,11 +509,6 @@ class Core:
                 "measured_bytes": lease.observed.reported_bytes,
                 "exiting": lease.departure.exiting,
                 "pinned": None if lease.pinned is None else [lease.pinned.by, lease.pinned.reason],
-                "comes_back": lease.comes_back,
-                "parks": lease.parks,
-                "parked_bytes": self.host.booked.get(lease.id, 0),
-                "left_for": lease.left_for,
-                "dismissed": lease.dismissed,
                 **({"users": users} if users else {}),
                 **features,
                 "spec": {

@@ -1,6 +1,6 @@
 """Answers for people and programs: views of leases, `status`, `why`, and the record of a switch. Reads only."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from heapq import merge, nsmallest
 from itertools import chain, islice
 from math import inf
@@ -8,7 +8,6 @@ from operator import attrgetter
 from statistics import median
 from typing import Any
 
-from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import drift
 from vram_arbiter.arbiter.core.model.lease import AWAY, LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
@@ -89,10 +88,6 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
         shown["yielded"] = len(lease.uses.paused)
     for feature in core.features:
         shown.update(feature.view(core, lease))
-    if lease.spec.standby:
-        shown["standby"] = True
-    if lease.id in core.host.booked:
-        shown["parked_bytes"] = core.host.booked[lease.id]
     if lease.state is LeaseState.QUEUED:
         shown["position"] = _best_position(core, lease)
     elif lease.state is not LeaseState.VERIFYING and lease.state not in AWAY:
@@ -163,6 +158,7 @@ def _processes(gpu: Gpu) -> list[dict[str, Any]]:
 
 def status(
     core: Core,
+    host_ram: Mapping[str, int],
     reader: ProcessKey | None = None,
     after: PageKey | None = None,
     limit: int | None = None,
@@ -180,10 +176,7 @@ def status(
         "leases": [view_for(core, lease, reader) for lease in leases],
         "totals": {"leases": len(core.leases), "waiting": len(core.waiting)},
         "clients": len(core.clients),
-        "host_ram": {
-            "budget_bytes": core.host.budget_bytes,
-            "parked_bytes": core.host.used_bytes(),
-        },
+        "host_ram": dict(host_ram),
         "drained": "" if core.drain is None else str(core.drain),
     }
     if leases and len(leases) == limit:
@@ -201,7 +194,7 @@ def _listed(core: Core, after: PageKey | None, limit: int | None) -> Iterator[Le
     """Leases with bytes or away by arrival, then the waiters in the order of the queues."""
     section, rank, arrival = after or (0, 0.0, 0)
     if section == 0:
-        granted = chain(*(gpu.residents.values() for gpu in core.gpus.values()), core.away.values())
+        granted = chain(*(gpu.residents.values() for gpu in core.gpus.values()), _away(core))
         rest = (lease for lease in granted if lease.request.arrival > arrival)
         by_arrival = attrgetter("request.arrival")
         yield from (
@@ -212,6 +205,11 @@ def _listed(core: Core, after: PageKey | None, limit: int | None) -> Iterator[Le
     yield from _in_queues(core, (rank, arrival) if section else (-inf, 0))
 
 
+def _away(core: Core) -> Iterator[Lease]:
+    for feature in core.features:
+        yield from (one for one in feature.unplaced() if one.state is not LeaseState.QUEUED)
+
+
 def _in_queues(core: Core, after: tuple[float, int]) -> Iterator[Lease]:
     """Waiters in the order of the queues, each once. Those that a feature keeps out of the queues are listed at their rank."""
 
@@ -219,7 +217,10 @@ def _in_queues(core: Core, after: tuple[float, int]) -> Iterator[Lease]:
         return core.gpus[lease.request.gpus[0]].queue.rank(lease)
 
     unqueued = [
-        lease for feature in core.features for lease in feature.unqueued() if rank(lease) > after
+        lease
+        for feature in core.features
+        for lease in feature.unplaced()
+        if lease.state is LeaseState.QUEUED and rank(lease) > after
     ]
     queued = [gpu.queue.after(after) for gpu in core.gpus.values()]
     last: Lease | None = None
@@ -350,9 +351,8 @@ def _explain_resident(core: Core, standing: Standing, lease: Lease, free: int) -
         LeaseState.REVOKING: f"it was asked to leave for {_wanted_by(lease)}, {uses(lease)}",
         LeaseState.UNLOADING: f"it {unloading(core, lease)}",
         LeaseState.VERIFYING: "it let go; its bytes are being measured",
-    }.get(lease.state) or standby.outlook(core, lease)
-    if standing.outlook:
-        says += f"; {standing.outlook}"
+    }.get(lease.state, "")
+    says = "; ".join(filter(None, (says, standing.outlook)))
     if drift.drift_bytes(core, gpu, lease):
         held = drift.held_bytes(gpu, lease)
         says += f"; it holds {gib(held)}, {gib(lease.spec.steady_bytes)} were declared"

@@ -6,9 +6,8 @@ What they hold becomes a debt and is measured away (`measure`).
 from collections.abc import Mapping
 from typing import Any
 
-from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import crashes
-from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.verification import schedule
 from vram_arbiter.schemas.ids import LeaseId
@@ -17,9 +16,6 @@ from vram_arbiter.schemas.ids import LeaseId
 def on_expiry_due(core: Core, lease_id: str) -> None:
     """A holder did not renew (who has let go has no such timer)."""
     lease = core.leases[LeaseId(lease_id)]
-    if lease.state in AWAY:
-        standby.give_up(core, lease, LeaseState.CANCELLED, "lease_lost", standby.NOT_BACK)
-        return
     expire(core, lease, f"{lease.id} was not renewed for {lease.spec.ttl_s:g} s")
 
 
@@ -77,13 +73,11 @@ def lose(
     for use in list(lease.uses.values()):
         core.unmark(lease, use)
     lease.uses.paused.clear()
-    for feature in core.features:
-        feature.on_unloading(core, lease, "the lease is over")
     gpu.ledger.to_debt(lease.id)
     core.record_lease(lease, debt=True)
     if lease.departure.eviction is not None:
         lease.departure.eviction.released_at = core.now
         lease.departure.eviction.unloading_at = lease.departure.eviction.unloading_at or core.now
     schedule.begin_for_lease(core, gpu, lease, alive=alive, grace_s=grace_s, fenced_at=fenced_at)
-    lease.move(to, core.now, str(error["message"]))
+    core.move(lease, to, str(error["message"]))
     core.end(lease, error)

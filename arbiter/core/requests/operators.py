@@ -10,7 +10,6 @@ from typing import Any
 
 from vram_arbiter.arbiter.core.events import OperatorAsked
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState, Order
 from vram_arbiter.arbiter.core.model.state import Core, Refused
 from vram_arbiter.arbiter.core.report import explain
@@ -80,12 +79,10 @@ def evict(core: Core, lease: Lease, order: Order) -> None:
     """
     if lease.state in AWAY:
         _note(core, "evict", order, lease)
-        standby.send_off(core, lease, f"evicted by {order}")
+        _dismiss(core, lease, order)
         return
     if lease.state in LEAVING:
-        lease.comes_back = False
-        lease.recalled = None
-        _ordered(core, lease, order)
+        _dismiss(core, lease, order)
         if lease.state is LeaseState.REVOKING and lease.departure.eviction is not None:
             # A holder may let a waiter wait that it would not keep an operator waiting for.
             eviction.push_revoke(core, lease, lease.departure.eviction)
@@ -108,16 +105,15 @@ def evict(core: Core, lease: Lease, order: Order) -> None:
         )
     gpu = core.gpu_of(lease)
     eviction.ask(core, gpu, lease, None, f"evicted by {order}", order=order)
-    _ordered(core, lease, order)
+    _dismiss(core, lease, order)
     _note(core, "evict", order, lease, uses=len(lease.uses))
 
 
-def _ordered(core: Core, lease: Lease, order: Order) -> None:
-    lease.dismissed = True
+def _dismiss(core: Core, lease: Lease, order: Order) -> None:
     if lease.departure.eviction is not None:
         lease.departure.eviction.order = order
-    if lease.spec.standby:
-        core.record_lease(lease)
+    for feature in core.features:
+        feature.on_dismissed(core, lease, f"evicted by {order}")
 
 
 def pin(core: Core, lease: Lease, order: Order) -> None:

@@ -20,12 +20,10 @@ from vram_arbiter.arbiter.core.events import (
     Spec,
 )
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import drift
 from vram_arbiter.arbiter.core.ledger.ledger import process_bytes
 from vram_arbiter.arbiter.core.model.lease import (
     AWAY,
-    EXPIRING,
     Lease,
     LeaseState,
     Order,
@@ -39,7 +37,6 @@ from vram_arbiter.arbiter.core.requests.requests import (
     become_held,
     client_of,
     ended_error,
-    let_go,
     touch,
 )
 from vram_arbiter.arbiter.core.scheduling import placement
@@ -101,12 +98,14 @@ def _restore_away(core: Core, record: Mapping[str, Any]) -> None:
     if not lease.request.gpus:  # the only card that it may come back to is gone
         core.forget(f"lease:{lease.id}")
         return
+    _register(core, lease, record)
+
+
+def _register(core: Core, lease: Lease, record: Mapping[str, Any]) -> None:
     core.add(lease)
     core.nonces[lease.process, lease.request.nonce] = lease.id
-    lease.away_since = core.now
-    core.away[lease.id] = lease
-    core.host.find(lease.id, int(record.get("parked_bytes", 0)))
-    core.timers.set(("ttl", lease.id), core.now + lease.spec.ttl_s + core.settings.fence_grace_s)
+    for feature in core.features:
+        feature.from_record(core, lease, record)
 
 
 def _remembered(core: Core, record: Mapping[str, Any], state: LeaseState) -> Lease:
@@ -134,10 +133,6 @@ def _remembered(core: Core, record: Mapping[str, Any], state: LeaseState) -> Lea
     lease.observed.reported_bytes = record["measured_bytes"]
     lease.departure.exiting = bool(record["exiting"])
     lease.pinned = None if record.get("pinned") is None else Order(*record["pinned"])
-    lease.dismissed = bool(record.get("dismissed", False))
-    lease.parks = bool(record.get("parks", False))
-    lease.comes_back = bool(record.get("comes_back", False))
-    lease.left_for = str(record.get("left_for", ""))
     return lease
 
 
@@ -151,8 +146,8 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
     lease_id, process, token, spec = lease.id, lease.process, lease.token, lease.spec
     lease.gpu, lease.request.gpus = gpu.info.id, (gpu.info.id,)
     _place(core, gpu, lease, int(record["charge_bytes"]))
-    core.nonces[process, lease.request.nonce] = lease_id
     if state == "debt":
+        core.nonces[process, lease.request.nonce] = lease_id
         gpu.ledger.to_debt(lease_id)
         grace_s = core.settings.fence_grace_s
         fenced_at = core.now + spec.ttl_s + grace_s
@@ -163,14 +158,11 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
             )
         )
         return
-    core.add(lease)
-    core.host.find(lease.id, int(record.get("parked_bytes", 0)))
+    _register(core, lease, record)
     gpu.residents[lease_id] = lease
     if lease.state is LeaseState.VERIFYING:
         begin_for_lease(core, gpu, lease, alive=True)
         return
-    for feature in core.features:
-        feature.from_record(core, lease, record)
     lease.expires_at = core.now + spec.ttl_s + core.settings.fence_grace_s
     core.timers.set(("ttl", lease_id), lease.expires_at)
     if lease.state is LeaseState.HELD:
@@ -273,9 +265,9 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
         lease.ready_at = core.now
         if lease.gpu is not None:
             core.gpu_of(lease).residents.recent[lease.id] = lease
-    if item.away:
-        _believe_away(core, lease, item)
-    elif lease.state is LeaseState.LOADING and item.held:  # its `ready` was lost
+    for feature in core.features:
+        feature.on_reattached(core, lease, item)
+    if lease.state is LeaseState.LOADING and item.held and not item.away:  # its `ready` was lost
         become_held(core, lease, item.measured_bytes)
         core.record_lease(lease)
     if lease.gpu is not None:
@@ -307,27 +299,6 @@ def _missed_its_grant(lease: Lease, client: Client, item: ReattachedLease) -> bo
         and lease.token is not None
         and item.token < lease.token
     )
-
-
-def _believe_away(core: Core, lease: Lease, item: ReattachedLease) -> None:
-    """The holder says that it let go. What was lost on the way is made up for: its `release`, or the `granted` to it."""
-    if lease.state in AWAY:
-        core.timers.clear(("ttl", lease.id))
-        standby.wake_all(core, lease)
-    elif lease.token != item.token:
-        core.push(lease, {"push": "granted", "lease": explain.view(core, lease)})
-    elif lease.state in EXPIRING:
-        back = lease.spec.standby and not lease.dismissed
-        if item.parked:
-            core.host.find(lease.id, lease.spec.park_bytes)
-        let_go(
-            core,
-            lease,
-            exiting=False,
-            why="let go, says its holder",
-            comes_back=back,
-            parks=item.parked,
-        )
 
 
 def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLease) -> None:
@@ -388,11 +359,7 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
     core.add(lease)
     core.nonces[lease.process, request.nonce] = lease.id
     if item.away:
-        lease.comes_back, lease.parks = spec.standby or not item.parked, item.parked
-        if item.parked:
-            core.host.find(lease.id, spec.park_bytes)
         request.gpus = tuple(gpu.info.id for gpu in gpus)
-        standby.enter(core, lease)
         return lease
     gpu = max(gpus, key=lambda gpu: (_seen_bytes(gpu, client.process), -gpu.info.index))
     lease.gpu, request.gpus = gpu.info.id, (gpu.info.id,)

@@ -10,7 +10,6 @@ from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
     CancelRequested,
     OomReported,
-    Reacquired,
     ReadyReported,
     ReleaseReported,
     Renewed,
@@ -19,15 +18,12 @@ from vram_arbiter.arbiter.core.events import (
     UnloadStarted,
 )
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import costs, crashes, drift
 from vram_arbiter.arbiter.core.model.lease import (
     AWAY,
     EXPIRING,
-    NONCES_MAX,
     Lease,
     LeaseState,
-    Recall,
     Request,
     Use,
 )
@@ -36,7 +32,7 @@ from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.requests.limits import check_leases, check_waiters
 from vram_arbiter.arbiter.core.scheduling import placement
 from vram_arbiter.arbiter.core.verification.schedule import begin_for_lease
-from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, RequestId, Token
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, Token
 
 _HINT_ACQUIRE = "unload, then acquire again"
 
@@ -123,12 +119,14 @@ def bad_state(lease: Lease, what: str) -> Refused:
 def acquire(core: Core, event: AcquireRequested) -> None:
     """Queue a lease; the scheduling after this event may grant it in the same breath, and answers either way."""
     client = client_of(core, event.client)
-    if find_again(core, event, client):
+    known = _known_by(core, event, client)
+    if any(feature.on_acquire(core, event, known) for feature in core.features):
         return
-    spec = replace(event.spec, exclusive=True) if core.settings.scheduling.alone else event.spec
+    if known is not None:
+        _answer_again(core, event, known)
+        return
+    spec = spec_of(core, event)
     load_peak, steady = drift.expected_bytes(core, spec)
-    for feature in core.features:
-        feature.check_request(core, spec)
     try:
         gpus = placement.places(core, spec, load_peak)
     except Refused as refused:
@@ -136,20 +134,17 @@ def acquire(core: Core, event: AcquireRequested) -> None:
             feature.on_refused(core, spec, refused.message)
         raise
     check_waiters(core, client, spec.priority)
-    away = (
-        None
-        if spec.gang is not None
-        else standby.find(core, client.process, spec.consumer, spec.key)
-    )
-    if away is not None:
-        _take_over(core, event, away, spec, gpus)
-        return
     if spec.gang is None:
         crashes.check(core, spec, load_peak, gpus)
     lease = new_lease(core, event, client, spec, load_peak, steady, gpus)
     core.unanswered.append(lease)
     if not any(feature.hold_back(core, lease) for feature in core.features):
         core.enqueue(lease)
+
+
+def spec_of(core: Core, event: AcquireRequested) -> Spec:
+    """Return what is asked for, as the scheduling policy has it."""
+    return replace(event.spec, exclusive=True) if core.settings.scheduling.alone else event.spec
 
 
 def new_lease(
@@ -188,74 +183,6 @@ def new_lease(
     return lease
 
 
-def _take_over(
-    core: Core, event: AcquireRequested, lease: Lease, spec: Spec, gpus: tuple[GpuId, ...]
-) -> None:
-    """The process has a lease for this model, away: the acquire means that one, as it is asked for now."""
-    if len(lease.request.earlier_nonces) == NONCES_MAX:
-        core.nonces.pop((lease.process, lease.request.earlier_nonces[0]), None)
-    lease.request.earlier_nonces.append(lease.request.nonce)
-    lease.request.nonce = event.nonce
-    core.nonces[lease.process, event.nonce] = lease.id
-    lease.spec = spec
-    lease.request.load_peak_bytes, lease.request.steady_bytes = drift.expected_bytes(core, spec)
-    core.record_lease(lease)  # still away: if a restart ends the wait, it is this that comes back
-    lease.request.traceparent = event.traceparent
-    _call_back(core, lease, event.client, event.request, event.wait_timeout_s, gpus)
-
-
-def _want_back(
-    core: Core, lease: Lease, client: ClientId, request: RequestId, wait_timeout_s: float | None
-) -> None:
-    """A lease that is away becomes a waiter, as it was last asked for."""
-    gpus = placement.places(core, lease.spec, drift.expected_bytes(core, lease.spec)[0])
-    check_waiters(core, client_of(core, client), lease.spec.priority)
-    _call_back(core, lease, client, request, wait_timeout_s, gpus)
-
-
-def _call_back(
-    core: Core,
-    lease: Lease,
-    client: ClientId,
-    request: RequestId,
-    wait_timeout_s: float | None,
-    gpus: tuple[GpuId, ...],
-) -> None:
-    lease.request.gpus = gpus
-    lease.request.uid = client_of(core, client).uid
-    lease.request.load_peak_bytes, lease.request.steady_bytes = drift.expected_bytes(
-        core, lease.spec
-    )
-    standby.queue_again(core, lease, client, request, core.now, wait_timeout_s)
-    costs.wanted(core, lease.spec.consumer)
-    core.unanswered.append(lease)
-
-
-def reacquire(core: Core, event: Reacquired) -> None:
-    """A lease that is away, or on its way there, is wanted now. One that is wanted or back already is answered as it is."""
-    client = client_of(core, event.client)
-    lease = lease_for(core, event.lease, event.token)
-    if lease.process != client.process:
-        raise Refused(
-            "not_permitted",
-            f"{lease.id} belongs to process {lease.process.pid}",
-            "ask as its holder",
-        )
-    if lease.state in AWAY:
-        lease.request.traceparent = event.traceparent
-        _want_back(core, lease, event.client, event.request, event.wait_timeout_s)
-        return
-    if lease.state is LeaseState.VERIFYING and (lease.comes_back or lease.parks):
-        lease.request.traceparent = event.traceparent
-        lease.recalled = lease.recalled or Recall(core.now, event.wait_timeout_s)
-    elif lease.state is not LeaseState.QUEUED:
-        raise bad_state(
-            lease, "only a lease that is away, or being measured on its way there, is called back"
-        )
-    core.hand_to(lease, client.id)
-    core.reply(event.client, event.request, {"state": "queued", "lease": explain.view(core, lease)})
-
-
 def answer_queued(core: Core) -> None:
     """After the scheduling: whoever was not granted at once is told that it waits, and why."""
     for lease in core.unanswered:
@@ -273,30 +200,22 @@ def answer_queued(core: Core) -> None:
     core.unanswered.clear()
 
 
-def find_again(core: Core, event: AcquireRequested, client: Client) -> bool:
-    """Was this acquire said before? Then it is answered as it stands. Raises Refused where its lease is over."""
+def _known_by(core: Core, event: AcquireRequested, client: Client) -> Lease | None:
+    """Return the lease that an earlier acquire with the same nonce asked for. Raises Refused where it is over."""
     lease_id = core.nonces.get((client.process, event.nonce))
     if lease_id is None:
-        return False
+        return None
     lease = core.leases.get(lease_id)
     if lease is None:
         raise ended_error(core.ended[lease_id])
-    if lease.state in AWAY and _still_waits(lease, event):
-        lease.request.traceparent = event.traceparent
-        _want_back(core, lease, event.client, event.request, event.wait_timeout_s)
-        return True
-    core.hand_to(
-        lease, event.client
-    )  # the newest connection of the process is the one that listens
+    return lease
+
+
+def _answer_again(core: Core, event: AcquireRequested, lease: Lease) -> None:
+    """A repeat is answered as its lease is. The newest connection of a process is the one that listens."""
+    core.hand_to(lease, event.client)
     state = str(lease.state) if lease.state in (LeaseState.QUEUED, *AWAY) else "loading"
     core.reply(event.client, event.request, {"state": state, "lease": explain.view(core, lease)})
-    return True
-
-
-def _still_waits(lease: Lease, event: AcquireRequested) -> bool:
-    """Does the newest acquire of a lease that is away wait still? A restart ended its wait: what came back from the journal was, as far as
-    anybody knows, not granted since it was asked for. A late repeat of one that waited and was granted means nothing."""
-    return event.nonce == lease.request.nonce and lease.granted_at <= lease.request.arrived_at
 
 
 def cancel(core: Core, event: CancelRequested) -> None:
@@ -319,26 +238,24 @@ def cancel(core: Core, event: CancelRequested) -> None:
             f"{lease.id} belongs to process {lease.process.pid}",
             "ask as its holder",
         )
-    if lease.state in AWAY:
-        standby.give_up(core, lease, LeaseState.CANCELLED, "cancelled", "its holder gave up")
-        core.reply(event.client, event.request, {"state": "cancelled"})
-        return
-    if lease.state is LeaseState.VERIFYING and (lease.comes_back or lease.parks):
-        standby.renounce(
-            core, lease
-        )  # on its way there: its bytes are measured away, and then it is over
-        core.record_lease(lease)
+    why = "its holder gave up"
+    if any(
+        feature.give_up(core, lease, LeaseState.CANCELLED, "cancelled", why)
+        for feature in core.features
+    ):
+        if lease.state is LeaseState.VERIFYING:  # over with its verdict
+            core.record_lease(lease)
         core.reply(event.client, event.request, {"state": str(lease.state)})
         return
     if lease.state is not LeaseState.QUEUED:
         raise bad_state(lease, "it is granted already, release it")
-    cancel_waiter(core, lease, "its holder gave up")
+    cancel_waiter(core, lease, why)
     core.reply(event.client, event.request, {"state": "cancelled"})
 
 
 def cancel_waiter(core: Core, lease: Lease, why: str) -> None:
     """A revoke that was sent for it stands: the holder may be unloading by now."""
-    lease.move(LeaseState.CANCELLED, core.now, why)
+    core.move(lease, LeaseState.CANCELLED, why)
     core.dequeue(lease)
     core.note("cancelled", lease, reason=why)
     core.end(
@@ -390,10 +307,9 @@ def ready(core: Core, event: ReadyReported) -> None:
 
 def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     """Mark the lease held."""
-    lease.move(LeaseState.HELD, core.now, "ready")
+    core.move(lease, LeaseState.HELD, "ready")
     lease.ready_at = lease.uses.last_at = core.now
     _charge_held(core, lease, measured_bytes)
-    core.host.drop(lease.id)
 
 
 def _charge_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
@@ -455,9 +371,7 @@ def unloading(core: Core, event: UnloadStarted) -> None:
         raise bad_state(lease, f"{running} uses still run; wait for the `revoke` that says 0 uses")
     gpu = core.gpu_of(lease)
     end_uses(core, lease, "unloaded while it paused")
-    for feature in core.features:
-        feature.on_unloading(core, lease, "it unloads")
-    lease.move(LeaseState.UNLOADING, core.now, "at its safe point")
+    core.move(lease, LeaseState.UNLOADING, "at its safe point")
     lease.departure.hangs = False
     core.timers.set(("revoke", lease.id), core.now + core.settings.revoke_deadline_s)
     lease.departure.baseline = gpu.sample
@@ -481,17 +395,12 @@ def release(core: Core, event: ReleaseReported) -> None:
         return
     lease = own_lease(core, event.client, event.lease, event.token)
     if lease.gpu is not None and lease.state is not LeaseState.VERIFYING:  # else: a repeat
-        _keep_parked(core, lease, parked=event.parked, exiting=event.exiting)
-        let_go(
-            core,
-            lease,
-            exiting=event.exiting,
-            why="exits" if event.exiting else "let go",
-            comes_back=standby.stays_on(lease) and not event.exiting,
-            parks=event.parked,
-        )
-    after = {"state": str(lease.state), "next": str(standby.next_state(lease))}
-    core.reply(event.client, event.request, after)
+        for feature in core.features:
+            feature.on_release(core, event, lease)
+        why = "exits" if event.exiting else "let go"
+        let_go(core, lease, exiting=event.exiting, why=why)
+    after = core.next_state(lease) or LeaseState.RELEASED
+    core.reply(event.client, event.request, {"state": str(lease.state), "next": str(after)})
 
 
 def end_uses(core: Core, lease: Lease, why: str) -> None:
@@ -514,48 +423,13 @@ def note_ended(core: Core, lease: Lease, use: Use, why: str) -> None:
     )
 
 
-def _keep_parked(core: Core, lease: Lease, *, parked: bool, exiting: bool) -> None:
-    """Book host RAM for what the holder says that it keeps there; refuse what it has no room for."""
-    if not parked:
-        return
-    count = lease.spec.park_bytes
-    if exiting or not count:
-        what = "a process that exits keeps nothing" if exiting else "its spec has no park_bytes"
-        raise bad_state(lease, f"it cannot be parked: {what}")
-    if lease.id in core.host.booked or core.host.book(lease.id, count):
-        return
-    host = core.host
-    raise Refused(
-        "host_ram_insufficient",
-        f"{count} bytes of host RAM are asked for; of a budget of {host.budget_bytes} {host.used_bytes()} are booked",
-        "release without parking, or raise host.park_budget_bytes",
-        needed_bytes=count,
-        budget_bytes=host.budget_bytes,
-        booked_bytes=host.used_bytes(),
-    )
-
-
-def let_go(
-    core: Core,
-    lease: Lease,
-    *,
-    exiting: bool,
-    why: str,
-    comes_back: bool = False,
-    parks: bool = False,
-) -> None:
+def let_go(core: Core, lease: Lease, *, exiting: bool, why: str) -> None:
     """From any resident state to verification. Uses that others left on it end with it."""
     gpu = core.gpu_of(lease)
     end_uses(core, lease, why)
     before = lease.state
     lease.departure.exiting = exiting
-    for feature in core.features:
-        feature.on_unloading(core, lease, "it let go")
-    lease.comes_back = comes_back
-    lease.parks = parks
-    if not parks:
-        core.host.drop(lease.id)
-    lease.move(LeaseState.VERIFYING, core.now, why)
+    core.move(lease, LeaseState.VERIFYING, why)
     core.timers.clear(("ttl", lease.id))
     if lease.departure.eviction is not None:
         lease.departure.eviction.unloading_at = lease.departure.eviction.unloading_at or core.now

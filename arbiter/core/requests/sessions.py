@@ -7,8 +7,7 @@ out); `bye` gives everything back; death ends everything, and what was held is m
 from dataclasses import replace
 
 from vram_arbiter.arbiter.core.events import BYE, ClientConnected, ClientLeft, JournalFailed
-from vram_arbiter.arbiter.core.features import standby
-from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.lease import EXPIRING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Client, Core, Refused
 from vram_arbiter.arbiter.core.requests.expiry import lose
 from vram_arbiter.arbiter.core.requests.recovery import account_for
@@ -66,14 +65,16 @@ def on_left(core: Core, event: ClientLeft) -> None:
             continue
         if lease.state is LeaseState.QUEUED:
             cancel_waiter(core, lease, f"its client left: {event.reason}")
-        elif lease.state in AWAY:
-            standby.give_up(
-                core, lease, LeaseState.CANCELLED, "cancelled", f"its client left: {event.reason}"
-            )
-        elif lease.state is LeaseState.VERIFYING:
-            standby.renounce(core, lease)
-        elif lease.state in EXPIRING and event.reason == BYE:
+        elif lease.state not in EXPIRING:
+            why = f"its client left: {event.reason}"
+            _give_up(core, lease, LeaseState.CANCELLED, "cancelled", why)
+        elif event.reason == BYE:
             let_go(core, lease, exiting=False, why="its client said bye")
+
+
+def _give_up(core: Core, lease: Lease, to: LeaseState, code: str, why: str) -> None:
+    for feature in core.features:
+        feature.give_up(core, lease, to, code, why)
 
 
 def concerns(core: Core, client: ClientId) -> bool:
@@ -126,15 +127,13 @@ def _bereave(core: Core, lease: Lease) -> None:
     account_for(core, lease.id)
     if lease.state is LeaseState.QUEUED:
         cancel_waiter(core, lease, "its process died")
-    elif lease.state in AWAY:
-        standby.give_up(core, lease, LeaseState.LOST, "lease_lost", "its process died")
     elif lease.state in EXPIRING:
         message = f"{lease.id}: process {lease.process.pid} died"
         core.note("lost", lease, reason=message)
         error = {"code": "lease_lost", "message": message, "hint": "acquire again", "details": {}}
         lose(core, lease, LeaseState.LOST, error, alive=False)
-    else:  # a lease under verification goes on: only its residue is no longer expected
-        standby.renounce(core, lease)
+    else:  # a verification goes on: only the residue is no longer expected
+        _give_up(core, lease, LeaseState.LOST, "lease_lost", "its process died")
 
 
 def on_journal_failed(core: Core, event: JournalFailed) -> None:
@@ -156,7 +155,7 @@ def on_journal_failed(core: Core, event: JournalFailed) -> None:
         "look at the daemon's log and its disk",
         key=event.key,
     )
-    lease.move(LeaseState.DENIED, core.now, refused.message)
+    core.move(lease, LeaseState.DENIED, refused.message)
     if lease.request.id is None:  # else: whoever held the reply back has refused the request
         core.push(lease, {"push": "denied", "lease_id": lease.id, "error": refused.wire()})
     core.note("denied", lease, code=refused.code, reason=refused.message)

@@ -2,10 +2,9 @@
 
 Per card, in this order (the numbers stand in `_serve`):
   1. under pressure: ask idle holders to leave, grant nothing
-  2. a feature keeps the GPU for its own requests: grant what it grants (`Feature.serve_reserved`)
+  2. a feature keeps the GPU for its own requests: it grants them (`Feature.blocks`, `serve`)
   3. blocked (recovering, drained, reading unknown, a load under way): grant nothing, ask nobody
-  4. nobody waits: whoever is on standby and fits may come back, asking nobody to leave; a head that a feature owns is served by it
-     alone (`Feature.serve`)
+  4. nothing waits, or a feature owns the head: served by features alone
   5. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a head for which another card is
      being emptied is passed over from here on
   6. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out already
@@ -16,7 +15,7 @@ Per card, in this order (the numbers stand in `_serve`):
 from collections.abc import Mapping
 
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.features import standby
+from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.learning import costs
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
@@ -44,22 +43,25 @@ def _serve(core: Core, gpu: Gpu) -> None:
     if gpu.pressed and core.recovering is None:  # 1
         _relieve(core, gpu)
         return
-    if any(feature.serve_reserved(core, gpu) for feature in core.features):  # 2
+    keeper = next((feature for feature in core.features if feature.blocks(gpu)), None)
+    if keeper is not None:  # 2
+        keeper.serve(core, gpu, None)
         return
     if gpu.blocked:  # 3
         return
-    if gpu.queue.head() is None:  # 4
-        back = standby.next_back(core, gpu)
-        if back is not None:
-            _grant_if_measured(core, gpu, back)
+    if not len(gpu.queue):  # 4
+        for feature in core.features:
+            feature.serve(core, gpu, None)
         return
     head = policy.front(core, gpu)
     if head is None:
         return
-    if any(feature.serve(core, gpu, head) for feature in core.features):  # 4
+    owner = _owner(core, head)
+    if owner is not None:  # 4
+        owner.serve(core, gpu, head)
         return
     if policy.fits(gpu, head):  # 5
-        _grant_if_measured(core, gpu, head)
+        grant_if_measured(core, gpu, head)
         return
     leaving = policy.leaving(gpu)
     planned = policy.fits(gpu, head, leaving)
@@ -80,7 +82,8 @@ def _relieve(core: Core, gpu: Gpu) -> None:
     policy.wake_when_evictable(core, gpu, None)
 
 
-def _grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> None:
+def grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> None:
+    """Grant a lease that fits by the ledger, once a reading shows its bytes as free too."""
     room = policy.measured_room_bytes(core, gpu)
     need = policy.measured_need_bytes(gpu, lease)
     if room is None or (room < need and policy.sample_is_behind(gpu)):
@@ -145,15 +148,16 @@ def _backfill(
     for lease in gpu.queue.behind_head():
         if lease.request.load_peak_bytes > most or (lease.spec.exclusive and not alone):
             continue  # seen at a glance: thousands may wait
-        if lease is head or _is_owned(core, lease) or (stuck and not _may_be_asked(core, lease)):
+        if lease is head or _owner(core, lease) or (stuck and not _may_be_asked(core, lease)):
             continue
         if policy.added_bytes(gpu, lease) <= spare and policy.fits(gpu, lease):
-            _grant_if_measured(core, gpu, lease)
+            grant_if_measured(core, gpu, lease)
             return
 
 
-def _is_owned(core: Core, lease: Lease) -> bool:
-    return any(feature.owns(lease) for feature in core.features)
+def _owner(core: Core, request: Lease) -> Feature | None:
+    """Return the feature that alone grants a request."""
+    return next((feature for feature in core.features if feature.owns(request)), None)
 
 
 def _may_be_asked(core: Core, lease: Lease) -> bool:
@@ -169,11 +173,11 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     if any(feature.grant(core, gpu, lease) for feature in core.features):
         return
     core.dequeue(lease)
-    by_itself = standby.taken_back(core, lease)
+    by_itself = lease.state is not LeaseState.QUEUED
     token = core.next_token()
     lease.token = token
     lease.gpu = gpu.info.id
-    lease.move(LeaseState.LOADING, core.now, "came back by itself" if by_itself else "granted")
+    core.move(lease, LeaseState.LOADING, "came back by itself" if by_itself else "granted")
     lease.granted_at = lease.held_from = core.now
     lease.request.reason = ""
     gpu.residents[lease.id] = lease

@@ -285,7 +285,7 @@ def residency_ends_at(core: Core, lease: Lease, waiter: Lease | None) -> float:
     Who came back by itself and was not used since has no claim to stay: its return must cost nobody time. Two that keep throwing each
     other out stay longer, by what a switch of theirs costs.
     """
-    if lease.uncalled:
+    if any(feature.unclaimed(lease) for feature in core.features):
         return lease.ready_at
     held_s = 0.0 if waiter is None else costs.hold_s(core, lease, waiter)
     return lease.ready_at + max(lease.spec.min_residency_s, held_s)

@@ -5,7 +5,6 @@ The bytes stay charged until then.
 """
 
 from vram_arbiter.arbiter.core.events import MemorySampled
-from vram_arbiter.arbiter.core.features import standby
 from vram_arbiter.arbiter.core.learning import costs, drift
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
@@ -234,7 +233,10 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
     costs.left(core, verification.consumer)
     lease = core.leases.get(verification.lease)
     if lease is not None and lease.state is LeaseState.VERIFYING:
-        standby.settle(core, lease, str(judgement.verdict))
+        lives_on = core.next_state(lease)
+        core.move(lease, lives_on or LeaseState.RELEASED, str(judgement.verdict))
+        if lives_on is None:
+            core.end(lease, None)
     if core.recovering is not None:
         core.recovering.discard(verification.lease)
 

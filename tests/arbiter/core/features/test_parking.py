@@ -320,6 +320,6 @@ def test_a_lost_journal_does_not_lose_it(standby: bool) -> None:
 def test_the_invariant_of_the_budget() -> None:
     driver = driver_with(5)
     parked(driver)
-    state_of(driver.arbiter).host.booked[LeaseId("x")] = 1
+    driver.arbiter.inspect().standby.host.booked[LeaseId("x")] = 1
     with pytest.raises(InvariantViolation, match="bytes are parked, the budget is"):
         invariants.check(state_of(driver.arbiter))

@@ -300,11 +300,6 @@ def test_a_record_holds_all_that_was_asked_for() -> None:
         "measured_bytes": None,
         "exiting": False,
         "pinned": None,
-        "comes_back": False,
-        "parks": False,
-        "parked_bytes": 0,
-        "left_for": "",
-        "dismissed": False,
     }
 
 
