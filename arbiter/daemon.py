@@ -45,10 +45,11 @@ from vram_arbiter.arbiter.rpc.session import SessionSettings, SessionTable
 from vram_arbiter.schemas.config.arbiter import ArbiterConfig, GpuConfig
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime.connection import Limits
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint, runtime_dir, socket_path
 from vram_arbiter.schemas.runtime.folders import LockFile, private_folder, socket_folder
 from vram_arbiter.schemas.runtime.procfs import boot_id, start_ticks
-from vram_arbiter.schemas.runtime.router import Limits, Router
+from vram_arbiter.schemas.runtime.router import Router
 from vram_arbiter.schemas.runtime.telemetry import setup as otel
 from vram_arbiter.schemas.runtime.telemetry.commands import TRACEPARENT_VARIABLE
 from vram_arbiter.schemas.units import format_bytes

@@ -7,7 +7,7 @@ One folder per card:
     log.jsonl         append-only, one line per change (`LogLine`), for timelines and for the independent checker
     lock              flock'ed exclusively around every reading and every change
 
-Reader and writer do the I/O: take the lock, hand all texts to `read_card`, call transitions, perform their `Step`s in order.
+Reader and writer do the I/O: take the lock, hand all texts to `read_card`, call transitions, perform their `Edit`s in order.
 A step first replaces one process file (temporary file + rename), then appends that file's `last` to the log. So a kill at any
 instant leaves a readable card, and at most one line unwritten, which `read_card` orders to be appended by whoever comes next.
 
@@ -126,7 +126,7 @@ class ProcessFile(_Frozen):
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class Edit:
     """One atomic piece of I/O: replace (or, without `text`, remove) the file `name`, then append `line` to the log."""
 
     name: str
@@ -160,7 +160,7 @@ class Change:
     """What a transition did: the next card, the steps that make it so on disk, and the refusal, if it was one."""
 
     card: Card
-    steps: tuple[Step, ...] = ()
+    steps: tuple[Edit, ...] = ()
     error: SimulatedOutOfMemory | None = None
 
     def then(self, transition: Callable[[Card], "Change"]) -> "Change":
@@ -225,11 +225,11 @@ def read_card(texts: Mapping[str, str], log_tail: str) -> Change:
         if p.last is not None and int(p.last.get("seq", 0)) > logged
     ]
     torn = bool(log_tail) and not log_tail.endswith("\n")
-    steps: tuple[Step, ...] = ()
+    steps: tuple[Edit, ...] = ()
     if torn or missing:
         missing.sort(key=lambda line: int(line["seq"]))
         lines = "".join(_dump(line) for line in missing)
-        steps = (Step("", None, ("\n" if torn else "") + lines),)
+        steps = (Edit("", None, ("\n" if torn else "") + lines),)
     newest = missing[-1] if missing else newest
     card = Card(
         parse_config(texts[CARD_FILE]),
@@ -290,7 +290,7 @@ def _notice_edits(card: Card, now: float) -> Change:
         "capacity": card.config.capacity_bytes,
     }  # fmt: skip
     after = replace(card, seq=card.seq + 1, logged_bytes=card.used_bytes)
-    return Change(after, (Step("", None, _dump(line)),))
+    return Change(after, (Edit("", None, _dump(line)),))
 
 
 def touch(card: Card, key: ProcessKey, name: str, context_bytes: int, now: float) -> Change:
@@ -418,7 +418,7 @@ def _step(
             card.config, {**card.processes, name: written}, card.seq + 1, card.logged_bytes + delta
         )
         return Change(
-            after, (Step(name, written.model_dump_json(exclude_defaults=True), _dump(line)),)
+            after, (Edit(name, written.model_dump_json(exclude_defaults=True), _dump(line)),)
         )
 
     return transition
@@ -433,7 +433,7 @@ def _return(
 def _remove(name: str) -> Callable[[Card], Change]:
     def transition(card: Card) -> Change:
         processes = {other: process for other, process in card.processes.items() if other != name}
-        return Change(replace(card, processes=processes), (Step(name, None),))
+        return Change(replace(card, processes=processes), (Edit(name, None),))
 
     return transition
 

@@ -54,7 +54,7 @@ _KINDS = frozenset((*NOTE_KINDS, *DAEMON_KINDS))
 
 
 class Connection(Protocol):
-    """A peer's connection (`schemas.runtime.router.Connection`), as sessions need it."""
+    """A peer's connection (`schemas.runtime.connection.Connection`), as sessions need it."""
 
     serial: int
     peer: Peer

@@ -19,10 +19,11 @@ from typing import Any, Self
 from vram_arbiter.clients._protocol.codec import pack
 from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MIB, RATE_PER_CLIENT_PER_S
 from vram_arbiter.schemas.errors import LimitExceeded, MessageTooLarge, VramError
+from vram_arbiter.schemas.runtime.connection import Connection, Limits
 from vram_arbiter.schemas.runtime.endpoints import socket_path
 from vram_arbiter.schemas.runtime.folders import LockFile, socket_folder
 from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
-from vram_arbiter.schemas.runtime.router import Connection, Limits, Router
+from vram_arbiter.schemas.runtime.router import Router
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 
 log = logging.getLogger(__name__)
@@ -118,7 +119,7 @@ class RouterServer:
     A handler runs in a task of its own, so that a slow one delays no other request; its work up to
     the first wait is done at once.
     Args: `message_max_bytes` bounds one request; beside binary values, as pictures are, it holds at
-    most 1 MiB. `work_share` as in `schemas.runtime.router.Limits`.
+    most 1 MiB. `work_share` as in `schemas.runtime.connection.Limits`.
     Raises ConfigError for an endpoint that cannot be bound, AlreadyRunning when a living server has
     it.
     """

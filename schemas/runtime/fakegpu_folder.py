@@ -72,7 +72,7 @@ def alive(key: ProcessKey) -> bool:
     return stat is not None and stat.alive and key.start_ticks in (0, stat.start_ticks)
 
 
-def _perform(folder: Path, step: fakegpu.Step) -> None:
+def _perform(folder: Path, step: fakegpu.Edit) -> None:
     if step.text is not None:
         replace(folder / step.name, step.text)
     elif step.name:

@@ -1,13 +1,10 @@
 """A ZeroMQ ROUTER on asyncio for unix sockets, for every server of the product.
 
-Peers are untrusted. They may send anything, at any speed, and never read; the limits of `Limits`
-hold in bytes as well
-as in counts, per connection, process and user. The kernel names a peer once, at accept
-(`peercred`). Work is done in
-turns over users, processes and connections, so a flood delays others by a few messages. libzmq is
-not involved: it
-aborts or buffers without bound on such input before a program sees a byte. Must not know what a
-message means.
+Peers are untrusted: they may send anything, at any speed, and never read. The bounds of `Limits`
+hold in bytes as well as in counts, per connection, process and user. The kernel names a peer once,
+at accept (`peercred`). Work is done in turns over users, processes and connections, so that a flood
+delays others by a few messages. libzmq is not involved: it aborts or buffers without bound on such
+input before a program sees a byte. Must not know what a message means.
 """
 
 import asyncio
@@ -22,23 +19,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
-from vram_arbiter.schemas.defaults import KIB, MESSAGE_MAX_BYTES, MIB
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime.connection import Connection, Handler, Limits, User
 from vram_arbiter.schemas.runtime.peercred import Peer, PeerGone, identify
 from vram_arbiter.schemas.runtime.turns import Turns
-from vram_arbiter.schemas.runtime.zmtp import (
-    Heartbeat,
-    Message,
-    Oversize,
-    Ready,
-    ServerConnection,
-    ZmtpError,
-    encode,
-)
-from vram_arbiter.schemas.runtime.zmtp import Limits as WireLimits
+from vram_arbiter.schemas.runtime.zmtp import Oversize
 
 log = logging.getLogger(__name__)
 
@@ -55,71 +42,6 @@ DIRECT_SHARE = 0.5
 """Share of the loop's time in which a message is handled as it arrives; beyond it messages wait for
 their turn.
 """
-REST_S = 0.005
-"""A connection that is over its rate is not read for so long; the kernel's buffer then slows its
-sender.
-"""
-READ_AHEAD_BYTES = 16 * KIB
-"""Unread bytes from which on a connection that waits for its turn is not read any further."""
-OUT_MESSAGES_MAX = 4096
-"""Messages queued for a peer that does not read."""
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Bounds of a server; sizes in bytes, times in seconds."""
-
-    message_max_bytes: int = MESSAGE_MAX_BYTES
-    stranger_message_max_bytes: int = 64 * KIB
-    """Largest message of a connection that is not admitted yet."""
-    skip_max_bytes: int = 64 * MIB
-    """A message beyond its limit is skipped and answered; beyond this the connection is cut."""
-    handshake_s: float = 2.0
-    hello_s: float = 5.0
-    """A connection that is not admitted within this time is cut."""
-    connections_max: int = 2048
-    descriptor_reserve: int = 128
-    """Descriptors of the process that connections never take."""
-    user_share: float = 0.75
-    """Largest share of the connections that one user may have."""
-    process_share: float = 0.25
-    """Largest share of the connections that one process may have."""
-    out_max_bytes: int = 4 * MIB
-    """Queued for one connection that does not read."""
-    user_out_max_bytes: int = 64 * MIB
-    user_in_max_bytes: int = 16 * MIB
-    """Incomplete messages of all connections of one user."""
-    work_share: float = 1.0
-    """Largest share of the time for accepting and handling. Below 1 the loop rests between its
-    turns, so that another thread of the process, as a control loop, gets the interpreter at once
-    while a flood lasts.
-    """
-
-
-class Handler(Protocol):
-    """What a server does with its connections. Every method is called on the loop and must not
-    block.
-    """
-
-    def connected(self, connection: "Connection") -> None:
-        """A peer has finished the handshake."""
-
-    def received(self, connection: "Connection", payload: bytes | bytearray | Oversize) -> bool:
-        """One message came; `Oversize` where it was skipped. Return False if its sender is over its
-        rate.
-        """
-
-    def disconnected(self, connection: "Connection", reason: str) -> None:
-        """A connection of which `connected` was told has ended."""
-
-
-@dataclass(slots=True)
-class _User:
-    """Bytes and connections of one uid."""
-
-    connections: int = 0
-    in_bytes: int = 0
-    out_bytes: int = 0
 
 
 @dataclass(slots=True)
@@ -128,216 +50,6 @@ class _Process:
 
     pidfd: int
     connections: "set[Connection]" = field(default_factory=set)
-
-
-class Connection(asyncio.Protocol):
-    """One peer's connection. `serial` is unique within its router; a peer's own ZeroMQ identity is
-    ignored.
-    """
-
-    def __init__(self, router: "Router", serial: int, peer: Peer, user: _User, now: float) -> None:
-        self.serial = serial
-        self.peer = peer
-        self.accepted_at = now
-        self.admitted = False
-        self.ready = False
-        self.ended = False
-        self._router = router
-        self._user = user
-        self._transport: asyncio.Transport | None = None
-        limits = router.limits
-        self._wire = ServerConnection(
-            WireLimits(limits.stranger_message_max_bytes, limits.skip_max_bytes)
-        )
-        self._delimiter = False
-        self._resting = False  # over its rate
-        self._clogged = False  # bytes wait for the peer to read
-        self._finishing = False  # nothing more is sent
-        self._in_bytes = 0
-        self._out_bytes = 0
-        self._out_messages = 0
-        self._reason = "the peer hung up"
-
-    def __repr__(self) -> str:
-        return f"<connection {self.serial} of process {self.peer.process}, uid {self.peer.uid}>"
-
-    # -- for handlers ----------------------------------------------------------------------------
-    def admit(self) -> None:
-        """The peer said who it is: the time limit of `hello_s` ends, and messages may have their
-        full size.
-        """
-        self.admitted = True
-        limits = self._router.limits
-        self._wire.limits = WireLimits(limits.message_max_bytes, limits.skip_max_bytes)
-        self._router._admitted(self)
-
-    def send(self, payload: bytes) -> bool:
-        """Queue one message, in the envelope of the last one received. False: the peer is gone or
-        does not read.
-        """
-        transport = self._transport
-        if transport is None or self._finishing or transport.is_closing():
-            return False
-        frames = encode(payload, self._delimiter)
-        if self._clogged:
-            if not self._may_queue(len(frames)):
-                self._count_out()
-                if not self._may_queue(len(frames)):
-                    return False
-            self._out_messages += 1
-            self._out_bytes += len(frames)
-            self._user.out_bytes += len(frames)
-        transport.write(frames)
-        return True
-
-    def close(self, reason: str) -> None:
-        """Hang up as soon as what was sent has left, or after `handshake_s` if the peer does not
-        read.
-        """
-        transport = self._transport
-        if transport is None or transport.is_closing():
-            return
-        self._reason = reason
-        self._finishing = True
-        transport.close()
-        self._router._loop_or_fail.call_later(self._router.limits.handshake_s, transport.abort)
-
-    # -- asyncio.Protocol ------------------------------------------------------------------------
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
-        transport.set_write_buffer_limits(high=0)  # reading stops while anything waits for the peer
-        if self.ended:  # cut between accept and here
-            transport.abort()
-            return
-        transport.write(self._wire.outgoing())
-
-    def data_received(self, data: bytes) -> None:
-        if self._finishing:  # read on all the same: the peer's end of file ends the connection
-            return
-        self._wire.feed(data)
-        self._router._readable(self)
-
-    def pause_writing(self) -> None:
-        self._clogged = True
-        self._count_out()
-        self.update_reading()
-
-    def resume_writing(self) -> None:
-        self._clogged = False
-        self._out_messages = 0
-        self._count_out()
-        self._router._readable(self)  # requests wait until their sender has read the answers before
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._transport = None
-        self._router._lost(self, self._reason if exc is None else f"{exc}")
-
-    # -- for the router --------------------------------------------------------------------------
-    def cut(self, reason: str) -> None:
-        """Hang up now; what is queued is lost."""
-        self._reason = reason
-        if self._transport is not None:
-            self._transport.abort()
-        self._router._lost(self, reason)
-
-    def half_close(self) -> None:
-        """Flush, then tell the peer that nothing more comes; it hangs up when it has read
-        everything.
-        """
-        if self._transport is not None and not self._transport.is_closing():
-            self._reason = "the server ends"
-            self._finishing = True
-            self._transport.write_eof()
-            self.update_reading()
-
-    def handle(self) -> bool:
-        """Handle one event of what was read. True: more may be left, and the connection wants
-        another turn.
-        """
-        event = None
-        try:
-            if not self._stopped and (event := self._wire.next_event()) is not None:
-                self._handle(event)
-        except ZmtpError as error:
-            self._flush_wire()
-            self._router._complain(f"process {self.peer.process} of uid {self.peer.uid}: {error}")
-            self.cut(f"protocol error: {error}")
-        if self.ended:
-            return False
-        self._flush_wire()
-        self._count_in()
-        self.update_reading()
-        more = event is not None and self._wire.unread_bytes > 0
-        return more and not self._stopped and not self.ended
-
-    @property
-    def _stopped(self) -> bool:
-        """Nothing is handled for now, or any more."""
-        return self._resting or self._clogged or self._finishing
-
-    def _handle(self, event: Ready | Heartbeat | Message | Oversize) -> None:
-        match event:
-            case Message():
-                self._delimiter = event.delimiter
-                within_rate = self._router._deliver(self, event.payload)
-            case Oversize():
-                self._delimiter = event.delimiter
-                within_rate = self._router._deliver(self, event)
-            case Ready():
-                self._flush_wire()
-                self.ready = within_rate = True
-                self._router.handler.connected(self)
-            case Heartbeat():
-                within_rate = True
-        if not within_rate:
-            self._resting = True
-            self._router._loop_or_fail.call_later(REST_S, self._rested)
-
-    def _rested(self) -> None:
-        self._resting = False
-        if not self.ended:
-            self._router._readable(self)
-
-    def _flush_wire(self) -> None:
-        data = self._wire.outgoing()
-        if data and self._transport is not None and not self._transport.is_closing():
-            self._transport.write(data)
-
-    def update_reading(self) -> None:
-        transport = self._transport
-        if transport is None or transport.is_closing():
-            return
-        full = self._stopped or self._wire.unread_bytes > READ_AHEAD_BYTES
-        if full and not self._finishing:
-            transport.pause_reading()
-        else:
-            transport.resume_reading()
-
-    def _may_queue(self, size: int) -> bool:
-        limits = self._router.limits
-        return (
-            self._out_messages < OUT_MESSAGES_MAX
-            and self._out_bytes + size <= limits.out_max_bytes
-            and self._user.out_bytes + size <= limits.user_out_max_bytes
-        )
-
-    def _count_in(self) -> None:
-        kept = self._wire.kept_bytes
-        self._user.in_bytes += kept - self._in_bytes
-        self._in_bytes = kept
-        if self._user.in_bytes > self._router.limits.user_in_max_bytes and not self.ended:
-            self.cut(f"incomplete messages of uid {self.peer.uid} exceed their limit")
-
-    def _count_out(self) -> None:
-        queued = 0 if self._transport is None else self._transport.get_write_buffer_size()
-        self._user.out_bytes += queued - self._out_bytes
-        self._out_bytes = queued
-
-    def forget_bytes(self) -> None:
-        self._user.in_bytes -= self._in_bytes
-        self._user.out_bytes -= self._out_bytes
-        self._in_bytes = self._out_bytes = 0
 
 
 class Router:
@@ -361,7 +73,7 @@ class Router:
         self._connections_max = self.limits.connections_max
         self._connections: set[Connection] = set()
         self._strangers: dict[Connection, None] = {}  # not admitted, the oldest first
-        self._users: dict[int, _User] = {}
+        self._users: dict[int, User] = {}
         self._processes: dict[ProcessKey, _Process] = {}
         self._turns: Turns[Connection] = Turns()
         self._turn_scheduled = False
@@ -376,6 +88,10 @@ class Router:
     def _loop_or_fail(self) -> asyncio.AbstractEventLoop:
         assert self._loop is not None, "the router was not started"
         return self._loop
+
+    def call_later(self, delay_s: float, callback: Callable[[], object]) -> asyncio.TimerHandle:
+        """Run `callback` on the loop after `delay_s`."""
+        return self._loop_or_fail.call_later(delay_s, callback)
 
     def __len__(self) -> int:
         """Number of open connections."""
@@ -484,7 +200,7 @@ class Router:
             try:
                 peer = identify(sock)  # 2
             except PeerGone as gone:
-                self._complain(f"a connection: {gone}")
+                self.complain(f"a connection: {gone}")
                 sock.close()
                 continue
             except OSError as error:
@@ -492,7 +208,7 @@ class Router:
                 self._pause_accept(error)
                 return
             if not self._make_room(peer):  # 3
-                self._complain(f"process {peer.process} of uid {peer.uid}: too many connections")
+                self.complain(f"process {peer.process} of uid {peer.uid}: too many connections")
                 _close(peer.pidfd)
                 sock.close()
                 continue
@@ -561,7 +277,7 @@ class Router:
         else:
             _close(peer.pidfd)
             peer = Peer(peer.process, peer.uid, peer.gid, process.pidfd)
-        user = self._users.setdefault(peer.uid, _User())
+        user = self._users.setdefault(peer.uid, User())
         user.connections += 1
         self._serial += 1
         connection = Connection(self, self._serial, peer, user, self._loop_or_fail.time())
@@ -577,10 +293,10 @@ class Router:
         for connection in list(known.connections):
             connection.cut("its process has ended")
 
-    def _admitted(self, connection: Connection) -> None:
+    def admitted(self, connection: Connection) -> None:
         self._strangers.pop(connection, None)
 
-    def _lost(self, connection: Connection, reason: str) -> None:
+    def lost(self, connection: Connection, reason: str) -> None:
         """Forget a connection. The second call, from asyncio after a cut, changes nothing."""
         if connection.ended:
             return
@@ -607,7 +323,7 @@ class Router:
             self._empty.set_result(None)
 
     # -- handling ----------------------------------------------------------------------------------
-    def _readable(self, connection: Connection) -> None:
+    def readable(self, connection: Connection) -> None:
         """Handle what has come at once while the loop has time for it, else when it is the
         connection's turn.
         """
@@ -653,7 +369,7 @@ class Router:
     def _rest_s(self, worked_s: float) -> float:
         return worked_s * (1.0 / self.limits.work_share - 1.0)
 
-    def _deliver(self, connection: Connection, payload: bytes | bytearray | Oversize) -> bool:
+    def deliver(self, connection: Connection, payload: bytes | bytearray | Oversize) -> bool:
         if not self._receiving:
             return True
         try:
@@ -662,7 +378,7 @@ class Router:
             log.exception("a message of %r could not be handled", connection)
             return True
 
-    def _complain(self, what: str) -> None:
+    def complain(self, what: str) -> None:
         """Log what was refused, once per sweep: a flood must not fill the log."""
         self._complaints += 1
         if self._complaints == 1:

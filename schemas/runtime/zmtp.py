@@ -4,7 +4,7 @@ Implements the server side of https://rfc.zeromq.org/spec/37/ with the NULL mech
 and REQ peers of any
 ZeroMQ library from version 4.0 on. Every length is checked before a byte of it is kept: memory is
 bounded by
-`Limits.message_max_bytes` and one read of the caller, whatever a peer sends. Must not know sockets,
+`WireLimits.message_max_bytes` and one read of the caller, whatever a peer sends. Must not know sockets,
 loops or what a
 message means.
 """
@@ -45,7 +45,7 @@ class ZmtpError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class WireLimits:
     """Sizes in bytes. A message over `message_max_bytes` is skipped and reported, over
     `skip_max_bytes` it is an error.
     """
@@ -55,7 +55,7 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True)
-class Ready:
+class PeerReady:
     """The handshake has ended; messages may be sent from here on."""
 
 
@@ -90,7 +90,7 @@ class Oversize:
     delimiter: bool
 
 
-Event = Ready | Heartbeat | Message | Oversize
+Event = PeerReady | Heartbeat | Message | Oversize
 
 
 class ServerConnection:
@@ -101,7 +101,7 @@ class ServerConnection:
     may be called any more but `outgoing`.
     """
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: WireLimits) -> None:
         self.limits = limits
         self._data: bytes = b""
         self._at = 0
@@ -266,7 +266,7 @@ class ServerConnection:
                 raise ZmtpError("a command before READY")
             _check_properties(rest)
             self._ready = True
-            return Ready()
+            return PeerReady()
         if name == b"PING":
             if not 2 <= len(rest) <= 2 + CONTEXT_MAX_BYTES:
                 raise ZmtpError(f"a PING of {len(rest)} bytes")

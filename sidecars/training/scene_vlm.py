@@ -56,7 +56,7 @@ CHAT_TEMPLATE: Final = (
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Recipe:
+class VlmRecipe:
     """Parameters of a run beside its data."""
 
     seed: int = 7
@@ -94,13 +94,13 @@ class Recipe:
         return self.grid[0] * self.patch_px, self.grid[1] * self.patch_px
 
 
-SMOKE: Final = Recipe(
+SMOKE: Final = VlmRecipe(
     grid=(8, 6), vision_width=32, vision_layers=1, width=32, batch=6,
     vision_steps=6, language_steps=6, steps=4, held_out=0.25,
 )  # fmt: skip
 
 
-def build_processor(folder: Path, recipe: Recipe, names: Sequence[str]) -> Any:
+def build_processor(folder: Path, recipe: VlmRecipe, names: Sequence[str]) -> Any:
     """Write tokenizer (byte-level BPE of Qwen's kind), image processor and chat template.
 
     `AutoProcessor` reads them back.
@@ -146,7 +146,7 @@ def build_processor(folder: Path, recipe: Recipe, names: Sequence[str]) -> Any:
     return processor
 
 
-def build_model(recipe: Recipe, processor: Any) -> Any:
+def build_model(recipe: VlmRecipe, processor: Any) -> Any:
     """Return a new Qwen3.5 with this tokenizer's ids."""
     import torch
     from transformers import Qwen3_5Config, Qwen3_5ForConditionalGeneration
@@ -211,7 +211,7 @@ def build_model(recipe: Recipe, processor: Any) -> Any:
     return model
 
 
-def to_patches(images: Any, recipe: Recipe) -> Any:
+def to_patches(images: Any, recipe: VlmRecipe) -> Any:
     """Convert float images (n, 3, h, w) in 0..1 to patch rows of Qwen's image processor."""
     count = images.shape[0]
     across, down = recipe.grid
@@ -277,7 +277,7 @@ class Heads:
         return functional.cross_entropy(logits, held) + visible, right
 
 
-def image_tokens(model: Any, patches: Any, recipe: Recipe) -> Any:
+def image_tokens(model: Any, patches: Any, recipe: VlmRecipe) -> Any:
     """Return (images, tokens, width) of the vision tower: its forward pass for equal images.
 
     The library's convolution over patches and its attention image by image cost three times as much
@@ -370,7 +370,7 @@ def encode(
 
 
 def answer_loss(
-    model: Any, tokens: Any, owner: Any, encoded: tuple[Any, Any, Any], recipe: Recipe
+    model: Any, tokens: Any, owner: Any, encoded: tuple[Any, Any, Any], recipe: VlmRecipe
 ) -> tuple[Any, float]:
     """Return the cross-entropy of the answers, and the share with the right first word.
 
@@ -412,7 +412,7 @@ def take_over(model: Any, start: Path) -> None:
 
 
 def train(
-    recipe: Recipe,
+    recipe: VlmRecipe,
     frames: Sequence[Frame],
     names: Sequence[str],
     out: Path,
@@ -506,7 +506,7 @@ def balanced(some: Sequence[int], others: Sequence[int]) -> list[int]:
     return [half[i % len(half)] for i in range(longest) for half in (some, others)]
 
 
-def run(recipe: Recipe, data: Path, out: Path, start: Path | None = None) -> dict[str, Any]:
+def run(recipe: VlmRecipe, data: Path, out: Path, start: Path | None = None) -> dict[str, Any]:
     """Train, save, evaluate the saved checkpoint as a user would load it, write the model card.
 
     Returns the figures.
@@ -521,7 +521,7 @@ def run(recipe: Recipe, data: Path, out: Path, start: Path | None = None) -> dic
 
 
 def report(
-    recipe: Recipe,
+    recipe: VlmRecipe,
     training: Sequence[Frame],
     testing: Sequence[Frame],
     names: Sequence[str],
@@ -579,11 +579,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--smoke", action="store_true", help="toy size, a few seconds: checks that all code runs"
     )
-    parser.add_argument("--seed", type=int, default=Recipe().seed)
-    parser.add_argument("--threads", type=int, default=Recipe().threads)
+    parser.add_argument("--seed", type=int, default=VlmRecipe().seed)
+    parser.add_argument("--threads", type=int, default=VlmRecipe().threads)
     args = parser.parse_args(argv)
     recipe = dataclasses.replace(
-        SMOKE if args.smoke else Recipe(), seed=args.seed, threads=args.threads
+        SMOKE if args.smoke else VlmRecipe(), seed=args.seed, threads=args.threads
     )
     if args.vision_steps is not None:
         recipe = dataclasses.replace(recipe, vision_steps=args.vision_steps)

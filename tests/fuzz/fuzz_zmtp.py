@@ -17,13 +17,13 @@ with atheris.instrument_imports(include=["vram_arbiter.schemas.runtime.zmtp"]):
         GREETING,
         READY,
         Event,
-        Limits,
         Message,
         ServerConnection,
+        WireLimits,
         ZmtpError,
     )
 
-LIMITS = Limits(message_max_bytes=300, skip_max_bytes=1000)
+LIMITS = WireLimits(message_max_bytes=300, skip_max_bytes=1000)
 GREETED = bytes.fromhex("ff00000000000000017f03014e554c4c") + bytes(48)
 DEALER = b"\x04)\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER\x08Identity\x00\x00\x00\x00"
 REQ = b"\x04&\x05READY\x0bSocket-Type\x00\x00\x00\x03REQ\x08Identity\x00\x00\x00\x00"

@@ -17,7 +17,8 @@ import pytest
 import zmq
 
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.runtime.router import OUT_MESSAGES_MAX, Connection, Limits, Router
+from vram_arbiter.schemas.runtime.connection import OUT_MESSAGES_MAX, Connection, Limits
+from vram_arbiter.schemas.runtime.router import Router
 from vram_arbiter.schemas.runtime.zmtp import FRAMES_MAX, GREETING, READY, Oversize, encode
 
 GREETING_AND_READY = (

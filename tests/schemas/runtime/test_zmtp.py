@@ -11,16 +11,16 @@ from vram_arbiter.schemas.runtime.zmtp import (
     READY,
     Event,
     Heartbeat,
-    Limits,
     Message,
     Oversize,
-    Ready,
+    PeerReady,
     ServerConnection,
+    WireLimits,
     ZmtpError,
     encode,
 )
 
-LIMITS = Limits(message_max_bytes=1000, skip_max_bytes=4000)
+LIMITS = WireLimits(message_max_bytes=1000, skip_max_bytes=4000)
 
 # what pyzmq 27.1 (libzmq 4.3.5) sent to a unix socket: greeting, READY, "hello", a heartbeat
 PEER_GREETING = bytes.fromhex("ff00000000000000017f03014e554c4c") + bytes(48)
@@ -41,7 +41,7 @@ def events(connection: ServerConnection, data: bytes) -> list[Event]:
 
 def greeted(ready: bytes = DEALER_READY) -> ServerConnection:
     connection = ServerConnection(LIMITS)
-    assert events(connection, PEER_GREETING + ready) == [Ready()]
+    assert events(connection, PEER_GREETING + ready) == [PeerReady()]
     connection.outgoing()
     return connection
 
@@ -75,7 +75,7 @@ def test_recorded_peers_are_understood_in_pieces_of_any_size(
     found = [
         e for at in range(0, len(data), piece) for e in events(connection, data[at : at + piece])
     ]
-    assert found == [Ready(), Message(b"hello", delimiter), Heartbeat()]
+    assert found == [PeerReady(), Message(b"hello", delimiter), Heartbeat()]
     assert connection.outgoing() == GREETING + READY + b"\x04\x05\x04PONG"
     assert connection.outgoing() == b""
     assert connection.kept_bytes == 0
@@ -139,7 +139,7 @@ def test_what_breaks_the_protocol_is_refused(data: bytes, reason: str) -> None:
 def test_names_of_properties_are_case_insensitive_and_unknown_ones_are_allowed() -> None:
     connection = ServerConnection(LIMITS)
     data = PEER_GREETING + ready((b"X-Version", b"1"), (b"socket-type", b"DEALER"))
-    assert events(connection, data) == [Ready()]
+    assert events(connection, data) == [PeerReady()]
 
 
 def test_an_identity_of_the_peer_is_read_over() -> None:
@@ -148,7 +148,7 @@ def test_an_identity_of_the_peer_is_read_over() -> None:
     data = PEER_GREETING + ready(
         (b"Socket-Type", b"DEALER"), (b"Identity", b"\x00\x00\x00\x00\x01")
     )
-    assert events(connection, data) == [Ready()]
+    assert events(connection, data) == [PeerReady()]
 
 
 @pytest.mark.parametrize("delimiter", [False, True])

@@ -19,7 +19,7 @@ from vram_arbiter.schemas.runtime.peercred import Peer
 LATENCY_S = (0.00005, 0.0004)
 RECONNECT_S = (0.02, 0.5)
 QUEUE_MAX = 4096
-"""As `schemas.runtime.router.OUT_MESSAGES_MAX`: a peer that does not read loses what comes beyond."""
+"""As `schemas.runtime.connection.OUT_MESSAGES_MAX`: a peer that does not read loses what comes beyond."""
 
 
 class Server(Protocol):

@@ -1,0 +1,310 @@
+"""One connection of the router: framing, the bounds on its bytes, and when it is read.
+
+Must not know other connections: what concerns several is asked of its `Owner`, the router.
+"""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from vram_arbiter.schemas.defaults import KIB, MESSAGE_MAX_BYTES, MIB
+from vram_arbiter.schemas.runtime.peercred import Peer
+from vram_arbiter.schemas.runtime.zmtp import (
+    Heartbeat,
+    Message,
+    Oversize,
+    PeerReady,
+    ServerConnection,
+    WireLimits,
+    ZmtpError,
+    encode,
+)
+
+REST_S = 0.005
+"""A connection that is over its rate is not read for this long; its sender's buffer then fills."""
+READ_AHEAD_BYTES = 16 * KIB
+"""Unread bytes from which on a connection that waits for its turn is not read any further."""
+OUT_MESSAGES_MAX = 4096
+"""Messages queued for a peer that does not read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Bounds of a server; sizes in bytes, times in seconds."""
+
+    message_max_bytes: int = MESSAGE_MAX_BYTES
+    stranger_message_max_bytes: int = 64 * KIB
+    """Largest message of a connection that is not admitted yet."""
+    skip_max_bytes: int = 64 * MIB
+    """A message beyond its limit is skipped and answered; beyond this the connection is cut."""
+    handshake_s: float = 2.0
+    hello_s: float = 5.0
+    """A connection that is not admitted within this time is cut."""
+    connections_max: int = 2048
+    descriptor_reserve: int = 128
+    """Descriptors of the process that connections never take."""
+    user_share: float = 0.75
+    """Largest share of the connections that one user may have."""
+    process_share: float = 0.25
+    """Largest share of the connections that one process may have."""
+    out_max_bytes: int = 4 * MIB
+    """Queued for one connection that does not read."""
+    user_out_max_bytes: int = 64 * MIB
+    user_in_max_bytes: int = 16 * MIB
+    """Incomplete messages of all connections of one user."""
+    work_share: float = 1.0
+    """Largest share of the time for accepting and handling. Below 1 the loop rests between its
+    turns, so that another thread of the process, as a control loop, gets the interpreter at once
+    while a flood lasts.
+    """
+
+
+class Handler(Protocol):
+    """What a server does with its connections. Every method is called on the loop and must not
+    block.
+    """
+
+    def connected(self, connection: "Connection") -> None:
+        """A peer has finished the handshake."""
+
+    def received(self, connection: "Connection", payload: bytes | bytearray | Oversize) -> bool:
+        """One message came; `Oversize` where it was skipped. Return False if its sender is over its
+        rate.
+        """
+
+    def disconnected(self, connection: "Connection", reason: str) -> None:
+        """A connection of which `connected` was told has ended."""
+
+
+@dataclass(slots=True)
+class User:
+    """Bytes and connections of one uid."""
+
+    connections: int = 0
+    in_bytes: int = 0
+    out_bytes: int = 0
+
+
+class Owner(Protocol):
+    """What a connection asks of the router that accepted it."""
+
+    limits: Limits
+    handler: Handler
+
+    def call_later(self, delay_s: float, callback: Callable[[], object]) -> object: ...
+    def admitted(self, connection: "Connection") -> None: ...
+    def readable(self, connection: "Connection") -> None: ...
+    def lost(self, connection: "Connection", reason: str) -> None: ...
+    def deliver(self, connection: "Connection", payload: bytes | bytearray | Oversize) -> bool: ...
+    def complain(self, what: str) -> None: ...
+
+
+class Connection(asyncio.Protocol):
+    """One peer's connection. `serial` is unique within its router; a peer's own ZeroMQ identity is
+    ignored.
+    """
+
+    def __init__(self, owner: Owner, serial: int, peer: Peer, user: User, now: float) -> None:
+        self.serial = serial
+        self.peer = peer
+        self.accepted_at = now
+        self.admitted = False
+        self.ready = False
+        self.ended = False
+        self._owner = owner
+        self._user = user
+        self._transport: asyncio.Transport | None = None
+        limits = owner.limits
+        self._wire = ServerConnection(
+            WireLimits(limits.stranger_message_max_bytes, limits.skip_max_bytes)
+        )
+        self._delimiter = False
+        self._resting = False  # over its rate
+        self._clogged = False  # bytes wait for the peer to read
+        self._finishing = False  # nothing more is sent
+        self._in_bytes = 0
+        self._out_bytes = 0
+        self._out_messages = 0
+        self._reason = "the peer hung up"
+
+    def __repr__(self) -> str:
+        return f"<connection {self.serial} of process {self.peer.process}, uid {self.peer.uid}>"
+
+    # -- for handlers ----------------------------------------------------------------------------
+    def admit(self) -> None:
+        """The peer said who it is: the time limit of `hello_s` ends, and messages may have their
+        full size.
+        """
+        self.admitted = True
+        limits = self._owner.limits
+        self._wire.limits = WireLimits(limits.message_max_bytes, limits.skip_max_bytes)
+        self._owner.admitted(self)
+
+    def send(self, payload: bytes) -> bool:
+        """Queue one message, in the envelope of the last one received. False: the peer is gone or
+        does not read.
+        """
+        transport = self._transport
+        if transport is None or self._finishing or transport.is_closing():
+            return False
+        frames = encode(payload, self._delimiter)
+        if self._clogged:
+            if not self._may_queue(len(frames)):
+                self._count_out()
+                if not self._may_queue(len(frames)):
+                    return False
+            self._out_messages += 1
+            self._out_bytes += len(frames)
+            self._user.out_bytes += len(frames)
+        transport.write(frames)
+        return True
+
+    def close(self, reason: str) -> None:
+        """Hang up as soon as what was sent has left, or after `handshake_s` if the peer does not
+        read.
+        """
+        transport = self._transport
+        if transport is None or transport.is_closing():
+            return
+        self._reason = reason
+        self._finishing = True
+        transport.close()
+        self._owner.call_later(self._owner.limits.handshake_s, transport.abort)
+
+    # -- asyncio.Protocol ------------------------------------------------------------------------
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        transport.set_write_buffer_limits(high=0)  # reading stops while anything waits for the peer
+        if self.ended:  # cut between accept and here
+            transport.abort()
+            return
+        transport.write(self._wire.outgoing())
+
+    def data_received(self, data: bytes) -> None:
+        if self._finishing:  # read on all the same: the peer's end of file ends the connection
+            return
+        self._wire.feed(data)
+        self._owner.readable(self)
+
+    def pause_writing(self) -> None:
+        self._clogged = True
+        self._count_out()
+        self.update_reading()
+
+    def resume_writing(self) -> None:
+        self._clogged = False
+        self._out_messages = 0
+        self._count_out()
+        self._owner.readable(self)  # requests wait until their sender has read the answers before
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._transport = None
+        self._owner.lost(self, self._reason if exc is None else f"{exc}")
+
+    # -- for the owner ---------------------------------------------------------------------------
+    def cut(self, reason: str) -> None:
+        """Hang up now; what is queued is lost."""
+        self._reason = reason
+        if self._transport is not None:
+            self._transport.abort()
+        self._owner.lost(self, reason)
+
+    def half_close(self) -> None:
+        """Flush, then tell the peer that nothing more comes; it hangs up when it has read
+        everything.
+        """
+        if self._transport is not None and not self._transport.is_closing():
+            self._reason = "the server ends"
+            self._finishing = True
+            self._transport.write_eof()
+            self.update_reading()
+
+    def handle(self) -> bool:
+        """Handle one event of what was read. True: more may be left, and the connection wants
+        another turn.
+        """
+        event = None
+        try:
+            if not self._stopped and (event := self._wire.next_event()) is not None:
+                self._handle(event)
+        except ZmtpError as error:
+            self._flush_wire()
+            self._owner.complain(f"process {self.peer.process} of uid {self.peer.uid}: {error}")
+            self.cut(f"protocol error: {error}")
+        if self.ended:
+            return False
+        self._flush_wire()
+        self._count_in()
+        self.update_reading()
+        more = event is not None and self._wire.unread_bytes > 0
+        return more and not self._stopped and not self.ended
+
+    @property
+    def _stopped(self) -> bool:
+        """Nothing is handled for now, or any more."""
+        return self._resting or self._clogged or self._finishing
+
+    def _handle(self, event: PeerReady | Heartbeat | Message | Oversize) -> None:
+        match event:
+            case Message():
+                self._delimiter = event.delimiter
+                within_rate = self._owner.deliver(self, event.payload)
+            case Oversize():
+                self._delimiter = event.delimiter
+                within_rate = self._owner.deliver(self, event)
+            case PeerReady():
+                self._flush_wire()
+                self.ready = within_rate = True
+                self._owner.handler.connected(self)
+            case Heartbeat():
+                within_rate = True
+        if not within_rate:
+            self._resting = True
+            self._owner.call_later(REST_S, self._rested)
+
+    def _rested(self) -> None:
+        self._resting = False
+        if not self.ended:
+            self._owner.readable(self)
+
+    def _flush_wire(self) -> None:
+        data = self._wire.outgoing()
+        if data and self._transport is not None and not self._transport.is_closing():
+            self._transport.write(data)
+
+    def update_reading(self) -> None:
+        transport = self._transport
+        if transport is None or transport.is_closing():
+            return
+        full = self._stopped or self._wire.unread_bytes > READ_AHEAD_BYTES
+        if full and not self._finishing:
+            transport.pause_reading()
+        else:
+            transport.resume_reading()
+
+    def _may_queue(self, size: int) -> bool:
+        limits = self._owner.limits
+        return (
+            self._out_messages < OUT_MESSAGES_MAX
+            and self._out_bytes + size <= limits.out_max_bytes
+            and self._user.out_bytes + size <= limits.user_out_max_bytes
+        )
+
+    def _count_in(self) -> None:
+        kept = self._wire.kept_bytes
+        self._user.in_bytes += kept - self._in_bytes
+        self._in_bytes = kept
+        if self._user.in_bytes > self._owner.limits.user_in_max_bytes and not self.ended:
+            self.cut(f"incomplete messages of uid {self.peer.uid} exceed their limit")
+
+    def _count_out(self) -> None:
+        queued = 0 if self._transport is None else self._transport.get_write_buffer_size()
+        self._user.out_bytes += queued - self._out_bytes
+        self._out_bytes = queued
+
+    def forget_bytes(self) -> None:
+        self._user.in_bytes -= self._in_bytes
+        self._user.out_bytes -= self._out_bytes
+        self._in_bytes = self._out_bytes = 0
