@@ -1,7 +1,8 @@
-"""The runner's command line: a thin dispatcher, one module a command (`runner/cli/COMMAND.py`).
+"""Command line of the runner: a thin dispatcher, one module per command (`runner/cli/COMMAND.py`).
 
-A command's module has `add_parser(commands)`, which returns its parser, and `async run(args)`, which returns the exit code: 0 ended on
-request, 1 failed, 2 wrong usage or configuration. `SERVES = True` says that it works for others, each in a trace of his own.
+A command's module has `add_parser(commands)`, which returns its parser, and `async run(args)`,
+which returns the exit code: 0 ended on request, 1 failed, 2 wrong usage or configuration. `SERVES =
+True` marks a server: each of its requests has a trace of its own.
 """
 
 from __future__ import annotations
@@ -57,9 +58,9 @@ def main(argv: list[str] | None = None) -> int:
     )
     logging.getLogger("OpenGL").setLevel(
         logging.WARNING
-    )  # it announces an accelerator that nobody needs
+    )  # it announces an accelerator that this program does not use
     try:
-        # a stop has no span: no variable of the telemetry, and no port that the runner itself has, may refuse it
+        # a stop has no span: neither telemetry variables nor the runner's own port may refuse it
         urgent = args.command == URGENT
         with (
             nullcontext(Command())

@@ -1,7 +1,8 @@
-"""What the parts of the runner are to each other: the loop, the skills, the robot or simulator, the safety gate.
+"""Interfaces between the parts of the runner: loop, skills, robot or simulator, safety gate.
 
-Shapes only; nothing here does anything. Two threads meet in a skill: its `async` methods run on the event loop, `step` and
-`wants_frames` on the control thread, which must never wait for the network beyond the bound that a skill states.
+Shapes only. Two threads meet in a skill: its `async` methods run on the event loop, `step` and
+`wants_frames` on the control thread, which must never wait for the network beyond the bound that a
+skill states.
 """
 
 from __future__ import annotations
@@ -28,13 +29,17 @@ type GoalData = dict[str, Any]
 
 
 class DeadlineMissed(TransientError):
-    """A tick took longer than its slot under the policy RAISE. Stays inside the runner's process."""
+    """A tick took longer than its slot under the policy RAISE. Stays inside the runner's
+    process.
+    """
 
     code: ClassVar[str] = "deadline_missed"
 
 
 class DeadlinePolicy(StrEnum):
-    """What becomes of an action that was ready too late: applied and counted, withheld, or the end of the run."""
+    """Fate of an action that was ready too late: applied and counted, withheld, or the end of the
+    run.
+    """
 
     WARN = "warn"
     DROP = "drop"
@@ -57,10 +62,10 @@ class InferenceRunner(Protocol):
     def deactivate(self) -> None: ...
 
 
-# -- skills -------------------------------------------------------------------------------------------------------
+# -- skills
 @dataclass(frozen=True, slots=True)
 class SkillKey:
-    """What residency is kept by: the same key is reused and reset, another one makes the old one leave."""
+    """Key of residency: a skill of the same key is reused and reset, another key replaces it."""
 
     rskill_id: str
     revision: str = ""
@@ -71,7 +76,10 @@ class SkillKey:
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """One accepted goal. `deadline_s` is already resolved (seconds from acceptance); `max_ticks` counts ticks with the arm."""
+    """One accepted goal.
+
+    `deadline_s` is resolved (seconds from acceptance); `max_ticks` counts ticks with the robot.
+    """
 
     goal_id: str
     rskill_id: str
@@ -87,7 +95,8 @@ class Goal:
 class Act:
     """Apply this one-step action now.
 
-    `prefetched` comes with the first action of a chunk: whether the chunk was there when it was due. None says nothing about that.
+    `prefetched` comes with the first action of a chunk: whether the chunk was there when it was
+    due. None: unknown.
     """
 
     action: Action
@@ -125,7 +134,7 @@ class Progress:
 
 
 class Stepped(Protocol):
-    """What the control loop needs of a skill while it has the robot. Without a manifest nobody tightens the robot's own limits."""
+    """Skill as the control loop sees it. Without a manifest the robot's own limits apply."""
 
     @property
     def manifest(self) -> RSkillManifest | None: ...
@@ -135,7 +144,7 @@ class Stepped(Protocol):
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Cameras whose frames `step` wants to see when `wants_frames` says so."""
+        """Cameras that `step` needs when `wants_frames` is true."""
         ...
 
     def wants_frames(self) -> bool: ...
@@ -147,16 +156,19 @@ class Stepped(Protocol):
 
 
 class Skill(Stepped, Protocol):
-    """Something that a goal can run. Life: `start` → `step`… → `finish` per goal, `release` when it loses residency.
+    """A skill that a goal can run. Life: `start` → `step`… → `finish` per goal, then `release`.
 
-    `start` leaves it reset whatever happened before. `step` raises a VramError to fail the goal; the arm then holds.
+    `start` resets it whatever happened before. `step` raises a VramError to fail the goal; the
+    robot then holds.
     """
 
     manifest: RSkillManifest
 
     @property
     def holds_gpu(self) -> bool:
-        """Whether it takes the resident slot. GPU-free skills neither take it nor make anyone leave."""
+        """Whether it takes the resident slot. GPU-free skills neither take it nor displace a
+        skill.
+        """
         ...
 
     async def start(self, goal: Goal) -> None: ...
@@ -174,10 +186,14 @@ class SkillEnded:
     error: VramError | None = None
 
 
-# -- whoever follows a goal ------------------------------------------------------------------------------------------
+# -- recording a goal
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """A step of a world that is no robot: what it showed before, and what it was sent, by name, in its own units. `sent` empty: time stood still."""
+    """Step of a world that is not a robot: its observation and its action, by name, in its own
+    units.
+
+    `sent` empty: time stood still.
+    """
 
     shown: Mapping[str, float]
     sent: Mapping[str, float]
@@ -185,11 +201,11 @@ class Transition:
 
 @dataclass(frozen=True, slots=True)
 class GoalTick:
-    """One tick in which a goal's skill was asked, when it is over. Nothing in it changes any more: it may be read on any thread.
+    """One finished tick in which a goal's skill was asked. Immutable: any thread may read it.
 
-    `targets` are the joint targets in force now, rad by joint: a joint that got no new one keeps its last. A joint that nobody has
-    told anything yet is not among them. `base_velocity` is what the base was told for this tick (m/s, m/s, rad/s); None: it has none.
-    `transition` stands for joint state and targets where there is no robot.
+    `targets` are the joint targets in force, rad by joint: a joint without a new target keeps its
+    last; a joint without any is missing. `base_velocity` is the base's command (m/s, m/s, rad/s),
+    None without a base. `transition` replaces joint state and targets where there is no robot.
     """
 
     goal: Goal
@@ -201,7 +217,7 @@ class GoalTick:
 
 
 class TickSink(Protocol):
-    """Hears of every tick of a goal and of its end, on the control thread: it must take them over at once, and never wait."""
+    """Receives every tick of a goal and its end, on the control thread: it must never wait."""
 
     def tick(self, tick: GoalTick) -> None: ...
 
@@ -214,12 +230,14 @@ class TickSink(Protocol):
         ...
 
 
-# -- robot, simulator, safety -----------------------------------------------------------------------------------------
+# -- robot, simulator, safety
 class SafetyGate(Protocol):
     """Decides on every single action before it reaches a motor."""
 
     def check(self, action: Action, world: WorldState) -> tuple[Action | None, tuple[str, ...]]:
-        """The action to apply (possibly clamped within the tolerance) or None, and what was wrong with it."""
+        """Return the action to apply (possibly clamped within the tolerance) or None, and the
+        violations.
+        """
         ...
 
 
@@ -244,7 +262,7 @@ class MobileBase:
 
 @dataclass(frozen=True, slots=True)
 class RobotDescription:
-    """What a skill and the safety gate must know of a robot. Joints in the order in which the robot names them."""
+    """A robot as skills and the safety gate see it. Joints in the robot's own order."""
 
     name: str
     joints: tuple[Joint, ...]
@@ -261,10 +279,11 @@ class RobotDescription:
 
 
 class Hal(Protocol):
-    """One robot's hardware, or its twin. All calls on the control thread; joint units are rad, whatever the hardware speaks.
+    """Hardware of one robot, or its twin. All calls on the control thread; joint units are rad.
 
-    `send_action` takes one-step joint-position actions that have passed the safety gate. `estop` stops the motors as fast as this
-    hardware can, latches, and always raises `schemas.errors.EstopRequested`; from then on `send_action` raises it too.
+    `send_action` takes one-step joint-position actions that have passed the safety gate. `estop`
+    stops the motors as fast as the hardware can, latches, and always raises
+    `schemas.errors.EstopRequested`; from then on `send_action` raises it too.
     """
 
     description: RobotDescription
@@ -278,7 +297,7 @@ class Hal(Protocol):
     def send_action(self, action: Action) -> None: ...
 
     def sent(self) -> Mapping[str, float]:
-        """The last target (rad) that the motors were really given, by joint; empty before the first action."""
+        """Return the last target (rad) that the motors really got, by joint; empty at first."""
         ...
 
     def estop(self, reason: str) -> NoReturn: ...
@@ -301,13 +320,14 @@ class Picture(Protocol):
         ...
 
 
-# -- cameras ------------------------------------------------------------------------------------------------------
+# -- cameras
 class SensorReader(Protocol):
-    """One camera. `start` and `stop` on one thread, the reads on any.
+    """One camera. `start` and `stop` on one thread, reads on any.
 
-    `read_latest` gives the newest frame without waiting; FrameStale when there is none, or it is older than `max_age_ms` (None: the
-    configured age). `read_synced` waits for the first frame taken after the call, until the monotonic `deadline_ns`; then FrameStale.
-    A source that ended or broke raises FrameStale with the reason in its message: its last frame is never served again.
+    `read_latest` returns the newest frame without waiting; it raises FrameStale when there is none,
+    or it is older than `max_age_ms` (None: the configured age). `read_synced` waits for the first
+    frame taken after the call, until the monotonic `deadline_ns`; then FrameStale. A source that
+    ended or broke raises FrameStale with the reason: its last frame is never served again.
     """
 
     sensor_id: str

@@ -1,4 +1,7 @@
-"""`vram-runner benchmark`: how often skills and policies succeed, over worlds and seeds. Puts its parts together, writes the report, prints the table."""
+"""`vram-runner benchmark`: success rates of skills and policies over worlds and seeds.
+
+Composes the parts, writes the report and prints the table.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import argparse
 import asyncio
 import contextlib
 import dataclasses
+import functools
 import json
 import logging
 import os
@@ -31,6 +35,7 @@ from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.printable import printable_lines
 
 if TYPE_CHECKING:
+    from vram_arbiter.runner.protocols import Skill
     from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, Contestant
     from vram_arbiter.runner.sim.tasks import Task
     from vram_arbiter.runner.sim.worlds import World
@@ -78,7 +83,7 @@ def add_parser(
     )
     bench.add_argument(
         "--policy", action="append", default=[],
-        help="random, scripted:MODULE, scripted:FILE.py or, for grabs in so101, expert; may be given several times",
+        help="random, scripted:MODULE, scripted:FILE.py or, for grabs in so101, expert; repeatable",
     )  # fmt: skip
     bench.add_argument("--episodes", type=positive_int, default=10, help="seeds a cell; default 10")
     bench.add_argument("--seed", type=int, default=0, help="the first one")
@@ -106,7 +111,7 @@ def add_parser(
         help="rskill.yaml files or folders of them",
     )
     bench.add_argument("--arbiter", help="the arbiter's endpoint")
-    bench.add_argument("--no-arbiter", action="store_true", help="nobody arbitrates: mark no uses")
+    bench.add_argument("--no-arbiter", action="store_true", help="run without arbiter and leases")
     bench.add_argument("--sidecar", action="append", default=[], metavar="RSKILL=ENDPOINT")
     add_trace_flag(bench)
     return bench
@@ -123,7 +128,11 @@ class Entry:
 
 
 async def run(args: argparse.Namespace) -> int:
-    """Exit 0: every episode got a verdict or nobody judges; 1: errors, or stopped. Either way the report says what was played."""
+    """Run the benchmark.
+
+    Returns: 0 if every episode got a verdict or the world does not judge, 1 after errors or a stop.
+    The report lists what was played in either case.
+    """
     async with contextlib.AsyncExitStack() as stack:
         arbiter = None
         if args.skill and not args.no_arbiter:
@@ -202,7 +211,7 @@ def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
     )
 
 
-# -- what is to be played -------------------------------------------------------------------------------------------------
+# -- what is to be played
 def worlds_of(args: argparse.Namespace) -> list[World]:
     """Raises ConfigError for worlds that there are not, and files that could belong to several."""
     from vram_arbiter.runner.sim.worlds import SO101, world_of
@@ -211,7 +220,8 @@ def worlds_of(args: argparse.Namespace) -> list[World]:
     others = [name for name in names if name != SO101]
     if len(others) > 1 and (args.env_config is not None or args.success is not None):
         raise ConfigError(
-            "--env-config and --success are for one gymnasium environment: run them one after another"
+            "--env-config and --success are for one gymnasium environment:"
+            " run them one after another"
         )
     if (args.scene or args.task) and SO101 not in names:
         raise ConfigError(f"--scene and --task are for --env {SO101}")
@@ -234,7 +244,10 @@ def worlds_of(args: argparse.Namespace) -> list[World]:
 
 
 def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
-    """Every contestant in every world. Raises ConfigError and UnknownSkill before anything is played."""
+    """Return every contestant in every world.
+
+    Raises ConfigError and UnknownSkill before anything is played.
+    """
     from vram_arbiter.runner.goals.catalogue import Catalogue, read_manifests
     from vram_arbiter.runner.sim.benchmark import PolicyContestant, SkillContestant
     from vram_arbiter.runner.sim.policies import policy_of
@@ -244,16 +257,20 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
 
     if not args.skill and not args.policy:
         raise ConfigError(
-            "nobody is to play", hint="--skill RSKILL or --policy random, any number of them"
+            "there are no contestants", hint="--skill RSKILL or --policy random, any number of them"
         )
     if args.task is not None and args.task not in TASKS:
-        raise ConfigError(f"--task {args.task} is no task", hint=" or ".join(TASKS))
+        raise ConfigError(f"unknown --task {args.task}", hint=" or ".join(TASKS))
     given_task = TASKS[args.task] if args.task is not None else None
     policies = {name: policy_of(name) for name in dict.fromkeys(args.policy) if name != EXPERT}
     manifests = read_manifests(args.skills or [default_skills()]) if args.skill else []
     given = sidecars_given(args.sidecar)
     if args.skill:
         check_sidecars(given, manifests)
+
+    def skilled(make: Callable[[], Skill]) -> SkillContestant:
+        return SkillContestant(make())
+
     entries = []
     for world in worlds_of(args):
         arm, environment = world.arm, world.environment
@@ -262,7 +279,7 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
         for name in dict.fromkeys(args.skill):
             _, make, manifest = catalogue.find(name)
             task = None if arm is None else given_task or task_of(manifest)
-            entries.append(Entry(world, name, task, lambda make=make: SkillContestant(make())))  # type: ignore[misc]
+            entries.append(Entry(world, name, task, functools.partial(skilled, make)))
         for name in dict.fromkeys(args.policy):
             task = None if arm is None else given_task or GRAB
             if name != EXPERT:
@@ -271,13 +288,13 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
                 raise ConfigError(f"--policy {EXPERT} grabs in so101, and does nothing else")
             else:
                 policy = expert_policy(arm, environment)
-            entries.append(Entry(world, name, task, lambda policy=policy: PolicyContestant(policy)))  # type: ignore[misc]
+            entries.append(Entry(world, name, task, functools.partial(PolicyContestant, policy)))
     _check_names(entries)
     return entries
 
 
 def _check_names(entries: Sequence[Entry]) -> None:
-    """Raises ConfigError for cells whose videos would overwrite each other's, and that nobody could tell apart in the report."""
+    """Raise ConfigError for cells with the same name: their videos would overwrite each other."""
     from vram_arbiter.runner.sim.benchmark import file_name
 
     taken: dict[tuple[str, str], Entry] = {}
@@ -285,12 +302,13 @@ def _check_names(entries: Sequence[Entry]) -> None:
         other = taken.setdefault((file_name(entry.world.name), file_name(entry.name)), entry)
         if other is not entry:
             raise ConfigError(
-                f"{entry.world.name}, {entry.name} and {other.world.name}, {other.name} would have one name",
+                f"{entry.world.name}, {entry.name} and {other.world.name}, {other.name}"
+                " would have one name",
                 hint="rename one of the files, or run them one after another with an --out each",
             )
 
 
-# -- what comes of it ---------------------------------------------------------------------------------------------------
+# -- what comes of it
 def _write(args: argparse.Namespace, cells: Sequence[Cell], *, complete: bool) -> None:
     """After every cell, whole or not at all: a run that is killed leaves the cells before."""
     report = {

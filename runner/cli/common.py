@@ -1,4 +1,4 @@
-"""What the commands of `vram-runner` share: where the arbiter, the sidecars and the skills are, and how a signal ends a command."""
+"""Arguments and parts that the commands of `vram-runner` share."""
 
 from __future__ import annotations
 
@@ -64,7 +64,8 @@ def not_negative(text: str) -> float:
 def add_trace_flag(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--trace-ticks", type=share, default=1.0, metavar="RATIO",
-        help="share of a goal's ticks that telemetry records, beyond those up to its first action; goals are recorded always",
+        help="share of a goal's ticks that telemetry records after its first action;"
+        " goals are always recorded",
     )  # fmt: skip
 
 
@@ -81,14 +82,16 @@ def add_serving_flags(parser: argparse.ArgumentParser) -> None:
         "--endpoint", help="where goals are served; default ipc://RUNTIME/runner.sock"
     )
     parser.add_argument("--arbiter", help="the arbiter's endpoint")
-    parser.add_argument("--no-arbiter", action="store_true", help="nobody arbitrates: mark no uses")
+    parser.add_argument("--no-arbiter", action="store_true", help="run without arbiter and leases")
     parser.add_argument(
         "--sidecar", action="append", default=[], metavar="RSKILL=ENDPOINT",
-        help="where a policy's sidecar is; default ipc://RUNTIME/NAME.sock, NAME being what follows the first - of the skill's name",
+        help="address of a policy's sidecar; default ipc://RUNTIME/NAME.sock,"
+        " NAME being what follows the first - of the skill's name",
     )  # fmt: skip
     parser.add_argument(
         "--realtime", action=argparse.BooleanOptionalAction, default=True,
-        help="run the control loop before ordinary programs (SCHED_FIFO, or a lower nice value) where the machine allows it",
+        help="run the control loop before ordinary programs (SCHED_FIFO, or a lower nice value)"
+        " where the machine allows it",
     )  # fmt: skip
     add_trace_flag(parser)
     parser.add_argument("--max-seconds", type=positive, help="stop by itself after so many seconds")
@@ -105,7 +108,7 @@ def sidecars_given(flags: list[str]) -> dict[str, str]:
 
 
 def check_sidecars(given: Mapping[str, str], manifests: Iterable[RSkillManifest]) -> None:
-    """An address for a skill that is not installed is a typing error; its skill would be looked for elsewhere. Raises ConfigError."""
+    """Raise ConfigError for the address of a skill that is not installed: it is a typing error."""
     installed = [manifest.name for manifest in manifests if manifest.kind is Kind.VLA]
     for name in given:
         if name not in installed:
@@ -116,8 +119,10 @@ def check_sidecars(given: Mapping[str, str], manifests: Iterable[RSkillManifest]
 
 
 def check_endpoint(endpoint: str) -> None:
-    """Before a world begins or a robot has power: where no goal and no emergency stop can be served nothing may move. Raises ConfigError,
-    AlreadyRunning."""
+    """Raise ConfigError or AlreadyRunning where goals or emergency stops cannot be served.
+
+    Checked before a world begins or a robot has power: without them nothing may move.
+    """
     check_free(endpoint)
     estop.path_of(endpoint)
 
@@ -132,7 +137,10 @@ def warm_up() -> None:
 
 
 async def connect_arbiter(endpoint: str | None, stack: contextlib.AsyncExitStack) -> Any:
-    """A plain client of the arbiter. A robot does not start half-safe: an arbiter that is missing is an error, said at once."""
+    """Connect a plain client of the arbiter.
+
+    Raises ArbiterUnreachable: a robot does not start half-safe.
+    """
     from vram_arbiter.clients.client import AsyncClient
 
     try:
@@ -152,9 +160,10 @@ async def record_into[R: Robot](
     robot: str,
     stack: contextlib.AsyncExitStack,
 ) -> DatasetRecorder:
-    """Record the runner's goals, from before its control thread starts until after it has ended. `rate_hz` 0: as fast as possible.
+    """Record the runner's goals, from before its control thread starts until after it has ended.
 
-    Raises ConfigError for a folder or a rate that nothing can be recorded with, AlreadyRunning when somebody else records there.
+    Args: `rate_hz` 0 records as fast as possible. Raises ConfigError for a folder or a rate that
+    cannot be recorded, AlreadyRunning when another program records there.
     """
     from vram_arbiter.runner.recording.recorder import DatasetRecorder
 
@@ -187,7 +196,9 @@ def default_skills() -> Path:
 
 
 def install_signals(stopping: asyncio.Event) -> None:
-    """The first SIGTERM or SIGINT ends in order (the video is finished); a second one ends at once."""
+    """End in order on the first SIGTERM or SIGINT (the video is finished), at once on the
+    second.
+    """
     loop = asyncio.get_running_loop()
 
     def stop(number: signal.Signals) -> None:

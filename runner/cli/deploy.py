@@ -1,6 +1,7 @@
-"""`vram-runner deploy --config FILE`: owns a robot, its cameras and safety, serves goals or does the file's one task.
+"""`vram-runner deploy --config FILE`: run a robot and serve goals, or do the file's one task.
 
-Puts its parts together, and nothing else. A signal ends it in order: the goal is canceled, the arm holds, the robot is disconnected.
+Composes the parts and nothing else. A signal ends it in order: the goal is canceled, the arm holds,
+the robot is disconnected.
 """
 
 from __future__ import annotations
@@ -85,15 +86,18 @@ def add_parser(
     deploy.add_argument(
         "--allow-noncommercial",
         action="store_true",
-        help="run skills whose licence forbids commercial use, too",
+        help="also run skills whose license forbids commercial use",
     )
     add_serving_flags(deploy)
     return deploy
 
 
 async def run(args: argparse.Namespace) -> int:
-    """`vram-runner deploy`. 0: ended on request, or the task succeeded; 1: it failed; 2: a person has to act (a wrong file
-    or flag, or a task that the emergency stop ended)."""
+    """Deploy the robot.
+
+    Returns: 0 ended on request, or the task succeeded; 1 it failed; 2 a person has to act (a wrong
+    file or flag, or a task that the emergency stop ended).
+    """
     file = read_deployment(shipped(args.config, "robots", configs_folder(os.environ)))
     return await Deploy(args, file, policy_makers(args, file)).run()
 
@@ -199,7 +203,7 @@ class Deploy:
             mark.remove()
         return self._conclude(runner, ended, failed)
 
-    # -- steps -------------------------------------------------------------------------------------------------------
+    # -- steps
     def _offered(
         self, parts: Parts, manifests: list[RSkillManifest], arbiter: Arbiter | None
     ) -> Catalogue:
@@ -261,7 +265,9 @@ class Deploy:
                 raise
 
     async def _serve(self, server: GoalServer, runner: HardwareRunner) -> ResultPush | None:
-        """Until a signal, `shutdown`, the end of the time, or of the file's task, whose result is returned."""
+        """Serve until a signal, `shutdown`, the end of the time or of the file's task; return its
+        result.
+        """
         task = self._file.robot.task
         own = asyncio.create_task(self._own_task(server, runner)) if task is not None else None
         try:
@@ -278,9 +284,10 @@ class Deploy:
         return server.result_of(OWN_GOAL)
 
     async def _own_task(self, server: GoalServer, runner: HardwareRunner) -> None:
-        """The file's task, as a goal like any other; its end is the end of the program.
+        """Run the file's task as a goal like any other; its end ends the program.
 
-        Not after an emergency stop: disconnecting may take the torque away, and that is for a person to decide.
+        After an emergency stop the program stays: disconnecting may cut the torque, and a person
+        decides about that.
         """
         robot = self._file.robot
         if robot.task is None or robot.vla is None:
@@ -317,12 +324,15 @@ class Deploy:
             return 0
         return (
             1 if runner.estop is None else 2
-        )  # 2: whoever restarts failed programs leaves this one alone
+        )  # 2: a supervisor that restarts failed programs must not restart this one
 
 
 def claim(robot: RobotEnvironment, stack: contextlib.AsyncExitStack) -> None:
-    """One robot, one runner; one port, too, under whatever names its robots go. Raises AlreadyRunning before a second one touches the
-    motors of the first."""
+    """Claim the robot and its port for this process.
+
+    A port counts as well because a robot may have several names. Raises AlreadyRunning before a
+    second runner touches the motors of the first.
+    """
     _claim(f"robot {robot.robot_id}", robot.robot_id, stack)
     if port := robot.hal.transport.get("port"):
         _claim(f"port {port}", os.path.realpath(str(port)), stack)

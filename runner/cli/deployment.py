@@ -1,7 +1,8 @@
-"""A deployment file, checked and taken apart: robot, cameras, skills and task that fit together, or every mistake by line and field.
+"""A deployment file, checked: robot, cameras, skills and task that fit together.
 
-Nothing here opens a device, loads a model or moves anything; what can be wrong is said before any of that. Puts no program together:
-`runner.cli.deploy` does. Licences are looked at here, because a robot at work is commercial use unless somebody says otherwise.
+Every mistake is reported by line and field before a device is opened, a model loads or anything
+moves. `runner.cli.deploy` composes the program. Licenses are checked here because a robot at work
+is commercial use unless the operator says otherwise.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.yamltext import Path as FieldPath
 from vram_arbiter.schemas.yamltext import Problem, YamlText, config_error, parse_yaml, read_text
 
-LICENCE_FLAG = "--allow-noncommercial"
+LICENSE_FLAG = "--allow-noncommercial"
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +38,9 @@ class DeploymentFile:
     source: YamlText
 
     def error(self, *found: tuple[str, str]) -> ConfigError:
-        """`(field, problem)` pairs as one error: `robot.yaml:7: sensors[0].backend_params.device: …`"""
+        """Return `(field, problem)` pairs as one error: `robot.yaml:7:
+        sensors[0].backend_params.device: …`
+        """
         problems = [
             Problem(self.source.line(_path(field)), field, _on_one_line(text))
             for field, text in found
@@ -51,7 +54,9 @@ class DeploymentFile:
         )
 
     def located(self, error: ConfigError, section: str) -> ConfigError:
-        """An adapter's mistakes, whose fields may be relative to its section, with this file's lines."""
+        """Return an adapter's errors, whose fields may be relative to `section`, with this file's
+        lines.
+        """
         found = []
         for item in error.details.get("fields") or [{"field": "", "problem": error.message}]:
             field = str(item["field"])
@@ -72,7 +77,9 @@ def read_deployment(path: Path) -> DeploymentFile:
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """What a deployment is made of; nothing of it is opened yet. The gate is the robot's own, with the file's `safety`."""
+    """Parts of a deployment, not opened yet. The gate is the robot's own with the file's
+    `safety`.
+    """
 
     hal: Hal
     readers: tuple[SensorReader, ...]
@@ -129,14 +136,16 @@ def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
 
 
 def unkept(parts: Parts, catalogue: Catalogue) -> tuple[str, ...]:
-    """What the file's `safety`, and the envelope of any skill that goals may ask for, want and the gate does not keep."""
+    """Return the safety limits of the file and of all executable skills that the gate cannot
+    enforce.
+    """
     found = dict.fromkeys(parts.gate.unkept)
     for manifest in catalogue.executable():
         found |= dict.fromkeys(parts.gate.for_skill(manifest, ()).unkept)
     return tuple(found)
 
 
-# -- skills -----------------------------------------------------------------------------------------------------------
+# -- skills
 def offered(
     file: DeploymentFile,
     parts: Parts,
@@ -144,9 +153,11 @@ def offered(
     makers: Mapping[Kind, Maker],
     allow_noncommercial: bool,
 ) -> Catalogue:
-    """What goals may ask for. Raises ConfigError when the skill of the file's own task is not among it or does not fit the robot.
+    """Return the catalogue of skills that goals may name.
 
-    Skills that nobody executes here (detectors, scene VLMs) are listed for whoever plans; their licences are their sidecars' matter.
+    Skills that are not executed here (detectors, scene VLMs) are listed for planners; their
+    licenses are checked by their sidecars. Raises ConfigError when the skill of the file's own task
+    is not offered or does not fit the robot.
     """
     spec = file.robot.vla
     manifests = list(manifests)
@@ -158,7 +169,8 @@ def offered(
             kept.append(manifest)
         elif not (allow_noncommercial or manifest.is_commercial_use_allowed):
             refused[manifest.name] = (
-                f"its licence, {manifest.license}, does not allow commercial use; {LICENCE_FLAG} lets it run all the same"
+                f"its license, {manifest.license}, does not allow commercial use;"
+                f" {LICENSE_FLAG} allows it all the same"
             )
         elif found and wanted != manifest.name:
             refused[manifest.name] = "; ".join(problem for _, problem in found)
@@ -198,7 +210,9 @@ def _folder_of(name: str) -> str:
 def misfits(
     robot: RobotEnvironment, parts: Parts, manifest: RSkillManifest
 ) -> list[tuple[str, str]]:
-    """What of a skill does not fit this robot: its envelope; of a learnt policy its joints and cameras, too."""
+    """Return what of a skill does not fit this robot: its envelope, and a policy's joints and
+    cameras.
+    """
     problems = []
     try:
         parts.gate.for_skill(manifest, ())
@@ -226,14 +240,15 @@ def misfits(
         problems.append(
             (
                 "sensors",
-                f"{manifest.name} looks at {', '.join(missing)}; there is {', '.join(there) or 'none'}",
+                f"{manifest.name} needs the cameras {', '.join(missing)};"
+                f" there is {', '.join(there) or 'none'}",
             )
         )
     return problems
 
 
 def _contradictions(spec: VlaSpec, manifest: RSkillManifest) -> list[tuple[str, str]]:
-    """The file may say again what the manifest says, never something else: the weights are the sidecar's to load."""
+    """Refuse fields that contradict the manifest: the sidecar loads the weights."""
     said: list[tuple[str, object, object]] = [("runtime", spec.runtime, manifest.runtime)]
     if spec.id == manifest.name:
         said.append(("weights_uri", spec.weights_uri or None, manifest.weights_uri))
@@ -252,14 +267,14 @@ def _contradictions(spec: VlaSpec, manifest: RSkillManifest) -> list[tuple[str, 
 
 
 def unused(robot: RobotEnvironment) -> list[str]:
-    """Fields that are given but mean nothing here, with the reason: nobody shall believe that they had an effect."""
+    """Return fields that are given but have no effect, with the reason."""
     notes = [
         f"embodiment_tags: {tag!r}, which no manifest can name"
         for tag in robot.embodiment_tags
         if tag not in robot.known_tags
     ]
     if "thumbnail_hz" in robot.model_fields_set:
-        notes.append("thumbnail_hz: pictures are made when somebody asks for them")
+        notes.append("thumbnail_hz: pictures are made on request")
     if robot.vla is not None:
         for field in ("device", "deterministic", "extra"):
             if field in robot.vla.model_fields_set:
@@ -269,11 +284,11 @@ def unused(robot: RobotEnvironment) -> list[str]:
     return notes
 
 
-# -- for people ---------------------------------------------------------------------------------------------------------
+# -- for people
 def plan(
     file: DeploymentFile, parts: Parts, catalogue: Catalogue, facts: Iterable[tuple[str, str]]
 ) -> str:
-    """What would run, a line a part. `facts` are lines of whoever puts the program together."""
+    """Describe what would run, one line per part. `facts` are lines of the calling program."""
     robot, description = file.robot, parts.hal.description
     twin = ", simulated" if description.simulated else ""
     body = body_of(robot, description)
@@ -288,7 +303,8 @@ def plan(
     lines += [
         (
             "joint",
-            f"{j.name} {j.lower_rad:+.3f} … {j.upper_rad:+.3f} rad, at most {j.max_speed_rad_s:g} rad/s",
+            f"{j.name} {j.lower_rad:+.3f} … {j.upper_rad:+.3f} rad,"
+            f" at most {j.max_speed_rad_s:g} rad/s",
         )
         for j in description.joints
     ]

@@ -1,6 +1,7 @@
-"""`vram-runner estop`: the emergency stop of the runners of this machine. Exits 0 only when their motors have been told.
+"""`vram-runner estop`: emergency stop of this machine's runners.
 
-Without an endpoint it stops the runner of this login and the system service's, as far as they are there.
+Without an endpoint it stops the runner of this login and the system service's, where they exist.
+Exits 0 only when their motors have been told.
 """
 
 from __future__ import annotations
@@ -27,14 +28,19 @@ def add_parser(
     estop.add_argument("--reason", default="", help="kept in the log and in every refusal")
     estop.add_argument(
         "--endpoint",
-        help="the runner's endpoint; default: those of ipc://RUNTIME/runner.sock and of the system's service that are there",
+        help="the runner's endpoint; default: ipc://RUNTIME/runner.sock and the system service's,"
+        " where they exist",
     )
     return estop
 
 
 async def run(args: argparse.Namespace) -> int:
-    """0: all were told. Raises, when others have been told, RunnerUnreachable for one that does not answer, InternalError for one whose
-    control loop does not, RobotFault for one whose motors could not be told."""
+    """Stop the runners.
+
+    Returns: 0 when all motors were told. Raises, after all others have been told, RunnerUnreachable
+    for a runner that does not answer, InternalError for a control loop that hangs, RobotFault for
+    motors that could not be told.
+    """
     endpoints = [args.endpoint] if args.endpoint else _there()
     outcomes = await asyncio.gather(
         *(_stop(endpoint, args.reason) for endpoint in endpoints), return_exceptions=True
@@ -57,7 +63,7 @@ def _there() -> list[str]:
         own = program_endpoint("runner", os.environ, os.getuid())
     except ConfigError:  # a user without a login session may still stop the system's
         own = system
-    # os.path: a folder that may not be looked into does not keep the other runner from being stopped
+    # os.path: a folder without permission must not keep the other runner from being stopped
     there = [name for name in dict.fromkeys((own, system)) if _exists(name)]
     return there or [own]
 

@@ -1,4 +1,4 @@
-"""`vram-runner replay --dataset DIR --frame N`: from a frame of a recorded dataset back to the tick that it was, and to its trace."""
+"""`vram-runner replay --dataset DIR --frame N`: from a recorded frame to its tick and trace."""
 
 from __future__ import annotations
 
@@ -32,13 +32,17 @@ def add_parser(
     replay.add_argument("--json", action="store_true", help="all of it, for programs")
     replay.add_argument(
         "--trace-url",
-        help=f"how a trace is opened, with {' and '.join(TRACE_FIELDS)}; default: {TRACE_URL_VARIABLE}",
+        help=f"URL template of a trace, with {' and '.join(TRACE_FIELDS)};"
+        f" default: {TRACE_URL_VARIABLE}",
     )
     return replay
 
 
 async def run(args: argparse.Namespace) -> int:
-    """Print one frame. Raises ConfigError for a folder or an address that is of no use, BadRequest for a frame that is not there."""
+    """Print one frame.
+
+    Raises ConfigError for an unusable folder or URL, BadRequest for a missing frame.
+    """
     template = trace_template(args.trace_url, os.environ)
     recorded = await asyncio.to_thread(read_frame, args.dataset, args.frame, args.episode)
     link = trace_link(recorded, template)
@@ -50,7 +54,7 @@ async def run(args: argparse.Namespace) -> int:
 
 
 def trace_template(given: str | None, environ: Mapping[str, str]) -> str | None:
-    """The address of a trace, with its fields still to be put in; None when none is configured. Raises ConfigError."""
+    """Return the URL template of traces; None when none is configured. Raises ConfigError."""
     template = given or environ.get(TRACE_URL_VARIABLE) or None
     if template is not None and TRACE_FIELDS[0] not in template:
         raise ConfigError(
@@ -111,7 +115,7 @@ def as_text(recorded: Recorded, link: str | None) -> str:
             ("joint", f"{name}: at {value:+.4f} rad, told {recorded.action[name]:+.4f}")
             for name, value in recorded.state.items()
         ]
-    else:  # a world's own numbers, and what it was sent: neither need have anything to do with the other
+    else:  # a world's own numbers, and what it was sent: they need not be related
         lines += [("shown", f"{name}: {value:+.4g}") for name, value in recorded.state.items()]
         lines += [("sent", f"{name}: {value:+.4g}") for name, value in recorded.action.items()]
     lines += [
@@ -135,7 +139,7 @@ def _outcome(goal: Mapping[str, object]) -> str:
 
 def _index(text: str) -> int:
     if not text.removeprefix("-").isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of a frame or an episode")
+        raise argparse.ArgumentTypeError(f"expected a frame or episode number, got {text!r}")
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"{text} is negative")

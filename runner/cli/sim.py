@@ -1,5 +1,7 @@
-"""`vram-runner sim`: owns the simulated world, its cameras and safety, and serves goals, or lets a policy play. Puts its parts together, and
-nothing else."""
+"""`vram-runner sim`: run a simulated world and serve goals, or let a policy play.
+
+Composes the parts and nothing else.
+"""
 
 from __future__ import annotations
 
@@ -62,13 +64,15 @@ def add_parser(
     add_world_flags(sim)
     sim.add_argument(
         "--policy",
-        help="random, scripted:MODULE or scripted:FILE.py plays --episodes episodes by itself; no goals are taken then",
+        help="random, scripted:MODULE or scripted:FILE.py plays --episodes episodes;"
+        " no goals are taken then",
     )
     sim.add_argument("--episodes", type=positive_int, help="of --policy; default 1")
     sim.add_argument("--seed", type=int, default=0, help="decides everything about the episode")
     sim.add_argument(
         "--record", type=Path, metavar="DIR",
-        help="write every goal, or episode of --policy, as an episode of the LeRobotDataset in this folder; a new one, or one of an earlier recording",
+        help="write every goal, or episode of --policy, as an episode of the LeRobotDataset"
+        " in this folder; a new one, or one of an earlier recording",
     )  # fmt: skip
     sim.add_argument("--video", type=Path, help="write the episode as H.264 video to this file")
     sim.add_argument(
@@ -82,14 +86,17 @@ def add_parser(
     sim.add_argument("--deadline-policy", choices=("warn", "drop", "raise"), default="warn")
     sim.add_argument(
         "--lockstep", action=argparse.BooleanOptionalAction, default=True,
-        help="the simulated world waits for the policy's chunks, so that a slow machine changes only how long a run takes",
+        help="the simulated world waits for the policy's chunks:"
+        " a slow machine only takes longer",
     )  # fmt: skip
     add_serving_flags(sim)
     return sim
 
 
 async def run(args: argparse.Namespace) -> int:
-    """Build everything, serve until a signal, `shutdown`, `--max-seconds` or the last of `--episodes`, end in order."""
+    """Build everything, serve until a signal, `shutdown`, `--max-seconds` or the last episode,
+    end.
+    """
     endpoint = args.endpoint or program_endpoint("runner", os.environ, os.getuid())
     check_endpoint(endpoint)
     need("the simulator", "numpy", "cv2", extra="runner")
@@ -127,11 +134,11 @@ async def run(args: argparse.Namespace) -> int:
 
     dataset = None
     async with contextlib.AsyncExitStack() as stack:
-        alone = args.no_arbiter or policy is not None  # such a policy holds no memory of a card
+        alone = args.no_arbiter or policy is not None  # such a policy needs no GPU memory
         arbiter = None if alone else await connect_arbiter(args.arbiter, stack)
         recorder = None
         if args.video is not None:
-            patient = policy is not None and args.rate == 0  # nobody else waits for this world
+            patient = policy is not None and args.rate == 0  # nothing else waits for this world
             recorder = VideoRecorder(
                 args.video, fps=1.0 / period_s / world.video_every, wait=patient
             )
@@ -153,7 +160,7 @@ async def run(args: argparse.Namespace) -> int:
         if policy is not None:
             runner.identity["policy"] = policy.name
             runner.robot.video.recorder = (
-                recorder  # from its first step on: it may be over before anybody asks
+                recorder  # from its first step on: the run may be over before the socket is bound
             )
         runner.spans.share = args.trace_ticks
         if args.record is not None:
@@ -209,12 +216,16 @@ async def run(args: argparse.Namespace) -> int:
     if runner.robot.policy_error is not None:
         raise runner.robot.policy_error
     if policy is not None and dataset is not None and dataset.error is not None:
-        raise dataset.error  # it was played for the recording; goals are served whatever becomes of theirs
+        # it was played for the recording; goals are served whatever becomes of theirs
+        raise dataset.error
     return 1 if control.ended.exception() is not None else 0
 
 
 async def ready(control: ControlThread) -> None:
-    """The scene stands and the cameras have rendered: ready means ready. Raises what the first reset raised."""
+    """Wait until the scene stands and the cameras have rendered.
+
+    Raises what the first reset raised.
+    """
     try:
         await control.call(lambda: None)
     except InternalError:

@@ -1,6 +1,6 @@
-"""Time for control loops: a monotonic clock that can be replaced, and a sleep that wakes within the millisecond.
+"""Time for control loops: a replaceable monotonic clock and a precise sleep.
 
-The only place of the runner that sleeps. It knows nothing of ticks or skills.
+The only place of the runner that sleeps. Must not know ticks or skills.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ BUSY_TAIL_S = (
 
 
 class Clock(Protocol):
-    """Monotonic seconds and nanoseconds of one machine, wall nanoseconds for people, and sleeping."""
+    """Monotonic time of one machine, wall time for people, and sleeping."""
 
     def now_s(self) -> float: ...
 
@@ -32,7 +32,10 @@ def precise_sleep(
     sleep: Callable[[float], None] = time.sleep,
     now_s: Callable[[], float] = time.monotonic,
 ) -> None:
-    """Sleep until `duration_s` from now: asleep up to the last millisecond, awake for that one. Returns at once if not positive."""
+    """Sleep for `duration_s`: asleep up to the last millisecond, awake for that one.
+
+    Returns at once if the duration is not positive.
+    """
     wake_s = now_s() + duration_s
     if duration_s > BUSY_TAIL_S:
         sleep(duration_s - BUSY_TAIL_S)

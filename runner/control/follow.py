@@ -12,7 +12,7 @@ class GoalFollower:
 
     def __init__(self) -> None:
         self.sink: TickSink | None = None  # set it before the first goal
-        self._asked: Goal | None = None  # whose skill this tick asked
+        self._asked: Goal | None = None  # the goal whose skill this tick asked
         self._over: tuple[Goal, SkillEnded | None] | None = None
 
     def goal_asked(self, goal: Goal) -> None:

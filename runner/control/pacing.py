@@ -13,7 +13,7 @@ class Slot:
     """One tick's place on the grid: how late it began and when it has to be over."""
 
     late_ms: float = 0.0
-    deadline_s: float = math.inf  # infinite where there is no rate
+    deadline_s: float = math.inf  # infinite without a rate
 
 
 class Pacing:

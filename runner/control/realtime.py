@@ -1,7 +1,7 @@
-"""What this process asks of the machine so that its control loop begins each tick on time, beside programs that take all cores.
+"""Scheduling requests of this process, so that ticks begin on time beside busy programs.
 
-Asked once, when everything is imported and built. Each of the three may be refused (a container, no `LimitRTPRIO=`): the runner then works on
-without it and says so. Knows no robot.
+Made once, when everything is imported and built. Each may be refused (a container, no
+`LimitRTPRIO=`): the runner then works without it and logs so. Must not know the robot.
 """
 
 from __future__ import annotations
@@ -19,10 +19,13 @@ from vram_arbiter.schemas.errors import InternalError
 
 log = logging.getLogger("runner")
 
-SWITCH_S = 0.0005  # Python hands the interpreter over every 5 ms; a thread that wakes for its tick must not wait that long
+# Python switches threads every 5 ms; a thread that wakes for its tick must not wait that long
+SWITCH_S = 0.0005
 REALTIME_PRIORITY = 1  # the lowest: before every ordinary program, behind all that is as urgent
-AWAKE_MAX = 0.5  # of each period; the kernel stops a real-time thread that never sleeps for 50 ms of every second
-NICE = -10  # of the ordinary threads: whoever holds the interpreter must not be kept from running while the loop waits for it
+# of each period; the kernel stops a real-time thread that never sleeps for 50 ms of every second
+AWAKE_MAX = 0.5
+# of ordinary threads: the holder of the interpreter lock has to run while the loop waits for it
+NICE = -10
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,14 +40,20 @@ class Promptness:
 
 
 def settle_interpreter() -> None:
-    """For the whole process, once all is imported: quick changes between threads, and no collector walking a million objects that stay."""
+    """Switch threads quickly, and keep the garbage collector off the objects that stay.
+
+    For the whole process, once everything is imported.
+    """
     sys.setswitchinterval(SWITCH_S)
     gc.collect()
     gc.freeze()
 
 
 def leaves_room(rate_hz: float) -> bool:
-    """Whether a loop of this rate sleeps enough to go before other programs: it is awake for the end of every wait. 0: it never waits."""
+    """Return whether a loop of this rate sleeps enough to run before other programs.
+
+    It is awake for the end of every wait. Rate 0 never waits.
+    """
     return 0 < rate_hz * BUSY_TAIL_S <= AWAKE_MAX
 
 
@@ -65,9 +74,12 @@ def hasten(*, realtime: bool = False) -> Promptness:
 
 
 async def make_prompt(control: ControlThread, *, first: bool) -> None:
-    """Call it when the runner is ready to serve, from its event loop. `first`: the control thread and the caller's go before other programs.
+    """Raise the priority of the control loop.
 
-    Not for a loop that hardly sleeps (`leaves_room`): it would leave nothing to the others.
+    Call it from the runner's event loop once it can serve.
+
+    Args: `first` runs the control thread and the calling thread before other programs; not for a
+    loop that hardly sleeps (`leaves_room`), which would starve the others.
     """
     settle_interpreter()
     if not first:
@@ -76,11 +88,12 @@ async def make_prompt(control: ControlThread, *, first: bool) -> None:
     try:
         loop = await control.call(lambda: hasten(realtime=True))
     except InternalError:
-        return  # the run is over already, and whoever awaits its end hears why
+        return  # the run is over already; its awaiter gets the error
     if loop.realtime or loop.nice < 0:
         log.info("the control loop runs at %s, the sockets at %s", loop, sockets)
     else:
         log.info(
-            "the control loop shares the cores evenly: neither real time nor a low nice value is allowed"
+            "the control loop shares the cores evenly:"
+            " neither real time nor a low nice value is allowed"
             " (LimitRTPRIO=1, LimitNICE=-10)"
         )

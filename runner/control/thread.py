@@ -1,7 +1,8 @@
-"""The control thread: one thread owns a runner, its robot or simulator and its cameras; the event loop sends it work.
+"""Thread that owns a runner, its robot or simulator and its cameras; the event loop sends it work.
 
-MuJoCo's rendering contexts belong to the thread that made them, and a control loop must not wait behind sockets. So the event
-loop never touches the runner: it posts callables, which run between two ticks, and awaits what they return.
+MuJoCo's rendering contexts belong to the thread that made them, and a control loop must not wait
+behind sockets. So the event loop never touches the runner: it posts callables, which run between
+two ticks, and awaits their results.
 """
 
 from __future__ import annotations
@@ -40,9 +41,10 @@ class Controlled(Protocol):
 
 
 class ControlThread:
-    """`async with ControlThread(runner)`: activates the runner in its own thread, runs it, stops it at exit.
+    """`async with ControlThread(runner)`: activate the runner in its own thread, run it, stop it.
 
-    Raises what `activate` raised. `ended` resolves when the run is over, with its RunResult or its error.
+    Raises what `activate` raised. `ended` resolves when the run is over, with its RunResult or
+    error.
     """
 
     def __init__(self, runner: Controlled, *, max_ticks: int | None = None) -> None:
@@ -77,7 +79,7 @@ class ControlThread:
     def _main(self) -> None:
         try:
             self.runner.activate()
-        except BaseException as error:  # noqa: BLE001 — handed to whoever awaits the start
+        except BaseException as error:  # noqa: BLE001 — delivered to the awaiter of the start
             self.runner.mailbox.close()
             self._deactivate()
             self._settle(self._ready, None, error)
@@ -88,7 +90,7 @@ class ControlThread:
         failure: BaseException | None = None
         try:
             result = self.runner.run(self._max_ticks)
-        except VramError as error:  # says by itself what it is; who leaves the thread logs it
+        except VramError as error:  # self-explanatory; logged when the thread is left
             failure = error
         except BaseException as error:
             log.exception("the control loop failed")
@@ -98,7 +100,7 @@ class ControlThread:
         self._settle(self.ended, result, failure or stuck)
 
     def _deactivate(self) -> BaseException | None:
-        """What went wrong, if anything: whoever waits for the end hears of it, however it ends."""
+        """Deactivate the runner. Returns the error, if any, for the awaiter of the end."""
         try:
             self.runner.deactivate()
         except BaseException as error:
@@ -123,7 +125,10 @@ class ControlThread:
             log.debug("the event loop closed before the control thread did")
 
     async def call[T](self, work: Callable[[], T]) -> T:
-        """Run `work` on the control thread between two ticks. Raises what it raises, InternalError when the thread has ended."""
+        """Run `work` on the control thread between two ticks.
+
+        Raises what it raises, InternalError when the thread has ended.
+        """
         future: asyncio.Future[T] = self._loop.create_future()
         self.runner.mailbox.post(work, lambda result, error: self._settle(future, result, error))
         return await future
@@ -135,10 +140,11 @@ class ControlThread:
         on_begun: Callable[[], None] = lambda: None,
         taken_back: Callable[[dict[str, Any]], None] = lambda data: None,
     ) -> SkillEnded:
-        """Give the arm to a started skill until it is done or fails. Cancelling takes the arm back: it holds.
+        """Give the robot to a started skill until it succeeds or fails. Canceling takes it back.
 
-        `on_begun` is called (event loop) when it has the arm: until then the runner's progress is that of the goal before. `taken_back` hears
-        what became of a goal that was cancelled.
+        Args: `on_begun` is called (event loop) when the skill has the robot: until then the
+        runner's progress is that of the goal before. `taken_back` gets the counts of a canceled
+        goal.
         """
         ended: asyncio.Future[SkillEnded] = self._loop.create_future()
         try:
@@ -158,7 +164,7 @@ class ControlThread:
         finally:
             if (
                 not ended.done()
-            ):  # cancelled, deadline, or the loop died: the mailbox keeps the order
+            ):  # canceled, deadline, or the loop died: the mailbox keeps the order
                 ended.cancel()
                 try:
                     taken_back(await self.call(self.runner.end_skill))

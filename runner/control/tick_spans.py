@@ -1,4 +1,4 @@
-"""Trace spans of ticks: which ticks get one, and whose trace they join."""
+"""Trace spans of ticks: which ticks get one, and which trace they join."""
 
 from __future__ import annotations
 

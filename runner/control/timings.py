@@ -1,6 +1,7 @@
-"""When the ticks of a run began, how far behind their slots, and how long they took: the newest of them, for figures and for a file.
+"""Start times, delays and durations of a run's newest ticks.
 
-Plain numbers, no objects that the garbage collector would have to walk. Written by the control thread, read by any.
+Plain numbers, so that the garbage collector has no objects to walk. Written by the control thread,
+read by any.
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ TIMINGS_KEPT = (
 
 
 def percentile(values: Sequence[float], share: float) -> float:
-    """Percentile by linear interpolation between the two nearest ranks; 0.0 for no values. `share` runs from 0 to 1."""
+    """Return a percentile by linear interpolation between ranks; 0.0 for no values.
+
+    Args: `share` runs from 0 to 1.
+    """
     if not values:
         return 0.0
     ordered = sorted(values)
@@ -33,7 +37,10 @@ def mean(values: Sequence[float]) -> float:
 
 
 class Timings:
-    """The last `kept` ticks. A reset tick builds a scene: it says nothing of how a skill fares, or of the rate."""
+    """The last `kept` ticks.
+
+    Reset ticks build a scene: they count neither as inference nor as late.
+    """
 
     def __init__(self, kept: int = TIMINGS_KEPT) -> None:
         self._rows: deque[tuple[float, ...]] = deque(maxlen=kept)
@@ -48,7 +55,9 @@ class Timings:
         *,
         reset: bool = False,
     ) -> None:
-        """One tick: monotonic start, how far behind its slot that was, how long it took, its skill in it, and the robot."""
+        """Add one tick: monotonic start, delay, and durations of the tick, its skill and the
+        robot.
+        """
         self._rows.append((started_s, late_ms, tick_ms, inference_ms, hal_ms, float(reset)))
 
     def clear(self) -> None:

@@ -1,6 +1,6 @@
-"""The installed skills: manifests by name, which of them a goal may execute, and who makes them.
+"""Installed skills: manifests by name, which of them a goal may execute, and their makers.
 
-Only kinds that move something can be executed: a detector, a scene VLM or a reward model never, whoever asks.
+Only kinds that move something can be executed: never a detector, a scene VLM or a reward model.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ from vram_arbiter.schemas.runtime.endpoints import program_endpoint
 
 EXECUTABLE = frozenset({Kind.VLA, Kind.ROS_ACTION, Kind.ROS_SERVICE})
 NOT_EXECUTED = {
-    Kind.DETECTOR: "it is asked for things in a picture, by whoever plans",
+    Kind.DETECTOR: "a planner asks it for things in a picture",
     Kind.SEGMENTER: "it is asked about a picture, and nothing here serves it",
-    Kind.VLM: "it is asked about a picture, by whoever plans",
+    Kind.VLM: "a planner asks it about a picture",
     Kind.REWARD: "it judges progress and moves nothing",
-    Kind.PLAYBOOK: "it is a text for whoever plans",
+    Kind.PLAYBOOK: "it is a text for planners",
     Kind.WAM: "nothing here runs world action models",
 }
 UNMADE = {
-    Kind.VLA: "nothing here makes learnt policies",
+    Kind.VLA: "nothing here makes learned policies",
     Kind.ROS_ACTION: "this runner has no ROS 2 action client and no stand-in for this one",
     Kind.ROS_SERVICE: "this runner has no ROS 2 service client",
 }
 MOTION_S = 45.0  # of a goal when neither it nor its manifest says how long
-START_S = 90.0  # for what comes before the motion: others finish and leave, a model loads, the arm goes to its start
+# before the motion: other models finish and leave, a model loads, the arm goes to its start
+START_S = 90.0
 FILE_NAME = "rskill.yaml"
 
 Maker = Callable[[RSkillManifest], Skill]
@@ -47,7 +48,10 @@ class Selective(Protocol):
 
 
 def read_manifests(paths: Iterable[Path]) -> list[RSkillManifest]:
-    """Manifests of files, or of folders that hold `rskill.yaml` files at any depth. Raises ManifestInvalid for a wrong one, or none."""
+    """Read manifests from files, or from folders that hold `rskill.yaml` files at any depth.
+
+    Raises ManifestInvalid for a wrong one, or if there are none.
+    """
     files: list[Path] = []
     for path in paths:
         files += sorted(path.rglob(FILE_NAME)) if path.is_dir() else [path]
@@ -70,8 +74,11 @@ def read_manifests(paths: Iterable[Path]) -> list[RSkillManifest]:
 
 
 class Catalogue:
-    """`makers` says how a skill of a kind is made; kinds without a maker are listed but not executed. `refused` names what is installed
-    but not offered here, and why. `body` is the robot: skills that are made for others are listed and refused, whoever asks; None: any fits."""
+    """`makers` make the skills of a kind; kinds without a maker are listed but not executed.
+
+    `refused` names skills that are installed but not offered here, with the reason. `body` is the
+    robot's: skills for other bodies are listed and refused; None accepts all.
+    """
 
     def __init__(
         self,
@@ -90,7 +97,9 @@ class Catalogue:
                 self._refused.setdefault(manifest.name, why)
 
     def _misfit(self, manifest: RSkillManifest) -> str:
-        """Why a skill that could be executed by its kind is not for this robot, or cannot be made here."""
+        """Return why a skill of an executable kind does not fit this robot, or cannot be made
+        here.
+        """
         if self._body is not None and (why := self._body.misfit(manifest)):
             return why
         maker = self._makers.get(manifest.kind)
@@ -99,7 +108,10 @@ class Catalogue:
     def find(
         self, rskill_id: str, revision: str = ""
     ) -> tuple[SkillKey, Callable[[], Skill], RSkillManifest]:
-        """Key, maker and manifest of an executable skill. Raises UnknownSkill, which says what there is."""
+        """Return key, maker and manifest of an executable skill.
+
+        Raises UnknownSkill, which lists what there is.
+        """
         manifest = self._manifests.get(rskill_id)
         runnable = [manifest.name for manifest in self.executable()]
         if (why := self._refused.get(rskill_id)) is not None:
@@ -111,7 +123,8 @@ class Catalogue:
         maker = self._makers.get(manifest.kind)
         if maker is None:
             raise UnknownSkill(
-                f"{rskill_id} is a {manifest.kind} and cannot be executed: {_why_not(manifest.kind)}",
+                f"{rskill_id} is a {manifest.kind} and cannot be executed:"
+                f" {_why_not(manifest.kind)}",
                 hint=f"choose from {', '.join(runnable)}",
             )
         if revision not in ("", manifest.version):
@@ -119,7 +132,10 @@ class Catalogue:
         return SkillKey(manifest.name, manifest.version), lambda: maker(manifest), manifest
 
     def deadline_s(self, manifest: RSkillManifest, asked_s: float) -> float:
-        """Seconds a goal may take in all, from acceptance: as asked, else the manifest's time of motion and 90 s to get there."""
+        """Return the seconds a goal may take from its acceptance.
+
+        As requested, else the manifest's time of motion plus START_S to get there.
+        """
         return asked_s or (manifest.latency_budget.max_execution_s or MOTION_S) + START_S
 
     def executable(self) -> list[RSkillManifest]:
@@ -131,7 +147,7 @@ class Catalogue:
         ]
 
     def summary(self) -> list[str]:
-        """A line a skill, for people: name, version, licence, and whether a goal may execute it."""
+        """Return one line per skill: name, version, license, and whether a goal may execute it."""
         lines = []
         for manifest in self._manifests.values():
             if manifest.name in self._refused:
@@ -158,7 +174,9 @@ def _why_not(kind: Kind) -> str:
 
 
 def sidecar_endpoint(rskill_id: str, given: Mapping[str, str], environ: Mapping[str, str]) -> str:
-    """Where the policy of a skill is served: as given, else by its name, `OWNER/so101-grab` → `grab`."""
+    """Return the address of a policy's sidecar: as given, else by name (`OWNER/so101-grab` →
+    `grab`).
+    """
     repository = rskill_id.rpartition("/")[2]
     _, dash, rest = repository.partition("-")
     return given.get(rskill_id) or program_endpoint(

@@ -1,7 +1,7 @@
-"""Pictures for other processes: the newest frame of a camera, encoded, with its stamp, or a typed refusal.
+"""Pictures for other processes: the newest frame of a camera, encoded, with its stamp.
 
-A frame that is older than the caller accepts is never served: `frame_stale` says how old it would have been. Knows the control
-thread, no goals and no wire.
+A frame that is older than the caller accepts is never served: `frame_stale` names its age. Must not
+know goals or the wire.
 """
 
 from __future__ import annotations
@@ -53,7 +53,10 @@ async def fetch(
     max_age_ms: float,
     encoding: Encoding,
 ) -> FrameReply:
-    """The newest picture of `camera` ("" takes the first one). Raises BadRequest for an unknown camera, FrameStale otherwise."""
+    """Return the newest picture of `camera` ("" takes the first camera).
+
+    Raises BadRequest for an unknown camera, FrameStale otherwise.
+    """
     known = source.camera_names()
     name = camera or (known[0] if known else "")
     if name not in known:

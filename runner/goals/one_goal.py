@@ -1,8 +1,9 @@
-"""One goal at a time, from its acceptance to its one result, whatever happens to the client or the skill.
+"""One goal at a time, from its acceptance to its one result.
 
-A goal: accept (or refuse) → resident skill → `start` → the arm → `finish` → result. The deadline counts from acceptance and covers all of it:
-status `deadline` is no success. The arm is given to a skill on the control thread and taken back by cancel, deadline, failure or end; a client that
-went away finds its result again. Knows no socket: whom to tell what goes through `Tell`.
+A goal: accept (or refuse) → resident skill → `start` → the robot → `finish` → result. The deadline
+counts from acceptance and covers all of it; status `deadline` is not a success. The skill gets the
+robot on the control thread and loses it by cancel, deadline, failure or success; a client that
+disconnected finds its result again. Must not know a socket: messages go through `Tell`.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ FEEDBACK_PERIOD_S = 0.2  # at most five a second
 FEEDBACK_QUIET_S = 1.0  # said again after this long even if nothing changed
 FINISHING = "finishing"
 FINISH_S = (
-    8.0  # a skill that has not finished by then is left to itself; nobody waits longer for a result
+    8.0  # a skill that has not finished by then is abandoned; the result does not wait longer
 )
 
 Status = Literal["succeeded", "failed", "canceled", "deadline"]
@@ -50,7 +51,7 @@ Tell = Callable[[Peer, Message], Awaitable[None]]
 
 
 class Performer(Protocol):
-    """What a goal reads and writes of the runner. The attributes are replaced whole, never changed in place."""
+    """Parts of the runner that a goal reads and writes. Attributes are replaced whole."""
 
     caption: tuple[str, ...]
 
@@ -81,7 +82,10 @@ class _Running:
 
 
 class OneGoal:
-    """`accept` begins a goal, `close` ends the one that runs and lets the resident skill go. With `stopping` set no goal is accepted."""
+    """`accept` begins a goal; `close` cancels the active one and releases the resident skill.
+
+    No goal is accepted once `stopping` is set.
+    """
 
     def __init__(
         self,
@@ -132,9 +136,12 @@ class OneGoal:
             await asyncio.gather(running.task, return_exceptions=True)
         await self._residency.close()
 
-    # -- what a client asks --------------------------------------------------------------------------------------------
+    # -- what a client asks
     def accept(self, peer: Peer, request: SendGoal) -> Message:
-        """The reply. Raises EstopRequested, GoalRejected and what the catalogue says of the skill."""
+        """Accept or refuse a goal and return the reply.
+
+        Raises EstopRequested, GoalRejected and what the catalogue raises.
+        """
         if self._robot.estop is not None:
             raise self._robot.estop
         if (running := self._running) is not None:
@@ -187,10 +194,12 @@ class OneGoal:
 
     @staticmethod
     def _stop(running: _Running) -> None:
-        """At most one cancellation reaches the task, and none when its end is decided: what it does to end cleanly is not interrupted."""
+        """Cancel the goal's task, at most once, and not while it finishes: ending cleanly is
+        protected.
+        """
         if running.task is not None and not running.canceled and running.phase != FINISHING:
             running.canceled = True
-            if running.begun:  # a task that is cancelled before its first step would never answer
+            if running.begun:  # a task that is canceled before its first step would never answer
                 running.task.cancel()
 
     def result(self, goal_id: str) -> Message:
@@ -203,9 +212,9 @@ class OneGoal:
             f"there is no goal {goal_id}", hint=f"the last {RESULTS_KEPT} results are kept"
         )
 
-    # -- a goal --------------------------------------------------------------------------------------------------------
+    # -- a goal
     async def _execute(self, running: _Running, make: Callable[[], Skill]) -> None:
-        """All of it is one span, `rskill.goal`: the caller's child, and the parent of activation and ticks."""
+        """Run a goal within one span, `rskill.goal`: parent of activation and ticks."""
         goal = running.goal
         running.begun = True
         attributes = {telemetry.ATTR_SKILL: goal.rskill_id, telemetry.ATTR_GOAL: goal.goal_id}
@@ -256,7 +265,11 @@ class OneGoal:
 
     @staticmethod
     async def _finish(skill: Skill) -> None:
-        """The goal's result is what it is, whatever happens here; the lease's use ends with our connection at the latest."""
+        """Finish the skill.
+
+        Errors are logged only: the result is decided, and the use of the lease ends with the
+        connection at the latest.
+        """
         try:
             async with asyncio.timeout(FINISH_S):
                 await skill.finish()
@@ -314,7 +327,7 @@ class OneGoal:
         for peer in running.peers:
             await self._tell_peer(peer, dict(result))
 
-    # -- progress ------------------------------------------------------------------------------------------------------
+    # -- progress
     async def _tell(self, running: _Running) -> None:
         while True:
             progress = (
@@ -350,7 +363,7 @@ def _identity(request: SendGoal) -> str:
 
 
 def _sendable(data: dict[str, Any]) -> dict[str, Any]:
-    """A skill's own words, if a wire carries them; a result reaches its client whatever they are."""
+    """Return the skill's data if a wire can carry it: a result must reach its client."""
     try:
         pack(data)
     except (TypeError, ValueError, OverflowError):

@@ -1,7 +1,8 @@
-"""The goal server: what the runner is asked on its socket, and who answers it.
+"""Goal server: the requests of the runner's socket and their answers.
 
-Speaks `schemas.goals` on a `RouterServer`. Goals are `runner.goals.one_goal`'s, pictures `runner.goals.frames`'; the emergency stop has a socket and a thread of
-its own beside it (`runner.safety.estop`). It knows no model and no simulator.
+Speaks `schemas.goals` on a `RouterServer`. `runner.goals.one_goal` runs goals,
+`runner.goals.frames` serves pictures; the emergency stop has a socket and a thread of its own
+(`runner.safety.estop`). Must not know models or simulators.
 """
 
 from __future__ import annotations
@@ -48,14 +49,18 @@ from vram_arbiter.schemas.world import WorldState
 
 log = logging.getLogger(__name__)
 
-READS_MAX = 16  # requests that wait for the control thread; more are refused, so that its mailbox keeps room for others
-WORK_SHARE = 0.25  # of the time, for the goal socket: the control thread waits for this thread's turn with the interpreter
+READS_MAX = 16  # requests that wait for the control thread; a limit keeps room in its mailbox
+# of the time, for the goal socket: the control thread waits for the interpreter lock meanwhile
+WORK_SHARE = 0.25
 LOOP_SILENT_S = 1.0  # a control loop that has not looked at the world for so long hangs
 OPS = ("goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "ping", "shutdown")
 
 
 class ServedRunner(frames.FrameSource, Performer, Protocol):
-    """What the server reads of the runner. The attributes are replaced whole by the control thread, never changed in place."""
+    """Parts of the runner that the server reads.
+
+    Attributes are replaced whole by the control thread.
+    """
 
     tick_idx: int
     deadline_misses: int
@@ -75,10 +80,10 @@ class ServedRunner(frames.FrameSource, Performer, Protocol):
 
 
 class GoalServer:
-    """`await GoalServer(...).serve()` until `shutdown` or cancellation; then the running goal is canceled and answered.
+    """`await GoalServer(...).serve()` until `shutdown` or cancellation; cancels the active goal.
 
-    `estop_s`: a control loop that has not obeyed an emergency stop by then is said to hang. `realtime`: the emergency stop's thread goes
-    before other programs.
+    `estop_s`: a control loop that has not obeyed an emergency stop by then is reported as hanging.
+    `realtime` runs the emergency stop's thread before other programs.
     """
 
     def __init__(
@@ -168,7 +173,7 @@ class GoalServer:
         """How a goal ended; None while it has not, or if it never was accepted."""
         return self._goals.result_of(goal_id)
 
-    # -- requests ------------------------------------------------------------------------------------------------------
+    # -- requests
     async def _handle(self, peer: Peer, message: Message) -> None:
         request_id = message.get("id") if isinstance(message.get("id"), int) else None
         try:
@@ -247,7 +252,7 @@ class GoalServer:
             self._reads -= 1
 
     def _stopped(self, reason: str, pid: int, uid: int) -> None:
-        """An emergency stop was latched on its own thread; words for the log, and the end of the goal, are left to this one."""
+        """Log an emergency stop and end the goal; the stop's own thread has latched it already."""
         log.critical("emergency stop by process %d of uid %d: %s", pid, uid, reason)
         if (error := self._robot.estop) is not None:
             self._goals.stop(error)
@@ -268,7 +273,10 @@ class GoalServer:
         }
 
     def _world(self) -> dict[str, Any] | None:
-        """The newest world state. What was fresh when the control loop last looked is not fresh while it hangs."""
+        """Return the newest world state.
+
+        While the control loop hangs nothing in it counts as fresh.
+        """
         robot = self._robot
         if (world := robot.world) is None:
             return None

@@ -1,9 +1,10 @@
-"""What of a dataset's folder is finished: a commit after every episode, and the way back to the last one after a crash.
+"""Commits of a dataset's folder after every episode, and recovery after a crash.
 
-Parquet and MP4 files are worthless until they are closed, so every episode gets files of its own, which never change again, and is
-committed by one rename: `.runner/commit.json` lists them with their sizes and keeps the three small files that do change. While an
-episode is being written `.runner/open` lies there; whoever finds it on opening was preceded by a crash, takes away what no commit
-lists, and says so. Knows neither lerobot nor the runner.
+Parquet and MP4 files are worthless until they are closed, so every episode gets files of its own,
+which never change again, and is committed by one rename: `.runner/commit.json` lists them with
+their sizes and keeps the three small files that do change. While an episode is being written
+`.runner/open` exists; a program that finds it when it opens the folder follows a crash, removes
+what no commit lists, and logs it. Must not know lerobot or the runner.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ Commit = dict[str, Any]
 
 
 def check_folder(root: Path) -> None:
-    """Raises ConfigError for a folder that nothing may be recorded into: somebody else's, or one that cannot be written."""
+    """Raise ConfigError for a folder that cannot be recorded into: foreign, or not writable."""
     if (root / FOLDER).is_dir() or not root.exists():
         parent = (
             root
@@ -59,7 +60,10 @@ def check_folder(root: Path) -> None:
 
 @contextlib.contextmanager
 def locked(root: Path, wait_s: float = LOCK_WAIT_S) -> Iterator[None]:
-    """While inside, nobody else writes the dataset. Raises AlreadyRunning when somebody still does after `wait_s`."""
+    """Lock the dataset against other writers.
+
+    Raises AlreadyRunning when it is still locked after `wait_s`.
+    """
     (root / FOLDER).mkdir(parents=True, exist_ok=True)
     lock = os.open(root / FOLDER / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:
@@ -126,8 +130,10 @@ def commit(root: Path, episode: dict[str, Any] | None) -> None:
 
 
 def repair(root: Path) -> list[str]:
-    """Back to the last commit if a crash left the folder in between; says what was done. Raises ConfigError when a file of the
-    commit is missing or cut: then nothing is touched."""
+    """Restore the last commit if a crash left the folder in between. Returns what was done.
+
+    Raises ConfigError when a file of the commit is missing or cut: then nothing is touched.
+    """
     record = last(root)
     if record is None:
         return _clear(root)
@@ -161,7 +167,7 @@ def notes(root: Path) -> list[dict[str, Any]]:
 
 
 def _clear(root: Path) -> list[str]:
-    """Before the first commit there are no episodes: what lies there is a beginning that a crash cut off."""
+    """Remove an unfinished beginning: before the first commit there are no episodes."""
     said = []
     for path in (root / "meta", root / FOLDER / "creating"):
         if path.exists():
@@ -227,7 +233,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _flush(path: Path) -> None:
-    """Onto the disk: a file's bytes and the name that its folder has for it, or a folder's names."""
+    """Sync to the disk: a file's bytes and its name in the folder, or a folder's names."""
     for each in (path, path.parent) if path.is_file() else (path,):
         handle = os.open(each, os.O_RDONLY | os.O_CLOEXEC)
         try:

@@ -1,7 +1,8 @@
-"""The dataset on disk, through lerobot's own class: one episode at a time, each in files of its own, each committed when it is closed.
+"""Dataset on disk through lerobot's own class: one episode at a time, in files of its own.
 
-Runs in the writer's process only. lerobot's pictures go through a video encoder with a short queue that drops what it cannot take,
-which would shift the pictures against the rows: here a full queue is waited for, and the video's length is checked at the end.
+Runs in the writer's process only. lerobot's pictures go through a video encoder with a short queue
+that drops what it cannot take, which would shift the pictures against the rows: this module waits
+for a full queue and checks the video's length at the end.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ REPO_ID = "local/recording"  # lerobot wants a name; nothing is ever pushed or p
 VIDEO_CODEC = (
     "h264"  # plays everywhere; AV1, lerobot's default, takes several times the processor's time
 )
-VIDEO_CRF = 20  # hardly to be told from the original
+VIDEO_CRF = 20  # visually close to the original
 ENCODER_QUEUE = 16  # pictures a camera
 ENCODER_WAIT_S = 60.0
 ENCODER_POLL_S = 0.002
@@ -34,9 +35,10 @@ Features = dict[str, dict[str, Any]]
 
 
 def features_of(row: Row) -> Features:
-    """The columns of the dataset that this row is the first of. Raises ConfigError for pictures that no video can hold.
+    """Return the dataset's columns, from its first row.
 
-    Only cameras' columns may have `image` in their names: lerobot takes the statistics of all such for those of pictures.
+    Only cameras' columns may have `image` in their names: lerobot takes the statistics of all such
+    columns for those of pictures. Raises ConfigError for pictures that a video cannot hold.
     """
     features: Features = {"action": _vector("float32", row["action_names"])}
     if row["state_names"]:  # a world may show nothing but pictures
@@ -45,7 +47,8 @@ def features_of(row: Row) -> Features:
         height, width = frame["height"], frame["width"]
         if height % 2 or width % 2:
             raise ConfigError(
-                f"camera {frame['camera']} gives {width} × {height} pixels; a video needs even numbers",
+                f"camera {frame['camera']} gives {width} × {height} pixels;"
+                " a video needs even numbers",
                 hint="choose another size for it, or leave it out",
             )
         if _camera(frame["camera"]) in features:
@@ -88,8 +91,11 @@ def features_of(row: Row) -> Features:
 
 
 def frame_of(row: Row, pictures: Sequence[bytes], features: Features) -> dict[str, Any]:
-    """The row as lerobot takes it. Raises ModelError and FrameStale for a picture without colours, ConfigError for one of
-    another size than the first."""
+    """Return the row as lerobot takes it.
+
+    Raises ModelError and FrameStale for a picture without colors, ConfigError for one of another
+    size than the first.
+    """
     import numpy as np
 
     values: dict[str, Any] = {
@@ -136,13 +142,16 @@ def frame_of(row: Row, pictures: Sequence[bytes], features: Features) -> dict[st
 
 
 class LerobotFiles:
-    """`begin` → `add`… → `finish` or `abandon`, episode after episode. Between them the folder is committed and whole."""
+    """`begin` → `add`… → `finish` or `abandon`, for each episode.
+
+    In between the folder is committed.
+    """
 
     def __init__(self, root: Path, *, fps: int, robot: str) -> None:
         import av
         from lerobot.configs import RGBEncoderConfig
 
-        av.logging.set_libav_level(av.logging.ERROR)  # the encoder's figures are nobody's business
+        av.logging.set_libav_level(av.logging.ERROR)  # the encoder's statistics are noise
         self._root = root
         self._fps = fps
         self._robot = robot
@@ -164,10 +173,10 @@ class LerobotFiles:
         return meta.total_episodes, meta.total_frames
 
     def begin(self, features: Features) -> Features:
-        """Open an episode and return its columns: `features`, without the verdict where the
-        folder's dataset has no column for it.
+        """Open an episode and return its columns.
 
-        Raises: ConfigError when the folder's dataset has other columns or another rate.
+        They are `features`, without the verdict where the folder's dataset has no column for it.
+        Raises ConfigError when the folder's dataset has other columns or another rate.
         """
         from lerobot.datasets import LeRobotDataset
 
@@ -201,14 +210,18 @@ class LerobotFiles:
         return features
 
     def add(self, frame: dict[str, Any]) -> None:
-        """Raises InternalError when the encoder hangs, ValueError for a row that does not fit the columns."""
+        """Add a row. Raises InternalError when the encoder hangs, ValueError for a row that does
+        not fit.
+        """
         self._await_encoder()
         self._dataset.add_frame(frame)
         self._rows += 1
 
     def finish(self, note: Mapping[str, Any]) -> int:
-        """Close the episode's files and commit them with `note`; the episode's index. Raises InternalError for a video that lacks
-        pictures."""
+        """Close the episode's files, commit them with `note`, and return the episode's index.
+
+        Raises InternalError for a video that lacks pictures.
+        """
         dataset, self._dataset = self._dataset, None
         dataset.save_episode()
         episode = dataset.meta.latest_episode
@@ -238,7 +251,7 @@ class LerobotFiles:
         finally:
             commit.repair(self._root)
 
-    # -- lerobot ---------------------------------------------------------------------------------------------------------
+    # -- lerobot
     def _meta(self) -> Any:
         from datasets.exceptions import DatasetsError
         from lerobot.datasets import LeRobotDatasetMetadata

@@ -1,7 +1,7 @@
-"""One frame of a recorded dataset, with the trace and span that it belongs to. Reads the files themselves: no lerobot, no torch.
+"""One frame of a recorded dataset, with its trace and span. Needs neither lerobot nor torch.
 
-What is read is what was committed last, also while a runner records into the folder. Datasets of other programs are refused: their
-rows lead to no trace.
+Reads the last commit, also while a runner records into the folder. Datasets of other programs are
+refused: their rows lead to no trace.
 """
 
 from __future__ import annotations
@@ -21,8 +21,12 @@ EPISODE_COLUMNS = ("episode_index", "length", "dataset_from_index", "dataset_to_
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """One frame. `state` and `action` are by joint (rad), or with `units` "own" by what their world calls its numbers; `timings_ms` by part of the tick, `pictures` where they are: by camera the
-    video's path and the second in it."""
+    """One frame.
+
+    `state` and `action` are by joint (rad), or with `units` "own" by the names of their world;
+    `timings_ms` by part of the tick; `pictures` maps a camera to its video's path and the second in
+    it.
+    """
 
     root: str
     robot: str
@@ -46,8 +50,11 @@ class Recorded:
 
 
 def read_frame(root: Path, frame: int, episode: int | None = None) -> Recorded:
-    """Frame `frame` of the dataset, or of one of its episodes. Raises ConfigError for a folder that cannot be read or is nobody's of
-    ours, BadRequest for a frame or an episode that there is not."""
+    """Read frame `frame` of the dataset, or of one of its episodes.
+
+    Raises ConfigError for a folder that cannot be read or is not one of ours, BadRequest for a
+    frame or an episode that does not exist.
+    """
     info, record = _open(root)
     names = [name for name in record["files"] if name.startswith("meta/episodes/")]
     about = _episode(_rows(root, names), frame, episode)
@@ -67,7 +74,7 @@ def _open(root: Path) -> tuple[dict[str, Any], commit.Commit]:
     record = commit.last(root)
     if record is None:
         raise ConfigError(
-            f"{root} is no dataset that this program recorded",
+            f"{root} is not a dataset that this program recorded",
             hint="name the folder that --record or save_dir named",
         )
     try:

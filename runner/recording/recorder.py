@@ -1,7 +1,8 @@
-"""Records a runner's goals: takes ticks over from the control thread and hands them to the process that writes the dataset.
+"""Recorder of a runner's goals: hands ticks from the control thread to the writer process.
 
-The control thread only appends to a bounded queue. When the writer is slower than the robot, ticks are dropped, counted and said;
-when it dies, the robot goes on and the loss is said. Knows no lerobot: that lives in the writer's process.
+The control thread only appends to a bounded queue. When the writer is slower than the robot, ticks
+are dropped, counted and logged; when it dies, the robot continues and the loss is logged. Must not
+import lerobot: that lives in the writer's process.
 """
 
 from __future__ import annotations
@@ -44,7 +45,10 @@ class _End:
 
 
 def whole_rate(rate_hz: float) -> int:
-    """The dataset's frames a second. Raises ConfigError for a rate that is no whole number: the format has no other."""
+    """Return the dataset's frames per second.
+
+    Raises ConfigError for a rate that is not a whole number.
+    """
     if rate_hz < 1 or rate_hz != round(rate_hz):
         raise ConfigError(
             f"a recording needs a whole number of ticks a second, not {rate_hz:g}",
@@ -54,10 +58,11 @@ def whole_rate(rate_hz: float) -> int:
 
 
 class DatasetRecorder:
-    """`start()`, then `tick` and `goal_ended` on the control thread, then `close()`. Everything else may be read at any time.
+    """`start()`, then `tick` and `goal_ended` on the control thread, then `close()`.
 
-    `cameras` is asked for every tick, on a thread of its own: some worlds know theirs after their first reset.
-    `patient`: wait for room instead of dropping; only where no tick has a deadline.
+    Everything else may be read at any time. `cameras` is called for every tick, on a thread of its
+    own: some worlds know theirs only after their first reset. `patient` waits for room instead of
+    dropping; only where no tick has a deadline.
     """
 
     def __init__(
@@ -89,16 +94,20 @@ class DatasetRecorder:
         self._refused: VramError | None = None
         self.pid = 0  # of the writer
         self.dropped = 0
-        self.incomplete: Counter[str] = Counter()  # ticks that were no row, by reason
+        self.incomplete: Counter[str] = Counter()  # ticks without a row, by reason
         self.episodes = 0  # of this run
         self.frames = 0
         self.skipped = 0  # goals of too few ticks to be an episode
         self.error: VramError | None = None  # the last thing that was not recorded
 
-    # -- life ------------------------------------------------------------------------------------------------------------
+    # -- life
     def start(self) -> None:
-        """Returns when the writer can take rows. Raises ConfigError for a folder that it cannot record into or packages that are
-        missing, AlreadyRunning when somebody else records into it, InternalError when the writer does not come up."""
+        """Start the writer; return when it can take rows.
+
+        Raises ConfigError for a folder that cannot be recorded into or missing packages,
+        AlreadyRunning when another program records there, InternalError when the writer does not
+        start.
+        """
         if absent := [name for name in PACKAGES if importlib.util.find_spec(name) is None]:
             raise ConfigError(
                 f"recording needs the packages {', '.join(absent)}",
@@ -141,14 +150,17 @@ class DatasetRecorder:
         self._feeding.start()
 
     def abort(self) -> None:
-        """Any thread: before the first row. Whoever is in `start` leaves it; the writer ends by itself, nothing is written."""
+        """End a `start` that runs, from any thread before the first row; nothing is written."""
         self._aborted = True
         if self._peer is not None:
             with contextlib.suppress(OSError):  # it is gone already
                 self._peer.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """Finish what runs, wait until it is on disk, at most CLOSE_S; repeatable. The writer then finishes by itself."""
+        """Finish the open episode and wait for the disk, at most CLOSE_S. Repeatable.
+
+        The writer then ends by itself.
+        """
         if self._feeding is None or self._process is None or self._closing:
             return
         with self._room:
@@ -172,7 +184,9 @@ class DatasetRecorder:
         log.info("%s", self.summary())
 
     def facts(self) -> dict[str, Any]:
-        """See `runner.protocols.TickSink`. `dropped` and `left_out` count ticks, `skipped` goals."""
+        """Return the facts of `runner.protocols.TickSink`: `dropped` and `left_out` count ticks,
+        `skipped` goals.
+        """
         return {
             "episodes": self.episodes,
             "frames": self.frames,
@@ -194,7 +208,7 @@ class DatasetRecorder:
             parts.append(f"NOT ALL WAS RECORDED: {self.error}")
         return "; ".join(parts)
 
-    # -- control thread --------------------------------------------------------------------------------------------------
+    # -- control thread
     def tick(self, tick: GoalTick) -> None:
         """See `runner.protocols.TickSink`."""
         size = sum(len(frame.data or b"") for frame in (tick.world.image_frames or {}).values())
@@ -235,7 +249,7 @@ class DatasetRecorder:
     def _lost(self) -> bool:
         return self._process is not None and self._process.returncode is not None
 
-    # -- the queue's other end ---------------------------------------------------------------------------------------------
+    # -- the queue's other end
     def _feed(self) -> None:
         peer = self._peer
         assert peer is not None
@@ -288,7 +302,7 @@ class DatasetRecorder:
             "reasons": dict(reasons),
         }
 
-    # -- what the writer says --------------------------------------------------------------------------------------------
+    # -- what the writer says
     def _hear(self) -> None:
         peer, process = self._peer, self._process
         assert peer is not None
@@ -344,7 +358,7 @@ class DatasetRecorder:
 
 
 def _environment(root: Path) -> dict[str, str]:
-    """Nothing is looked up on the network, nothing left in the user's caches, no core taken from the control loop."""
+    """Return the writer's environment: no network look-ups, no user caches, no core of the loop."""
     return {
         **os.environ,
         "HF_HUB_OFFLINE": "1",

@@ -1,7 +1,8 @@
-"""A tick as a row on its way to the dataset: plain values and the pictures' bytes. Nothing is filled in: a tick that lacks a part
-of the row is no row, and says why.
+"""Ticks as rows on their way to the dataset: plain values and the pictures' bytes.
 
-Units are those of `schemas.world`: rad, m, s, and ms where a name says so; those of a world that is no robot are its own. Knows no lerobot and no numpy.
+Nothing is filled in: a tick that lacks a part of the row is refused with the reason. Units are
+those of `schemas.world` (rad, m, s, and ms where a name says so), or the world's own where it is
+not a robot. Must not import lerobot or numpy.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ Row = dict[str, Any]
 
 
 class Incomplete(Exception):
-    """This tick is no row of the dataset; the message says what it lacks."""
+    """This tick cannot become a row of the dataset; the message names what it lacks."""
 
 
 def row_of(tick: GoalTick, cameras: Sequence[str]) -> tuple[Row, list[bytes]]:
@@ -92,12 +93,13 @@ def _joints(tick: GoalTick) -> tuple[dict[str, float], dict[str, float]]:
 
 
 def _step(step: Transition) -> tuple[dict[str, float], dict[str, float]]:
-    """What a world that is no robot showed, and was sent."""
+    """Return the observation and the action of a world that is not a robot."""
     if not step.sent:
         raise Incomplete("nothing was sent: the world stood still")
     if len(step.shown) > NUMBERS_MAX:
         raise Incomplete(
-            f"the world shows {len(step.shown)} numbers, at most {NUMBERS_MAX} are recorded: name some as `joints`"
+            f"the world shows {len(step.shown)} numbers, at most {NUMBERS_MAX} are recorded:"
+            " name some as `joints`"
         )
     for name, value in (*step.shown.items(), *step.sent.items()):
         if not abs(value) <= LARGEST:  # nor for NaN
@@ -106,7 +108,9 @@ def _step(step: Transition) -> tuple[dict[str, float], dict[str, float]]:
 
 
 def trace_of(traceparent: str | None) -> tuple[str, str, bool]:
-    """Trace id, span id (hex) and whether the trace is kept, of a W3C traceparent; empty texts without one."""
+    """Return trace id, span id (hex) and whether the trace is kept, of a W3C traceparent; else
+    empty texts.
+    """
     parts = (traceparent or "").split("-")
     if len(parts) < 4 or len(parts[1]) != 32 or len(parts[2]) != 16:
         return "", "", False
@@ -121,7 +125,7 @@ def _colours(frames: dict[str, SensorFrame], camera: str) -> SensorFrame:
     if frame is None:
         raise Incomplete(f"camera {camera} has no picture")
     if frame.data is None or frame.encoding not in COLOURS:
-        raise Incomplete(f"the pictures of camera {camera} ({frame.encoding}) have no colours here")
+        raise Incomplete(f"the pictures of camera {camera} ({frame.encoding}) have no colors here")
     return frame
 
 

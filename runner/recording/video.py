@@ -1,7 +1,7 @@
-"""Writes the episode as H.264 video: RGB pictures with a caption, encoded by ffmpeg on a thread of its own.
+"""H.264 video of an episode: RGB pictures with a caption, encoded by ffmpeg on its own thread.
 
-The control thread only hands a picture over: when the encoder is slow, pictures are dropped and counted, never waited for. Only a world that
-waits for nobody else (a benchmark) may `wait`, and misses none.
+The control thread only hands a picture over: when the encoder is slow, pictures are dropped and
+counted. Only a world that nothing else waits for (a benchmark) may `wait`, and misses none.
 """
 
 from __future__ import annotations
@@ -21,8 +21,11 @@ FONT_SCALE = 0.5
 
 
 class VideoRecorder:
-    """`VideoRecorder(path, fps)`; `submit(rgb, lines)` from any one thread; `close()` finishes the file. H.264 wants even sizes: an odd last row or
-    column is cut off."""
+    """`VideoRecorder(path, fps)`; `submit(rgb, lines)` from one thread; `close()` finishes the
+    file.
+
+    H.264 wants even sizes: an odd last row or column is cut off.
+    """
 
     def __init__(self, path: Path, *, fps: float, wait: bool = False) -> None:
         self.path = path
@@ -61,7 +64,7 @@ class VideoRecorder:
         try:
             while (item := self._queue.get()) is not None:
                 if self.error:
-                    continue  # keep the queue moving, so that close() never waits for a dead encoder
+                    continue  # keep the queue moving: close() must not wait for a dead encoder
                 rgb, lines = item
                 rgb = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
                 try:
@@ -71,7 +74,8 @@ class VideoRecorder:
                         rgb.shape != size
                     ):  # ffmpeg counts bytes: every later picture would be garbled
                         raise RuntimeError(
-                            f"the pictures were {size[1]} × {size[0]}, now one is {rgb.shape[1]} × {rgb.shape[0]}"
+                            f"the pictures were {size[1]} × {size[0]},"
+                            f" now one is {rgb.shape[1]} × {rgb.shape[0]}"
                         )
                     writer.send(_caption(rgb, lines))
                     self.written += 1
@@ -84,7 +88,7 @@ class VideoRecorder:
         finally:
             if writer is not None:
                 writer.close()
-                if not self.error and not _whole(self.path):  # ffmpeg says nothing of how it ended
+                if not self.error and not _whole(self.path):  # ffmpeg does not report errors
                     self.error = f"{self.path} could not be finished; is the disk full?"
                     log.error("no video: %s", self.error)
 
@@ -145,7 +149,8 @@ def _caption(rgb: Any, lines: tuple[str, ...]) -> Any:
     for index, line in enumerate(lines):
         text = line.encode("ascii", "replace").decode()  # OpenCV's fonts know ASCII only
         cv2.putText(
-            picture, text, (8, LINE_PX * (index + 1) - 2), cv2.FONT_HERSHEY_SIMPLEX, FONT_SCALE, (255, 255, 255), 1,
+            picture, text, (8, LINE_PX * (index + 1) - 2),
+            cv2.FONT_HERSHEY_SIMPLEX, FONT_SCALE, (255, 255, 255), 1,
             cv2.LINE_AA,
         )  # fmt: skip
     return picture

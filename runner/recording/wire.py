@@ -1,6 +1,7 @@
-"""Messages between the runner and the process that writes its dataset: a header in msgpack, then the pictures as they are.
+"""Messages between the runner and its dataset writer: a msgpack header, then the raw pictures.
 
-One stream socket, one message after the other. A stream that ends, even in the middle of a message, is the other side's end.
+One stream socket, one message after the other. A stream that ends, even within a message, means
+that the other side has ended.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ Header = dict[str, Any]
 
 
 def send(peer: socket.socket, header: Header, blobs: Sequence[bytes] = ()) -> None:
-    """Blocks until the kernel has taken all of it. Raises OSError when the other side is gone, ValueError for one too large."""
+    """Send all of it. Blocks.
+
+    Raises OSError when the other side is gone, ValueError if it is too large.
+    """
     packed = msgpack.packb({**header, "blobs": [len(blob) for blob in blobs]})
     if len(packed) > HEADER_MAX_BYTES or any(len(blob) > BLOB_MAX_BYTES for blob in blobs):
         raise ValueError(f"a message of {len(packed)} bytes and {len(blobs)} pictures is too large")
@@ -30,7 +34,10 @@ def send(peer: socket.socket, header: Header, blobs: Sequence[bytes] = ()) -> No
 
 
 def receive(peer: socket.socket) -> tuple[Header, list[bytes]] | None:
-    """The next message; None when the other side is gone. Raises ValueError for what is no message."""
+    """Return the next message; None when the other side is gone.
+
+    Raises ValueError for anything else.
+    """
     try:
         if (prefix := _exactly(peer, _LENGTH.size)) is None:
             return None

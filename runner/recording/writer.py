@@ -1,8 +1,10 @@
-"""The process that writes a runner's dataset: `python -m vram_arbiter.runner.recording.writer FD`, started by `runner.recording.recorder`, never by hand.
+"""Process that writes a runner's dataset: `python -m vram_arbiter.runner.recording.writer FD`.
 
-A process of its own, because importing torch, encoding video and compressing would take the interpreter from the control thread, and
-because it outlives the runner: whatever kills that, its socket ends, and the episode so far is finished. It is deaf to SIGTERM and
-SIGINT for the same reason. A row comes, or the end of a goal, or the end of all; it answers with what it has finished or could not.
+Started by `runner.recording.recorder`, never by hand. It is a process of its own because importing
+torch, encoding video and compressing would take the interpreter from the control thread, and
+because it outlives the runner: whatever kills that, the socket ends and the episode so far is
+finished. It ignores SIGTERM and SIGINT for the same reason. It takes rows, the end of a goal and
+the end of all, and answers with what it has finished or could not.
 """
 
 from __future__ import annotations
@@ -55,12 +57,15 @@ class EpisodeWriter:
         self._last: dict[str, Any] | None = (
             None  # written when it is known whether it is the episode's last
         )
-        self._judged: bool | None = None  # what the world said of the last row; None: nobody judges
+        self._judged: bool | None = None  # verdict of the world with the last row; None: no verdict
         self._broken = 0  # rows of it with a picture that cannot be read
-        self._refused = ""  # goal of whose rows nothing can be made
+        self._refused = ""  # goal whose rows cannot be recorded
 
     def row(self, row: Row, pictures: list[bytes]) -> None:
-        """One row of a goal; the first one begins its episode. Raises what keeps the goal from being recorded."""
+        """Add one row of a goal; the first one begins its episode.
+
+        Raises what prevents the recording.
+        """
         goal_id = row["goal_id"]
         if goal_id == self._refused:
             return
@@ -85,14 +90,14 @@ class EpisodeWriter:
             self._close({"status": "continued"})
 
     def ended(self, note: dict[str, Any]) -> None:
-        """A goal's end; also one that had no rows. Raises what keeps its episode from being finished."""
+        """End a goal, with or without rows. Raises what keeps its episode from being finished."""
         if self._goal is not None and self._goal["goal_id"] == note["goal_id"]:
             self._close(note)
         elif self._refused == note["goal_id"]:
             self._refused = ""
 
     def close(self, status: str) -> None:
-        """The end of all; a goal that runs is finished with what came of it. Raises like `ended`."""
+        """End everything; an open goal is finished with its rows so far. Raises like `ended`."""
         if self._goal is not None:
             self.ended({"goal_id": self._goal["goal_id"], "status": status})
 
@@ -183,7 +188,7 @@ def _answer(peer: socket.socket, message: wire.Header) -> None:
 
 
 def _typed(root: Path, error: Exception) -> VramError:
-    """Why nothing can be recorded, as somebody's error."""
+    """Return the reason why nothing can be recorded, as an error for the runner."""
     match error:
         case VramError():
             return error

@@ -1,4 +1,5 @@
-"""Robots and their twins behind `runner.protocols.Hal`. `factory.make_hal` turns the `hal` section of a deployment file into one.
+"""Robots and their twins behind `runner.protocols.Hal`; `factory.make_hal` makes one from a file.
 
-Joint units are rad and rad/s here, efforts N·m; what the hardware speaks (degrees, 0–100) is turned into that by its adapter.
+Joint units are rad and rad/s, efforts N·m; the adapter converts what the hardware speaks (degrees,
+0–100).
 """

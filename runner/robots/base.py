@@ -1,7 +1,7 @@
-"""What all adapters have in common: connected or not, the latched emergency stop, and which actions they take at all.
+"""Base of all adapters: connection state, latched emergency stop, and the actions they accept.
 
-A subclass says how its hardware connects, is read, is driven and is stopped. Knows no safety limits: that is the gate's work; what is
-refused here is what could not be sent.
+A subclass connects, reads, drives and stops its hardware. Must not know safety limits: the gate
+enforces them; this class refuses only what cannot be sent.
 """
 
 from __future__ import annotations
@@ -36,10 +36,13 @@ class HalBase(ABC):
         self._estop: EstopRequested | None = None
         self._sent: dict[str, float] = {}
 
-    # -- what the hardware does ------------------------------------------------------------------------------------------
+    # -- what the hardware does
     @abstractmethod
     def _open(self) -> None:
-        """Reach the hardware; nothing moves. RobotFault or OperatorError when that fails; nothing is left open then."""
+        """Connect to the hardware; nothing moves.
+
+        Raises RobotFault or OperatorError, with nothing left open.
+        """
 
     @abstractmethod
     def _close(self) -> None: ...
@@ -49,15 +52,22 @@ class HalBase(ABC):
 
     @abstractmethod
     def _drive(self, targets: Mapping[str, float]) -> Mapping[str, float]:
-        """Send joint targets in rad; returns those that the hardware accepted. Joints that are left out keep their last target."""
+        """Send joint targets in rad; return those that the hardware accepted.
+
+        Other joints keep theirs.
+        """
 
     @abstractmethod
     def _halt(self) -> str:
-        """Stop the motors; returns in a few words what was done. RobotFault when it could not be done."""
+        """Stop the motors; return in a few words what was done. Raises RobotFault when it
+        failed.
+        """
 
-    # -- the protocol ------------------------------------------------------------------------------------------------------
+    # -- the protocol
     def connect(self) -> None:
-        """Raises EstopRequested once the emergency stop is latched: a person looks, then starts the runner again."""
+        """Raise EstopRequested once the emergency stop is latched: a person has to restart the
+        runner.
+        """
         if self._estop is not None:
             raise self._estop
         if not self._connected:
@@ -71,9 +81,11 @@ class HalBase(ABC):
             self._close()
 
     def read_state(self) -> JointState:
-        """Measured positions (rad) and, where the hardware knows them, velocities (rad/s) and efforts (N·m).
+        """Return measured positions (rad) and, where the hardware knows them, velocities (rad/s)
+        and efforts (N·m).
 
-        Raises BadState when not connected, RobotFault when the hardware does not answer or answers what is no number.
+        Raises BadState when not connected, RobotFault when the hardware does not answer or answers
+        without a number.
         """
         self._require_connected()
         try:
@@ -85,28 +97,32 @@ class HalBase(ABC):
             ) from error
 
     def send_action(self, action: Action) -> None:
-        """Raises EstopRequested once latched, BadState when not connected, InternalError for what no gate lets through."""
+        """Send an action that passed the gate.
+
+        Raises EstopRequested once latched, BadState when not connected, InternalError for an action
+        that cannot have passed a gate.
+        """
         if self._estop is not None:
             raise self._estop
         self._require_connected()
         self._sent.update(self._drive(self._targets_of(action)))
 
     def sent(self) -> Mapping[str, float]:
-        """The last target (rad) that the motors were really given, by joint; empty before the first action."""
+        """Return the last target (rad) that the motors really got, by joint; empty at first."""
         return self._sent
 
     def estop(self, reason: str) -> NoReturn:
-        """Stop the motors, latch, raise EstopRequested. Again: stops again and raises the first one's reason.
+        """Stop the motors, latch, raise EstopRequested.
 
-        `details.told` says whether the motors have been told; while they have not it is worth trying again.
+        Again: stops again and raises the first reason.
+
+        `details.told` is true once the motors have been told; until then it is worth trying again.
         """
         told, halted = True, "the robot is not connected"
         if self._connected:
             try:
                 halted = self._halt()
-            except (
-                Exception
-            ) as error:  # a driver's defect, too, must not keep anybody from hearing this
+            except Exception as error:  # a driver's defect must not hide the stop
                 if self._estop is None:
                     log.exception("the motors of %s could not be stopped", self.description.name)
                 text = (
@@ -131,7 +147,8 @@ class HalBase(ABC):
     def _targets_of(self, action: Action) -> dict[str, float]:
         if action.control_mode is not ControlMode.JOINT_POSITION or action.horizon != 1:
             raise InternalError(
-                f"{self.description.name} takes one step of joint positions, not {action.horizon} of {action.control_mode}"
+                f"{self.description.name} takes one step of joint positions,"
+                f" got {action.horizon} of {action.control_mode}"
             )
         names = action.joint_names or self.description.joint_names
         row = action.rows[0]

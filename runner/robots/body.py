@@ -1,4 +1,4 @@
-"""Which body a robot has: by its adapter, its parts, and what its deployment file says of it. Opens nothing."""
+"""Body of a robot, from its adapter, its parts and its deployment file. Opens nothing."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ SIMULATED = Body(
 
 
 def body_of(robot: RobotEnvironment, description: RobotDescription) -> Body:
-    """The file's `embodiment_tags`, else what the adapter is known to be; and what can be seen of it, with the file's `capabilities` on top.
+    """Return the robot's tags and capabilities.
 
-    Tags of the file take the place of the adapter's: whoever gives any gives all.
+    The file's `embodiment_tags` replace those of the adapter; the file's `capabilities` are added
+    to what its parts show.
     """
     seen: dict[str, Capability] = {
         "has_vision": bool(robot.sensors),

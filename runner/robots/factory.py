@@ -1,6 +1,6 @@
-"""The `hal` section of a deployment file → an adapter. Opens no port and moves nothing: `connect` does.
+"""Adapters from the `hal` section of a deployment file. Opens no port and moves nothing.
 
-Every mistake is a ConfigError that names the field (`hal.params.start_pose_rad.elbow`), before anything starts.
+Every mistake is a ConfigError that names the field (`hal.params.start_pose_rad.elbow`).
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ class TwinParams(_Params):
 
 
 class JointParams(_Params):
-    """One joint of a lerobot robot, as far as lerobot does not say it: what its numbers mean, its range, its greatest speed."""
+    """One joint of a lerobot robot, where lerobot does not describe it: unit, range, maximum
+    speed.
+    """
 
     unit: JointUnit | None = None
     lower_rad: Finite | None = None
@@ -74,9 +76,9 @@ class LerobotParams(_Params):
 def make_hal(
     config: HalConfig, *, clock: Clock | None = None, source: str = "deployment"
 ) -> HalBase:
-    """The adapter that `config` asks for, not connected. `source` is how errors call the file.
+    """Return the adapter that `config` asks for, not connected. `source` names the file in errors.
 
-    Raises ConfigError (details.fields: field, problem) for an unknown adapter and for what it does not take.
+    Raises ConfigError (details.fields: field, problem) for an unknown adapter and unknown fields.
     """
     name = config.adapter
     if name in (MUJOCO, KINEMATIC):
@@ -119,7 +121,7 @@ def _joints_are_known(
         raise config_error(source, problems)
 
 
-# -- twins --------------------------------------------------------------------------------------------------------------
+# -- twins
 def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
     if config.transport:
         raise _wrong(
@@ -152,7 +154,7 @@ def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
     return So101MujocoTwin(start_pose_rad=start, clock=clock)
 
 
-# -- lerobot ------------------------------------------------------------------------------------------------------------
+# -- lerobot
 def _lerobot(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
     params = _params(LerobotParams, config, source)
     robot = _robot(config, source)
@@ -227,7 +229,10 @@ def _robot(config: HalConfig, source: str) -> Any:
 
 
 def _robot_types(registry: Any, wanted: str) -> list[str]:
-    """lerobot's robot types; its packages register theirs when imported, hence one after the other until `wanted` is there."""
+    """Return lerobot's robot types.
+
+    Its packages register theirs on import, hence one after the other until `wanted` is there.
+    """
     import importlib
     import pkgutil
 
@@ -252,7 +257,10 @@ def _robot_types(registry: Any, wanted: str) -> list[str]:
 def _joint(
     name: str, params: JointParams, robot: Any, known: RobotDescription | None
 ) -> tuple[Joint, JointScale] | str:
-    """The joint and what its numbers mean, or what is missing. The file's word goes before lerobot's and the built-in one's."""
+    """Return the joint and its unit, or what is missing.
+
+    The file precedes lerobot and the built-in table.
+    """
     built_in = (
         next((joint for joint in known.joints if joint.name == name), None) if known else None
     )
@@ -266,7 +274,8 @@ def _joint(
     unit = params.unit or _bus_unit(robot, name)
     wanted = {"unit": unit, "lower_rad": lower, "upper_rad": upper, "max_speed_rad_s": speed}
     if missing := [key for key, value in wanted.items() if value is None]:
-        return f"lerobot does not say {', '.join(missing)}: give {'it' if len(missing) == 1 else 'them'} here"
+        them = "it" if len(missing) == 1 else "them"
+        return f"lerobot does not describe {', '.join(missing)}: give {them} here"
     if unit is None or lower is None or upper is None or speed is None or lower >= upper:
         return "lower_rad must be below upper_rad"
     joint = Joint(name, lower, upper, speed, bool(gripper))

@@ -272,7 +272,7 @@ class HardwareRobot:
         """Return the newest frame. Raises FrameStale if it is too old, BadRequest if unknown."""
         if camera not in self._readers:
             raise BadRequest(
-                f"there is no camera {camera!r}", hint=f"choose from {', '.join(self._readers)}"
+                f"unknown camera {camera!r}", hint=f"choose from {', '.join(self._readers)}"
             )
         return FramePicture(self._readers[camera].read_latest(max_age_s * 1e3))
 
@@ -294,8 +294,8 @@ def hardware_runner(
 ) -> HardwareRunner:
     """Compose a control loop on hardware.
 
-    Args: as for `HardwareRobot` and `ControlLoop`; `on_estop` is told of an emergency stop at
-    once, on the thread that asks for it.
+    Args: as for `HardwareRobot` and `ControlLoop`; `on_estop` is told of an emergency stop at once,
+    on the thread that asks for it.
     """
     clock = clock or SystemClock()
     latch = EstopLatch(on_estop)

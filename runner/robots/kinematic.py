@@ -1,7 +1,7 @@
-"""Twin without physics: every joint goes straight to its target at its greatest speed. Needs nothing but the base install.
+"""Twin without physics: every joint goes straight to its target at its maximum speed.
 
-For tests of everything around a robot, and for trying a deployment file on a machine without simulator. Time is the clock's: the
-joints move on between the calls, as a robot's do.
+Needs only the base install: for tests of everything around a robot, and to try a deployment file on
+a machine without simulator. Joints move with the clock between calls, as a robot's do.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from vram_arbiter.schemas.world import JointState
 
 
 class KinematicTwin(HalBase):
-    """Starts at the description's rest pose, or where `start_pose_rad` says; a joint in neither starts at 0."""
+    """Starts at the description's rest pose, or at `start_pose_rad`; a joint in neither starts at
+    0.
+    """
 
     def __init__(
         self,

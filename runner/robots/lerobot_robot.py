@@ -1,8 +1,9 @@
-"""Any robot that lerobot drives by joint positions, in rad. `adapter: lerobot:TYPE`; `transport` holds the fields of lerobot's own config.
+"""Any robot that lerobot drives by joint positions, in rad: `adapter: lerobot:TYPE`.
 
-Degrees and percentages of lerobot become rad here. It never calibrates: lerobot's calibration asks questions on the terminal
-(`lerobot-calibrate` does that once). Cameras belong under `sensors`: lerobot would read them in the middle of the control loop.
-lerobot is imported when the adapter is made, not before.
+`transport` holds the fields of lerobot's own config; its degrees and percentages become rad here.
+It never calibrates: lerobot's calibration asks questions on the terminal (`lerobot-calibrate` does
+that once). Cameras belong under `sensors`: lerobot would read them within the control loop. lerobot
+is imported when the adapter is made.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ Estop = Literal["hold", "torque_off"]
 
 
 class LerobotHal(HalBase):
-    """`robot` is a `lerobot.robots.Robot` that is not connected yet; `scales` says what its numbers mean, by joint.
+    """`robot` is an unconnected `lerobot.robots.Robot`; `scales` gives the unit of each joint.
 
-    `estop` `hold` makes the motors keep the present pose (an arm without torque falls); `torque_off` switches them off. Where holding
-    fails, they are switched off.
+    `estop` `hold` makes the motors keep the present pose (an arm without torque falls);
+    `torque_off` switches them off. Where holding fails, they are switched off.
     """
 
     def __init__(
@@ -69,7 +70,9 @@ class LerobotHal(HalBase):
             if not calibrated:
                 raise RobotFault(
                     f"{self.description.name} is not calibrated",
-                    hint=f"run lerobot-calibrate --robot.type={robot.name} --robot.id={robot.id} once, and give the same id in hal.transport",
+                    hint=f"run lerobot-calibrate --robot.type={robot.name}"
+                    f" --robot.id={robot.id} once,"
+                    " and give the same id in hal.transport",
                 )
             self._target = self._positions()  # the first action moves only the joints it names
         except RobotFault:
@@ -80,7 +83,7 @@ class LerobotHal(HalBase):
         try:
             with self._faults("disconnect"):
                 self._robot.disconnect()
-        except RobotFault as error:  # the cable is out: nobody can switch the motors off, but the port is given back
+        except RobotFault as error:  # the cable is out: the torque stays on, but the port is closed
             log.warning("%s", error)
             bus = getattr(self._robot, "bus", None)
             if getattr(bus, "is_connected", False):
@@ -104,7 +107,8 @@ class LerobotHal(HalBase):
         }
         with self._faults("move"):
             sent: Mapping[str, Any] = self._robot.send_action(command)
-        # lerobot answers with what it really sent (`max_relative_target` shortens steps): joints that later actions leave out stay there
+        # lerobot answers with what it really sent (`max_relative_target` shortens steps): joints
+        # that later actions leave out stay there
         for name in wanted:
             value = sent.get(name + POSITION, command[name + POSITION])
             self._target[name] = self._scales[name].to_rad(self._number(name, value))
@@ -139,14 +143,17 @@ class LerobotHal(HalBase):
             number = math.nan
         if not math.isfinite(number):
             raise RobotFault(
-                f"{self.description.name} reports {value!r} for {name}, which is no number"
+                f"{self.description.name} reports {value!r} for {name}, which is not a number"
             )
         return number
 
     @contextmanager
     def _faults(self, what: str) -> Iterator[None]:
-        """Whatever a driver raises, as RobotFault: lerobot's own errors, and what a cable that is pulled makes of a serial port
-        (`termios.error` is no OSError)."""
+        """Turn whatever a driver raises into RobotFault.
+
+        That covers lerobot's own errors and a serial port whose cable is pulled (`termios.error` is
+        not an OSError).
+        """
         try:
             yield
         except RobotFault:
@@ -159,12 +166,12 @@ class LerobotHal(HalBase):
 
 
 def can_switch_off(robot: Any) -> bool:
-    """Whether the torque of this robot's motors can be switched off at once: it has a bus of lerobot's."""
+    """Return whether this robot's torque can be switched off at once: it has a bus of lerobot's."""
     return callable(getattr(getattr(robot, "bus", None), "disable_torque", None))
 
 
 def switch_off(robot: Any, faults: Callable[[str], Any]) -> None:
-    """Take the torque away; a robot without a bus of lerobot's is disconnected, which is all its interface offers."""
+    """Switch the torque off; a robot without a bus of lerobot's is disconnected instead."""
     with faults("switch off"):
         if can_switch_off(robot):
             robot.bus.disable_torque()

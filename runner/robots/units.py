@@ -8,7 +8,7 @@ from enum import StrEnum
 
 
 class JointUnit(StrEnum):
-    """What one number of a robot means. The last two run from one end of the joint's calibrated range to the other."""
+    """Unit of a robot's number. The last two run over the joint's calibrated range."""
 
     DEG = "deg"
     RAD = "rad"
@@ -18,7 +18,10 @@ class JointUnit(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class JointScale:
-    """One joint's numbers ↔ rad. `sign` -1 turns the direction round; `offset_rad` is added to angles (never to percentages)."""
+    """Conversion of one joint's numbers to and from rad.
+
+    `sign` -1 reverses the direction; `offset_rad` is added to angles (never to percentages).
+    """
 
     unit: JointUnit
     lower_rad: float
@@ -27,7 +30,7 @@ class JointScale:
     offset_rad: float = 0.0
 
     def to_rad(self, value: float) -> float:
-        """What the robot says, in rad. Not clipped: a joint beyond its range is told as such."""
+        """Convert to rad. Not clipped: a joint beyond its range is reported as such."""
         match self.unit:
             case JointUnit.DEG:
                 return self.sign * math.radians(value) + self.offset_rad

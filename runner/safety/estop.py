@@ -45,8 +45,9 @@ _NO_DESCRIPTOR = (errno.EMFILE, errno.ENFILE)
 
 
 class Stoppable(Protocol):
-    """What the server needs of a runner. `request_estop` is called on the server's thread,
-    `obey_estop` on the control thread.
+    """What the server needs of a runner.
+
+    `request_estop` is called on the server's thread, `obey_estop` on the control thread.
     """
 
     @property
@@ -121,7 +122,7 @@ class EstopServer:
         self._file: tuple[int, int] | None = None  # device and inode of the bound socket
         self._thread = threading.Thread(target=self._main, name="estop", daemon=True)
 
-    # -- life --------------------------------------------------------------------------------------------------------
+    # -- life
     def __enter__(self) -> Self:
         self._listener = self._bind()
         self._keep_spare()
@@ -196,7 +197,7 @@ class EstopServer:
             return False
         return (found.st_dev, found.st_ino) == self._file
 
-    # -- the thread ----------------------------------------------------------------------------------------------------
+    # -- the thread
     def _main(self) -> None:
         if self._realtime:
             hasten(realtime=True)
@@ -218,9 +219,7 @@ class EstopServer:
             *(c.obey_by_s or c.since_s + self._silent_s for c in self._connections.values()),
         ]
         ready = self._selector.select(max(0.0, min(due) - time.monotonic()))
-        began_cpu_s = (
-            time.thread_time()
-        )  # waits for the interpreter are no work, and no reason to rest
+        began_cpu_s = time.thread_time()  # waiting for the interpreter lock is not work
         for key, _ in ready:
             if key.fileobj is self._listener:
                 self._accept()
@@ -238,7 +237,8 @@ class EstopServer:
                 self._reply(
                     connection,
                     Answer.HUNG,
-                    f"the control loop has not obeyed the emergency stop within {self._obey_s:.0f} s",
+                    f"the control loop has not obeyed the emergency stop"
+                    f" within {self._obey_s:.0f} s",
                 )
                 self._close(connection)
         self._keep_spare()

@@ -1,7 +1,7 @@
-"""The emergency stop's mark on disk: a runner that crashed, or was killed, after somebody stopped its robot does not move it again because
-systemd starts it anew.
+"""Mark of the emergency stop on disk: systemd must not restart a stopped robot into motion.
 
-Left the moment the stop latches, taken away when the program ends in order, which is a person's doing. Knows no robot.
+Written the moment the stop latches, removed when a person ends the program in order. It survives a
+crash or a kill. Must not know the robot.
 """
 
 from __future__ import annotations
@@ -27,13 +27,16 @@ class EstopMark:
         except FileNotFoundError:
             return
         raise EstopRequested(
-            f"an earlier run ended under its emergency stop, and not because somebody ended it: {reason}",
+            f"an earlier run ended under its emergency stop, not on request: {reason}",
             hint=f"look at the robot, then delete {self._path}",
             details={"reason": reason},
         )
 
     def leave(self, reason: str) -> None:
-        """Any thread. Never raises: the stop itself must go on. The first reason stays, as in the gate: it is why somebody has to look."""
+        """Leave the mark. Any thread.
+
+        Never raises: the stop itself must proceed. The first reason stays.
+        """
         try:
             with self._path.open("x", encoding="utf-8", errors="replace") as mark:
                 mark.write(f"{reason}\n")

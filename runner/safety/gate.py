@@ -1,9 +1,10 @@
-"""The gate before the motors, of a robot and of its simulation: joint ranges, joint and base speed, workspace, no-go zones, tool speed,
-effort, and how fresh the state is.
+"""Safety gate before the motors, of a robot and of its simulation.
 
-Every action passes it, whoever made it. What is a little too much is shortened and said, what is far too much is withheld: the robot
-then keeps its last targets. It judges by the measured state; where that is stale or incomplete nothing moves. `Action.safety_overrides`
-is not read: nobody who makes actions can switch a check off. Knows no skills, and nothing of the card's memory: no eviction weakens it.
+It checks joint ranges, joint and base speed, workspace, no-go zones, tool speed, effort, and how
+fresh the state is. Every action passes it. A small excess is shortened and reported, a large one is
+withheld: the robot then keeps its last targets. It judges by the measured state; where that is
+stale or incomplete nothing moves. `Action.safety_overrides` is not read: the source of an action
+cannot switch a check off. Must not know skills or GPU memory: no eviction weakens it.
 """
 
 from __future__ import annotations
@@ -29,8 +30,10 @@ from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
 from vram_arbiter.schemas.world import Action, WorldState
 
 MAX_STATE_AGE_S = 0.2  # an older joint state is not the robot's any more
-REFERENCE_AGE_S = 0.2  # steps are measured from the last target while it is so young, else from where the robot is
-SPARE = 1.0  # so many periods a joint may be ahead of its speed limit: what a tick came late the next one comes early
+# steps are measured from the last target while it is this young, else from the robot's pose
+REFERENCE_AGE_S = 0.2
+# periods a joint may be ahead of its speed limit: a late tick is made up by the next one
+SPARE = 1.0
 LATE_MAX = (
     1.5  # a late tick's step may be so much longer, no more: the servo makes it as fast as it can
 )
@@ -38,7 +41,7 @@ MAX_FOLLOWING_ERROR_RAD = (
     0.8  # a joint so far behind its target is blocked; servos lag by 0.1 s at most
 )
 OVERSPEED = 1.5  # a measured speed of so many times the limit is a fault, not a servo's overshoot
-EASE_FROM = 0.8  # from this share of an effort limit on, a joint is not told to push harder
+EASE_FROM = 0.8  # from this share of an effort limit on, a joint is not commanded to push harder
 SHORTENED_MIN = 0.5  # a tool step that would have to shrink to less than this share is withheld
 SHORTENINGS_MAX = 20
 EPSILON = 1e-9
@@ -50,7 +53,9 @@ Verdict = tuple[Action | None, tuple[str, ...]]
 
 @dataclass(slots=True)
 class _Memory:
-    """What all gates of one robot share: the last targets that passed (rad, stamp) and the latch."""
+    """State that all gates of one robot share: the last targets that passed (rad, stamp) and the
+    latch.
+    """
 
     last: dict[str, tuple[float, int]] = field(default_factory=dict)
     passed_ns: int = 0  # when the last action passed
@@ -74,13 +79,15 @@ class _Withheld(Exception):
 
 
 class RobotGate:
-    """`envelopes` by the name that errors use for them; each only tightens the robot's own limits (see `runner.safety.limits`).
+    """`envelopes` by the name that errors use; each only tightens the robot's own limits.
 
-    `sent` gives the last target (rad) that the motors really got, by joint (`HalBase.sent`): an action that passes here can still be
-    dropped for being late, and the next step must not begin where that one would have ended. Without it what passed counts as sent.
-    `now_ns` is the clock of the world's stamps: a skill that thought for long must not move the robot on what it saw before; without
-    it the state's age counts to the world state's stamp only. `needs` are the components of the world state that must be fresh, beside the joint state; None: all that are in it. Raises
-    ConfigError for envelopes that cannot be kept. `check` on the control thread, `trip` on any.
+    `sent` returns the last target (rad) that the motors really got, by joint (`HalBase.sent`): an
+    action that passes here can still be dropped for being late, and the next step must not begin
+    where that one would have ended. Without it what passed counts as sent. `now_ns` is the clock of
+    the world's stamps: a skill that thought for long must not move the robot on outdated inputs;
+    without it the state's age counts to the world state's stamp only. `needs` are the components of
+    the world state that must be fresh, beside the joint state; None: all of them. Raises
+    ConfigError for envelopes that cannot be enforced. `check` on the control thread, `trip` on any.
     """
 
     def __init__(
@@ -111,7 +118,10 @@ class RobotGate:
     def tightened(
         self, name: str, envelope: SafetyEnvelope | None, needs: frozenset[str] | None = None
     ) -> RobotGate:
-        """The gate for one goal: this one and the skill's envelope. Latch and last targets stay shared."""
+        """Return the gate for one goal: this one tightened by the skill's envelope.
+
+        Latch and targets stay shared.
+        """
         return RobotGate(
             self._robot,
             rate_hz=1.0 / self._period_s,
@@ -124,21 +134,26 @@ class RobotGate:
         )
 
     def for_skill(self, manifest: RSkillManifest | None, cameras: Iterable[str]) -> RobotGate:
-        """The gate for one skill's goals. Raises ConfigError for an envelope that cannot be kept on this robot."""
+        """Return the gate for one skill's goals.
+
+        Raises ConfigError for an envelope that cannot be enforced.
+        """
         if manifest is None:
             return self.tightened("", None, frozenset(cameras))
         return self.tightened(f"envelope of {manifest.name}", manifest.envelope, frozenset(cameras))
 
     @property
     def unkept(self) -> tuple[str, ...]:
-        """What the envelopes ask for and this gate does not keep: to be shown before the robot moves."""
+        """Return what the envelopes ask for and this gate cannot enforce: shown before the robot
+        moves.
+        """
         return self.limits.unkept
 
     def trip(self, reason: str) -> None:
         """Latch: from now on nothing passes, until the program is started again."""
         self._memory.tripped = self._memory.tripped or reason
 
-    # -- one action --------------------------------------------------------------------------------------------------------
+    # -- one action
     def check(self, action: Action, world: WorldState) -> Verdict:
         """The action to apply, possibly shortened, or None; and what was wrong with it."""
         problems: list[str] = []
@@ -149,8 +164,11 @@ class RobotGate:
         return allowed, tuple(problems)
 
     def _judge(self, action: Action, world: WorldState, problems: list[str]) -> Action:
-        """1. latch, freshness, form; a base's speed, and for an arm 2. ranges 3. measured state 4. efforts 5. joint speed 6. tool speed
-        7. workspace."""
+        """Check an action.
+
+        Order: 1. latch, freshness, form; a base's speed, and for an arm 2. ranges 3. measured state
+        4. efforts 5. joint speed 6. tool speed 7. workspace.
+        """
         if self._memory.tripped:
             raise _Withheld(f"the emergency stop is latched: {self._memory.tripped}")
         self._fresh(world)
@@ -222,10 +240,11 @@ class RobotGate:
         for place, force in world.contact_forces.items():
             if math.hypot(*force) > self.limits.contact_force_n:
                 raise _Withheld(
-                    f"{place}: {math.hypot(*force):.1f} N of contact, the limit is {self.limits.contact_force_n:g}"
+                    f"{place}: {math.hypot(*force):.1f} N of contact,"
+                    f" the limit is {self.limits.contact_force_n:g}"
                 )
 
-    # -- efforts -----------------------------------------------------------------------------------------------------------
+    # -- efforts
     def _yield(
         self,
         targets: Targets,
@@ -233,14 +252,17 @@ class RobotGate:
         world: WorldState,
         problems: list[str],
     ) -> frozenset[str]:
-        """Joints that push too hard get a target nearer to where they are. Withholding would keep up the pressure: targets stay."""
+        """Move the targets of joints that push too hard nearer to their positions.
+
+        Withholding would keep up the pressure: targets stay in force.
+        """
         yielding = set()
         for name, effort in zip(world.joint_state.name, world.joint_state.effort, strict=False):
             limit = self._effort_limit_nm(name)
             target = targets.get(name)
             if target is None or abs(effort) <= EASE_FROM * limit:
                 continue
-            # what made this effort is the last target's distance; with less distance there is less effort
+            # the effort comes from the target's distance: less distance, less effort
             share = min(1.0, limit / abs(effort))
             most = measured[name] + share * (self._last(name, measured) - measured[name])
             if (target - most) * effort <= 0:
@@ -267,7 +289,7 @@ class RobotGate:
             return self._sent().get(name, measured[name])
         return self._memory.last.get(name, (measured[name], 0))[0]
 
-    # -- speeds ------------------------------------------------------------------------------------------------------------
+    # -- speeds
     def _motion(
         self, targets: Targets, measured: Mapping[str, float], yielding: frozenset[str], now_ns: int
     ) -> _Motion:
@@ -326,9 +348,11 @@ class RobotGate:
             if (
                 behind > MAX_FOLLOWING_ERROR_RAD and name not in grippers
             ):  # a grasp is meant to block
-                # withholding would keep up the pressure; a policy that goes on from its far target is withheld as too fast
+                # withholding would keep up the pressure; a policy that continues from its far
+                # target is withheld as too fast
                 problems.append(
-                    f"{name} is {behind:.2f} rad behind its target: it does not follow, and is let go"
+                    f"{name} is {behind:.2f} rad behind its target:"
+                    " it does not follow, and is relaxed"
                 )
                 low, high = self.limits.joints_rad[name]
                 targets[name] = motion.start[name] = min(max(motion.measured[name], low), high)
@@ -341,7 +365,10 @@ class RobotGate:
         way = math.dist(begin, self._tool({**motion.measured, **targets}))
         if way <= longest + EPSILON:
             return
-        said = f"the tool would move {way * 1e3:.0f} mm in {motion.elapsed_s * 1e3:.0f} ms, the limit is {longest * 1e3:.0f} mm"
+        said = (
+            f"the tool would move {way * 1e3:.0f} mm in {motion.elapsed_s * 1e3:.0f} ms,"
+            f" the limit is {longest * 1e3:.0f} mm"
+        )
         share = longest / way
         if share < SHORTENED_MIN:
             raise _Withheld(said)
@@ -362,7 +389,7 @@ class RobotGate:
             low, high = self.limits.joints_rad[name]
             targets[name] = min(max(value, low), high)
 
-    # -- places ------------------------------------------------------------------------------------------------------------
+    # -- places
     def _workspace(self, targets: Targets, motion: _Motion, problems: list[str]) -> None:
         """The target and the way half there. A robot that is already outside may come back in."""
         if self._kinematics is None or (self.limits.box == EVERYWHERE and not self.limits.zones):

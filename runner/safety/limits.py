@@ -1,8 +1,9 @@
-"""What one robot may do now: its own limits, tightened by the deployment file's `safety` and by the skill's `envelope`.
+"""Limits of one robot, tightened by the deployment file's `safety` and the skill's `envelope`.
 
-Pure. Envelopes are intersected: of two numbers the smaller counts, of two boxes what both contain, of zones all. None of them can widen
-what the robot itself allows. What an envelope asks for and this runner cannot keep is either refused (a workspace without kinematics) or
-listed in `unkept`, for the operator to read before the robot moves; it is never dropped in silence.
+Pure. Envelopes are intersected: the smaller of two numbers, the intersection of two boxes, all
+zones. None can widen what the robot itself allows. What an envelope asks for and this runner cannot
+enforce is either refused (a workspace without kinematics) or listed in `unkept`, for the operator
+to read before the robot moves.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ POSITIVE = (
     "max_base_linear_speed_m_s",
     "max_base_angular_speed_rad_s",
 )
-"""Fields that the gate keeps; a NaN or a zero among them would switch a check off or stop everything."""
+"""Fields that the gate enforces; a NaN or a zero among them would disable a check or all motion."""
 NEEDS_KINEMATICS = (
     "workspace_box_min_xyz",
     "workspace_box_max_xyz",
@@ -43,21 +44,25 @@ NEEDS_KINEMATICS = (
     "max_ee_speed_m_s",
     "max_cartesian_step_m",
 )
-OF_A_TOPIC = ("e_stop_topic", "e_stop_qos")  # told once, below
+OF_A_TOPIC = ("e_stop_topic", "e_stop_qos")  # reported once, below
 
 
 class Kinematics(Protocol):
-    """Where an arm's parts are. Joints in rad by name, points in metres in the arm's base frame."""
+    """Positions of an arm's parts. Joints in rad by name, points in meters in the arm's base
+    frame.
+    """
 
     gripper_lever_m: float
     """From the gripper's axis to its pads: torque over this is the force at the pads."""
 
     def points(self, joints: Mapping[str, float]) -> Mapping[str, Vector3]:
-        """`tool` (between the fingers) and further points along the arm that must keep out of no-go zones."""
+        """Return the `tool` (between the fingers) and further points that must keep out of no-go
+        zones.
+        """
         ...
 
 
-# -- zones ----------------------------------------------------------------------------------------------------------------
+# -- zones
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -67,7 +72,7 @@ class _Zone(BaseModel):
 
 
 class BoxZone(_Zone):
-    """A box along the axes of the arm's base frame, in metres."""
+    """A box along the axes of the arm's base frame, in meters."""
 
     min_xyz: tuple[Finite, Finite, Finite]
     max_xyz: tuple[Finite, Finite, Finite]
@@ -85,7 +90,7 @@ class BoxZone(_Zone):
 
 
 class BallZone(_Zone):
-    """A ball in the arm's base frame, in metres."""
+    """A ball in the arm's base frame, in meters."""
 
     center_xyz: tuple[Finite, Finite, Finite]
     radius_m: Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -104,10 +109,10 @@ def outside_m(box: tuple[Vector3, Vector3], point: Vector3) -> float:
     return math.hypot(*(max(low - value, value - high, 0.0) for value, low, high in sides))
 
 
-# -- limits ---------------------------------------------------------------------------------------------------------------
+# -- limits
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Radians, metres, seconds, newtons. Infinite: nobody limits it."""
+    """Limits in radians, meters, seconds, newtons. Infinite: no limit."""
 
     joints_rad: Mapping[str, tuple[float, float]]
     speeds_rad_s: Mapping[str, float]
@@ -148,10 +153,11 @@ def tighten(
     name: str,
     kinematics: Kinematics | None,
 ) -> Limits:
-    """`limits` and `envelope`, both. `name` says whose envelope it is, for errors: `safety`, `envelope of lerobot/grab`.
+    """Return the intersection of `limits` and `envelope`.
 
-    Raises ConfigError for numbers that limit nothing, an empty workspace, a zone that nobody can read, and a workspace, zone or tool
-    speed that was asked for where the robot has no kinematics.
+    `name` names the envelope in errors: `safety`, `envelope of lerobot/grab`. Raises ConfigError
+    for numbers that limit nothing, an empty workspace, an unreadable zone, and a workspace, zone or
+    tool speed where the robot has no kinematics.
     """
     _refuse_what_is_wrong(limits, envelope, name, kinematics)
     box = _intersection(limits.box, envelope)
@@ -213,7 +219,8 @@ def _refuse_what_is_wrong(
             Problem(
                 0,
                 f"{name}.{key}",
-                "this cannot be kept: there are no kinematics of this robot (those of the SO-101 need MuJoCo)",
+                "this cannot be enforced: there are no kinematics of this robot"
+                " (those of the SO-101 need MuJoCo)",
             )
             for key in asked
             if getattr(envelope, key)
@@ -246,7 +253,7 @@ def _vector(values: Iterable[float]) -> Vector3:
 def _unkept(
     envelope: SafetyEnvelope, name: str, robot: RobotDescription, kinematics: Kinematics | None
 ) -> Sequence[str]:
-    """Fields that somebody wrote down and that this gate does not keep."""
+    """Return the given fields that this gate does not enforce."""
     kept = {*POSITIVE, *NEEDS_KINEMATICS, *OF_A_TOPIC}
     found = [
         f"{name}.{key}"

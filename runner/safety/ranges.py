@@ -1,7 +1,7 @@
-"""The first of the gate's checks (`runner.safety.gate`): joint targets are within the joints' ranges.
+"""First check of the gate (`runner.safety.gate`): joint targets are within the joints' ranges.
 
-A small excess (a learnt policy aims at a stop) is clamped and said; a large one is withheld. Knows joint names and ranges, not
-robots or skills.
+A small excess (a learned policy aims at a stop) is clamped and reported; a large one is withheld.
+Must not know robots or skills.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ class JointRanges:
     clamp_tolerance_rad: float = CLAMP_TOLERANCE_RAD
 
     def check(self, action: Action, world: WorldState) -> tuple[Action | None, tuple[str, ...]]:
-        """The action to apply, clamped where the excess is within tolerance, or None; and what was wrong with it."""
+        """Return the action to apply, clamped where the excess is tolerable, or None; and the
+        violations.
+        """
         if "joint_state" in world.stale:
             return None, ("the joint state is stale",)
         if action.control_mode is not ControlMode.JOINT_POSITION:
@@ -39,9 +41,9 @@ class JointRanges:
             values = []
             for name, value in zip(names, row, strict=True):
                 if name not in self.joint_limits:
-                    return None, (f"there is no joint {name}",)
+                    return None, (f"unknown joint {name}",)
                 if not math.isfinite(value):  # of a copy that was not validated
-                    return None, (f"{name}: {value} is no number of rad",)
+                    return None, (f"{name}: expected a number of rad, got {value}",)
                 low, high = self.joint_limits[name]
                 excess = max(low - value, value - high, 0.0)
                 if excess > 0:

@@ -1,6 +1,7 @@
-"""From the description of a camera to its reader. Nothing is opened here; what can be wrong in the description is said here.
+"""Readers from the description of a camera. Opens nothing; reports mistakes in the description.
 
-A backend is a module with `make(config, clock, tee) -> SlotReader`, imported when a camera asks for it.
+A backend is a module with `make(config, clock, tee) -> SlotReader`, imported when a camera needs
+it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,10 @@ BACKENDS: Mapping[SensorBackend, str] = {
 
 
 def make_reader(config: SensorReaderConfig, clock: Clock) -> SlotReader:
-    """The reader of one camera, not started. Raises ConfigError: backend not there, packages missing, parameters unknown or not needed."""
+    """Return the reader of one camera, not started.
+
+    Raises ConfigError: missing backend or packages, unknown or unneeded parameters.
+    """
     module = BACKENDS.get(config.backend)
     if module is None:
         known = ", ".join(BACKENDS)

@@ -1,7 +1,8 @@
-"""Cameras by GStreamer: devices, streams and files with hardware decoders, or any pipeline that an operator writes.
+"""Cameras by GStreamer: devices, streams and files with hardware decoders, or any pipeline.
 
-One thread a camera, which alone touches its pipeline. Frames carry the time at which the picture was taken, as far as the source says it.
-GStreamer is loaded when a reader is made, never by importing this: programs without such a camera stay free of it.
+One thread per camera, which alone touches its pipeline. Frames carry the time at which the picture
+was taken, as far as the source gives it. GStreamer is loaded when a reader is made, never by
+importing this module.
 """
 
 from __future__ import annotations
@@ -77,7 +78,8 @@ def load() -> Libraries:
     ) as error:  # ValueError: its word for a description that is not installed
         raise ConfigError(
             f"GStreamer cannot be used here: {error}",
-            hint="Debian, Ubuntu: install the system's packages that docs/runner.md names, then pip install 'vram-arbiter[gstreamer]'",
+            hint="Debian, Ubuntu: install the system's packages that docs/runner.md names,"
+            " then pip install 'vram-arbiter[gstreamer]'",
         ) from error
     if not Gst.is_initialized():
         Gst.init(None)
@@ -85,8 +87,12 @@ def load() -> Libraries:
 
 
 def _keep_unwinding() -> None:
-    """Let C++ exceptions unwind by libgcc, as before: Debian's GStreamer brings libunwind, whose functions have the same names, and the
-    next library that throws (matplotlib's, OpenCV's) would end the process. Whoever comes first in the global scope is taken."""
+    """Let C++ exceptions unwind by libgcc.
+
+    Debian's GStreamer brings libunwind, whose functions have the same names; the next library that
+    throws (matplotlib's, OpenCV's) would end the process. The first one in the global scope is
+    used.
+    """
     try:
         ctypes.CDLL("libgcc_s.so.1", mode=ctypes.RTLD_GLOBAL)
     except OSError as error:  # a system without GNU's compiler library has no such clash
@@ -94,7 +100,10 @@ def _keep_unwinding() -> None:
 
 
 def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> SlotReader:
-    """A reader, not started. Raises ConfigError: parameters, GStreamer or one of its elements missing, a pipeline that is none."""
+    """Return a reader, not started.
+
+    Raises ConfigError: wrong parameters, GStreamer or an element missing, an invalid pipeline.
+    """
     params = read_params(config, GStreamerParams)
     if params.path is not None and not Path(params.path).is_file():
         raise refuse(config, "path", f"there is no file {params.path}")
@@ -128,7 +137,8 @@ def _parse(libraries: Libraries, text: str) -> tuple[Any, Any]:
     sink = pipeline.get_by_name(SINK) if isinstance(pipeline, gst.Bin) else None
     if not isinstance(sink, libraries.app.AppSink):
         raise ValueError(
-            f"the pipeline has no appsink named {SINK}: end it with `appsink name={SINK}`, or with none"
+            f"the pipeline has no appsink named {SINK}: end it with `appsink name={SINK}`,"
+            " or without an appsink"
         )
     return pipeline, sink
 
@@ -153,7 +163,10 @@ def _explain(problem: str) -> str:
 
 
 class GStreamerReader(SlotReader):
-    """One camera through GStreamer. A source that ends or breaks ends the reader, with GStreamer's words as the reason."""
+    """One camera through GStreamer.
+
+    A source that ends or breaks ends the reader with GStreamer's reason.
+    """
 
     def __init__(
         self,
@@ -171,7 +184,10 @@ class GStreamerReader(SlotReader):
         self._thread: threading.Thread | None = None
 
     def _run_begins(self, feed: Feed) -> None:
-        """Wait until the source is open; for a file, until its first picture is decoded. Raises FrameStale when it cannot be opened."""
+        """Wait until the source is open; for a file, until its first picture is decoded.
+
+        Raises FrameStale.
+        """
         opened: Future[None] = Future()
         self._stopping = threading.Event()
         self._thread = threading.Thread(
@@ -208,7 +224,7 @@ class GStreamerReader(SlotReader):
                 )
             self._thread = None
 
-    # -- on the camera's thread ---------------------------------------------------------------------------------
+    # -- on the camera's thread
     def _run(self, feed: Feed, opened: Future[None], stopping: threading.Event) -> None:
         run = None
         try:
@@ -274,13 +290,17 @@ class _Run:
             raise _Broken(self._problem() or "the pipeline does not start")
         if begun == gst.StateChangeReturn.ASYNC:
             raise _Broken(self._problem() or f"it has given no picture within {START_S:.0f} s")
-        # a live source sets the pace itself and its pictures are wanted at once; a recording is played at its own
+        # a live source sets the pace itself and its pictures are needed at once; a recording is
+        # played at its own pace
         self._sink.set_property("sync", begun != gst.StateChangeReturn.NO_PREROLL)
         if self._pipeline.set_state(gst.State.PLAYING) == gst.StateChangeReturn.FAILURE:
             raise _Broken(self._problem() or "the pipeline does not play")
 
     def next_frame(self) -> SensorFrame | None:
-        """The newest picture, or None after a while without one or for a damaged one. Raises _Broken when there will be no more."""
+        """Return the newest picture, or None after a while without one or for a damaged one.
+
+        Raises _Broken when there will be no more.
+        """
         sample = self._sink.try_pull_sample(POLL_NS)
         # at the end there is nothing to wait for at the sink, so wait at the bus
         at_end = sample is None and self._sink.is_eos()
@@ -340,7 +360,8 @@ class _Run:
         info = video.VideoInfo.new_from_caps(caps)
         if info is None:
             raise _Broken(f"its pictures cannot be understood: {caps.to_string()}")
-        # a decoder may lay its rows out otherwise than the format's rule, and then says so with the buffer
+        # a decoder may lay its rows out differently from the format's rule, and says so in the
+        # buffer
         meta = video.buffer_get_video_meta(buffer) or info
         stride, offset, row = meta.stride[0], meta.offset[0], info.width * pixel_bytes
         data = buffer.extract_dup(0, buffer.get_size())
@@ -355,8 +376,11 @@ class _Run:
         return info.width, info.height, b"".join(view[start : start + row] for start in starts)
 
     def _clocks_apart_ns(self) -> int:
-        """The runner's clock less GStreamer's. Measured once: a thread that is stopped between looking at the one and at the other for each
-        picture would make it younger than it is."""
+        """Return the runner's clock minus GStreamer's.
+
+        Measured once: a thread that is preempted between reading both clocks would make a picture
+        look younger than it is.
+        """
         looks = []
         for _ in range(CLOCK_LOOKS):
             before_ns, theirs_ns = self._clock.now_ns(), int(self._time.get_time())
@@ -364,7 +388,9 @@ class _Run:
         return min(looks)[1]
 
     def _taken_ns(self, segment: Any, buffer: Any, now_ns: int) -> int:
-        """When the picture was taken by its own stamp, on the runner's clock; `now_ns` if it has none or one of the future."""
+        """Return when the picture was taken, on the runner's clock; `now_ns` without a usable
+        stamp.
+        """
         running = segment.to_running_time(self._gst.Format.TIME, buffer.pts)
         base = self._pipeline.get_base_time()
         if NANOSECONDS_MAX in (buffer.pts, running, base):
@@ -373,7 +399,9 @@ class _Run:
 
 
 def _words(message: Any) -> str:
-    """An error of GStreamer: who, what, and where it says so, the internal part (file names, line numbers)."""
+    """Describe an error of GStreamer: element, message, and the internal part (file names,
+    lines).
+    """
     error, debug = message.parse_error()
     reason = debug.rpartition("\n")[2].strip() if debug and "\n" in debug else ""
     text = f"{message.src.get_name()}: {error.message.strip()}" + (f" ({reason})" if reason else "")

@@ -1,13 +1,15 @@
-"""How late a picture comes, from the source's own time stamps: what waited in a driver's or the network's queue is as old as it is.
+"""Delay of pictures in queues, from the source's own time stamps.
 
-Arrival alone would call everything fresh that a stream delivers in a rush after it, or this program, stood still. A source counts its own
-time from an unknown start; the smallest difference seen between arrival and that count belongs to the picture that waited least, and how far a
-picture lies above it is how much longer it waited. The part that every picture takes stays unseen.
+By arrival alone, everything that a stream delivers in a rush after a pause would look fresh. A
+source counts its own time from an unknown start; the smallest difference seen between arrival and
+that count belongs to the picture that waited least, and how far a picture lies above it is how much
+longer it waited. The part that every picture takes stays unseen.
 """
 
 from __future__ import annotations
 
-WINDOW_S = 15.0  # the smallest difference of this and the window before it counts: the two clocks drift apart, some ms a minute
+# the smallest difference of this and the window before it counts: the two clocks drift
+WINDOW_S = 15.0
 
 
 class LagMeter:
@@ -20,9 +22,10 @@ class LagMeter:
         self._last_pts_ns: int | None = None
 
     def taken_ns(self, arrival_ns: int, pts_ms: float) -> int:
-        """When the picture was taken, by the clock of `arrival_ns` and never later than it. `pts_ms` is the source's own time of it.
+        """Return when the picture was taken, by the clock of `arrival_ns` and never later than it.
 
-        A source whose time does not move has none: its pictures count from their arrival. One that begins anew is measured anew.
+        `pts_ms` is the source's own time of it. Pictures of a source whose time does not move count
+        from their arrival; a source that restarts is measured anew.
         """
         pts_ns = round(pts_ms * 1e6)
         if self._last_pts_ns is None or pts_ns <= self._last_pts_ns:

@@ -1,7 +1,8 @@
-"""Cameras by OpenCV: a device of this machine, a video file, or a stream by URL (RTSP). One thread a camera.
+"""Cameras by OpenCV: a local device, a video file, or a stream by URL (RTSP). One thread each.
 
-OpenCV works with one thread inside (`cv2.setNumThreads(1)`): the cores belong to the control loop and the models. A device or a stream that breaks
-off is opened again, a bounded number of times and ever more slowly; a file is paced at its own rate and ends.
+OpenCV works with one thread inside (`cv2.setNumThreads(1)`): the cores belong to the control loop
+and the models. A device or a stream that breaks is reopened, a bounded number of times and ever
+more slowly; a file is paced at its own rate and ends.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ Pixels = Annotated[int, Field(gt=0, le=16_384)]
 
 
 class OpenCvParams(BackendParams):
-    """`backend_params` of `opencv_thread`: one of `device`, `path` and `url`, and what goes with it."""
+    """`backend_params` of `opencv_thread`: one of `device`, `path` and `url`, and their options."""
 
     device: Annotated[int, Field(ge=0, le=255)] | None = None
     """Number of a camera of this machine: 0 is /dev/video0."""
@@ -53,8 +54,11 @@ class OpenCvParams(BackendParams):
     reconnect_s: Seconds = 0.25
     """Devices and URLs: pause before the first new try."""
     stamp: Literal["source", "arrival"] = "source"
-    """Devices and URLs: what a picture's age counts from. `source` adds the time that it waited in a queue, by the source's own stamps; `arrival` is for
-    sources whose stamps are wrong."""
+    """Devices and URLs: start of a picture's age.
+
+    `source` adds the time that it waited in a queue, by the source's own stamps; `arrival` is for
+    sources whose stamps are wrong.
+    """
     timeout_s: Seconds = 5.0
     """URLs: the longest that opening, or waiting for a picture, may take."""
 
@@ -98,7 +102,10 @@ def without_credentials(url: str) -> str:
 
 
 def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> SlotReader:
-    """A reader, not started. Raises ConfigError: parameters, a file that is not there, OpenCV not installed."""
+    """Return a reader, not started.
+
+    Raises ConfigError: wrong parameters, missing file, missing OpenCV.
+    """
     params = read_params(config, OpenCvParams)
     require_module(config, "cv2", "OpenCV", "runner")
     if params.path is not None and not Path(params.path).is_file():
@@ -138,7 +145,7 @@ class OpenCvReader(SlotReader):
             self._thread.join(STOP_S)
             self._thread = None
 
-    # -- on the camera's thread ---------------------------------------------------------------------------------
+    # -- on the camera's thread
     def _run(self, feed: Feed, stopping: threading.Event) -> None:
         import cv2
 
@@ -186,7 +193,10 @@ class OpenCvReader(SlotReader):
                 return
 
     def _play(self, cv2: Any, feed: Feed, stopping: threading.Event) -> None:
-        """A file: each picture at its time, as at the camera that took it. A late picture shifts the rest, nothing is caught up in a burst."""
+        """Play a file at its own pace.
+
+        A late picture shifts the rest, nothing is caught up in a burst.
+        """
         params = self._params
         while True:
             capture = self._open(cv2)
@@ -249,7 +259,11 @@ class OpenCvReader(SlotReader):
             capture.set(cv2.CAP_PROP_FPS, params.fps)
 
     def _take(self, cv2: Any, capture: Any, lag: LagMeter | None = None) -> SensorFrame | None:
-        """The next picture, stamped when it was taken, as far as `lag` can tell, else when it arrived; None if there is none."""
+        """Return the next picture, stamped when it was taken as far as `lag` knows, else on
+        arrival.
+
+        None if there is none.
+        """
         if not capture.grab():
             return None
         arrival_ns, wall_ns = self.clock.now_ns(), self.clock.wall_ns()
@@ -274,7 +288,7 @@ class OpenCvReader(SlotReader):
 
 
 def as_encoding(cv2: Any, image: Any, encoding: Literal["bgr8", "rgb8", "mono8"]) -> Any:
-    """An 8-bit picture of OpenCV (grey, or blue-green-red) in the layout of `encoding`."""
+    """Return an 8-bit picture of OpenCV (gray, or blue-green-red) in the layout of `encoding`."""
     grey = image.ndim == 2 or image.shape[2] == 1
     if encoding == "mono8":
         return image.reshape(image.shape[:2]) if grey else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)

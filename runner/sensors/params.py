@@ -1,4 +1,4 @@
-"""`backend_params` of a deployment file: read by the backend that they are for, refused with the name of the field otherwise.
+"""`backend_params` of a deployment file, read by their backend, with errors by field.
 
 Everything here happens while a reader is made, before any device is opened.
 """
@@ -17,7 +17,7 @@ from vram_arbiter.schemas.yamltext import Problem, YamlText, config_error, probl
 
 
 class BackendParams(BaseModel):
-    """Base of each backend's parameters. Strict: the text "0" is no device number."""
+    """Base of each backend's parameters. Strict: the text "0" is not a device number."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
@@ -25,7 +25,10 @@ class BackendParams(BaseModel):
 
 
 def read_params[P: BackendParams](config: SensorReaderConfig, model: type[P]) -> P:
-    """The parameters of one camera. Raises ConfigError with every unknown, unneeded, missing or wrong one."""
+    """Read the parameters of one camera.
+
+    Raises ConfigError with every unknown, unneeded, missing or wrong one.
+    """
     try:
         return model.model_validate(dict(config.backend_params))
     except ValidationError as error:
@@ -46,7 +49,7 @@ def refuse_field(config: SensorReaderConfig, field: str, problem: str) -> Config
 
 
 def require_module(config: SensorReaderConfig, module: str, distribution: str, extra: str) -> None:
-    """Raise ConfigError unless `module` can be imported; does not import it (heavy packages wait until they are used)."""
+    """Raise ConfigError unless `module` can be imported; heavy packages are imported when used."""
     if importlib.util.find_spec(module) is None:
         problem = f"{config.backend} needs {distribution}: pip install 'vram-arbiter[{extra}]'"
         raise refuse_field(config, "backend", problem)

@@ -1,7 +1,8 @@
-"""GStreamer pipelines as text: from what a deployment file says of a camera and the platform to what `gst-launch-1.0` would take.
+"""GStreamer pipelines as text, from a camera's description and the platform.
 
-Pure: loads no GStreamer and looks at no machine. Every pipeline ends in an appsink named `sink`, to which the reader gives format, depth and
-pacing. What an operator wrote goes in as quoted values only: a path with a `!` in it is a path, not another element.
+Pure: loads no GStreamer and looks at no machine. Every pipeline ends in an appsink named `sink`, to
+which the reader gives format, depth and pacing. An operator's values are quoted: a path with a `!`
+in it is a path, not another element.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ SINK = "sink"
 FPS_MAX = 1000.0
 LATENCY_MAX_MS = 10_000
 RTSP_TIMEOUT_S = (
-    5  # a server that says nothing for so long is gone; GStreamer's own 20 s suit films, not robots
+    5  # a server that is silent for this long is gone; GStreamer's own 20 s suit films, not robots
 )
 
 Source = Literal["v4l2", "rtsp", "file", "test"]
@@ -36,7 +37,10 @@ class GStreamerParams(BackendParams):
     """`backend_params` of `gstreamer`: either `pipeline`, or `source` and what goes with it."""
 
     pipeline: Text | None = None
-    """A whole pipeline as for gst-launch-1.0. Without an appsink its end is converted and taken; one of its own must be named `sink`."""
+    """A whole pipeline as for gst-launch-1.0.
+
+    Without an appsink its end is converted and taken; one of its own must be named `sink`.
+    """
     source: Source | None = None
     device: Value | None = None
     """v4l2: /dev/video0."""
@@ -49,7 +53,10 @@ class GStreamerParams(BackendParams):
     codec: Codec | None = None
     """v4l2: raw if not given; rtsp and file: h264 if not given."""
     encoding: Encoding = "bgr8"
-    """Of the frames. `jpeg` hands on what an mjpeg camera sends; `depth16` (mm) is taken only from a device that gives it itself."""
+    """Encoding of the frames.
+
+    `jpeg` passes on what an mjpeg camera sends; `depth16` (mm) is taken only from a depth device.
+    """
     width: Pixels | None = None
     """v4l2 and test: asked of the source. rtsp and file: scaled to."""
     height: Pixels | None = None
@@ -62,7 +69,7 @@ class GStreamerParams(BackendParams):
     loop: bool = False
     """file: begin again at the end."""
     platform: Literal["tegra", "nvidia_desktop", "cpu_only"] | None = None
-    """Whose decoders; probed if not given."""
+    """Platform of the decoders; probed if not given."""
 
     @model_validator(mode="after")
     def _fits_the_source(self) -> Self:
@@ -90,7 +97,8 @@ class GStreamerParams(BackendParams):
             return
         if self.source in ("rtsp", "file") and self.codec == "raw":
             raise ValueError(
-                f"source {self.source} carries mjpeg, h264 or h265; for anything else write a pipeline"
+                f"source {self.source} carries mjpeg, h264 or h265;"
+                " for anything else write a pipeline"
             )
         if self.path is not None:
             demuxer(self.path, self.codec_used)
@@ -162,13 +170,14 @@ _DECODERS: Mapping[Platform, Mapping[Codec, str]] = {
         "h264": "h264parse ! nvv4l2decoder",
         "h265": "h265parse ! nvv4l2decoder",
     },
-    # JPEG by the CPU: many cameras send 4:2:2, which the card's JPEG decoder refuses
+    # JPEG on the CPU: many cameras send 4:2:2, which the GPU's JPEG decoder refuses
     Platform.NVIDIA_DESKTOP: {
         "mjpeg": "jpegdec",
         "h264": "h264parse ! nvh264dec",
         "h265": "h265parse ! nvh265dec",
     },
-    # no parser: depayloaders and demuxers give whole pictures already, and Debian keeps the parsers in a large package
+    # no parser: depayloaders and demuxers give whole pictures already, and Debian keeps the parsers
+    # in a large package
     Platform.CPU_ONLY: {"mjpeg": "jpegdec", "h264": "avdec_h264", "h265": "avdec_h265"},
 }
 _LATEST_ONLY = "queue leaky=downstream max-size-buffers=1 max-size-bytes=0 max-size-time=0"
@@ -204,7 +213,10 @@ def framerate(fps: float) -> str:
 
 
 def build(params: GStreamerParams, platform: Platform) -> str:
-    """The text of one camera's pipeline, `platform` (unless the parameters name another) choosing decoders and converters."""
+    """Return one camera's pipeline.
+
+    `platform` (unless the parameters name one) chooses the elements.
+    """
     if params.pipeline is not None:
         if re.search(r"\bappsink\b", params.pipeline):
             return params.pipeline
@@ -237,7 +249,10 @@ def _source(params: GStreamerParams) -> list[str]:
         return [f"v4l2src device={quoted(params.device or '')}", form + _asked(params)]
     if params.source == "rtsp":
         microseconds = RTSP_TIMEOUT_S * 1_000_000
-        head = f"rtspsrc location={quoted(params.url or '')} protocols={params.transport} latency={params.latency_ms}"
+        head = (
+            f"rtspsrc location={quoted(params.url or '')} protocols={params.transport}"
+            f" latency={params.latency_ms}"
+        )
         return [f"{head} timeout={microseconds} tcp-timeout={microseconds}", _DEPAY[codec]]
     if params.source == "file":
         return [f"filesrc location={quoted(params.path or '')}", demuxer(params.path or "", codec)]
@@ -253,11 +268,10 @@ def _decode(params: GStreamerParams, platform: Platform) -> list[str]:
     scaled = _size(params) if params.source in ("rtsp", "file") else ""
     elements = [_DECODERS[platform][codec]]
     if params.source != "file":
-        elements.append(
-            _LATEST_ONLY
-        )  # whoever converts too slowly loses pictures instead of falling behind
+        elements.append(_LATEST_ONLY)  # a slow converter loses pictures instead of falling behind
     if platform is Platform.TEGRA:
-        # only there are decoded pictures in NVMM memory; the engine that brings them out of it scales as well
+        # only there are decoded pictures in NVMM memory; the engine that copies them out scales as
+        # well
         elements += ["nvvidconv", f"video/x-raw,format=BGRx{scaled}"]
     elif scaled:
         elements += ["videoscale", f"video/x-raw{scaled}"]
@@ -265,5 +279,8 @@ def _decode(params: GStreamerParams, platform: Platform) -> list[str]:
 
 
 def _convert(params: GStreamerParams) -> list[str]:
-    """Into the colours asked for. Nothing is converted to depth: grey values are no distances."""
+    """Convert to the requested colors.
+
+    Nothing is converted to depth: gray values are not distances.
+    """
     return [] if params.encoding in ("depth16", "jpeg") else ["videoconvert"]

@@ -1,7 +1,8 @@
-"""What machine this is, as far as decoding pictures goes: Tegra, a PC with an NVIDIA card, or a CPU alone.
+"""Platform of picture decoding: Tegra, a PC with an NVIDIA GPU, or a CPU alone.
 
-Looks at files that drivers and boards put there; loads no driver library, needs no permission and never fails. It says what the machine
-is, not whether a certain decoder is installed: whoever builds a pipeline checks that element by element.
+Looks at files that drivers and boards provide; loads no driver library, needs no permission and
+never fails. It does not check whether a decoder is installed: the pipeline builder checks each
+element.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ from enum import StrEnum
 from pathlib import Path
 
 TEGRA_RELEASE = "etc/nv_tegra_release"
-BOARD = "proc/device-tree/compatible"  # NUL-separated texts, such as nvidia,p3737-0000 and nvidia,tegra234
+# NUL-separated texts, such as nvidia,p3737-0000 and nvidia,tegra234
+BOARD = "proc/device-tree/compatible"
 DRIVER = "proc/driver/nvidia/version"
 CARDS = "dev/nvidia[0-9]*"
 
@@ -22,7 +24,7 @@ class Platform(StrEnum):
     TEGRA = "tegra"
     """Jetson: nvv4l2decoder and nvvidconv on NVMM memory."""
     NVIDIA_DESKTOP = "nvidia_desktop"
-    """A PC or server with an NVIDIA card: nvh264dec and the like, plain videoconvert behind them."""
+    """A PC or server with an NVIDIA GPU: nvh264dec and the like, plain videoconvert behind them."""
     CPU_ONLY = "cpu_only"
     """No NVIDIA device that this process can reach: software decoders."""
 
@@ -36,7 +38,10 @@ class PlatformReport:
 
 
 def probe_platform(root: Path = Path("/")) -> PlatformReport:
-    """Look at the machine whose file system begins at `root`. Tegra is asked first: new Jetsons show a PC's device files as well."""
+    """Probe the machine whose file system begins at `root`.
+
+    Tegra comes first: new Jetsons have a PC's device files as well.
+    """
     if (root / TEGRA_RELEASE).exists():
         return PlatformReport(Platform.TEGRA, f"/{TEGRA_RELEASE} exists")
     if board := next(

@@ -1,6 +1,6 @@
-"""ROS 2's side of DDS: topic and type names, the domain, the quality of service. Cyclone DDS, without a ROS installation.
+"""ROS 2's side of DDS: topic and type names, domain, quality of service. Needs no ROS installation.
 
-Which network is used is Cyclone's own business: `CYCLONEDDS_URI` says it, as it does for ROS with rmw_cyclonedds.
+Cyclone DDS chooses the network: `CYCLONEDDS_URI` configures it, as for ROS with rmw_cyclonedds.
 """
 
 from __future__ import annotations
@@ -23,10 +23,15 @@ _NAME = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*")
 
 
 def full_topic(name: str) -> str:
-    """A topic as `ros2 topic list` shows it, with its leading slash. Raises ValueError if it is no ROS name."""
+    """Return the DDS topic of a ROS name with its leading slash.
+
+    Raises ValueError for a wrong name.
+    """
     if not _NAME.fullmatch(name):
         raise ValueError(
-            f"{name!r} is no ROS topic: letters, digits and _ between slashes, such as /front/image_raw"
+            "expected a ROS topic (letters, digits and _ between slashes,"
+            " such as /front/image_raw),"
+            f" got {name!r}"
         )
     return "/" + name.removeprefix("/")
 
@@ -46,9 +51,10 @@ def domain_of(environment: Mapping[str, str] = os.environ) -> int:
 
 @functools.cache
 def dds_type(kind: MessageKind) -> Any:
-    """The DDS type of a message, under the name that ROS gives it.
+    """Return the DDS type of a message, under its ROS name.
 
-    Its samples stay as bytes (`cdr_of`, `sample_of`): the fields only describe the type to other participants.
+    Its samples stay as bytes (`cdr_of`, `sample_of`): the fields only describe the type to other
+    participants.
     """
     from cyclonedds.idl import make_idl_struct
     from cyclonedds.idl.types import int32, sequence, uint8, uint32
@@ -61,7 +67,8 @@ def dds_type(kind: MessageKind) -> Any:
     )
     if kind == "image":
         fields = {
-            "header": header, "height": uint32, "width": uint32, "encoding": str, "is_bigendian": uint8, "step": uint32,
+            "header": header, "height": uint32, "width": uint32, "encoding": str,
+            "is_bigendian": uint8, "step": uint32,
             "data": sequence[uint8],
         }  # fmt: skip
         made = make_idl_struct("Image_", "sensor_msgs.msg.dds_.Image_", fields)
@@ -87,7 +94,10 @@ def cdr_of(sample: Any) -> bytes:
 
 
 def qos_of(reliability: str, *, writer: bool) -> Any:
-    """What ROS offers or asks: volatile, the newest sample only, plain CDR. A writer never waits for a slow reader: it drops."""
+    """Return ROS's quality of service: volatile, newest sample only, plain CDR.
+
+    A writer never waits for a slow reader: it drops.
+    """
     from cyclonedds.core import Policy, Qos
 
     reliable = Policy.Reliability.Reliable(max_blocking_time=0)
@@ -104,7 +114,9 @@ def qos_of(reliability: str, *, writer: bool) -> Any:
 
 @contextmanager
 def dds_problems(domain_id: int) -> Iterator[None]:
-    """Turns DDS's errors while something is made into ConfigError: no such interface, a broken CYCLONEDDS_URI, no free port."""
+    """Turn DDS's errors into ConfigError: no such interface, a broken CYCLONEDDS_URI, no free
+    port.
+    """
     from cyclonedds.core import DDSException
 
     try:
@@ -112,5 +124,5 @@ def dds_problems(domain_id: int) -> Iterator[None]:
     except DDSException as error:
         raise ConfigError(
             f"DDS could not be started on domain {domain_id}: {error}",
-            hint="look at CYCLONEDDS_URI: its interfaces and peers; Cyclone's own words are on stderr",
+            hint="look at CYCLONEDDS_URI: its interfaces and peers; Cyclone logs details on stderr",
         ) from error

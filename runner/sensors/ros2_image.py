@@ -1,4 +1,4 @@
-"""Cameras of ROS 2, read from the network by DDS, and the way back: the frames of any reader as ROS pictures."""
+"""Cameras of ROS 2, read from the network by DDS, and the frames of any reader as ROS pictures."""
 
 from __future__ import annotations
 
@@ -68,7 +68,10 @@ class RosImageParams(BackendParams):
     domain_id: Annotated[int, Field(ge=0, le=DOMAIN_MAX)] | None = None
     """null: ROS_DOMAIN_ID of the environment, else 0."""
     stamp: Literal["header", "arrival"] = "header"
-    """What a picture's age counts from: its header's stamp (the clocks of both machines must agree), or its arrival here (delays stay unseen)."""
+    """Start of a picture's age: its header's stamp, or its arrival.
+
+    With the stamp the clocks of both machines must agree; with the arrival delays stay unseen.
+    """
 
 
 def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> SlotReader:
@@ -100,7 +103,9 @@ def make_tee(config: SensorReaderConfig) -> RosImagePublisher:
 
 
 class RosImageReader(SlotReader):
-    """One ROS topic as a camera. Its thread sleeps in DDS until a picture comes, publishers come or go, or it is stopped."""
+    """One ROS topic as a camera. Its thread sleeps in DDS until something happens or it is
+    stopped.
+    """
 
     def __init__(
         self,
@@ -162,7 +167,7 @@ class RosImageReader(SlotReader):
             self._thread.join(STOP_S)
             self._thread = self._guard = None
 
-    # -- on the camera's thread ---------------------------------------------------------------------------------
+    # -- on the camera's thread
     def _run(self, feed: Feed, waitset: Any, reader: Any, guard: Any) -> None:
         from cyclonedds.core import DDSException
         from cyclonedds.util import duration
@@ -195,15 +200,18 @@ class RosImageReader(SlotReader):
         refused = reader.get_requested_incompatible_qos_status()
         if matched.current_count:
             return
-        # what those who left have sent before comes before the word that they are gone: a picture says that somebody is there
+        # pictures that former publishers sent arrive before the notice that they are gone
         self._take(feed, reader)
         if matched.current_count_change < 0:
-            feed.interrupt(f"nobody publishes on {self._topic} any more")
+            feed.interrupt(f"{self._topic} has no publisher any more")
         if refused.total_count_change:
             feed.interrupt(
-                f"who publishes on {self._topic} offers best effort, and this reader asks for reliable: say reliability: best_effort"
+                f"the publisher on {self._topic} offers best effort,"
+                " and this reader asks for reliable:"
+                " set reliability: best_effort"
                 if refused.last_policy_id == _RELIABILITY
-                else f"a publisher on {self._topic} offers another quality of service (policy {refused.last_policy_id})"
+                else f"a publisher on {self._topic} offers another quality of service"
+                f" (policy {refused.last_policy_id})"
             )
 
     def _take(self, feed: Feed, reader: Any) -> None:
@@ -235,7 +243,9 @@ class RosImageReader(SlotReader):
         age_ns = wall_ns - taken_ns
         if age_ns < -AHEAD_MAX_NS:
             raise ValueError(
-                f"it is stamped {-age_ns / 1e6:.0f} ms in the future; set the machines' clocks, or say stamp: arrival"
+                f"it is stamped {-age_ns / 1e6:.0f} ms in the future;"
+                " synchronize the machines' clocks,"
+                " or set stamp: arrival"
             )
         return SensorFrame(
             sensor_id=self.sensor_id,
@@ -251,14 +261,17 @@ class RosImageReader(SlotReader):
 
 
 class RosImagePublisher:
-    """A `FrameTee` onto a ROS topic: Image, or CompressedImage for JPEG frames.
+    """`FrameTee` to a ROS topic: Image, or CompressedImage for JPEG frames.
 
-    Offered as reliable, which every ROS subscriber takes; kept for nobody, so a slow one misses pictures and the camera never waits.
-    `publish` never raises: pictures that could not be sent are counted in `dropped`, and the first of a row is logged.
+    Offered as reliable, which every ROS subscriber takes; without history, so a slow subscriber
+    misses pictures and the camera never waits. `publish` never raises: failures are counted in
+    `dropped`, and the first of a series is logged.
     """
 
     def __init__(self, topic: str, domain_id: int, *, rate_hz: float | None = None) -> None:
-        """Raises ValueError if `topic` is no ROS name. `rate_hz`: at most so many pictures a second."""
+        """Raises ValueError if `topic` is not a ROS name. `rate_hz` limits the pictures per
+        second.
+        """
         self.topic = full_topic(topic)
         self.domain_id = domain_id
         self.published = 0

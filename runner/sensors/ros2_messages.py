@@ -1,7 +1,8 @@
-"""The two picture messages of ROS 2 (`sensor_msgs/Image`, `sensor_msgs/CompressedImage`): their bytes, and what they mean as frames.
+"""Picture messages of ROS 2 (`sensor_msgs/Image`, `sensor_msgs/CompressedImage`) as frames.
 
-Pure: no DDS, no clock. Their CDR is written and read here because a general codec makes a Python list with one integer a byte of every
-picture, 50 ms of the interpreter for 640 × 480. Nothing is guessed: a message whose parts contradict each other is a ValueError.
+Pure: no DDS, no clock. Their CDR is written and read here because a general codec makes a Python
+list with one integer per byte of every picture, 50 ms of the interpreter for 640 × 480. Nothing is
+guessed: a message whose parts contradict each other is a ValueError.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from vram_arbiter.schemas.world import FrameEncoding
 NANOSECONDS = 1_000_000_000
 STAMP_END_NS = 2**31 * NANOSECONDS
 SIDE_MAX = 16_384  # pixels
-MESSAGE_BYTES_MAX = 256 * 2**20  # 8K pictures with 16 bits a colour are 200 MB
+MESSAGE_BYTES_MAX = 256 * 2**20  # 8K pictures with 16 bits a color are 200 MB
 
 _ENCODINGS: Mapping[str, tuple[FrameEncoding, int]] = {
     "bgr8": (FrameEncoding.BGR8, 3),
@@ -27,7 +28,7 @@ _ENCODINGS: Mapping[str, tuple[FrameEncoding, int]] = {
     "8UC1": (FrameEncoding.MONO8, 1),
     "16UC1": (FrameEncoding.DEPTH16, 2),
 }
-"""ROS's name → ours, and bytes per pixel. `16UC1` is depth in millimetres (REP 118)."""
+"""ROS's name → ours, and bytes per pixel. `16UC1` is depth in millimeters (REP 118)."""
 _ROS_NAME = {
     FrameEncoding.BGR8: "bgr8",
     FrameEncoding.RGB8: "rgb8",
@@ -38,7 +39,7 @@ _ROS_NAME = {
 
 @dataclass(frozen=True, slots=True)
 class RosImage:
-    """`sensor_msgs/Image`. `stamp_ns` counts from 1970 by the sender's clock; 0 means that it was not stamped."""
+    """`sensor_msgs/Image`. `stamp_ns` counts from 1970 by the sender's clock; 0: not stamped."""
 
     stamp_ns: int
     frame_id: str
@@ -72,7 +73,10 @@ class ImageContent:
 
 
 def picture_of(message: RosImage | RosCompressedImage) -> ImageContent:
-    """The picture in a message, without the padding of its rows, 16-bit values in little-endian order. Raises ValueError with the reason."""
+    """Return the picture in a message. Raises ValueError with the reason.
+
+    Rows lose their padding, 16-bit values become little-endian.
+    """
     if isinstance(message, RosCompressedImage):
         return _compressed(message)
     known = _ENCODINGS.get(message.encoding)
@@ -86,7 +90,8 @@ def picture_of(message: RosImage | RosCompressedImage) -> ImageContent:
     row, step, rows = message.width * per_pixel, message.step, message.height
     if step < row or len(message.data) != step * rows:
         raise ValueError(
-            f"{rows} rows of {step} bytes do not make a {encoding} picture of {message.width} × {rows} in {len(message.data)} bytes"
+            f"{rows} rows of {step} bytes do not make a {encoding} picture"
+            f" of {message.width} × {rows} in {len(message.data)} bytes"
         )
     data = message.data
     if step > row:
@@ -109,7 +114,10 @@ def _compressed(message: RosCompressedImage) -> ImageContent:
 def message_of(
     picture: ImageContent, stamp_ns: int, frame_id: str
 ) -> RosImage | RosCompressedImage:
-    """A frame's picture as the ROS message that fits it. Raises ValueError for an encoding that ROS has no picture message for."""
+    """Return the ROS message for a picture.
+
+    Raises ValueError for an encoding that ROS does not have.
+    """
     if not 0 <= stamp_ns < STAMP_END_NS:
         raise ValueError("ROS has no stamp for this time: its seconds end in 2038")
     if picture.encoding is FrameEncoding.JPEG:
@@ -133,7 +141,7 @@ def jpeg_size(data: bytes) -> tuple[int, int, int]:
     return width, height, channels
 
 
-# -- CDR ------------------------------------------------------------------------------------------------------
+# -- CDR
 class _Writer:
     def __init__(self) -> None:
         self.parts: list[bytes] = [b"\x00\x01\x00\x00"]  # plain CDR, little-endian

@@ -1,7 +1,8 @@
-"""Where a camera's thread leaves its newest frame, and where everybody else picks it up or learns why there is none.
+"""Slot of a camera's newest frame, or of the reason why there is none.
 
-Every reader is built on this, so that all of them mean the same by `fresh`, `stale`, `interrupted` and `ended`. It knows nothing of
-devices, decoders and topics, and holds one frame: a slow consumer sees fewer frames, never older ones.
+Every reader is built on this, so that all mean the same by `fresh`, `stale`, `interrupted` and
+`ended`. Must not know devices, decoders or topics. It holds one frame: a slow consumer sees fewer
+frames, never older ones.
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ class FrameTee(Protocol):
 
 
 class LatestSlot:
-    """The newest frame of one camera under a lock, or the reason why there is none. Reads on any thread.
+    """The newest frame of one camera under a lock, or the reason why there is none.
 
-    `open` gives the feed through which one thread fills it. A feed that was replaced is deaf: a thread that hangs in a driver and
-    comes back after a restart cannot put its old picture among the new ones.
+    Reads on any thread. `open` returns the feed through which one thread fills it. A replaced feed
+    has no effect: a thread that hangs in a driver and returns after a restart cannot deliver an old
+    picture.
     """
 
     def __init__(self, sensor_id: str, max_age_ms: float, clock: Clock) -> None:
@@ -51,7 +53,10 @@ class LatestSlot:
             return self._feed
 
     def latest(self, max_age_ms: float | None = None) -> SensorFrame:
-        """The newest frame, without waiting. Raises FrameStale: none yet, older than `max_age_ms` (None: as configured), or ended."""
+        """Return the newest frame without waiting.
+
+        Raises FrameStale: none yet, older than `max_age_ms` (None: as configured), or ended.
+        """
         limit_ms = self.max_age_ms if max_age_ms is None else max_age_ms
         with self._changed:
             frame = self._frame
@@ -63,7 +68,10 @@ class LatestSlot:
         return frame
 
     def synced(self, deadline_ns: int) -> SensorFrame:
-        """Wait for the first frame taken after this call. Raises FrameStale at the monotonic `deadline_ns`, and as soon as the source ends."""
+        """Wait for the first frame taken after this call.
+
+        Raises FrameStale at the monotonic `deadline_ns`, and as soon as the source ends.
+        """
         begun_ns = self._clock.now_ns()
         with self._changed:
             while True:
@@ -74,7 +82,8 @@ class LatestSlot:
                     raise self._missing()
                 if left_s <= 0:
                     raise FrameStale(
-                        f"camera {self.sensor_id} took no new picture within {(deadline_ns - begun_ns) / 1e6:.0f} ms",
+                        f"camera {self.sensor_id} took no new picture"
+                        f" within {(deadline_ns - begun_ns) / 1e6:.0f} ms",
                         hint="look at its rate, or wait longer",
                         details={"sensor_id": self.sensor_id, "reason": self._reason},
                     )
@@ -134,13 +143,18 @@ class LatestSlot:
 
 
 class Feed:
-    """The writing side of a slot, for one run of one reader. Each call says whether it still had an effect."""
+    """Writing side of a slot, for one run of one reader. Calls return whether they had an
+    effect.
+    """
 
     def __init__(self, slot: LatestSlot) -> None:
         self._slot = slot
 
     def put(self, frame: SensorFrame) -> bool:
-        """Make it the newest. Without effect if the feed was replaced or ended, or a later frame is there already."""
+        """Make it the newest.
+
+        Without effect if the feed was replaced or ended, or a later frame is there.
+        """
         return self._slot._put(self, frame)
 
     def interrupt(self, reason: str) -> bool:
@@ -153,9 +167,10 @@ class Feed:
 
 
 class SlotReader(ABC):
-    """A `SensorReader` whose thread, bus or listener fills a slot; derived classes say how (`_run_begins`, `_run_ends`).
+    """A `SensorReader` whose thread, bus or listener fills a slot; subclasses provide it.
 
-    `start` twice or `stop` twice does no harm. After `stop` every read raises FrameStale; `start` begins anew.
+    They override `_run_begins` and `_run_ends`. `start` and `stop` may be repeated. After `stop`
+    every read raises FrameStale; `start` begins anew.
     """
 
     def __init__(
@@ -168,7 +183,7 @@ class SlotReader(ABC):
         self._feed: Feed | None = None
 
     def start(self) -> None:
-        """Open the source. What opening takes is the derived class's; a source that cannot be opened may raise or end its feed."""
+        """Open the source. A source that cannot be opened may raise or end its feed."""
         if self._feed is not None:
             return
         feed = self._feed = self.slot.open()
@@ -204,8 +219,12 @@ class SlotReader(ABC):
 
     @abstractmethod
     def _run_begins(self, feed: Feed) -> None:
-        """Begin to call `deliver(feed, frame)`, `feed.interrupt` and `feed.end` on a thread of one's own."""
+        """Begin to call `deliver(feed, frame)`, `feed.interrupt` and `feed.end` on a thread of its
+        own.
+        """
 
     @abstractmethod
     def _run_ends(self) -> None:
-        """Stop calling them and let go of the source, within a bounded time. The feed is ended already."""
+        """Stop calling them and close the source, within a bounded time. The feed is ended
+        already.
+        """

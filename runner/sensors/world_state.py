@@ -1,8 +1,9 @@
-"""What the robot knows of itself and its surroundings right now: joint state and camera frames, each fresh or said to be stale.
+"""World state: joint state and camera frames, each fresh or marked as stale.
 
-Fails closed. A component that is older than it may be is `stale` in `diagnostics`, a camera's frame is gone from `image_frames`, and both
-stay so (latched) until RECOVERY_UPDATES fresh values have come in a row: a camera that flickers does not make the arm jerk. Nothing
-is ever filled in: without a single joint state there is no world state. Knows no sensor and no robot; any thread may call it.
+Fails closed. A component older than its limit is `stale` in `diagnostics`, a stale camera's frame
+is missing from `image_frames`, and both stay so (latched) until RECOVERY_UPDATES fresh values have
+come in a row: a camera that flickers must not make the arm jerk. Nothing is filled in: without any
+joint state there is no world state. Must not know sensors or robots; any thread may call it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ RATE_HZ = 30.0
 JOINT_MAX_AGE_MS = 100.0
 RECOVERY_UPDATES = 3
 FUTURE_TOLERANCE_MS = 5.0  # a stamp further ahead is of another clock, and its age unknown
-EARLY = 0.25  # share of a period by which a caller may come early and still be on the cadence: ticks jitter
+# share of a period by which a caller may be early and still be on the cadence: ticks jitter
+EARLY = 0.25
 
 
 @dataclass(slots=True)
@@ -45,12 +47,16 @@ class _Component:
         self.latched, self.fresh_in_a_row, self.why = True, 0, why
 
     def update(self, stamp_ns: int, now_ns: int) -> bool:
-        """Whether the value of this stamp is news that may be kept. A pause between two updates is judged by who looked meanwhile: a slow
-        loop asks rarely, and what it then measures is fresh."""
+        """Take the stamp of an update. Returns whether its value is new and may be kept.
+
+        A pause between two updates is judged by snapshots in between: a slow loop asks rarely, and
+        what it then measures is fresh.
+        """
         if stamp_ns - now_ns > FUTURE_TOLERANCE_MS * 1e6:
             ahead_ms = (stamp_ns - now_ns) / 1e6
             self.latch(
-                f"stamped {ahead_ms:.0f} ms in the future; stamps must be of this machine's monotonic clock"
+                f"stamped {ahead_ms:.0f} ms in the future;"
+                " stamps must be of this machine's monotonic clock"
             )
             return False
         if self.stamp_ns is not None and stamp_ns <= self.stamp_ns:
@@ -71,10 +77,11 @@ class _Component:
 
 
 class WorldStateAggregator:
-    """`max_age_ms` names the cameras and how old their frames may get; `topics` says where cameras are published as well.
+    """`max_age_ms` names the cameras and the age limits of their frames; `topics` where they are
+    published.
 
-    It has a cadence of its own: `due` says when cameras are to be read again, so that a loop of 200 Hz does not copy pictures 200 times a
-    second. Ages are judged at every snapshot, whatever the cadence.
+    It has a cadence of its own: `due` tells when cameras are to be read again, so that a loop of
+    200 Hz does not copy pictures 200 times a second. Ages are judged at every snapshot.
     """
 
     def __init__(
@@ -97,7 +104,9 @@ class WorldStateAggregator:
         self._lock = threading.Lock()
 
     def due(self, now_ns: int) -> bool:
-        """Whether the cadence wants the cameras read now; says yes once per slot, and skips slots that have passed."""
+        """Return whether cameras are due, once per slot of the cadence; missed slots are
+        skipped.
+        """
         early_ns = round(self._period_ns * EARLY)
         with self._lock:
             if self._next_ns is None:
@@ -108,21 +117,21 @@ class WorldStateAggregator:
             self._next_ns += (missed + 1) * self._period_ns
             return True
 
-    # -- what comes in ---------------------------------------------------------------------------------------------------
+    # -- what comes in
     def update_joint_state(self, state: JointState, now_ns: int) -> None:
-        """A measurement, by its own stamp: a bus that repeats its last answer does not look alive."""
+        """Take a measurement by its own stamp: a bus that repeats its last answer is not fresh."""
         with self._lock:
             if self._joints.update(state.stamp_ns, now_ns):
                 self._joint_state = state
 
     def update_image_frame(self, frame: SensorFrame, now_ns: int) -> None:
-        """A frame of a known camera. Raises KeyError for another one: a camera without a known age cannot be judged."""
+        """Take a frame. Raises KeyError for an unknown camera: it has no age limit."""
         with self._lock:
             if self._components[frame.sensor_id].update(frame.stamp_monotonic_ns, now_ns):
                 self._frames[frame.sensor_id] = frame
 
     def lose(self, name: str, why: str) -> None:
-        """The source says that it has nothing that may be used: stale from now on, whatever its last value's age."""
+        """Mark a component as stale from now on, whatever its last value's age."""
         with self._lock:
             self._components[name].latch(why)
 
@@ -134,7 +143,7 @@ class WorldStateAggregator:
             if component.stamp_ns is None:
                 component.why = why
 
-    # -- what comes out --------------------------------------------------------------------------------------------------
+    # -- what comes out
     def snapshot(self, now_ns: int) -> WorldState:
         """Everything as of now. Raises StateStale when no joint state has ever come."""
         with self._lock:

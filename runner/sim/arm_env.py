@@ -1,7 +1,9 @@
-"""An arm on a mobile base (`runner.sim.env.SimEnv`) as an `Environment`: joint targets and base velocities in, joint state and odometry out.
+"""An arm on a mobile base (`runner.sim.env.SimEnv`) as an `Environment`.
 
-Every action passes the same gate as a robot's, on simulated time. What an episode is about comes from outside: `prepare` sets the scene up after a reset, `judge` looks at it after each step. Without a judge an
-episode never ends by itself and nobody says whether it went well.
+Joint targets and base velocities in, joint state and odometry out. Every action passes the same
+gate as a robot's, on simulated time. The task comes from outside: `prepare` sets the scene up after
+a reset, `judge` checks it after each step. Without a judge an episode neither ends by itself nor
+has a verdict.
 """
 
 from __future__ import annotations
@@ -34,7 +36,9 @@ REACH_SHARE = 0.98  # of the longest step: rounding must not reach the gate
 
 
 class MobileArm(Protocol):
-    """What is needed of the robot's simulator: joints in rad by name, the base's pose in m and rad."""
+    """The robot's simulator as far as it is needed: joints in rad by name, base pose in m and
+    rad.
+    """
 
     def reset(self, seed: int) -> None: ...
 
@@ -62,7 +66,7 @@ class MobileArm(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SimulatedTime:
-    """A gate that judges speeds by the simulated clock: the world waits for a slow policy, and may run faster than the real one."""
+    """Gate that judges speeds by the simulated clock: the world waits for a slow policy."""
 
     gate: RobotGate
     arm: MobileArm
@@ -76,9 +80,11 @@ class SimulatedTime:
 
 
 class ArmEnvironment:
-    """`robot` describes the arm; without `kinematics` the gate knows no tool, and refuses skills that limit it.
+    """`robot` describes the arm; without `kinematics` the gate refuses skills that limit the tool.
 
-    `cameras` for skills, the default one first. An episode is over once `judge` has said True for `steady` steps in a row; 0: never."""
+    `cameras` are for skills, the default one first. An episode is over once `judge` has returned
+    True for `steady` steps in a row; 0: never.
+    """
 
     def __init__(
         self,
@@ -145,11 +151,13 @@ class ArmEnvironment:
 
     @property
     def acted(self) -> dict[str, float]:
-        """Nothing: `targets` are what it was told."""
+        """Nothing: the commands are in `targets`."""
         return {}
 
     def step(self, action: Action | None) -> EnvStep:
-        """Joints that an action leaves out keep their last target: a closed gripper stays closed."""
+        """Joints that an action leaves out keep their last target: a closed gripper stays
+        closed.
+        """
         arm, base = _commands(action)
         if arm is not None:
             self._targets.update(arm)
@@ -167,7 +175,10 @@ class ArmEnvironment:
         return SimulatedTime(self._gate.for_skill(skill.manifest, skill.cameras), self.arm)
 
     def limits_for(self, manifest: RSkillManifest) -> Limits:
-        """What a skill may do here, before it begins. Raises ConfigError for an envelope that cannot be kept."""
+        """Return what a skill may do here.
+
+        Raises ConfigError for an envelope that cannot be enforced.
+        """
         return self._gate.for_skill(manifest, ()).limits
 
     def action_of(self, raw: Any) -> Action:
@@ -179,7 +190,7 @@ class ArmEnvironment:
             else:
                 row = [float(value) for value in raw]
         except (TypeError, ValueError) as error:
-            raise ModelError(f"{raw!r} is no row of joint targets: {error}") from error
+            raise ModelError(f"expected a row of joint targets, got {raw!r}: {error}") from error
         if not row or len(row) != len(names) or not all(map(math.isfinite, row)):
             raise ModelError(f"an action is {len(names)} finite joint targets in rad, not {row}")
         return _joint_action(names, row)
@@ -203,7 +214,10 @@ class ArmEnvironment:
         return self._targets
 
     def toward(self, row: Sequence[float]) -> list[float]:
-        """Joint targets, or as much of the way there as the gate lets through in one step: for those whose targets lead the arm."""
+        """Return joint targets, or as much of the way there as the gate allows in one step.
+
+        For policies whose targets lead the arm.
+        """
         most = self._gate.limits.speeds_rad_s
         return [
             bounded(self._targets[name], target, REACH_SHARE * most[name] / CONTROL_HZ)

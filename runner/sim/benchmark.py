@@ -1,7 +1,8 @@
-"""How often does it work? Plays seeds in a world with one contestant (an installed skill or a policy), judged by the world itself.
+"""Success rate of one contestant (an installed skill or a policy) over seeds of a world.
 
-Everything of the world happens on one worker thread, ticks happen only while a contestant has the world: nothing passes while a model loads, so
-that the same seed is the same episode on any machine. Knows no command line and no files but the videos.
+The world runs on one worker thread and ticks only while a contestant has it: no time passes while a
+model loads, so that the same seed is the same episode on any machine. Must not know the command
+line or files other than videos.
 """
 
 from __future__ import annotations
@@ -38,7 +39,10 @@ Told = tuple[str, dict[str, Any]]
 
 
 def wilson(successes: int, of: int) -> tuple[float, float] | None:
-    """Wilson's 95 % interval of a success rate: sensible for few episodes, too, and for none or all of them. None without episodes."""
+    """Return Wilson's 95 % interval of a success rate; None without episodes.
+
+    It is sensible for few episodes, and for zero or all successes.
+    """
     if of == 0:
         return None
     share, square = successes / of, Z_95**2
@@ -51,10 +55,10 @@ def wilson(successes: int, of: int) -> tuple[float, float] | None:
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """One seed. `success` None: nobody judges in this world, or `error` says why there is no verdict.
+    """Outcome of one seed. `success` None: the world does not judge, or `error` tells why not.
 
-    An error of the contestant while it plays (`model_error`) is a failure, where anybody judges; any other (a sidecar that is not there, an
-    environment that raised) is no verdict on it.
+    An error of the contestant while it plays (`model_error`) is a failure where the world judges;
+    any other error (a missing sidecar, an environment that raised) is not a verdict.
     """
 
     seed: int
@@ -75,7 +79,9 @@ class Played:
 
 @dataclass(slots=True)
 class Cell:
-    """All episodes of one contestant in one world. `complete` False: stopped, or given up (`why`)."""
+    """All episodes of one contestant in one world. `complete` False: stopped, or abandoned
+    (`why`).
+    """
 
     world: str
     contestant: str
@@ -102,8 +108,11 @@ class Cell:
         return self.successes / self.judged if self.judged else None
 
     def add(self, played: Played) -> None:
-        """In a world that judges, whoever fails by himself has failed, also before the first word of the world; and so has an episode of
-        which it says nothing: some only ever speak of successes."""
+        """Add an outcome.
+
+        In a world that judges, a contestant's own error is a failure, also before the world's first
+        verdict; and so is an episode without a verdict: some worlds report successes only.
+        """
         self.episodes.append(played)
         if self.judged:
             self.episodes = [
@@ -138,7 +147,7 @@ class Cell:
 
 
 class Contestant(Protocol):
-    """Who plays. `begin` on the event loop, before each episode; `player` on the worker thread."""
+    """A player. `begin` on the event loop, before each episode; `player` on the worker thread."""
 
     name: str
     revision: str
@@ -192,9 +201,10 @@ class PolicyContestant:
 
 
 class Benchmark:
-    """`runner` runs as fast as it can, its episodes end with their skill. `told` says on the worker thread what the goal of an episode is.
+    """`runner` runs as fast as it can; its episodes end with their skill.
 
-    `episode_s` bounds an episode on the wall clock (a contestant that never acts, a world that hangs between two steps).
+    `told` returns the goal of an episode, on the worker thread. `episode_s` bounds an episode on
+    the wall clock (a contestant that never acts, a world that hangs between two steps).
     """
 
     def __init__(
@@ -292,7 +302,7 @@ class Benchmark:
         )
         return replace(played, seconds=round(time.monotonic() - began_s, 3), video=video)
 
-    # -- worker thread -------------------------------------------------------------------------------------------------
+    # -- worker thread
     def _reset(self, seed: int) -> Told:
         self.runner.robot.begin_episode(seed)
         self.runner.tick()
@@ -336,7 +346,7 @@ class Benchmark:
             failed=error is not None,
         )
 
-    # -- helpers -------------------------------------------------------------------------------------------------------
+    # -- helpers
     async def _on[T](self, worker: ThreadPoolExecutor, work: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(worker, work)
 

@@ -1,7 +1,7 @@
-"""What a tabletop scene is made of: sizes, vocabulary, camera places; all of it data, none of it MuJoCo.
+"""Description of a tabletop scene: sizes, vocabulary, camera places. Data only.
 
-Lengths in metres, angles in radians unless the name says otherwise. This module must not know the simulator, the
-policies or the arbiter: training scripts, tests and the runner read it alike.
+Lengths in meters, angles in radians unless the name says otherwise. Must not know the simulator,
+the policies or the arbiter: training scripts, tests and the runner read it alike.
 """
 
 from __future__ import annotations
@@ -38,14 +38,16 @@ COLOURS: Final[dict[str, tuple[float, float, float]]] = {
 }
 SHAPES: Final = ("cube", "ball", "cylinder")
 
-# The folded pose the arm drives, looks and starts from: gripper open, pointing down, clear of table and objects.
+# Folded pose in which the arm drives, looks and starts: gripper open, pointing down, clear of table
+# and objects.
 REST_POSE: Final = (0.0, -1.20, 1.05, 1.35, 0.0, 0.60)
 
 
 class CameraSpec(BaseModel):
-    """A camera: image size in pixels, vertical field of view in degrees, place and aim in its parent's frame.
+    """A camera: image size in pixels, vertical field of view in degrees, place and aim.
 
-    `parent` is `base` (mobile base), `gripper` (the arm's last link) or `world`.
+    Place and aim are in its parent's frame; `parent` is `base` (mobile base), `gripper` (the arm's
+    last link) or `world`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -58,7 +60,7 @@ class CameraSpec(BaseModel):
     look_at_m: tuple[float, float, float]
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     shadows: bool = False
-    # multisampling triples what a frame costs in software; small views are averaged down afterwards anyway
+    # multisampling triples a frame's cost in software; small views are averaged down afterwards
     samples: int = Field(default=0, ge=0, le=8)
 
 
@@ -108,7 +110,8 @@ class SceneConfig(BaseModel):
                 fovy_deg=42.0,
                 pos_m=(1.00, -1.10, 0.85),
                 look_at_m=(0.42, 0.0, 0.20),
-                shadows=True,  # and no multisampling: together they cost a tick's slot where there is no GPU to render
+                # without multisampling: together they cost a tick's slot on a CPU renderer
+                shadows=True,
             ),
         }
     )
@@ -123,13 +126,18 @@ class SceneConfig(BaseModel):
 
     @classmethod
     def load(cls, path: Path | None = None) -> SceneConfig:
-        """The scene of a YAML file (keys as the fields), or the built-in one. Raises ConfigError with the file's name, line and field."""
+        """Read the scene of a YAML file (keys as the fields), or return the built-in one.
+
+        Raises ConfigError with the file's name, line and field.
+        """
         return cls() if path is None else validated(cls, read_yaml(path))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ObjectSpec:
-    """One thing on the table. `size_m` is the cube's side, the ball's diameter or the cylinder's diameter."""
+    """One thing on the table. `size_m` is the cube's side, or the diameter of a ball or
+    cylinder.
+    """
 
     colour: str
     shape: str

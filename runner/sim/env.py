@@ -1,7 +1,7 @@
 """One simulated robot before one table: step it, look through its cameras, ask for the truth.
 
-The whole episode follows from the seed. An env belongs to one thread: MuJoCo's EGL contexts are bound to the thread that
-made them. Must not know policies, skills, goals or the arbiter.
+The whole episode follows from the seed. An env belongs to one thread: MuJoCo's EGL contexts are
+bound to the thread that made them. Must not know policies, skills, goals or the arbiter.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SETTLE_STEPS = 6
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ObjectTruth:
-    """An object's centre in the map and in the base frame (metres), its turn about the vertical, its height over rest."""
+    """An object's center in the map and base frames (m), its turn about the vertical, its lift."""
 
     name: str
     position_map: tuple[float, float, float]
@@ -64,7 +64,9 @@ class GroundTruth:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SeenObject:
-    """An object in an image: its box (x_min, y_min, x_max, y_max; pixels, max exclusive) and how many pixels show it."""
+    """An object in an image: its box (x_min, y_min, x_max, y_max; pixels, max exclusive) and
+    size.
+    """
 
     name: str
     box: tuple[int, int, int, int]
@@ -74,8 +76,9 @@ class SeenObject:
 class SimEnv:
     """SO-101 on a planar base, stepped at 30 Hz.
 
-    Arm targets are six joint angles in radians in the order of `ARM_JOINTS`; base velocities are (vx, vy, wz) in the base's
-    own frame, in m/s and rad/s. Call `close` (or use `with`) in the thread that rendered.
+    Arm targets are six joint angles in radians in the order of `ARM_JOINTS`; base velocities are
+    (vx, vy, wz) in the base's own frame, in m/s and rad/s. Call `close` (or use `with`) in the
+    thread that rendered.
     """
 
     def __init__(self, config: SceneConfig | None = None) -> None:
@@ -86,9 +89,11 @@ class SimEnv:
         self._data: Any = None
         self.steps = 0  # control steps since the reset
 
-    # -- life --------------------------------------------------------------------------------------------------
+    # -- life
     def reset(self, seed: int, *, names: tuple[str, ...] | None = None) -> None:
-        """Build the scene of a seed and let it settle; the arm is at rest, the base at its start."""
+        """Build the scene of a seed and let it settle; the arm is at rest, the base at its
+        start.
+        """
         mujoco = load_mujoco()
 
         self.close()
@@ -114,7 +119,9 @@ class SimEnv:
         self.steps = 0
 
     def place(self, base_pose: Sequence[float], arm: Sequence[float] | None = None) -> None:
-        """Teleport base (x, y, yaw) and optionally the arm; for datasets, tests and evaluation only."""
+        """Teleport base (x, y, yaw) and optionally the arm; for datasets, tests and evaluation
+        only.
+        """
         mujoco = load_mujoco()
 
         for q, u, value in zip(self._base_q, self._base_u, base_pose, strict=True):
@@ -144,7 +151,7 @@ class SimEnv:
     ) -> None:
         self.close()
 
-    # -- acting ------------------------------------------------------------------------------------------------
+    # -- acting
     def step(
         self,
         arm_target: Mapping[str, float] | Sequence[float] | None,
@@ -152,8 +159,9 @@ class SimEnv:
     ) -> None:
         """Advance 1/30 s. None keeps the last arm target, or stands still.
 
-        Joint targets are clipped to the servos' ranges, base speeds to the platform's. Raises ValueError for a wrong number
-        of values or one that is not finite, and KeyError for a missing joint; nothing has moved then.
+        Joint targets are clipped to the servos' ranges, base speeds to the platform's. Raises
+        ValueError for a wrong number of values or one that is not finite, and KeyError for a
+        missing joint; nothing has moved then.
         """
         mujoco = load_mujoco()
 
@@ -191,7 +199,7 @@ class SimEnv:
         mujoco.mj_forward(self._model, self._data)
         self.steps += 1
 
-    # -- state the robot itself knows ----------------------------------------------------------------------------
+    # -- state the robot itself knows
     @property
     def time_s(self) -> float:
         """Simulated seconds since the scene was built."""
@@ -233,7 +241,7 @@ class SimEnv:
         """The grasp point between the fingers, in the base frame (forward kinematics)."""
         return self._to_base(self._data.site(ARM_PREFIX + GRASP_SITE).xpos)
 
-    # -- cameras -----------------------------------------------------------------------------------------------
+    # -- cameras
     def render(self, camera: str) -> Any:
         """RGB image, uint8, height × width × 3. Raises KeyError for an unknown camera."""
         mujoco = load_mujoco()
@@ -247,8 +255,8 @@ class SimEnv:
     def camera_model(self, camera: str) -> CameraModel:
         """Intrinsics and present pose of a camera in the base frame.
 
-        The support plane is the one through the middles of things that stand on the table, so that the ray through the
-        middle of a box meets it where the thing is.
+        The support plane is the one through the middles of things that stand on the table, so that
+        the ray through the middle of a box meets it where the thing is.
         """
         import numpy as np
 
@@ -297,7 +305,7 @@ class SimEnv:
             self._renderers[camera] = mujoco.Renderer(self._model, spec.height_px, spec.width_px)
         return self._renderers[camera]
 
-    # -- truth -------------------------------------------------------------------------------------------------
+    # -- truth
     def ground_truth(self) -> GroundTruth:
         """Where everything really is, and what the gripper really holds."""
         objects = {o.name: self._truth(o.name, o.rest_z_m) for o in self.layout.objects}
@@ -306,11 +314,15 @@ class SimEnv:
         return GroundTruth(objects, self.base_pose(), name, self.target)
 
     def held_object(self) -> str | None:
-        """Name of the object between both fingers, its centre at least 3 cm above where it would rest; else None."""
+        """Return the object between both fingers with its center at least 3 cm above its rest; else
+        None.
+        """
         return self.ground_truth().held
 
     def is_held_above_table(self, name: str) -> bool:
-        """Whether this object is the held one. Raises KeyError for a name that is not in the scene."""
+        """Return whether this object is held. Raises KeyError for a name that is not in the
+        scene.
+        """
         truth = self.ground_truth()
         return truth.objects[name].name == truth.held
 

@@ -1,7 +1,8 @@
-"""`Environment`: what `SimRunner` needs of a simulator, whatever it simulates.
+"""`Environment`: interface of the simulators behind `SimRobot`.
 
-`runner.sim.arm_env.ArmEnvironment` is our SO-101 scene, `runner.sim.gym_env.GymEnv` any gymnasium environment. All calls on one thread, the one
-that made it. Nothing is filled in: what an environment does not tell is missing in its world state.
+`runner.sim.arm_env.ArmEnvironment` is our SO-101 scene, `runner.sim.gym_env.GymEnv` any gymnasium
+environment. All calls on the thread that made it. Nothing is filled in: what an environment does
+not report is missing in its world state.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from vram_arbiter.schemas.world import Action, CameraModel, SensorFrame, WorldSt
 
 @dataclass(frozen=True, slots=True)
 class EnvStep:
-    """What one step came to. None: this environment does not say.
+    """Outcome of one step. None: the environment does not report it.
 
-    `moved` False: time stood still, because there was no action and this world has no way to wait. `success` is what is so now, not only
-    at the end. `unearned`: whoever does nothing has this success, as long as the episode goes on; it takes one that is played to its end.
+    `moved` False: time stood still, because there was no action and this world cannot wait.
+    `success` holds now, not only at the end. `unearned`: doing nothing has this success while the
+    episode goes on; it counts only when the episode is played to its end.
     """
 
     reward: float | None = None
@@ -31,25 +33,35 @@ class EnvStep:
 
 
 class Environment(Protocol):
-    """One simulated world. `reset` begins an episode that follows from the seed alone; it comes before everything else.
+    """One simulated world.
 
-    Raises EnvironmentFailed for what goes wrong inside; the world is then of no use before the next reset.
+    `reset` begins an episode that follows from the seed alone; call it first.
+
+    Raises EnvironmentFailed for errors inside; the world is then unusable until the next reset.
     """
 
     def reset(self, seed: int) -> None: ...
 
     def observe(self, stamp_ns: int, frames: Mapping[str, SensorFrame] | None) -> WorldState:
-        """The state now, with the frames that the caller took. Raises pydantic's ValidationError for numbers that are not finite."""
+        """Return the state with the caller's frames.
+
+        Raises pydantic's ValidationError if it is not finite.
+        """
         ...
 
     def shown(self) -> Mapping[str, float] | None:
-        """What it observes, in numbers, by name and in its own units, for recordings; None for a robot: that is its joint state. Raises
-        EnvironmentFailed."""
+        """Return the observed numbers by name, in the world's own units, for recordings.
+
+        None for a robot, whose joint state is recorded. Raises EnvironmentFailed.
+        """
         ...
 
     @property
     def acted(self) -> Mapping[str, float]:
-        """What the last step was given, by name and in its own units; empty for a robot, and where time stood still."""
+        """Numbers of the last action, by name and in the world's own units.
+
+        Empty for a robot, and where time stood still.
+        """
         ...
 
     def step(self, action: Action | None) -> EnvStep:
@@ -57,15 +69,22 @@ class Environment(Protocol):
         ...
 
     def gate(self, skill: Stepped) -> SafetyGate:
-        """What every action of a skill passes before `step`, over all resets. Raises ConfigError for an envelope that cannot be kept here."""
+        """Return the gate of a skill's actions, over all resets.
+
+        Raises ConfigError for an envelope that cannot be enforced here.
+        """
         ...
 
     def action_of(self, raw: Any) -> Action:
-        """An action from what a scripted policy returns. Raises ModelError for what cannot be one."""
+        """Convert the result of a scripted policy. Raises ModelError for what cannot be an
+        action.
+        """
         ...
 
     def sample(self) -> Action:
-        """An action at random, within the limits; the sequence follows from the seed of the reset."""
+        """Return a random action within the limits; the sequence follows from the seed of the
+        reset.
+        """
         ...
 
     @property

@@ -1,7 +1,7 @@
-"""Episodes as a view over ticks: nobody counts them, they are read off the results of a run's ticks.
+"""Episodes as a view of the results of a run's ticks.
 
-An episode begins with its reset tick and ends with the first tick that is terminated or truncated. One that did not get that far is no
-episode: a run that is stopped in the middle leaves none behind.
+An episode begins with its reset tick and ends with the first tick that is terminated or truncated.
+A run that is stopped before that has an unfinished episode, which does not count.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ EPISODES_KEPT = 10_000  # a live run may have any number; older ones are counted
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One finished episode. `total_reward` and `success` None: the environment rewards nothing, or does not judge."""
+    """One finished episode. `total_reward`, `success` None: the environment does not report it."""
 
     index: int
     steps: int
@@ -29,8 +29,11 @@ class Episode:
 
 
 class EpisodeView:
-    """Takes a run's ticks in order. `finished` are the last whole episodes, `count` says how many there were; `steps` and `total_reward`
-    are those of the open one."""
+    """Takes a run's ticks in order.
+
+    `finished` are the last whole episodes, `count` is their number; `steps` and `total_reward` are
+    those of the open one.
+    """
 
     def __init__(self) -> None:
         self.finished: deque[Episode] = deque(maxlen=EPISODES_KEPT)

@@ -18,14 +18,15 @@ CLOSED_RAD = -0.10
 LOWEST_M = 0.0135  # of the grasp point above the table: the finger tips clear it by 3 mm
 PAN_AXIS_X_M = 0.119  # the shoulder's pan axis in the base frame
 HOVER_M = 0.060  # of the grasp point above the object's centre
-# The open fixed finger is nearer to the grasp point than a turned cube's corner: descend this much short of the object's
-# centre, towards the arm, and make up for it while closing.
+# The open fixed finger is nearer to the grasp point than a turned cube's corner: descend this much
+# short of the object's center, towards the arm, and make up for it while closing.
 SHY_M = 0.013
 LIFT_STRAIGHT_M = 0.04
 CARRY_POSE = (0.0, -0.70, 0.45, 0.85, 0.0)
 CARRY_REACHED_RAD = 0.06
-# Targets lead the arm by at most this much; the servos' lag turns it into a speed of about 0.35 m/s. Leading from where the
-# arm is, not from where it was told to be, makes the target a function of what the cameras and joints show.
+# Targets lead the arm by at most this much; the servos' lag turns it into a speed of about 0.35
+# m/s. Leading from the arm's measured pose, not from its last target, makes the target a function
+# of what the cameras and joints show.
 LEAD_M = 0.022
 LEAD_RAD = 0.13
 NARROWEST_HOLD_RAD = 0.12  # the gripper closes beyond this only when nothing is between the fingers
@@ -47,8 +48,8 @@ class Phase(enum.Enum):
 class GrabExpert:
     """Produces one joint target per control step until `done`; closed loop on the true object pose.
 
-    `offset_m` shifts where the expert believes the object to be, and `retry` False lets it lift an empty gripper: together a
-    way to record misses.
+    `offset_m` shifts where the expert believes the object to be, and `retry` False lets it lift an
+    empty gripper: together a way to record misses.
     """
 
     def __init__(
@@ -105,7 +106,9 @@ class GrabExpert:
                 return self._carry()
 
     def _advance(self, aside: float, gz: float, oz: float, low: float) -> None:
-        """Enter the next phase when the present one has done its work, or the first again when it went wrong."""
+        """Enter the next phase when the present one has done its work, or the first one on
+        failure.
+        """
         grip = self._env.joint_state()["gripper"]
         match self.phase:
             case Phase.APPROACH if (
@@ -146,7 +149,9 @@ class GrabExpert:
         return [*arm, CLOSED_RAD]
 
     def _towards(self, goal: tuple[float, float, float], grip: float) -> list[float]:
-        """Joint angles for a point at most the lead ahead of the grasp point, on the straight way to the goal."""
+        """Return joint angles for a point on the straight way to the grasp point, within the
+        lead.
+        """
         here = self._env.gripper_position()
         gap = math.dist(here, goal)
         share = 1.0 if gap <= LEAD_M else LEAD_M / gap
@@ -156,7 +161,9 @@ class GrabExpert:
 
 
 class RestController:
-    """Brings the arm back to the rest pose at a bounded joint speed, first opening what it holds when asked."""
+    """Brings the arm back to the rest pose at a bounded joint speed, optionally opening it
+    first.
+    """
 
     def __init__(self, start: dict[str, float], *, speed_rad_s: float = 1.6) -> None:
         self._target = [start[n] for n in ARM_JOINTS]

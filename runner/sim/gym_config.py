@@ -1,6 +1,7 @@
-"""How a gymnasium environment's observations and actions are to be read: what its spaces do not say, a file says (`--env-config FILE`).
+"""Reading of a gymnasium environment's observations and actions (`--env-config FILE`).
 
-Nothing is guessed: without `joints` a world state has no joints, without `success` (and without gymnasium's usual keys) nobody judges.
+A file says what the spaces do not. Nothing is guessed: without `joints` a world state has no
+joints, without `success` (and without gymnasium's usual keys) there is no verdict.
 """
 
 from __future__ import annotations
@@ -30,12 +31,15 @@ type Held = int | float | tuple[Held, ...] | dict[str, Held]
 
 
 class GymConfig(BaseModel):
-    """Paths into a Dict or Tuple observation are written with dots (`pixels.top`, `views.0`); an empty path is the whole observation.
+    """Paths into a Dict or Tuple observation are written with dots (`pixels.top`, `views.0`).
 
-    `joints` and `velocities` name entries of the vector at `state`: a list in its order, or a map from name to index (rad and rad/s). Where
-    several parts are at `state`, their numbers follow each other in the space's order. `actions` names the numbers of an action, in their
-    order (`runner.sim.gym_spaces`); `control_mode` says what they are. `hold` is the action that waits, as the environment itself takes it:
-    without one the world stands still while nobody acts. `success` is `info:KEY` or `return:NUMBER` (rewards of the episode, summed).
+    An empty path is the whole observation. `joints` and `velocities` name entries of the vector at
+    `state`: a list in its order, or a map from name to index (rad and rad/s). Where several parts
+    are at `state`, their numbers follow each other in the space's order. `actions` names the
+    numbers of an action, in their order (`runner.sim.gym_spaces`); `control_mode` gives their
+    meaning. `hold` is the action that waits, as the environment itself takes it: without one the
+    world stands still until an action comes. `success` is `info:KEY` or `return:NUMBER` (rewards of
+    the episode, summed).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

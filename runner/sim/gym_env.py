@@ -1,11 +1,13 @@
 """`GymEnv`: any gymnasium environment by its id, as an `Environment`.
 
-Actions. What `runner.sim.gym_spaces` can write as a row of numbers, in the field of the configured `control_mode`; an action may name its columns,
-in any order, as the file's `actions` do or as the parts are called. A Discrete that is all there is to an action is `composite_mode`. Other
-spaces are refused. What is out of the limits by at most 5 % of the range is clamped and said, more is withheld.
+Actions: what `runner.sim.gym_spaces` can write as a row of numbers, in the field of the configured
+`control_mode`; an action may name its columns, in any order, as the file's `actions` do or as the
+parts are called. A Discrete that is the whole action is `composite_mode`. Other spaces are refused.
+An excess of at most 5 % of the range is clamped and reported, more is withheld.
 
-Observations. Pictures (uint8, height × width × 3) become cameras, the file's `joints` the joint state; everything else only scripted policies see,
-and recordings. The environment's code is foreign: whatever it raises becomes EnvironmentFailed.
+Observations: pictures (uint8, height × width × 3) become cameras, the file's `joints` the joint
+state; only scripted policies and recordings see the rest. The environment's code is foreign:
+whatever it raises becomes EnvironmentFailed.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ from vram_arbiter.schemas.world import PAYLOAD_OF_MODE, Action, JointState, Sens
 
 log = logging.getLogger(__name__)
 
-SHOWN_MAX = 4096  # numbers of a part that is recorded; beyond that it is a picture of some kind: a depth map, a point cloud
+# numbers of a recorded part; beyond that it is a depth map, a point cloud or the like
+SHOWN_MAX = 4096
 CLAMP_SHARE = 0.05  # of a number's range: an aim at the stop; beyond it a mistake
 
 
@@ -45,7 +48,9 @@ class SpaceGate:
     names: tuple[str, ...]
 
     def check(self, action: Action, world: WorldState) -> tuple[Action | None, tuple[str, ...]]:
-        """The action to apply, clamped where the excess is small, or None; and what was wrong with it."""
+        """Return the action to apply, clamped where the excess is small, or None; and the
+        violations.
+        """
         if action.control_mode is not self.mode:
             return None, (f"this environment takes {self.mode}, not {action.control_mode}",)
         if action.horizon != 1:
@@ -85,9 +90,10 @@ class SpaceGate:
 
 
 class GymEnv:
-    """`GymEnv("CartPole-v1", GymConfig())`. `render`: whether its `render()` is offered as a camera; None: where that works.
+    """`GymEnv("CartPole-v1", GymConfig())`.
 
-    Raises ConfigError for an id, a file or spaces that do not fit.
+    `render`: whether its `render()` is offered as a camera; None: where that works. Raises
+    ConfigError for an id, a file or spaces that do not fit.
     """
 
     def __init__(
@@ -103,9 +109,7 @@ class GymEnv:
         self._observation: Any = None
         self._sent: dict[str, float] = {}
         kind, _, least = self.config.success.partition(":")
-        self._unearned = (
-            kind == "return" and float(least) <= 0
-        )  # whoever does nothing has that return
+        self._unearned = kind == "return" and float(least) <= 0  # doing nothing has that return
         try:
             self._check_spaces()
             self._row = self._action_row()
@@ -116,19 +120,20 @@ class GymEnv:
             self._views = self._views_of()
             self._state = self._state_parts()
             self._shown = self._shown_parts()
-            self._said_what_is_shown = bool(self.config.joints)  # whoever names some wants no more
+            # a file that names some needs no list of the rest
+            self._said_what_is_shown = bool(self.config.joints)
         except BaseException:
             self.close()
             raise
 
-    # -- what the spaces say -----------------------------------------------------------------------------------------------
+    # -- what the spaces say
     def _check_spaces(self) -> None:
         from gymnasium import Space
 
         for what in ("action_space", "observation_space"):
             if not isinstance(getattr(self._env, what, None), Space):
                 raise ConfigError(
-                    f"{self.env_id} has no {what}: nobody could know what it takes and what it shows"
+                    f"{self.env_id} has no {what}: its actions and observations are unknown"
                 )
 
     def _action_row(self) -> ActionRow:
@@ -137,7 +142,9 @@ class GymEnv:
         except NoNumbers as error:
             raise ConfigError(
                 f"{self.env_id} takes actions that are no row of numbers: {error}",
-                hint="Box, Discrete, MultiDiscrete and MultiBinary can be driven, also in Dict and Tuple; wrap the environment to change others",
+                hint="Box, Discrete, MultiDiscrete and MultiBinary can be driven,"
+                " also in Dict and Tuple;"
+                " wrap the environment to change others",
             ) from error
 
     def _make_gate(self) -> SpaceGate:
@@ -156,9 +163,11 @@ class GymEnv:
         try:
             action = self.action_of(raw)
         except ModelError as error:
-            raise ConfigError(f"`hold` is no action of {self.env_id}: {error.message}") from error
+            raise ConfigError(
+                f"`hold` is not an action of {self.env_id}: {error.message}"
+            ) from error
         if problems := self._gate.check(action, WORLDLESS)[1]:
-            raise ConfigError(f"`hold` is no action of {self.env_id}: {problems[0]}")
+            raise ConfigError(f"`hold` is not an action of {self.env_id}: {problems[0]}")
         return action
 
     def _parts_observed(self) -> dict[str, Leaf]:
@@ -170,7 +179,9 @@ class GymEnv:
         return {part.path: part for part in parts}
 
     def _views_of(self) -> dict[str, Leaf | None]:
-        """Pictures are called by the last key of their path; those that share it, and those without one, by all of it."""
+        """Name pictures by the last key of their path; by the whole path where it is shared or
+        missing.
+        """
         pictures = {path: part for path, part in self._observed.items() if part.picture}
         views: dict[str, Leaf | None] = {}
         for name, path in self.config.cameras.items():
@@ -233,10 +244,11 @@ class GymEnv:
             raise ConfigError(f"two numbers of {self.env_id}'s observation are called {twice[0]}")
         return tuple(shown)
 
-    # -- Environment -------------------------------------------------------------------------------------------------------
+    # -- Environment
     def reset(self, seed: int) -> None:
         self._steps, self._total_reward, self._sent = 0, 0.0, {}
-        # not the same seed: both draw from the same kind of generator, and random actions would be the world's own random numbers
+        # not the same seed: both draw from the same kind of generator, and random actions would be
+        # the world's own random numbers
         actions_seed = random.Random(f"actions-{seed}").getrandbits(31)
         try:
             self._env.action_space.seed(actions_seed)
@@ -289,7 +301,9 @@ class GymEnv:
         )
 
     def shown(self) -> dict[str, float]:
-        """The joints (rad) where the file names some; else every number that is observed beside pictures, in its own units."""
+        """Return the joints (rad) where the file names some; else all observed numbers in their own
+        units.
+        """
         joints, parts = self.config.joints, self._state or self._shown
         if not self._said_what_is_shown:
             self._said_what_is_shown = True
@@ -318,7 +332,7 @@ class GymEnv:
 
     @property
     def acted(self) -> dict[str, float]:
-        """The numbers of the last step's action as they passed the gate, by the names that actions have here."""
+        """Numbers of the last step's action as they passed the gate, by name."""
         return self._sent
 
     def step(self, action: Action | None) -> EnvStep:
@@ -348,7 +362,10 @@ class GymEnv:
         return self._last
 
     def gate(self, skill: Stepped) -> SpaceGate:
-        """The action space is the only limit that is known here; what the skill's envelope asks for beyond it is said, once a goal."""
+        """Return the gate: the action space is the only known limit.
+
+        What the skill's envelope asks for beyond it is logged once per goal.
+        """
         envelope = None if skill.manifest is None else skill.manifest.envelope
         if envelope is not None and envelope.model_fields_set:
             asked = ", ".join(sorted(envelope.model_fields_set))
@@ -356,13 +373,16 @@ class GymEnv:
         return self._gate
 
     def action_of(self, raw: Any) -> Action:
-        """What the environment itself takes: a number of a Discrete, the numbers of a Box (any shape that has as many), a map for a Dict."""
+        """Convert what the environment itself takes.
+
+        A number of a Discrete, the numbers of a Box (any shape that has as many), a map for a Dict.
+        """
         mode = self._gate.mode
         try:
             row = tuple(self._row.row_of(raw))
         except NoNumbers as error:
             raise ModelError(
-                f"{reprlib.repr(raw)} is no action of {self.env_id}: {error}"
+                f"expected an action of {self.env_id}, got {reprlib.repr(raw)}: {error}"
             ) from error
         payload = row if mode is ControlMode.COMPOSITE_MODE else (row,)
         return Action.model_validate({"control_mode": mode, PAYLOAD_OF_MODE[mode]: payload})
@@ -391,7 +411,7 @@ class GymEnv:
     def clock_text(self) -> str:
         return f"step {self._steps}, return {self._total_reward:.2f}"
 
-    # -- pictures ------------------------------------------------------------------------------------------------------
+    # -- pictures
     def render(self, camera: str) -> Any:
         import numpy as np
 
@@ -411,7 +431,8 @@ class GymEnv:
         ):
             raise EnvironmentFailed(
                 f"{self.env_id} renders no picture (uint8, height × width × 3)",
-                hint="it needs the render mode rgb_array; leave videos out, or name a camera of its observation",
+                hint="it needs the render mode rgb_array;"
+                " leave videos out, or name a camera of its observation",
             )
         return np.array(picture, order="C")
 
@@ -432,7 +453,7 @@ class GymEnv:
         except Exception:
             log.exception("%s did not close cleanly", self.env_id)
 
-    # -- judging -------------------------------------------------------------------------------------------------------
+    # -- judging
     def _success(self, info: Any) -> bool | None:
         kind, _, rest = self.config.success.partition(":")
         if kind == "return":
@@ -444,7 +465,10 @@ class GymEnv:
         return None
 
     def _yes_or_no(self, key: str, value: Any) -> bool:
-        """A truth value or a whole number. Half a success is none, nor is a text or a NaN. Raises EnvironmentFailed."""
+        """Return a verdict from a truth value or a whole number.
+
+        Raises EnvironmentFailed for others.
+        """
         import numpy as np
 
         plain = np.asarray(value)
@@ -452,7 +476,8 @@ class GymEnv:
             return bool(plain.item())
         raise EnvironmentFailed(
             f"{self.env_id} says {value!r} of {key}, which is neither yes nor no",
-            hint="choose what a success is with `success`: info:KEY of a truth value, or return:NUMBER",
+            hint="choose what a success is with `success`:"
+            " info:KEY of a truth value, or return:NUMBER",
         )
 
     def _failed(self, what: str, error: Exception) -> EnvironmentFailed:
@@ -464,7 +489,7 @@ WORLDLESS = WorldState(stamp_ns=0, joint_state=JointState(name=(), position=(), 
 
 
 def _make(env_id: str, config: GymConfig, *, pictures: bool) -> Any:
-    os.environ.setdefault("MUJOCO_GL", "egl")  # no display is needed, unless somebody says so
+    os.environ.setdefault("MUJOCO_GL", "egl")  # no display is needed by default
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     try:
         import gymnasium
@@ -486,5 +511,6 @@ def _make(env_id: str, config: GymConfig, *, pictures: bool) -> Any:
     except Exception as error:
         raise ConfigError(
             f"the environment {env_id} cannot be made: {type(error).__name__}: {error}",
-            hint="gym:ID takes the ids that gymnasium knows, or MODULE:ID, where importing MODULE registers it",
+            hint="gym:ID takes the ids that gymnasium knows, or MODULE:ID,"
+            " where importing MODULE registers it",
         ) from error

@@ -1,10 +1,13 @@
-"""gymnasium's spaces as rows of named numbers: what an action or an observation of Box, Discrete, MultiDiscrete and MultiBinary parts is,
-however deep they lie in Dict and Tuple. Knows no environment and no runner.
+"""gymnasium's spaces as rows of named numbers.
 
-A part's numbers are called by its path, dots between keys and indices: `gripper` for one number, `arm.0`, `arm.1` … for more, those of a Box of
-several dimensions row by row. As an action a Box is its own numbers (whole ones rounded), a Discrete of n one number, [-1, 1] cut into n equal
-parts, a MultiDiscrete such a number per axis, and a MultiBinary (or a Box of truth values) 0 to 1 per bit, set from 0.5 on. As an observation
-every part is its own numbers.
+Covers actions and observations of Box, Discrete, MultiDiscrete and MultiBinary parts, nested in
+Dict and Tuple at any depth. Must not know environments or the runner.
+
+A part's numbers are named by its path, dots between keys and indices: `gripper` for one number,
+`arm.0`, `arm.1` … for more, those of a Box of several dimensions row by row. As an action a Box is
+its own numbers (whole ones rounded), a Discrete of n one number, [-1, 1] cut into n equal parts, a
+MultiDiscrete such a number per axis, and a MultiBinary (or a Box of truth values) 0 to 1 per bit,
+set from 0.5 on. As an observation every part is its own numbers.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ Keys = tuple[Any, ...]
 
 
 class NoNumbers(Exception):
-    """This space, or this value, is no row of numbers; the message says why."""
+    """This space or value is not a row of numbers; the message tells why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +59,7 @@ class Leaf:
 
     @property
     def bytes_in_a_plane(self) -> bool:
-        """Pictures of any kind: of one colour, several behind each other."""
+        """Return whether it is a picture of any kind: of one color, or several stacked."""
         from gymnasium import spaces
 
         space = self.space
@@ -65,7 +68,9 @@ class Leaf:
         )
 
     def names(self, otherwise: str) -> list[str]:
-        """Of its numbers; `otherwise` stands for the path of a space that has no parts."""
+        """Return the names of its numbers; `otherwise` replaces the path of a space without
+        parts.
+        """
         path, size = self.path or otherwise, self.size
         return [path] if size == 1 else [f"{path}.{index}" for index in range(size)]
 
@@ -79,7 +84,10 @@ class Leaf:
         return whole
 
     def numbers(self, whole: Any) -> list[float]:
-        """This part's numbers as they are. Raises NoNumbers when they are none, or not as many as the space says."""
+        """Return this part's numbers as they are.
+
+        Raises NoNumbers for others than the space describes.
+        """
         import numpy as np
 
         part = self.of(whole)
@@ -99,7 +107,7 @@ def _why_not(space: Any) -> str:
 
     match space:
         case spaces.Text():
-            return "a text is no number"
+            return "a text is not a number"
         case spaces.Sequence():
             return "a sequence is longer one time than another"
         case spaces.Graph():
@@ -110,7 +118,7 @@ def _why_not(space: Any) -> str:
 
 
 def leaves(space: Any, keys: Keys = ()) -> Iterator[Leaf]:
-    """All parts, in the space's own order (gymnasium sorts the keys of a Dict unless it is told otherwise)."""
+    """Return all parts in the space's own order (gymnasium sorts the keys of a Dict by default)."""
     from gymnasium import spaces
 
     if isinstance(space, spaces.Dict):
@@ -123,12 +131,12 @@ def leaves(space: Any, keys: Keys = ()) -> Iterator[Leaf]:
         yield Leaf(keys, space)
 
 
-# -- actions ------------------------------------------------------------------------------------------------------------
+# -- actions
 class ActionRow:
     """An action space as a row. `names`, `low` and `high` in the row's order.
 
-    `element(row)` is in the space for every row of finite numbers, those out of the limits being taken to them; `element(row_of(x))` is x.
-    Raises NoNumbers for a space that is no such row.
+    `element(row)` is in the space for every row of finite numbers, with excess clamped to the
+    limits; `element(row_of(x))` is x. Raises NoNumbers for a space that is not such a row.
     """
 
     def __init__(self, space: Any) -> None:
@@ -144,7 +152,10 @@ class ActionRow:
             raise NoNumbers(f"several of its numbers have the same name: {', '.join(self.names)}")
 
     def row_of(self, element: Any) -> list[float]:
-        """The row of what the space itself takes. A Box's numbers may be beyond its limits. Raises NoNumbers for what is none."""
+        """Return the row of what the space itself takes; a Box's numbers may be beyond its limits.
+
+        Raises NoNumbers for anything else.
+        """
         _check_keys(self.space, element, "it")
         return [number for leaf in self._leaves for number in _row_of(leaf, element)]
 
@@ -155,7 +166,7 @@ class ActionRow:
 
 
 def _bounds(box: Any) -> list[tuple[Any, Any]]:
-    """Low and high of every number of a Box; where it has no limits, those of its dtype."""
+    """Return low and high of every number of a Box; without limits, those of its dtype."""
     import numpy as np
 
     low, high = box.low.reshape(-1), box.high.reshape(-1)
@@ -228,14 +239,14 @@ def _middle(leaf: Leaf, value: float, start: int, n: int) -> float:
     """The middle of a choice's share of [-1, 1]."""
     if not value.is_integer() or not start <= int(value) < start + n:
         raise NoNumbers(
-            f"{value:g} is no choice of {leaf.path or leaf.space}: {start} to {start + n - 1}"
+            f"{value:g} is not a choice of {leaf.path or leaf.space}: {start} to {start + n - 1}"
         )
     return -1 + (2 * (int(value) - start) + 1) / n
 
 
 def _bit(leaf: Leaf, value: float) -> float:
     if value not in (0.0, 1.0):
-        raise NoNumbers(f"{value:g} is no bit of {leaf.path or leaf.space}")
+        raise NoNumbers(f"{value:g} is not a bit of {leaf.path or leaf.space}")
     return value
 
 
@@ -267,7 +278,7 @@ def _element(space: Any, numbers: Iterator[float]) -> Any:
 
 
 def _within(number: float, low: Any, high: Any, kind: str) -> Any:
-    """A Box's number. Whole numbers are compared as such: 2^63 - 1 is no float."""
+    """Convert a Box's number. Whole numbers are compared as such: 2^63 - 1 is not a float."""
     if kind == "f":
         return min(max(number, low), high)
     whole = int(number >= BIT_FROM) if kind == "b" else round(number)

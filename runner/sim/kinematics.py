@@ -1,7 +1,7 @@
 """Inverse kinematics of the arm: damped least squares on MuJoCo's Jacobian of the arm alone.
 
-The wrist roll is given, the other four joints place the grasp point and point the fingers down as far as they can. Must
-not know scenes, objects or policies.
+The wrist roll is given, the other four joints place the grasp point and point the fingers down as
+far as they can. Must not know scenes, objects or policies.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class ArmKinematics:
         self._mount = np.array(config.mount_in_base_m)
 
     def grasp_point(self, joints: Sequence[float]) -> tuple[float, float, float]:
-        """Forward kinematics: where the grasp point is in the base frame, in metres."""
+        """Forward kinematics: where the grasp point is in the base frame, in meters."""
         self._pose(joints)
         x, y, z = self._data.site_xpos[self._site] + self._mount
         return float(x), float(y), float(z)
@@ -49,7 +49,9 @@ class ArmKinematics:
         *,
         roll_rad: float = 0.0,
     ) -> tuple[list[float], float]:
-        """Joint angles (all six; the gripper's is `start`'s) and the position error left, in metres."""
+        """Return joint angles (all six; the gripper's is `start`'s) and the remaining error in
+        meters.
+        """
         np, mujoco = self._np, self._mujoco
         goal = np.asarray(point_base_m, dtype=float) - self._mount
         joints = np.asarray(start, dtype=float).copy()

@@ -44,10 +44,12 @@ PLACING_TRIES = 400
 
 
 def make_layout(seed: int, config: SceneConfig, *, names: tuple[str, ...] | None = None) -> Layout:
-    """The layout of a seed: a target, one distractor of its colour, one of its shape, the rest at random.
+    """Return the layout of a seed: a target, one distractor of its color, one of its shape, the
+    rest.
 
-    `names` fixes the objects (first one is the target) and leaves only places and light to the seed.
-    Raises ValueError for a name outside the vocabulary or when the objects do not fit on the zone.
+    The rest is random. `names` fixes the objects (first one is the target) and leaves only places
+    and light to the seed. Raises ValueError for a name outside the vocabulary or when the objects
+    do not fit on the zone.
     """
     rng = random.Random(f"tabletop-{seed}")
     pairs = _pairs(rng, config.object_count) if names is None else [_parse(name) for name in names]
@@ -83,13 +85,13 @@ def _parse(name: str) -> tuple[str, str]:
     colour, _, shape = name.partition(" ")
     if colour not in COLOURS or shape not in SHAPES:
         raise ValueError(
-            f"unknown object {name!r}: say a colour of {list(COLOURS)} and a shape of {list(SHAPES)}"
+            f"unknown object {name!r}: use a color of {list(COLOURS)} and a shape of {list(SHAPES)}"
         )
     return colour, shape
 
 
 def _pairs(rng: random.Random, count: int) -> list[tuple[str, str]]:
-    """Distinct (colour, shape); the second shares the first's colour, the third its shape."""
+    """Distinct (color, shape); the second shares the first's color, the third its shape."""
     every = [(colour, shape) for colour in COLOURS for shape in SHAPES]
     target = rng.choice(every)
     same_colour = rng.choice([p for p in every if p[0] == target[0] and p[1] != target[1]])
@@ -101,7 +103,7 @@ def _pairs(rng: random.Random, count: int) -> list[tuple[str, str]]:
 
 
 def _spots(rng: random.Random, count: int, config: SceneConfig) -> list[tuple[float, float]]:
-    """Places on the zone, at least `object_spacing_m` apart (rejection, restarted when it gets stuck)."""
+    """Return places on the zone, at least `object_spacing_m` apart (rejection with restarts)."""
     near, far = (config.table_edge_x_m + d for d in config.zone_from_edge_m)
     for _ in range(PLACING_TRIES):
         spots: list[tuple[float, float]] = []

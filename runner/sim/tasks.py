@@ -1,7 +1,7 @@
-"""What an episode in our own scene is about: how it is set up, what the skill is told, when it is a success. For benchmarks.
+"""Tasks of episodes in our own scene, for benchmarks: set-up, goal and verdict.
 
-Both tasks are about the seed's target object; the verdict is the simulator's ground truth, which no skill sees. A gymnasium environment
-brings its own task.
+Both tasks are about the seed's target object; the verdict is the simulator's ground truth, which no
+skill sees. A gymnasium environment brings its own task.
 """
 
 from __future__ import annotations
@@ -32,8 +32,12 @@ NAVIGATION_ERROR_RAD: Final = 0.10
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """`actions`: those of a manifest that ask for this task. `prepare` follows `reset(seed)`. `steady`: steps in a row that the judge must
-    say yes for the episode to be over; 0: it is over when the skill says so."""
+    """One task.
+
+    `actions` are those of a manifest that ask for it. `prepare` follows `reset(seed)`. `steady`:
+    the episode is over after this many steps in a row with a positive verdict; 0: when the skill
+    ends.
+    """
 
     name: str
     actions: frozenset[str]
@@ -65,7 +69,7 @@ def stand_before(
 
 
 def _stand(env: SimEnv, seed: int) -> None:
-    """Where navigation leaves the base: before the target, a few centimetres off."""
+    """Put the base where navigation leaves it: before the target, a few centimeters off."""
     stand_before(env, env.target, random.Random(f"benchmark-{seed}"))
 
 
@@ -110,7 +114,10 @@ def task_of(manifest: RSkillManifest) -> Task:
 
 
 def expert_policy(arm: SimEnv, environment: ArmEnvironment) -> Policy:
-    """The scripted grab that the demonstrations are made by. It reads the ground truth: the ceiling of a benchmark, nothing else."""
+    """Return the scripted grab of the demonstrations.
+
+    It reads the ground truth: a benchmark's ceiling.
+    """
 
     def make(_: Any, seed: int) -> Step:
         expert = GrabExpert(arm, ArmKinematics(arm.config), arm.target)

@@ -1,4 +1,4 @@
-"""The simulator's ground truth as the runner's wire shows it: for judges and demos, never for skills or planners."""
+"""Ground truth of the simulator on the runner's wire: for judges and demos, never for planners."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from vram_arbiter.runner.sim.env import SimEnv
 
 
 def truth_as_wire(env: SimEnv) -> dict[str, Any]:
-    """Target, objects with their place (metres, map and base frame), what is held."""
+    """Target, objects with their place (meters, map and base frame), what is held."""
     truth = env.ground_truth()
     return {
         "target": truth.target,

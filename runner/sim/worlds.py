@@ -1,6 +1,7 @@
-"""Which world the runner is to simulate (`--env`), and what goes with it: cameras, joints, who may act in it.
+"""Worlds that the runner can simulate (`--env`), with their cameras, joints and skills.
 
-`so101` is our own scene, `gym:ID` any gymnasium environment. Nothing is simulated here yet: `World.make` does that, on the control thread.
+`so101` is our own scene, `gym:ID` any gymnasium environment. Nothing is simulated here:
+`World.make` does that, on the control thread.
 """
 
 from __future__ import annotations
@@ -36,8 +37,12 @@ OBSERVATION_CAMERAS: Final = ("front", "wrist")  # the first is the default one
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """`cameras` None: what the environment has. `arm`, `scene` and `environment` are those of our own scene. `joints` are what a policy sees and moves, in
-    the policy's order; `rest` is where it begins (rad), None: wherever a reset leaves the world."""
+    """One choice of `--env`.
+
+    `cameras` None: those of the environment. `arm`, `scene` and `environment` are those of our own
+    scene. `joints` are what a policy sees and moves, in the policy's order; `rest` is its start
+    (rad), None: wherever a reset leaves the world.
+    """
 
     name: str
     make: Callable[[], Environment]
@@ -102,7 +107,7 @@ def world_of(
     success: str | None = None,
     render: bool | None = None,
 ) -> World:
-    """The world of `--env` and the flags beside it. Raises ConfigError for flags that do not go together."""
+    """Return the world of `--env` and its flags. Raises ConfigError for flags that contradict."""
     if env == SO101:
         if env_config is not None or success is not None:
             raise ConfigError(
@@ -110,7 +115,7 @@ def world_of(
             )
         return so101_world(scene)
     if not env.startswith(GYM) or env == GYM:
-        raise ConfigError(f"--env {env} is no world", hint="so101, or gym:ID, e.g. gym:CartPole-v1")
+        raise ConfigError(f"unknown --env {env}", hint="so101, or gym:ID, e.g. gym:CartPole-v1")
     if scene is not None:
         raise ConfigError(f"--scene is for --env {SO101}; a gymnasium environment has --env-config")
     config = GymConfig() if env_config is None else GymConfig.load(env_config)
@@ -122,7 +127,7 @@ def world_of(
 def makers_of(
     world: World, given: Mapping[str, str], arbiter: Any, *, period_s: float, wait_s: float
 ) -> dict[Kind, Maker]:
-    """Who makes the installed skills that can act in this world."""
+    """Return the makers of the skills that can act in this world."""
     from vram_arbiter.clients.sidecar.policy import PolicyClient
     from vram_arbiter.runner.skills.navigate import Navigate
     from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy, wire_up
@@ -132,7 +137,8 @@ def makers_of(
         if not world.joints:
             raise ManifestInvalid(
                 f"{manifest.name} moves joints, and {world.name} names none",
-                hint="name them in the environment's file: `joints`, `actions`, control_mode joint_position",
+                hint="name them in the environment's file: `joints`, `actions`,"
+                " control_mode joint_position",
             )
         wiring = wire_up(manifest, world.joints, world.rest)
         client = PolicyClient(sidecar_endpoint(manifest.name, given, os.environ))

@@ -1,7 +1,8 @@
-"""The life of a skill: what may happen to it, in which order. Concrete skills fill in the hooks.
+"""Life cycle of a skill; concrete skills fill in the hooks.
 
-A skill is started for a goal, stepped by the control thread, finished (also after a failed start), started again for the next
-goal of the same key, and released once. Anything else raises with the state it was in.
+A skill is started for a goal, stepped by the control thread, finished (also after a failed start),
+started again for the next goal of the same key, and released once. Any other order raises with the
+present state.
 """
 
 from __future__ import annotations
@@ -31,7 +32,10 @@ _ALLOWED = {
 
 
 class SkillBase(ABC):
-    """Hooks: `_start` (reset included), `_step`, `_finish`, `_release`. `fraction` is the share done, 0 to 1."""
+    """Hooks: `_start` (reset included), `_step`, `_finish`, `_release`.
+
+    `fraction`: share done, 0 to 1.
+    """
 
     holds_gpu = False
 
@@ -48,7 +52,10 @@ class SkillBase(ABC):
         self.state = to
 
     async def start(self, goal: Goal) -> None:
-        """Make it ready to be stepped, reset whatever happened before. Raises typed errors; then it is idle again."""
+        """Make it ready to be stepped, reset in any case.
+
+        Raises typed errors; then it is idle again.
+        """
         self._move(SkillState.STARTING)
         self.fraction = 0.0
         try:
@@ -76,7 +83,7 @@ class SkillBase(ABC):
                 self._move(SkillState.IDLE)
 
     async def release(self) -> None:
-        """Let go of everything for good. Repeatable."""
+        """Free everything for good. Repeatable."""
         if self.state is not SkillState.RELEASED:
             await self.finish()
             self._move(SkillState.RELEASED)

@@ -1,10 +1,12 @@
-"""Plays chunks of actions in order: nothing twice, nothing dropped, one request at a time, one owner.
+"""Playback of action chunks in order: nothing twice, nothing dropped, one request at a time.
 
-The owner is the control thread: it alone pops rows and asks for the next chunk. A chunk is fetched elsewhere (`fetch` returns a
-future at once). With `prefetch_at` 0 the next observation is taken when the last row was played; with n > 0 it is taken when n
-rows are left, and the new chunk plays after them. Any chunk size works with any `prefetch_at`.
+The owner is the control thread: it alone pops rows and asks for the next chunk. A chunk is fetched
+elsewhere (`fetch` returns a future at once). With `prefetch_at` 0 the next observation is taken
+when the last row was played; with n > 0 it is taken when n rows are left, and the new chunk plays
+after them. Any chunk size works with any `prefetch_at`.
 
-A chunk after the first is a *hit* when it was there as its first row was due, a *miss* when the robot (or the simulated world) waited.
+A chunk after the first is a *hit* when it was there as its first row was due, a *miss* when the
+robot (or the simulated world) waited.
 """
 
 from __future__ import annotations
@@ -24,8 +26,11 @@ CHUNK_ROWS_MAX = 1000
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """A row to play now, of which chunk. `prefetched`: with the first row of a chunk, whether it came in time; None with any other row,
-    and with the very first chunk, before which there was nothing to play."""
+    """A row to play now, and its chunk.
+
+    `prefetched` comes with the first row of every chunk but the first: whether the chunk was in
+    time.
+    """
 
     chunk: int
     row: Row
@@ -33,7 +38,9 @@ class Played:
 
 
 class ChunkPlayer:
-    """`wait_s` is how long `next_row` may wait for a chunk that is under way: in a simulator the world waits with it."""
+    """`wait_s` is how long `next_row` may wait for a pending chunk: in a simulator the world
+    waits.
+    """
 
     def __init__(
         self,
@@ -59,7 +66,10 @@ class ChunkPlayer:
         return self._under_way is None and len(self._rows) <= self._prefetch_at
 
     def next_row(self, observation: Any) -> Played | None:
-        """What to play now, or None while the next chunk is awaited. Raises what the fetch raised."""
+        """Return what to play now, or None while the next chunk is pending.
+
+        Raises what the fetch raised.
+        """
         if self.wants_observation():
             if observation is None:
                 raise ModelError(

@@ -1,4 +1,4 @@
-"""Bounded joint motion to a known pose: how the arm folds before it drives or before a policy takes over.
+"""Bounded joint motion to a known pose: the arm folds before it drives or before a policy begins.
 
 Pure: joint names and radians in, targets out, one per control step.
 """
@@ -16,7 +16,9 @@ SETTLE_STEPS_MAX = 45  # after the target stands still the arm gets 1.5 s to arr
 
 
 def joint_positions(world: WorldState, names: tuple[str, ...]) -> dict[str, float]:
-    """Measured positions of the named joints. Raises ModelError when one is missing or the state is stale: never made up."""
+    """Return measured positions of the named joints. Raises ModelError for a missing or stale
+    one.
+    """
     if "joint_state" in world.stale:
         raise ModelError("the joint state is stale", hint="nothing moves on an old state")
     known = dict(zip(world.joint_state.name, world.joint_state.position, strict=True))
@@ -32,7 +34,10 @@ def bounded(here: float, there: float, reach: float) -> float:
 
 
 class JointRamp:
-    """From where the joints are to `goal` (rad, by name) at a bounded speed. `done` when they arrived, or cannot go further."""
+    """Motion from the present pose to `goal` (rad, by name) at a bounded speed.
+
+    `done` when the joints arrived, or cannot go further.
+    """
 
     def __init__(
         self,

@@ -1,8 +1,10 @@
-"""`navigate`: drive the base to a pose, square up to a point on the table, or turn in place. Needs no GPU and takes no lease.
+"""`navigate`: drive the base to a pose, square up to a point on the table, or turn in place.
 
-Goal parameters as Nav2's NavigateToPose (`pose` with `header.frame_id` map, odom or base_link), or `target_point` (x, y, z in base_link:
-stand so that this point lies where the arm grasps), or `turn_rad`. The arm folds first, its gripper stays as it is. Places in
-`base_link` mean the base as it stands when the first step is taken; the planar simulator's odometry is its map.
+Needs no GPU and takes no lease. Goal parameters as Nav2's NavigateToPose (`pose` with
+`header.frame_id` map, odom or base_link), or `target_point` (x, y, z in base_link: stand so that
+this point lies where the arm grasps), or `turn_rad`. The arm folds first, its gripper stays as it
+is. Places in `base_link` refer to the base at the first step; the planar simulator's odometry is
+its map.
 """
 
 from __future__ import annotations
@@ -82,7 +84,9 @@ class StampedPose(_Part):
 
 
 class NavigateParams(_Part):
-    """What a goal may ask for: `target_point` and `turn_rad` go before `pose`, which the manifest's default always gives."""
+    """Goal parameters: `target_point` and `turn_rad` precede `pose`, which the manifest always
+    sets.
+    """
 
     pose: StampedPose | None = None
     target_point: Position | None = None
@@ -99,7 +103,7 @@ class NavigateParams(_Part):
 
 
 def base_pose(world: WorldState) -> Pose2D:
-    """Where the base stands on the map. Raises ModelError when that is unknown or stale: never assumed."""
+    """Return the base's pose on the map. Raises ModelError when it is unknown or stale."""
     if world.base_pose is None or "base_pose" in world.stale:
         raise ModelError("the base's pose is not known", hint="nothing drives without odometry")
     x, y, _ = world.base_pose.xyz
@@ -124,7 +128,7 @@ def goal_pose(params: NavigateParams, here: Pose2D, config: SceneConfig) -> Pose
 
 
 class Navigate(SkillBase):
-    """Fold, drive, stand still. Fails with `goal_rejected` when the base stops coming closer (a table is in the way)."""
+    """Fold, drive, stand still. Fails with `goal_rejected` when the base stops coming closer."""
 
     def __init__(self, manifest: RSkillManifest, config: SceneConfig, *, period_s: float) -> None:
         super().__init__(manifest)

@@ -1,7 +1,8 @@
-"""Which skill is resident: one GPU-holding skill at a time, by (rskill_id, revision); the prompt is no part of the key.
+"""Residency: one GPU-holding skill at a time, by (rskill_id, revision); the prompt does not matter.
 
-The same key is reused (and reset by its `start`), another key makes the old one leave first. GPU-free skills live beside it, take no
-slot and make nobody leave. Holds no lock over a goal: callers run one goal at a time.
+The same key is reused (and reset by its `start`), another key displaces the old skill first.
+GPU-free skills are independent: they take no slot and displace no skill. Holds no lock over a goal:
+callers run one goal at a time.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ from vram_arbiter.schemas.errors import VramError
 
 log = logging.getLogger(__name__)
 
-EVICT_S = 30.0  # a skill that needs longer to leave is left behind: whoever measures the card decides what is free
+EVICT_S = 30.0  # a skill that needs longer to leave is abandoned: the arbiter measures what is free
 CLOSE_S = 3.0  # the runner ends: its sidecar may be ending too
 
 
 class Residency:
-    """`acquire(key, make)` returns the resident skill of a key, making it if need be; `start` begins a goal with it."""
+    """`acquire(key, make)` returns the resident skill of a key, made if need be; `start` begins a
+    goal.
+    """
 
     def __init__(self) -> None:
         self._lock = asyncio.Lock()
@@ -34,7 +37,7 @@ class Residency:
         return self._resident.key if self._resident is not None else None
 
     async def acquire(self, key: SkillKey, make: Callable[[], Skill]) -> Skill:
-        """Reuse or make. Raises what `make` raises; then nothing is resident that was not before."""
+        """Reuse or make a skill. Raises what `make` raises; then the slot is as empty as before."""
         async with self._lock:
             if key in self._free:
                 return self._free[key]
@@ -49,8 +52,11 @@ class Residency:
             return skill
 
     async def start(self, skill: Skill, goal: Goal) -> None:
-        """Start it for a goal. One that fails its very first start (its model does not load) leaves nothing behind; one that has
-        served stays, and its next start loads again what is missing. Raises what the start raises."""
+        """Start it for a goal. Raises what the start raises.
+
+        A skill that fails its very first start (its model does not load) leaves nothing behind; one
+        that has served stays, and its next start loads again what is missing.
+        """
         try:
             await skill.start(goal)
         except BaseException:

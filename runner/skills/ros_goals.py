@@ -1,6 +1,6 @@
-"""Goals of ROS actions as the stand-ins read them: the manifest's default goal with what was asked for laid over it, checked field by field.
+"""Goals of ROS actions for the stand-ins: the manifest's default goal updated with the request.
 
-Pure; the message itself is a pydantic model of the stand-in's.
+Pure; checked field by field by a pydantic model of the stand-in.
 """
 
 from __future__ import annotations

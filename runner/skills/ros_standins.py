@@ -1,6 +1,7 @@
-"""What this runner does itself in place of a ROS 2 server: by package and type of the interface. It has no ROS 2 action client.
+"""Skills that this runner performs itself in place of a ROS 2 server, by interface type.
 
-A `ros_action` that nothing here stands for is refused before a goal could ask for it, with what there is.
+It has no ROS 2 action client. A `ros_action` without a stand-in is refused before a goal could ask
+for it, with a list of the known ones.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ class StandIn:
 
 
 class StandIns:
-    """A maker of `ros_action` skills that refuses some. `joints` are the robot's, for manifests that name an order."""
+    """Maker of `ros_action` skills, with refusals. `joints` are the robot's, for ordered
+    manifests.
+    """
 
     def __init__(self, known: Mapping[str, StandIn], joints: Iterable[str]) -> None:
         self._known = dict(known)
@@ -39,7 +42,11 @@ class StandIns:
         wanted = interface_of(manifest)
         stand_in = self._known.get(wanted)
         if stand_in is None:
-            return f"this runner has no ROS 2 action client; it stands in for {' and '.join(sorted(self._known)) or 'none'}, not for {wanted}"
+            known = " and ".join(sorted(self._known)) or "none"
+            return (
+                f"this runner has no ROS 2 action client;"
+                f" it stands in for {known}, not for {wanted}"
+            )
         for actuator in manifest.actuators_required:
             if actuator.kind not in stand_in.drives:
                 drives = " and ".join(sorted(stand_in.drives))
@@ -51,6 +58,6 @@ class StandIns:
 
 
 def interface_of(manifest: RSkillManifest) -> str:
-    """`package/Type`, whether the manifest writes the type short, or as ROS does: `package/action/Type`."""
+    """Return `package/Type`, for a short type as well as ROS's `package/action/Type`."""
     ros = manifest.ros_integration
     return "" if ros is None else f"{ros.package}/{ros.interface_type.rpartition('/')[2]}"

@@ -1,8 +1,10 @@
-"""A learnt policy (`vla`) that lives in its own sidecar process: this is the runner's end of it.
+"""Runner's end of a learned policy (`vla`) that lives in its own sidecar process.
 
-A goal: `load` (the sidecar acquires its lease and says lease and token) → mark one use on that lease for the whole goal, so that
-nobody is evicted mid-step → arm to the start pose → `reset` → chunks, played in order → use ended. If the lease is lost in between, the
-goal fails with that error and the arm holds. Knows no robot model: joints, cameras and limits come from manifest and world state.
+A goal: `load` (the sidecar acquires its lease and returns lease and token) → mark one use on that
+lease for the whole goal, so that it is not evicted mid-step → arm to the start pose → `reset` →
+chunks, played in order → use ended. If the lease is lost in between, the goal fails with that error
+and the robot holds. Must not know robot models: joints, cameras and limits come from manifest and
+world state.
 """
 
 from __future__ import annotations
@@ -92,7 +94,7 @@ class Arbiter(Protocol):
 
 
 class View(BaseModel):
-    """A crop in fractions of the picture (x0, y0, x1, y1) and the size it is averaged down to (width, height)."""
+    """Crop in fractions of the picture (x0, y0, x1, y1) and the size it is averaged down to."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     crop: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
@@ -100,7 +102,7 @@ class View(BaseModel):
 
 
 class Rollout(BaseModel):
-    """The part of `policy_extras` that the runner reads; other keys belong to the sidecar's adapter."""
+    """Part of `policy_extras` that the runner reads; other keys belong to the sidecar's adapter."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
     rollout_steps: int | None = Field(
@@ -116,7 +118,7 @@ class Rollout(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """How a manifest's features map to this robot: camera → key of the observation, joint order, start pose (rad)."""
+    """Map from a manifest's features to this robot: cameras, joint order, start pose (rad)."""
 
     cameras: Mapping[str, str]
     joints: tuple[str, ...]
@@ -130,7 +132,9 @@ class Wiring:
 def wire_up(
     manifest: RSkillManifest, joints: tuple[str, ...], rest: Mapping[str, float] | None
 ) -> Wiring:
-    """Read the manifest. Raises ManifestInvalid when it does not say what it looks at or does not fit the joints."""
+    """Read the manifest. Raises ManifestInvalid without inputs, or if it does not fit the
+    joints.
+    """
     aliases = manifest.image_preprocessing.aliases if manifest.image_preprocessing else {}
     robot_name = {model: robot for robot, model in aliases.items()}
     cameras: dict[str, str] = {}
@@ -166,11 +170,14 @@ def wire_up(
 
 
 class SidecarPolicy(SkillBase):
-    """`arbiter` None: nobody arbitrates, the sidecar loads at once. `wait_s` > 0 lets a simulated world wait for each chunk.
+    """`arbiter` None: the sidecar loads at once.
 
-    `speeds_rad_s`, by joint: never command a step that is longer than this allows in one period. The safety gate withholds such leaps, and
-    rightly; they are meant only where the manifest says so (`targets_lead`). None sends the policy's targets as they are. Steps begin where
-    the motors were really sent (`sent`, rad by joint): what is commanded may be dropped for being late, or shortened by the gate.
+    `wait_s` > 0 lets a simulated world wait for chunks.
+
+    `speeds_rad_s`, by joint, limits a step to what one period allows. The safety gate would rightly
+    withhold larger leaps; they are intended only where the manifest says so (`targets_lead`). None
+    sends the policy's targets as they are. Steps begin at the motors' last targets (`sent`, rad by
+    joint): a command may be dropped for being late, or shortened by the gate.
     """
 
     holds_gpu = True
@@ -215,7 +222,7 @@ class SidecarPolicy(SkillBase):
         self._recent: deque[Row] = deque(maxlen=STILL_WINDOW)
         self._target: dict[str, float] = {}
 
-    # -- event loop ----------------------------------------------------------------------------------------------------
+    # -- event loop
     async def _start(self, goal: Goal) -> None:
         self._loop = asyncio.get_running_loop()
         self._traceparent = goal.traceparent
@@ -228,7 +235,8 @@ class SidecarPolicy(SkillBase):
         await self._client.reset({TASK_KEY: self._task}, token=self._token)
         self._ramp, self._running, self._commanded = None, False, None
         self._recent.clear()
-        token = self._token  # of this goal: a request that comes late must not load the model anew, as one without a token would
+        # of this goal: a late request without a token would load the model anew
+        token = self._token
         self._player = ChunkPlayer(
             lambda observation: self._request(observation, token),
             prefetch_at=self._wiring.rollout.prefetch_at,
@@ -257,7 +265,9 @@ class SidecarPolicy(SkillBase):
                 await asyncio.sleep(RETRY_S)
 
     async def _load(self, goal: Goal) -> LoadResult:
-        """A goal that is over before the model is there takes its load back: nobody else leaves the card for it."""
+        """Take back the load of a goal that is over before the model is there: no eviction for
+        it.
+        """
         try:
             return await self._client.load(timeout_s=goal.deadline_s or None)
         except (
@@ -280,7 +290,9 @@ class SidecarPolicy(SkillBase):
             await use.end()
 
     async def _release(self) -> None:
-        """Another policy takes its place: the sidecar gives its memory back. One that never loaded for us is not even looked for."""
+        """Make the sidecar free its memory for another policy; skip a sidecar that never loaded for
+        us.
+        """
         try:
             if self._loaded:
                 await self._client.unload()
@@ -298,7 +310,7 @@ class SidecarPolicy(SkillBase):
             )
             return self._rows(answer)
 
-    # -- control thread ------------------------------------------------------------------------------------------------
+    # -- control thread
     def wants_frames(self) -> bool:
         return self._running and self._player is not None and self._player.wants_observation()
 
@@ -390,7 +402,10 @@ class SidecarPolicy(SkillBase):
         return asyncio.run_coroutine_threadsafe(self._fetch(observation, token), self._loop)
 
     def _rows(self, answer: Mapping[str, Any]) -> list[Row]:
-        """Rows of joint targets in rad. Raises ModelError for a wrong shape or a number that is not finite."""
+        """Return rows of joint targets in rad.
+
+        Raises ModelError for a wrong shape or infinite numbers.
+        """
         import numpy as np
 
         if ACTION_KEY not in answer:

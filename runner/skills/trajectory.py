@@ -1,7 +1,8 @@
-"""A joint trajectory, played by this runner: what `control_msgs/FollowJointTrajectory` asks of a ROS 2 controller, without ROS.
+"""Joint trajectories, played by this runner in place of a ROS 2 controller.
 
-Targets run straight from point to point, at most one period's worth a tick: a runner that is late plays slower, never faster. Whoever sends one is
-told before anything moves that a point is out of range or too fast. Safety is the gate's, as for every skill.
+Reads goals of `control_msgs/FollowJointTrajectory`. Targets run straight from point to point, at
+most one period's worth per tick: a late runner plays slower, never faster. A point out of range or
+too fast is refused before anything moves. Safety is the gate's, as for every skill.
 """
 
 from __future__ import annotations
@@ -57,7 +58,10 @@ class IgnoredHeader(BaseModel):
 
 
 class Point(_Ros):
-    """Positions in rad, in the order of `joint_names`. The way between points is straight: velocities and the like are not kept."""
+    """Positions in rad, in the order of `joint_names`.
+
+    The way between points is straight: velocities and the like are refused.
+    """
 
     positions: Annotated[tuple[Finite, ...], FIRST, Field(min_length=1, max_length=JOINTS_MAX)]
     velocities: Annotated[tuple[Finite, ...], FIRST, Field(max_length=0)] = ()
@@ -91,7 +95,10 @@ class TrajectoryParams(_Ros):
 
 
 def problem_of(asked: TrajectoryParams, limits: Limits) -> str:
-    """What of a trajectory this robot cannot do; empty: nothing. The way to the first point is not looked at: nobody knows yet where it begins."""
+    """Return what this robot cannot do of a trajectory; empty: nothing.
+
+    The way to the first point is not checked: its start is unknown yet.
+    """
     names, points = asked.trajectory.joint_names, asked.trajectory.points
     if not names or not points:
         return "trajectory: give joint_names and at least one point: an empty one moves nothing"
@@ -100,16 +107,24 @@ def problem_of(asked: TrajectoryParams, limits: Limits) -> str:
     known = ", ".join(limits.joints_rad)
     for name in (*names, *(tolerance.name for tolerance in asked.goal_tolerance)):
         if name not in limits.joints_rad:
-            return f"there is no joint {name}; the robot has {known}"
+            return f"unknown joint {name}; the robot has {known}"
     for index, point in enumerate(points):
         if len(point.positions) != len(names):
-            return f"trajectory.points[{index}]: {len(point.positions)} positions for {len(names)} joints"
+            return (
+                f"trajectory.points[{index}]:"
+                f" {len(point.positions)} positions for {len(names)} joints"
+            )
         for name, position in zip(names, point.positions, strict=True):
             low, high = limits.joints_rad[name]
             if not low <= position <= high:
-                return f"trajectory.points[{index}]: {name} {position:g} rad is outside [{low:g}, {high:g}]"
+                return (
+                    f"trajectory.points[{index}]:"
+                    f" {name} {position:g} rad is outside [{low:g}, {high:g}]"
+                )
     if points[0].time_from_start.seconds <= 0:
-        return "trajectory.points[0]: time_from_start must be above 0: the arm is somewhere else when it begins"
+        return (
+            "trajectory.points[0]: time_from_start must be above 0: the arm begins at another pose"
+        )
     for index, (here, there) in enumerate(pairwise(points), start=1):
         if wrong := too_fast(names, here.positions, there.positions, _gap_s(here, there), limits):
             return f"trajectory.points[{index}]: {wrong}"
@@ -140,8 +155,10 @@ def _gap_s(here: Point, there: Point) -> float:
 class FollowJointTrajectory(SkillBase):
     """One goal, one trajectory. Fails with `goal_rejected` when the arm does not arrive in time.
 
-    `sent` gives the targets in force (rad by joint), from which it begins; without it, and for joints that it does not name, it begins where they are. A
-    gripper that holds something never gets to where it was told: from where it is it would let go for a moment.
+    `sent` returns the targets in force (rad by joint), from which it begins; without it, and for
+    joints that it does not name, it begins at the measured positions. A gripper that holds
+    something never reaches its target: starting from its measured position would open it for a
+    moment.
     """
 
     def __init__(

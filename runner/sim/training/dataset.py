@@ -1,9 +1,11 @@
-"""Writes the datasets that the training scripts read: `python -m vram_arbiter.runner.sim.training.dataset grab|scenes --out DIR`.
+"""Writer of training data: `python -m vram_arbiter.runner.sim.training.dataset grab|scenes --out
+DIR`.
 
-`scenes`: PNG frames of the front and wrist cameras and `labels.jsonl`, one JSON object a frame (boxes, names, what is held).
-`grab`: demonstrations as plain .npy arrays and `info.json`, because a step is two tiny images and six numbers: random
-access by index is all the trainer needs, and a video codec would blur objects that are twelve pixels wide.
-The programs meet on files only: trainers live in `sidecars/`, which never imports the runner.
+`scenes`: PNG frames of the front and wrist cameras and `labels.jsonl`, one JSON object per frame
+(boxes, names, what is held). `grab`: demonstrations as plain .npy arrays and `info.json`, because a
+step is two tiny images and six numbers: random access by index is all the trainer needs, and a
+video codec would blur objects that are twelve pixels wide. The programs meet on files only:
+trainers live in `sidecars/`, which never imports the runner.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ from vram_arbiter.runner.sim.kinematics import ArmKinematics
 from vram_arbiter.runner.sim.tasks import stand_before
 from vram_arbiter.runner.sim.training.learned import LoadedPolicy
 
-# What the grab policy looks at: crops as fractions of the image (x0, y0, x1, y1), and the size they are averaged down to.
+# Views of the grab policy: crops as fractions of the image (x0, y0, x1, y1), and the size they are
+# averaged down to.
 VIEWS: Final[dict[str, tuple[tuple[float, float, float, float], tuple[int, int]]]] = {
     "front": ((0.45, 0.20, 0.85, 0.7333333333), (96, 96)),
     "wrist": ((0.10, 0.0, 1.0, 1.0), (96, 80)),
@@ -53,7 +56,7 @@ def policy_view(image: Any, camera: str) -> Any:
     return cv2.resize(crop, size, interpolation=cv2.INTER_AREA)
 
 
-# -- scenes -------------------------------------------------------------------------------------------------------
+# -- scenes
 def capture(env: SimEnv, camera: str, stage: str) -> Capture:
     """Render a camera and label what is in the picture."""
     truth = env.ground_truth()
@@ -90,9 +93,11 @@ def capture(env: SimEnv, camera: str, stage: str) -> Capture:
 
 
 def scene_captures(env: SimEnv, kinematics: ArmKinematics, seed: int) -> Iterator[Capture]:
-    """All frames of one layout: from the start, from the way, in front of an object, while grabbing, and after.
+    """Yield all frames of one layout: at the start, on the way, before an object, grabbing, and
+    after.
 
-    A third of the grabs is made to miss, so that a closed gripper, or one above an object, is no sign of holding it.
+    A third of the grabs is made to miss, so that a closed gripper, or one above an object, does not
+    imply that it holds the object.
     """
     rng = random.Random(f"captures-{seed}")
     env.reset(seed)
@@ -142,7 +147,10 @@ def scene_captures(env: SimEnv, kinematics: ArmKinematics, seed: int) -> Iterato
 
 
 def write_scenes(out: Path, count: int, seed: int) -> dict[str, int]:
-    """Write `count` labelled frames. Returns how many show a held object, by camera. Raises OSError when it cannot."""
+    """Write `count` labeled frames. Returns how many show a held object, by camera.
+
+    Raises OSError when it cannot.
+    """
     import cv2
 
     out.mkdir(parents=True, exist_ok=True)
@@ -167,12 +175,14 @@ def write_scenes(out: Path, count: int, seed: int) -> dict[str, int]:
     return held
 
 
-# -- grab demonstrations ------------------------------------------------------------------------------------------
+# -- grab demonstrations
 @dataclasses.dataclass(slots=True)
 class Demonstration:
-    """One recorded grab: per step both views (uint8), the measured joints and the expert's target (float32, rad).
+    """One recorded grab: per step both views (uint8), measured joints, expert's target (float32,
+    rad).
 
-    `point` is where the object really is in the base frame (m): a second thing to learn from, no input.
+    `point` is where the object really is in the base frame (m): a second thing to learn from, not
+    an input.
     """
 
     front: list[Any] = dataclasses.field(default_factory=list)
@@ -189,11 +199,12 @@ class Demonstration:
 def demonstrate(
     env: SimEnv, kinematics: ArmKinematics, seed: int, policy: LoadedPolicy | None = None
 ) -> tuple[Demonstration, bool]:
-    """One perturbed demonstration and whether it ended with the object held.
+    """Return one perturbed demonstration and whether it ended with the object held.
 
-    Bursts of noise push the arm off its way (as in DART); what is recorded is always what the expert would do from where the
-    arm really is, so the policy learns to come back. With a `policy` it is the policy that drives for most of the time (as in
-    DAgger), so that what is recorded are the states it gets itself into.
+    Bursts of noise push the arm off its way (as in DART); what is recorded is always what the
+    expert would do from the arm's real pose, so the policy learns to come back. With a `policy` it
+    drives most of the time (as in DAgger), so that the states are recorded that it gets itself
+    into.
     """
     rng = random.Random(f"demonstration-{seed}")
     env.reset(seed)
@@ -235,7 +246,9 @@ def demonstrate(
 def write_grab(
     out: Path, episodes: int, seed: int, policy: LoadedPolicy | None = None
 ) -> dict[str, int]:
-    """Record `episodes` successful demonstrations. Returns episodes, steps and discarded failures."""
+    """Record `episodes` successful demonstrations. Returns episodes, steps and discarded
+    failures.
+    """
     import numpy as np
 
     out.mkdir(parents=True, exist_ok=True)

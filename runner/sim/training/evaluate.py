@@ -1,7 +1,9 @@
-"""Closed-loop success rate of a grab policy: `python -m vram_arbiter.runner.sim.training.evaluate --policy DIR --episodes 40`.
+"""Closed-loop success rate of a grab policy.
 
-Loads the checkpoint through lerobot's own factory, as the sidecar does, puts the base where navigation would leave it, and
-lets the policy act. The verdict is the simulator's ground truth. Must not know leases, goals or sockets.
+`python -m vram_arbiter.runner.sim.training.evaluate --policy DIR --episodes 40` loads the
+checkpoint through lerobot's own factory, as the sidecar does, puts the base where navigation would
+leave it, and lets the policy act. The verdict is the simulator's ground truth. Must not know
+leases, goals or sockets.
 """
 
 from __future__ import annotations

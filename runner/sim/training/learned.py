@@ -1,7 +1,7 @@
-"""A learnt grab policy in this process: for evaluation and for data sets in which the policy drives and the expert labels.
+"""A learned grab policy in this process, for evaluation and for data sets that the policy drives.
 
-Loads a checkpoint through lerobot's own factory, as the sidecar does. The robot's programs never use it: they talk to the
-policy sidecar. Must not know leases, goals or sockets.
+Loads a checkpoint through lerobot's own factory, as the sidecar does. The robot's programs never
+use it: they talk to the policy sidecar. Must not know leases, goals or sockets.
 """
 
 from __future__ import annotations
@@ -13,11 +13,14 @@ from typing import Any
 
 from vram_arbiter.runner.sim.env import SimEnv
 
-OWN_POLICIES = "vram_arbiter.sidecars.models.compact_act"  # registers the demo's policy type; loaded by name, as any lerobot plug-in
+# registers the demo's policy type; loaded by name, as any lerobot plug-in
+OWN_POLICIES = "vram_arbiter.sidecars.models.compact_act"
 
 
 class LoadedPolicy:
-    """A checkpoint with its processors; predicts joint targets from the env's cameras and joints."""
+    """A checkpoint with its processors; predicts joint targets from the env's cameras and
+    joints.
+    """
 
     def __init__(
         self, folder: Path, plugin: str | None = OWN_POLICIES, execute: int | None = None
@@ -41,7 +44,9 @@ class LoadedPolicy:
         self._policy.reset()
 
     def chunk(self, env: SimEnv, images: Mapping[str, Any] | None = None) -> list[list[float]]:
-        """The joint targets (rad) to execute next; `images` (RGB by camera) saves rendering them again."""
+        """Return the next joint targets (rad); `images` (RGB by camera) saves rendering them
+        again.
+        """
         import torch
 
         observation: dict[str, Any] = {

@@ -1,8 +1,10 @@
-"""Writes what the progress model is trained on: `python -m vram_arbiter.runner.sim.training.progress --out DIR --episodes 240`.
+"""Writer of the progress model's data: `python -m vram_arbiter.runner.sim.training.progress --out
+DIR`.
 
-Grabs of the scripted expert, two in five made to miss, as small wrist pictures, and for every object on the table how far a grab of *that* object
-is: the same picture is progress for one instruction and none for another. Everything is told by the simulator's truth, nothing by time:
-a grab that stands still makes no progress. The trainer lives in `sidecars/` and meets this on files only.
+Grabs of the scripted expert, two in five made to miss, as small wrist pictures, and for every
+object on the table the progress of a grab of *that* object: the same picture is progress for one
+instruction and none for another. The simulator's truth decides, not time: a grab that stands still
+makes no progress. The trainer lives in `sidecars/` and meets this program on files only.
 """
 
 from __future__ import annotations
@@ -38,7 +40,10 @@ LIFT_M: Final = 0.10  # where the arm carries a thing
 
 @dataclasses.dataclass(slots=True)
 class Grab:
-    """One recorded try: pictures, and by object name its progress (0..1) and whether it is held, a value a picture."""
+    """One recorded try: pictures, and by object name its progress (0..1) and whether it is held.
+
+    One value per picture.
+    """
 
     images: list[Any]
     progress: dict[str, list[float]]
@@ -46,7 +51,10 @@ class Grab:
 
 
 def progress_of(truth: GroundTruth, gripper: tuple[float, float, float], name: str) -> float:
-    """How far a grab of this object is: nearing it up to 0.5, both fingers on it 0.6, held 0.7 and, with its height, up to 1."""
+    """Return the progress of a grab of this object.
+
+    Nearing it counts up to 0.5, both fingers on it 0.6, held 0.7 and, with its height, up to 1.
+    """
     thing = truth.objects[name]
     if truth.held == name:
         return LIFTED_FROM + (1 - LIFTED_FROM) * min(1.0, thing.lift_m / LIFT_M)
@@ -95,7 +103,10 @@ def _take(env: SimEnv, grab: Grab) -> None:
 
 
 def write(out: Path, episodes: int, seed: int) -> dict[str, int]:
-    """Record so many tries into `out`. Returns how many pictures there are, and how many show something held."""
+    """Record tries into `out`.
+
+    Returns the number of pictures, and of those that show a held object.
+    """
     import numpy as np
 
     out.mkdir(parents=True, exist_ok=True)

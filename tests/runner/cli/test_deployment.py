@@ -206,7 +206,8 @@ def test_a_task_needs_the_cameras_that_its_skill_looks_at(dry_run: DryRun) -> No
     )
     assert code == 2
     assert re.search(
-        r"robot\.yaml:3: sensors: vram-arbiter/so101-grab looks at wrist; there is front", err
+        r"robot\.yaml:3: sensors: vram-arbiter/so101-grab needs the cameras wrist; there is front",
+        err,
     ), err
 
 
@@ -292,12 +293,12 @@ def test_serving_goals_offers_only_what_is_licensed_and_fits(
     code, out, _ = dry_run(TWIN, skills=licensed(tmp_path, "unknown"))
     assert code == 0
     assert re.search(
-        r"skill +vram-arbiter/so101-navigate is not offered: its licence, unknown", out
+        r"skill +vram-arbiter/so101-navigate is not offered: its license, unknown", out
     ), out
     code, out, _ = dry_run(TWIN, skills=GRAB)
     assert code == 0
     assert re.search(
-        r"skill +vram-arbiter/so101-grab is not offered: .*looks at front, wrist; there is none",
+        r"skill +vram-arbiter/so101-grab is not offered: .*needs the cameras front, wrist; there is none",
         out,
     ), out
 

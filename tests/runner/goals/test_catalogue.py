@@ -32,12 +32,12 @@ BY_KIND: dict[Kind, dict[str, object]] = {
 }
 REASON = {
     Kind.WAM: "nothing here runs world action models",
-    Kind.DETECTOR: "asked for things in a picture",
+    Kind.DETECTOR: "a planner asks it for things",
     Kind.SEGMENTER: "nothing here serves it",
-    Kind.VLM: "asked about a picture",
+    Kind.VLM: "a planner asks it about a picture",
     Kind.REWARD: "it judges progress and moves nothing",
-    Kind.PLAYBOOK: "it is a text for whoever plans",
-    Kind.VLA: "nothing here makes learnt policies",
+    Kind.PLAYBOOK: "it is a text for planners",
+    Kind.VLA: "nothing here makes learned policies",
     Kind.ROS_ACTION: "no ROS 2 action client",
     Kind.ROS_SERVICE: "no ROS 2 service client",
 }

@@ -336,7 +336,7 @@ def test_the_command_prints_the_frame_and_opens_its_trace(
     assert (
         program.main(["replay", "--dataset", root, "--frame", "0", "--trace-url", "http://x"]) == 2
     )
-    assert "is no dataset that this program recorded" in capsys.readouterr().err
+    assert "is not a dataset that this program recorded" in capsys.readouterr().err
 
 
 def test_two_cameras_of_one_column_are_refused() -> None:

@@ -53,11 +53,11 @@ def test_a_goal_without_a_prompt_is_called_by_its_skill() -> None:
         (tick(0, frames={}), "camera front has no picture"),
         (
             tick(0, frames={"front": picture("front", 0, encoding=FrameEncoding.RAW)}),
-            r"camera front \(raw\) have no colours",
+            r"camera front \(raw\) have no colors",
         ),
         (
             tick(0, frames={"front": picture("front", 0, data=None, topic="/front")}),
-            "have no colours",
+            "have no colors",
         ),
     ],
 )

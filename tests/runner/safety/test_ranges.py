@@ -36,7 +36,7 @@ def test_a_small_excess_is_clamped_and_said() -> None:
         (joints(1.5, 1.0), "outside"),
         (joints(0.0, -0.4), "outside"),
         (joints(0.0, names=("a",)), ""),
-        (joints(0.0, 0.0, names=("a", "z")), "no joint z"),
+        (joints(0.0, 0.0, names=("a", "z")), "unknown joint z"),
         (joints(0.0, 0.0, 0.0, names=None), "3 joint targets for 2"),
         (Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.0,) * 6,)), "not supported"),
         (Action(control_mode=ControlMode.GRIPPER_POSITION, gripper=(0.5,)), "not supported"),

@@ -297,7 +297,7 @@ def test_a_skill_and_the_expert_in_our_own_scene(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        ([], "nobody is to play"),
+        ([], "there are no contestants"),
         (["--policy", "clever"], "clever"),
         (["--skill", "nobody/nothing"], "nobody/nothing"),
         (["--skill", "vram-arbiter/so101-detector"], "cannot be executed"),

@@ -109,7 +109,9 @@ def test_a_script_gives_what_the_environment_itself_takes() -> None:
     taken = {"arm": [0.5, 0.5], "gripper": -1, "lamps": [0, 1], "walk": ([1, 3], 0)}
     assert env.action_of(taken).rows[0] == pytest.approx((0.5, 0.5, -2 / 3, 0, 1, 0.5, 0.75, -0.5))
     for wrong in ({}, {**taken, "gripper": 2}, {**taken, "walk": [[1, 3]]}, [0.0] * 8, 1):
-        with pytest.raises(ModelError, match=r"is no action of gym_worlds:test/Hand-v0: "):
+        with pytest.raises(
+            ModelError, match=r"expected an action of gym_worlds:test/Hand-v0, got "
+        ):
             env.action_of(wrong)
 
 
@@ -119,7 +121,7 @@ def test_the_action_that_waits_may_have_parts() -> None:
     env.reset(0)
     assert env.step(None).moved
     assert env._env.unwrapped.taken[-1]["arm"].tolist() == [0.25, 0.0]
-    with pytest.raises(ConfigError, match="`hold` is no action"):
+    with pytest.raises(ConfigError, match="`hold` is not an action"):
         GymEnv(HAND, GymConfig.model_validate({"hold": {**hold, "gripper": 5}}), render=False)
 
 
@@ -157,10 +159,10 @@ def test_random_actions_of_every_kind_are_the_spaces_own_and_follow_from_the_see
 @pytest.mark.parametrize(
     ("space", "said"),
     [
-        (spaces.Text(3), "it is Text.*: a text is no number"),
+        (spaces.Text(3), "it is Text.*: a text is not a number"),
         (
             spaces.Dict(say=spaces.Text(3), go=spaces.Discrete(2)),
-            "say is Text.*: a text is no number",
+            "say is Text.*: a text is not a number",
         ),
         (spaces.Tuple((spaces.Sequence(spaces.Discrete(2)),)), "0 is Sequence.*longer one time"),
         (
@@ -208,7 +210,7 @@ def test_joints_may_be_spread_over_the_parts_of_an_observation() -> None:
     ("state", "said"),
     [
         ("", "views.0 is a picture"),
-        ("order", "order is Text.*a text is no number"),
+        ("order", "order is Text.*a text is not a number"),
         ("views", "views.0 is a picture"),
         ("arms", "there is no such part"),
         ("ar", "there is no such part"),

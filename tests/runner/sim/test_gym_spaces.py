@@ -160,7 +160,7 @@ def test_the_ends_of_whole_numbers_are_kept() -> None:
 @pytest.mark.parametrize(
     ("space", "said"),
     [
-        (spaces.Text(3), "it is Text.*a text is no number"),
+        (spaces.Text(3), "it is Text.*a text is not a number"),
         (spaces.Dict(a=spaces.Discrete(2), b=spaces.Tuple((spaces.Text(3),))), "b.0 is Text"),
         (spaces.Sequence(spaces.Discrete(2)), "longer one time than another"),
         (spaces.Graph(spaces.Box(0, 1, (1,)), None), "a graph has more nodes"),

@@ -248,7 +248,7 @@ def test_a_skill_loses_the_world_with_its_episode(make_runner: Make, env: Any) -
 def test_an_episode_that_nobody_judges_is_no_success(make_runner: Make) -> None:
     _, ended = play(make_runner(rate_hz=0, max_steps=2), [Act(joints(0.1))] * 9, 2)
     assert isinstance(ended[0].error, ModelError)
-    assert "nobody says" in ended[0].error.message
+    assert "does not say" in ended[0].error.message
 
 
 def test_an_episode_may_end_with_its_skill(make_runner: Make, env: Any) -> None:

@@ -102,7 +102,7 @@ def test_layout_has_distractors_of_the_targets_colour_and_shape(seed: int) -> No
 
 
 def test_layout_refuses_what_it_does_not_know() -> None:
-    with pytest.raises(ValueError, match="colour"):
+    with pytest.raises(ValueError, match="color"):
         make_layout(0, SceneConfig(), names=("pink cube",))
     with pytest.raises(ValueError, match="differ"):
         make_layout(0, SceneConfig(), names=("red cube", "red cube"))

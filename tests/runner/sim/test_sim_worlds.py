@@ -138,8 +138,8 @@ def test_the_video_of_an_environment(tmp_path: Path, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--env", "gym:"], "is no world"),
-        (["--env", "mujoco"], "is no world"),
+        (["--env", "gym:"], "unknown --env"),
+        (["--env", "mujoco"], "unknown --env"),
         (["--env", "gym:NoSuch-v0", "--policy", "random"], "NoSuch"),
         (["--env", "gym:CartPole-v1", "--scene", "x.yaml"], "--scene"),
         (["--env-config", "x.yaml"], "--env-config"),

@@ -141,7 +141,7 @@ def test_it_is_refused_or_played_within_the_limits(
         (trajectory((0.1, 0.1), names=("elbow_flex", "elbow_flex")), "named twice"),
         (
             trajectory((0.1,), names=("elbow",)),
-            "there is no joint elbow; the robot has shoulder_pan",
+            "unknown joint elbow; the robot has shoulder_pan",
         ),
         (trajectory((0.1, 0.2)), r"points\[0\]: 2 positions for 1 joints"),
         (trajectory((2.0,)), r"points\[0\]: elbow_flex 2 rad is outside"),
@@ -154,7 +154,7 @@ def test_it_is_refused_or_played_within_the_limits(
         (trajectory((0.1,), path_tolerance=[{"name": "elbow_flex"}]), "path_tolerance"),
         (
             trajectory((0.1,), goal_tolerance=[{"name": "elbow", "position": 0.1}]),
-            "there is no joint elbow",
+            "unknown joint elbow",
         ),
         (trajectory((0.1,)) | {"speed": 3}, "speed"),
     ],
