@@ -1,7 +1,7 @@
 """The one place that owns the core: events in, one after the other, effects out to the executor, one timer for time.
 
 All of it runs on the thread of the event loop; other threads post through `loop.call_soon_threadsafe(inbox.post, event)`. Nothing
-else may touch the core, except its reads: `status`, `why`, and who owns what when a probe's reading is handed on. `now` is `time.monotonic()`: the clock of the event
+else may touch the core, except its reads: `status`, `why`, and the owners when a probe's reading is handed on. `now` is `time.monotonic()`: the clock of the event
 loop's timers and of the probes' time stamps.
 """
 
@@ -22,7 +22,7 @@ from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
 log = logging.getLogger(__name__)
 
 HELD_UP_S = 1.0
-"""A daemon that wakes up so late did not run meanwhile (stopped, swapped out, a paused virtual machine). It has heard nobody, so nobody's
+"""A daemon that wakes up so late did not run meanwhile (stopped, swapped out, a paused virtual machine). It heard no client, so no client's
 silence counts: the core is told that it slept."""
 TIMER_FLOOR_S = 0.0002
 """A deadline that has passed is served this soon, and not in a busy loop."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from vram_arbiter.reasoner.params import misfits
-from vram_arbiter.schemas.body import NOBODY, Body
+from vram_arbiter.schemas.body import UNKNOWN_BODY, Body
 from vram_arbiter.schemas.errors import BadRequest, CallerError, NotPermitted, UnknownSkill
 from vram_arbiter.schemas.manifest import Role, RSkillManifest
 from vram_arbiter.schemas.tools import (
@@ -252,7 +252,7 @@ def palette_of(
     allow_noncommercial: bool = False,
     managed: Iterable[str] = (),
     topics: Iterable[str] = (),
-    body: Body = NOBODY,
+    body: Body = UNKNOWN_BODY,
 ) -> Palette:
     """Palette of installed manifests. Templates, models that do not fit the robot's `body` and, unless allowed, those whose licence forbids
     commercial use are listed but barred. A robot that does not say what it is gets what is made for any."""

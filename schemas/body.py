@@ -1,6 +1,6 @@
 """What a robot is and can, and whether a skill was made for it: its embodiment and the capabilities that the manifest asks for.
 
-Pure. The runner says its body with the list of its skills and refuses goals that do not fit it; whoever plans reads the same words, so that
+Pure. The runner says its body with the list of its skills and refuses goals that do not fit it; a planner reads the same words, so that
 what is offered and what is accepted cannot differ. A body that says nothing is fitted only by skills for any robot that ask for nothing.
 """
 
@@ -64,18 +64,18 @@ class Body(BaseModel):
         return "; ".join(problem for _, problem in self.misfits(manifest))
 
 
-NOBODY = Body()
+UNKNOWN_BODY = Body()
 """A robot of which nothing is known."""
 
 
 def read_body(value: object) -> Body:
     """A body as it came over a wire. What is missing or cannot be read is a body of which nothing is known: fewer skills, never more."""
     if not isinstance(value, Mapping):
-        return NOBODY
+        return UNKNOWN_BODY
     try:
         return Body.model_validate(dict(value))
     except ValidationError:
-        return NOBODY
+        return UNKNOWN_BODY
 
 
 def _has(have: Any, wanted: Capability) -> bool:

@@ -1,7 +1,7 @@
 """All errors that cross a process border: one tree, one table from wire codes to types.
 
 The type says who must act: `CallerError` (the program that asked), `OperatorError` (a person), `TransientError`
-(nobody: wait or retry), `InternalError` (us).
+(wait or retry), `InternalError` (us).
 """
 
 from collections.abc import Mapping
@@ -95,7 +95,7 @@ class HostRamInsufficient(TransientError):
 
 
 class LoadFailing(TransientError):
-    code = "load_failing"  # it died in its load several times in a row, and somebody would have to leave: details.retry_in_s, cause
+    code = "load_failing"  # its loads failed several times in a row, and an eviction would be needed: details.retry_in_s, cause
 
 
 class GangBroken(TransientError):
@@ -103,7 +103,7 @@ class GangBroken(TransientError):
 
 
 class WouldDeadlock(CallerError):
-    code = "would_deadlock"  # the wait is for what a use of this process keeps: details.cycle, who uses and waits for what
+    code = "would_deadlock"  # the wait is for what a use of this process keeps: details.cycle, the uses and waits in it
 
 
 class UnknownGpu(CallerError):
@@ -135,7 +135,7 @@ class BadState(CallerError):
 
 
 class WaitTimeout(TransientError):
-    code = "wait_timeout"  # details.why explains who blocked
+    code = "wait_timeout"  # details.why explains what blocked
 
 
 class HolderBusy(TransientError):

@@ -9,7 +9,7 @@ One folder per card:
 
 Reader and writer do the I/O: take the lock, hand all texts to `read_card`, call transitions, perform their `Edit`s in order.
 A step first replaces one process file (temporary file + rename), then appends that file's `last` to the log. So a kill at any
-instant leaves a readable card, and at most one line unwritten, which `read_card` orders to be appended by whoever comes next.
+instant leaves a readable card, and at most one line unwritten, which `read_card` orders the next process to append.
 
 It behaves as a card under a caching framework does: a context on first touch stays until the process ends; a freed block goes to
 the process's cache and only `empty_cache` gives it back; memory comes back `release_lag_s` late, also that of a dead process;
@@ -79,7 +79,7 @@ class LogLine(TypedDict):
     """One line of the log. `delta` is what it changed on the card; the sum of all deltas is `used_after`.
 
     ops: context, alloc, cache (freed into the process's cache), free (let go of: still on the card), leak, returned (free again),
-    oom (refused: delta 0), died (noticed: delta 0), edited (pid 0: somebody wrote or removed process files by hand).
+    oom (refused: delta 0), died (noticed: delta 0), edited (pid 0: process files were written or removed by hand).
     """
 
     seq: int
@@ -141,7 +141,9 @@ class Card:
     config: CardConfig
     processes: Mapping[str, ProcessFile]
     seq: int = 0
-    logged_bytes: int = 0  # used bytes by the log; differs from `used_bytes` only after somebody edited a file by hand
+    logged_bytes: int = (
+        0  # used bytes by the log; differs from `used_bytes` only after a file was edited by hand
+    )
 
     @property
     def used_bytes(self) -> int:
@@ -316,7 +318,7 @@ def allocate(card: Card, key: ProcessKey, name: str, label: str, size: int, now:
 
 
 def free(card: Card, key: ProcessKey, label: str, size: int, now: float) -> Change:
-    """A block goes back to its process's cache; nobody else gets anything. Raises ValueError for more than is allocated."""
+    """A block goes back to its process's cache; no other process gets it. Raises ValueError for more than is allocated."""
     process = card.process(key)
     if process is None or process.allocated_bytes < size:
         raise ValueError(f"process {key} frees {size} bytes that it has not")

@@ -1,7 +1,7 @@
 """The runner's wire: goals, frames and state, on one ZeroMQ ROUTER socket.
 
 Request {"op": …, "id": n, …} → reply {"re": n, "ok": true, …} | {"re": n, "ok": false, "error": {…}}.
-A goal's progress comes as pushes to whoever sent it: {"push": "feedback", …} and exactly one {"push": "result", …} per accepted goal.
+A goal's progress comes as pushes to its sender: {"push": "feedback", …} and exactly one {"push": "result", …} per accepted goal.
 The emergency stop has a socket of its own: `schemas.estop`.
 """
 

@@ -16,7 +16,7 @@ ClientId = NewType("ClientId", str)
 """Names one connection to the arbiter (the hex of its ZeroMQ routing id)."""
 
 UseId = NewType("UseId", str)
-"""Names one busy interval on a lease; chosen by whoever begins it."""
+"""Names one busy interval on a lease; chosen by the client that begins it."""
 
 RequestId = NewType("RequestId", int)
 """Counts the requests of one connection; replies repeat it."""

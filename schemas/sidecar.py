@@ -144,7 +144,7 @@ class PingResult(TypedDict):
     lease_id: NotRequired[str | None]
     token: NotRequired[list[int] | None]
     standby: NotRequired[bool]  # evicted, and it comes back by itself when there is room
-    wanted: NotRequired[bool]  # somebody waits for the model: `unload` takes that back
+    wanted: NotRequired[bool]  # a client waits for the model: `unload` takes that back
     last_error: NotRequired[str]
 
 

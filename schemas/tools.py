@@ -1,6 +1,6 @@
 """The tools that a reasoner may call, as frozen values discriminated by `tool`.
 
-Only the shapes: what a call does, whether it is allowed and who serves it are the reasoner's business. The same classes give
+Only the shapes: what a call does, whether it is allowed and what serves it are the reasoner's business. The same classes give
 the function schemas that are offered to a language model, so that what is offered and what is accepted cannot drift apart.
 
 A skill may also be offered as a function of its own, `execute_rskill__OWNER__REPO`, with the parameters its manifest describes:

@@ -388,7 +388,7 @@ class TickResult(_Frozen):
 
 
 class RunResult(_Frozen):
-    """A whole run of a runner. `success` is None where nobody judged."""
+    """A whole run of a runner. `success` is None where it was not judged."""
 
     n_ticks: Annotated[int, Field(ge=0)]
     success: bool | None = None

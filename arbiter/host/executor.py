@@ -83,7 +83,7 @@ class Executor:
         """One batch. Its records are written first, all in one transaction, so a grant is on disk before its holder hears of it. If that
         fails, what the batch says about a lease after it was granted is not said (the waiting request is refused instead).
 
-        Whoever waits for an answer has it first: facts are written down after all answers, and readings are begun last of all, since
+        Answers go out first: facts are written down after all answers, and readings are begun last of all, since
         their thread takes the interpreter from this one.
         """
         if self._traces is not None:

@@ -3,7 +3,7 @@
 A reading that fails or hangs is *unknown*. A thread that hangs cannot be ended, so the card stays unknown and no further reading is
 started until it returns. Requests are merged, except that one that comes after a reading began is answered by a fresh one: a
 verification must never be fed with a reading from before its question. Bytes of children are booked on the ancestor that holds the lease
-(`tree`): ancestors are read in the thread, who holds a lease is asked when the reading is handed on.
+(`tree`): ancestors are read in the thread, holders are looked up when the reading is handed on.
 """
 
 import asyncio
@@ -157,7 +157,7 @@ class _Reader:
         else:
             self._fail(outcome)
         if self._again and self._state == "idle":
-            self._begin()  # else whoever handled this answer asked again: that one serves all
+            self._begin()  # else the handler of this answer asked again, and that reading serves all
 
     # -- the thread ----------------------------------------------------------------------------------------------
     def _run(self) -> None:

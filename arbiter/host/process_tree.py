@@ -1,6 +1,6 @@
-"""Whose bytes are these? A lease belongs to a process *tree*: what a child puts on a card is booked on the ancestor that holds the lease.
+"""Attribution of bytes in a process *tree*: a child's bytes are charged to the ancestor that holds the lease.
 
-In two halves: `Lineages` reads ancestors from /proc and may block (a probe's thread); `on_owners` books with who holds what at that very
+In two halves: `Lineages` reads ancestors from /proc and may block (a probe's thread); `on_owners` attributes by the holders of that very
 moment (the loop's thread). Must not decide anything about leases: it only says which process a reading's bytes belong to.
 """
 
@@ -32,13 +32,13 @@ Lineage = tuple[Kin, ...]
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """Who an arbiter knows of: processes with an account on the card in question, and processes with a connection."""
+    """Processes that the arbiter knows: with an account on the GPU, and with a connection."""
 
     owners: Set[ProcessKey]
     clients: Set[ProcessKey]
 
     def independent(self, process: ProcessKey) -> bool:
-        """Does it keep its own bytes? One that is listed by its pid alone (start time 0) is whoever has that pid."""
+        """Whether a process keeps its own bytes. Start time 0 matches any process with that pid."""
         if process in self.owners or process in self.clients:
             return True
         return process.start_ticks == 0 and any(
@@ -55,7 +55,7 @@ def read_kin(pid: int) -> Kin | None:
 
 
 class Lineages:
-    """Ancestors of the processes of one card's readings. Remembers the last reading's, for who dies between a reading and its tracing."""
+    """Ancestors of the processes of one card's readings. Remembers the last reading's, for a process that dies before it is traced."""
 
     def __init__(self, read: Reader = read_kin) -> None:
         self._read = read
@@ -98,7 +98,7 @@ def on_owners(
 ) -> tuple[ProcessUse, ...]:
     """The reading's processes with the bytes of children booked on their nearest ancestor that has an account.
 
-    A process with an account or a connection of its own keeps its own bytes; who has no such ancestor stays what it is (a stowaway).
+    A process with an account or a connection of its own keeps its own bytes; one without such an ancestor stays a stowaway.
     Bytes that the driver does not say (None) make the sum unknown.
     """
     booked: dict[ProcessKey, ProcessUse] = {}
@@ -126,7 +126,7 @@ def on_owners(
 
 
 def _named(use: ProcessUse, children: list[str]) -> ProcessUse:
-    """`vramctl (python)`: the owner, and whose bytes are booked on it."""
+    """Return `vramctl (python)`: the owner, and the child that is charged to it."""
     if not children:
         return use
     return replace(use, name=f"{use.name} ({', '.join(children)})"[:NAME_MAX])

@@ -1,6 +1,6 @@
 """Was the machine suspended? CLOCK_BOOTTIME runs on while it sleeps, CLOCK_MONOTONIC does not: their difference is the sleep.
 
-Timers, deadlines and readings all use the monotonic clock, which is why nothing expires over night and why somebody has to notice
+Timers, deadlines and readings all use the monotonic clock, so nothing expires over night, and the daemon has to notice
 that the night was there. Must not know what is done about it.
 """
 

@@ -1,4 +1,4 @@
-"""Connections: whose they are, what they may do, and requests turned into events of the engine.
+"""Connections: their processes, what they may do, and requests turned into events of the engine.
 
 One `SessionTable` is the router's handler. It runs on the thread of the event loop, never blocks, and knows neither sockets (it is given
 `Connection`) nor how the engine decides (it is given `Decisions`). Rules: nothing but `hello` before a hello; a connection belongs to the
@@ -495,7 +495,7 @@ class SessionTable:
             self._watch.drop(process)
 
     def _stop_standing_for(self, client: ClientId) -> None:
-        """Forget whom a connection has replaced."""
+        """Forget the connection that this one has replaced."""
         for old in [old for old, new in self._moved.items() if new == client]:
             del self._moved[old]
 

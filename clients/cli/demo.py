@@ -180,7 +180,7 @@ async def _episode(
 
 
 def _make_card(folder: Path, capacity_bytes: int) -> None:
-    """The simulated card, made before anybody needs it: without an arbiter nobody else would."""
+    """Make the simulated GPU before a program needs it: there may be no arbiter that makes one."""
     boot_id = procfs.boot_id()
     folder.mkdir()
     config = fakegpu.CardConfig(

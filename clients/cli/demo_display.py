@@ -1,6 +1,6 @@
 """The demo's live display: the card as a bar, the leases as a table, the last switches, and where the robot is.
 
-On a terminal it redraws in place; into a file or a CI log it prints one line per event. It is told everything and asks nobody.
+On a terminal it redraws in place; into a file or a CI log it prints one line per event. It sends no requests.
 """
 
 import sys
@@ -38,7 +38,7 @@ def describe(event: Mapping[str, Any]) -> str:
             gone = ", ".join(victim["consumer"] for victim in event["evicted"])
             return f"{who} took over from {gone} in {event['total_ms']:.0f} ms"
         case "switch":
-            return f"{who} loaded beside the others in {event['load_ms']:.0f} ms, nobody evicted"
+            return f"{who} loaded beside the others in {event['load_ms']:.0f} ms, no eviction"
         case kind:
             reason = event.get("reason", "")
             return f"{who or 'arbiter'}: {kind}" + (f" ({reason})" if reason else "")

@@ -53,7 +53,7 @@ class Programs:
         return {program.process.pid: program.name for program in self.running.values()}
 
     def check(self) -> None:
-        """Raises SidecarUnavailable for a program that ended although nobody asked it to."""
+        """Raise SidecarUnavailable for a program that ended by itself."""
         for program in self.running.values():
             if program.process.returncode is not None:
                 raise SidecarUnavailable(

@@ -201,7 +201,7 @@ def _before(wall_s: float, last_seq: int, endpoint: str | None) -> int:
 async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = None) -> int:
     """The newest events, then every further one as it happens, until Ctrl-C; also across restarts of the arbiter.
 
-    Raises ArbiterUnreachable if nobody answers at first.
+    Raises ArbiterUnreachable if no arbiter answers at first.
     """
     from vram_arbiter.clients.client import AsyncClient
 

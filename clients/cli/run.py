@@ -207,7 +207,7 @@ class _Run:
         self._ending = False
         self._last: asyncio.Task[None] | None = None  # ends the program
         self._reason = "its lease is over"  # said when the program is made to end
-        self._told: set[str] = set()  # whom the program keeps waiting
+        self._told: set[str] = set()  # waiters that were named to the user
 
     async def until_ended(self, child: asyncio.subprocess.Process, lease: AsyncLease) -> int:
         self._child = child
@@ -318,7 +318,7 @@ class _Run:
 async def _tell_why(
     client: AsyncClient, acquiring: asyncio.Future[AsyncLease], consumer: str
 ) -> AsyncLease:
-    """The lease; a person who waits for it is told once whom for."""
+    """Return the lease. Say once, on stderr, what a long wait is for."""
     try:
         done, _ = await asyncio.wait({acquiring}, timeout=PATIENCE_S)
         if not done:

@@ -1,4 +1,4 @@
-"""Signals that `vramctl run` passes on to its program, whose end is its own: from before the program starts, so that none ends `vramctl`
+"""Signals that `vramctl run` passes on to its program: from before it starts, so that none ends `vramctl`
 while it runs."""
 
 import asyncio

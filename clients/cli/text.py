@@ -50,7 +50,7 @@ def plural(count: int, word: str) -> str:
 # -- status ------------------------------------------------------------------------------------------------------------
 @makes_printable
 def status_lines(status: Message) -> list[str]:
-    """The arbiter, each card, who else is on it, and all leases (residents first, then the queue in order)."""
+    """Return the arbiter, each GPU with its other processes, and all leases: residents, then the queue."""
     lines = [
         f"arbiter {status['phase']} · epoch {status['epoch']} · up {duration(status['uptime_s'])} · "
         + plural(status["clients"], "client")
@@ -162,11 +162,11 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 # -- why ---------------------------------------------------------------------------------------------------------------
 @makes_printable
 def why_lines(why: Message) -> list[str]:
-    """Who blocks a consumer, how many bytes, on which condition, what happens next, and when."""
+    """Return what blocks a consumer: leases, bytes, conditions, what happens next and when."""
     if not why["leases"]:
         name = why["consumer"]
         return [
-            f"{name} has no lease and waits for none (who has: `vramctl status`; what became of it: `vramctl history -c {name}`)"
+            f"{name} has no lease and waits for none (all leases: `vramctl status`; what became of it: `vramctl history -c {name}`)"
         ]
     lines: list[str] = []
     for lease in why["leases"]:
@@ -215,9 +215,7 @@ def by_hand_lines(action: str, reply: Message) -> list[str]:
         return [f"given up: its bytes stay charged until they are measured gone ({reply['state']})"]
     name = f"{lease['consumer']} ({lease['lease_id']})"
     if action == "pin":
-        return [
-            f"{name} is pinned: nobody makes it leave until `vramctl unpin {lease['lease_id']}`"
-        ]
+        return [f"{name} is pinned: it is not evicted until `vramctl unpin {lease['lease_id']}`"]
     if action == "unpin":
         return [f"{name} is no longer pinned by an operator"]
     uses = lease["uses"]

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 async def watch(endpoint: str | None, events_shown: int) -> int:
-    """Until Ctrl-C. Raises ArbiterUnreachable if nobody answers at first; later it waits for the arbiter to come back."""
+    """Show until Ctrl-C. Raises ArbiterUnreachable if no arbiter answers at first; later it waits for one."""
     client = AsyncClient(
         "vramctl watch", endpoint=endpoint, role="observer", connect_timeout_s=TIMEOUT_S
     )

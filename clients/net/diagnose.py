@@ -1,6 +1,6 @@
 """What the kernel says at once about a socket that does not answer.
 
-libzmq connects in silence, again and again: to whom may not use the socket, or whose arbiter was killed, it looks like an arbiter that
+libzmq connects in silence, again and again: a forbidden socket or a killed arbiter looks like an arbiter that
 is slow.
 """
 

@@ -1,4 +1,4 @@
-"""One DEALER on one connection to a server whose user was checked: nothing is sent to another one, and nothing of it is believed.
+"""One DEALER on one connection to a server of a checked user: nothing is sent to, or read from, another one.
 
 libzmq connects in its own thread and would reconnect without a word, to whatever listens by then. So that is put off, and nothing is
 handed to it before its monitor names the connection's descriptor, of which the kernel names the user (SO_PEERCRED). The number of a
@@ -141,6 +141,6 @@ def _uid_of(frame: Any) -> int:
         uid = None
     if uid is None:
         raise InternalError(
-            "this libzmq does not tell who the peer is", hint="use pyzmq ≥ 27 with libzmq ≥ 4.3"
+            "this libzmq does not name the peer", hint="use pyzmq ≥ 27 with libzmq ≥ 4.3"
         )
     return uid

@@ -120,7 +120,7 @@ def _reply(link: "Link", where: str, deadline: float, silent: Unreachable) -> Me
 
 
 def _look(where: str) -> None:
-    """Raises Unreachable if the kernel knows at once why nobody answers."""
+    """Raise Unreachable if the kernel knows at once why no arbiter answers."""
     from vram_arbiter.clients.net.diagnose import obstacle
 
     if found := obstacle(where):

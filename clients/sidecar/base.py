@@ -1,7 +1,7 @@
-"""Talk to one sidecar: lazy connection, replies matched by id, typed errors, a child of our own where nobody serves.
+"""Talk to one sidecar: lazy connection, replies matched by id, typed errors, a child of its own where no sidecar serves.
 
 Rules. The first call connects; a socket that timed out or was hung up on is replaced before the next call; a child of ours that
-died is started again by the next call; a sidecar that somebody else started is used and left running. No failure here reads
+died is started again by the next call; a sidecar that another program started is used and left running. No failure here reads
 as an answer: *evicted* or *unavailable* is never "not found". It knows nothing of images or actions.
 """
 
@@ -21,7 +21,7 @@ from vram_arbiter.schemas.sidecar import LoadResult, PingResult
 Message = dict[str, Any]
 
 CALL_TIMEOUT_S = 180.0  # a cold load of a large model; the field's clients wait as long
-CONNECT_TIMEOUT_S = 10.0  # for a sidecar that somebody else starts
+CONNECT_TIMEOUT_S = 10.0  # for a sidecar that another program starts
 PROBE_S = 1.0  # one ping
 REBIRTH_S = 0.2  # between a broken connection and the kernel's word on its process
 SHUTDOWN_S = 5.0  # from the op's answer to the exit
@@ -30,7 +30,7 @@ SHUTDOWN_S = 5.0  # from the op's answer to the exit
 class SidecarClient:
     """Base of the sidecars' clients. `family` says how requests are tagged: `op` (perception) or `endpoint` (policy).
 
-    `spawn` starts the sidecar when nobody answers at `endpoint`. Several calls may be under way. One loop, one process.
+    `spawn` starts the sidecar when none answers at `endpoint`. Several calls may be under way. One loop, one process.
     """
 
     family = "op"
@@ -80,7 +80,7 @@ class SidecarClient:
         await self.call("unload")
 
     async def shutdown(self) -> None:
-        """Ask the process to end, whoever started it."""
+        """Ask the process to end, also one that another program started."""
         await self._exchange("shutdown", {}, PROBE_S * 2)
 
     async def call(
@@ -124,7 +124,7 @@ class SidecarClient:
 
     # -- steps: connection ---------------------------------------------------------------------------------------------
     async def _ensure(self) -> None:
-        """1. Proven already, child alive. 2. Somebody answers: adopt. 3. Start a child, or wait for somebody else's start."""
+        """1. Proven already, child alive. 2. A sidecar answers: adopt it. 3. Start a child, or wait for another program's start."""
         async with self._connecting:
             if self.child is not None and not self._rpc.proven:
                 await self.child.wait(REBIRTH_S)  # it may have hung up because it is dying
@@ -145,7 +145,7 @@ class SidecarClient:
                 )
 
     def _somebody_listens(self) -> bool:
-        """Quick no for an ipc path that is not there or whose owner died; otherwise a ping has to tell."""
+        """Return False at once for a missing or dead ipc path; otherwise a ping decides."""
         if not self.endpoint.startswith("ipc://"):
             return True
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as knock:
@@ -180,7 +180,7 @@ class SidecarClient:
                 await asyncio.wait({exited, answered}, return_when=asyncio.FIRST_COMPLETED)
                 if answered.done() and answered.result():
                     if self.identity and self.identity.get("pid", child.pid) != child.pid:
-                        await self._bury()  # somebody else was faster: use theirs, end ours
+                        await self._bury()  # another program was faster: use its sidecar, end ours
                     return
                 answered.cancel()
                 if await child.wait(REBIRTH_S):

@@ -22,7 +22,7 @@ _HINT = "send numpy.save output of an array of numbers"
 
 def pack(value: Any) -> Any:
     """A copy of nested maps and lists with every array (and torch-free numpy scalar) made plain."""
-    numpy = sys.modules.get("numpy")  # without it loaded nobody can have made an array
+    numpy = sys.modules.get("numpy")  # unless it is loaded there can be no array
     if isinstance(value, dict):
         return {key: pack(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

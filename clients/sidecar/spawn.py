@@ -88,7 +88,7 @@ class Child:
         if code == -signal.SIGKILL:
             what, hint = (
                 "was killed (SIGKILL)",
-                "if nobody did it: the machine's memory was full, see dmesg",
+                "if no person did it, the machine's memory was full: see dmesg",
             )
         elif code is not None and code < 0:
             what, hint = f"died of {signal.Signals(-code).name}", "see its log"
@@ -127,7 +127,7 @@ class Child:
 
     async def end(self, polite_s: float) -> None:
         """Wait `polite_s` for it to end by itself (after a `shutdown` op), then SIGTERM, then SIGKILL. Through the pidfd: the pid
-        may belong to somebody else by the time."""
+        may belong to another process by then."""
         for timeout_s, number in (
             (polite_s, signal.SIGTERM),
             (TERM_TIMEOUT_S, signal.SIGKILL),

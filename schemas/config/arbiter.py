@@ -36,7 +36,7 @@ class GpuConfig(_Section):
     """Cap per card, by UUID or index as text: lease out less than the card has. A card that is not named has no cap."""
 
     pids: Literal["auto", "own", "host"] = "auto"
-    """In whose pid namespace the driver counts. `auto`: this one on a host, the host's in a container."""
+    """Pid namespace in which the driver counts. `auto`: this one on a host, the host's in a container."""
     host_proc: Annotated[str, Field(pattern="^/")] | None = None
     """In a container: where the host's /proc is mounted, so that the driver's pids can be told apart. Null: lists are no evidence there."""
 
@@ -58,18 +58,18 @@ class GpuConfig(_Section):
 
 
 class SchedulingConfig(_Section):
-    """Who is next."""
+    """Order of the queue."""
 
     ageing_s_per_point: Seconds = d.AGEING_S_PER_POINT
-    """A waiter gains one point of priority per so many seconds, so that nobody starves."""
+    """A waiter gains one point of priority per so many seconds, so that none starves."""
     thrash_window_s: Seconds = d.THRASH_WINDOW_S
     """Two consumers that made each other leave within so many seconds are thrashing."""
     thrash_hold_max_s: Annotated[float, Field(ge=0, le=86_400, allow_inf_nan=False)] = (
         d.THRASH_HOLD_MAX_S
     )
-    """Of two that thrash, whoever is there stays for what a switch costs, at most so long. 0: never."""
+    """Of two consumers that thrash, the resident one stays for the cost of a switch, at most this long. 0: never."""
     policy: Literal["default", "fifo", "no_backfill", "lru", "one_model"] = "default"
-    """Who is next and who leaves; docs/policies.md compares them."""
+    """Order of the queue and choice of victims; docs/policies.md compares the policies."""
 
 
 class RevokeConfig(_Section):
@@ -121,9 +121,9 @@ class ProbeConfig(_Section):
     deadline_s: Seconds = d.PROBE_DEADLINE_S
     """A reading that takes longer has failed: the card is unknown, which blocks grants."""
     period_s: Seconds = d.PROBE_PERIOD_S
-    """Background readings while anybody holds or waits."""
+    """Period of background readings while there are leases or waiters."""
     load_s: Annotated[float, Field(ge=0.005, le=60, allow_inf_nan=False)] = d.LOAD_PROBE_S
-    """Readings while somebody loads: its load peak is learnt from them, and what falls between two is not seen."""
+    """Period of readings while a lease loads: its load peak is learned from them, and a peak between two is not seen."""
     sample_max_age_s: Seconds = d.SAMPLE_MAX_AGE_S
     """An older reading does not gate a grant; a fresh one is taken first."""
 
@@ -139,7 +139,7 @@ class HostConfig(_Section):
     """Memory of the machine itself."""
 
     park_budget_bytes: ByteSize | None = None
-    """Host RAM that parked models may keep together; 0: nobody parks. Null: half of what is available when the daemon starts."""
+    """Host RAM that parked models may keep together; 0: no parking. Null: half of what is available when the daemon starts."""
 
 
 class LimitsConfig(_Section):

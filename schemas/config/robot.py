@@ -73,7 +73,7 @@ class HalConfig(_Section):
 
 
 class TaskSpec(_Section):
-    """What the robot is to do when nobody sends goals."""
+    """What the robot is to do when no goals arrive."""
 
     id: Text
     scene_id: str = ""

@@ -115,7 +115,7 @@ class ScenarioConsumer(_Part):
 
 
 class Stowaway(_Part):
-    """Somebody who takes bytes without a lease."""
+    """A process that takes bytes without a lease."""
 
     name: Name
     bytes: ByteSize

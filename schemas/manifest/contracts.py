@@ -28,7 +28,7 @@ Vector3 = tuple[Finite, Finite, Finite]
 
 
 class Block(BaseModel):
-    """Base of every block: immutable, and a field that nobody knows is an error."""
+    """Base of every block: immutable, and an unknown field is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

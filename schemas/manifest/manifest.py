@@ -213,7 +213,7 @@ _WARNINGS: tuple[tuple[tuple[str, ...], str, Callable[[RSkillManifest], bool]], 
     ),
     (
         ("state_contract", "layout"),
-        "is a layout that nobody here knows; only its own adapter can assemble it",
+        "is a layout that is unknown here; only its own adapter can assemble it",
         lambda m: (
             m.state_contract is not None
             and m.state_contract.layout is not None

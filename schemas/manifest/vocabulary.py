@@ -81,7 +81,7 @@ PROCESSOR_FAMILIES = frozenset(
         ModelFamily.MOLMOACT2,
     }
 )
-"""Families whose checkpoints are unusable without their pre- and postprocessor files."""
+"""Families with checkpoints that are unusable without their pre- and postprocessor files."""
 
 
 class SkillAction(StrEnum):

@@ -133,7 +133,7 @@ class Connection(asyncio.Protocol):
 
     # -- for handlers ----------------------------------------------------------------------------
     def admit(self) -> None:
-        """The peer said who it is: the time limit of `hello_s` ends, and messages may have their
+        """The peer has said hello: the time limit of `hello_s` ends, and messages may have their
         full size.
         """
         self.admitted = True

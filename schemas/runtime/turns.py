@@ -1,4 +1,4 @@
-"""Whose turn it is: a fair order of waiting items over nested keys."""
+"""Turns: a fair order of waiting items over nested keys."""
 
 from collections import OrderedDict
 from collections.abc import Hashable, Sequence

@@ -50,7 +50,7 @@ class Gang(_Frozen):
 
 
 class LeaseSpec(_Frozen):
-    """What a lease is to be. `evictable=False` pins it: nobody makes it leave."""
+    """What a lease is to be. `evictable=False` pins it: it is never evicted."""
 
     consumer: Name
     model_id: Name
@@ -255,7 +255,7 @@ class Evict(_ByHandOn):
 
 
 class Pin(_ByHandOn):
-    """Nobody makes this lease leave until it is unpinned."""
+    """Protect the lease from eviction until it is unpinned."""
 
     op: Literal["pin"]
 

@@ -138,7 +138,7 @@ class NvmlProbe:
             ) from error
 
     def processes(self, gpu: GpuId) -> tuple[ProcessUse, ...] | None:
-        """Who is on a card; None where the driver does not say."""
+        """Return the processes on a GPU; None where the driver does not list them."""
         return self._processes(self._handles[gpu])
 
     def close(self) -> None:

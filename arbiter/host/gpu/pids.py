@@ -1,4 +1,4 @@
-"""Whose pid does a driver mean? NVML counts in the pid namespace of the host, the daemon may live in a container.
+"""Pids of the driver as pids of this namespace: NVML counts in the host's, a daemon may run in a container.
 
 On a host there is nothing to translate (the kernel gives the pids of clients in containers as the host's). In a container the same number
 is another process, so a pid is believed only if the host's /proc, mounted somewhere here, leads from it to one of ours: NSpid names its pids

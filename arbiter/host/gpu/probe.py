@@ -13,7 +13,7 @@ from vram_arbiter.schemas.ids import GpuId
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """One GPU as its backend names it. `reserved_bytes` the driver keeps for itself: nobody can ever use them.
+    """One GPU as its backend names it. `reserved_bytes` the driver keeps for itself.
 
     A card whose memory others live in too asks for more: `margin_bytes` is its least reserve, `noise_bytes` its least tolerance.
     """

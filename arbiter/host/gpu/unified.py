@@ -32,7 +32,7 @@ type Evidence = Callable[[], tuple[ProcessUse, ...] | None]
 class UnifiedProbe:
     """`GpuProbe` with one card: the memory of the machine.
 
-    `root` is where /proc, /sys and /etc are looked for; `evidence` lists bytes per process, None where nobody can.
+    `root` is where /proc, /sys and /etc are looked for; `evidence` lists bytes per process; None where that is impossible.
     """
 
     def __init__(self, gpu: GpuId, name: str, root: Path, evidence: Evidence) -> None:

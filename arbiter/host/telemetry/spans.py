@@ -49,7 +49,7 @@ class Counts(Protocol):
     def granted(
         self, consumer: str, waited_s: float, handover_s: float | None, context: Context
     ) -> None:
-        """`handover_s`: since the first ask, for a grant that somebody had to leave for. `context`: its span, for exemplars."""
+        """`handover_s`: from the first revoke to the grant, where an eviction made room. `context`: its span, for exemplars."""
 
     def denied(self, code: str) -> None: ...
 
@@ -67,7 +67,7 @@ class _Acquire:
     started_ns: int
     queue: trace.Span | None = None
     load: trace.Span | None = None
-    asked_ns: int | None = None  # when somebody was first asked to leave for it
+    asked_ns: int | None = None  # when the first holder was revoked for it
     grows: str = ""  # it is no lease of its own: that one waits for more bytes
 
 
@@ -94,7 +94,7 @@ class LeaseTelemetry:
 
     # -- what the core wants done ------------------------------------------------------------------------------------------
     def outgoing(self, effects: Sequence[fx.Effect]) -> None:
-        """Begin the spans of evictions before anybody is asked, and count refusals, which the history does not keep."""
+        """Begin the spans of evictions before a revoke is sent, and count refusals, which history leaves out."""
         asked: dict[str, Event] = {}
         told: list[str] = []
         for effect in effects:
@@ -266,7 +266,7 @@ class LeaseTelemetry:
 
     # -- leaving -------------------------------------------------------------------------------------------------------------
     def _begin_evict(self, asked: Event, traceparent: str | None, at_ns: int) -> None:
-        """`asked`: the note `revoke_asked`. It belongs to whoever needs the room; under pressure nobody does, and it is a trace of its own."""
+        """`asked`: the note `revoke_asked`. It belongs to the request's trace; under pressure it is a trace of its own."""
         lease_id, wanted_by = asked["lease_id"], asked["wanted_by_lease"]
         parent = Context()
         if wanted_by is not None:
@@ -330,7 +330,7 @@ class LeaseTelemetry:
                 parent = trace.set_span_in_context(leaving.evict, parent)
             elif traceparent := event.get(
                 "traceparent"
-            ):  # nobody asked: no part of its acquirer's trace
+            ):  # came back by itself: not part of its acquirer's trace
                 links = _links(_W3C.extract({"traceparent": traceparent}, Context()))
             leaving.verify = self._tracer.start_span(
                 names.SPAN_VERIFY,
@@ -413,7 +413,7 @@ def _links(context: Context) -> list[trace.Link]:
 def _ids(span: trace.Span) -> Mapping[str, str]:
     context = span.get_span_context()
     if not context.is_valid:
-        return _NONE  # only metrics are on, and nobody named a trace
+        return _NONE  # only metrics are on, and no trace was named
     return {"trace_id": f"{context.trace_id:032x}", "span_id": f"{context.span_id:016x}"}
 
 

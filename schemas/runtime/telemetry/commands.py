@@ -49,7 +49,9 @@ def command(
         return
     from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
-    in_main = threading.current_thread() is threading.main_thread()  # nobody else may
+    in_main = (
+        threading.current_thread() is threading.main_thread()
+    )  # only the main thread may set handlers
     if in_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _terminated)
     span = tracing.begin(

@@ -1,6 +1,6 @@
 """Names of all spans, span events, metrics and attributes, in one place. Names only: nothing is recorded here.
 
-Who records what: the arbiter `lease.*`, the runner `rskill.*` and the parts of a tick, the reasoner `reasoner.*`, a sidecar `sidecar.*`,
+Recorded by: the arbiter `lease.*`, the runner `rskill.*` and the parts of a tick, the reasoner `reasoner.*`, a sidecar `sidecar.*`,
 every command line `cli.command`. One trace runs through all of them by the W3C `traceparent` on their sockets.
 """
 

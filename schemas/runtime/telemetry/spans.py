@@ -1,7 +1,7 @@
 """Spans and the way of a trace over a socket. On the API alone: costs next to nothing until `schemas.runtime.telemetry.setup` has installed an SDK.
 
 The wire is W3C `traceparent` whatever `OTEL_PROPAGATORS` says: it is a field of our messages. Without an SDK a caller's trace is not recorded
-here, but handed on to whoever is called next.
+here, but handed on to what is called next.
 """
 
 from collections.abc import Iterator, Mapping
@@ -65,7 +65,7 @@ def joined(traceparent: str | None) -> Iterator[None]:
 
 @contextmanager
 def left_out(traceparent: str | None) -> Iterator[None]:
-    """Within the block nothing is recorded, here or by whoever is called from here. What the work would have joined (the caller's span or the
+    """Within the block nothing is recorded, here or in anything called from here. What the work would have joined (the caller's span or the
     present one, if any) is still what `carrier` names, marked as not sampled."""
     caller = trace.get_current_span(_of(traceparent)) if traceparent else trace.get_current_span()
     known = caller.get_span_context()

@@ -1,6 +1,6 @@
 """A caller's W3C `traceparent`, read once and in one way, on every wire and of every environment.
 
-Telemetry refuses nobody: what is no traceparent is none, and the request begins a trace of its own. A later version than ours (00) is read as
+Telemetry never refuses a request: a malformed traceparent is ignored, and the request begins a trace of its own. A later version than ours (00) is read as
 far as ours goes, which is what https://www.w3.org/TR/trace-context/ asks for, and handed on as ours. Pure.
 """
 

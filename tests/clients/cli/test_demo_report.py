@@ -88,7 +88,7 @@ def test_switches_are_counted_apart_from_loads_beside_others() -> None:
 
 def test_events_read_as_sentences() -> None:
     assert describe(SWITCH) == "grab took over from detector in 15 ms"
-    assert describe(LOAD) == "grab loaded beside the others in 5 ms, nobody evicted"
+    assert describe(LOAD) == "grab loaded beside the others in 5 ms, no eviction"
     assert (
         describe({"kind": "denied", "consumer": "x", "reason": "too big"}) == "x: denied (too big)"
     )
