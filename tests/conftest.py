@@ -3,6 +3,7 @@
 import logging
 import os
 import signal
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -70,3 +71,10 @@ def connect(arbiter_daemon: ArbiterProcess) -> Iterator[Callable[..., WireClient
     yield make
     for client in made:
         client.close()
+
+
+@pytest.fixture
+def short_folder() -> Iterator[Path]:
+    """An empty folder with a short path: the path of a socket holds 107 bytes."""
+    with tempfile.TemporaryDirectory(prefix="va") as made:
+        yield Path(made)

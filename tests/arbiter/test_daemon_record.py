@@ -1,13 +1,12 @@
 """A real daemon's event log: what it decided is decided again, byte for byte. Real processes."""
 
 import json
-import subprocess
 import sys
 from collections.abc import Callable
 
 import pytest
 
-from tests.support.process import ArbiterProcess
+from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.arbiter.eventlog import replay as runner
 from vram_arbiter.arbiter.eventlog.logfile import FOLDER
 
@@ -17,19 +16,8 @@ PATIENCE_S = 60
 Make = Callable[..., ArbiterProcess]
 
 
-def vramctl(arbiter: ArbiterProcess, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(
-        [sys.executable, "-m", "vram_arbiter.clients", *arguments],
-        env=arbiter.environ,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-
-
 def lease_something(arbiter: ArbiterProcess) -> None:
-    done = vramctl(arbiter, "run", "--vram", "5GiB", "--", sys.executable, "-c", "")
+    done = vramctl("run", "--vram", "5GiB", "--", sys.executable, "-c", "", environ=arbiter.environ)
     assert done.returncode == 0, done.stderr
 
 
@@ -47,13 +35,13 @@ def test_a_daemon_replays_identically_also_after_kill_9_and_a_restart(make_arbit
         assert found.identical
         assert found.events > 0
 
-    done = vramctl(arbiter, "replay", str(arbiter.state))
+    done = vramctl("replay", str(arbiter.state), environ=arbiter.environ)
     assert (done.returncode, done.stderr) == (0, "")
     assert "events, identical (1 file" in done.stdout
-    done = vramctl(arbiter, "replay", str(arbiter.state), "--json")
+    done = vramctl("replay", str(arbiter.state), "--json", environ=arbiter.environ)
     assert json.loads(done.stdout)["identical"] is True
-    assert vramctl(arbiter, "replay", "/nonexistent").returncode == 1
-    assert vramctl(arbiter, "replay").returncode == 2
+    assert vramctl("replay", "/nonexistent", environ=arbiter.environ).returncode == 1
+    assert vramctl("replay", environ=arbiter.environ).returncode == 2
 
 
 def test_recording_can_be_switched_off(make_arbiter: Make) -> None:

@@ -1,19 +1,16 @@
 """What the tests of the clients share: a scripted arbiter, a way to write specs, and waiting for a condition with a deadline."""
 
-import sys
-from collections.abc import AsyncIterator, Callable
-from pathlib import Path
+from collections.abc import AsyncIterator, Callable, Iterator
 
 import anyio
 import pytest
 
+from tests.support.beside import Beside, Start
+from tests.support.process import ArbiterProcess
+from tests.support.protocol_wire import Wire
+from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
-
-sys.path.insert(0, str(Path(__file__).parent))  # for the helpers beside it
-
-from tests.support.beside import Beside, Start
-from tests.support.protocol_wire import Wire
 
 DEADLINE_S = 60.0
 TTL_S = 120.0
@@ -73,3 +70,10 @@ def until() -> Callable[..., object]:
                 await anyio.sleep(0.01)
 
     return wait
+
+
+@pytest.fixture
+def client(arbiter_daemon: ArbiterProcess) -> Iterator[Client]:
+    """A blocking client of `arbiter_daemon`."""
+    with Client("t", endpoint=arbiter_daemon.endpoint) as client:
+        yield client

@@ -2,7 +2,7 @@
 
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,12 +22,6 @@ pytestmark = pytest.mark.e2e
 
 Spec = Callable[..., LeaseSpec]
 PATIENCE_S = 60.0
-
-
-@pytest.fixture
-def client(arbiter_daemon: ArbiterProcess) -> Iterator[Client]:
-    with Client("t", endpoint=arbiter_daemon.endpoint) as client:
-        yield client
 
 
 def test_lease_use_release(client: Client, spec: Spec) -> None:

@@ -6,11 +6,11 @@ Steps at which it stops and waits to be killed are given by VRAM_TEST_PAUSE (com
 
 import asyncio
 import contextlib
-import json
 import os
 import sys
 from pathlib import Path
 
+from tests.support.saying import say
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
@@ -19,10 +19,6 @@ from vram_arbiter.sidecars.device.memory import Block
 
 TTL_S = 120.0  # a daemon that is started again on a busy machine is away for seconds, and nobody is to fence himself
 PAUSE = frozenset(os.environ.get("VRAM_TEST_PAUSE", "").split(","))
-
-
-def say(event: str, **data: object) -> None:
-    print(json.dumps({"event": event, **data}), flush=True)
 
 
 async def pause(step: str) -> None:

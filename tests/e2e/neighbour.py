@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from tests.support.saying import say
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
@@ -20,10 +21,6 @@ from vram_arbiter.sidecars.device.memory import Block
 
 RESIDUE = 256 << 20
 TTL_S = 120.0  # one that is stopped for a while, on a busy machine, has its lease still
-
-
-def say(event: str, **facts: object) -> None:
-    print(json.dumps({"event": event, **facts}), flush=True)
 
 
 async def live(name: str, size: int, card: Path, habits: dict[str, Any]) -> None:

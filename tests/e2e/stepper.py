@@ -5,20 +5,16 @@ after `loading`, `in_use` and `unloading`. `use` begins a use, which the next `g
 """
 
 import asyncio
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from tests.support.saying import say
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
 TTL_S = 120.0  # a daemon that is started again on a busy machine is away for seconds, and nobody is to fence himself
-
-
-def say(event: str, **facts: object) -> None:
-    print(json.dumps({"event": event, **facts}), flush=True)
 
 
 async def live(name: str, size: int, card: Path, residue: int) -> None:

@@ -145,7 +145,7 @@ def stage(all_cases: Stage) -> Iterator[Stage]:
     all_cases.end_case()
 
 
-def until(ask: Callable[[], str], word: str) -> str:
+def asked_until(ask: Callable[[], str], word: str) -> str:
     """What an operator sees once it says so. Every answer of the program paces the questions."""
     for _ in range(60):
         if word in (said := ask()):
@@ -171,9 +171,9 @@ def test_1_the_next_one_loads_when_the_memory_is_back_and_nothing_stays_failed(
 
 def test_1_while_the_card_cannot_be_read_no_figure_of_it_is_printed(stage: Stage) -> None:
     """comfyui-mcp#2050: "1205 MB free", and 24 GB a moment later. A failed poll must print nothing."""
-    until(lambda: stage.vramctl("status"), "free 7.71 GiB")
+    asked_until(lambda: stage.vramctl("status"), "free 7.71 GiB")
     stage.configure(faults=fakegpu.Faults(probe="fail"))
-    shown = until(lambda: stage.vramctl("status"), "measured: unknown")
+    shown = asked_until(lambda: stage.vramctl("status"), "measured: unknown")
     assert "free" not in shown
     waiter = stage.spawn("waiter-1", 1)
     stage.event("queued", consumer="waiter-1")
@@ -297,7 +297,7 @@ def test_14_after_a_restart_it_is_said_who_lives_and_who_has_exited(stage: Stage
     stage.arbiter.start()
     stage.watch()
     assert f"silent-14 (pid {silent.pid}) must come back first" in stage.vramctl("status")
-    until(
+    asked_until(
         lambda: stage.vramctl("history", "--kind", "lost", "-c", "exits-14"),
         f"process {exits.pid} died",
     )

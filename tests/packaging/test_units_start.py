@@ -57,7 +57,7 @@ def machine() -> Iterator[Machine]:
         made.close()
 
 
-def until[T](found: Callable[[], T | None], what: Callable[[], str]) -> T:
+def answer_of[T](found: Callable[[], T | None], what: Callable[[], str]) -> T:
     """Ask until there is an answer: what happens inside the machine shows from outside only."""
     deadline = time.monotonic() + PATIENCE_S
     while (answer := found()) is None:
@@ -92,7 +92,7 @@ def held(
     """A program that runs under a lease."""
     command = ["vramctl", "run", "--endpoint", ENDPOINT, "--name", name, "--vram", "1GiB", *options]
     process = subprocess.Popen(machine.inside(*command, "--", "sleep", "1000", user=user))
-    lease = until(lambda: (leases(machine) or {}).get(name), lambda: machine.log(ARBITER))
+    lease = answer_of(lambda: (leases(machine) or {}).get(name), lambda: machine.log(ARBITER))
     yield lease
     assert process.poll() is None, "the holder ended with the arbiter"
     machine.run("kill", str(lease["pid"]))
@@ -108,7 +108,7 @@ def hit(machine: Machine, name: str) -> None:
         restarts, state = machine.show(ARBITER, "NRestarts", "ActiveState")
         return True if [restarts] != before and state == "active" else None
 
-    until(again, lambda: machine.log(ARBITER) + machine.console)
+    answer_of(again, lambda: machine.log(ARBITER) + machine.console)
 
 
 def test_each_group_may_do_its_part(machine: Machine) -> None:
@@ -129,7 +129,9 @@ def test_each_group_may_do_its_part(machine: Machine) -> None:
 def test_a_killed_arbiter_comes_back_with_its_leases(machine: Machine) -> None:
     with held(machine, "survivor") as before:
         hit(machine, "KILL")
-        after = until(lambda: (leases(machine) or {}).get("survivor"), lambda: machine.log(ARBITER))
+        after = answer_of(
+            lambda: (leases(machine) or {}).get("survivor"), lambda: machine.log(ARBITER)
+        )
         assert (after["lease_id"], after["pid"]) == (before["lease_id"], before["pid"])
 
 
@@ -137,7 +139,9 @@ def test_the_watchdog_ends_an_arbiter_that_hangs(machine: Machine) -> None:
     with held(machine, "patient") as before:
         hit(machine, "STOP")
         assert "Fatal Python error: Aborted" in machine.log(ARBITER), "where it hung, is said"
-        after = until(lambda: (leases(machine) or {}).get("patient"), lambda: machine.log(ARBITER))
+        after = answer_of(
+            lambda: (leases(machine) or {}).get("patient"), lambda: machine.log(ARBITER)
+        )
         assert (after["lease_id"], after["pid"]) == (before["lease_id"], before["pid"])
 
 
@@ -210,13 +214,13 @@ def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
         raise AssertionError(machine.log(f"{sidecar}.service")) from error
     assert set(leases(machine) or {}) == {"reward"}
 
-    until(
+    answer_of(
         lambda: True if "runner.sock" in machine.run("ls", "/run/vram-arbiter").split() else None,
         lambda: machine.log(f"{runner}.service"),
     )
     machine.run("vram-runner", "estop", "--reason", "a test", user="vram-robot")
     machine.start(reasoner)
-    until(
+    answer_of(
         lambda: True if machine.show(reasoner, "ActiveState") == ["failed"] else None,
         lambda: machine.log(f"{reasoner}.service"),
     )

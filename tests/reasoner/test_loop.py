@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.waiting import play
 from vram_arbiter.reasoner import loop as looping
 from vram_arbiter.reasoner.inbox import WORDS_MAX, Cancel, Danger, Inbox, Said
 from vram_arbiter.reasoner.loop import LOOKS_IN_A_ROW_MAX, REFUSALS_MAX, Result, run_episode
@@ -70,14 +71,6 @@ class Robot:
             self.cancelled = True
             raise
         return Outcome("succeeded", "there")
-
-
-def play(story: Callable[[], Any]) -> Any:
-    async def bounded() -> Any:
-        async with asyncio.timeout(30):
-            return await story()
-
-    return asyncio.run(bounded())
 
 
 def test_a_cancel_passes_a_planner_that_hangs() -> None:

@@ -1,12 +1,12 @@
 """An operator's way into a running episode: over the socket, past the planner."""
 
 import asyncio
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.support.waiting import play
 from vram_arbiter.reasoner.inbox import Cancel, Inbox, Said
 from vram_arbiter.reasoner.loop import run_episode
 from vram_arbiter.reasoner.palette import Palette
@@ -14,14 +14,6 @@ from vram_arbiter.reasoner.planner import Episode, Finish, Outcome
 from vram_arbiter.reasoner.server import OperatorServer, send
 from vram_arbiter.schemas.errors import AlreadyRunning, BadRequest, ReasonerUnreachable, UnknownOp
 from vram_arbiter.schemas.tools import ToolCall
-
-
-def play(story: Callable[[], Any]) -> Any:
-    async def bounded() -> Any:
-        async with asyncio.timeout(30):
-            return await story()
-
-    return asyncio.run(bounded())
 
 
 def test_words_and_a_cancel_reach_the_inbox(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.waiting import play
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import RewardClient
 from vram_arbiter.reasoner.history import KEPT_MAX, SHOWN_MAX, Past, Taken, spread
@@ -33,14 +34,6 @@ from vram_arbiter.schemas.tools import (
 
 ASK = QueryTaskProgress()
 TASK = "grab the red cube"
-
-
-def play(story: Callable[[], Any]) -> Any:
-    async def bounded() -> Any:
-        async with asyncio.timeout(60):
-            return await story()
-
-    return asyncio.run(bounded())
 
 
 # -- the pictures -------------------------------------------------------------------------------------------------------

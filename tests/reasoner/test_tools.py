@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import pytest
 
+from tests.support.waiting import play
 from vram_arbiter.clients.runner import Goal, RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient, SceneVlmClient
 from vram_arbiter.reasoner.inbox import Cancel, Danger, Inbox, Said
@@ -51,14 +52,6 @@ from vram_arbiter.schemas.world import CameraModel
 GRAB = ExecuteRskill(rskill_id="lab/grab", prompt="grab it", deadline_s=30)
 LOOK = LocateInView(query="red cube")
 ASK = QueryScene(question="what is held?")
-
-
-def play(story: Callable[[], Any]) -> Any:
-    async def bounded() -> Any:
-        async with asyncio.timeout(60):
-            return await story()
-
-    return asyncio.run(bounded())
 
 
 def test_a_goals_end_becomes_an_outcome(a_runner: Any) -> None:

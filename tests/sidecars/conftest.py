@@ -5,13 +5,12 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
-import time
 from pathlib import Path
 
 import pytest
 
 from tests.support.fakegpu_check import check_log
+from tests.support.waiting import until
 from tests.support.wire import WireClient
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
 
@@ -29,15 +28,6 @@ latency_budget: {{per_chunk_ms: 100}}
 actions: [detect]
 detector: {{labels: [cube]}}
 """
-
-
-def until(condition, deadline_s=PATIENCE_S):
-    """Wait for something that only shows from outside; returns what the condition returned."""
-    began, pause = time.monotonic(), threading.Event()
-    while not (found := condition()):
-        assert time.monotonic() < began + deadline_s, "it did not happen in time"
-        pause.wait(0.01)
-    return found
 
 
 class Sidecar:

@@ -2,11 +2,10 @@
 
 import os
 import signal
-from threading import Event
-from time import monotonic
 
 import pytest
 
+from tests.support.waiting import until
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
@@ -31,13 +30,6 @@ def state(arbiter, consumer):
         ),
         None,
     )
-
-
-def until(condition):
-    deadline = monotonic() + PATIENCE_S
-    while not condition():
-        assert monotonic() < deadline, "it did not happen in time"
-        Event().wait(0.01)
 
 
 def sent_away(box, arbiter):

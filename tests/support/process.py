@@ -166,3 +166,19 @@ class ArbiterProcess:
             self.process.wait(STOP_S)
         self._notify.close()
         shutil.rmtree(self.runtime, ignore_errors=True)
+
+
+def vramctl(
+    *arguments: str | bytes,
+    environ: Mapping[str, str],
+    program: tuple[str, ...] = ("-m", "vram_arbiter.clients"),
+) -> "subprocess.CompletedProcess[str]":
+    """Run `vramctl`, or another program that ends by itself, and return what it printed."""
+    return subprocess.run(
+        [sys.executable, *program, *arguments],
+        env=environ,
+        capture_output=True,
+        text=True,
+        timeout=STOP_S,
+        check=False,
+    )

@@ -2,27 +2,18 @@
 
 import subprocess
 import sys
-from typing import Any
 
 import pytest
 
-from tests.support.core_driver import READING_S, Consumer, CoreDriver
+from tests.support.core_driver import READING_S, CoreDriver
+from tests.support.scenes import held
 from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed
 from vram_arbiter.arbiter.core.verification.judge import DYING_S
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+from vram_arbiter.schemas.ids import ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 BROWSER = ProcessKey(9, 9)
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.1)
-    return person, lease
 
 
 # -- 1: freed is not free yet --------------------------------------------------------------------------------------------

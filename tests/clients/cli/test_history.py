@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.process import ArbiterProcess
+from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients.cli import history
 from vram_arbiter.clients.cli.history import Wanted, collect, parse_since
 from vram_arbiter.clients.sync import Client
@@ -118,31 +118,24 @@ def test_after_a_number_come_the_first_that_are_wanted(archive: Archive) -> None
     assert [event["at_wall_s"] for event in found] == [993.0, 996.0, 999.0, 1002.0]
 
 
-def vramctl(arbiter: ArbiterProcess, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(
-        [sys.executable, "-m", "vram_arbiter.clients", *arguments],
-        env=arbiter.environ,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-
-
 @pytest.mark.e2e
 def test_following_shows_the_past_and_then_the_present(
     arbiter_daemon: ArbiterProcess, spec: Callable[..., LeaseSpec]
 ) -> None:
     with Client("t", endpoint=arbiter_daemon.endpoint) as client:
         client.acquire(spec("early", 1)).ready()
-        shown = vramctl(arbiter_daemon, "history", "--since", "1h", "-c", "early", "--json")
+        shown = vramctl(
+            "history", "--since", "1h", "-c", "early", "--json", environ=arbiter_daemon.environ
+        )
         kinds = [event["kind"] for event in json.loads(shown.stdout)["events"]]
         kinds = [
             kind for kind in kinds if kind != "queued"
         ]  # where the first reading was still under way
         assert kinds == ["granted", "ready", "switch"]
-        assert vramctl(arbiter_daemon, "history", "-c", "nobody").stdout.strip() == ""
-        assert vramctl(arbiter_daemon, "history", "--since", "soon").returncode == 2
+        assert (
+            vramctl("history", "-c", "nobody", environ=arbiter_daemon.environ).stdout.strip() == ""
+        )
+        assert vramctl("history", "--since", "soon", environ=arbiter_daemon.environ).returncode == 2
 
         process = subprocess.Popen(
             [
@@ -183,7 +176,7 @@ def test_following_goes_on_after_a_restart_with_a_new_history(
     """A deleted state folder begins the numbers at 1 again: nothing was shown any more."""
     arbiter = make_arbiter().start()
     for _ in range(3):
-        assert vramctl(arbiter, "drain", "-r", "x").returncode == 0
+        assert vramctl("drain", "-r", "x", environ=arbiter.environ).returncode == 0
     process = subprocess.Popen(
         [
             sys.executable,
@@ -209,7 +202,7 @@ def test_following_goes_on_after_a_restart_with_a_new_history(
         arbiter.start()
         while process.poll() is None and not arbiter_has_two_clients(arbiter):
             pass
-        assert vramctl(arbiter, "drain", "-r", "after").returncode == 0
+        assert vramctl("drain", "-r", "after", environ=arbiter.environ).returncode == 0
         assert json.loads(output.readline())["reason"] == "after"
     finally:
         process.kill()
@@ -218,5 +211,5 @@ def test_following_goes_on_after_a_restart_with_a_new_history(
 
 def arbiter_has_two_clients(arbiter: ArbiterProcess) -> bool:
     """The follower has come back."""
-    clients = json.loads(vramctl(arbiter, "status", "--json").stdout)["clients"]
+    clients = json.loads(vramctl("status", "--json", environ=arbiter.environ).stdout)["clients"]
     return int(clients) >= 2

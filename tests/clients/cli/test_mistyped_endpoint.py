@@ -3,21 +3,12 @@
 import os
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[3]
 GRAB = ROOT / "configs/rskills/so101-grab/rskill.yaml"
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    """A short one: a socket's path has at most 107 bytes."""
-    with tempfile.TemporaryDirectory(prefix="va") as name:
-        yield Path(name)
 
 
 @pytest.mark.parametrize(
@@ -31,13 +22,13 @@ def folder() -> Iterator[Path]:
         ["vram_arbiter.runner", "estop", "--endpoint", "EP"],
     ],
 )
-def test_a_mistyped_endpoint_makes_no_folders(command: list[str], folder: Path) -> None:
+def test_a_mistyped_endpoint_makes_no_folders(command: list[str], short_folder: Path) -> None:
     """A daemon on a mistyped endpoint served there, alone, in folders that it had made on the way."""
-    endpoint = f"ipc://{folder}/runn/vram-arbiter/arbiter.sock"
+    endpoint = f"ipc://{short_folder}/runn/vram-arbiter/arbiter.sock"
     done = subprocess.run(
         [sys.executable, "-m", *(endpoint if word == "EP" else word for word in command)],
         cwd=ROOT,
-        env={**os.environ, "VRAM_ARBITER_RUNTIME": str(folder)},
+        env={**os.environ, "VRAM_ARBITER_RUNTIME": str(short_folder)},
         capture_output=True,
         text=True,
         timeout=60,
@@ -46,4 +37,4 @@ def test_a_mistyped_endpoint_makes_no_folders(command: list[str], folder: Path) 
     assert done.returncode in (1, 2, 3)
     (line,) = done.stderr.splitlines()
     assert "/runn" in line
-    assert list(folder.iterdir()) == []
+    assert list(short_folder.iterdir()) == []

@@ -8,13 +8,12 @@ import json
 import os
 import signal
 import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.support.process import ArbiterProcess
+from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients.net.diagnose import obstacle
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.errors import CODES
@@ -36,17 +35,6 @@ vram_arbiter.clients.cli.main.main()
 """
 
 
-def vramctl(
-    environ: dict[str, str],
-    *arguments: str,
-    program: tuple[str, ...] = ("-m", "vram_arbiter.clients"),
-) -> Finished:
-    return subprocess.run(
-        [sys.executable, *program, *arguments],
-        env=environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
-    )  # fmt: skip
-
-
 def one_line(done: Finished) -> str:
     """What was said, if it is an error as errors are: one line on stderr, `vramctl: what is wrong (what to do)`."""
     assert done.stdout == ""
@@ -65,12 +53,6 @@ def typed(done: Finished) -> str:
     return str(error["code"])
 
 
-@pytest.fixture
-def client(arbiter_daemon: ArbiterProcess) -> Iterator[Client]:
-    with Client("t", endpoint=arbiter_daemon.endpoint) as client:
-        yield client
-
-
 @pytest.mark.parametrize(
     "command",
     [
@@ -86,7 +68,7 @@ def test_2_what_is_mistyped_is_told_before_anybody_is_asked(
 ) -> None:
     """There is no daemon: who asked one would end with 3."""
     environ = {k: v for k, v in os.environ.items() if not k.startswith("VRAM_ARBITER_")}
-    done = vramctl({**environ, "VRAM_ARBITER_RUNTIME": str(tmp_path)}, *command)
+    done = vramctl(*command, environ={**environ, "VRAM_ARBITER_RUNTIME": str(tmp_path)})
     assert (done.returncode, done.stdout) == (2, "")
     assert "usage: vramctl" in done.stderr.lower()
     assert "Traceback" not in done.stderr
@@ -104,18 +86,24 @@ def test_1_for_what_cannot_be_done(
         client.acquire(spec(name, 1)).ready()
     ended = client.acquire(spec("gone", 1))
     ended.release()
-    assert "no lease or consumer 'x'" in one_line(vramctl(environ, "evict", "x", "-r", "why"))
-    assert "name one of them: L" in one_line(vramctl(environ, "pin", "twin", "-r", "why"))
-    assert "nothing to undo" in one_line(vramctl(environ, "unpin", "det"))
-    assert "it is not dead (evict it instead)" in one_line(
-        vramctl(environ, "release-dead", "det", "-r", "why")
+    assert "no lease or consumer 'x'" in one_line(
+        vramctl("evict", "x", "-r", "why", environ=environ)
     )
-    assert "vramctl history" in one_line(vramctl(environ, "evict", ended.lease_id, "-r", "why"))
-    assert "did you mean granted?" in one_line(vramctl(environ, "history", "--kind", "grant"))
+    assert "name one of them: L" in one_line(vramctl("pin", "twin", "-r", "why", environ=environ))
+    assert "nothing to undo" in one_line(vramctl("unpin", "det", environ=environ))
+    assert "it is not dead (evict it instead)" in one_line(
+        vramctl("release-dead", "det", "-r", "why", environ=environ)
+    )
+    assert "vramctl history" in one_line(
+        vramctl("evict", ended.lease_id, "-r", "why", environ=environ)
+    )
+    assert "did you mean granted?" in one_line(
+        vramctl("history", "--kind", "grant", environ=environ)
+    )
     codes = {
         command: (done.returncode, typed(done))
         for command in (("evict", "x", "-r", "y"), ("pin", "twin", "-r", "y"), ("unpin", "det"), ("history", "--kind", "grant"))
-        for done in (vramctl(environ, *command, "--json"),)
+        for done in (vramctl(*command, "--json", environ=environ),)
     }  # fmt: skip
     assert list(codes.values()) == [
         (1, "unknown_lease"),
@@ -123,13 +111,13 @@ def test_1_for_what_cannot_be_done(
         (1, "bad_state"),
         (1, "bad_request"),
     ]
-    nobody = vramctl(environ, "why", "nobody")
+    nobody = vramctl("why", "nobody", environ=environ)
     assert (nobody.returncode, nobody.stdout.count("\n")) == (1, 1)
     assert "`vramctl history -c nobody`" in nobody.stdout
-    assert vramctl(environ, "why", det.lease_id).stdout.startswith("det: "), (
+    assert vramctl("why", det.lease_id, environ=environ).stdout.startswith("det: "), (
         "a lease is named by its id as well"
     )
-    empty = vramctl(environ, "history", "-c", "nobody")
+    empty = vramctl("history", "-c", "nobody", environ=environ)
     assert (empty.returncode, empty.stdout) == (0, ""), "nothing is an answer, and no line"
 
 
@@ -147,13 +135,13 @@ def test_who_is_no_operator_may_look_and_is_told_who_may_act(
     sock.chmod(0o666)
     stranger = ("-c", STRANGER)
     for action in EVERY_ACTION:
-        refused = vramctl(environ, *action, program=stranger)
+        refused = vramctl(*action, program=stranger, environ=environ)
         assert (refused.returncode, "operators_group" in one_line(refused)) == (1, True), action
     assert (
-        typed(vramctl(environ, "evict", "det", "-r", "why", "--json", program=stranger))
+        typed(vramctl("evict", "det", "-r", "why", "--json", program=stranger, environ=environ))
         == "not_permitted"
     )
-    assert vramctl(environ, "why", "det", program=stranger).returncode == 0
+    assert vramctl("why", "det", program=stranger, environ=environ).returncode == 0
     assert lease.state == "held"
     sock.chmod(0o660)
     os.chown(sock, -1, 0)
@@ -163,17 +151,19 @@ def test_who_is_no_operator_may_look_and_is_told_who_may_act(
         ("history", "--follow"),
         ("run", "--vram", "1GiB", "true"),
     ):
-        shut_out = vramctl(environ, *command, program=stranger)
+        shut_out = vramctl(*command, program=stranger, environ=environ)
         assert (shut_out.returncode, "may not be used by uid 65534" in one_line(shut_out)) == (
             3,
             True,
         ), command
     assert "join the group root" in shut_out.stderr
     arbiter_daemon.runtime.chmod(0o700)
-    assert "its folder is closed to you" in one_line(vramctl(environ, "status", program=stranger))
+    assert "its folder is closed to you" in one_line(
+        vramctl("status", program=stranger, environ=environ)
+    )
     os.chown(arbiter_daemon.runtime, -1, grp.getgrnam("daemon").gr_gid)
     arbiter_daemon.runtime.chmod(0o750)  # as the daemon makes it for a group
-    assert "join the group daemon" in one_line(vramctl(environ, "status", program=stranger))
+    assert "join the group daemon" in one_line(vramctl("status", program=stranger, environ=environ))
 
 
 def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) -> None:
@@ -182,29 +172,31 @@ def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) 
     environ = arbiter_daemon.environ
     os.kill(arbiter_daemon.pid, signal.SIGSTOP)
     try:
-        assert "look at the arbiter's log" in one_line(vramctl(environ, "drain", "-r", "why"))
+        assert "look at the arbiter's log" in one_line(
+            vramctl("drain", "-r", "why", environ=environ)
+        )
     finally:
         os.kill(arbiter_daemon.pid, signal.SIGCONT)
-    status = json.loads(vramctl(environ, "status", "--json").stdout)
+    status = json.loads(vramctl("status", "--json", environ=environ).stdout)
     assert status["drained"] == "", "what ended with 3 was not done afterwards"
     arbiter_daemon.kill()
     for action in (*EVERY_ACTION, ("history",), ("why", "x"), ("watch",), ("history", "-f")):
-        dead = vramctl(environ, *action)
+        dead = vramctl(*action, environ=environ)
         assert (dead.returncode, "it was killed, its socket is left over" in one_line(dead)) == (
             3,
             True,
         ), action
     for action in (("resume", "--json"), ("history", "-f", "--json")):
-        assert typed(vramctl(environ, *action)) == "arbiter_unreachable"
+        assert typed(vramctl(*action, environ=environ)) == "arbiter_unreachable"
     (arbiter_daemon.runtime / "arbiter.sock").unlink()
-    assert "there is no such socket" in one_line(vramctl(environ, "resume"))
+    assert "there is no such socket" in one_line(vramctl("resume", environ=environ))
     (arbiter_daemon.runtime / "arbiter.sock").write_text("")
-    assert "is no socket" in one_line(vramctl(environ, "resume"))
+    assert "is no socket" in one_line(vramctl("resume", environ=environ))
     assert "Linux allows 107" in one_line(
-        vramctl(environ, "resume", "--endpoint", f"ipc:///{'x' * 200}")
+        vramctl("resume", "--endpoint", f"ipc:///{'x' * 200}", environ=environ)
     )
     assert "'garbage' is not an endpoint" in one_line(
-        vramctl(environ, "resume", "--endpoint", "garbage")
+        vramctl("resume", "--endpoint", "garbage", environ=environ)
     )
 
 
@@ -219,8 +211,8 @@ def test_a_look_at_the_socket_disturbs_nobody(
 
 def test_an_empty_and_a_cut_log(arbiter_daemon: ArbiterProcess, tmp_path: Path) -> None:
     environ = arbiter_daemon.environ
-    assert vramctl(environ, "drain", "-r", "so that there is an event").returncode == 0
-    assert vramctl(environ, "resume").returncode == 0
+    assert vramctl("drain", "-r", "so that there is an event", environ=environ).returncode == 0
+    assert vramctl("resume", environ=environ).returncode == 0
     assert arbiter_daemon.stop() == 0
     (whole,) = (arbiter_daemon.state / "record").glob("*.jsonl")
     lines = whole.read_bytes().splitlines(keepends=True)
@@ -235,11 +227,15 @@ def test_an_empty_and_a_cut_log(arbiter_daemon: ArbiterProcess, tmp_path: Path) 
         (b"".join(lines), 0, " identical ("),
     ):
         log.write_bytes(content)
-        done = vramctl(environ, "replay", str(log))
+        done = vramctl("replay", str(log), environ=environ)
         assert done.returncode == code, done.stderr
         assert says in (done.stdout if code == 0 else one_line(done))
-    assert "no event log here" in one_line(vramctl(environ, "replay", str(tmp_path / "nothing")))
-    assert "one that is shipped: desktop" in one_line(vramctl(environ, "simulate", "nothing"))
-    assert json.loads(vramctl(environ, "replay", str(tmp_path / "nothing"), "--json").stdout)[
-        "error"
-    ]["hint"]
+    assert "no event log here" in one_line(
+        vramctl("replay", str(tmp_path / "nothing"), environ=environ)
+    )
+    assert "one that is shipped: desktop" in one_line(
+        vramctl("simulate", "nothing", environ=environ)
+    )
+    assert json.loads(
+        vramctl("replay", str(tmp_path / "nothing"), "--json", environ=environ).stdout
+    )["error"]["hint"]

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.process import ArbiterProcess
+from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients import cuda
 from vram_arbiter.clients.cli.run import RunSpec, _Run, lease_spec
 from vram_arbiter.clients.client import AsyncClient
@@ -57,13 +57,6 @@ def command(*options: str, program: str = PROGRAM) -> list[str]:
     return [*run, "--", sys.executable, "-c", program]
 
 
-def vramctl(*arguments: str | bytes, environ: dict[str, str]) -> Finished:
-    return subprocess.run(
-        [sys.executable, "-m", "vram_arbiter.clients", *arguments],
-        env=environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
-    )  # fmt: skip
-
-
 @contextlib.contextmanager
 def running(
     environ: dict[str, str], *options: str, program: str = PROGRAM
@@ -81,12 +74,6 @@ def running(
         if process.poll() is None:
             process.terminate()  # passed on to the program
         process.communicate(timeout=PATIENCE_S)
-
-
-@pytest.fixture
-def client(arbiter_daemon: ArbiterProcess) -> Iterator[Client]:
-    with Client("t", endpoint=arbiter_daemon.endpoint) as client:
-        yield client
 
 
 def view(client: Client, consumer: str) -> dict[str, Any]:

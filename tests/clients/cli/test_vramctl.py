@@ -12,12 +12,12 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.support.process import ArbiterProcess
+from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.wire.requests import LeaseSpec
 
@@ -26,29 +26,12 @@ Finished = subprocess.CompletedProcess[str]
 PATIENCE_S = 60.0
 
 
-def vramctl(*arguments: str, environ: dict[str, str]) -> Finished:
-    return subprocess.run(
-        [sys.executable, "-m", "vram_arbiter.clients", *arguments],
-        env=environ,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-
-
 @pytest.fixture
 def nowhere(tmp_path: Path) -> dict[str, str]:
     """An environment without an arbiter."""
     root = str(Path(__file__).parents[3])
     kept = {key: value for key, value in os.environ.items() if not key.startswith("VRAM_ARBITER_")}
     return {**kept, "VRAM_ARBITER_RUNTIME": str(tmp_path), "PYTHONPATH": f"{root}/src:{root}"}
-
-
-@pytest.fixture
-def client(arbiter_daemon: ArbiterProcess) -> Iterator[Client]:
-    with Client("t", endpoint=arbiter_daemon.endpoint) as client:
-        yield client
 
 
 # -- without a daemon ----------------------------------------------------------------------------------------------

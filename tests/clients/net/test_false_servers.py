@@ -11,7 +11,6 @@ import os
 import pwd
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -40,12 +39,12 @@ Heard = Callable[[], list[str]]
 
 
 @contextlib.contextmanager
-def false_server(folder: Path, name: str) -> Iterator[Heard]:
+def false_server(short_folder: Path, name: str) -> Iterator[Heard]:
     """A server of the user nobody on `folder/name`. What it yields ends it, and returns what it heard."""
     nobody = pwd.getpwnam("nobody").pw_uid
-    owner = folder.stat().st_uid
-    os.chown(folder, nobody, -1)
-    command = [sys.executable, str(SCRIPT), str(folder), name, str(nobody)]
+    owner = short_folder.stat().st_uid
+    os.chown(short_folder, nobody, -1)
+    command = [sys.executable, str(SCRIPT), str(short_folder), name, str(nobody)]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as child:
@@ -63,14 +62,7 @@ def false_server(folder: Path, name: str) -> Iterator[Heard]:
             yield heard
         finally:
             heard()
-            os.chown(folder, owner, -1)
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    """Short: a socket path holds 107 bytes."""
-    with tempfile.TemporaryDirectory(prefix="va") as made:
-        yield Path(made)
+            os.chown(short_folder, owner, -1)
 
 
 async def ask_arbiter(endpoint: str) -> None:
@@ -113,18 +105,20 @@ async def ask_reasoner(endpoint: str) -> None:
         ask_reasoner,
     ],
 )
-def test_nothing_is_said_to_a_false_server(ask: Callable[[str], object], folder: Path) -> None:
+def test_nothing_is_said_to_a_false_server(
+    ask: Callable[[str], object], short_folder: Path
+) -> None:
     """Regression: clients believed any process that served the path."""
-    with false_server(folder, "s") as heard:
+    with false_server(short_folder, "s") as heard:
         with pytest.raises(UntrustedServer, match=r"served by uid \d+ \(nobody\)"):
-            asyncio.run(ask(f"ipc://{folder}/s"))  # type: ignore[arg-type]
+            asyncio.run(ask(f"ipc://{short_folder}/s"))  # type: ignore[arg-type]
         assert heard() == []
 
 
-def test_vramctl_says_who_serves_there(folder: Path) -> None:
+def test_vramctl_says_who_serves_there(short_folder: Path) -> None:
     """Regression: clients believed any process that served the path."""
-    environ = {**os.environ, "VRAM_ARBITER_ENDPOINT": f"ipc://{folder}/s"}
-    with false_server(folder, "s") as heard:
+    environ = {**os.environ, "VRAM_ARBITER_ENDPOINT": f"ipc://{short_folder}/s"}
+    with false_server(short_folder, "s") as heard:
         for command in (["status"], ["status", "--json"], ["resume"], ["watch"]):
             done = subprocess.run(
                 [sys.executable, "-m", "vram_arbiter.clients", *command],
@@ -141,10 +135,12 @@ def test_vramctl_says_who_serves_there(folder: Path) -> None:
         assert heard() == []
 
 
-def test_a_user_that_was_named_is_believed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_user_that_was_named_is_believed(
+    short_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("VRAM_ARBITER_SERVER_USERS", "nobody")
-    with false_server(folder, "s") as heard:
-        assert request.ask("status", {}, f"ipc://{folder}/s")["ok"]
+    with false_server(short_folder, "s") as heard:
+        assert request.ask("status", {}, f"ipc://{short_folder}/s")["ok"]
         assert any("'op': 'hello'" in line for line in heard())
 
 

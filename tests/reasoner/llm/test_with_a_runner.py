@@ -80,7 +80,7 @@ class Programs:
         return found
 
 
-async def until(condition: Callable[[], Any]) -> Any:
+async def comes_true(condition: Callable[[], Any]) -> Any:
     """The condition's value once it is true; the test's own time limit bounds it."""
     while True:
         value = condition()
@@ -111,7 +111,7 @@ def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(
             stand_in.hangs()
             stand_in.json(openai("finish", success=True, reason="turned"))
             async with programs.reasoner("openai") as reasoner:
-                await until(goal)
+                await comes_true(goal)
                 await send(
                     f"ipc://{tmp_path}/reasoner.sock",
                     {"op": "say", "text": "slowly"},
@@ -127,7 +127,7 @@ def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(
             # a signal ends the reasoner, and its goal with it
             stand_in.json(anthropic(TURN, goal_params={"turn_rad": 6.2}))
             async with programs.reasoner("anthropic") as reasoner:
-                running = await until(goal)
+                running = await comes_true(goal)
                 reasoner.send_signal(signal.SIGTERM)
                 assert await reasoner.wait() == 1
             assert (await client.call("result", {"goal_id": running}))["status"] == "canceled"
@@ -137,7 +137,7 @@ def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(
             asked = len(stand_in.asked)
             stand_in.hangs()
             async with programs.reasoner("anthropic") as reasoner:
-                await until(lambda: len(stand_in.asked) > asked)
+                await comes_true(lambda: len(stand_in.asked) > asked)
                 await client.estop("a hand in the way")
                 assert await reasoner.wait() == 1
             assert programs.result()["reason"].startswith("stopped: emergency stop")

@@ -8,14 +8,13 @@ import shutil
 import signal
 import socket
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.support.waiting import until
 from vram_arbiter.runner import __main__ as program
 from vram_arbiter.runner.cli.replay import as_text
 from vram_arbiter.runner.protocols import Transition
@@ -49,13 +48,6 @@ FIRST, SECOND = goal("g1", "grab the cube"), goal("g2", "put it down")
 def recorder(root: Path, **options: Any) -> DatasetRecorder:
     given: dict[str, Any] = {"rate_hz": 30.0, "cameras": lambda: ("front",), "robot": "bench"}
     return DatasetRecorder(root, **given | options)
-
-
-def until(so: Callable[[], bool]) -> None:
-    until_s = time.monotonic() + WAIT_S
-    while not so():
-        assert time.monotonic() < until_s, "it never came"
-        time.sleep(0.01)
 
 
 def play(made: DatasetRecorder, of: Any, ended: Any, ticks: int, **options: Any) -> None:

@@ -3,7 +3,6 @@
 import json
 import math
 import random
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -24,12 +23,6 @@ from vram_arbiter.runner.sim.training.learned import LoadedPolicy
 pytestmark = pytest.mark.heavy
 
 CHECKPOINT = Path(__file__).parents[3] / "configs" / "models" / "so101-grab"
-
-
-@pytest.fixture
-def env() -> Iterator[SimEnv]:
-    with SimEnv() as one:
-        yield one
 
 
 @pytest.fixture(scope="module")

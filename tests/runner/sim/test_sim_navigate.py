@@ -1,7 +1,6 @@
 """Navigation reaches its pose and never drives into the table."""
 
 import math
-from collections.abc import Iterator
 
 import pytest
 
@@ -18,12 +17,6 @@ from vram_arbiter.runner.sim.navigate import (
 )
 
 pytestmark = pytest.mark.heavy
-
-
-@pytest.fixture
-def env() -> Iterator[SimEnv]:
-    with SimEnv() as one:
-        yield one
 
 
 def drive(env: SimEnv, controller: PlanarController, limit: int = 300) -> int:

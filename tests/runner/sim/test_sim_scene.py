@@ -31,7 +31,7 @@ SCENE_FILE = Path(__file__).parents[3] / "configs" / "scenes" / "tabletop.yaml"
 
 
 @pytest.fixture
-def env() -> Iterator[SimEnv]:
+def scene_3() -> Iterator[SimEnv]:
     with SimEnv() as one:
         one.reset(3)
         yield one
@@ -112,15 +112,15 @@ def test_vocabulary_is_colours_times_shapes() -> None:
     assert len(vocabulary()) == len(COLOURS) * len(SHAPES)
 
 
-def test_same_seed_same_pixels_and_same_motion(env: SimEnv) -> None:
+def test_same_seed_same_pixels_and_same_motion(scene_3: SimEnv) -> None:
     def play(one: SimEnv) -> tuple[np.ndarray, list[float]]:
         one.reset(5)
         for index in range(10):
             one.step([a + 0.02 * index for a in REST_POSE], (0.1, 0.05, 0.1))
         return one.render("front"), list(one.joint_state().values())
 
-    image, joints = play(env)
-    again, joints_again = play(env)
+    image, joints = play(scene_3)
+    again, joints_again = play(scene_3)
     assert np.array_equal(image, again)
     assert joints == joints_again
     assert image.shape == (360, 480, 3)
@@ -128,62 +128,64 @@ def test_same_seed_same_pixels_and_same_motion(env: SimEnv) -> None:
     assert image.std() > 10
 
 
-def test_all_objects_show_from_the_start(env: SimEnv) -> None:
+def test_all_objects_show_from_the_start(scene_3: SimEnv) -> None:
     for seed in range(6):
-        env.reset(seed)
-        seen = env.seen_objects("front")
-        assert set(seen) == {o.name for o in env.layout.objects}
+        scene_3.reset(seed)
+        seen = scene_3.seen_objects("front")
+        assert set(seen) == {o.name for o in scene_3.layout.objects}
         assert all(s.pixels > 80 for s in seen.values())
 
 
-def test_middle_of_a_box_lands_on_the_object(env: SimEnv) -> None:
+def test_middle_of_a_box_lands_on_the_object(scene_3: SimEnv) -> None:
     for seed in range(6):
-        env.reset(seed)
-        model = env.camera_model("front")
-        for name, seen in env.seen_objects("front").items():
+        scene_3.reset(seed)
+        model = scene_3.camera_model("front")
+        for name, seen in scene_3.seen_objects("front").items():
             x0, y0, x1, y1 = seen.box
             point = model.ground_point((x0 + x1) / 2, (y0 + y1) / 2)
             assert point is not None
-            assert math.dist(point[:2], env.ground_truth().objects[name].position_base[:2]) < 0.015
+            assert (
+                math.dist(point[:2], scene_3.ground_truth().objects[name].position_base[:2]) < 0.015
+            )
 
 
-def test_standing_still_holds_nothing_and_moves_nothing(env: SimEnv) -> None:
-    before = env.ground_truth()
+def test_standing_still_holds_nothing_and_moves_nothing(scene_3: SimEnv) -> None:
+    before = scene_3.ground_truth()
     for _ in range(30):
-        env.step(None)
-    after = env.ground_truth()
+        scene_3.step(None)
+    after = scene_3.ground_truth()
     assert after.held is None
-    assert not env.is_held_above_table(env.target)
+    assert not scene_3.is_held_above_table(scene_3.target)
     for name, truth in before.objects.items():
         assert math.dist(truth.position_map, after.objects[name].position_map) < 0.001
-    assert list(env.joint_state()) == list(ARM_JOINTS)
+    assert list(scene_3.joint_state()) == list(ARM_JOINTS)
 
 
-def test_arm_at_rest_clears_the_objects_when_the_base_stands_before_them(env: SimEnv) -> None:
-    for name, truth in env.ground_truth().objects.items():
-        pose = standoff_pose(truth.position_map[:2], env.config)
-        env.place((pose.x_m, pose.y_m, pose.yaw_rad), REST_POSE)
-        env.step(None)
-        assert env.ground_truth().objects[name].touching_fingers == 0
+def test_arm_at_rest_clears_the_objects_when_the_base_stands_before_them(scene_3: SimEnv) -> None:
+    for name, truth in scene_3.ground_truth().objects.items():
+        pose = standoff_pose(truth.position_map[:2], scene_3.config)
+        scene_3.place((pose.x_m, pose.y_m, pose.yaw_rad), REST_POSE)
+        scene_3.step(None)
+        assert scene_3.ground_truth().objects[name].touching_fingers == 0
 
 
 @pytest.mark.parametrize("bad", [[0.0] * 5, [math.nan] * 6, [math.inf] * 6])
-def test_bad_arm_targets_move_nothing(env: SimEnv, bad: list[float]) -> None:
-    before = env.time_s
+def test_bad_arm_targets_move_nothing(scene_3: SimEnv, bad: list[float]) -> None:
+    before = scene_3.time_s
     with pytest.raises(ValueError, match="finite"):
-        env.step(bad)
+        scene_3.step(bad)
     with pytest.raises(KeyError):
-        env.step({"shoulder_pan": 0.0})
+        scene_3.step({"shoulder_pan": 0.0})
     with pytest.raises(ValueError, match="base velocity"):
-        env.step(None, (0.0, math.nan, 0.0))
-    assert env.time_s == before
+        scene_3.step(None, (0.0, math.nan, 0.0))
+    assert scene_3.time_s == before
 
 
-def test_targets_are_clipped_to_the_servos_range(env: SimEnv) -> None:
-    limits = env.joint_limits()
+def test_targets_are_clipped_to_the_servos_range(scene_3: SimEnv) -> None:
+    limits = scene_3.joint_limits()
     for _ in range(60):
-        env.step([9.0, *REST_POSE[1:]])
-    assert env.joint_state()["shoulder_pan"] <= limits["shoulder_pan"][1] + 0.02
+        scene_3.step([9.0, *REST_POSE[1:]])
+    assert scene_3.joint_state()["shoulder_pan"] <= limits["shoulder_pan"][1] + 0.02
 
 
 def test_an_env_without_reset_says_so() -> None:

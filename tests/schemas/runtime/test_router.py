@@ -92,7 +92,7 @@ def run(scenario: Callable[[], Awaitable[None]]) -> None:
     asyncio.run(limited())
 
 
-async def until(condition: Callable[[], bool]) -> None:
+async def comes_true(condition: Callable[[], bool]) -> None:
     while not condition():
         await asyncio.sleep(0.001)
 
@@ -153,7 +153,7 @@ def test_an_unmodified_peer_is_answered(path: Path, kind: int) -> None:
         handler = Echo()
         async with serving(path, handler):
             assert await asyncio.to_thread(ask, path, kind, *payloads) == list(payloads)
-            await until(lambda: len(handler.ended) == 1)
+            await comes_true(lambda: len(handler.ended) == 1)
 
     run(scenario)
 
@@ -203,7 +203,7 @@ def test_a_peer_that_breaks_the_protocol_is_cut_and_others_are_served(
             raw = await (await Raw.connect(path)).ready()
             raw.writer.write(attack)
             await raw.ended()
-            await until(lambda: len(handler.ended) == 1)
+            await comes_true(lambda: len(handler.ended) == 1)
             assert "protocol error" in handler.ended[0]
             assert router._users == {}
             assert router._processes == {}
@@ -245,7 +245,7 @@ def test_a_peer_that_does_not_read_is_not_read_either_and_its_bytes_come_back(pa
         async with serving(path, handler) as router:
             slow = await (await Raw.connect(path)).ready()
             slow.writer.write(encode(bytes(1 << 19), False) * 64)
-            await until(lambda: any(user.out_bytes for user in router._users.values()))
+            await comes_true(lambda: any(user.out_bytes for user in router._users.values()))
             connection = next(iter(handler.open.values()))
             handled = len(handler.received_from)
             assert await asyncio.to_thread(ask, path, zmq.DEALER, b"honest") == [b"honest"]
@@ -255,7 +255,7 @@ def test_a_peer_that_does_not_read_is_not_read_either_and_its_bytes_come_back(pa
                 pass
             assert connection._out_bytes <= LIMITS.out_max_bytes
             slow.close()
-            await until(lambda: not handler.open)
+            await comes_true(lambda: not handler.open)
             assert router._users == {}
         assert handler.dropped == 0
 
@@ -267,7 +267,7 @@ def test_small_messages_to_a_peer_that_does_not_read_are_counted(path: Path) -> 
         handler = Echo()
         async with serving(path, handler):
             raw = await (await Raw.connect(path)).ready()
-            await until(lambda: bool(handler.open))
+            await comes_true(lambda: bool(handler.open))
             connection = next(iter(handler.open.values()))
             connection.send(bytes(1 << 20))
             sent = 0
@@ -290,7 +290,7 @@ def test_silent_connections_are_cut(path: Path) -> None:
             shaken = await Raw.connect(path)
             for raw in (*bare, shaken):
                 await raw.ended()
-            await until(lambda: len(router) == 0)
+            await comes_true(lambda: len(router) == 0)
             assert router._processes == {}
 
     run(scenario)
@@ -350,7 +350,7 @@ def test_a_flood_of_one_connection_delays_another_by_a_few_messages(path: Path) 
         async with serving(path, handler):
             flood = await (await Raw.connect(path)).ready()
             honest = await (await Raw.connect(path)).ready()
-            await until(lambda: len(handler.open) == 2)
+            await comes_true(lambda: len(handler.open) == 2)
             flooder, other = handler.open
             reading = asyncio.create_task(flood.reader.read(-1))
             flood.writer.write(
@@ -358,7 +358,7 @@ def test_a_flood_of_one_connection_delays_another_by_a_few_messages(path: Path) 
             )  # both lie in their sockets from here on
             assert await honest.echo(b"now") == b"now"
             assert handler.received_from.index(other) < 2_000  # a turn of the flood, or two
-            await until(lambda: handler.received_from.count(flooder) == 20_000)
+            await comes_true(lambda: handler.received_from.count(flooder) == 20_000)
             for raw in (flood, honest):
                 raw.close()
             await reading
@@ -401,7 +401,7 @@ def test_a_child_does_not_speak_on_its_dead_parents_connection(path: Path) -> No
                 sys.executable, "-c", _ORPHAN, path, GREETING_AND_READY.hex()
             )
             await process.wait()
-            await until(lambda: bool(handler.ended))
+            await comes_true(lambda: bool(handler.ended))
             assert handler.ended == ["its process has ended"]
 
     run(scenario)
@@ -439,7 +439,7 @@ def test_the_last_answer_arrives_though_the_server_ends_behind_it(path: Path) ->
         async with serving(path, handler) as router:
             raw = await (await Raw.connect(path)).ready()
             raw.writer.write(encode(bytes(1 << 19), False))
-            await until(lambda: bool(handler.received_from))
+            await comes_true(lambda: bool(handler.received_from))
             ending = asyncio.create_task(router.aclose(WAIT_S))
             assert len(await raw.reader.read(-1)) == 9 + (1 << 19)
             assert next(iter(handler.open.values())).send(b"late") is False
@@ -457,7 +457,7 @@ def test_a_deleted_socket_file_is_bound_again(path: Path) -> None:
         async with serving(path, handler):
             before = await (await Raw.connect(path)).ready()
             path.unlink()
-            await until(path.exists)
+            await comes_true(path.exists)
             assert await asyncio.to_thread(ask, path, zmq.REQ, b"again") == [b"again"]
             assert await before.echo(b"still here") == b"still here"
             before.close()

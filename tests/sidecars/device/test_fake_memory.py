@@ -52,17 +52,17 @@ sys.stdin.read()
 
 
 @pytest.fixture
-def folder(tmp_path):
+def card_folder(tmp_path):
     make_card(tmp_path, 8 * GIB, release_lag_s=0.2)
     return tmp_path
 
 
 @pytest.fixture
-def start(folder):
+def start(card_folder):
     children = []
 
     def start(code, *arguments):
-        command = [sys.executable, "-c", code, str(folder), *arguments]
+        command = [sys.executable, "-c", code, str(card_folder), *arguments]
         child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         children.append(child)
         return child
@@ -73,12 +73,12 @@ def start(folder):
         child.communicate()
 
 
-def used(folder):
-    probe = FakeProbe([folder])
+def used(card_folder):
+    probe = FakeProbe([card_folder])
     return probe.sample(probe.cards()[0].id).used_bytes
 
 
-def until(condition, deadline_s=60.0):
+def seconds_until(condition, deadline_s=60.0):
     """Wait until a condition on the card's files holds; returns how long it took."""
     began, pause = time.monotonic(), threading.Event()
     while not condition():
@@ -87,40 +87,42 @@ def until(condition, deadline_s=60.0):
     return time.monotonic() - began
 
 
-def test_racing_processes_never_exceed_the_capacity(tmp_path, start, folder):
-    make_card(folder, 1 * GIB, release_lag_s=0.01)
+def test_racing_processes_never_exceed_the_capacity(tmp_path, start, card_folder):
+    make_card(card_folder, 1 * GIB, release_lag_s=0.01)
     children = [start(CONTENDER, str(seed)) for seed in range(4)]
     refused = [int(child.communicate(timeout=60)[0]) for child in children]
     assert sum(refused) > 0, "the race was not tight enough to show anything"
-    until(lambda: used(folder) == 0)
-    report = check_log((folder / "log.jsonl").read_text())
+    seconds_until(lambda: used(card_folder) == 0)
+    report = check_log((card_folder / "log.jsonl").read_text())
     assert report.problems == []
     assert report.oom_events == sum(refused)
     assert 0.5 * GIB < report.peak_bytes <= GIB
 
 
-def test_a_killed_process_gives_its_memory_back_after_the_lag(start, folder):
+def test_a_killed_process_gives_its_memory_back_after_the_lag(start, card_folder):
     holder = start(HOLDER)
     assert holder.stdout.readline() == "ready\n"
-    assert used(folder) == 4 * GIB + 450 * MIB
+    assert used(card_folder) == 4 * GIB + 450 * MIB
     with pytest.raises(SimulatedOutOfMemory):
-        FakeMemory(folder, "other", 0).allocate("w", 5 * GIB)
+        FakeMemory(card_folder, "other", 0).allocate("w", 5 * GIB)
     os.kill(holder.pid, signal.SIGKILL)
-    assert until(lambda: used(folder) == 0) >= 0.2, "it came back before the lag was over"
-    FakeMemory(folder, "other", 0).allocate("w", 5 * GIB)
-    assert check_log((folder / "log.jsonl").read_text()).problems == []
+    assert seconds_until(lambda: used(card_folder) == 0) >= 0.2, (
+        "it came back before the lag was over"
+    )
+    FakeMemory(card_folder, "other", 0).allocate("w", 5 * GIB)
+    assert check_log((card_folder / "log.jsonl").read_text()).problems == []
 
 
-def test_a_zombie_holds_nothing(start, folder):
+def test_a_zombie_holds_nothing(start, card_folder):
     holder = start(HOLDER)
     holder.stdout.readline()
     os.kill(holder.pid, signal.SIGKILL)  # not reaped: it stays as a zombie
-    until(lambda: used(folder) == 0)
+    seconds_until(lambda: used(card_folder) == 0)
     assert holder.poll() is not None
 
 
-def test_the_life_of_one_model(folder):
-    memory = FakeMemory(folder, "model", 450 * MIB)
+def test_the_life_of_one_model(card_folder):
+    memory = FakeMemory(card_folder, "model", 450 * MIB)
     assert memory.used_bytes() == 0
     block = memory.allocate("weights", 3 * GIB)
     peak = memory.allocate("shard", GIB)
@@ -132,13 +134,13 @@ def test_the_life_of_one_model(folder):
     )
     memory.empty_cache()
     assert memory.used_bytes() == 450 * MIB
-    until(lambda: used(folder) == 450 * MIB)
+    seconds_until(lambda: used(card_folder) == 450 * MIB)
     memory.close()
-    until(lambda: used(folder) == 0)
+    seconds_until(lambda: used(card_folder) == 0)
 
 
-def test_an_out_of_memory_while_filling_leaves_nothing_behind(folder):
-    memory = FakeMemory(folder, "model", 0)
+def test_an_out_of_memory_while_filling_leaves_nothing_behind(card_folder):
+    memory = FakeMemory(card_folder, "model", 0)
     with pytest.raises(OutOfMemory):
         fill(memory, "weights", 9 * GIB, bytes_per_s=None, wait=lambda seconds: False)
     memory.empty_cache()
@@ -155,8 +157,8 @@ def test_filling_is_throttled_and_can_be_stopped():
     assert len(fill(NoDevice(), "w", 300 * MIB, bytes_per_s=1, wait=lambda seconds: True)) == 1
 
 
-def test_threads_of_one_process_do_not_lose_each_others_bytes(folder):
-    memory = FakeMemory(folder, "model", 0)
+def test_threads_of_one_process_do_not_lose_each_others_bytes(card_folder):
+    memory = FakeMemory(card_folder, "model", 0)
     threads = [
         threading.Thread(target=lambda: [memory.allocate("w", MIB) for _ in range(20)])
         for _ in range(4)

@@ -1,24 +1,17 @@
 """The ladder: ask, ask again until heard, remind, deadline. Exact times, no sleep."""
 
-from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.core_driver import CoreDriver
+from tests.support.scenes import held
 from vram_arbiter.arbiter.core.events import ClientConnected
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.ids import ClientId, LeaseId
+from vram_arbiter.schemas.ids import ClientId
 
 GIB = d.GIB
 
 
-def held(driver: CoreDriver, name: str = "det") -> tuple[Consumer, LeaseId]:
-    holder = driver.consumer(name)
-    lease = holder.acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "loading")
-    holder.load(lease)
-    return holder, lease
-
-
 def test_revoke_is_sent_again_until_acknowledged() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease = held(driver)
+    det, lease = held(driver, "det", 5)
     det.use_begin(lease)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     (first,) = driver.pushes("revoke")
@@ -54,7 +47,7 @@ def test_revoke_is_sent_again_until_acknowledged() -> None:
 
 def test_a_waiter_that_is_patient_waits_past_the_deadline() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease = held(driver)
+    det, lease = held(driver, "det", 5)
     det.use_begin(lease)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     driver.advance(31.0)
@@ -69,7 +62,7 @@ def test_a_waiter_that_is_patient_waits_past_the_deadline() -> None:
 
 def test_a_waiter_that_said_deny_is_denied_at_the_deadline() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease = held(driver)
+    det, lease = held(driver, "det", 5)
     det.use_begin(lease)
     det.ack(lease)
     waiter = driver.consumer("vlm").acquire(5 * GIB, deny_on_deadline=True)
@@ -87,7 +80,7 @@ def test_a_waiter_that_said_deny_is_denied_at_the_deadline() -> None:
 
 def test_a_revoke_stands_when_its_waiter_is_gone_and_counts_for_the_next() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease = held(driver)
+    det, lease = held(driver, "det", 5)
     det.use_begin(lease)
     vlm = driver.consumer("vlm")
     vlm.cancel(vlm.acquire(5 * GIB))
@@ -105,7 +98,7 @@ def test_a_revoke_stands_when_its_waiter_is_gone_and_counts_for_the_next() -> No
 def test_a_holder_that_does_not_answer_at_the_deadline_no_longer_counts_as_leaving() -> None:
     """Another idle holder is asked instead, so that the waiter does not hang on a deaf one."""
     driver = CoreDriver(8 * GIB)
-    deaf, deaf_lease = held(driver, "deaf")
+    deaf, deaf_lease = held(driver, "deaf", 5)
     idle = driver.consumer("idle")
     idle_lease = idle.acquire(2 * GIB)
     driver.until(lambda: driver.state(idle_lease) == "loading")
@@ -120,7 +113,7 @@ def test_a_holder_that_does_not_answer_at_the_deadline_no_longer_counts_as_leavi
 
 def test_a_voluntary_release_while_asked_is_as_good() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease = held(driver)
+    det, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     assert driver.state(lease) == "revoking"
     det.hold(0)
@@ -131,7 +124,7 @@ def test_a_voluntary_release_while_asked_is_as_good() -> None:
 
 def test_death_while_asked_counts_as_leaving() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease = held(driver)
+    det, lease = held(driver, "det", 5)
     vlm = driver.consumer("vlm")
     waiter = vlm.acquire(5 * GIB)
     driver.advance(0.1)
@@ -144,7 +137,7 @@ def test_death_while_asked_counts_as_leaving() -> None:
 
 def test_a_reminder_between_two_pushes_pushes_nothing() -> None:
     driver = CoreDriver(8 * GIB, settings={"revoke_resend_s": 0.3})
-    det, lease = held(driver)
+    det, lease = held(driver, "det", 5)
     det.use_begin(lease)
     driver.consumer("vlm").acquire(5 * GIB)
     driver.advance(2.05)
@@ -154,7 +147,7 @@ def test_a_reminder_between_two_pushes_pushes_nothing() -> None:
 
 def test_a_holder_that_comes_back_is_asked_again_and_keeps_the_uses_of_others() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease = held(driver)
+    det, lease = held(driver, "det", 5)
     runner = driver.consumer("runner")
     runner.use_begin(lease, "goal", det.token(lease))
     det.use_begin(lease, "own")

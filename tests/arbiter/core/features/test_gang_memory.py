@@ -29,7 +29,7 @@ def to_peak_and_down(who: Consumer, lease: LeaseId) -> None:
     who.ready(lease)
 
 
-def say(driver: CoreDriver, lease: LeaseId) -> str:
+def why_text(driver: CoreDriver, lease: LeaseId) -> str:
     consumer = (driver.view(lease) or {})["consumer"]
     return str(driver.arbiter.why(consumer, driver.now)["leases"][0]["text"])
 
@@ -43,9 +43,9 @@ def test_a_member_does_not_load_into_the_peak_of_the_one_before(lists: bool) -> 
     first, second = member(a, 5, 2.5), member(b, 4.5, 2.5)
     to_peak_and_down(a, first)
     assert driver.state(second) == "queued"
-    assert "waits for a fresh reading" in say(driver, second)
+    assert "waits for a fresh reading" in why_text(driver, second)
     driver.advance(0.1)
-    assert "measured memory is not free yet" in say(driver, second)
+    assert "measured memory is not free yet" in why_text(driver, second)
     waited = driver.until(lambda: driver.state(second) == "loading", limit_s=2.0)
     assert 0.6 < waited < 0.8 + 2 * d.LOAD_PROBE_S
     assert sum(driver.card.shown(driver.now).values()) + int(4.5 * GIB) <= 8 * GIB
@@ -79,7 +79,7 @@ def test_memory_that_does_not_come_back_breaks_the_gang_in_time() -> None:
     a.load(first)
     driver.advance(2 * d.VERIFY_TIMEOUT_S)
     driver.card.failing = ""
-    driver.until(lambda: "measured memory is not free yet" in say(driver, second), limit_s=1.5)
+    driver.until(lambda: "measured memory is not free yet" in why_text(driver, second), limit_s=1.5)
     driver.advance(d.VERIFY_TIMEOUT_S - 0.5)
     assert driver.state(second) == "queued"
     driver.advance(1.0)

@@ -15,11 +15,6 @@ GIB = d.GIB
 MIB = d.MIB
 
 
-@pytest.fixture
-def driver() -> CoreDriver:
-    return CoreDriver(8 * GIB)
-
-
 class Member:
     """One process with its lease in a gang."""
 
@@ -43,7 +38,7 @@ def pair(driver: CoreDriver, **spec: Any) -> tuple[Member, Member]:
     return Member(driver, "policy", 4, 3, **spec), Member(driver, "reward", 3, 2, **spec)
 
 
-def states(*members: Member) -> list[str]:
+def states_of(*members: Member) -> list[str]:
     return [member.state for member in members]
 
 
@@ -63,7 +58,7 @@ def test_nobody_is_granted_before_all_have_come(driver: CoreDriver) -> None:
     assert driver.gpu()["charged_bytes"] == 0
     held(driver, "other", 1)
     b = Member(driver, "reward", 2, 2)
-    assert states(a, b) == ["loading", "queued"]
+    assert states_of(a, b) == ["loading", "queued"]
     assert driver.gpu()["charged_bytes"] == 1 * GIB + 3 * GIB + 2 * GIB + 1 * GIB, (
         "all have their bytes from now on"
     )
@@ -73,7 +68,7 @@ def test_they_load_one_after_the_other_and_nobody_comes_between(driver: CoreDriv
     a, b = pair(driver)
     small = driver.consumer("small").acquire(GIB)
     driver.advance(5.0)
-    assert states(a, b) == ["loading", "queued"]
+    assert states_of(a, b) == ["loading", "queued"]
     assert (
         "its bytes are kept for it" in driver.arbiter.why("reward", driver.now)["leases"][0]["text"]
     )
@@ -135,10 +130,10 @@ def test_a_member_that_can_never_fit_alone_breaks_the_gang(driver: CoreDriver) -
 def test_serial_loading_counts_only_the_largest_headroom(driver: CoreDriver) -> None:
     """4 + 3.6 at their peaks do not fit on 7.7, but 3 + 2.6 and one headroom of 1 do."""
     a, b = Member(driver, "a", 4, 3), Member(driver, "b", 3.6, 2.6)
-    assert states(a, b) == ["loading", "queued"]
+    assert states_of(a, b) == ["loading", "queued"]
     a.load()
     b.load()
-    assert states(a, b) == ["held", "held"]
+    assert states_of(a, b) == ["held", "held"]
 
 
 @pytest.mark.parametrize("end", ["cancel", "die", "leave", "timeout"])
@@ -148,7 +143,7 @@ def test_one_that_gives_up_while_waiting_breaks_it(driver: CoreDriver, end: str)
         Member(driver, "a", 4, 3),
         Member(driver, "b", 3, 2, wait_timeout_s=5.0 if end == "timeout" else None),
     )
-    assert states(a, b) == ["queued", "queued"]
+    assert states_of(a, b) == ["queued", "queued"]
     if end == "cancel":
         b.who.cancel(b.lease)
     elif end == "die":
@@ -157,7 +152,7 @@ def test_one_that_gives_up_while_waiting_breaks_it(driver: CoreDriver, end: str)
         b.who.leave("dropped")
     else:
         driver.advance(5.1)
-    assert states(a, b) == ["over", "over"]
+    assert states_of(a, b) == ["over", "over"]
     assert "gang_broken" in codes(driver, a) + codes(driver, b)
     (note,) = [n for n in driver.notes("gang") if n["phase"] == "broken"]
     assert b.lease in note["reason"] or a.lease in note["reason"]
@@ -169,7 +164,7 @@ def test_victims_are_asked_only_if_the_whole_gang_then_fits(driver: CoreDriver) 
     held(driver, "pinned", 3, evictable=False)
     a, b = Member(driver, "a", 2), Member(driver, "b", 2)
     assert driver.state(first) == "revoking"
-    assert states(a, b) == ["queued", "queued"]
+    assert states_of(a, b) == ["queued", "queued"]
     assert (
         "room is being made for the whole gang"
         in driver.arbiter.why("a", driver.now)["leases"][0]["text"]
@@ -186,7 +181,7 @@ def test_nobody_is_evicted_for_a_gang_that_would_not_fit_all_the_same(driver: Co
     a, b = Member(driver, "a", 2), Member(driver, "b", 2)
     driver.advance(3.0)
     assert driver.state(idle) == "held"
-    assert states(a, b) == ["queued", "queued"]
+    assert states_of(a, b) == ["queued", "queued"]
     assert (
         "nobody who could make room for the whole gang"
         in driver.arbiter.why("a", driver.now)["leases"][0]["text"]
@@ -215,7 +210,7 @@ def test_nobody_of_a_gang_is_backfilled_alone(driver: CoreDriver) -> None:
     driver.consumer("big").acquire(6 * GIB, priority=60)
     a, b = Member(driver, "a", 1), Member(driver, "b", 0.5)
     driver.advance(2.0)
-    assert states(a, b) == ["queued", "queued"]
+    assert states_of(a, b) == ["queued", "queued"]
     assert (
         "as one of gang g behind big as number 2"
         in driver.arbiter.why("b", driver.now)["leases"][0]["text"]
@@ -227,7 +222,7 @@ def test_measured_memory_that_is_not_there_keeps_a_gang_waiting(driver: CoreDriv
     driver.card.silent = True
     driver.advance(3.0)
     a, b = Member(driver, "a", 2), Member(driver, "b", 2)
-    assert states(a, b) == ["queued", "queued"], "the reading is too old"
+    assert states_of(a, b) == ["queued", "queued"], "the reading is too old"
     driver.card.silent = False
     driver.until(lambda: a.state == "loading", limit_s=3.0)
     del person, lease
@@ -251,7 +246,7 @@ def test_members_that_may_be_anywhere_are_spread_so_that_all_fit() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     a = Member(driver, "a", 6)
     b = Member(driver, "b", 2, gpu="0")
-    assert states(a, b) == ["loading", "loading"]
+    assert states_of(a, b) == ["loading", "loading"]
     assert driver.view(a.lease)["gpu"] == "GPU-1"  # type: ignore[index]
 
 
@@ -267,16 +262,16 @@ def test_both_cards_are_emptied_or_none() -> None:
     assert (driver.state(first), driver.state(second)) == ("revoking", "revoking")
     idle.unload(first)
     driver.advance(1.0)
-    assert states(a, b) == ["queued", "queued"], "one card is free, the other is not"
+    assert states_of(a, b) == ["queued", "queued"], "one card is free, the other is not"
     busy.unload(second)
-    driver.until(lambda: states(a, b) == ["loading", "loading"])
+    driver.until(lambda: states_of(a, b) == ["loading", "loading"])
 
 
 def test_an_exclusive_member_wants_a_card_of_its_own() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     a = Member(driver, "a", 2, exclusive=True)
     b = Member(driver, "b", 2)
-    assert states(a, b) == ["loading", "loading"]
+    assert states_of(a, b) == ["loading", "loading"]
     assert driver.view(a.lease)["gpu"] != driver.view(b.lease)["gpu"]  # type: ignore[index]
     single = CoreDriver(8 * GIB)
     Member(single, "a", 2, exclusive=True)
@@ -312,7 +307,7 @@ def test_who_holds_keeps_its_lease_when_the_gang_breaks(driver: CoreDriver) -> N
     a, b = pair(driver)
     a.load()
     b.who.die()
-    assert states(a, b) == ["held", "over"]
+    assert states_of(a, b) == ["held", "over"]
     driver.advance(1.0)
     assert driver.gpu()["charged_bytes"] == 3 * GIB
     driver.consumer("w").acquire(7 * GIB)
@@ -324,7 +319,7 @@ def test_a_member_that_waits_for_its_turn_and_gives_up_gives_its_bytes_back(
 ) -> None:
     a, b = pair(driver)
     b.who.cancel(b.lease)
-    assert states(a, b) == ["loading", "over"]
+    assert states_of(a, b) == ["loading", "over"]
     assert driver.gpu()["charged_bytes"] == 4 * GIB
     a.load()
     assert a.state == "held"
@@ -336,10 +331,10 @@ def test_nobody_of_an_unfinished_gang_is_evicted(driver: CoreDriver) -> None:
     driver.card.set(ProcessKey(9, 9), 5 * GIB, driver.now)
     driver.advance(2.0)
     assert driver.gpu()["pressure_bytes"] > 0
-    assert states(a, b) == ["held", "loading"]
+    assert states_of(a, b) == ["held", "loading"]
     b.load()
     driver.advance(1.5)
-    assert "revoking" in states(a, b), "complete: relief of pressure as for anybody"
+    assert "revoking" in states_of(a, b), "complete: relief of pressure as for anybody"
 
 
 def test_a_member_that_takes_more_than_it_said_breaks_what_no_longer_fits() -> None:
@@ -430,7 +425,7 @@ def test_a_gang_that_was_loading_is_completed_after_a_restart(driver: CoreDriver
 def test_a_gang_of_which_not_all_come_back_is_broken_in_time(driver: CoreDriver) -> None:
     a = Member(driver, "a", 3, 2, gang=("g", 3))
     b, c = Member(driver, "b", 1, gang=("g", 3)), Member(driver, "c", 1, gang=("g", 3))
-    assert states(a, b, c) == ["loading", "queued", "queued"]
+    assert states_of(a, b, c) == ["loading", "queued", "queued"]
     token = a.who.token(a.lease)
     driver.restart()
     for member in (a, b):
@@ -456,10 +451,10 @@ def test_a_gang_that_was_all_granted_is_complete_when_the_last_is_ready_after_a_
         member.who.connect()
         answer(member.who.reattach(member.lease, token, held=done))
     b.load()
-    assert states(a, b) == ["held", "held"]
+    assert states_of(a, b) == ["held", "held"]
     assert [n["phase"] for n in driver.notes("gang")][-1] == "complete"
     driver.advance(60.0)
-    assert states(a, b) == ["held", "held"]
+    assert states_of(a, b) == ["held", "held"]
 
 
 def test_refusals_of_a_gang_reach_who_has_only_just_asked(driver: CoreDriver) -> None:
@@ -476,7 +471,7 @@ def test_memory_that_nobody_can_explain_is_not_free_for_a_gang(driver: CoreDrive
     driver.advance(1.5)
     a, b = Member(driver, "a", 3), Member(driver, "b", 2)
     driver.advance(1.5)
-    assert states(a, b) == ["queued", "queued"]
+    assert states_of(a, b) == ["queued", "queued"]
     assert "measured memory is not free yet" in driver.gpu()["blocked"]
     driver.card.set(ProcessKey(9, 9), 0, driver.now)
     driver.until(lambda: a.state == "loading", limit_s=2.0)
@@ -490,7 +485,7 @@ def test_an_idle_card_beside_a_busy_one_is_no_place_for_half_a_gang() -> None:
     _, idle = held(driver, "idle", 2, gpu="0")
     a, b = Member(driver, "a", 2, exclusive=True), Member(driver, "b", 2, exclusive=True)
     driver.advance(3.0)
-    assert states(a, b) == ["queued", "queued"]
+    assert states_of(a, b) == ["queued", "queued"]
     assert driver.state(idle) == "held"
     busy.use_end(lease)
     assert (driver.state(idle), driver.state(lease)) == ("revoking", "revoking")
@@ -507,5 +502,5 @@ def test_a_gang_goes_ahead_of_a_waiter_for_which_another_card_is_being_emptied()
     assert (driver.state(idle), driver.state(first)) == ("revoking", "queued")
     a, b = Member(driver, "a", 1, gpu="0"), Member(driver, "b", 1, gpu="0")
     driver.advance(0.1)
-    assert states(a, b) == ["loading", "queued"]
+    assert states_of(a, b) == ["loading", "queued"]
     assert driver.view(b.lease)["gang"] == "g: loading, 2 of 2"  # type: ignore[index]

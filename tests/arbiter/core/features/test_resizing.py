@@ -1,12 +1,10 @@
 """A held lease that shrinks when the card agrees, and grows when it is its turn."""
 
-from typing import Any
-
 import pytest
 
-from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.core_driver import CoreDriver, answer, refusal
 from tests.support.engine_state import state_of
-from tests.support.scenes import charge, shown
+from tests.support.scenes import charge, held, shown
 from vram_arbiter.arbiter.core import invariants
 from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
@@ -14,15 +12,6 @@ from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, LeaseId
 
 GIB, MIB = d.GIB, d.MIB
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.05)
-    return person, lease
 
 
 # -- shrinking -------------------------------------------------------------------------------------------------------

@@ -15,11 +15,6 @@ BY = "ops (uid 0, pid 7)"
 
 
 @pytest.fixture
-def driver() -> CoreDriver:
-    return CoreDriver(8 * GIB)
-
-
-@pytest.fixture
 def ops(driver: CoreDriver) -> Consumer:
     return driver.consumer("ops")
 

@@ -14,7 +14,7 @@ GIB = d.GIB
 
 
 @pytest.fixture
-def driver() -> CoreDriver:
+def full_queue() -> CoreDriver:
     return CoreDriver(8 * GIB, settings={"waiters_max": 1})
 
 
@@ -55,13 +55,13 @@ def called_back_though_it_is_here(person: Consumer) -> None:
     ],
 )
 def test_what_is_refused_at_once_is_noted_with_its_reason(
-    driver: CoreDriver, ask: Any, code: str, leased: bool
+    full_queue: CoreDriver, ask: Any, code: str, leased: bool
 ) -> None:
     """Regression: only waits that ended were in the history."""
-    person = driver.consumer("big")
+    person = full_queue.consumer("big")
     ask(person)
-    (note,) = driver.notes("refused")
-    refused = refusal([effect for effect in driver.effects if hasattr(effect, "code")])
+    (note,) = full_queue.notes("refused")
+    refused = refusal([effect for effect in full_queue.effects if hasattr(effect, "code")])
     assert (note["code"], note["reason"]) == (code, refused.message)
     assert (note["consumer"], note["pid"], "lease_id" in note) == (
         "big",
@@ -70,40 +70,40 @@ def test_what_is_refused_at_once_is_noted_with_its_reason(
     )
 
 
-def test_timeouts_and_cancels_are_noted_too(driver: CoreDriver) -> None:
-    driver = CoreDriver(8 * GIB)
-    held(driver, "holder", 5, priority=99)[0].use_begin(
-        driver.arbiter.status(driver.now)["leases"][0]["lease_id"]
+def test_timeouts_and_cancels_are_noted_too(full_queue: CoreDriver) -> None:
+    full_queue = CoreDriver(8 * GIB)
+    held(full_queue, "holder", 5, priority=99)[0].use_begin(
+        full_queue.arbiter.status(full_queue.now)["leases"][0]["lease_id"]
     )
-    bounded, fickle = driver.consumer("bounded"), driver.consumer("fickle")
+    bounded, fickle = full_queue.consumer("bounded"), full_queue.consumer("fickle")
     bounded.acquire(5 * GIB, wait_timeout_s=1.0)
     lease = fickle.acquire(5 * GIB)
-    driver.advance(1.5)
+    full_queue.advance(1.5)
     fickle.cancel(lease)
-    (denied,) = driver.notes("denied")
-    (cancelled,) = driver.notes("cancelled")
+    (denied,) = full_queue.notes("denied")
+    (cancelled,) = full_queue.notes("cancelled")
     assert (denied["consumer"], denied["code"]) == ("bounded", "wait_timeout")
     assert (cancelled["consumer"], cancelled["reason"]) == ("fickle", "its holder gave up")
 
 
-def test_a_flood_of_refusals_is_counted_instead(driver: CoreDriver) -> None:
-    flooder, other = driver.consumer("flooder"), driver.consumer("other")
+def test_a_flood_of_refusals_is_counted_instead(full_queue: CoreDriver) -> None:
+    flooder, other = full_queue.consumer("flooder"), full_queue.consumer("other")
     for _ in range(10 * AT_ONCE):
         too_large(flooder)
     too_large(other)
-    assert [note["consumer"] for note in driver.notes("refused")] == ["flooder"] * AT_ONCE + [
+    assert [note["consumer"] for note in full_queue.notes("refused")] == ["flooder"] * AT_ONCE + [
         "other"
     ]
-    driver.advance(1.5)
+    full_queue.advance(1.5)
     too_large(flooder)
     too_large(flooder)
-    (last,) = [note for note in driver.notes("refused") if "left_out" in note]
+    (last,) = [note for note in full_queue.notes("refused") if "left_out" in note]
     assert (last["consumer"], last["left_out"]) == ("flooder", 9 * AT_ONCE)
 
 
-def test_little_is_remembered_of_those_who_were_refused(driver: CoreDriver) -> None:
-    refusals = driver.arbiter.inspect().refusals
-    people = [driver.consumer(f"p{number}") for number in range(PROCESSES_REMEMBERED + 1)]
+def test_little_is_remembered_of_those_who_were_refused(full_queue: CoreDriver) -> None:
+    refusals = full_queue.arbiter.inspect().refusals
+    people = [full_queue.consumer(f"p{number}") for number in range(PROCESSES_REMEMBERED + 1)]
     for person in people:
         too_large(person)
     assert len(refusals) == PROCESSES_REMEMBERED

@@ -13,11 +13,6 @@ from vram_arbiter.schemas.ids import ClientId, LeaseId, RequestId, Token
 GIB = d.GIB
 
 
-@pytest.fixture
-def driver() -> CoreDriver:
-    return CoreDriver(8 * GIB)
-
-
 def kinds(effects: list[Any]) -> list[str]:
     return [
         f"{type(e).__name__}:{e.kind}" if isinstance(e, Note) else type(e).__name__ for e in effects

@@ -3,31 +3,20 @@
 from collections.abc import Mapping
 from typing import Any
 
-from tests.support.core_driver import Consumer, CoreDriver, answer
+from tests.support.core_driver import CoreDriver, answer
+from tests.support.scenes import held
 from vram_arbiter.arbiter.core.effects import Note, Sample
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessDied, Resumed
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.ids import LeaseId
 
 GIB = d.GIB
 NIGHT_S = 8 * 3600.0
 
 
-def held(
-    driver: CoreDriver, name: str, gib: float, ttl_s: float = 10.0
-) -> tuple[Consumer, LeaseId]:
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), ttl_s=ttl_s)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
-
-
 def test_every_holder_gets_its_full_ttl_anew_and_none_expires() -> None:
     """They wake up in any order, behind a driver that takes its time: the first to be late must not lose its lease for it."""
     driver = CoreDriver(8 * GIB)
-    holders = [held(driver, name, 1) for name in ("a", "b", "c")]
+    holders = [held(driver, name, 1, ttl_s=10.0) for name in ("a", "b", "c")]
     driver.advance(8.0)  # of ten
     driver.post(Resumed(NIGHT_S))
     assert [driver.notes("resumed")[0]["slept_s"]] == [NIGHT_S]
@@ -78,11 +67,11 @@ def test_a_verification_begins_again() -> None:
     """Its time is up by what it waited for before; the readings of a new day decide, with the whole time for them."""
     driver = CoreDriver(8 * GIB)
     driver.card.lag_s = 1000.0
-    person, lease = held(driver, "a", 5)
+    person, lease = held(driver, "a", 5, ttl_s=10.0)
     person.unload(lease)
     driver.advance(driver.settings.verify_timeout_s + 1)
     assert [note["verdict"] for note in driver.notes("verified")] == ["residue"]
-    other, second = held(driver, "b", 1)
+    other, second = held(driver, "b", 1, ttl_s=10.0)
     driver.advance(1.0)
     driver.post(ProcessDied(other.process))  # its bytes stay
     driver.advance(driver.settings.verify_timeout_s + 1)
@@ -99,7 +88,7 @@ def test_a_verification_begins_again() -> None:
 
 def test_a_recovery_that_was_under_way_waits_for_its_holders_anew() -> None:
     driver = CoreDriver(8 * GIB)
-    person, lease = held(driver, "a", 5)
+    person, lease = held(driver, "a", 5, ttl_s=10.0)
     token = person.token(lease)
     driver.restart()
     driver.advance(14.0)  # of ttl and grace, fifteen
@@ -111,7 +100,7 @@ def test_a_recovery_that_was_under_way_waits_for_its_holders_anew() -> None:
 
 def test_a_recovery_without_a_journal_waits_anew_too() -> None:
     driver = CoreDriver(8 * GIB)
-    held(driver, "a", 5)
+    held(driver, "a", 5, ttl_s=10.0)
     driver.restart(keep_journal=False)
     driver.advance(14.0)
     driver.post(Resumed(NIGHT_S))
@@ -146,7 +135,7 @@ def test_what_was_there_before_the_night_has_to_come_back_before_a_dead_holder_i
     unused = idle.acquire(GIB, residue_bytes=450 * d.MIB)
     idle.release(unused)
     driver.until(lambda: driver.state(unused) == "over")
-    person, lease = held(driver, "a", 0.4)
+    person, lease = held(driver, "a", 0.4, ttl_s=10.0)
     driver.advance(1.5)
     driver.card.lag_s = 3.0
     driver.card.set(person.process, 0, driver.now)

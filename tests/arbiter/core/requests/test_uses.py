@@ -1,18 +1,11 @@
 """Uses that yield: a job that pauses keeps nobody out, and comes back under its own name."""
 
-import pytest
-
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
 
 GIB = d.GIB
-
-
-@pytest.fixture
-def driver() -> CoreDriver:
-    return CoreDriver(8 * GIB)
 
 
 def in_use(driver: CoreDriver, name: str = "job") -> tuple[Consumer, LeaseId]:

@@ -13,11 +13,6 @@ from vram_arbiter.schemas.ids import LeaseId
 GIB = d.GIB
 
 
-@pytest.fixture
-def driver() -> CoreDriver:
-    return CoreDriver(8 * GIB)
-
-
 def using(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
     """A process in the middle of a use of its own model."""
     person = driver.consumer(name)

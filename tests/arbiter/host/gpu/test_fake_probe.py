@@ -16,26 +16,26 @@ GIB = 2**30
 PATIENCE_S = 60.0
 
 
-def edit(folder, **changes):
-    path = folder / "gpu.json"
+def edit(card_folder, **changes):
+    path = card_folder / "gpu.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
-def stowaway(folder, pid, size, name="browser"):
-    (folder / f"{name}.json").write_text(
+def stowaway(card_folder, pid, size, name="browser"):
+    (card_folder / f"{name}.json").write_text(
         json.dumps({"pid": pid, "name": name, "allocated_bytes": size})
     )
 
 
 @pytest.fixture
-def folder(tmp_path):
+def card_folder(tmp_path):
     make_card(tmp_path / "card", 8 * GIB, release_lag_s=0.0)
     return tmp_path / "card"
 
 
 @pytest.fixture
-def probe(folder):
-    probe = FakeProbe([folder])
+def probe(card_folder):
+    probe = FakeProbe([card_folder])
     yield probe
     probe.close()
 
@@ -47,10 +47,10 @@ def test_a_new_card_is_empty(probe):
     assert (reading.used_bytes, reading.total_bytes, reading.processes) == (0, 8 * GIB, ())
 
 
-def test_a_process_is_listed_with_its_bytes_and_a_dead_one_is_not(probe, folder):
-    edit(folder, release_lag_s=3600)
-    stowaway(folder, os.getpid(), 2 * GIB)
-    stowaway(folder, 2**22 + 1, GIB, name="ghost")
+def test_a_process_is_listed_with_its_bytes_and_a_dead_one_is_not(probe, card_folder):
+    edit(card_folder, release_lag_s=3600)
+    stowaway(card_folder, os.getpid(), 2 * GIB)
+    stowaway(card_folder, 2**22 + 1, GIB, name="ghost")
     reading = probe.sample(probe.cards()[0].id)
     assert reading.used_bytes == 3 * GIB, "the bytes of the dead are still on the card"
     (use,) = reading.processes
@@ -58,32 +58,32 @@ def test_a_process_is_listed_with_its_bytes_and_a_dead_one_is_not(probe, folder)
 
 
 def test_a_name_that_is_cut_in_the_middle_of_a_letter_fails_no_reading(
-    probe, folder, half_a_letter
+    probe, card_folder, half_a_letter
 ):
     """Regression: the kernel cuts names at 15 bytes, and `/proc/PID/stat` was decoded as text."""
-    stowaway(folder, half_a_letter, GIB)
+    stowaway(card_folder, half_a_letter, GIB)
     (use,) = probe.sample(probe.cards()[0].id).processes
     assert (use.process.pid, use.used_bytes) == (half_a_letter, GIB)
 
 
-def test_memory_of_the_dead_is_gone_after_the_lag(probe, folder):
-    stowaway(folder, 2**22 + 1, GIB, name="ghost")
+def test_memory_of_the_dead_is_gone_after_the_lag(probe, card_folder):
+    stowaway(card_folder, 2**22 + 1, GIB, name="ghost")
     assert probe.sample(probe.cards()[0].id).used_bytes == 0
-    assert not [path for path in folder.iterdir() if fakegpu.is_process_file(path.name)]
+    assert not [path for path in card_folder.iterdir() if fakegpu.is_process_file(path.name)]
 
 
-def test_a_probe_can_fail_and_recover(probe, folder):
+def test_a_probe_can_fail_and_recover(probe, card_folder):
     gpu = probe.cards()[0].id
-    edit(folder, faults={"probe": "fail"})
+    edit(card_folder, faults={"probe": "fail"})
     with pytest.raises(ProbeFailed, match=r"gpu\.json says so"):
         probe.sample(gpu)
-    edit(folder, faults={})
+    edit(card_folder, faults={})
     assert probe.sample(gpu).used_bytes == 0
 
 
-def test_a_hang_ends_with_the_fault_or_with_close(probe, folder):
+def test_a_hang_ends_with_the_fault_or_with_close(probe, card_folder):
     gpu = probe.cards()[0].id
-    edit(folder, faults={"probe": "hang"})
+    edit(card_folder, faults={"probe": "hang"})
     outcome: list[object] = []
 
     def read():
@@ -101,16 +101,16 @@ def test_a_hang_ends_with_the_fault_or_with_close(probe, folder):
     assert isinstance(outcome[0], ProbeFailed)
 
 
-def test_processes_can_be_hidden(probe, folder):
-    edit(folder, faults={"hide_processes": True})
-    stowaway(folder, os.getpid(), GIB)
+def test_processes_can_be_hidden(probe, card_folder):
+    edit(card_folder, faults={"hide_processes": True})
+    stowaway(card_folder, os.getpid(), GIB)
     reading = probe.sample(probe.cards()[0].id)
     assert (reading.used_bytes, reading.processes) == (GIB, None)
 
 
-def test_a_broken_file_is_a_failed_reading_not_a_free_card(probe, folder):
+def test_a_broken_file_is_a_failed_reading_not_a_free_card(probe, card_folder):
     gpu = probe.cards()[0].id
-    (folder / "7-7.json").write_text("{")
+    (card_folder / "7-7.json").write_text("{")
     with pytest.raises(ProbeFailed, match=r"7-7\.json"):
         probe.sample(gpu)
 
@@ -150,7 +150,7 @@ def test_a_reboot_voids_what_processes_held(tmp_path):
     assert probe.sample(probe.cards()[0].id).used_bytes == 0
 
 
-def test_readings_wait_for_the_lock(probe, folder):
+def test_readings_wait_for_the_lock(probe, card_folder):
     gpu = probe.cards()[0].id
     done = threading.Event()
 
@@ -158,7 +158,7 @@ def test_readings_wait_for_the_lock(probe, folder):
         probe.sample(gpu)
         done.set()
 
-    with locked(folder):
+    with locked(card_folder):
         thread = threading.Thread(target=read)
         thread.start()
         assert not done.wait(0.1)
@@ -166,12 +166,12 @@ def test_readings_wait_for_the_lock(probe, folder):
     thread.join()
 
 
-def test_what_a_killed_process_left_half_written_is_mended(probe, folder):
+def test_what_a_killed_process_left_half_written_is_mended(probe, card_folder):
     line = {"seq": 1, "t": 0.0, "pid": os.getpid(), "start": 0, "name": "", "op": "alloc", "label": "", "bytes": 5, "delta": 5,
             "process_bytes": 5, "used_after": 5, "capacity": 8 * GIB}  # fmt: skip
-    (folder / "half.json").write_text(
+    (card_folder / "half.json").write_text(
         json.dumps({"pid": os.getpid(), "allocated_bytes": 5, "last": line})
     )
-    (folder / fakegpu.LOG_FILE).write_text('{"seq": 1, "t"')
+    (card_folder / fakegpu.LOG_FILE).write_text('{"seq": 1, "t"')
     probe.sample(probe.cards()[0].id)
-    assert json.loads((folder / fakegpu.LOG_FILE).read_text().splitlines()[1]) == line
+    assert json.loads((card_folder / fakegpu.LOG_FILE).read_text().splitlines()[1]) == line

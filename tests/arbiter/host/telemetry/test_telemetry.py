@@ -89,11 +89,6 @@ class Listener:
 
 
 @pytest.fixture
-def driver() -> CoreDriver:
-    return CoreDriver(8 * GIB)
-
-
-@pytest.fixture
 def heard(driver: CoreDriver) -> Listener:
     return Listener().on(driver)
 

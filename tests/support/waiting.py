@@ -1,0 +1,27 @@
+"""Waiting in tests: for a condition that shows from outside, and for a story with an end."""
+
+import asyncio
+import threading
+import time
+from collections.abc import Awaitable, Callable
+
+PATIENCE_S = 60.0
+
+
+def until[T](condition: Callable[[], T], deadline_s: float = PATIENCE_S) -> T:
+    """Poll until the condition is true, and return its value; AssertionError at the deadline."""
+    ends, pause = time.monotonic() + deadline_s, threading.Event()
+    while not (found := condition()):
+        assert time.monotonic() < ends, f"not true within {deadline_s:g} s"
+        pause.wait(0.01)
+    return found
+
+
+def play[T](story: Callable[[], Awaitable[T]], limit_s: float = PATIENCE_S) -> T:
+    """Run a story in an event loop of its own, and return its result; TimeoutError at the limit."""
+
+    async def bounded() -> T:
+        async with asyncio.timeout(limit_s):
+            return await story()
+
+    return asyncio.run(bounded())
