@@ -29,7 +29,9 @@ EVERY_ACTION = (
 )  # fmt: skip
 STRANGER = """
 import os, sys
-import vram_arbiter.clients.client, vram_arbiter.clients.cli.operators, vram_arbiter.clients.cli.history, vram_arbiter.clients.cli.main, msgpack, zmq
+import anyio._backends._asyncio, msgpack, zmq  # later the interpreter's folder may be closed to it
+import vram_arbiter.clients.client, vram_arbiter.clients.cli.main
+import vram_arbiter.clients.cli.operators, vram_arbiter.clients.cli.history
 os.setgroups([]); os.setresgid(65534, 65534, 65534); os.setresuid(65534, 65534, 65534)
 vram_arbiter.clients.cli.main.main()
 """
