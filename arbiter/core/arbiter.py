@@ -113,7 +113,7 @@ class Arbiter:
 
     def inspect(self) -> Inspection:
         """Return a read-only view of the records, for tests and offline tools."""
-        return Inspection.of(self._core, self._resizing, self._gangs, self._standby)
+        return Inspection.of(self._core)
 
     def next_deadline(self) -> float | None:
         """When a Tick is due (monotonic seconds); None: nothing is planned."""

@@ -1,7 +1,8 @@
 """Hooks through which an optional feature takes part in the engine.
 
-The rooms of the engine call the hooks of every registered feature (`Core.features`) and know no feature by name.
-A feature owns its records, keyed by lease id; `Arbiter` registers it. Without features the engine is whole.
+The rooms of the engine call the hooks of every registered feature (`Core.features`) and know no
+feature by name. A feature owns its records, keyed by lease id; `Arbiter` registers it. Without
+features the engine is whole.
 """
 
 from collections.abc import Iterable, Mapping
@@ -22,14 +23,17 @@ if TYPE_CHECKING:
 
 
 class Feature:
-    """One optional feature. Each hook does nothing here; a feature overrides the ones that it needs."""
+    """One optional feature. Each hook does nothing here; a feature overrides what it needs."""
 
     timers: ClassVar[frozenset[str]] = frozenset()
     """Kinds of timers that are due to this feature."""
 
-    # -- requests --------------------------------------------------------------------------------------------------
+    # -- requests ----------------------------------------------------------------------------------
     def on_acquire(self, core: "Core", event: AcquireRequested, known: Lease | None) -> bool:
-        """A lease is acquired; `known`: by a repeat of an acquire. Return whether this feature answers. May raise Refused."""
+        """A lease is acquired. Return whether this feature answers. May raise Refused.
+
+        `known`: the lease, if this acquire is a repeat.
+        """
         return False
 
     def on_refused(self, core: "Core", spec: Spec, why: str) -> None:
@@ -47,13 +51,16 @@ class Feature:
         """A resident lease is about to be released. May raise Refused."""
 
     def give_up(self, core: "Core", lease: Lease, to: LeaseState, code: str, why: str) -> bool:
-        """End a lease that outlives its release, for its holder is gone or wants it no more. Return whether it was one."""
+        """End a lease that would outlive its release. Return whether it was one.
+
+        Its holder is gone, or does not want it any more.
+        """
         return False
 
     def on_dismissed(self, core: "Core", lease: Lease, why: str) -> None:
         """An operator evicted a lease."""
 
-    # -- scheduling ------------------------------------------------------------------------------------------------
+    # -- scheduling --------------------------------------------------------------------------------
     def blocks(self, gpu: "Gpu") -> str:
         """Say why this feature keeps a GPU from the requests of all others; "" if it does not."""
         return ""
@@ -63,7 +70,7 @@ class Feature:
         return False
 
     def serve(self, core: "Core", gpu: "Gpu", head: Lease | None) -> None:
-        """Serve a GPU that this feature blocks, whose head it owns, or for which nothing waits (no head)."""
+        """Serve a GPU that this feature blocks, whose head it owns, or that has no head."""
 
     def grant(self, core: "Core", gpu: "Gpu", request: Lease) -> bool:
         """Grant a request in this feature's own way. Return whether it was granted."""
@@ -78,10 +85,10 @@ class Feature:
         return False
 
     def can_park(self, lease: Lease) -> bool:
-        """Return whether the holder of a lease may keep its weights in host RAM when it is revoked."""
+        """Return whether a revoked holder may keep its weights in host RAM."""
         return False
 
-    # -- the life of a lease ---------------------------------------------------------------------------------------
+    # -- the life of a lease -----------------------------------------------------------------------
     def on_moved(self, core: "Core", lease: Lease, before: LeaseState) -> None:
         """A lease came to another state."""
 
@@ -89,14 +96,14 @@ class Feature:
         """A use of a lease begins."""
 
     def next_state(self, lease: Lease) -> LeaseState | None:
-        """Return where a released lease goes once its bytes are measured gone; None: it is over then."""
+        """Return where a released lease goes after its verdict; None: it is over then."""
         return None
 
     def size_changes(self, lease: Lease) -> bool:
-        """Return whether the declared size of a resident lease is not to be compared with readings now."""
+        """Return whether readings cannot be compared with the declared size of a resident now."""
         return False
 
-    # -- readings and time -----------------------------------------------------------------------------------------
+    # -- readings and time -------------------------------------------------------------------------
     def settle(self, core: "Core") -> None:
         """An event was handled; the GPUs are scheduled next."""
 
@@ -106,7 +113,7 @@ class Feature:
     def on_timer(self, core: "Core", kind: str, subject: str) -> None:
         """A timer of one of `timers` is due."""
 
-    # -- across a restart ------------------------------------------------------------------------------------------
+    # -- across a restart --------------------------------------------------------------------------
     def to_record(self, lease: Lease) -> Mapping[str, Any]:
         """Return what the journal's record of a lease keeps of this feature."""
         return {}
@@ -117,7 +124,7 @@ class Feature:
     def on_reattached(self, core: "Core", lease: Lease, item: ReattachedLease) -> None:
         """A holder reattached, and tells how it knows its lease."""
 
-    # -- reports and invariants ------------------------------------------------------------------------------------
+    # -- reports and invariants --------------------------------------------------------------------
     def view(self, core: "Core", lease: Lease) -> Mapping[str, object]:
         """Return the fields of `schemas.wire.LeaseView` that this feature adds."""
         return {}
@@ -127,4 +134,7 @@ class Feature:
         return None
 
     def check(self, core: "Core", *, everything: bool) -> None:
-        """Raise InvariantViolation if a record that the last event can have changed, or any of them, is unsound."""
+        """Raise InvariantViolation if a record is unsound that the last event can have changed.
+
+        `everything`: if any record is.
+        """

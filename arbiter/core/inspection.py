@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Self
 
-from vram_arbiter.arbiter.core.features.gangs import Gangs
-from vram_arbiter.arbiter.core.features.resizing import Resizing
-from vram_arbiter.arbiter.core.features.standby import Standby
+from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.learning.footprints import Footprints
 from vram_arbiter.arbiter.core.model.lease import Failures, Lease
 from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Gpu, Refusals, Reuse
@@ -26,9 +24,7 @@ class Inspection:
     nonces: Mapping[tuple[ProcessKey, str], LeaseId]
     clients: Mapping[ClientId, Client]
     users: Mapping[ProcessKey, Mapping[tuple[LeaseId, UseId], Lease]]
-    resizing: Resizing
-    gangs: Gangs
-    standby: Standby
+    features: tuple[Feature, ...]
     crashes: Mapping[str, Failures]
     reuse: Mapping[str, Reuse]
     switches: Mapping[tuple[str, str], float]
@@ -37,7 +33,7 @@ class Inspection:
     timers: Timers
 
     @classmethod
-    def of(cls, core: Core, resizing: Resizing, gangs: Gangs, standby: Standby) -> Self:
+    def of(cls, core: Core) -> Self:
         return cls(
             gpus=MappingProxyType(core.gpus),
             leases=MappingProxyType(core.leases),
@@ -46,9 +42,7 @@ class Inspection:
             nonces=MappingProxyType(core.nonces),
             clients=MappingProxyType(core.clients),
             users=MappingProxyType(core.users),
-            resizing=resizing,
-            gangs=gangs,
-            standby=standby,
+            features=core.features,
             crashes=MappingProxyType(core.crashes),
             reuse=MappingProxyType(core.reuse),
             switches=MappingProxyType(core.switches),
@@ -56,3 +50,7 @@ class Inspection:
             footprints=core.footprints,
             timers=core.timers,
         )
+
+    def feature[F: Feature](self, kind: type[F]) -> F:
+        """Return the feature of a class, with its records."""
+        return next(feature for feature in self.features if isinstance(feature, kind))

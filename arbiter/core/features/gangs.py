@@ -1,12 +1,13 @@
-"""Gangs: several leases that are granted together or not at all, on one GPU or several, to one process or many.
+"""Gangs: leases that are granted together or not at all, on one GPU or several.
 
 A gang passes through three phases:
   gathering: until all its members have asked; none of them is in a queue
   waiting: as one request, with the priority of its lowest member, aged from its first
-  loading: it fits. Every member's steady bytes are charged at once, and on each GPU the largest headroom that one member
-    needs on top while it loads. Members load one after the other per GPU, and nothing else is granted there meanwhile.
-When all members are held the gang is complete, and they are leases like any other. If a member ends before that, the gang
-is broken: waiting members are denied, granted ones keep what they have.
+  loading: it fits. Every member's steady bytes are charged at once, and on each GPU the largest
+    headroom that one member needs on top while it loads. Members load one after the other per
+    GPU, and nothing else is granted there meanwhile.
+When all members are held the gang is complete, and they are leases like any other. If a member
+ends before that, the gang is broken: waiting members are denied, granted ones keep what they have.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -25,7 +26,7 @@ from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 
 SEARCH_MAX = 4096
-"""Placements that are examined. A gang with more possible placements may be denied although one exists."""
+"""Placements to examine. A gang with more possible ones may wait although one of them fits."""
 
 _STANDING = frozenset({LeaseState.QUEUED, LeaseState.LOADING, LeaseState.HELD})
 """States of a member that do not break its gang."""
@@ -43,7 +44,7 @@ class Gang:
     phase: str = "gathering"  # → waiting → loading
     members: list[Lease] = field(default_factory=list)
     planned: _Placement = field(default_factory=dict)  # where room is being made
-    cards: list[GpuId] = field(default_factory=list)  # loading: where its bytes are charged
+    gpus: list[GpuId] = field(default_factory=list)  # loading: where its bytes are charged
     reserved_bytes: dict[GpuId, int] = field(default_factory=dict)  # admitted there
     short_since: dict[GpuId, float] = field(default_factory=dict)  # readings show less free
 
@@ -62,7 +63,7 @@ class Gang:
 
     @property
     def headroom_id(self) -> LeaseId:
-        """Ledger entry of the bytes that the next member needs on top of its steady bytes while it loads."""
+        """Ledger entry of what the next member needs on top of its steady bytes while it loads."""
         return LeaseId(f"gang:{self.name}")
 
     def planned_on(self, lease: Lease) -> GpuId | None:
@@ -82,7 +83,7 @@ class Gangs(Feature):
 
     timers = frozenset({"gang"})
 
-    # -- gathering -------------------------------------------------------------------------------------------------
+    # -- gathering ---------------------------------------------------------------------------------
     def on_acquire(self, core: Core, event: AcquireRequested, known: Lease | None) -> bool:
         """Refuse a member too many, or one that says another size."""
         if known is not None or event.spec.gang is None:
@@ -138,7 +139,8 @@ class Gangs(Feature):
             self._break(
                 core,
                 gang,
-                f"its {len(waiting)} members need {needed} bytes together, more than the cards can ever hold",
+                f"its {len(waiting)} members need {needed} bytes together, "
+                "more than the GPUs can ever hold",
                 code="vram_insufficient",
                 needed_bytes=needed,
                 budget_bytes=budgets,
@@ -161,7 +163,7 @@ class Gangs(Feature):
         fixed = sum(gpu.ledger.charge_bytes(lease.id) for lease in staying)
         return fixed + sum(_needs(some).values()) <= gpu.ledger.budget_bytes
 
-    # -- waiting ---------------------------------------------------------------------------------------------------
+    # -- waiting -----------------------------------------------------------------------------------
     def owns(self, request: Lease) -> bool:
         """Return whether a request is granted by `serve` alone."""
         return request.id in self.of
@@ -179,9 +181,9 @@ class Gangs(Feature):
     def _serve_waiting(self, core: Core, gpu: Gpu, gang: Gang) -> None:
         """Grant all members if all fit, else revoke the victims that let all of them in."""
         waiting = gang.waiting()
-        fitting = _place(core, waiting, lambda card, some: self._fits(core, card, gang, some))
+        fitting = _place(core, waiting, lambda gpu, some: self._fits(core, gpu, gang, some))
         if fitting:
-            readings = [_has_room(core, card, gang, some) for card, some in _cards(core, fitting)]
+            readings = [_has_room(core, gpu, gang, some) for gpu, some in _by_gpu(core, fitting)]
             if all(readings):
                 self._admit(core, gang, fitting)
             return
@@ -191,24 +193,24 @@ class Gangs(Feature):
             policy.wake_when_evictable(core, gpu, _bundle(gang, waiting))
             return
         _say(waiting, "room is being made for the whole gang")
-        for card, some in _cards(core, placement):
-            bundle, going = _bundle(gang, some), policy.leaving(card)
-            if policy.fits(card, bundle, going):
+        for gpu, some in _by_gpu(core, placement):
+            bundle, going = _bundle(gang, some), policy.leaving(gpu)
+            if policy.fits(gpu, bundle, going):
                 continue
-            for victim in policy.choose_victims(core, card, bundle, going) or ():
-                eviction.ask(core, card, victim, some[0], f"gang {gang.name} needs the room")
+            for victim in policy.choose_victims(core, gpu, bundle, going) or ():
+                eviction.ask(core, gpu, victim, some[0], f"gang {gang.name} needs the room")
 
     def _plan(self, core: Core, gang: Gang) -> _Placement | None:
-        """Return where room can be made for all waiting members: where it is being made, as long as that is possible."""
+        """Return where room can be made for all waiting members, preferably where it is made."""
         waiting = gang.waiting()
 
-        def possible(card: Gpu, some: list[Lease]) -> bool:
-            return self._can_be_made(core, card, gang, some)
+        def possible(gpu: Gpu, some: list[Lease]) -> bool:
+            return self._can_be_made(core, gpu, gang, some)
 
         planned = {
-            card: [one for one in some if one in waiting] for card, some in gang.planned.items()
+            gpu: [one for one in some if one in waiting] for gpu, some in gang.planned.items()
         }
-        if not planned or not all(possible(card, some) for card, some in _cards(core, planned)):
+        if not planned or not all(possible(gpu, some) for gpu, some in _by_gpu(core, planned)):
             planned = _place(core, waiting, possible) or {}
         gang.planned = planned
         return planned or None
@@ -237,12 +239,12 @@ class Gangs(Feature):
             or policy.choose_victims(core, gpu, bundle, going) is not None
         )
 
-    # -- loading ---------------------------------------------------------------------------------------------------
+    # -- loading -----------------------------------------------------------------------------------
     def _admit(self, core: Core, gang: Gang, placement: _Placement) -> None:
         """Charge all members at once: from now on each has its bytes, whichever loads first."""
         gang.phase, gang.planned = "loading", {}
-        for gpu, some in _cards(core, placement):
-            gang.cards.append(gpu.info.id)
+        for gpu, some in _by_gpu(core, placement):
+            gang.gpus.append(gpu.info.id)
             self.loading[gpu.info.id] = gang
             for lease in some:
                 for gpu_id in lease.request.gpus:
@@ -286,7 +288,7 @@ class Gangs(Feature):
         if over > 0:
             self._relieve(core, gpu, gang, lease, over)
             return None
-        # the headroom is booked on one member's process, and may cover what that still shows of its load peak
+        # the headroom is charged to one member's process, and may cover the rest of its load peak
         moved = min(headroom, more)
         total = gpu.ledger.total_if_moved(gang.headroom_id, moved, lease.process) if moved else 0
         crowded = total + extra > gpu.ledger.budget_bytes
@@ -296,7 +298,7 @@ class Gangs(Feature):
         return lease
 
     def _relieve(self, core: Core, gpu: Gpu, gang: Gang, lease: Lease, over: int) -> None:
-        """Revoke others that have grown since the gang was admitted, or break it if there are none to revoke."""
+        """Revoke holders that have grown since the gang was admitted, or break it."""
         going = policy.leaving(gpu)
         victims = [] if going else policy.choose_relief(core, gpu, going, over)
         for victim in victims:
@@ -307,9 +309,10 @@ class Gangs(Feature):
             )
 
     def _is_free(self, core: Core, gpu: Gpu, gang: Gang, lease: Lease, *, crowded: bool) -> bool:
-        """Return whether readings show a member's bytes as free: the one before needed some of them while it loaded.
+        """Return whether readings show a member's bytes as free.
 
-        Memory that does not come back in time breaks the gang, or its other members would keep the GPU from everyone.
+        The member before needed some of them while it loaded. If they do not come back in time the
+        gang is broken: it must not keep the GPU from other requests forever.
         """
         room = policy.measured_room_bytes(core, gpu)
         if not crowded and room is not None and room >= policy.measured_need_bytes(gpu, lease):
@@ -326,7 +329,7 @@ class Gangs(Feature):
             core.read_again(gpu, core.settings.load_probe_s)
         return False
 
-    # -- the end ---------------------------------------------------------------------------------------------------
+    # -- the end -----------------------------------------------------------------------------------
     def on_moved(self, core: Core, lease: Lease, before: LeaseState) -> None:
         """Examine the gang of a member that came to another state."""
         gang = self.of.get(lease.id)
@@ -334,7 +337,7 @@ class Gangs(Feature):
             self.touched.add(gang.name)
 
     def settle(self, core: Core) -> None:
-        """Break gangs of which a member ended or leaves, and finish those of which all members are held."""
+        """Break the gangs of members that ended or leave; finish those with all members held."""
         if not self.by_name:
             return
         self.settled = self.touched | {gang.name for gang in self.loading.values()}
@@ -353,7 +356,7 @@ class Gangs(Feature):
                 self._dissolve(core, gang)
                 _note(core, gang, "complete", "all are held")
             elif gang.phase == "loading":
-                for gpu_id in gang.cards:
+                for gpu_id in gang.gpus:
                     _trim(core, core.gpus[gpu_id], gang)
 
     def _named(self, names: Iterable[str]) -> list[Gang]:
@@ -381,7 +384,7 @@ class Gangs(Feature):
         core.timers.clear(("gang", gang.name))
         for lease in gang.members:
             self.of.pop(lease.id, None)
-        for gpu_id in gang.cards:
+        for gpu_id in gang.gpus:
             gpu = core.gpus[gpu_id]
             for lease in gang.members:
                 if lease.id in gpu.ledger.reserved:
@@ -394,14 +397,17 @@ class Gangs(Feature):
             if lease.state in EXPIRING:
                 core.record_lease(lease)  # a restart must not wait for the rest of the gang
 
-    # -- across a restart ------------------------------------------------------------------------------------------
+    # -- across a restart --------------------------------------------------------------------------
     def to_record(self, lease: Lease) -> Mapping[str, Any]:
         """Name the gang of a granted member."""
         gang = self.of.get(lease.id)
         return {} if gang is None else {"gang": [gang.name, gang.size]}
 
     def from_record(self, core: Core, lease: Lease, record: Mapping[str, Any]) -> None:
-        """Take a granted member back. The others ask again, by their nonces, within the time that a holder has to reattach."""
+        """Take a granted member back.
+
+        The others ask again, by their nonces, within the time that a holder has to reattach.
+        """
         if record.get("gang") is None or lease.state not in EXPIRING:
             return
         name, size = record["gang"]
@@ -415,7 +421,7 @@ class Gangs(Feature):
         if gang is not None and gang.phase == "gathering":
             self._break(core, gang, "not all of it came back after the restart")
 
-    # -- answers ------------------------------------------------------------------------------------
+    # -- answers -----------------------------------------------------------------------------------
     def protects(self, lease: Lease) -> str:
         """A member is not revoked before its gang is complete."""
         gang = self.of.get(lease.id)
@@ -428,7 +434,7 @@ class Gangs(Feature):
                 yield from gang.waiting()
 
     def check(self, core: Core, *, everything: bool) -> None:
-        """Of a gang that is neither complete nor broken, all waiting members are charged or none (invariant 7)."""
+        """Check invariant 7: all waiting members of a gang are charged, or none."""
         for gang in self._named(self.by_name if everything else self.settled | self.touched):
             for lease in gang.waiting():
                 charged = lease.gpu is not None and core.gpus[lease.gpu].ledger.charges(lease.id)
@@ -450,10 +456,10 @@ class Gangs(Feature):
         gang = self.of.get(lease.id)
         if gang is None:
             return None
-        gpu = core.gpus[_card_of(gang, lease)]
+        gpu = core.gpus[_gpu_of(gang, lease)]
         mine = [one for one in gang.members if one.state is not LeaseState.HELD]
         before = mine[: mine.index(lease) + 1] if lease in mine else []
-        loads = [one for one in before if _card_of(gang, one) == gpu.info.id]
+        loads = [one for one in before if _gpu_of(gang, one) == gpu.info.id]
         queued = gang.phase == "waiting" and lease.state is LeaseState.QUEUED
         reserved_bytes = 0
         if lease.id in gpu.ledger.reserved:
@@ -471,7 +477,7 @@ class Gangs(Feature):
         )
 
 
-# -- bytes -------------------------------------------------------------------------------------------------------------
+# -- bytes -----------------------------------------------------------------------------------------
 def _needs(some: Iterable[Lease]) -> dict[ProcessKey, int]:
     """Return what an admission charges, by process: all steady bytes and the largest headroom."""
     some = list(some)
@@ -498,7 +504,7 @@ def _bundle(gang: Gang, some: list[Lease]) -> Lease:
 
 
 def _as_waiter(gang: Gang, gpu: Gpu, lease: Lease) -> Lease:
-    """Return the members that are to come to a GPU, or may come to no other, as a single request."""
+    """Return the members planned for a GPU, or that may have no other, as a single request."""
     planned = gang.planned.get(gpu.info.id, [])
     some = [one for one in gang.waiting() if one in planned]
     only = (gpu.info.id,)
@@ -516,7 +522,7 @@ def _approved(gpu: Gpu, lease_id: LeaseId) -> int:
 
 
 def _set_headroom(core: Core, gpu: Gpu, gang: Gang, count: int) -> None:
-    """Reserve bytes for the member that loads next, in the account of one of the gang's processes on the GPU."""
+    """Reserve bytes for the member that loads next, charged to one of the gang's processes."""
     if gpu.ledger.charges(gang.headroom_id):
         gpu.ledger.withdraw(gang.headroom_id, core.now)
     if count:
@@ -525,7 +531,7 @@ def _set_headroom(core: Core, gpu: Gpu, gang: Gang, count: int) -> None:
 
 
 def _trim(core: Core, gpu: Gpu, gang: Gang) -> None:
-    """Between two loads, reserve what the next one needs on top, out of what was admitted and is not held."""
+    """Between two loads, reserve the next one's headroom out of what is admitted and not held."""
     if gpu.in_state(LeaseState.LOADING):
         return
     here = [one for one in gang.members if one.gpu == gpu.info.id]
@@ -537,9 +543,9 @@ def _trim(core: Core, gpu: Gpu, gang: Gang) -> None:
         core.wake(gpu)
 
 
-# -- readings ----------------------------------------------------------------------------------------------------------
+# -- readings --------------------------------------------------------------------------------------
 def _has_room(core: Core, gpu: Gpu, gang: Gang, some: list[Lease]) -> bool:
-    """Return whether a reading shows room for all members that are to come to a GPU. Asks for one that can tell."""
+    """Return whether a reading shows room for members on a GPU; ask for one if none can."""
     room = policy.measured_room_bytes(core, gpu)
     need = policy.measured_need_bytes(gpu, _bundle(gang, some))
     if room is None or (room < need and policy.sample_is_behind(gpu)):
@@ -556,11 +562,11 @@ def _want_reading(core: Core, gpu: Gpu, some: Iterable[Lease]) -> None:
     core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
 
 
-# -- placement ---------------------------------------------------------------------------------------------------------
+# -- placement -------------------------------------------------------------------------------------
 def _place(
     core: Core, members: list[Lease], may: Callable[[Gpu, list[Lease]], bool]
 ) -> _Placement | None:
-    """Return a GPU for every member, or None. `may` says whether some of them may be on a GPU together.
+    """Return a GPU for every member, or None. `may`: whether some may be on a GPU together.
 
     Members with the fewest GPUs choose first, then the largest; GPUs are tried in their order.
     """
@@ -596,18 +602,18 @@ def _place(
     return placement if extend(0) else None
 
 
-def _cards(core: Core, placement: _Placement) -> list[tuple[Gpu, list[Lease]]]:
+def _by_gpu(core: Core, placement: _Placement) -> list[tuple[Gpu, list[Lease]]]:
     return [
         (gpu, placement[gpu.info.id]) for gpu in core.gpus.values() if placement.get(gpu.info.id)
     ]
 
 
-def _card_of(gang: Gang, lease: Lease) -> GpuId:
-    """Return the GPU of a member: where it is, where room is made for it, or the first where it may be placed."""
+def _gpu_of(gang: Gang, lease: Lease) -> GpuId:
+    """Return where a member is, where room is made for it, or its first candidate."""
     return lease.gpu or gang.planned_on(lease) or lease.request.planned_gpu or lease.request.gpus[0]
 
 
-# -- words -------------------------------------------------------------------------------------------------------------
+# -- words -----------------------------------------------------------------------------------------
 def _note(core: Core, gang: Gang, phase: str, reason: str) -> None:
     members = [lease.id for lease in gang.members]
     core.note("gang", gang=gang.name, phase=phase, members=members, reason=reason)
@@ -629,7 +635,8 @@ def _outlook(gang: Gang, lease: Lease) -> str:
     if gang.phase == "loading":
         return (
             lease.request.reason
-            or f"its bytes are kept for it; it loads when those of gang {gang.name} before it are ready"
+            or "its bytes are kept for it; it loads when those of "
+            f"gang {gang.name} before it are ready"
         )
     return f"waits as one of gang {gang.name}: {lease.request.reason or 'behind others'}"
 

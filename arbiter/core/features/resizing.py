@@ -1,9 +1,9 @@
-"""Resizing: a held lease shrinks when readings agree, and grows when its request for more bytes is granted.
+"""Resizing: a held lease shrinks when readings agree, and grows by a request for more bytes.
 
-A growth is a request for the difference (`Lease.extends`): it waits in the GPU's queue with the holder's priority, has
-victims and a timeout like any other, and its bytes are added to the lease at its grant. A shrink is a claim of the
-holder: the charge falls when two readings in a row agree, or stays when none does in time. The lease stays held, in use
-or not.
+A growth is a request for the difference (`Request.extends`): it waits in the GPU's queue with the
+holder's priority, has victims and a timeout like any other, and its bytes are added to the lease at
+its grant. A shrink is a claim of the holder: the charge falls when two readings in a row agree, and
+stays when they do not in time. The lease stays held, in use or not.
 """
 
 from collections.abc import Mapping
@@ -40,11 +40,14 @@ class Resizing(Feature):
 
     timers = frozenset({"shrink"})
 
-    # -- the request -----------------------------------------------------------------------------------------------
+    # -- the request -------------------------------------------------------------------------------
     def resize(self, core: Core, event: ResizeAsked) -> None:
-        """Begin to resize a held lease, and reply with what it waits for: nothing (`held`), readings (`shrinking`) or its
-        turn (`growing`). The push `resized` or `denied` follows. A repeat changes nothing; another size replaces the one
-        before. Raises Refused."""
+        """Begin to resize a held lease; the push `resized` or `denied` follows.
+
+        The reply says what it waits for: nothing (`held`), readings (`shrinking`) or its turn
+        (`growing`). A repeat changes nothing; another size replaces the one before.
+        Raises Refused.
+        """
         lease = own_lease(core, event.client, event.lease, event.token)
         _check_resizable(lease)
         gpu = core.gpu_of(lease)
@@ -94,7 +97,7 @@ class Resizing(Feature):
             core.note("cancelled", growth, reason=why)
             core.end(growth, None)
 
-    # -- growing ---------------------------------------------------------------------------------------------------
+    # -- growing -----------------------------------------------------------------------------------
     def _begin_growth(
         self, core: Core, gpu: Gpu, lease: Lease, event: ResizeAsked, more_bytes: int
     ) -> None:
@@ -136,7 +139,7 @@ class Resizing(Feature):
         core.note("queued", growth, position=position, grows=lease.id, reason=reason)
 
     def grant(self, core: Core, gpu: Gpu, request: Lease) -> bool:
-        """Add the bytes of a growth to its lease. The record is written before the holder hears of it."""
+        """Add the bytes of a growth to its lease; record it before the holder is told."""
         if request.request.extends is None:
             return False
         lease, more_bytes = core.leases[request.request.extends], request.request.load_peak_bytes
@@ -151,9 +154,9 @@ class Resizing(Feature):
         _tell(core, gpu, lease, more_bytes)
         return True
 
-    # -- shrinking -------------------------------------------------------------------------------------------------
+    # -- shrinking ---------------------------------------------------------------------------------
     def _begin_shrink(self, core: Core, gpu: Gpu, lease: Lease, target_bytes: int) -> None:
-        """Wait for readings that begin from now on: the holder says that the bytes are freed already."""
+        """Wait for readings that begin from now on: the bytes are freed already."""
         deadline_at = core.now + core.settings.verify_timeout_s
         self.shrinks[lease.id] = Shrink(target_bytes, core.now, deadline_at)
         lease.observed.steady_bytes = 0  # seen under another declaration: no drift from the new one
@@ -194,9 +197,9 @@ class Resizing(Feature):
         if self.shrinks.pop(lease.id, None) is not None:
             core.timers.clear(("shrink", lease.id))
 
-    # -- hooks -----------------------------------------------------------------------------------------------------
+    # -- hooks -------------------------------------------------------------------------------------
     def on_moved(self, core: Core, lease: Lease, before: LeaseState) -> None:
-        """Forget a growth however it ended, and end the resize of a lease that gives everything back."""
+        """Forget a growth that ended, and end the resize of a lease that is released."""
         if lease.request.extends is not None:
             del self.growths[lease.request.extends]
         elif lease.state is LeaseState.UNLOADING:
@@ -236,7 +239,8 @@ def _check_ever_fits(gpu: Gpu, lease: Lease, target: int, charge: int) -> None:
         return
     raise Refused(
         "vram_insufficient",
-        f"{lease.spec.consumer} would need {target} bytes; alone on its GPU it can have {charge + room}",
+        f"{lease.spec.consumer} would need {target} bytes; "
+        f"alone on its GPU it can have {charge + room}",
         "stay smaller",
         needed_bytes=target,
         capacity_bytes=gpu.info.capacity_bytes,
@@ -260,7 +264,10 @@ def _declare(lease: Lease, event: ResizeAsked, target: int) -> None:
 
 
 def _is_freed(core: Core, gpu: Gpu, lease: Lease, shrink: Shrink, sample: MemorySampled) -> bool:
-    """Return whether a reading shows no more than the charges would be afterwards: on the GPU, and for the process where it is listed."""
+    """Return whether a reading shows no more than the charges after the shrink.
+
+    On the GPU, and for the process if the reading lists it.
+    """
     ledger, tolerance = gpu.ledger, core.settings.verify_tolerance_bytes
     less = ledger.charge_bytes(lease.id) - shrink.target_bytes
     held = process_bytes(sample, lease.process)

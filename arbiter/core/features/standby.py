@@ -1,9 +1,10 @@
 """Standby and parking: leases that live on without bytes on a GPU.
 
-A lease on standby comes back by itself when there is room. A parked lease keeps its weights in host RAM, and comes back
-by itself only if it is on standby too. Coming back is a favor, never a claim: no holder is revoked for it, no waiter is
-passed by, and the lease stays away while the consumer that it left for is on the GPU. A holder that needs its lease now
-acquires or reacquires it, and waits in the queues like any other.
+A lease on standby comes back by itself when there is room. A parked lease keeps its weights in
+host RAM, and comes back by itself only if it is on standby too. Coming back is a favor, never a
+claim: no holder is revoked for it, no waiter is passed by, and the lease stays away while the
+consumer that it left for is on the GPU. A holder that needs its lease now acquires or reacquires
+it, and waits in the queues like any other.
 """
 
 from collections.abc import Iterable, Mapping
@@ -82,9 +83,9 @@ class Standby(Feature):
     def _of(self, lease: Lease) -> Absence:
         return self.absences.setdefault(lease.id, Absence())
 
-    # -- leaving ---------------------------------------------------------------------------------------------------
+    # -- leaving -----------------------------------------------------------------------------------
     def on_release(self, core: Core, event: ReleaseReported, lease: Lease) -> None:
-        """Decide whether a lease goes on standby or is parked. Raises Refused if it cannot be parked."""
+        """Decide whether a lease goes on standby or is parked. Raises Refused."""
         if not (event.parked or lease.spec.standby):
             return
         if event.parked:
@@ -94,7 +95,7 @@ class Standby(Feature):
         absence.comes_back = self._stays(lease, absence) and not event.exiting
 
     def _stays(self, lease: Lease, absence: Absence) -> bool:
-        """Return whether a released lease goes on standby: only if the engine revoked it, and no operator did.
+        """Return whether a released lease goes on standby: if the engine revoked it, no operator.
 
         A holder that releases by itself does not want it back.
         """
@@ -193,7 +194,10 @@ class Standby(Feature):
         _wake(core, lease)
 
     def on_dismissed(self, core: Core, lease: Lease, why: str) -> None:
-        """Do not bring back what an operator evicts. On standby it ends; parked it stays until its holder asks."""
+        """Do not bring back what an operator evicts.
+
+        On standby a lease ends; parked it stays until its holder asks.
+        """
         absence = self._of(lease)
         absence.comes_back, absence.recall = False, None
         if lease.state is LeaseState.STANDBY:
@@ -218,9 +222,9 @@ class Standby(Feature):
         self.host.drop(lease.id)
         return leaves
 
-    # -- wanted by the holder --------------------------------------------------------------------------------------
+    # -- wanted by the holder ----------------------------------------------------------------------
     def on_acquire(self, core: Core, event: AcquireRequested, known: Lease | None) -> bool:
-        """Take an acquire for the lease of its process and model that is away, or for a repeat of what that one asked."""
+        """Take an acquire whose process has a lease for the model that is away."""
         if known is not None:
             if known.state not in AWAY or not _still_waits(known, event):
                 return False
@@ -309,7 +313,7 @@ class Standby(Feature):
         asked_at: float,
         wait_timeout_s: float | None,
     ) -> None:
-        """Make a waiter of a lease that is away, as of `asked_at`. Without a request its grant is pushed."""
+        """Queue a lease that is away as of `asked_at`. Without a request its grant is pushed."""
         del self.away[lease.id]
         core.move(lease, LeaseState.QUEUED, "wanted again")
         core.timers.clear(("away", lease.id))  # after a restart: its holder reattached
@@ -323,7 +327,7 @@ class Standby(Feature):
         lease.request.planned_gpu = None
         core.enqueue(lease)
 
-    # -- coming back by itself -------------------------------------------------------------------------------------
+    # -- coming back by itself ---------------------------------------------------------------------
     def serve(self, core: Core, gpu: Gpu, head: Lease | None) -> None:
         """Grant the lease that comes back to a GPU for which nothing waits."""
         back = None if head is not None else self._next_back(core, gpu)
@@ -347,15 +351,16 @@ class Standby(Feature):
             absence.unused = False
 
     def unclaimed(self, lease: Lease) -> bool:
-        """Return whether a lease came back by itself and was not used since: it has no minimum residency."""
+        """Return whether a lease came back by itself and was not used since."""
         absence = self.absences.get(lease.id)
         return absence is not None and absence.unused
 
     def _next_back(self, core: Core, gpu: Gpu) -> Lease | None:
         """Return the lease that comes back now: by priority, then in the order of their leaving.
 
-        One that does not fit yet keeps its turn: others pass it only where it would still fit beside them. The GPU has to
-        be quiet for the lease's own minimum residency first: between two goals a policy is away for a moment only.
+        One that does not fit yet keeps its turn: others pass it only where it would still fit
+        beside them. The GPU has to be quiet for the lease's own minimum residency first: between
+        two goals a policy is away for a moment only.
         """
         ahead: Lease | None = None
         spare_bytes = 0
@@ -396,7 +401,7 @@ class Standby(Feature):
         )
 
     def _returned_since(self, since: float, other: Lease) -> bool:
-        """Return whether a resident came back by itself after that moment: it would not be revoked for another that does."""
+        """Return whether a resident came back by itself after that moment."""
         absence = self.absences.get(other.id)
         return absence is not None and absence.returned and other.granted_at >= since
 
@@ -410,14 +415,14 @@ class Standby(Feature):
         return max(gpu.changed_at, self.absences[lease.id].since) + lease.spec.min_residency_s
 
     def on_timer(self, core: Core, kind: str, subject: str) -> None:
-        """The GPU was quiet for long enough, or the holder of a lease that is away did not reattach after a restart."""
+        """A GPU was quiet for long enough, or a holder did not reattach after a restart."""
         if kind == "return":
             core.wake(core.gpus[GpuId(subject)])
             return
         lease = core.leases[LeaseId(subject)]
         _end(core, lease, LeaseState.CANCELLED, "lease_lost", NOT_BACK)
 
-    # -- across a restart ------------------------------------------------------------------------------------------
+    # -- across a restart --------------------------------------------------------------------------
     def to_record(self, lease: Lease) -> Mapping[str, Any]:
         """Write down where a lease goes, or how it is away."""
         absence = self.absences.get(lease.id)
@@ -432,7 +437,7 @@ class Standby(Feature):
         }
 
     def from_record(self, core: Core, lease: Lease, record: Mapping[str, Any]) -> None:
-        """Restore an absence. A lease that is away does not come back before its holder reattached."""
+        """Restore an absence. A lease comes back only after its holder reattached."""
         self.absences[lease.id] = Absence(
             left_for=str(record.get("left_for", "")),
             dismissed=bool(record.get("dismissed", False)),
@@ -447,7 +452,7 @@ class Standby(Feature):
             core.timers.set(("away", lease.id), core.now + patience_s)
 
     def on_reattached(self, core: Core, lease: Lease, item: ReattachedLease) -> None:
-        """Believe a holder that says that its lease is away. What was lost on the way is made up for: its release, or its grant."""
+        """Believe a holder whose lease, it says, is away; its release, or the grant, was lost."""
         if not item.away:
             return
         if lease.state in AWAY:
@@ -469,9 +474,9 @@ class Standby(Feature):
                 self.host.find(lease.id, lease.spec.park_bytes)
             let_go(core, lease, exiting=False, why="let go, says its holder")
 
-    # -- answers ------------------------------------------------------------------------------------
+    # -- answers -----------------------------------------------------------------------------------
     def can_park(self, lease: Lease) -> bool:
-        """Return whether host RAM is booked for the weights of a revoked lease, or has room for those of another."""
+        """Return whether host RAM is booked for a revoked lease, or has room for another."""
         if lease.departure.eviction is not None:
             return lease.id in self.host.booked
         return lease.spec.park_bytes > 0 and self.host.fits(lease.id, lease.spec.park_bytes)
@@ -481,7 +486,7 @@ class Standby(Feature):
         return self.away.values()
 
     def check(self, core: Core, *, everything: bool) -> None:
-        """A lease that is away has no GPU and does not wait; parked weights stay within their budget (invariant 4)."""
+        """Check invariant 4: what is away has no GPU and does not wait; parked bytes fit."""
         parked = self.host.granted_bytes() if self.host.booked else 0
         if parked > self.host.budget_bytes:
             raise InvariantViolation(
@@ -492,7 +497,7 @@ class Standby(Feature):
                 raise InvariantViolation(4, f"{lease.id} is {lease.state}, yet it counts as away")
             if lease.gpu is not None or lease.id in core.waiting:
                 raise InvariantViolation(
-                    4, f"{lease.id} is {lease.state}, yet it has a card or waits for one"
+                    4, f"{lease.id} is {lease.state}, yet it has a GPU or waits for one"
                 )
 
     def view(self, core: Core, lease: Lease) -> Mapping[str, object]:
@@ -503,7 +508,7 @@ class Standby(Feature):
         return shown
 
     def standing(self, core: Core, lease: Lease) -> Standing | None:
-        """Tell what a lease that is away waits for; of several GPUs the first that it may return to."""
+        """Tell what a lease that is away waits for on the first GPU that it may return to."""
         if lease.state not in AWAY:
             return None
         gpu = core.gpus[lease.request.planned_gpu or lease.request.gpus[0]]
@@ -537,8 +542,8 @@ class Standby(Feature):
 def _still_waits(lease: Lease, event: AcquireRequested) -> bool:
     """Return whether the newest acquire of a lease that is away still waits.
 
-    A restart ended its wait: what came back from the journal was, as far as known, not granted since it was asked for. A
-    late repeat of one that waited and was granted means nothing.
+    A restart ended its wait: what came back from the journal was, as far as known, not granted
+    since it was asked for. A late repeat of one that waited and was granted means nothing.
     """
     return event.nonce == lease.request.nonce and lease.granted_at <= lease.request.arrived_at
 

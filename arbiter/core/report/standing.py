@@ -1,4 +1,4 @@
-"""How a request waits, as reports tell it: alone in its queues, or as a feature tells it of its own requests."""
+"""How a request waits, for reports: alone in its queues, or as its feature tells."""
 
 from dataclasses import dataclass
 

@@ -12,6 +12,7 @@ from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invar
 from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.machines import walk
 from vram_arbiter.arbiter.core.effects import Effect, Refuse, Reply
+from vram_arbiter.arbiter.core.features import gangs as features_gangs
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
@@ -248,9 +249,8 @@ class Gangs(RuleBasedStateMachine):
         assert self.driver.gpu()["charged_bytes"] == 0, self.driver.arbiter.status(self.driver.now)
         core = self.driver.arbiter.inspect()
         assert not core.users
-        assert not core.gangs.by_name
-        assert not core.gangs.of
-        assert not core.gangs.loading
+        gangs = core.feature(features_gangs.Gangs)
+        assert not any((gangs.by_name, gangs.of, gangs.loading))
         assert not any(gpu.ledger.reserved for gpu in core.gpus.values())
 
 

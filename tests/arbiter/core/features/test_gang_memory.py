@@ -5,6 +5,7 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver, answer
 from tests.support.scenes import held, hidden_card
 from vram_arbiter.arbiter.core.effects import Sample
+from vram_arbiter.arbiter.core.features.gangs import Gangs
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
@@ -175,7 +176,7 @@ def test_a_gang_that_broke_is_not_waited_for_after_a_restart(asked: bool) -> Non
     driver.restart()
     a.connect()
     answer(a.reattach(first, token))
-    assert not driver.arbiter.inspect().gangs.by_name
+    assert not driver.arbiter.inspect().feature(Gangs).by_name
 
 
 def test_bytes_kept_for_the_next_member_hide_no_context_of_the_one_before() -> None:

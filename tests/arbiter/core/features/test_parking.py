@@ -11,6 +11,7 @@ from tests.support.scenes import held
 from vram_arbiter.arbiter.core import invariants
 from vram_arbiter.arbiter.core.events import OperatorAsked
 from vram_arbiter.arbiter.core.features.parking import HostRam
+from vram_arbiter.arbiter.core.features.standby import Standby
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
@@ -320,6 +321,6 @@ def test_a_lost_journal_does_not_lose_it(standby: bool) -> None:
 def test_the_invariant_of_the_budget() -> None:
     driver = driver_with(5)
     parked(driver)
-    driver.arbiter.inspect().standby.host.booked[LeaseId("x")] = 1
+    driver.arbiter.inspect().feature(Standby).host.booked[LeaseId("x")] = 1
     with pytest.raises(InvariantViolation, match="bytes are parked, the budget is"):
         invariants.check(state_of(driver.arbiter))

@@ -7,6 +7,7 @@ from tests.support.engine_state import state_of
 from tests.support.scenes import charge, held, shown
 from vram_arbiter.arbiter.core import invariants
 from vram_arbiter.arbiter.core.events import MemorySampled
+from vram_arbiter.arbiter.core.features.resizing import Resizing
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, LeaseId
@@ -141,7 +142,9 @@ def test_one_reading_that_agrees_is_not_enough() -> None:
     vlm, lease = held(driver, "vlm", 6)
     vlm.hold(4 * GIB)
     vlm.resize(lease, 4 * GIB)
-    driver.until(lambda: driver.arbiter.inspect().resizing.shrinks[lease].agreed, limit_s=1.0)
+    driver.until(
+        lambda: driver.arbiter.inspect().feature(Resizing).shrinks[lease].agreed, limit_s=1.0
+    )
     vlm.hold(6 * GIB)
     driver.advance(5.0)
     assert charge(driver, lease) == 6 * GIB
@@ -266,9 +269,11 @@ def test_another_size_replaces_the_one_before() -> None:
     det, other = held(driver, "det", 3)
     det.use_begin(other)
     vlm.resize(lease, 6 * GIB)
-    before = driver.arbiter.inspect().resizing.growths[lease]
+    before = driver.arbiter.inspect().feature(Resizing).growths[lease]
     assert answer(vlm.resize(lease, 6 * GIB))["state"] == "growing"
-    assert driver.arbiter.inspect().resizing.growths[lease] == before, "a repeat keeps its place"
+    assert driver.arbiter.inspect().feature(Resizing).growths[lease] == before, (
+        "a repeat keeps its place"
+    )
     vlm.resize(lease, 5 * GIB)
     assert driver.state(before) == "over"
     assert answer(vlm.resize(lease, 4 * GIB))["state"] == "held"
@@ -342,7 +347,7 @@ def test_the_invariant_of_a_growth() -> None:
     det.use_begin(other)
     vlm.resize(lease, 6 * GIB)
     core = state_of(driver.arbiter)
-    growth = core.leases[driver.arbiter.inspect().resizing.growths[lease]]
+    growth = core.leases[driver.arbiter.inspect().feature(Resizing).growths[lease]]
     growth.request.extends = LeaseId("gone")
     with pytest.raises(InvariantViolation, match="which is not there"):
         invariants.check(core)

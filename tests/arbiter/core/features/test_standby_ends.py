@@ -185,5 +185,5 @@ def test_invariants_of_what_is_away() -> None:
         invariants.check(core)
     one.state = LeaseState.STANDBY
     one.gpu = next(iter(core.gpus))
-    with pytest.raises(InvariantViolation, match="it has a card"):
+    with pytest.raises(InvariantViolation, match="it has a GPU"):
         invariants.check(core)
