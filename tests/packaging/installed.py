@@ -11,7 +11,8 @@ import tomllib
 from pathlib import Path
 
 TREE = Path(__file__).parents[2]
-PYTHON = Path(sys._base_executable).resolve()  # type: ignore[attr-defined]  # without the environment
+# without the environment
+PYTHON = Path(sys._base_executable).resolve()  # type: ignore[attr-defined]
 DEPENDENCIES = Path(site.getsitepackages()[0])
 
 
@@ -47,6 +48,7 @@ def install_into(
         path = programs / name
         interpreter = (seen_at or prefix) / "bin" / "python"
         path.write_text(
-            f"#!{interpreter}\nimport sys\nfrom {module} import {function}\nsys.exit({function}())\n"
+            f"#!{interpreter}\nimport sys\nfrom {module} import "
+            f"{function}\nsys.exit({function}())\n"
         )
         path.chmod(0o755)

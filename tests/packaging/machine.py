@@ -1,6 +1,8 @@
-"""A machine with a real systemd as its PID 1, in namespaces of its own: `boot_machine.sh` says what it is made of.
+"""A machine with a real systemd as its PID 1, in namespaces of its own: `boot_machine.sh` says what
+it is made of.
 
-It ends with its PID 1, however the test ends: the kernel then ends every process of it and its mounts go.
+It ends with its PID 1, however the test ends: the kernel then ends every process of it and its
+mounts go.
 """
 
 import contextlib
@@ -62,7 +64,8 @@ def _own_cgroup() -> Path:
 
 
 class Machine:
-    """Booted when made; `close` ends it. Its /opt/vram-arbiter holds the installed product, its /opt/tree the checkout."""
+    """Booted when made; `close` ends it. Its /opt/vram-arbiter holds the installed product, its
+    /opt/tree the checkout."""
 
     def __init__(self) -> None:
         self._init: int | None = None  # pidfd
@@ -93,7 +96,8 @@ class Machine:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
             notify.bind(str(self._scratch / "notify" / "socket"))
             boot = [
-                "unshare", "--fork", "--kill-child", "--pid", "--mount", "--uts", "--ipc", "--net", "--cgroup",
+                "unshare", "--fork", "--kill-child", "--pid", "--mount", "--uts", "--ipc", "--net",
+                "--cgroup",
                 str(Path(__file__).with_name("boot_machine.sh")), str(self._scratch), str(TREE),
                 str(self._scratch / "prefix"), sys.base_prefix, str(DEPENDENCIES),
             ]  # fmt: skip
@@ -134,7 +138,8 @@ class Machine:
         return [*enter, *become, *command]
 
     def run(self, *command: str, user: str | None = None, code: int = 0, stdin: str = "") -> str:
-        """Run a command on the machine; returns what it printed. Fails the test at another exit code."""
+        """Run a command on the machine; returns what it printed. Fails the test at another exit
+        code."""
         done = subprocess.run(
             self.inside(*command, user=user),
             input=stdin, capture_output=True, text=True, timeout=PATIENCE_S,

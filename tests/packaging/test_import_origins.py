@@ -1,7 +1,7 @@
 """Everything is imported as `vram_arbiter`, and the base install must stay light.
 
-Everything runs in a fresh interpreter in an empty folder: inside pytest the tree itself lies on the path and the answer
-would always be the wished one.
+Everything runs in a fresh interpreter in an empty folder: inside pytest the tree itself lies on the
+path and the answer would always be the wished one.
 """
 
 import ast

@@ -1,4 +1,5 @@
-"""README.md does what it says: its commands are typed in a fresh clone with an installed product, its example runs as printed.
+"""README.md does what it says: its commands are typed in a fresh clone with an installed product,
+its example runs as printed.
 
 `readme.sh` alone types all of them; what installs, trains or takes minutes is left out here.
 """
@@ -26,7 +27,8 @@ LONG = "^vram-(reasoner|runner (benchmark|sim --policy|replay)) ?"
 
 
 class Reader:
-    """A folder with a clone, an environment with the product, and a home that is removed afterwards."""
+    """A folder with a clone, an environment with the product, and a home that is removed
+    afterwards."""
 
     def __init__(self, folder: Path) -> None:
         for name in ("clone", "home", "run"):
@@ -97,13 +99,15 @@ def test_a_command_that_fails_fails_the_script(reader: Reader, tmp_path: Path) -
     (tmp_path / "README.md").write_text("## A\n```sh\ntrue  # fine\nfalse\n```\n")
     done = subprocess.run(
         [str(TREE / "tests/packaging/readme.sh")],
-        cwd=tmp_path, env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}, capture_output=True, text=True, timeout=60,
+        cwd=tmp_path, env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}, capture_output=True,
+        text=True, timeout=60,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (1, "readme.sh: exit code 1 of: false\n")
 
 
 def test_the_example_runs_as_printed(arbiter_daemon: ArbiterProcess, tmp_path: Path) -> None:
-    """It ended in a traceback: its `unload` is a plain function, and only coroutine functions were taken."""
+    """It ended in a traceback: its `unload` is a plain function, and only coroutine functions were
+    taken."""
     (example,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     path = tmp_path / "example.py"
     path.write_text(example)

@@ -14,7 +14,8 @@ TOOLS = ("bash", "cat", "cksum", "dirname", "env", "rm", "uname")
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """A copy of what the script reads, in a folder without environments, and a PATH with nothing but the basic tools."""
+    """A copy of what the script reads, in a folder without environments, and a PATH with nothing
+    but the basic tools."""
     folder = tmp_path / "project"
     (folder / ".ci").mkdir(parents=True)
     for name in (".ci/setup", "pyproject.toml", "constraints.txt"):
@@ -109,13 +110,16 @@ def test_python_can_be_chosen(project: Path) -> None:
 
 @pytest.fixture
 def full(project: Path) -> Path:
-    """`.ci/setup full` gets as far as the packages here: its uv makes an environment and keeps a log, nothing is installed."""
+    """`.ci/setup full` gets as far as the packages here: its uv makes an environment and keeps a
+    log, nothing is installed."""
     log = project / "log"
     script(
         project,
         "uv",
-        f'[ "$1" = --version ] && exit 0; echo "uv $*" >>{log}; case "$*" in *,gstreamer*) [ ! -e {project}/unbuildable ] || exit 1 ;; esac; '
-        f'[ "$1" != venv ] || {{ mkdir -p "${{@: -1}}/bin"; ln -s {sys.executable} "${{@: -1}}/bin/python"; }}',
+        f'[ "$1" = --version ] && exit 0; echo "uv $*" >>{log}; case "$*" in *,gstreamer*) [ ! -e '
+        f"{project}/unbuildable ] || exit 1 ;; esac; "
+        f'[ "$1" != venv ] || {{ mkdir -p "${{@: -1}}/bin"; ln -s {sys.executable} "${{@: '
+        '-1}/bin/python"; }',
     )
     for tool in ("mkdir", "ln", "touch"):
         (project / "bin" / tool).symlink_to(str(shutil.which(tool)))
@@ -127,7 +131,8 @@ def full(project: Path) -> Path:
     script(
         project,
         "apt-get",
-        f'echo "apt-get $*" >>{log}; [ ! -e {project}/offline ] || exit 100; touch {project}/headers',
+        f'echo "apt-get $*" >>{log}; [ ! -e {project}/offline ] || exit 100; touch '
+        f"{project}/headers",
     )
     return project
 

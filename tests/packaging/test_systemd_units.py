@@ -1,7 +1,9 @@
-"""The units as systemd's own tools see them, and what must hold for them whatever those tools think.
+"""The units as systemd's own tools see them, and what must hold for them whatever those tools
+think.
 
-Nothing here is started and nothing is written outside the test's folder: `verify` and `security --offline` only read, and the tools that
-create users and folders are always given a root of their own.
+Nothing here is started and nothing is written outside the test's folder: `verify` and `security
+--offline` only read, and the tools that create users and folders are always given a root of their
+own.
 """
 
 import os
@@ -26,13 +28,15 @@ UNITS = (
 HOLDERS = UNITS[1:]
 EXPOSURES_MAX = {
     "system/vram-arbiter.service": 1.0,
-    "system/vram-sidecar@.service": 2.0,  # the network of a model hub, memory that CUDA compiles into
+    # the network of a model hub, memory that CUDA compiles into
+    "system/vram-sidecar@.service": 2.0,
     "system/vram-runner@.service": 2.3,  # and cameras, motor buses and realtime scheduling
     "system/vram-reasoner@.service": 1.6,  # the network of a language model
     # The tool counts what only a privileged manager can restrict, as if a user's manager could.
     "user/vram-arbiter.service": 6.2,
 }
-"""Figures of systemd 252. Each unit is at most 0.1 below its limit, so that a setting that goes missing shows."""
+"""Figures of systemd 252. Each unit is at most 0.1 below its limit, so that a setting that goes
+missing shows."""
 
 needs_analyze = pytest.mark.skipif(
     shutil.which("systemd-analyze") is None,
@@ -79,7 +83,7 @@ def install(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-# -- what systemd says ---------------------------------------------------------------------------------------------------
+# -- what systemd says
 @needs_analyze
 @pytest.mark.parametrize("name", UNITS)
 def test_verify_is_silent(installed: Path, name: str) -> None:
@@ -153,9 +157,11 @@ def analyze(*arguments: str, **environ: str) -> subprocess.CompletedProcess[str]
     )
 
 
-# -- a stop of the arbiter stops nobody ------------------------------------------------------------------------------------
-STOPPING_TIES = ("Requires", "Requisite", "BindsTo", "PartOf", "PropagatesStopTo", "StopPropagatedFrom",
-                 "PropagatesReloadTo", "Conflicts", "Upholds", "JoinsNamespaceOf", "OnFailure")  # fmt: skip
+# -- a stop of the arbiter stops nobody
+STOPPING_TIES = ("Requires", "Requisite", "BindsTo", "PartOf", "PropagatesStopTo",
+"StopPropagatedFrom",
+                 "PropagatesReloadTo", "Conflicts", "Upholds", "JoinsNamespaceOf",
+                 "OnFailure")  # fmt: skip
 
 
 @pytest.mark.parametrize("name", HOLDERS)
@@ -173,7 +179,7 @@ def test_the_arbiter_pulls_nobody_down_with_it(kind: str) -> None:
     assert found["Service", "RuntimeDirectoryPreserve"] == ["yes"], "holders' sockets lie in it"
 
 
-# -- what the daemon needs to be allowed -----------------------------------------------------------------------------------
+# -- what the daemon needs to be allowed
 def test_the_watchdog_is_on_and_the_daemon_speaks_for_itself() -> None:
     for kind in ("system", "user"):
         found = unit("vram-arbiter.service", kind)
@@ -245,7 +251,7 @@ def test_the_flags_of_the_units_are_understood(tmp_path: Path) -> None:
             assert flag in done.stdout, f"{name}: {flag}"
 
 
-# -- the installer, users and folders ----------------------------------------------------------------------------------------
+# -- the installer, users and folders
 def test_the_prefix_takes_the_place_of_the_usual_one(installed: Path) -> None:
     for path in sorted(installed.rglob("*.service")):
         text = path.read_text()
@@ -279,7 +285,8 @@ def test_the_installer_refuses_what_cannot_work(tmp_path: Path) -> None:
     reason="needs root and systemd-sysusers",
 )
 def test_users_and_folders_are_made_below_a_root_of_their_own(installed: Path) -> None:
-    """Always with --root and a single snippet: without, these tools would work on the machine itself."""
+    """Always with --root and a single snippet: without, these tools would work on the machine
+    itself."""
 
     def below_root(*command: str, snippet: Path) -> None:
         done = subprocess.run(

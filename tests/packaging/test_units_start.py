@@ -1,7 +1,8 @@
-"""Every unit under a real systemd with a simulated GPU: it starts, serves, is killed, and comes back.
+"""Every unit under a real systemd with a simulated GPU: it starts, serves, is killed, and comes
+back.
 
-The units as `make install-units` copies them once never started: a system call filter ended the daemon before its first line.
-Reading the files did not show that.
+The units as `make install-units` copies them once never started: a system call filter ended the
+daemon before its first line. Reading the files did not show that.
 """
 
 import json
@@ -36,7 +37,8 @@ def steps(heading: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def machine() -> Iterator[Machine]:
-    """Booted and set up by the commands of docs/systemd.md, with a simulated GPU; the units log into files."""
+    """Booted and set up by the commands of docs/systemd.md, with a simulated GPU; the units log
+    into files."""
     made = Machine()
     try:
         made.run("mkdir", "-m", "1777", "/run/logs")
@@ -154,7 +156,8 @@ def test_a_mistake_in_the_configuration_is_not_tried_again(machine: Machine) -> 
 
 
 def test_the_unit_of_a_user_starts_in_the_manager_of_a_user(machine: Machine) -> None:
-    """Such a manager has no privileges: a setting that drops capabilities keeps a unit from starting there."""
+    """Such a manager has no privileges: a setting that drops capabilities keeps a unit from
+    starting there."""
     home, runtime = "/tmp/home", "/run/user/robot"
     machine.run(
         "install",
@@ -170,8 +173,10 @@ def test_the_unit_of_a_user_starts_in_the_manager_of_a_user(machine: Machine) ->
     machine.write(f"{home}/.config/vram-arbiter/arbiter.env", 'ARBITER_OPTIONS="--gpu fake:8GiB"\n')
     machine.write(
         f"{SYSTEM}/manager.service",
-        "[Service]\nType=notify\nUser=vram-robot\nDelegate=yes\nKillSignal=SIGKILL\nExecStart=/lib/systemd/systemd --user\n"
-        f"Environment=HOME={home} XDG_RUNTIME_DIR={runtime} SYSTEMD_UNIT_PATH=/etc/systemd/user:/run/targets\n",
+        "[Service]\nType=notify\nUser=vram-robot\nDelegate=yes\nKillSignal=SIGKILL\n"
+        "ExecStart=/lib/systemd/systemd --user\n"
+        f"Environment=HOME={home} XDG_RUNTIME_DIR={runtime} "
+        "SYSTEMD_UNIT_PATH=/etc/systemd/user:/run/targets\n",
     )
     machine.run("ln", "-s", "multi-user.target", "/run/targets/default.target")
     machine.run("systemctl", "daemon-reload")
@@ -194,12 +199,14 @@ asyncio.run(load())
 
 @pytest.mark.heavy
 def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
-    """A model loads under a lease, a robot is stopped, and a task fails because of that, each as its unit's user."""
+    """A model loads under a lease, a robot is stopped, and a task fails because of that, each as
+    its unit's user."""
     machine.run(
         "chmod", "-R", "g+rwX", "/run/vram-arbiter/fakegpu"
     )  # a driver serves several users
     skill = "vram_arbiter/configs/rskills/so101-progress/rskill.yaml"
-    options = f"--rskill /opt/vram-arbiter/lib/python3*/site-packages/{skill} --device fake:/run/vram-arbiter/fakegpu"
+    manifest = f"/opt/vram-arbiter/lib/python3*/site-packages/{skill}"
+    options = f"--rskill {manifest} --device fake:/run/vram-arbiter/fakegpu"
     options = machine.run("sh", "-c", f"echo {options}").strip()
     machine.write("/etc/vram-arbiter/sidecar-reward.env", f'SIDECAR_OPTIONS="{options}"\n')
     machine.write("/etc/vram-arbiter/reasoner-tidy.env", 'TASK="grab the red cube"\n')

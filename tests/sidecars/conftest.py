@@ -83,8 +83,10 @@ class Box:
         folder.mkdir(exist_ok=True)
         (folder / "rskill.yaml").write_text(MANIFEST.format(name=name))
         command = [
-            sys.executable, str(Path(__file__).with_name("echo_sidecar.py")), str(folder), "--name", name,
-            "--rskill", str(folder / "rskill.yaml"), "--device", device or f"fake:{self.card}", "--footprint", footprint, *flags,
+            sys.executable, str(Path(__file__).with_name("echo_sidecar.py")), str(folder), "--name",
+            name,
+            "--rskill", str(folder / "rskill.yaml"), "--device", device or f"fake:{self.card}",
+            "--footprint", footprint, *flags,
         ]  # fmt: skip
         with (folder / "log").open("ab") as log:
             process = subprocess.Popen(

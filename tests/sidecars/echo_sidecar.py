@@ -1,8 +1,10 @@
-"""A whole sidecar process around a model without weights: `python echo_sidecar.py FOLDER [flags of vram-sidecar]`.
+"""A whole sidecar process around a model without weights: `python echo_sidecar.py FOLDER [flags of
+vram-sidecar]`.
 
-FOLDER tells it what to do: a file `fail_prepare`, `fail_load` or `fail_unload` makes that step fail, `slow_prepare`,
-`slow_load` or `slow_unload` makes it last. The query tells `run`: `hold NAME` waits until the file NAME appears there, `fail` raises; anything else is echoed.
-`query` is answered with what stands behind the picture's first eight bytes.
+FOLDER tells it what to do: a file `fail_prepare`, `fail_load` or `fail_unload` makes that step
+fail, `slow_prepare`, `slow_load` or `slow_unload` makes it last. The query tells `run`: `hold NAME`
+waits until the file NAME appears there, `fail` raises; anything else is echoed. `query` is answered
+with what stands behind the picture's first eight bytes.
 """
 
 import sys

@@ -1,4 +1,5 @@
-"""What a model looks at is of now: a picture that waited for the card is not looked at. A real sidecar beside a real daemon, asked by the reasoner's tools."""
+"""What a model looks at is of now: a picture that waited for the card is not looked at. A real
+sidecar beside a real daemon, asked by the reasoner's tools."""
 
 import asyncio
 import time
@@ -31,13 +32,15 @@ class Camera:
         reply: Message = {"re": message["id"], "ok": True}
         if message["op"] == "frame":
             self.taken += 1
-            reply |= {"camera": "wrist", "encoding": "png", "data": PNG + b"%d" % self.taken, "width": 4, "height": 4,
+            reply |= {"camera": "wrist", "encoding": "png", "data": PNG + b"%d" % self.taken,
+            "width": 4, "height": 4,
                       "stamp_monotonic_ns": 1, "age_ms": 0.0}  # fmt: skip
         await self._server.send(peer, reply)
 
 
 def test_an_answer_is_not_about_a_picture_from_before_a_long_load(box) -> None:
-    """Regression: the scene model waited for the card and loaded for minutes, and then told of the picture it had been sent before."""
+    """Regression: the scene model waited for the card and loaded for minutes, and then told of the
+    picture it had been sent before."""
     sidecar = box.start("vlm")
     (sidecar.folder / "slow_load").touch()
 

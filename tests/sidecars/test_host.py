@@ -1,4 +1,5 @@
-"""One sidecar's life, in real processes: on demand, under a token, evicted, out of memory, ended."""
+"""One sidecar's life, in real processes: on demand, under a token, evicted, out of memory,
+ended."""
 
 import json
 import os
@@ -55,7 +56,8 @@ def test_it_loads_on_the_first_request_and_not_before(box, arbiter):
     )
     assert (lease["charge_bytes"], box.used(), lease["pid"]) == (GB, GB, sidecar.process.pid)
     assert sidecar.ask("load") == {
-        "ok": True, "lease_id": lease["lease_id"], "token": lease["token"], "loaded": False, "re": sidecar.client._id
+        "ok": True, "lease_id": lease["lease_id"], "token": lease["token"], "loaded": False,
+        "re": sidecar.client._id
     }  # fmt: skip
 
 
@@ -156,7 +158,8 @@ def test_a_failed_start_takes_everything_back_and_can_be_tried_again(box, arbite
 
 
 def test_a_load_that_can_not_even_be_taken_back_keeps_no_lease(box, arbiter):
-    """Regression: after a fault of the card emptying its caches fails too, and the lease was renewed for ever for a load that no request ended."""
+    """Regression: after a fault of the card emptying its caches fails too, and the lease was
+    renewed for ever for a load that no request ended."""
     (box.runtime / "detector-model").mkdir()
     switches = [box.runtime / "detector-model" / f"fail_{step}" for step in ("load", "unload")]
     for switch in switches:
@@ -237,7 +240,8 @@ def test_a_wait_for_the_lease_is_bounded(box):
 
 
 def test_imports_are_no_wait_for_the_lease(box, arbiter):
-    """Regression: on a slow machine the first request of a model with large imports was denied its lease without the arbiter being asked."""
+    """Regression: on a slow machine the first request of a model with large imports was denied its
+    lease without the arbiter being asked."""
     (box.runtime / "detector-model").mkdir()
     switch = box.runtime / "detector-model" / "slow_prepare"
     switch.touch()
@@ -300,7 +304,8 @@ def test_a_process_without_a_device_needs_no_card(lone_box):
 
 @pytest.mark.parametrize("mode", ["empties", "maps", "more", "connects"])
 def test_an_attacked_sidecar_serves_others_and_lives(lone_box, mode):
-    """Regression: bare connects, an odd identity or frames without end aborted the process, or took its memory."""
+    """Regression: bare connects, an odd identity or frames without end aborted the process, or took
+    its memory."""
     sidecar = lone_box.start("detector", "--no-arbiter", device="none")
     assert sidecar.detect()["ok"]
     path = sidecar.endpoint.removeprefix("ipc://")

@@ -44,7 +44,8 @@ def png(width: int, height: int, depth: int = 8, color: int = 2, *more: bytes) -
 @pytest.mark.parametrize(
     ("form", "mode", "options"),
     [
-        ("PNG", "RGB", {}), ("PNG", "L", {}), ("PNG", "P", {}), ("PNG", "RGBA", {}), ("PNG", "1", {}),
+        ("PNG", "RGB", {}), ("PNG", "L", {}), ("PNG", "P", {}), ("PNG", "RGBA", {}),
+        ("PNG", "1", {}),
         ("JPEG", "RGB", {}), ("JPEG", "L", {}), ("JPEG", "RGB", {"progressive": True}),
         ("JPEG", "RGB", {"comment": b"\xff\xda" * 100}),
     ],

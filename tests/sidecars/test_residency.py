@@ -1,4 +1,5 @@
-"""The residency itself, in this process, beside the real daemon: what happens between two steps of it that no other process can hit."""
+"""The residency itself, in this process, beside the real daemon: what happens between two steps of
+it that no other process can hit."""
 
 import asyncio
 import threading
@@ -64,7 +65,8 @@ class Model:
 
 
 class Client(AsyncClient):
-    """Does something in the very moment in which a lease is granted, before whoever waits for it goes on."""
+    """Does something in the very moment in which a lease is granted, before whoever waits for it
+    goes on."""
 
     def __init__(self, endpoint):
         super().__init__("eye", endpoint=endpoint)
@@ -83,12 +85,14 @@ def settings(daemon):
     footprint = Footprint(load_peak_bytes=GB, steady_bytes=GB, residue_bytes=GB // 10)
     manifest = parse_manifest(MANIFEST)
     return Settings(
-        "eye", manifest, Weights("test/eye", local=False), footprint, "ipc://nobody", f"fake:{daemon.card}", daemon.endpoint
+        "eye", manifest, Weights("test/eye", local=False), footprint, "ipc://nobody",
+        f"fake:{daemon.card}", daemon.endpoint
     )  # fmt: skip
 
 
 async def test_an_unload_between_the_grant_and_the_load_is_heard(arbiter_daemon):
-    """Regression: the wait was over and the lease not taken yet, so there was nothing to give up, and the model was loaded."""
+    """Regression: the wait was over and the lease not taken yet, so there was nothing to give up,
+    and the model was loaded."""
     worker, model = Worker(), Model()
     async with Client(arbiter_daemon.endpoint) as client, asyncio.timeout(WAIT_S):
         memory = FakeMemory(arbiter_daemon.card, "eye", GB // 10)
@@ -131,7 +135,8 @@ async def test_a_process_that_cannot_change_its_gpu_asks_for_that_one(arbiter_da
 
 
 async def test_an_unload_without_an_arbiter_is_heard_in_the_middle_of_a_load_too(arbiter_daemon):
-    """Regression: there was no lease to give up and nothing resident to unload yet, so it was answered and the model stayed."""
+    """Regression: there was no lease to give up and nothing resident to unload yet, so it was
+    answered and the model stayed."""
     worker, model = Worker(), Model()
     memory = FakeMemory(arbiter_daemon.card, "eye", GB // 10)
     residency = Residency(settings(arbiter_daemon), model, memory, worker, None)

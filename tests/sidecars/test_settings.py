@@ -18,7 +18,10 @@ from vram_arbiter.sidecars.settings import (
 from vram_arbiter.sidecars.weights import Weights
 
 MIB = 2**20
-HEAD = "name: test/model\nversion: 1.2.3\nembodiment_tags: [any]\nchunk_size: 1\ndescription: d\nlatency_budget: {per_chunk_ms: 1}\n"
+HEAD = (
+    "name: test/model\nversion: 1.2.3\nembodiment_tags: [any]\nchunk_size: 1\n"
+    "description: d\nlatency_budget: {per_chunk_ms: 1}\n"
+)
 DETECTOR = (
     HEAD + "kind: detector\nweights_uri: hf://a/b@rev\nactions: [detect]\ndetector: {labels: [x]}\n"
 )
@@ -178,8 +181,8 @@ def test_check_says_ok_or_what_is_wrong(rskill, tmp_path, capsys):
         (DETECTOR + "runtime: onnx\n", "runtime 'onnx'"),
         (HEAD + "kind: wam\nweights_uri: hf://a/b\nactions: [grasp]\n", "kind 'wam' is not served"),
         (
-            HEAD
-            + "kind: segmenter\nweights_uri: hf://a/b\nactions: [detect]\nsegmenter: {engine: sam2_hf}\n",
+            HEAD + "kind: segmenter\nweights_uri: hf://a/b\nactions: [detect]\nsegmenter: {engine: "
+            "sam2_hf}\n",
             "kind 'segmenter' is not served",
         ),
     ],
@@ -193,10 +196,12 @@ def test_what_no_sidecar_serves_is_said(text, told):
     "text",
     [
         "kind: playbook\nrole: s2\nactions: [plan]\n"
-        "playbook: {trigger: t, body_uri: ./P.md, composes_tools: [wait], done_predicate: d, max_steps: 3}\n",
+        "playbook: {trigger: t, body_uri: ./P.md, composes_tools: [wait], done_predicate: d, "
+        "max_steps: 3}\n",
         "kind: ros_action\nactions: [reach]\n"
         "actuators_required: [{kind: joint_position, control_mode_semantics: {mode: absolute}}]\n"
-        "ros_integration: {package: p, interface_type: T, interface_name: /t, default_goal_json: '{}'}\n",
+        "ros_integration: {package: p, interface_type: T, interface_name: /t, default_goal_json: "
+        "'{}'}\n",
     ],
 )
 def test_a_kind_without_weights_is_no_sidecars_business(rskill, capsys, text):

@@ -1,4 +1,5 @@
-"""What a sidecar records: each request with its outcome, the loading in it, its own run; in the caller's trace, and whatever ends it."""
+"""What a sidecar records: each request with its outcome, the loading in it, its own run; in the
+caller's trace, and whatever ends it."""
 
 import pytest
 

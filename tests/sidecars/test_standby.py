@@ -1,4 +1,5 @@
-"""A sidecar that was evicted and is on standby: it comes back by itself, or as soon as it may when somebody wants it."""
+"""A sidecar that was evicted and is on standby: it comes back by itself, or as soon as it may when
+somebody wants it."""
 
 import os
 import signal
@@ -114,7 +115,8 @@ def test_the_arbiter_may_be_killed_while_it_is_away(box, arbiter_daemon, arbiter
 def test_it_comes_back_by_itself_although_the_arbiter_was_away_when_it_left(
     box, arbiter_daemon, arbiter
 ):
-    """Regression: its release was said for 5 s; after a longer absence the lease was over here, and kept its room there for its ttl."""
+    """Regression: its release was said for 5 s; after a longer absence the lease was over here, and
+    kept its room there for its ttl."""
     detector = box.start("detector", *DETECTOR, footprint=BOTH)
     policy = box.start("policy", "--min-residency-s", "0", footprint=BOTH)
     left = detector.ask("load")["lease_id"]
@@ -134,7 +136,8 @@ def test_it_comes_back_by_itself_although_the_arbiter_was_away_when_it_left(
 
 
 def test_a_model_that_a_goal_uses_is_not_idle(box, arbiter):
-    """Regression: an idle policy was let go of in the middle of a goal whose arm was still on its way to the start pose."""
+    """Regression: an idle policy was let go of in the middle of a goal whose arm was still on its
+    way to the start pose."""
     policy = box.start("policy", "--idle-release-s", "0.1", "--log-level", "debug", footprint=BOTH)
     held = policy.ask("load")
     goal = {"lease_id": held["lease_id"], "token": held["token"], "use_id": "goal-1"}
@@ -169,7 +172,8 @@ def test_told_to_unload_while_it_waits_it_waits_no_longer(box, arbiter):
 
 
 def test_told_to_unload_while_it_is_called_back_it_is_called_back_no_longer(box, arbiter):
-    """Regression: it did not say that somebody waits for it, so a runner whose goal was canceled did not take its load back."""
+    """Regression: it did not say that somebody waits for it, so a runner whose goal was canceled
+    did not take its load back."""
     detector, policy = sent_away(box, arbiter)
     assert "wanted" not in detector.ask("ping"), "coming back by itself it is wanted by nobody"
     running = policy.hold()
@@ -214,7 +218,8 @@ def test_told_to_unload_while_it_loads_it_takes_the_load_back(box, arbiter):
 def test_a_load_that_is_taken_back_while_the_arbiter_is_told_of_it_is_not_resident(
     box, arbiter_daemon, arbiter
 ):
-    """Regression: `ready` was answered behind the unload, and the sidecar said `resident`, with a token, of a model that was gone."""
+    """Regression: `ready` was answered behind the unload, and the sidecar said `resident`, with a
+    token, of a model that was gone."""
     (box.runtime / "detector-model").mkdir()
     switch = box.runtime / "detector-model" / "slow_load"
     switch.touch()

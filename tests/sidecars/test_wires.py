@@ -1,4 +1,5 @@
-"""The sidecars' wires: both families, REQ and DEALER peers, and everything that strangers may send."""
+"""The sidecars' wires: both families, REQ and DEALER peers, and everything that strangers
+may send."""
 
 import asyncio
 import io
@@ -160,9 +161,8 @@ def test_arrays_go_both_ways_and_objects_never():
     assert (host.calls[0][1].data["observation"]["state"] == np.arange(3.0)).all()
     assert reply["action"]["__ndarray_class__"] is True
     assert msgpack.packb(reply), "nothing but plain values goes to the codec"
-    bomb = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(
-        128, b" "
-    )
+    shape = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }"
+    bomb = (b"\x93NUMPY\x01\x00v\x00" + shape).ljust(128, b" ")
     for bad in (
         npy(np.array([{"a": 1}], dtype=object), allow_pickle=True),
         {"__ndarray_class__": True, "as_npy": b"no array"},
@@ -180,7 +180,8 @@ def test_arrays_go_both_ways_and_objects_never():
 def test_errors_of_the_model_keep_their_type(error):
     (reply,), _ = talk({"op": "detect", "image": PNG, "query": "x", "id": 3}, answer=error)
     assert reply == {
-        "ok": False, "error": f"{type(error).__name__}: {error.message}", "code": error.code, "hint": "", "details": error.details,
+        "ok": False, "error": f"{type(error).__name__}: {error.message}", "code": error.code,
+        "hint": "", "details": error.details,
         "message": error.message, "re": 3,
     }  # fmt: skip
     assert CODES[reply["code"]] is type(error)
@@ -219,7 +220,7 @@ def test_error_replies_have_the_fields_form():
     assert error_reply(ModelError("no", hint="try"))["error"] == "ModelError: no"
 
 
-# -- pictures --------------------------------------------------------------------------------------------------------
+# -- pictures
 def picture(kind, size=(8, 6), mode="RGB"):
     from PIL import Image
 
@@ -245,7 +246,8 @@ def test_what_is_no_picture_or_too_large_is_refused():
     whole = picture("PNG", size=(64, 64))
     for data, told in (
         (b"no picture", "cannot be decoded"), (whole[: len(whole) // 2], "cannot be decoded"),
-        (picture("GIF"), "cannot be decoded"), (picture("PNG", size=(4200, 4200), mode="1"), "4200 x 4200"),
+        (picture("GIF"), "cannot be decoded"),
+        (picture("PNG", size=(4200, 4200), mode="1"), "4200 x 4200"),
     ):  # fmt: skip
         with pytest.raises(BadRequest, match=told):
             decode(data)
@@ -258,7 +260,7 @@ def test_pictures_are_shrunk_never_enlarged():
     assert within(image.new("RGB", (80, 60)), 400).size == (80, 60)
 
 
-# -- on a real socket ------------------------------------------------------------------------------------------------
+# -- on a real socket
 @pytest.mark.e2e
 def test_a_real_sidecar_survives_what_strangers_send(lone_box):
     sidecar = lone_box.start("detector", "--no-arbiter", device="none")

@@ -16,7 +16,8 @@ class Weights:
 
 @pytest.mark.parametrize("typed", [False, True])
 def test_a_failed_load_keeps_none_of_what_it_loaded(typed: bool) -> None:
-    """The sidecar remembers its last error, and an error's traceback keeps the locals of every frame: the memory would not come back."""
+    """The sidecar remembers its last error, and an error's traceback keeps the locals of every
+    frame: the memory would not come back."""
     held: list[weakref.ref[Weights]] = []
 
     def load() -> None:
@@ -45,7 +46,8 @@ def test_a_failed_load_keeps_none_of_what_it_loaded(typed: bool) -> None:
 
 
 def test_work_that_could_not_begin_in_time_never_does_and_stuck_work_is_told() -> None:
-    """Regression: a request behind one that hung in a decoder kept its use of the lease for ever."""
+    """Regression: a request behind one that hung in a decoder kept its use of the lease
+    for ever."""
     let_go, done = threading.Event(), []
 
     async def story() -> None:

@@ -1,4 +1,5 @@
-"""The model's thread stands back behind other programs; the loop that answers `ping` and `revoke` does not."""
+"""The model's thread stands back behind other programs; the loop that answers `ping` and `revoke`
+does not."""
 
 import asyncio
 import os

@@ -1,4 +1,5 @@
-"""Tiny models with random weights, saved as hub checkpoints are, for the production loading path to read back."""
+"""Tiny models with random weights, saved as hub checkpoints are, for the production loading path to
+read back."""
 
 import io
 from pathlib import Path
@@ -9,8 +10,10 @@ from vram_arbiter.schemas.manifest import parse_manifest
 from vram_arbiter.sidecars.weights import resolve
 
 CHAT = (
-    "{%- for message in messages -%}<|im_start|>{{ message.role }}\n{%- for part in message.content -%}"
-    "{%- if part.type == 'image' -%}<|vision_start|><|image_pad|><|vision_end|>{%- else -%}{{ part.text }}{%- endif -%}{%- endfor -%}"
+    "{%- for message in messages -%}<|im_start|>{{ message.role }}\n{%- for part in "
+    "message.content -%}"
+    "{%- if part.type == 'image' -%}<|vision_start|><|image_pad|><|vision_end|>{%- else -%}{{ "
+    "part.text }}{%- endif -%}{%- endfor -%}"
     "<|im_end|>\n{%- endfor -%}{%- if add_generation_prompt -%}<|im_start|>assistant\n{%- endif -%}"
 )
 
@@ -34,7 +37,8 @@ def save_owlvit(folder: Path) -> None:
     letters = bytes_alphabet()
     tokens = ["<pad>", *letters, *(letter + "</w>" for letter in letters), "<start>", "<end>"]
     tokenizer = CLIPTokenizer(
-        vocab={token: index for index, token in enumerate(tokens)}, merges=[], unk_token="<end>", bos_token="<start>",
+        vocab={token: index for index, token in enumerate(tokens)}, merges=[], unk_token="<end>",
+        bos_token="<start>",
         eos_token="<end>", pad_token="<pad>", model_max_length=16,
     )  # fmt: skip
     size = {"height": 64, "width": 64}
@@ -50,7 +54,8 @@ def save_owlvit(folder: Path) -> None:
         "num_attention_heads": 2,
     }
     config = OwlViTConfig(
-        text_config=small | {"vocab_size": len(tokens), "max_position_embeddings": 16, "pad_token_id": 0,
+        text_config=small | {"vocab_size": len(tokens), "max_position_embeddings": 16,
+        "pad_token_id": 0,
                              "bos_token_id": len(tokens) - 2, "eos_token_id": len(tokens) - 1},
         vision_config=small | {"image_size": 64, "patch_size": 16},
         projection_dim=32,
@@ -104,13 +109,18 @@ def save_qwen(folder: Path) -> None:
     ).save_pretrained(folder)
     torch.manual_seed(0)
     config = Qwen3_5Config(
-        text_config={"vocab_size": len(tokenizer), "hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2,
-                     "num_attention_heads": 2, "num_key_value_heads": 1, "head_dim": 16, "linear_key_head_dim": 8,
-                     "linear_value_head_dim": 8, "linear_num_key_heads": 2, "linear_num_value_heads": 2,
+        text_config={"vocab_size": len(tokenizer), "hidden_size": 32, "intermediate_size": 64,
+        "num_hidden_layers": 2,
+                     "num_attention_heads": 2, "num_key_value_heads": 1, "head_dim": 16,
+                     "linear_key_head_dim": 8,
+                     "linear_value_head_dim": 8, "linear_num_key_heads": 2,
+                     "linear_num_value_heads": 2,
                      "layer_types": ["linear_attention", "full_attention"],
-                     "rope_parameters": {"rope_type": "default", "rope_theta": 10000.0, "mrope_section": [2, 1, 1],
+                     "rope_parameters": {"rope_type": "default", "rope_theta": 10000.0,
+                     "mrope_section": [2, 1, 1],
                                          "mrope_interleaved": True, "partial_rotary_factor": 0.5}},
-        vision_config={"depth": 1, "hidden_size": 32, "intermediate_size": 64, "num_heads": 2, "patch_size": 8,
+        vision_config={"depth": 1, "hidden_size": 32, "intermediate_size": 64, "num_heads": 2,
+        "patch_size": 8,
                        "out_hidden_size": 32, "num_position_embeddings": 64},
         image_token_id=ids("<|image_pad|>"), video_token_id=ids("<|video_pad|>"),
         vision_start_token_id=ids("<|vision_start|>"), vision_end_token_id=ids("<|vision_end|>"),
@@ -135,7 +145,8 @@ def save_act(folder: Path) -> None:
             "observation.state": PolicyFeature(FeatureType.STATE, (6,)),
         },
         output_features={"action": PolicyFeature(FeatureType.ACTION, (6,))},
-        pretrained_backbone_weights=None, dim_model=32, n_heads=2, dim_feedforward=32, n_encoder_layers=1,
+        pretrained_backbone_weights=None, dim_model=32, n_heads=2, dim_feedforward=32,
+        n_encoder_layers=1,
         n_vae_encoder_layers=1, chunk_size=5, n_action_steps=5, device="cpu",
     )  # fmt: skip
     ones = torch.ones(6)
@@ -177,8 +188,10 @@ def weights(configs):
 def manifest():
     def manifest(kind: str, more: str):
         return parse_manifest(
-            f"name: test/model\nversion: 0.1.0\nkind: {kind}\nembodiment_tags: [any]\nchunk_size: 1\n"
-            f"weights_uri: local://models/x\ndescription: a tiny model\nlatency_budget: {{per_chunk_ms: 100}}\n{more}"
+            f"name: test/model\nversion: 0.1.0\nkind: {kind}\nembodiment_tags: [any]\nchunk_size: "
+            "1\n"
+            "weights_uri: local://models/x\ndescription: a tiny model\nlatency_budget: "
+            f"{{per_chunk_ms: 100}}\n{more}"
         )
 
     return manifest

@@ -1,4 +1,5 @@
-"""The detector behind transformers' zero-shot classes, loaded as in production from a tiny checkpoint."""
+"""The detector behind transformers' zero-shot classes, loaded as in production from a tiny
+checkpoint."""
 
 import math
 

@@ -22,7 +22,8 @@ def adapter(weights):
     from vram_arbiter.schemas.manifest import parse_manifest
 
     head = (
-        "name: test/model\nversion: 0.1.0\nkind: vla\nembodiment_tags: [any]\nchunk_size: 5\nweights_uri: local://models/x\n"
+        "name: test/model\nversion: 0.1.0\nkind: vla\nembodiment_tags: [any]\nchunk_size: "
+        "5\nweights_uri: local://models/x\n"
         "description: a tiny model\nlatency_budget: {per_chunk_ms: 100}\n"
     )
     adapter = PolicyAdapter(parse_manifest(head + BLOCK + ALIASES), weights("act"))

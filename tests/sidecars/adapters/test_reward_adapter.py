@@ -1,4 +1,5 @@
-"""Reward models behind lerobot's own factory: the shipped one, judged on the simulator's own pictures, and one that knows lerobot's bare question."""
+"""Reward models behind lerobot's own factory: the shipped one, judged on the simulator's own
+pictures, and one that knows lerobot's bare question."""
 
 import dataclasses
 import io
@@ -111,10 +112,11 @@ def test_pictures_that_do_not_go_together_are_refused(shipped: RewardAdapter, pn
         score(shipped, *[png(4000, 4000)[:100]] * 2)  # looked at no further than their headers
 
 
-# -- a reward model that somebody else registers ----------------------------------------------------------------------
+# -- a reward model that somebody else registers
 @pytest.fixture(scope="module")
 def mean_red() -> Any:
-    """lerobot's plug-in convention, with `compute_reward` alone: how red the newest picture is, times `gain`."""
+    """lerobot's plug-in convention, with `compute_reward` alone: how red the newest picture is,
+    times `gain`."""
     import torch
     from lerobot.configs import FeatureType, PolicyFeature
     from lerobot.configs.rewards import RewardModelConfig
@@ -142,8 +144,10 @@ def mean_red() -> Any:
             return batch["observation.images.top"][:, -1, 0].mean((1, 2)) * self.gain
 
     modules = {
-        "configuration_mean_red": {}, "modeling_mean_red": {"MeanRedRewardModel": MeanRedRewardModel},
-        "processor_mean_red": {"make_mean_red_pre_post_processors": lambda config, dataset_stats=None: (lambda batch: batch, None)},
+        "configuration_mean_red": {},
+        "modeling_mean_red": {"MeanRedRewardModel": MeanRedRewardModel},
+        "processor_mean_red": {"make_mean_red_pre_post_processors": lambda config,
+        dataset_stats=None: (lambda batch: batch, None)},
     }  # fmt: skip
     for name, content in modules.items():
         sys.modules[name] = types.ModuleType(name)
@@ -159,8 +163,10 @@ def mean_red() -> Any:
 def reward_manifest(**block: Any) -> RSkillManifest:
     return RSkillManifest.model_validate(
         {
-            "name": "lab/red", "version": "1.0.0", "kind": "reward", "embodiment_tags": ["any"], "chunk_size": 1, "description": "d",
-            "latency_budget": {"per_chunk_ms": 1}, "actions": ["monitor"], "weights_uri": "local://models/x",
+            "name": "lab/red", "version": "1.0.0", "kind": "reward", "embodiment_tags": ["any"],
+            "chunk_size": 1, "description": "d",
+            "latency_budget": {"per_chunk_ms": 1}, "actions": ["monitor"],
+            "weights_uri": "local://models/x",
             "reward": {"frame_window_s": 8, "target_fps": 1, **block},
         }
     )  # fmt: skip

@@ -1,4 +1,5 @@
-"""Detector, scene VLM and policy as real processes with real (tiny) checkpoints and the demo's footprints, under a real daemon on 8 GiB."""
+"""Detector, scene VLM and policy as real processes with real (tiny) checkpoints and the demo's
+footprints, under a real daemon on 8 GiB."""
 
 import subprocess
 import sys
@@ -14,9 +15,13 @@ from vram_arbiter.clients.sidecar import npy
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(400)]
 
 PATIENCE_S = 180.0
-COMMON = "version: 0.1.0\nembodiment_tags: [any]\nchunk_size: 5\ndescription: a tiny model\nlatency_budget: {per_chunk_ms: 100}\n"
+COMMON = (
+    "version: 0.1.0\nembodiment_tags: [any]\nchunk_size: 5\n"
+    "description: a tiny model\nlatency_budget: {per_chunk_ms: 100}\n"
+)
 SKILLS = {
-    "detector": ("so101-detector", "owlvit", "kind: detector\nactions: [detect]\ndetector: {labels: [cube], score_threshold: 0.0}\n"),
+    "detector": ("so101-detector", "owlvit",
+    "kind: detector\nactions: [detect]\ndetector: {labels: [cube], score_threshold: 0.0}\n"),
     "scene-vlm": ("so101-scene-vlm", "qwen", "kind: vlm\nrole: s2\nactions: [query]\n"),
     "grab": (
         "so101-grab", "act",
@@ -37,7 +42,8 @@ def sidecars(arbiter_daemon, configs, weights, tmp_path):
             f"name: vram-arbiter/{skill}\nweights_uri: local://models/{model}\n{COMMON}{block}"
         )
         command = [
-            sys.executable, "-m", "vram_arbiter.sidecars", "--name", name, "--rskill", str(rskill), "--configs", str(configs),
+            sys.executable, "-m", "vram_arbiter.sidecars", "--name", name, "--rskill", str(rskill),
+            "--configs", str(configs),
             "--footprints", str(footprints), "--device", f"fake:{arbiter_daemon.card}",
         ]  # fmt: skip
         environ = {**arbiter_daemon.environ, "OMP_NUM_THREADS": "1"}

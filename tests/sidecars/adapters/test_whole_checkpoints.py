@@ -53,9 +53,11 @@ def save_grounding_dino(folder: Path) -> None:
             image_size=64, embed_dim=8, depths=[1, 1, 1, 1], num_heads=[1, 1, 1, 1], window_size=2,
             out_features=["stage2", "stage3", "stage4"],
         ),
-        text_config=BertConfig(vocab_size=64, hidden_size=16, num_hidden_layers=1, num_attention_heads=2, intermediate_size=16),
+        text_config=BertConfig(vocab_size=64, hidden_size=16, num_hidden_layers=1,
+        num_attention_heads=2, intermediate_size=16),
         encoder_layers=1, decoder_layers=2, d_model=32, encoder_ffn_dim=16, decoder_ffn_dim=16,
-        encoder_attention_heads=2, decoder_attention_heads=2, num_queries=4, encoder_n_points=1, decoder_n_points=1,
+        encoder_attention_heads=2, decoder_attention_heads=2, num_queries=4, encoder_n_points=1,
+        decoder_n_points=1,
     )  # fmt: skip
     GroundingDinoForObjectDetection(config).save_pretrained(folder)
 
@@ -78,8 +80,10 @@ def save_vqbet(folder: Path) -> None:
     from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
 
     config = VQBeTConfig(
-        **features(), pretrained_backbone_weights=None, crop_shape=None, gpt_n_layer=1, gpt_n_head=2, gpt_hidden_dim=16, gpt_input_dim=16,
-        gpt_output_dim=16, vqvae_embedding_dim=8, vqvae_enc_hidden_dim=8, vqvae_n_embed=4, spatial_softmax_num_keypoints=4,
+        **features(), pretrained_backbone_weights=None, crop_shape=None, gpt_n_layer=1,
+        gpt_n_head=2, gpt_hidden_dim=16, gpt_input_dim=16,
+        gpt_output_dim=16, vqvae_embedding_dim=8, vqvae_enc_hidden_dim=8, vqvae_n_embed=4,
+        spatial_softmax_num_keypoints=4,
         use_group_norm=True, gpt_block_size=50,
     )  # fmt: skip
     VQBeTPolicy(config).save_pretrained(folder)
@@ -122,7 +126,10 @@ def save_smolvla(folder: Path) -> None:
 
 
 def shipped(name: str) -> Callable[[Path], None]:
-    return lambda folder: shutil.copytree(CONFIGS / "models" / name, folder, dirs_exist_ok=True)  # type: ignore[arg-type,func-returns-value]
+    def copy(folder: Path) -> None:
+        shutil.copytree(CONFIGS / "models" / name, folder, dirs_exist_ok=True)
+
+    return copy
 
 
 def load_detector(weights: Weights, device: str) -> Any:
@@ -169,7 +176,8 @@ OTHERS: dict[str, Callable[[Path], None]] = {
     "shipped detector": shipped("so101-detector"),
     "shipped vlm": shipped("so101-scene-vlm"),
 }
-MODELS: dict[str, tuple[Callable[[Weights, str], Any], str]] = {  # how it is loaded, and a part that it does not work without
+MODELS: dict[str, tuple[Callable[[Weights, str], Any],
+str]] = {  # how it is loaded, and a part that it does not work without
     "act": (load_policy, "model.action_head"),
     "vqbet": (load_policy, "vqbet.action_head"),
     "smolvla": (load_policy, "model.action_out_proj"),
@@ -347,7 +355,8 @@ def test_check_compares_the_weights_and_ends_with_2(
     for name in ("so101-grab", "so101-detector"):
         shutil.copytree(CONFIGS / "models" / name, tmp_path / "models" / name)
         flags = [
-            "--name", "x", "--rskill", str(CONFIGS / f"rskills/{name}/rskill.yaml"), "--device", "none",
+            "--name", "x", "--rskill", str(CONFIGS / f"rskills/{name}/rskill.yaml"), "--device",
+            "none",
             "--configs", str(tmp_path), "--footprint", "1GB", "--check",
         ]  # fmt: skip
         assert main(flags) == 0

@@ -1,4 +1,5 @@
-"""The writer on a simulated card: real processes, real files, real kills; the daemon's reader and the checker look on."""
+"""The writer on a simulated card: real processes, real files, real kills; the daemon's reader and
+the checker look on."""
 
 import os
 import signal
@@ -25,7 +26,8 @@ from pathlib import Path
 from vram_arbiter.schemas.fakegpu import SimulatedOutOfMemory
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
-memory, dice, blocks, refused = FakeMemory(Path(sys.argv[1]), "contender", 10 << 20), random.Random(int(sys.argv[2])), [], 0
+memory, dice = FakeMemory(Path(sys.argv[1]), "contender", 10 << 20), random.Random(int(sys.argv[2]))
+blocks, refused = [], 0
 for _ in range(60):
     if blocks and dice.random() < 0.4:
         memory.free(blocks.pop(dice.randrange(len(blocks))))

@@ -1,4 +1,5 @@
-"""The detector's training script: labels on the patch grid, queries, a whole smoke run, and the shipped checkpoint."""
+"""The detector's training script: labels on the patch grid, queries, a whole smoke run, and the
+shipped checkpoint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The policy trainer's code path in seconds: recorded arrays in, a checkpoint that lerobot's own factory loads out."""
+"""The policy trainer's code path in seconds: recorded arrays in, a checkpoint that lerobot's own
+factory loads out."""
 
 import json
 from pathlib import Path

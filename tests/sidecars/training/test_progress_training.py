@@ -1,4 +1,5 @@
-"""The progress trainer's code path in seconds: recorded pictures in, a checkpoint that lerobot's own factory loads out."""
+"""The progress trainer's code path in seconds: recorded pictures in, a checkpoint that lerobot's
+own factory loads out."""
 
 import json
 from pathlib import Path
@@ -18,7 +19,8 @@ COLOURS = {"red cube": (220, 30, 30), "blue ball": (30, 30, 220)}
 
 
 def write_grabs(folder: Path, episodes: int = 10, length: int = 6) -> None:
-    """Grabs in which a coloured square grows: the wider, the farther; in the last picture of every other one it is held."""
+    """Grabs in which a coloured square grows: the wider, the farther; in the last picture of every
+    other one it is held."""
     rng = np.random.default_rng(0)
     images, info = [], []
     for number in range(episodes):

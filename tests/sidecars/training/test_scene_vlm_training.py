@@ -1,4 +1,5 @@
-"""The scene VLM's training script: true answers, its own image path against the library's, a smoke run, the checkpoint."""
+"""The scene VLM's training script: true answers, its own image path against the library's, a smoke
+run, the checkpoint."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ NAMES = ["blue ball", "blue cube", "red ball", "red cube"]
 
 
 def draw_dataset(folder: Path, scenes: int) -> Path:
-    """A gripper of two bars with or without something between them, labelled as the simulator's writer does."""
+    """A gripper of two bars with or without something between them, labelled as the simulator's
+    writer does."""
     from PIL import Image, ImageDraw
 
     rng = random.Random("drawn")
@@ -164,5 +166,6 @@ def test_the_shipped_checkpoint_tells_held_from_empty_and_from_another(tmp_path:
             assert env.held_object() == target, "the scripted expert failed: choose another seed"
             expect("Yes", target, env)
             expect("No", other, env)
-    # 18 questions; the model card gives 98 % over all and 95 % while another thing of the same colour is held
+    # 18 questions; the model card gives 98 % over all and 95 % while another thing of the same
+    # colour is held
     assert len(wrong) <= 2, wrong
