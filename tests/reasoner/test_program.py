@@ -10,7 +10,14 @@ from typing import Any
 
 import pytest
 
-NOBODY = ["--runner", "ipc:///proc/none/runner.sock", "--detector", "none", "--scene-vlm", "none"]
+UNKNOWN_BODY = [
+    "--runner",
+    "ipc:///proc/none/runner.sock",
+    "--detector",
+    "none",
+    "--scene-vlm",
+    "none",
+]
 
 
 def reasoner(runtime: Path, *arguments: str, **environ: str) -> subprocess.CompletedProcess[str]:
@@ -32,14 +39,19 @@ def test_usage(tmp_path: Path) -> None:
     assert ended.returncode == 3
     assert "no reasoner answers" in ended.stderr
     ended = reasoner(
-        tmp_path, "--task", "grab the cube", "--playbook", "/nonexistent/rskill.yaml", *NOBODY
+        tmp_path, "--task", "grab the cube", "--playbook", "/nonexistent/rskill.yaml", *UNKNOWN_BODY
     )
     assert ended.returncode == 2
     assert "cannot be read" in ended.stderr
     assert "Traceback" not in ended.stderr
     written(tmp_path)
     ended = reasoner(
-        tmp_path, "--task", "grab the cube", "--playbook", str(tmp_path / "rskill.yaml"), *NOBODY
+        tmp_path,
+        "--task",
+        "grab the cube",
+        "--playbook",
+        str(tmp_path / "rskill.yaml"),
+        *UNKNOWN_BODY,
     )
     assert ended.returncode == 2
     assert "a playbook is read by a language model (--planner openai or anthropic)" in ended.stderr
@@ -60,7 +72,7 @@ def test_what_is_wrong_from_the_start_is_said_at_the_start(
     tmp_path: Path, arguments: list[str], said: str
 ) -> None:
     """Before the runner is waited for, and before an episode whose result could not be written."""
-    there = ["--listen", f"ipc://{tmp_path}/reasoner.sock", *NOBODY]
+    there = ["--listen", f"ipc://{tmp_path}/reasoner.sock", *UNKNOWN_BODY]
     ended = reasoner(tmp_path, *there, *arguments)
     assert ended.returncode == 2
     assert said in ended.stderr
@@ -142,11 +154,11 @@ def test_a_task_that_is_no_text_and_a_result_that_has_no_place_are_said_before_a
     """Regression: an undecodable byte, or a task of many pages, ended in a traceback; a result file that could not be written in one
     behind the episode."""
     for task in ("grab the \udcff cube", "grab the " + "very " * 2000 + "red cube"):
-        ended = reasoner(tmp_path, "--task", task, *NOBODY)
+        ended = reasoner(tmp_path, "--task", task, *UNKNOWN_BODY)
         assert (ended.returncode, "Traceback" in ended.stderr) == (2, False), ended.stderr
         assert ended.stderr.startswith("vram-reasoner: the task ")
     (tmp_path / "file").touch()
     for place in (tmp_path / "file" / "r.json", tmp_path):
-        ended = reasoner(tmp_path, "--task", "grab the cube", "--result", str(place), *NOBODY)
+        ended = reasoner(tmp_path, "--task", "grab the cube", "--result", str(place), *UNKNOWN_BODY)
         assert (ended.returncode, "Traceback" in ended.stderr) == (2, False), ended.stderr
         assert f"--result {place} cannot be written" in ended.stderr

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from vram_arbiter.schemas.body import NOBODY, Body, read_body
+from vram_arbiter.schemas.body import UNKNOWN_BODY, Body, read_body
 from vram_arbiter.schemas.manifest import RSkillManifest
 
 BASE: dict[str, Any] = {
@@ -29,12 +29,12 @@ def skill(tags: list[str], **needs: Any) -> RSkillManifest:
 def test_tags() -> None:
     assert ARM.misfit(skill(["so101_follower"])) == ""
     assert ARM.misfit(skill(["franka_panda", "so101_follower"])) == ""
-    assert ARM.misfit(skill(["any"])) == NOBODY.misfit(skill(["any"])) == ""
+    assert ARM.misfit(skill(["any"])) == UNKNOWN_BODY.misfit(skill(["any"])) == ""
     assert (
         ARM.misfit(skill(["franka_panda", "ur5e"]))
         == "it is made for franka_panda or ur5e; this robot is so101_follower"
     )
-    assert "does not say what it is" in NOBODY.misfit(skill(["so101_follower"]))
+    assert "does not say what it is" in UNKNOWN_BODY.misfit(skill(["so101_follower"]))
     assert ARM.misfit(skill(["multi"])), "several robots, and nobody says that this is one of them"
 
 
@@ -89,7 +89,7 @@ VALUES = st.booleans() | st.integers(-3, 3) | st.floats(allow_infinity=True) | s
 def test_a_robot_that_says_less_never_fits_more(wanted: Any, have: Any) -> None:
     manifest = skill(["any"], thing=wanted)
     fits = not Body(capabilities={} if have is None else {"thing": have}).misfits(manifest)
-    if not NOBODY.misfits(manifest):
+    if not UNKNOWN_BODY.misfits(manifest):
         assert wanted is False, "only what must not be there is fitted by silence"
     if fits and wanted is not False:
         assert have is not None
@@ -106,4 +106,4 @@ def test_a_body_from_a_stranger() -> None:
         {"tags": []},
         {"capabilities": {"x": []}},
     ):
-        assert read_body(broken) == NOBODY
+        assert read_body(broken) == UNKNOWN_BODY
