@@ -1,6 +1,7 @@
-"""`vram-reasoner`: run one task with the runner and the sidecars that are there; or speak to one that runs.
+"""`vram-reasoner`: run one task with the present runner and sidecars, or message a running one.
 
-Exit codes: 0 the task succeeded, 1 it failed, 2 wrong usage or configuration, 3 the runner, or the reasoner that was spoken to, cannot be reached.
+Exit codes: 0 the task succeeded, 1 it failed, 2 wrong usage or configuration, 3 the runner, or the
+addressed reasoner, cannot be reached.
 """
 
 import argparse
@@ -73,7 +74,8 @@ def _parser() -> argparse.ArgumentParser:
         "--planner",
         choices=("scripted", *LLM_PLANNERS),
         default="scripted",
-        help="openai, anthropic: VRAM_REASONER_LLM_{BASE_URL,MODEL,API_KEY,TIMEOUT_S,MAX_TOKENS} say where",
+        help="openai, anthropic: VRAM_REASONER_LLM_{BASE_URL,MODEL,API_KEY,TIMEOUT_S,MAX_TOKENS}"
+        " configure them",
     )
     parser.add_argument(
         "--playbook",
@@ -86,12 +88,13 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         choices=MANAGED,
-        help="a sidecar that the planner may load and unload (repeat; default: none, the arbiter decides)",
+        help="a sidecar that the planner may load and unload (repeatable;"
+        " default: none, the arbiter decides)",
     )
     parser.add_argument(
         "--allow-noncommercial",
         action="store_true",
-        help="also use models whose licence forbids commercial use",
+        help="also use models whose license forbids commercial use",
     )
     parser.add_argument(
         "--listen", help="where to hear --say and --cancel (default: ipc://RUNTIME/reasoner.sock)"
@@ -113,7 +116,8 @@ def _parser() -> argparse.ArgumentParser:
         nargs="?",
         const="",
         metavar="ENDPOINT",
-        help="there is a reward model to ask for progress (default endpoint: ipc://RUNTIME/reward.sock); without this flag there is none",
+        help="ask a reward model for progress (default endpoint: ipc://RUNTIME/reward.sock);"
+        " without this flag there is none",
     )
     parser.add_argument(
         "--reward-camera", default="wrist", help="which camera it looks at (default: %(default)s)"
@@ -166,7 +170,7 @@ def _check_task(task: str) -> None:
     try:
         task.encode()
     except UnicodeEncodeError:
-        raise BadRequest("the task is no text: it has bytes that are not UTF-8") from None
+        raise BadRequest("the task has bytes that are not UTF-8") from None
 
 
 def _complain(error: VramError, code: int) -> int:
@@ -255,7 +259,11 @@ async def _judge(
     manifests: list[RSkillManifest],
     stack: contextlib.AsyncExitStack,
 ) -> Judge:
-    """The reward model with its pictures, taken on a connection of their own as often as its manifest wants them."""
+    """Return the reward model with a history of pictures, taken as often as its manifest wants
+    them.
+
+    The pictures have a connection of their own.
+    """
     camera = arguments.reward_camera
     eyes = await stack.enter_async_context(RunnerClient(_endpoint(arguments.runner, "runner")))
     rates = [manifest.reward.target_fps for manifest in manifests if manifest.reward is not None]
@@ -269,7 +277,9 @@ async def _judge(
 
 
 def _checked(arguments: argparse.Namespace) -> LlmConfig | None:
-    """What would otherwise be found out after the runner was waited for, or after the whole episode. Raises ConfigError."""
+    """Raise ConfigError for mistakes that would otherwise show late: after the wait or the
+    episode.
+    """
     if not arguments.task.strip():
         raise ConfigError("--task says nothing", hint='e.g. --task "grab the red cube"')
     path: Path | None = arguments.result

@@ -1,8 +1,9 @@
-"""The episode as a conversation, for any language model: what was called, what came of it, what was said from outside.
+"""The episode as a conversation for any language model: calls, outcomes, messages from outside.
 
-The answers of `locate_in_view` and `query_scene` are prompts in their own right: they go back to the planner with their source and with
-what they mean, so that *not seen*, *evicted*, *no frame* and *error* stay four different things. Words of a model or of the
-scene are data inside a JSON text, cut to `ANSWER_MAX_CHARS`; only an operator's words are told as words. Knows no API.
+The answers of `locate_in_view` and `query_scene` are prompts in their own right: they go back to
+the planner with their source and their meaning, so that *not seen*, *evicted*, *no frame* and
+*error* stay four different things. Text from a model or from the scene is data inside a JSON text,
+cut to `ANSWER_MAX_CHARS`; only an operator's text is passed as a message. Must not know an API.
 """
 
 import json
@@ -35,8 +36,10 @@ MEANING: dict[Status, str] = {
     "failed": "the goal ended without success",
     "canceled": "the goal was called off before its end",
     "done": "it was done",
-    "evicted": "nothing was looked at: the model had to leave the card. This says nothing about the scene; try again",
-    "no_frame": "nothing was looked at: no picture is fresh enough. This says nothing about the scene",
+    "evicted": "nothing was looked at: the model had to leave the GPU."
+    " This says nothing about the scene; try again",
+    "no_frame": "nothing was looked at: no picture is fresh enough."
+    " This says nothing about the scene",
     "refused": "this call is not allowed or not understood; nothing was done",
     "error": "it could not be done. This says nothing about the scene",
 }
@@ -86,7 +89,7 @@ Turn = Words | Called | Answered | Thought
 
 
 def conversation(episode: Episode, palette: Palette) -> list[Turn]:
-    """Task, steps and notes in the order in which they happened; a goal that runs comes last, with nothing to show yet."""
+    """Return task, steps and notes in order; a running goal comes last, without an outcome yet."""
     turns: list[Turn] = [Words(episode.task)]
     notes = list(episode.notes)
     for number, step in enumerate(episode.steps):
@@ -120,7 +123,7 @@ def _step(number: int, step: Step, palette: Palette) -> list[Turn]:
 
 
 def told(call: ToolCall, outcome: Outcome) -> dict[str, Any]:
-    """An outcome as a model reads it: status, its meaning, who says so, the words, the numbers."""
+    """Return an outcome for a model: status, its meaning, source, text, numbers."""
     source = SOURCE.get(type(call), "reasoner")
     fields = {
         "status": outcome.status,
@@ -134,7 +137,9 @@ def told(call: ToolCall, outcome: Outcome) -> dict[str, Any]:
 
 
 def _told_data(data: Mapping[str, Any]) -> dict[str, Any]:
-    """A skill's or a model's own data, as JSON can say it and no longer than an answer may be; what is left out is said to be."""
+    """Return data of a skill or model as JSON within the limit of an answer; mark what is left
+    out.
+    """
     fields: dict[str, Any] = {}
     left = 2 * ANSWER_MAX_CHARS
     for key, value in _sayable(data).items():

@@ -1,6 +1,7 @@
-"""The last minute of one camera, for whoever has to judge progress: pictures with the time they were taken, never older than asked for.
+"""The last minute of one camera, for a model that judges progress: pictures with their times.
 
-Kept only where a reward model is given: nobody else pays for it. A camera that gives nothing leaves a gap, and a gap stays a gap.
+Kept only where a reward model is configured. A camera without pictures leaves a gap, and a gap
+stays a gap.
 """
 
 import asyncio
@@ -18,7 +19,8 @@ log = logging.getLogger(__name__)
 RATE_HZ = 2.0  # where the reward model's manifest is not installed
 RATE_MAX_HZ = 5.0  # the runner renders and encodes each one
 KEPT_MAX = 512
-SHOWN_MAX = 8  # to the model at once, as the field's clients do; the oldest and the newest are always among them
+# to the model at once, as other clients do; the oldest and the newest are always among them
+SHOWN_MAX = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +36,10 @@ class Taken:
 
 
 class Past:
-    """`look` gives the camera's newest picture, or raises. `run` looks at `rate_hz` until cancelled; `add` takes a picture that somebody else got."""
+    """`look` returns the camera's newest picture, or raises.
+
+    `run` looks at `rate_hz` until canceled; `add` takes a picture that was fetched elsewhere.
+    """
 
     def __init__(
         self, look: Callable[[], Awaitable[FrameReply]], *, rate_hz: float = RATE_HZ
@@ -57,7 +62,7 @@ class Past:
             await asyncio.sleep(self._period_s)
 
     async def look(self) -> Taken:
-        """The newest picture, which is kept, too. Raises FrameStale and what else the runner says."""
+        """Fetch and keep the newest picture. Raises FrameStale and what else the runner raises."""
         frame = await self._look()
         taken = Taken(_now_s() - frame["age_ms"] / 1e3, frame["data"])
         self.add(taken)

@@ -1,6 +1,6 @@
-"""What reaches a running episode from outside, past the planner: an operator's words, a cancel, a danger.
+"""Messages to a running episode that bypass the planner: an operator's text, a cancel, a danger.
 
-Bounded: words beyond `WORDS_MAX` push the oldest words out; a cancel or a danger is never dropped.
+Bounded: texts beyond `WORDS_MAX` drop the oldest ones; a cancel or a danger is never dropped.
 """
 
 import asyncio
@@ -21,14 +21,14 @@ class Said:
 
 @dataclass(frozen=True, slots=True)
 class Cancel:
-    """End the episode: the goal is cancelled, the planner is not asked."""
+    """End the episode: the goal is canceled, the planner is not asked."""
 
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class Danger:
-    """Something that concerns safety. `stop` ends the episode; otherwise the planner is told at once."""
+    """Report a danger. `stop` ends the episode; otherwise the planner learns of it at once."""
 
     text: str
     stop: bool

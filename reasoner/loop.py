@@ -1,12 +1,14 @@
-"""The reasoner's loop: ask the planner, check the palette, dispatch, remember. It knows neither VRAM nor any model.
+"""Loop of the reasoner: ask the planner, check the palette, dispatch, remember.
 
-Nothing waits for the planner (perhaps a language model that hangs): planner and tool are two tasks, and the loop wakes for whichever
-comes first, for them or for the inbox. A result, a cancel or a danger that comes while the planner thinks is taken at once; what the
-planner was asked is out of date then, so it is asked again. While a goal runs the planner is asked only when an operator
-said something, and may let the goal go on, stop it, or end the episode.
+It knows neither VRAM nor any model. Nothing waits for the planner (perhaps a language model that
+hangs): planner and tool are two tasks, and the loop wakes for the first event of them or of the
+inbox. A result, a cancel or a danger that comes while the planner thinks is taken at once; the
+planner's question is out of date then, so it is asked again. While a goal runs the planner is asked
+only when an operator sent a text, and may let the goal continue, stop it, or end the episode.
 
-Traced as `reasoner.tick`: from the first question to what came of the answer, with every `reasoner.plan` (also those whose answer came
-too late) and the `reasoner.tool` within it; the tool's calls carry it on to the runner and the sidecars.
+Traced as `reasoner.tick`: from the first question to the outcome, with every `reasoner.plan` (also
+outdated ones) and the `reasoner.tool` within it; the tool's calls carry the trace on to the runner
+and the sidecars.
 """
 
 import asyncio
@@ -45,8 +47,8 @@ LOOKS_IN_A_ROW_MAX = (
 )
 THINK_MAX_S = 300.0  # a decision, with all retries of the planner's own
 NOTES_MAX = 64  # the oldest are forgotten
-SUPERSEDED_MAX = 3  # whoever speaks all the time does not keep the planner from ever deciding
-STOP_MAX_S = 15.0  # at the end, for a goal that was cancelled to say so
+SUPERSEDED_MAX = 3  # an operator that keeps sending texts must not keep the planner from deciding
+STOP_MAX_S = 15.0  # at the end, for a canceled goal to report
 
 Dispatch = Callable[[ToolCall], Awaitable[Outcome]]
 
@@ -91,9 +93,9 @@ async def run_episode(
     steps_max: int = STEPS_MAX,
     think_max_s: float = THINK_MAX_S,
 ) -> Result:
-    """Run one task to its end. Never raises for what a planner or a tool does: the result says how it ended.
+    """Run one task to its end. Never raises for a planner or a tool: the result tells how it ended.
 
-    A cancelled episode cancels its goal and waits for it, at most `STOP_MAX_S`.
+    A canceled episode cancels its goal and waits for it, at most `STOP_MAX_S`.
     """
     loop = _Loop(
         Episode(task), planner, palette, dispatch, inbox or Inbox(), steps_max, think_max_s
@@ -130,7 +132,10 @@ class _Loop:
         self._tick: Span | None = None
 
     async def run(self) -> Finish:
-        """1. Ask whoever is to be asked. 2. Wait for the first news of any kind. 3. Take all of it, the urgent first."""
+        """1. Ask the planner if it is due.
+
+        2. Wait for the first event. 3. Take all events, urgent ones first.
+        """
         message = asyncio.create_task(self._inbox.wait())
         try:
             while self._ask():
@@ -153,7 +158,7 @@ class _Loop:
         assert self._finish is not None, "only an end stops the asking"
         return self._finish
 
-    # -- 1 -------------------------------------------------------------------------------------------------------------
+    # -- 1
     def _ask(self) -> bool:
         """Whether the episode goes on."""
         if self._finish is not None:
@@ -209,7 +214,7 @@ class _Loop:
             self._tick.end()
         self._tick = None
 
-    # -- 3 -------------------------------------------------------------------------------------------------------------
+    # -- 3
     def _take_messages(self) -> None:
         for item in self._inbox.take():
             match item:
@@ -237,7 +242,7 @@ class _Loop:
 
     def _take_outcome(self) -> None:
         assert self._acting is not None, "only called when it is done"
-        assert self._call is not None, "whoever acts does something"
+        assert self._call is not None, "a decision to act has a call"
         outcome = (
             Outcome("canceled", "called off", "cancelled")
             if self._acting.cancelled()
@@ -276,7 +281,9 @@ class _Loop:
             self._begin(decision)
 
     def _decided_beside(self, decision: ToolCall | Finish) -> None:
-        """A goal runs: it goes on unless the decision says clearly that it should not. A planner that failed says nothing."""
+        """Continue the goal unless the decision clearly ends it. A failed planner decides
+        nothing.
+        """
         match decision:
             case Finish() if not isinstance(decision, _NoDecision):
                 self._finish = decision
@@ -314,7 +321,7 @@ class _Loop:
             )
         return None
 
-    # -- ends --------------------------------------------------------------------------------------------------------
+    # -- ends
     def _forget_decision(self) -> None:
         if self._thinking is not None:
             self._thinking.cancel()
@@ -323,7 +330,7 @@ class _Loop:
         self.episode.running = None
 
     def _call_off(self) -> None:
-        """Once: a second cancellation would end the wait for the goal's end."""
+        """Cancel once: a second cancellation would end the wait for the goal's end."""
         if self._acting is not None and not self._acting.cancelling():
             self._acting.cancel()
 
@@ -344,7 +351,7 @@ class _Loop:
 
 
 def _look_away(task: "asyncio.Task[Any]") -> None:
-    """Retrieve an exception that nobody waits for any more."""
+    """Retrieve the exception of a task that is no longer awaited."""
     if not task.cancelled() and (error := task.exception()) is not None:
         log.warning("a decision that was not waited for failed: %r", error)
 

@@ -1,9 +1,10 @@
-"""Which tools and skills a planner may use: a skill is executable only if its *kind* is on the allow-list.
+"""Tools and skills that a planner may use: executable only if their *kind* is on the allow-list.
 
-A detector, a scene VLM or a reward model can never be executed as an action, whatever its role says: they are reached through
-`locate_in_view`, `query_scene` and `query_task_progress`, and only if those are provided. A playbook is read, not executed. A model that was made
-for another robot, or that needs what this one lacks, is listed and refused with the reason. What is offered and what is accepted come from
-the same fields; `check` is asked again for each call, whoever made it.
+A detector, a scene VLM or a reward model can never be executed as an action, whatever its role:
+they are reached through `locate_in_view`, `query_scene` and `query_task_progress`, and only if
+those are provided. A playbook is read, not executed. A model for another robot, or one that needs
+what this one lacks, is listed and refused with the reason. What is offered and what is accepted
+come from the same fields; `check` is asked again for each call.
 """
 
 import dataclasses
@@ -67,8 +68,9 @@ class Skill:
 class Palette:
     """`can_locate`, `can_query` and `can_judge` are independent: different sidecars provide them.
 
-    `managed` names the components that `lifecycle_transition` may touch, `topics` where `emit_prompt` may speak; empty: the tool is not
-    there. `only` narrows all of it to the tools that a playbook composes; None does not.
+    `managed` names the components that `lifecycle_transition` may touch, `topics` where
+    `emit_prompt` may publish; empty: the tool is not there. `only` restricts all of it to the tools
+    that a playbook composes; None does not.
     """
 
     skills: tuple[Skill, ...]
@@ -79,7 +81,9 @@ class Palette:
     topics: frozenset[str] = frozenset()
     only: frozenset[str] | None = None
     benched: frozenset[str] = field(default_factory=frozenset)
-    """Skills that could not be started several times in a row: not offered, and refused, for the rest of the episode."""
+    """Refuse skills that could not be started several times in a row, for the rest of the
+    episode.
+    """
 
     @property
     def executable(self) -> dict[str, Skill]:
@@ -131,7 +135,7 @@ class Palette:
             else dataclasses.replace(self, benched=frozenset(benched))
         )
 
-    # -- is a call allowed? ----------------------------------------------------------------------------------------
+    # -- is a call allowed?
     def check(self, call: ToolCall, *, goal_runs: bool = False) -> CallerError | None:
         """Why a call is not allowed, or None."""
         if isinstance(call, Wait | StopGoal):
@@ -165,11 +169,12 @@ class Palette:
             case LifecycleTransition() if call.node not in self.managed:
                 return NotPermitted(
                     f"{call.node} may not be managed by this reasoner",
-                    hint=f"it may manage {_list(self.managed)}; the arbiter decides what is resident",
+                    hint=f"it may manage {_list(self.managed)};"
+                    " the arbiter decides what is resident",
                 )
             case EmitPrompt() if call.target_topic not in self.topics:
                 return NotPermitted(
-                    f"nobody may be prompted at {call.target_topic}",
+                    f"prompts to {call.target_topic} are not allowed",
                     hint=f"choose from {_list(self.topics)}",
                 )
             case _:
@@ -189,7 +194,7 @@ class Palette:
             )
         known = next((known for known in self.skills if known.id == call.rskill_id), None)
         if known is None:
-            return UnknownSkill(f"there is no skill {call.rskill_id}", hint=choose)
+            return UnknownSkill(f"unknown skill {call.rskill_id}", hint=choose)
         if known.kind not in EXECUTABLE_KINDS:
             how = _USED_AS.get(known.kind, "nothing here runs this kind")
             return NotPermitted(
@@ -200,15 +205,20 @@ class Palette:
         return NotPermitted(f"{known.id} could not be started several times", hint=choose)
 
     def permits(self, rskill_id: str) -> CallerError | None:
-        """Whether the model that a perception sidecar says it serves may be asked. A model that is not listed here is its operator's business."""
+        """Return whether the model that a perception sidecar serves may be asked.
+
+        A model that is not listed here is its operator's responsibility.
+        """
         for skill in self.skills:
             if skill.id == rskill_id and skill.barred:
                 return NotPermitted(f"{rskill_id} must not be used: {skill.barred}")
         return None
 
-    # -- what is offered, and how it is read back ---------------------------------------------------------------
+    # -- what is offered, and how it is read back
     def functions(self, *, goal_runs: bool = False) -> list[dict[str, Any]]:
-        """OpenAI-style descriptions of what is allowed now: one function for each executable skill, and the other tools."""
+        """Return OpenAI-style descriptions of the tools and executable skills that are allowed
+        now.
+        """
         if goal_runs:
             return function_schemas(sorted(WHILE_A_GOAL_RUNS))
         tools = self.tools
@@ -233,7 +243,10 @@ class Palette:
         return offered
 
     def parse(self, name: str, arguments: str | Mapping[str, Any]) -> ToolCall:
-        """Read a call by the name under which it was offered, or by the tool's own. Raises UnknownOp and BadRequest."""
+        """Read a call by the name of its offer, or by the tool's own.
+
+        Raises UnknownOp and BadRequest.
+        """
         for skill in self.skills:
             if skill_tool_name(skill.id) == name:
                 call = parse_skill_call(skill.id, arguments)
@@ -254,8 +267,12 @@ def palette_of(
     topics: Iterable[str] = (),
     body: Body = UNKNOWN_BODY,
 ) -> Palette:
-    """Palette of installed manifests. Templates, models that do not fit the robot's `body` and, unless allowed, those whose licence forbids
-    commercial use are listed but barred. A robot that does not say what it is gets what is made for any."""
+    """Return the palette of installed manifests.
+
+    Templates, models that do not fit the robot's `body` and, unless allowed, those whose license
+    forbids commercial use are listed but barred. A robot without a described body gets what fits
+    any body.
+    """
     skills = (
         tuple(  # by name: the same skills read from folders in another order are the same prompt
             Skill(
@@ -285,9 +302,12 @@ def _barred(manifest: RSkillManifest, allow_noncommercial: bool) -> str:
         return "its manifest is still the template"
     if manifest.kind in EXECUTABLE_KINDS and manifest.role is not Role.S1:
         return f"its role is {manifest.role}, and only {Role.S1} acts"
-    weightless = manifest.weights_uri is None  # nothing that a licence of weights could be about
+    weightless = manifest.weights_uri is None  # no weights, no license of weights
     if not weightless and not allow_noncommercial and not manifest.is_commercial_use_allowed:
-        return f"its licence ({manifest.license}) does not allow commercial use; --allow-noncommercial lets it"
+        return (
+            f"its license ({manifest.license}) does not allow commercial use;"
+            " --allow-noncommercial lets it"
+        )
     return ""
 
 

@@ -1,7 +1,8 @@
-"""Do a call's goal parameters fit the schema in the skill's manifest? A check before anything is sent to the robot.
+"""Check of a call's goal parameters against the schema in the skill's manifest, before sending.
 
-The part of JSON Schema that manifests use: `type`, `properties`, `required`, `additionalProperties: false`, `enum`, `items`,
-`minItems`, `maxItems`, `minimum`, `maximum`. Other keywords are left to the skill, which checks its goal anyhow.
+Covers the part of JSON Schema that manifests use: `type`, `properties`, `required`,
+`additionalProperties: false`, `enum`, `items`, `minItems`, `maxItems`, `minimum`, `maximum`. Other
+keywords are left to the skill, which checks its goal as well.
 """
 
 from collections.abc import Mapping

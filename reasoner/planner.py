@@ -1,7 +1,8 @@
-"""What a planner is: it reads the episode so far and decides the next tool call, or that the episode is over.
+"""Interface of planners: read the episode so far, decide the next tool call or the end.
 
-Pure data and one protocol. Planners never touch sockets, models or leases: `reasoner.tools` does the calls, and no decision of a
-planner can put bytes on a GPU other than through a sidecar that holds a lease.
+Pure data and one protocol. Planners never touch sockets, models or leases: `reasoner.tools` makes
+the calls, and a planner's decision can put bytes on a GPU only through a sidecar that holds a
+lease.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,7 @@ Status = Literal[
     "failed",  # execute_rskill ended without success
     "canceled",  # execute_rskill was called off, by the planner or by a person
     "done",  # lifecycle_transition, emit_prompt
-    "evicted",  # the model was made to leave: says nothing about the scene
+    "evicted",  # the model was evicted: says nothing about the scene
     "no_frame",  # no picture young enough
     "refused",  # not allowed, or not understood
     "error",  # anything else; `code` says what
@@ -46,7 +47,9 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """Something said from outside while the episode ran. `after` counts the steps that were over by then."""
+    """A message from outside during the episode. `after` counts the steps that were over by
+    then.
+    """
 
     source: Literal["operator", "safety"]
     text: str
@@ -69,7 +72,9 @@ class Episode:
     steps: list[Step] = field(default_factory=list)
     notes: list[Note] = field(default_factory=list)
     running: ToolCall | None = None
-    """The goal that runs while the planner is asked: only `wait`, `stop_goal` and the end can be decided then."""
+    """The goal that runs while the planner is asked: only `wait`, `stop_goal` and the end are
+    valid.
+    """
 
     def attempts(self, manipulation: frozenset[str]) -> int:
         """How many goals of the skills named in `manipulation` were executed."""
@@ -97,17 +102,19 @@ def _executed(step: Step, manipulation: frozenset[str]) -> bool:
 
 
 class Planner(Protocol):
-    """Decides what happens next. May take long (a language model): the loop stays responsive meanwhile.
+    """Decides the next step. May take long (a language model): the loop stays responsive meanwhile.
 
-    A decision that came too late is thrown away and asked for again, with what has happened meanwhile: `decide` must not count
-    its calls. Raises LlmError when no decision can be had.
+    An outdated decision is discarded and asked for again, with what has happened meanwhile:
+    `decide` must not count its calls. Raises LlmError when no decision can be had.
     """
 
     async def decide(self, episode: Episode) -> ToolCall | Finish: ...
 
 
 def benched(steps: Sequence[Step]) -> frozenset[str]:
-    """Skills whose sidecar could not be started `UNSTARTABLE_MAX` times in a row: not worth another try in this episode."""
+    """Return skills whose sidecar failed to start `UNSTARTABLE_MAX` times in a row in this
+    episode.
+    """
     streaks: dict[str, int] = {}
     for step in steps:
         if (
@@ -120,5 +127,5 @@ def benched(steps: Sequence[Step]) -> frozenset[str]:
 
 
 def says_yes(answer: str) -> bool:
-    """Whether a scene VLM's answer to a yes-no question is a yes. Anything unclear is a no: claims need a clear yes."""
+    """Return whether a scene VLM's answer to a yes-no question is a clear yes."""
     return answer.strip().lower().startswith("yes")

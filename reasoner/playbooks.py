@@ -1,7 +1,8 @@
 """Playbooks: written procedures that narrow what a planner may do and tell it how.
 
-A playbook is no skill that could be executed: it is chosen for an episode. From then on only the tools that it composes are there, its text
-stands in the instructions, and its `max_steps` ends the episode. Only a language model can read one.
+A playbook is not an executable skill: it is chosen for an episode. From then on only the tools that
+it composes are available, its text is part of the instructions, and its `max_steps` ends the
+episode. Only a language model can read one.
 """
 
 import dataclasses
@@ -29,12 +30,16 @@ class Playbook:
     def procedure(self) -> str:
         """What a planner reads."""
         return (
-            f"Follow this procedure ({self.name}; it is for: {self.trigger}).\n\n{self.body.strip()}\n\n"
+            f"Follow this procedure ({self.name}; it is for: {self.trigger}).\n\n"
+            f"{self.body.strip()}\n\n"
             f"It is done when: {self.done_predicate}. You have {self.max_steps} steps."
         )
 
     def narrow(self, palette: Palette) -> Palette:
-        """The palette with the tools of this playbook only. Raises ConfigError when one of them is not there."""
+        """Return the palette with the tools of this playbook only.
+
+        Raises ConfigError for a missing one.
+        """
         missing = self.tools - palette.tools
         if missing:
             raise ConfigError(
@@ -45,7 +50,10 @@ class Playbook:
 
 
 def load_playbook(file: Path) -> Playbook:
-    """Read a manifest of kind playbook and its text. Raises ManifestInvalid, and ConfigError for a text that is not beside it."""
+    """Read a manifest of kind playbook and its text.
+
+    Raises ManifestInvalid, and ConfigError for a missing text.
+    """
     try:
         manifest = load_manifest(file)
     except ManifestError as error:
@@ -58,7 +66,7 @@ def load_playbook(file: Path) -> Playbook:
     unknown = [name for name in contract.composes_tools if name not in TOOLS]
     if unknown:
         raise ManifestInvalid(
-            f"{file}: composes_tools: there is no tool {unknown[0]}",
+            f"{file}: composes_tools: unknown tool {unknown[0]}",
             hint=f"choose from {', '.join(TOOLS)}",
         )
     return Playbook(
@@ -86,4 +94,4 @@ def _body(file: Path, uri: str) -> str:
     try:
         return content.decode()
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{file}: body_uri: {path} is no UTF-8 text") from error
+        raise ConfigError(f"{file}: body_uri: {path} is not UTF-8 text") from error

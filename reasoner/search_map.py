@@ -1,7 +1,8 @@
-"""Where the thing that is looked for may stand: what several looks from different places say together.
+"""Map of places where the object may stand, from several looks at different poses.
 
-A detector takes one thing for another now and then, mostly from one side only. Two looks that are joined by the base's odometry tell them
-apart better than either does: the scores that a place got add up, and the place with the most is the thing. Pure: no sockets, no clock.
+A detector takes one thing for another now and then, mostly from one side only. Two looks that are
+joined by the base's odometry tell them apart better than either does: scores of a place add up, and
+the best place wins. Pure: no sockets, no clock.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-SAME_M = 0.05  # two looks at one thing differ by less; the arm's gripper needs more room between two things
+# two looks at one thing differ by less; the arm's gripper needs more room between two things
+SAME_M = 0.05
 UNMOVED = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A place in the frame of the mobile base, metres."""
+    """A place in the frame of the mobile base, meters."""
 
     x: float
     y: float
@@ -26,19 +28,25 @@ class Point:
 
 @dataclass(slots=True)
 class Place:
-    """Where something like it stands: x, y in the odometry's frame, z over the base's floor, metres. `score` is what all looks gave it."""
+    """Place of a candidate: x, y in the odometry's frame, z over the base's floor, meters.
+
+    `score` is the sum over all looks.
+    """
 
     x: float
     y: float
     z: float
     score: float
     seen_from_m: float
-    """Of the look that the place is told from: the nearest, which errs least."""
+    """Distance of the look that determines the place: the nearest, which errs least."""
 
 
 @dataclass(slots=True)
 class Places:
-    """Add what `locate_in_view` found; ask for the best. Without odometry only the newest look counts: nothing joins it to the ones before."""
+    """Add what `locate_in_view` found; ask for the best.
+
+    Without odometry only the newest look counts: it cannot be joined to the ones before.
+    """
 
     known: list[Place] = field(default_factory=list)
     base_pose: tuple[float, float, float] = UNMOVED
@@ -46,7 +54,9 @@ class Places:
     """Whether odometry joins the newest look to the ones before."""
 
     def add(self, data: Mapping[str, Any]) -> None:
-        """`data` of a locate that found something: `point_base_m` and, where they are told, `seen` and `base_pose`."""
+        """Add `data` of a locate that found something: `point_base_m`, optionally `seen` and
+        `base_pose`.
+        """
         pose = data.get("base_pose")
         self.joined = pose is not None
         if not self.joined:
@@ -57,7 +67,7 @@ class Places:
             self._see(Point(*thing["point_base_m"]), thing["score"], before)
 
     def _see(self, point: Point, score: float, before: list[Place]) -> None:
-        """One thing of a look. `before` are the places that nothing in this look was matched with yet."""
+        """Add one thing of a look. `before`: places that are not matched in this look yet."""
         x0, y0, yaw = self.base_pose
         x = x0 + math.cos(yaw) * point.x - math.sin(yaw) * point.y
         y = y0 + math.sin(yaw) * point.x + math.cos(yaw) * point.y

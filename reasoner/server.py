@@ -1,6 +1,7 @@
-"""The operator's way into a running episode: a small socket whose messages go into the inbox, past the planner.
+"""Operator's access to a running episode: a small socket whose messages bypass the planner.
 
-Speaks `schemas.reasoner`. Both ends are here: the server beside the loop, and `send` for `vram-reasoner --say` and `--cancel`.
+Speaks `schemas.reasoner`. Both ends are here: the server beside the loop, and `send` for
+`vram-reasoner --say` and `--cancel`.
 """
 
 import asyncio
@@ -30,7 +31,10 @@ SEND_S = 5.0
 
 
 class OperatorServer:
-    """`async with OperatorServer(endpoint, task, inbox)`: serves until the block ends. Raises AlreadyRunning when another reasoner serves there."""
+    """`async with OperatorServer(endpoint, task, inbox)`: serve until the block ends.
+
+    Raises AlreadyRunning when another reasoner serves there.
+    """
 
     def __init__(self, endpoint: str, task: str, inbox: Inbox) -> None:
         self._task_text = task
@@ -79,7 +83,7 @@ def _parse(message: Message) -> Any:
             hint=f"one of {', '.join(OPS)}",
             details={"known": [*OPS]},
         )
-    if message["op"] == "cancel":  # nobody is refused a cancel for a long reason
+    if message["op"] == "cancel":  # a cancel is never refused for a long reason
         return CancelEpisode(op="cancel", id=0, reason=reason_of(message))
     try:
         return REASONER_REQUEST.validate_python(message)
@@ -96,7 +100,10 @@ def _refusal(request_id: int | None, error: VramError) -> Message:
 
 
 async def send(endpoint: str, request: Mapping[str, Any], *, timeout_s: float = SEND_S) -> Message:
-    """One request to a running reasoner. Raises ReasonerUnreachable, UntrustedServer, or the typed error of its answer."""
+    """Send one request to a running reasoner.
+
+    Raises ReasonerUnreachable, UntrustedServer, or the typed error of its answer.
+    """
 
     def lost(reason: str) -> VramError:
         return ReasonerUnreachable(

@@ -1,8 +1,10 @@
-"""What the tools do: each call becomes one request to the runner or to a sidecar, each answer a typed outcome.
+"""Implementation of the tools: one request to the runner or a sidecar, one typed outcome.
 
-The difference between *not seen*, *evicted*, *no frame* and *error* is kept: only a detector that really looked may say that something is not there.
-A goal does not outlive whoever waits for it: when its wait is cancelled, or it makes no progress for as long as the call allows, it is cancelled
-at the runner. Nothing here names bytes, leases or victims: loading and leaving are between the sidecars and the arbiter.
+The difference between *not seen*, *evicted*, *no frame* and *error* is kept: only a detector that
+really looked may say that something is not there. A goal does not outlive its waiter: when the wait
+is canceled, or the goal makes no progress for as long as the call allows, it is canceled at the
+runner. Nothing here names bytes, leases or victims: loading and unloading are between the sidecars
+and the arbiter.
 """
 
 import asyncio
@@ -53,7 +55,8 @@ from vram_arbiter.schemas.world import CameraModel
 log = logging.getLogger(__name__)
 
 FRAME_MAX_AGE_MS = 1000.0
-LOOKED_AT_MAX_S = 5.0  # a picture's age when a model begins to look at it; one that waited for the card is not looked at
+# a picture's age when a model begins to look at it; one that waited for the GPU is too old
+LOOKED_AT_MAX_S = 5.0
 PLACE_MAX_S = 10.0  # a later answer says where something stood: an arm would reach for that
 LOOKS_MAX = 3  # with a new picture each, for one answer: behind the first wait the model is there
 GOAL_GRACE_S = (
@@ -61,13 +64,15 @@ GOAL_GRACE_S = (
 )
 GOAL_MAX_S = 600.0  # when the manifest sets the deadline, and sets none that is longer
 START_S = 90.0  # what the runner adds to a manifest's time of motion, to get there
-HEARD_LATE_S = 0.5  # for feedback that came while this process stood still; without it a goal that goes on would be called off
-CANCEL_S = 10.0  # for a cancelled goal to end: it takes the arm back and finishes its use
-ASK_AGAIN_S = 0.2  # whether a goal has ended whose result goes to nobody
+# for feedback that came while this process was stopped; without it a live goal would be canceled
+HEARD_LATE_S = 0.5
+CANCEL_S = 10.0  # for a canceled goal to end: it gives the robot back and finishes its use
+ASK_AGAIN_S = 0.2  # whether a goal has ended whose result has no listener
 IDENTITY_S = 10.0  # for a perception sidecar to say which model it serves
 PROGRESS_TOLERANCE = 0.0
-THINGS_MAX = 8  # told of one look, best first
-BEFORE_MOTION = frozenset({"acquiring", "starting"})  # waiting for the card is no lack of progress
+THINGS_MAX = 8  # reported per look, best first
+# waiting for the GPU is not a lack of progress
+BEFORE_MOTION = frozenset({"acquiring", "starting"})
 
 
 class Dispatcher(Protocol):
@@ -76,8 +81,10 @@ class Dispatcher(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Judge:
-    """A reward model, the pictures it looks back at, and the task where a call names none. It only gives its opinion: no goal begins or
-    ends by it."""
+    """A reward model, its picture history, and the default task.
+
+    It only gives its opinion: goals do not depend on it.
+    """
 
     reward: RewardClient
     past: Past
@@ -85,9 +92,10 @@ class Judge:
 
 
 class Tools:
-    """Dispatch to a runner, a detector, a scene VLM and a reward model. None of the sidecars needs to be up before it is asked.
+    """Dispatch to a runner, a detector, a scene VLM and a reward model, started on demand.
 
-    `components` are the sidecars by name that `lifecycle_transition` may load and unload, if the palette allows it.
+    `components` are the sidecars by name that `lifecycle_transition` may load and unload, if the
+    palette allows it.
     """
 
     def __init__(
@@ -110,7 +118,9 @@ class Tools:
         self._goal_grace_s = goal_grace_s
 
     async def __call__(self, call: ToolCall) -> Outcome:
-        """Never raises for what the other side does; the outcome says it."""
+        """Execute a call. Never raises for errors of the other side; they are part of the
+        outcome.
+        """
         try:
             match call:
                 case LocateInView():
@@ -199,7 +209,9 @@ class Tools:
         )
 
     async def _progress(self, call: QueryTaskProgress) -> Outcome:
-        """Judged by what the camera showed within the window, up to now: a camera that shows nothing now is no evidence."""
+        """Judge by what the camera showed within the window, up to now: no picture now is no
+        evidence.
+        """
         if self._judge is None:
             return Outcome("refused", "no reward model is provided", "not_permitted")
         reward, past = self._judge.reward, self._judge.past
@@ -259,7 +271,7 @@ class Tools:
                     task.add_done_callback(_retrieve)
 
     async def _send(self, call: ExecuteRskill) -> Goal:
-        """A goal whose acceptance was not heard may run: it is cancelled by its name."""
+        """Cancel a goal by its name if its acceptance was lost: it may run."""
         goal_id = f"goal-{uuid.uuid4().hex[:12]}"
         try:
             return await self._runner.send_goal(
@@ -296,15 +308,14 @@ class Tools:
                 return
 
     async def _transition(self, call: LifecycleTransition) -> Outcome:
-        """`configure` asks whether it is there, `activate` loads, `deactivate` and `cleanup` unload; never beside a goal.
+        """`configure` checks presence, `activate` loads, `deactivate` and `cleanup` unload.
 
-        The state is read just before; should a goal begin in between, its lease is in use and the arbiter lets nobody in its way.
+        Never beside a goal: the state is read just before, and a goal that begins in between has
+        its lease in use, which the arbiter protects.
         """
         component = self._components.get(call.node)
         if component is None:
-            return Outcome(
-                "refused", f"there is no component {call.node} to manage", "not_permitted"
-            )
+            return Outcome("refused", f"no component {call.node} to manage", "not_permitted")
         if call.transition == "configure":
             identity = await component.ping(timeout_s=IDENTITY_S)
             return Outcome("done", f"{call.node} serves {identity['rskill']}, {identity['state']}")
@@ -326,7 +337,10 @@ class Tools:
         return Outcome("done", f"{call.node} leaves at its next safe point")
 
     async def _not_permitted(self, sidecar: SidecarClient) -> Outcome | None:
-        """Whether the palette bars the model that is served (its licence, say). Asked until the sidecar has answered once."""
+        """Return why the palette bars the served model, if it does.
+
+        Asked until the sidecar has answered.
+        """
         if self._palette is None:
             return None
         identity = sidecar.identity or await sidecar.ping(timeout_s=IDENTITY_S)
@@ -343,8 +357,12 @@ async def _look[P, A](
     *,
     answer_max_s: float = math.inf,
 ) -> tuple[P, A]:
-    """A picture and what a model says of it. One that grew too old before the model looked, or whose answer took longer than `answer_max_s`, is
-    asked about again with a new one, `LOOKS_MAX` in all. Raises FrameStale then, what `take` raises at once, and what `ask` raises else."""
+    """Return a picture and a model's answer about it.
+
+    A picture that grew too old before the model looked, or whose answer took longer than
+    `answer_max_s`, is replaced by a new one, `LOOKS_MAX` in all; then FrameStale. Raises what
+    `take` and `ask` raise.
+    """
     for _ in range(LOOKS_MAX):
         taken = await take()
         asked_s = monotonic()
@@ -356,7 +374,8 @@ async def _look[P, A](
         if (took_s := monotonic() - asked_s) <= answer_max_s:
             return taken, answer
         stale = FrameStale(
-            f"the answer took {took_s:.0f} s, which is more than {answer_max_s:g} s: it is not about now",
+            f"the answer took {took_s:.0f} s, which is more than {answer_max_s:g} s:"
+            " it is not about now",
             hint="look again, or use a faster model",
         )
     raise stale
@@ -374,7 +393,10 @@ def _opinion(task: str, shown: list[Taken], judged: Judgement) -> Outcome:
         now += f", {judged.progress[0]:.2f} {span_s:.1f} s before"
     if judged.success:
         done = "done" if judged.success[-1] >= judged.success_threshold else "not done"
-        now += f"; it looks {done} ({judged.success[-1]:.2f}, done from {judged.success_threshold:.2f} on)"
+        now += (
+            f"; it looks {done} ({judged.success[-1]:.2f},"
+            f" done from {judged.success_threshold:.2f} on)"
+        )
     data = {
         "task": task,
         "progress": [round(value, 3) for value in judged.progress],
@@ -389,9 +411,10 @@ def _opinion(task: str, shown: list[Taken], judged: Judgement) -> Outcome:
 
 
 def point_on_plane(frame: FrameReply, box: tuple[float, float, float, float]) -> list[float] | None:
-    """Centre of a detection's box (pixels) → point in the base's frame (metres), on the plane that the frame's camera model names.
+    """Return the point in the base's frame (meters) under the center of a detection's box (pixels).
 
-    None if the frame carries no model or the ray does not meet the plane.
+    It lies on the plane that the frame's camera model names. None if the frame carries no model or
+    the ray does not meet the plane.
     """
     if "camera_model" not in frame:
         return None
@@ -401,7 +424,10 @@ def point_on_plane(frame: FrameReply, box: tuple[float, float, float, float]) ->
 
 
 def _things(frame: FrameReply, detections: Sequence[Detection]) -> list[dict[str, Any]]:
-    """Detections, best first, as things with their places: several boxes may lie on one thing, whose best box counts."""
+    """Return detections as things with their places, best first.
+
+    Several boxes may lie on one thing; its best box counts.
+    """
     things: list[dict[str, Any]] = []
     for detection in detections:
         point = point_on_plane(frame, detection.box)
@@ -425,7 +451,11 @@ def _ended(result: ResultPush) -> Outcome:
 
 
 def waits_s(call: ExecuteRskill, palette: Palette | None, grace_s: float) -> float:
-    """How long a goal's result is waited for: its own deadline and `grace_s`, or what its manifest allows, and never less than `GOAL_MAX_S` then."""
+    """Return how long to wait for a goal's result.
+
+    Its own deadline and `grace_s`, or what its manifest allows, and never less than `GOAL_MAX_S`
+    then.
+    """
     if call.deadline_s:
         return call.deadline_s + grace_s
     known = palette.executable.get(call.rskill_id) if palette is not None else None
@@ -433,7 +463,11 @@ def waits_s(call: ExecuteRskill, palette: Palette | None, grace_s: float) -> flo
 
 
 async def _stands_still(goal: Goal, call: ExecuteRskill) -> bool:
-    """True once the goal's progress has not grown for `patience_s`; False when its feedback ends before. Getting ready does not count."""
+    """Return True once the goal's progress has not grown for `patience_s`, False when its feedback
+    ends.
+
+    Preparation before the motion does not count.
+    """
     assert call.patience_s is not None, "only watched with patience"
     tolerance = PROGRESS_TOLERANCE if call.progress_tolerance is None else call.progress_tolerance
     best: float | None = None
@@ -464,7 +498,10 @@ async def _stands_still(goal: Goal, call: ExecuteRskill) -> bool:
 
 
 async def _called_off(goal: Goal) -> ResultPush | None:
-    """Cancel a goal and hear its end, within `CANCEL_S`; None if the runner does not say. A cancellation of ours does not cut this short."""
+    """Cancel a goal and wait for its end, within `CANCEL_S`; None if the runner does not report it.
+
+    A cancellation of this task does not cut the wait short.
+    """
 
     async def end() -> ResultPush | None:
         try:
@@ -484,7 +521,9 @@ async def _called_off(goal: Goal) -> ResultPush | None:
 
 
 def _how_it_went(result: ResultPush | None) -> str:
-    """What became of a goal that was called off: nobody says `cancelled` of one that may still move the arm."""
+    """Return the outcome of an aborted goal: never `canceled` for one that may still move the
+    robot.
+    """
     if result is None:
         return (
             "the goal was called off, but the runner has not said that it ended: it may still run"

@@ -1,7 +1,8 @@
-"""Looks after the robot while an episode runs and the planner thinks: an emergency stop or a runner that is gone ends the episode, a
-sensor or joint state that has become stale is told to the planner.
+"""Watch over the robot while an episode runs and the planner thinks.
 
-Reads the runner's state once a second on a connection of its own, so that no other request delays it.
+An emergency stop or a lost runner ends the episode; a sensor or joint state that has become stale
+is reported to the planner. Reads the runner's state once a second on a connection of its own, so
+that no other request delays it.
 """
 
 import asyncio
@@ -22,15 +23,13 @@ LOST_MAX = 3  # answers missed in a row
 async def watch(
     runner: RunnerClient, inbox: Inbox, *, period_s: float = PERIOD_S, answer_s: float = ANSWER_S
 ) -> None:
-    """Until it has said that the episode must stop, or is cancelled. Whatever ends it is such a reason."""
+    """Run until the episode must stop, or until canceled."""
     try:
         await _watch(runner, inbox, period_s, answer_s)
     except Exception as error:
         log.exception("the watch over the robot failed")
         inbox.put(
-            Danger(
-                f"nobody looks after the robot any more: {type(error).__name__}: {error}", stop=True
-            )
+            Danger(f"the robot is not watched any more: {type(error).__name__}: {error}", stop=True)
         )
 
 

@@ -1,8 +1,9 @@
 """A planner behind Anthropic's Messages API, or a server that speaks it.
 
-Facts: the public API, version 2023-06-01. `POST /v1/messages` with `x-api-key`; a call is a `tool_use` block of the assistant and its result a
-`tool_result` block at the head of the next user message; neighbours of one role are one message; no text may be empty.
-`tool_choice: any` demands a call, and `disable_parallel_tool_use` one only.
+Facts: the public API, version 2023-06-01. `POST /v1/messages` with `x-api-key`; a call is a
+`tool_use` block of the assistant and its result a `tool_result` block at the head of the next user
+message; adjacent messages of one role are merged; no text may be empty. `tool_choice: any` demands
+a call, and `disable_parallel_tool_use` limits it to one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,7 +49,7 @@ class AnthropicPlanner(LlmPlanner):
             raise ValueError(f"a {body['type']}, not a message of the assistant")
         blocks = body["content"]
         if not isinstance(blocks, list):
-            raise TypeError("content is no list of blocks")
+            raise TypeError("content is not a list of blocks")
         words = [str(block["text"]) for block in blocks if block["type"] == "text"]
         calls = [
             Call(str(block["id"]), str(block["name"]), _input(block["input"]))

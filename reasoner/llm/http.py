@@ -1,7 +1,8 @@
-"""One JSON request to a model server that may be slow, broken or hostile: bounded in time, bytes and tries.
+"""One JSON request to a model server that may be slow, broken or hostile.
 
-The limit is on the whole exchange: a server that sends a byte a second is as late as one that sends none. A busy or failing
-server (`RETRY_STATUSES`) and a connection that broke are tried again after a pause; a wrong key or a wrong request is not.
+Bounded in time, bytes and tries. The limit is on the whole exchange: a server that sends a byte a
+second is as late as a silent one. A busy or failing server (`RETRY_STATUSES`) and a broken
+connection are tried again after a pause; a wrong key or a wrong request is not.
 """
 
 import asyncio
@@ -35,7 +36,10 @@ def check_installed() -> None:
 
 
 class JsonHttp:
-    """`async with JsonHttp(headers, timeout_s) as http: await http.post(url, body)`. Redirects are not followed: the key goes nowhere else."""
+    """`async with JsonHttp(headers, timeout_s) as http: await http.post(url, body)`.
+
+    Redirects are not followed: the key must not reach another server.
+    """
 
     def __init__(
         self, headers: Mapping[str, str], timeout_s: float, *, retry_pause_s: float = RETRY_PAUSE_S
@@ -44,7 +48,8 @@ class JsonHttp:
         self._timeout_s = timeout_s
         self._retry_pause_s = retry_pause_s
         self._http: Any = None
-        # its line for each request has the whole address in it, with a password or a key; what went wrong is in our errors
+        # its line for each request has the whole address in it, with a password or a key; our
+        # errors carry the rest
         logging.getLogger("httpx").setLevel(logging.WARNING)
 
     async def __aenter__(self) -> Self:
@@ -113,7 +118,7 @@ class JsonHttp:
         try:
             value = strictjson.loads(answer, max_chars=ANSWER_MAX_BYTES)
         except ValueError as error:
-            raise LlmError(f"{shown} answered something that is no JSON: {error}") from error
+            raise LlmError(f"{shown} did not answer with JSON: {error}") from error
         if not isinstance(value, dict):
             raise LlmError(f"{shown} answered a JSON {type(value).__name__}, not an object")
         return value

@@ -1,6 +1,7 @@
-"""A planner behind any OpenAI-compatible `/chat/completions` (vLLM, Ollama, llama.cpp, the cloud).
+"""A planner behind any OpenAI-compatible `/chat/completions` (vLLM, Ollama, llama.cpp, cloud).
 
-Facts: the wire is the public Chat Completions API (messages, tools, tool_calls). `tool_choice` is `auto`: not every server knows `required`.
+Facts: the wire is the public Chat Completions API (messages, tools, tool_calls). `tool_choice` is
+`auto`: not every server knows `required`.
 """
 
 import json
@@ -36,7 +37,7 @@ class OpenAiPlanner(LlmPlanner):
         message = body["choices"][0]["message"]
         calls = message.get("tool_calls") or []
         if not isinstance(calls, list):
-            raise TypeError("tool_calls is no list")
+            raise TypeError("tool_calls is not a list")
         return Answer(str(message.get("content") or ""), tuple(map(_call, calls)))
 
 

@@ -1,7 +1,7 @@
-"""The planner that needs no language model: find the named object, navigate to it, grab it, ask whether it is grasped.
+"""A planner without a language model: find the object, navigate to it, grab it, ask for success.
 
-Written as a generator, so that the script reads top-down: it yields a tool call and receives its outcome. It says nothing about VRAM:
-which model is resident when is the arbiter's business.
+Written as a generator, so that the script reads top-down: it yields a tool call and receives its
+outcome. It does not mention VRAM: the arbiter decides which model is resident.
 """
 
 import json
@@ -19,7 +19,7 @@ LOOKS_MAX = 3  # repeats of a locate that gave no answer about the scene
 PLACES_MAX = 3  # to stand before in one attempt
 TURNS_RAD = (0.35, -0.70, 0.35)  # look left, look right, back to the middle
 NAVIGATE_DEADLINE_S = 60.0
-GRAB_DEADLINE_S = 120.0  # counts from acceptance: waiting for the card and loading are in it
+GRAB_DEADLINE_S = 120.0  # counts from acceptance: waiting for the GPU and loading are in it
 GRASP_CAMERA = "wrist"  # looks at the fingers: what they hold cannot hide behind the arm
 
 NO_ANSWER = "the scene VLM gave no answer"
@@ -47,7 +47,10 @@ def object_of(task: str) -> str:
 
 
 class ScriptedPlanner:
-    """`Planner` by script. Raises BadRequest or UnknownSkill at construction for a task that cannot be done here."""
+    """`Planner` by script.
+
+    The constructor raises BadRequest or UnknownSkill for an impossible task.
+    """
 
     def __init__(self, task: str, palette: Palette) -> None:
         self._script = _script(
@@ -122,13 +125,16 @@ def _script(thing: str, navigate: str, grab: str, *, place: str | None, can_quer
             yield ExecuteRskill(
                 rskill_id=place,
                 deadline_s=NAVIGATE_DEADLINE_S,
-                rationale="a thing in the hand would be looked at, and dropped before the next grasp",
+                rationale="a held thing would be looked at, and dropped before the next grasp",
             )
     return Finish(False, reason)
 
 
 def _find(thing: str, navigate: str, places: Places) -> Generator[ToolCall, Outcome, str]:
-    """Look; where a detector that really looked does not see it, turn and look again. Says why there is no place; empty: there is."""
+    """Look; where a detector that really looked does not see it, turn and look again.
+
+    Returns: why no place is known; empty: one is.
+    """
     for turn in (*TURNS_RAD, None):
         looked = yield from _locate(thing, places)
         if looked.status == "found":
@@ -141,9 +147,10 @@ def _find(thing: str, navigate: str, places: Places) -> Generator[ToolCall, Outc
 
 
 def _approach(thing: str, navigate: str, places: Places) -> Generator[ToolCall, Outcome, str]:
-    """Stand before the likeliest place. Looks from there may speak for another one: then it is that one's turn, at most `PLACES_MAX` in all.
+    """Stand before the likeliest place, at most `PLACES_MAX` places in all.
 
-    Says why it does not stand there; empty: it does.
+    Looks from there may favor another place: then it goes there. Returns: why it does not stand
+    there; empty: it does.
     """
     place = places.best()
     why = f"stand in front of the {thing}"
@@ -168,7 +175,10 @@ def _approach(thing: str, navigate: str, places: Places) -> Generator[ToolCall, 
 
 
 def _locate(thing: str, places: Places) -> Generator[ToolCall, Outcome, Outcome]:
-    """Note where it may stand. The last outcome: only `not_seen` says something about the scene, everything else is tried again."""
+    """Note possible places and return the last outcome.
+
+    Only `not_seen` says something about the scene, everything else is tried again.
+    """
     outcome = Outcome("error", "never looked")
     for _ in range(LOOKS_MAX):
         outcome = yield LocateInView(query=thing, rationale=f"where is the {thing}?")
@@ -180,7 +190,10 @@ def _locate(thing: str, places: Places) -> Generator[ToolCall, Outcome, Outcome]
 
 
 def _confirm(thing: str) -> Generator[ToolCall, Outcome, tuple[bool, str]]:
-    """Whether the scene VLM says that the named thing is held, and its words. A yes that names something else, or nothing, is not enough."""
+    """Return whether the scene VLM confirms that the named thing is held, and its answer.
+
+    A yes that names something else, or nothing, is not enough.
+    """
     answer = yield from _ask(f"Has the robot gripper grasped the {thing}?")
     if answer is not None and says_yes(answer) and thing not in answer.lower():
         answer = yield from _ask("What is the gripper holding?")

@@ -110,7 +110,7 @@ def test_a_licence_that_forbids_commercial_use_bars_a_skill(license: str, commer
     assert gated.permits("lab/not-installed") is None
     if not commercial:
         assert "--allow-noncommercial" in str(gated.check(call))
-        with pytest.raises(UnknownSkill, match=f"licence \\({license}\\)"):
+        with pytest.raises(UnknownSkill, match=f"license \\({license}\\)"):
             gated.first("grasp")
 
 

@@ -59,7 +59,7 @@ def test_what_is_wrong_with_a_playbook_is_said(tmp_path: Path) -> None:
         load_playbook(written(tmp_path, tools="[query_scene]")).narrow(
             Palette(PALETTE.skills, can_query=False)
         )
-    with pytest.raises(ManifestInvalid, match="there is no tool format_disk"):
+    with pytest.raises(ManifestInvalid, match="unknown tool format_disk"):
         load_playbook(written(tmp_path, tools="[format_disk]"))
     with pytest.raises(ConfigError, match="outside of the playbook's folder"):
         load_playbook(written(tmp_path, body="../../etc/passwd"))
@@ -67,7 +67,7 @@ def test_what_is_wrong_with_a_playbook_is_said(tmp_path: Path) -> None:
         load_playbook(written(tmp_path, body="./NOTES.md"))
     file = written(tmp_path)
     (tmp_path / "PLAYBOOK.md").write_bytes(b"\xff\xfe")
-    with pytest.raises(ConfigError, match="no UTF-8"):
+    with pytest.raises(ConfigError, match="not UTF-8"):
         load_playbook(file)
     (tmp_path / "PLAYBOOK.md").write_bytes(b"x" * (BODY_MAX_BYTES + 1))
     with pytest.raises(ConfigError, match="more than"):

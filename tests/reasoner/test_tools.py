@@ -577,4 +577,4 @@ def test_nobody_looking_after_the_robot_ends_the_episode() -> None:
     (danger,) = inbox.take()
     assert isinstance(danger, Danger)
     assert danger.stop
-    assert "nobody looks after the robot" in danger.text
+    assert "the robot is not watched" in danger.text

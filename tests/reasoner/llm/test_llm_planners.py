@@ -398,7 +398,7 @@ def test_the_environment_is_checked() -> None:
         ("TIMEOUT_S", "nan"),
         ("MAX_TOKENS", "0"),
     ):
-        with pytest.raises(ConfigError, match="no number"):
+        with pytest.raises(ConfigError, match="expected a number"):
             LlmConfig.from_environ(complete | {f"VRAM_REASONER_LLM_{name}": text})
     with pytest.raises(ConfigError, match="no http"):
         LlmConfig.from_environ(complete | {"VRAM_REASONER_LLM_BASE_URL": "file:///etc/passwd"})
@@ -445,7 +445,9 @@ def test_a_key_that_no_header_carries_is_refused_and_not_shown() -> None:
         "http://",
         "http:///v1",
     ):
-        with pytest.raises(ConfigError, match="VRAM_REASONER_LLM_BASE_URL is no http") as caught:
+        with pytest.raises(
+            ConfigError, match="VRAM_REASONER_LLM_BASE_URL: expected an http"
+        ) as caught:
             LlmConfig.from_environ(complete | {"VRAM_REASONER_LLM_BASE_URL": url})
         assert "secret" not in str(caught.value)
     with pytest.raises(ConfigError, match="MAX_TOKENS is no number"):
