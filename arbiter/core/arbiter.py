@@ -71,7 +71,7 @@ from vram_arbiter.arbiter.core.requests.sessions import (
 )
 from vram_arbiter.arbiter.core.scheduling import deadlock, grants
 from vram_arbiter.arbiter.core.settings import Settings
-from vram_arbiter.arbiter.core.verification import evidence, schedule
+from vram_arbiter.arbiter.core.verification import schedule
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
 
 DUE_MAX = 64
@@ -136,9 +136,9 @@ class Arbiter:
         return explain.why(self._core, consumer)
 
     def stale(self, now: float) -> list[GpuId]:
-        """GPUs that have to be read before their state can be shown (`evidence.stale`)."""
+        """GPUs that have to be read before their state can be shown (`schedule.stale`)."""
         self._core.now = max(self._core.now, now)
-        return evidence.stale(self._core)
+        return schedule.stale(self._core)
 
     def figures(self) -> dict[str, Any]:
         """The present in numbers (`figures.figures`)."""
@@ -180,10 +180,10 @@ class Arbiter:
                 on_died(core, event.process)
             # 1.3 the machine
             case MemorySampled():
-                evidence.on_sample(core, event)
+                schedule.on_reading(core, event)
                 recovery.account_for_the_empty(core, event)
             case ProbeFailed():
-                evidence.on_probe_failed(core, event)
+                schedule.on_probe_failed(core, event)
             case JournalFailed():
                 on_journal_failed(core, event)
             case Recovered():
@@ -272,7 +272,7 @@ class Arbiter:
                 case "verify":
                     schedule.on_poll_due(core, subject)
                 case "probe":
-                    evidence.on_probe_due(core, subject)
+                    schedule.on_probe_due(core, subject)
                 case "users":
                     uses.on_users_due(core, subject)
                 case "recover":

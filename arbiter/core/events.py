@@ -236,22 +236,76 @@ class OperatorAsked:
 # -- the machine ---------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class ProcessUse:
-    """Bytes of one process on one card; evidence, not authority. `process` has start_ticks 0 where only a pid is known."""
+    """Bytes of one process on one GPU: evidence, not authority. Where only a pid is known, `start_ticks` is 0."""
 
     process: ProcessKey
     name: str
     used_bytes: int | None  # None: the driver does not say
 
+    @property
+    def held_bytes(self) -> int:
+        """Bytes shown; 0 where the driver does not say."""
+        return self.used_bytes or 0
+
+    def is_of(self, process: ProcessKey) -> bool:
+        """Whether this entry is of that process, as far as the source can tell."""
+        listed = self.process
+        return listed == process or (listed.start_ticks == 0 and listed.pid == process.pid)
+
 
 @dataclass(frozen=True, slots=True)
 class MemorySampled:
-    """One reading of one card. `taken_at` is the monotonic time at which the read *began*."""
+    """One reading of one GPU. `taken_at` is the monotonic time at which the reading *began*.
+
+    Every source tells the total. What else a reading tells is derived here and nowhere else
+    (`host.gpu.probe` has the table of sources).
+    """
 
     gpu: GpuId
     taken_at: float
     used_bytes: int
     total_bytes: int
-    processes: tuple[ProcessUse, ...] | None  # None: this backend cannot list processes
+    processes: tuple[ProcessUse, ...] | None  # None: this source cannot list processes
+
+    @property
+    def lists_processes(self) -> bool:
+        return self.processes is not None
+
+    @property
+    def lists_bytes(self) -> bool:
+        """Whether there is a list with the bytes of each process in it."""
+        return self.processes is not None and all(
+            use.used_bytes is not None for use in self.processes
+        )
+
+    @property
+    def listed(self) -> tuple[ProcessUse, ...]:
+        return self.processes or ()
+
+    def bytes_of(self, process: ProcessKey) -> int | None:
+        """Return the bytes of a process: 0 if the list omits it, None if the reading cannot tell.
+
+        An omitted process may hold bytes: it may live in a container that the driver cannot name, or be dying.
+        """
+        if self.processes is None:
+            return None
+        use = self._use_of(process)
+        return 0 if use is None else use.used_bytes
+
+    def shows(self, process: ProcessKey) -> bool:
+        """Whether the process is listed with its bytes."""
+        use = self._use_of(process)
+        return use is not None and use.used_bytes is not None
+
+    def omits(self, process: ProcessKey) -> bool:
+        """Whether there is a list without this process."""
+        return self.processes is not None and self._use_of(process) is None
+
+    def _use_of(self, process: ProcessKey) -> ProcessUse | None:
+        for use in self.listed:
+            if use.is_of(process):
+                return use
+        return None
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 
 from vram_arbiter.arbiter.core.events import MemorySampled, ResizeAsked
 from vram_arbiter.arbiter.core.hooks import Feature
-from vram_arbiter.arbiter.core.ledger.ledger import process_bytes
 from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState, Request
 from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
 from vram_arbiter.arbiter.core.report import explain
@@ -270,7 +269,7 @@ def _is_freed(core: Core, gpu: Gpu, lease: Lease, shrink: Shrink, sample: Memory
     """
     ledger, tolerance = gpu.ledger, core.settings.verify_tolerance_bytes
     less = ledger.charge_bytes(lease.id) - shrink.target_bytes
-    held = process_bytes(sample, lease.process)
+    held = sample.bytes_of(lease.process)
     if held is not None and held > ledger.booked_by(lease.process) - less + tolerance:
         return False
     unattributed = ledger.stowaway_bytes() + ledger.driver_bytes()

@@ -9,10 +9,9 @@ from typing import Any
 
 from vram_arbiter.arbiter.core.events import Spec
 from vram_arbiter.arbiter.core.learning.footprints import PARTS, Part
-from vram_arbiter.arbiter.core.ledger.ledger import process_bytes
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
-from vram_arbiter.arbiter.core.verification.judge import Verification
+from vram_arbiter.arbiter.core.model.verification import Verification
 from vram_arbiter.schemas.ids import LeaseId
 
 _RESIDENT = frozenset({LeaseState.HELD, LeaseState.REVOKING})
@@ -84,7 +83,7 @@ def on_verdict(core: Core, gpu: Gpu, verification: Verification) -> None:
     account = gpu.ledger.accounts[verification.process]
     if verification.vanishes or gpu.sample is None or len(account.charges) > 1:
         return
-    held = process_bytes(gpu.sample, verification.process)
+    held = gpu.sample.bytes_of(verification.process)
     if held:
         core.footprints.measured(verification.model, "residue", held)
 

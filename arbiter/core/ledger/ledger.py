@@ -12,7 +12,7 @@ Sums are kept as accounts change, never counted again: a decision must not cost 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
+from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.arbiter.core.settings import GpuInfo
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
@@ -108,11 +108,7 @@ class GpuLedger:
 
     def booked_by(self, process: ProcessKey) -> int:
         """What one process is booked; it may be known by its pid alone, as in a reading."""
-        account = self.accounts.get(process)
-        if account is None and not process.start_ticks:
-            account = next(
-                (one for key, one in self.accounts.items() if key.pid == process.pid), None
-            )
+        account = self._account_of(process)
         return 0 if account is None else account.booked_bytes()
 
     def approved_bytes(self) -> int:
@@ -128,15 +124,15 @@ class GpuLedger:
         """What a reading may show that nobody is charged: the driver's own bytes, or the whole reserve while those were never seen."""
         return self.info.reserve_bytes if self.overhead_bytes is None else self.overhead_bytes
 
-    def hidden_bytes(self, sample: MemorySampled) -> int | None:
-        """The most that processes which the list leaves out hold together. None: the reading cannot say.
+    def unlisted_bytes(self, reading: MemorySampled) -> int | None:
+        """Return the most that processes outside the list hold together; None: it cannot tell.
 
-        The total leaves nobody out, so what the list explains, and what is known to be the driver's, is none of theirs.
+        That is the total less what the list shows and what is known to be the driver's.
         """
-        if sample.processes is None or any(use.used_bytes is None for use in sample.processes):
+        if not reading.lists_bytes:
             return None
-        listed = sum(use.used_bytes or 0 for use in sample.processes)
-        return max(0, sample.used_bytes - listed - (self.overhead_bytes or 0))
+        listed_bytes = sum(use.held_bytes for use in reading.listed)
+        return max(0, reading.used_bytes - listed_bytes - (self.overhead_bytes or 0))
 
     def charge_bytes(self, lease: LeaseId) -> int:
         owner = self._owner.get(lease)
@@ -355,63 +351,59 @@ class GpuLedger:
         """The process died: it is not expected to keep anything. What is charged stays until measured gone."""
         self.accounts[process].residue_floor_bytes = 0
 
-    def observe(self, sample: MemorySampled, *, quiet: bool, returning_bytes: int = 0) -> None:
-        """Take evidence from a reading. `quiet`: nobody loads or unloads, so the unexplained rest means something.
+    def observe(self, reading: MemorySampled, *, quiet: bool, pending_bytes: int = 0) -> None:
+        """Take the evidence of a reading.
 
-        So many bytes of that rest may be on their way back, and mean nothing new.
+        Args:
+            quiet: Whether no lease loads or unloads, so that unexplained bytes mean something.
+            pending_bytes: How many of the unexplained bytes may be pending free.
         """
-        self._observe(sample, returning_bytes, quiet=quiet)
-        if sample.processes is None:  # it says nothing of anybody
-            return
-        for account in self.accounts.values():
-            self._count(account)
-        self._count_strangers()
-
-    def _observe(self, sample: MemorySampled, returning_bytes: int, *, quiet: bool) -> None:
-        if sample.processes is None:
-            if quiet:
-                rest_bytes = max(0, sample.used_bytes - self.booked_bytes())
-                self._take_rest(rest_bytes, returning_bytes, complete=not self.accounts)
-            return
-        named_bytes = 0
-        strangers: dict[ProcessKey, Stranger] = {}
-        seen: set[ProcessKey] = set()
-        by_pid = {process.pid: account for process, account in self.accounts.items()}
-        complete = True
-        for use in sample.processes:
-            account = self.accounts.get(use.process)
-            if account is None and use.process.start_ticks == 0:
-                account = by_pid.get(use.process.pid)
-            if account is None:
-                strangers[use.process] = Stranger(use.process, use.name, use.used_bytes or 0)
-                named_bytes += use.used_bytes or 0
-                complete = complete and use.used_bytes is not None
-            elif use.used_bytes is None:
-                complete = False
-            else:
-                named_bytes += use.used_bytes
-                seen.add(account.process)
-                if sample.taken_at > account.changed_at:
-                    account.measured_bytes = use.used_bytes
-        for account in self.accounts.values():
-            if account.process in seen:
-                continue
-            # A driver forgets a dying process before it has freed its bytes, and cannot show one of another container: what
-            # nobody in the list explains is theirs first, up to what they are charged, and no stowaway's.
-            named_bytes += account.booked_bytes()
-            complete = complete and not account.booked_bytes()
-            if sample.taken_at > account.changed_at:
-                account.measured_bytes = 0
-        self.strangers = strangers
+        if reading.lists_processes:
+            explained_bytes, complete = self._take_list(reading)
+        else:
+            explained_bytes, complete = self.booked_bytes(), not self.accounts
         if quiet:
-            self._take_rest(
-                max(0, sample.used_bytes - named_bytes), returning_bytes, complete=complete
-            )
+            rest_bytes = max(0, reading.used_bytes - explained_bytes)
+            self._take_rest(rest_bytes, pending_bytes, complete=complete)
 
-    def _take_rest(self, rest_bytes: int, returning_bytes: int, *, complete: bool) -> None:
+    def _take_list(self, reading: MemorySampled) -> tuple[int, bool]:
+        """Take bytes per process. Return the bytes explained, and whether the list explains all."""
+        shown: dict[ProcessKey, int] = {}
+        self.strangers = {}
+        for use in reading.listed:
+            account = self._account_of(use.process)
+            if account is None:
+                self.strangers[use.process] = Stranger(use.process, use.name, use.held_bytes)
+            elif use.used_bytes is not None:
+                shown[account.process] = use.used_bytes
+        self._count_strangers()
+        explained_bytes = self._strangers_bytes
+        complete = reading.lists_bytes
+        for account in self.accounts.values():
+            count = shown.get(account.process)
+            if reading.taken_at > account.changed_at:
+                account.measured_bytes = count or 0
+                self._count(account)
+            if count is None:
+                # The list may omit a process that is dying or in another container: unexplained
+                # bytes are its own first, up to its charge, and no stowaway's.
+                count = account.booked_bytes()
+                complete = complete and not count
+            explained_bytes += count
+        return explained_bytes, complete
+
+    def _account_of(self, listed: ProcessKey) -> Account | None:
+        """Return the account of a process as a reading names it, perhaps by its pid alone."""
+        account = self.accounts.get(listed)
+        if account is None and not listed.start_ticks:
+            named = (one for process, one in self.accounts.items() if process.pid == listed.pid)
+            account = next(named, None)
+        return account
+
+    def _take_rest(self, rest_bytes: int, pending_bytes: int, *, complete: bool) -> None:
         """What nobody explains: the driver's own up to the reserve, somebody's beyond it. What may be going is neither, if it is new."""
         reserve = self.info.reserve_bytes
-        stays_bytes = max(0, rest_bytes - returning_bytes)
+        stays_bytes = max(0, rest_bytes - pending_bytes)
         least, most = max(0, stays_bytes - reserve), max(0, rest_bytes - reserve)
         self.unnamed_bytes = min(max(self.unnamed_bytes, least), most)
         if not complete:
@@ -468,28 +460,3 @@ class GpuLedger:
 
     def _count_strangers(self) -> None:
         self._strangers_bytes = sum(stranger.used_bytes for stranger in self.strangers.values())
-
-
-def process_bytes(sample: MemorySampled, process: ProcessKey) -> int | None:
-    """Bytes of a process in a reading: 0 if it is not listed, None if the reading cannot say.
-
-    Not being listed is no proof of holding nothing (`is_hidden`): only the total can tell, or the end of the process.
-    """
-    if sample.processes is None:
-        return None
-    use = _use_of(sample.processes, process)
-    return 0 if use is None else use.used_bytes
-
-
-def is_hidden(sample: MemorySampled, process: ProcessKey) -> bool:
-    """Is there a list that leaves this process out? It holds nothing, or lives where the driver cannot name it (another container)."""
-    return sample.processes is not None and _use_of(sample.processes, process) is None
-
-
-def _use_of(processes: Iterable[ProcessUse], process: ProcessKey) -> ProcessUse | None:
-    for use in processes:
-        if use.process == process or (
-            use.process.start_ticks == 0 and use.process.pid == process.pid
-        ):
-            return use
-    return None

@@ -1,7 +1,7 @@
-"""Bytes that were given up outside any verification, and that the card may still show as nobody's: a load's peak, what a stowaway held.
+"""Bytes given up outside any verification that the driver may not have returned yet.
 
-A driver takes its time with these as with any others. Were such a rest taken for somebody's (a stowaway's that nobody can list, the
-driver's own), the verdict on the next release would allow for bytes that are gone by then, and so for as many of the lease's own.
+A load's peak and the bytes of a stowaway leave the GPU as slowly as any others. If they counted as
+unattributed bytes, the next verdict would allow for bytes that are gone by then.
 """
 
 from collections.abc import Callable, Collection
@@ -11,13 +11,13 @@ from vram_arbiter.schemas.ids import ProcessKey
 
 
 class PendingFree:
-    """What processes gave up on one card lately."""
+    """What each process gave up lately on one GPU."""
 
     def __init__(self) -> None:
-        self._parts: dict[ProcessKey, tuple[float, int]] = {}  # when last, how much
+        self._parts: dict[ProcessKey, tuple[float, int]] = {}  # (when last, bytes)
 
     def give_up(self, process: ProcessKey, count: int, now: float) -> None:
-        """`count` bytes less than before; a negative one is taken from the same memory again."""
+        """Add `count` bytes; a negative count takes the same memory again."""
         at, before = self._parts.get(process, (now, 0))
         if before + count > 0:
             self._parts[process] = (now if count > 0 else at, before + count)
@@ -27,32 +27,30 @@ class PendingFree:
     def watch(
         self,
         before: MemorySampled | None,
-        sample: MemorySampled,
+        reading: MemorySampled,
         leaving: Collection[ProcessKey],
         booked_bytes: Callable[[ProcessKey], int],
     ) -> None:
-        """Compare two readings in a row. What is leaving is measured away anyhow, and what is no longer listed explains its charge.
+        """Compare two consecutive readings. Processes in `leaving` are under verification anyway.
 
-        The first reading of a daemon is compared with the charges of the journal: a holder may have freed its bytes before the restart.
+        A process that is no longer listed may still hold its charge. The first reading of a daemon
+        is compared with the charges: a holder may have freed bytes before the restart.
         """
-        if sample.processes is None:
+        if not reading.lists_processes:
             return
         if before is None:
-            for use in sample.processes:
-                freed_bytes = booked_bytes(use.process) - (use.used_bytes or 0)
+            for use in reading.listed:
+                freed_bytes = booked_bytes(use.process) - use.held_bytes
                 if use.used_bytes is not None and freed_bytes > 0:
-                    self.give_up(use.process, freed_bytes, sample.taken_at)
+                    self.give_up(use.process, freed_bytes, reading.taken_at)
             return
-        if before.processes is None:
-            return
-        now = {use.process: use.used_bytes or 0 for use in sample.processes}
-        for use in before.processes:
-            if use.process in leaving:
-                continue
-            held = now[use.process] if use.process in now else booked_bytes(use.process)
-            self.give_up(use.process, (use.used_bytes or 0) - held, sample.taken_at)
+        now = {use.process: use.held_bytes for use in reading.listed}
+        for use in before.listed:
+            if use.process not in leaving:
+                held = now[use.process] if use.process in now else booked_bytes(use.process)
+                self.give_up(use.process, use.held_bytes - held, reading.taken_at)
 
     def since(self, at: float) -> int:
-        """The most that may be on its way, of what was given up after that moment; the rest is forgotten."""
+        """Return the most that may be pending of what was given up after `at`; forget the rest."""
         self._parts = {process: part for process, part in self._parts.items() if part[0] > at}
         return sum(count for _, count in self._parts.values())

@@ -35,10 +35,10 @@ from vram_arbiter.arbiter.core.model.lease import (
     Use,
 )
 from vram_arbiter.arbiter.core.model.residents import Residents
+from vram_arbiter.arbiter.core.model.verification import Verification
 from vram_arbiter.arbiter.core.scheduling.queue import WaitQueue
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.arbiter.core.timers import Timers
-from vram_arbiter.arbiter.core.verification.judge import Verification
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 
 ENDED_REMEMBERED = 1024
@@ -150,7 +150,7 @@ class Gpu:
 
     def sees_loads(self) -> bool:
         """Somebody loads, and readings can tell how much it takes."""
-        listed = self.sample is not None and self.sample.processes is not None
+        listed = self.sample is not None and self.sample.lists_processes
         return listed and self.residents.any_in(_LOADING)
 
     def quiet(self) -> bool:

@@ -127,8 +127,8 @@ def gpu_view(core: Core, gpu: Gpu) -> dict[str, Any]:
 
 def _processes(gpu: Gpu) -> list[dict[str, Any]]:
     names: dict[int, tuple[str, int | None]] = {}
-    if gpu.sample is not None and gpu.sample.processes is not None:
-        names = {use.process.pid: (use.name, use.used_bytes) for use in gpu.sample.processes}
+    if gpu.sample is not None:
+        names = {use.process.pid: (use.name, use.used_bytes) for use in gpu.sample.listed}
     shown = [
         {
             "pid": account.process.pid,

@@ -21,7 +21,6 @@ from vram_arbiter.arbiter.core.events import (
 )
 from vram_arbiter.arbiter.core.eviction import eviction
 from vram_arbiter.arbiter.core.learning import drift
-from vram_arbiter.arbiter.core.ledger.ledger import process_bytes
 from vram_arbiter.arbiter.core.model.lease import (
     AWAY,
     Lease,
@@ -323,7 +322,7 @@ def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLeas
 
 def _seen_bytes(gpu: Gpu, process: ProcessKey) -> int:
     """What the newest reading shows of a process; nothing where it cannot say. The journal that knew the card is lost."""
-    return 0 if gpu.sample is None else process_bytes(gpu.sample, process) or 0
+    return 0 if gpu.sample is None else gpu.sample.bytes_of(process) or 0
 
 
 def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
@@ -401,7 +400,7 @@ def account_for_the_empty(core: Core, sample: MemorySampled) -> None:
     """
     gpu = core.gpus.get(sample.gpu)
     if gpu is None or gpu.sample is not sample:
-        return  # it does not count (`evidence.on_sample`)
+        return  # it does not count (`schedule.on_reading`)
     if core.recovering is None or sample.taken_at < core.started_at:
         return
     noise_bytes = gpu.info.reserve_bytes + core.settings.verify_tolerance_bytes

@@ -33,6 +33,5 @@ def _measure_anew(core: Core, gpu: Gpu) -> None:
     gpu.sample = None
     gpu.read_from = core.now
     core.want_sample(gpu, core.now)
-    for verification in gpu.verifications.values():
-        schedule.begin_again(core, gpu, verification)
+    schedule.begin_again(core, gpu)
     core.wake(gpu)

@@ -13,7 +13,7 @@ from vram_arbiter.arbiter.core.requests.expiry import lose
 from vram_arbiter.arbiter.core.requests.recovery import account_for
 from vram_arbiter.arbiter.core.requests.requests import cancel_waiter, let_go
 from vram_arbiter.arbiter.core.requests.uses import end_use
-from vram_arbiter.arbiter.core.verification.schedule import begin_for_residue, bereave
+from vram_arbiter.arbiter.core.verification.schedule import on_process_died
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey
 
 
@@ -111,11 +111,7 @@ def on_died(core: Core, process: ProcessKey) -> None:
         if account is None:
             continue
         gpu.ledger.bury(process)
-        for verification in gpu.verifications.values():
-            if verification.process == process:
-                bereave(core, gpu, verification)
-        if not account.charges and f"residue:{process}" not in gpu.verifications:
-            begin_for_residue(core, gpu, process)
+        on_process_died(core, gpu, process)
     for lease in _concerned(core, core.leases_of(process)):
         for use in [use for use in lease.all_uses() if use.process == process]:
             end_use(core, lease, use, "its process died")

@@ -9,7 +9,7 @@ from itertools import combinations
 from math import inf
 
 from vram_arbiter.arbiter.core.learning import costs
-from vram_arbiter.arbiter.core.ledger.ledger import NOTHING, process_bytes
+from vram_arbiter.arbiter.core.ledger.ledger import NOTHING
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
@@ -82,7 +82,7 @@ def leaving(gpu: Gpu) -> dict[LeaseId, int]:
             and verification.lease not in gpu.residents
             and not verification.overdue
         ):
-            going[verification.lease] = verification.kept_bytes
+            going[verification.lease] = verification.retained_bytes
     return going
 
 
@@ -208,7 +208,7 @@ def _unheld_bytes(gpu: Gpu, process: ProcessKey, count: int) -> int:
     account = gpu.ledger.accounts.get(process)
     if account is not None and any(lease not in gpu.ledger.reserved for lease in account.charges):
         return count  # what it holds is of its leases; reserved bytes are not held by anyone yet
-    own = None if gpu.sample is None else process_bytes(gpu.sample, process)
+    own = None if gpu.sample is None else gpu.sample.bytes_of(process)
     if own is None:
         own = account.residue_bytes if account is not None else 0
     return max(0, count - own)

@@ -1,290 +1,265 @@
-"""Did the memory really come back? Pure judgement of readings; starts nothing, drops nothing.
+"""Verdict on a release from one reading. Pure: it starts nothing and changes nothing.
 
-A released lease stays charged until a verdict. Targets (all that can be checked must hold, twice in a row):
-  a. ledger bound: the card shows no more than everything else is charged;
-  b. delta bound: it shows less than before by what the lease held;
-  c. evidence: its process shows no more than it may keep.
-The device total decides; per-process figures are evidence and name the culprit. No reading means unknown, never free, and so does
-a list that leaves a living process out: what such a one did not give back by the total is charged to it.
+A released lease stays charged until a verdict. A reading is on target if all that can be checked
+holds:
+
+1. ledger bound: the GPU shows no more than everything else is charged;
+2. delta bound: it shows less than the baseline by what the lease held;
+3. process: the reading shows no more of the process than it may retain.
+
+Two such readings in a row verify the release. The device total decides; bytes per process are
+evidence and name the culprit. Where a list omits a living process, what the total misses is charged
+to that process.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 
 from vram_arbiter.arbiter.core.events import MemorySampled
-from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger, is_hidden, process_bytes
-from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger
+from vram_arbiter.arbiter.core.model.verification import Verdict, Verification
 
 DYING_S = 60.0
-"""Longer than any driver takes to free what a dead process held; what is still there then belongs to somebody who cannot be listed."""
+"""Longer than any driver takes to free the memory of a dead process. Bytes still there then belong
+to a process that cannot be listed."""
 
-
-class Verdict(StrEnum):
-    VERIFIED = "verified"
-    RESIDUE = "residue"
-    CONTESTED = "contested"
-    STALE = "stale"
-    UNVERIFIABLE = "unverifiable"
-
-
-@dataclass(frozen=True, slots=True)
-class Judgement:
-    """`resolved`: the charge may go, but for `residue_bytes`. Otherwise the bytes stay charged and the polling goes on."""
-
-    verdict: Verdict
-    resolved: bool
-    residue_bytes: int
-    culprits: tuple[tuple[int, str, int], ...] = ()  # (pid, name, bytes)
-
-
-@dataclass(slots=True)
-class Verification:
-    """One release, expiry or death under measurement."""
-
-    key: str
-    process: ProcessKey
-    lease: LeaseId | None  # None: only a residue of a dead process
-    consumer: str
-    model: str  # under which name its footprint is learnt
-    residue_bytes: int  # what may stay while the process lives
-    baseline: MemorySampled | None  # newest reading in which the bytes were still there
-    baseline_comparable: bool  # the lease was resident and ready when it was taken
-    confirmed_at: float  # only readings that began later count
-    not_before: (
-        float  # no verdict earlier: a lost holder may still be loading until it fences itself
-    )
-    deadline_at: float
-    paced_from: (
-        float  # since when the memory may come back: the readings are dense first, then rarer
-    )
-    next_poll_at: float = 0.0
-    settling: bool = False  # the newest reading is on target: one more has to agree
-    alive: bool = True
-    exiting: bool = False
-    exclusive: bool = False  # nobody else may come before these bytes are gone, whatever would fit
-    # until then a living holder may believe in its lease: what it keeps is no mere residue
-    fenced_at: float = 0.0
-    last_used_bytes: int | None = None  # of the newest counting reading
-    verdict: Verdict | None = None  # announced, but not resolved
-    overdue: bool = False
-
-    @property
-    def vanishes(self) -> bool:
-        """The process is dead or promised to be: nothing may stay."""
-        return self.exiting or not self.alive
-
-    @property
-    def kept_bytes(self) -> int:
-        return 0 if self.vanishes else self.residue_bytes
-
-    def going(self) -> Mapping[LeaseId, int]:
-        """The lease on its way out and what it leaves behind, as the ledger wants it."""
-        return {} if self.lease is None else {self.lease: self.kept_bytes}
+type Culprit = tuple[int, str, int]
+"""(pid, name, bytes)"""
 
 
 @dataclass(frozen=True, slots=True)
 class Others:
-    """What everybody else on the card may account for in a reading (`others.since_baseline`)."""
+    """What other processes on the GPU may account for (`evidence.others_since`)."""
 
-    grown_bytes: int
-    """They may have taken so much since the baseline, by right: up to what they are charged. From the lists of both readings; where one
-    has no list, from the charges that began to be filled since. 0 without a baseline."""
-    left_bytes: int
-    """The most that may have gone from the card since the baseline with those of them who leave, have left, shrink, or are no longer
-    listed. 0 without a baseline."""
-    loading_bytes: int
-    """Charged for loads under way, and not seen to be there yet. 0 where lists say who grew."""
+    grown_bytes: int = 0
+    """Others may have taken this since the baseline, up to what they are charged."""
+    left_bytes: int = 0
+    """The most that others may have freed since the baseline."""
+    loading_bytes: int = 0
+    """Charged for loads in progress and not yet seen. 0 where lists tell which process grew."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Comparison:
-    """A reading beside the three targets that stand at the head of this file."""
+class Judgement:
+    """A verdict. If resolved, the charge goes except for `residue_bytes`; otherwise polls go on."""
 
-    used_bytes: int  # the card's total in the reading
-    ledger_bound_bytes: int  # a.
-    delta_bound_bytes: int | None  # b.; None: there is nothing to compare with
-    held_bytes: int | None  # what the reading shows of the process; None: it cannot say
-    expected_bytes: int  # c.: the most that this may be
+    verdict: Verdict
+    resolved: bool
+    residue_bytes: int
+    culprits: tuple[Culprit, ...] = ()
 
-    def short_bytes(self) -> int:
-        """What did not come back; below 0: more came back than had to."""
-        short_bytes = self.used_bytes - self.ledger_bound_bytes
-        if self.delta_bound_bytes is not None:
-            short_bytes = max(short_bytes, self.used_bytes - self.delta_bound_bytes)
-        return short_bytes
 
-    def on_target(self, tolerance_bytes: int) -> bool:
-        """Does all that can be checked hold?"""
-        evident = (
-            self.held_bytes is None or self.held_bytes <= self.expected_bytes + tolerance_bytes
-        )
-        return evident and self.short_bytes() <= tolerance_bytes
+@dataclass(frozen=True, slots=True)
+class Opinion:
+    """What one reading says of one verification."""
+
+    settling: bool  # on target, and early enough: one more reading has to agree
+    judgement: Judgement | None  # None: not yet
+
+
+@dataclass(frozen=True, slots=True)
+class _Case:
+    """One reading beside what the ledger and the baseline allow it to show."""
+
+    verification: Verification
+    ledger: GpuLedger
+    reading: MemorySampled
+    tolerance_bytes: int
+    allowed_bytes: int  # the most that the process may still hold
+    held_bytes: int | None  # what the reading shows of the process; None: it cannot tell
+    ledger_bound_bytes: int
+    delta_bound_bytes: int | None  # None: no baseline to compare with
+
+    def over_ledger_bytes(self) -> int:
+        """Bytes by which the total exceeds the ledger bound."""
+        return self.reading.used_bytes - self.ledger_bound_bytes
+
+    def missing_bytes(self, taken_bytes: int = 0) -> int:
+        """Bytes that did not return, less `taken_bytes` of the delta; negative: more returned."""
+        over = self.over_ledger_bytes()
+        if self.delta_bound_bytes is None:
+            return over
+        return max(over, self.reading.used_bytes - self.delta_bound_bytes - taken_bytes)
+
+    def holds_too_much(self, held_bytes: int) -> bool:
+        return held_bytes > self.allowed_bytes + self.tolerance_bytes
+
+    def on_target(self) -> bool:
+        if self.held_bytes is not None and self.holds_too_much(self.held_bytes):
+            return False
+        return self.missing_bytes() <= self.tolerance_bytes
 
 
 def judge(
-    v: Verification, ledger: GpuLedger, sample: MemorySampled, others: Others, tolerance_bytes: int
-) -> Judgement | None:
-    """Judge a counting reading, and remember it for the one that has to agree. None: not yet."""
-    found = _compare(v, ledger, sample, others, tolerance_bytes)
-    stable = (
-        v.last_used_bytes is not None
-        and abs(found.used_bytes - v.last_used_bytes) <= tolerance_bytes
-    )
-    v.last_used_bytes = found.used_bytes
-    on_target = found.on_target(tolerance_bytes)
-    v.settling = on_target and sample.taken_at >= v.not_before
-    if on_target:
-        return Judgement(Verdict.VERIFIED, True, v.kept_bytes) if stable and v.settling else None
-    return _late(v, ledger, sample, found, tolerance_bytes) if v.overdue else None
+    verification: Verification,
+    ledger: GpuLedger,
+    reading: MemorySampled,
+    others: Others,
+    tolerance_bytes: int,
+) -> Opinion:
+    """Judge a reading that began after the release."""
+    case = _compare(verification, ledger, reading, others, tolerance_bytes)
+    if not case.on_target():
+        return Opinion(False, _late(case) if verification.overdue else None)
+    settling = reading.taken_at >= verification.not_before
+    last = verification.last_used_bytes
+    agrees = last is not None and abs(reading.used_bytes - last) <= tolerance_bytes
+    verified = Judgement(Verdict.VERIFIED, True, verification.retained_bytes)
+    return Opinion(settling, verified if settling and agrees else None)
 
 
-# -- what a reading should show ----------------------------------------------------------------------------------------
+# -- bounds --------------------------------------------------------------------------------------
 def _compare(
-    v: Verification, ledger: GpuLedger, sample: MemorySampled, others: Others, tolerance_bytes: int
-) -> _Comparison:
-    """Loads under way hide nothing: neither bound allows for bytes that may not have come yet."""
-    expected = ledger.process_after_bytes(v.process, v.going(), dead=v.vanishes)
-    ledger_bound = (
-        ledger.total_after_bytes(v.process, v.going(), dead=v.vanishes) + ledger.driver_bytes()
-    )
+    verification: Verification,
+    ledger: GpuLedger,
+    reading: MemorySampled,
+    others: Others,
+    tolerance_bytes: int,
+) -> _Case:
+    """Compute the bounds. Neither allows for loads in progress, whose bytes may not be there."""
+    process, leaving = verification.process, verification.leaving()
+    dead = verification.vanishes
+    allowed = ledger.process_after_bytes(process, leaving, dead=dead)
+    ledger_bound = ledger.total_after_bytes(process, leaving, dead=dead) + ledger.driver_bytes()
     ledger_bound -= others.loading_bytes
-    ledger_bound -= _doubtful_bytes(v, ledger, sample, expected, others.left_bytes, tolerance_bytes)
-    delta_bound = _delta_bound(v, ledger, expected)
+    if not verification.overdue:
+        ledger_bound -= _doubtful_bytes(
+            verification, ledger, reading, allowed, others.left_bytes, tolerance_bytes
+        )
+    delta_bound = _delta_bound(verification, ledger, allowed)
     if delta_bound is not None:
         delta_bound += others.grown_bytes - others.loading_bytes
-    held = process_bytes(sample, v.process)
-    return _Comparison(sample.used_bytes, ledger_bound, delta_bound, held, expected)
+    return _Case(
+        verification,
+        ledger,
+        reading,
+        tolerance_bytes,
+        allowed,
+        reading.bytes_of(process),
+        ledger_bound,
+        delta_bound,
+    )
 
 
-def _delta_bound(v: Verification, ledger: GpuLedger, expected: int) -> int | None:
-    """What the baseline showed, less what the process held then and should not any more. None: no baseline can tell."""
-    if v.baseline is None:
+def _delta_bound(verification: Verification, ledger: GpuLedger, allowed_bytes: int) -> int | None:
+    """Return the baseline's total less what the process must have freed; None: it cannot tell."""
+    baseline = verification.baseline
+    if baseline is None:
         return None
-    held_then = process_bytes(v.baseline, v.process)
-    if held_then is None or is_hidden(v.baseline, v.process):
-        if not v.baseline_comparable:
-            return None
-        held_then = _may_hold(v, ledger, v.baseline)
-    return v.baseline.used_bytes - (held_then - expected)
+    if baseline.shows(verification.process):
+        held_bytes = baseline.bytes_of(verification.process) or 0
+    elif verification.baseline_comparable:
+        held_bytes = _may_hold_bytes(verification, ledger, baseline)
+    else:
+        return None
+    return baseline.used_bytes - (held_bytes - allowed_bytes)
 
 
 def _doubtful_bytes(
-    v: Verification,
+    verification: Verification,
     ledger: GpuLedger,
-    sample: MemorySampled,
-    expected: int,
+    reading: MemorySampled,
+    allowed_bytes: int,
     left_bytes: int,
     tolerance_bytes: int,
 ) -> int:
-    """Bytes in nobody's list that the ledger still allows for, and that may have left in place of the lease's.
+    """Return unattributed bytes in the ledger that may have left in place of the lease's.
 
-    More is gone than everybody who leaves accounts for, so somebody unnamed went too, and what he left room for may be the lease's. A total
-    cannot tell, unless all of the unnamed is gone. Nor can it tell what stowaways of the last list did that no list shows any more. Once
-    the time is up this doubt alone keeps nobody waiting.
+    If more is gone than the leaving processes account for, an unlisted process freed memory too,
+    and the room may be hidden bytes of the lease. A total tells only once all unattributed bytes
+    are gone. Without a list, stowaways of the last list may have left as well.
     """
-    if v.overdue:
-        return 0
-    unseen_bytes = ledger.stowaway_bytes() - ledger.unnamed_bytes if sample.processes is None else 0
-    if v.baseline is None:
+    unseen_bytes = ledger.stowaway_bytes() - ledger.unnamed_bytes
+    if reading.lists_processes:
+        unseen_bytes = 0
+    baseline = verification.baseline
+    if baseline is None:
         return unseen_bytes
-    leaves_bytes = _may_hold(v, ledger, v.baseline) - expected + left_bytes
-    excess_bytes = v.baseline.used_bytes - sample.used_bytes - leaves_bytes
-    unnamed_bytes = ledger.unnamed_bytes
-    doubtful = tolerance_bytes < excess_bytes < unnamed_bytes - tolerance_bytes
-    return unseen_bytes + (unnamed_bytes if doubtful else 0)
+    expected_bytes = _may_hold_bytes(verification, ledger, baseline) - allowed_bytes + left_bytes
+    excess_bytes = baseline.used_bytes - reading.used_bytes - expected_bytes
+    doubtful = tolerance_bytes < excess_bytes < ledger.unnamed_bytes - tolerance_bytes
+    return unseen_bytes + (ledger.unnamed_bytes if doubtful else 0)
 
 
-def _may_hold(v: Verification, ledger: GpuLedger, sample: MemorySampled) -> int:
-    """A process that the reading does not name: what it is charged, as far as the total has bytes that nobody in the list explains."""
-    hidden = ledger.hidden_bytes(sample)
-    return min(ledger.filled_bytes(v.process), sample.used_bytes if hidden is None else hidden)
+def _may_hold_bytes(verification: Verification, ledger: GpuLedger, reading: MemorySampled) -> int:
+    """Return the most that a process may hold which the reading does not show."""
+    unlisted = ledger.unlisted_bytes(reading)
+    most = reading.used_bytes if unlisted is None else unlisted
+    return min(ledger.filled_bytes(verification.process), most)
 
 
-# -- the time is up ------------------------------------------------------------------------------------------------------
-def _late(
-    v: Verification,
-    ledger: GpuLedger,
-    sample: MemorySampled,
-    found: _Comparison,
-    tolerance_bytes: int,
-) -> Judgement:
-    """Say whose bytes these are, as far as this backend can tell."""
-    held = found.held_bytes
+# -- after the deadline --------------------------------------------------------------------------
+def _late(case: _Case) -> Judgement:
+    """Name the holder of the missing bytes, as far as the source can tell."""
+    verification, held = case.verification, case.held_bytes
     if held is None:
-        return _late_by_total(v, sample, found, tolerance_bytes)
-    if held > found.expected_bytes + tolerance_bytes:
-        name = next(
-            (use.name for use in sample.processes or () if use.process.pid == v.process.pid),
-            v.consumer,
-        )
-        culprits = ((v.process.pid, name, held),)
-        if v.alive:
-            return _residue(v, sample, held, culprits)
+        return _late_by_total(case)
+    if case.holds_too_much(held):
+        culprits = ((verification.process.pid, _name_of(case), held),)
+        if verification.alive:
+            return _residue(case, held, culprits)
         return Judgement(Verdict.CONTESTED, False, held, culprits)
-    missing = _missing_bytes(v, ledger, sample, found)
-    if v.alive and is_hidden(sample, v.process):
-        stays = _may_hold(v, ledger, sample)
-        if found.delta_bound_bytes is not None:
-            stays = min(stays, found.expected_bytes + missing)
-        if stays > found.expected_bytes + tolerance_bytes:
-            return _residue(v, sample, stays)
-    # a driver leaves a dying process out of its list before it has freed its bytes: what nobody has taken may be on its way still
-    freeing = not v.alive and sample.taken_at < v.deadline_at + DYING_S
-    resolved = not freeing or missing <= tolerance_bytes
-    return Judgement(Verdict.CONTESTED, resolved, v.kept_bytes, _grown_since(v, ledger, sample))
+    missing = case.missing_bytes(_taken_bytes(case))
+    if verification.alive and not case.reading.shows(verification.process):
+        stays = _may_hold_bytes(verification, case.ledger, case.reading)
+        if case.delta_bound_bytes is not None:
+            stays = min(stays, case.allowed_bytes + missing)
+        if case.holds_too_much(stays):
+            return _residue(case, stays)
+    # a driver may omit a dying process before it has freed its memory
+    dying = not verification.alive and case.reading.taken_at < verification.deadline_at + DYING_S
+    resolved = not dying or missing <= case.tolerance_bytes
+    return Judgement(Verdict.CONTESTED, resolved, verification.retained_bytes, _grown(case))
 
 
-def _late_by_total(
-    v: Verification, sample: MemorySampled, found: _Comparison, tolerance_bytes: int
-) -> Judgement:
-    """The reading names nobody: only the total can tell."""
-    if found.delta_bound_bytes is None:
-        return Judgement(Verdict.UNVERIFIABLE, False, v.kept_bytes)
-    if v.alive:
-        return _residue(v, sample, found.expected_bytes + found.short_bytes())
-    # a dead process holds nothing for ever: if the ledger explains the card, what is left belongs to others
-    return Judgement(
-        Verdict.CONTESTED, found.used_bytes <= found.ledger_bound_bytes + tolerance_bytes, 0
-    )
+def _late_by_total(case: _Case) -> Judgement:
+    """Judge by the total alone: the reading does not tell what the process holds."""
+    verification = case.verification
+    if case.delta_bound_bytes is None:
+        return Judgement(Verdict.UNVERIFIABLE, False, verification.retained_bytes)
+    if verification.alive:
+        return _residue(case, case.allowed_bytes + case.missing_bytes())
+    # a dead process frees everything: if the ledger explains the total, the rest is of others
+    return Judgement(Verdict.CONTESTED, case.over_ledger_bytes() <= case.tolerance_bytes, 0)
 
 
-def _residue(
-    v: Verification,
-    sample: MemorySampled,
-    stays: int,
-    culprits: tuple[tuple[int, str, int], ...] = (),
-) -> Judgement:
-    """A living process keeps more than it may. Until it has fenced itself these bytes are not left over: its lease is still in force for it."""
-    return Judgement(Verdict.RESIDUE, sample.taken_at >= v.fenced_at, stays, culprits)
+def _residue(case: _Case, stays_bytes: int, culprits: tuple[Culprit, ...] = ()) -> Judgement:
+    """A living process keeps too much. Until it has fenced itself its lease is in force for it."""
+    fenced = case.reading.taken_at >= case.verification.fenced_at
+    return Judgement(Verdict.RESIDUE, fenced, stays_bytes, culprits)
 
 
-def _missing_bytes(
-    v: Verification, ledger: GpuLedger, sample: MemorySampled, found: _Comparison
-) -> int:
-    """What did not come back, less what others visibly took beyond what they are charged; up to that they may grow, and were allowed for."""
-    if found.delta_bound_bytes is None or v.baseline is None:
-        return found.used_bytes - found.ledger_bound_bytes
+def _name_of(case: _Case) -> str:
+    pid = case.verification.process.pid
+    uses = (use for use in case.reading.listed if use.process.pid == pid)
+    return next((use.name for use in uses), case.verification.consumer)
+
+
+def _taken_bytes(case: _Case) -> int:
+    """Return what others visibly took since the baseline beyond their charges."""
+    baseline = case.verification.baseline
+    if baseline is None:
+        return 0
     taken = 0
-    for use in sample.processes or ():
-        if use.process.pid != v.process.pid:
-            then = process_bytes(v.baseline, use.process) or 0
-            taken += max(0, (use.used_bytes or 0) - max(then, ledger.booked_by(use.process)))
-    return max(
-        found.used_bytes - found.ledger_bound_bytes,
-        found.used_bytes - found.delta_bound_bytes - taken,
-    )
+    for use in case.reading.listed:
+        if use.process.pid != case.verification.process.pid:
+            explained = max(baseline.bytes_of(use.process) or 0, case.ledger.booked_by(use.process))
+            taken += max(0, use.held_bytes - explained)
+    return taken
 
 
-def _grown_since(
-    v: Verification, ledger: GpuLedger, sample: MemorySampled
-) -> tuple[tuple[int, str, int], ...]:
-    """Others that hold more than at the baseline, the largest first: (pid, name, bytes grown)."""
-    grown: list[tuple[int, str, int]] = []
-    for use in sample.processes or ():
-        if use.process.pid == v.process.pid or not use.used_bytes:
+def _grown(case: _Case) -> tuple[Culprit, ...]:
+    """Return the other processes that grew since the baseline, largest growth first.
+
+    Without a baseline: stowaways.
+    """
+    baseline = case.verification.baseline
+    grown: list[Culprit] = []
+    for use in case.reading.listed:
+        if use.process.pid == case.verification.process.pid:
             continue
-        then = (process_bytes(v.baseline, use.process) or 0) if v.baseline is not None else 0
-        if use.used_bytes > then and (v.baseline is not None or use.process in ledger.strangers):
-            grown.append((use.process.pid, use.name, use.used_bytes - then))
+        if baseline is None and use.process not in case.ledger.strangers:
+            continue
+        before = 0 if baseline is None else baseline.bytes_of(use.process) or 0
+        if use.held_bytes > before:
+            grown.append((use.process.pid, use.name, use.held_bytes - before))
     return tuple(sorted(grown, key=lambda item: (-item[2], item[0])))

@@ -1,27 +1,33 @@
-"""The bytes of a lease are measured away: a verification from its begin to its verdict.
+"""Course of a verification from its begin to its verdict: when the GPU is read, what follows.
 
-Says when to look, has each reading judged (`verify`, with what `others` may account for), tells the verdict and draws its consequences.
-The bytes stay charged until then.
+Readings are asked for and handed to `evidence` and `judge`; a resolved verdict frees the charge.
+The bytes stay charged until then. A failed reading means unknown: it frees nothing.
 """
 
-from vram_arbiter.arbiter.core.events import MemorySampled
+from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed
 from vram_arbiter.arbiter.core.learning import costs, drift
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
-from vram_arbiter.arbiter.core.verification import others
-from vram_arbiter.arbiter.core.verification.judge import Judgement, Verdict, Verification, judge
+from vram_arbiter.arbiter.core.model.verification import Verdict, Verification
+from vram_arbiter.arbiter.core.verification import evidence
+from vram_arbiter.arbiter.core.verification.judge import Judgement, judge
 from vram_arbiter.schemas.defaults import VERIFY_READING_SHARE
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 
 
-# -- begin -----------------------------------------------------------------------------------------------------------
+# -- begin ---------------------------------------------------------------------------------------
 def begin_for_lease(
     core: Core, gpu: Gpu, lease: Lease, *, alive: bool, grace_s: float = 0.0, fenced_at: float = 0.0
 ) -> None:
-    """Measure a lease's bytes away. Its charge is in the ledger and stays there until the verdict."""
+    """Verify that the bytes of a lease return.
+
+    Args:
+        alive: Whether its process lives.
+        grace_s: Seconds without a verdict: a lost holder may still be loading.
+        fenced_at: When the holder has fenced itself, in monotonic seconds.
+    """
     baseline = lease.departure.baseline or gpu.sample or gpu.before_sleep
     drift.on_leaving(core, lease)
-    comparable = baseline is not None and 0.0 < lease.ready_at <= baseline.taken_at
     verification = Verification(
         key=lease.id,
         process=lease.process,
@@ -30,7 +36,7 @@ def begin_for_lease(
         model=drift.model_name(lease.spec),
         residue_bytes=lease.spec.residue_bytes,
         baseline=baseline,
-        baseline_comparable=comparable,
+        baseline_comparable=baseline is not None and 0.0 < lease.ready_at <= baseline.taken_at,
         confirmed_at=core.now,
         not_before=core.now + grace_s,
         deadline_at=core.now + grace_s + core.settings.verify_timeout_s,
@@ -43,19 +49,35 @@ def begin_for_lease(
     _begin(core, gpu, verification)
 
 
-def begin_for_residue(core: Core, gpu: Gpu, process: ProcessKey) -> None:
-    """The process died and had only a residue here: measure that away too."""
+def on_process_died(core: Core, gpu: Gpu, process: ProcessKey) -> None:
+    """A process with an account on this GPU died: nothing may stay, and memory returns from now."""
+    for verification in gpu.verifications.values():
+        if verification.process == process:
+            verification.alive = False
+            verification.not_before = min(verification.not_before, core.now)
+            verification.paced_from = core.now
+            _read_soon(core, gpu, verification)
+    if not gpu.ledger.accounts[process].charges and _retained_key(process) not in gpu.verifications:
+        _begin_for_retained(core, gpu, process)
+
+
+def _retained_key(process: ProcessKey) -> str:
+    return f"residue:{process}"
+
+
+def _begin_for_retained(core: Core, gpu: Gpu, process: ProcessKey) -> None:
+    """Verify that the retained bytes of a dead process return."""
     baseline = gpu.sample or gpu.before_sleep
+    changed_at = gpu.ledger.accounts[process].changed_at
     verification = Verification(
-        key=f"residue:{process}",
+        key=_retained_key(process),
         process=process,
         lease=None,
         consumer=str(process),
         model="",
         residue_bytes=0,
         baseline=baseline,
-        baseline_comparable=baseline is not None
-        and baseline.taken_at > gpu.ledger.accounts[process].changed_at,
+        baseline_comparable=baseline is not None and baseline.taken_at > changed_at,
         confirmed_at=core.now,
         not_before=core.now,
         deadline_at=core.now + core.settings.verify_timeout_s,
@@ -70,24 +92,17 @@ def _begin(core: Core, gpu: Gpu, verification: Verification) -> None:
     _read_soon(core, gpu, verification)
 
 
-def bereave(core: Core, gpu: Gpu, verification: Verification) -> None:
-    """Its process died: nothing may stay any more, and it is from now on that the memory comes back."""
-    verification.alive = False
-    verification.not_before = min(verification.not_before, core.now)
-    verification.paced_from = core.now
-    _read_soon(core, gpu, verification)
+def begin_again(core: Core, gpu: Gpu) -> None:
+    """Restart the verifications of a GPU: readings before now no longer count."""
+    for verification in gpu.verifications.values():
+        verification.confirmed_at = core.now
+        verification.settling = False
+        verification.last_used_bytes = None
+        _restart_clock(core, gpu, verification)
 
 
-def begin_again(core: Core, gpu: Gpu, verification: Verification) -> None:
-    """What was read so far tells nothing any more, and neither does the time that it took."""
-    verification.confirmed_at = core.now
-    verification.settling = False
-    verification.last_used_bytes = None
-    _wait_anew(core, gpu, verification)
-
-
-def _wait_anew(core: Core, gpu: Gpu, verification: Verification) -> None:
-    """Nobody could look for a while: that time says nothing about when the memory comes back."""
+def _restart_clock(core: Core, gpu: Gpu, verification: Verification) -> None:
+    """Begin polls and deadline anew: time without readings says nothing of the memory's return."""
     verification.paced_from = max(core.now, verification.not_before)
     verification.deadline_at = verification.paced_from + core.settings.verify_timeout_s
     verification.overdue = False
@@ -95,9 +110,17 @@ def _wait_anew(core: Core, gpu: Gpu, verification: Verification) -> None:
     _read_soon(core, gpu, verification)
 
 
-# -- when to look ----------------------------------------------------------------------------------------------------
+# -- when to read --------------------------------------------------------------------------------
+def on_probe_due(core: Core, gpu_id: str) -> None:
+    """Take a background reading; `Arbiter.handle` plans the next one while the GPU is in demand."""
+    gpu = core.gpus[GpuId(gpu_id)]
+    gpu.asked_at = None  # a reading that never came must not silence the next one
+    core.want_sample(gpu, core.now)
+    core.wake(gpu)  # the last reading may be too old to carry a grant
+
+
 def on_poll_due(core: Core, gpu_id: str) -> None:
-    """Read the card for all verifications that are due, and say `stale` where no reading came in time."""
+    """Read the GPU for its due verifications; the verdict is `stale` where no reading came."""
     gpu = core.gpus[GpuId(gpu_id)]
     due = [v for v in gpu.verifications.values() if v.next_poll_at <= core.now]
     for verification in due:
@@ -107,13 +130,23 @@ def on_poll_due(core: Core, gpu_id: str) -> None:
             if verification.last_used_bytes is None:
                 _announce(core, gpu, verification, Judgement(Verdict.STALE, False, 0))
         verification.next_poll_at = _next_poll_at(core, gpu, verification)
-    # a reading that is under way and counts for all of them is not asked for twice
     core.want_sample(gpu, max(verification.confirmed_at for verification in due))
     _set_poll(core, gpu)
 
 
+def stale(core: Core) -> list[GpuId]:
+    """Return the GPUs whose newest reading, good or failed, is too old to gate a grant."""
+    oldest = core.now - core.settings.sample_max_age_s
+    return [
+        gpu.info.id
+        for gpu in core.gpus.values()
+        if (gpu.sample is None or gpu.sample.taken_at < oldest)
+        and (gpu.failed_at is None or gpu.failed_at < oldest)
+    ]
+
+
 def _read_soon(core: Core, gpu: Gpu, verification: Verification) -> None:
-    """A reading at once, and the next one soon: most memory is back when its holder says so."""
+    """Read at once and again soon: most memory is back when its holder reports the release."""
     core.want_sample(gpu, core.now)
     soon = core.now + core.settings.verify_confirm_s
     verification.next_poll_at = max(soon, verification.paced_from)
@@ -121,9 +154,10 @@ def _read_soon(core: Core, gpu: Gpu, verification: Verification) -> None:
 
 
 def _next_poll_at(core: Core, gpu: Gpu, verification: Verification) -> float:
-    """When to look again: dense as long as memory usually takes to come back, then rarer.
+    """Return the time of the next poll: dense while memory usually returns, then rarer.
 
-    A consumer that is known to take longer is looked at densely for longer, and a card that is slow to read is read less often.
+    Polls stay dense longer for a consumer that is known to take longer, and are rarer on a GPU that
+    is slow to read.
     """
     settings = core.settings
     pauses = settings.verify_poll_s
@@ -140,56 +174,95 @@ def _next_poll_at(core: Core, gpu: Gpu, verification: Verification) -> float:
 
 
 def _set_poll(core: Core, gpu: Gpu) -> None:
+    timer = ("verify", gpu.info.id)
     if gpu.verifications:
-        core.timers.set(
-            ("verify", gpu.info.id), min(v.next_poll_at for v in gpu.verifications.values())
-        )
+        core.timers.set(timer, min(v.next_poll_at for v in gpu.verifications.values()))
     else:
-        core.timers.clear(("verify", gpu.info.id))
+        core.timers.clear(timer)
 
 
-# -- weigh a reading -------------------------------------------------------------------------------------------------
-def on_reading(core: Core, gpu: Gpu, sample: MemorySampled, *, answers_again: bool) -> None:
-    """Weigh a new reading for all of whom it may say something. `answers_again`: the readings before it failed."""
+# -- a reading arrives ---------------------------------------------------------------------------
+def on_reading(core: Core, reading: MemorySampled) -> None:
+    """Take a reading and judge by it. An impossible one counts as failed, an outdated one not."""
+    gpu = core.gpus.get(reading.gpu)
+    if gpu is None or _outdated(gpu, reading):
+        return
+    problem = evidence.impossible(gpu, reading, core.settings.verify_tolerance_bytes)
+    if problem:
+        on_probe_failed(core, ProbeFailed(reading.gpu, reading.taken_at, problem))
+        return
+    answers_again = _on_answer(core, gpu, reading)
+    evidence.take(core, gpu, reading)
     for verification in list(gpu.verifications.values()):
-        if sample.taken_at > verification.confirmed_at:
+        if reading.taken_at > verification.confirmed_at:
             if answers_again or verification.verdict is Verdict.STALE:
-                _wait_anew(core, gpu, verification)
-            _weigh(core, gpu, verification, sample)
+                _restart_clock(core, gpu, verification)
+            _weigh(core, gpu, verification, reading)
+    evidence.note_pressure(core, gpu)
+    core.wake(gpu)
+    for feature in core.features:
+        feature.on_sample(core, gpu, reading)
 
 
-def _weigh(core: Core, gpu: Gpu, verification: Verification, sample: MemorySampled) -> None:
-    meanwhile = others.since_baseline(gpu, verification, sample, core.settings.verify_timeout_s)
-    judgement = judge(
-        verification, gpu.ledger, sample, meanwhile, core.settings.verify_tolerance_bytes
-    )
-    if meanwhile.loading_bytes and not verification.settling:
-        # nothing is granted before the load has ended, so nobody waits for this verdict
-        verification.deadline_at = max(
-            verification.deadline_at, core.now + core.settings.verify_timeout_s
-        )
+def on_probe_failed(core: Core, event: ProbeFailed) -> None:
+    """The GPU is unknown: grants stop until a good reading. Noted once per outage."""
+    gpu = core.gpus.get(event.gpu)
+    if gpu is None:
         return
-    if judgement is None:
-        if verification.settling:
-            verification.next_poll_at = max(
-                core.now, sample.taken_at + core.settings.verify_confirm_s
-            )
-            _set_poll(core, gpu)
-        return
-    _announce(core, gpu, verification, judgement, sample)
-    if judgement.resolved:
-        _resolve(core, gpu, verification, judgement)
+    gpu.asked_at = None
+    if gpu.failed_at is None:
+        core.note("probe_failed", gpu=event.gpu, reason=event.reason)
+    gpu.failed_at, gpu.failure = event.at, event.reason
+    core.wake(gpu)
 
 
-# -- the verdict -----------------------------------------------------------------------------------------------------
+def _outdated(gpu: Gpu, reading: MemorySampled) -> bool:
+    """Whether a reading began before the newest one, or before the machine was suspended."""
+    newest_at = gpu.read_from if gpu.sample is None else gpu.sample.taken_at
+    return reading.taken_at < max(newest_at, gpu.read_from)
+
+
+def _on_answer(core: Core, gpu: Gpu, reading: MemorySampled) -> bool:
+    """Record that the probe answered. Return whether this ends an outage."""
+    if gpu.asked_at is not None and reading.taken_at >= gpu.asked_at:
+        gpu.asked_at = None
+    gpu.reading_s = max(0.0, core.now - reading.taken_at)
+    if gpu.failed_at is None:
+        return False
+    gpu.failed_at, gpu.failure = None, ""
+    core.note("probe_ok", gpu=gpu.info.id)
+    return True
+
+
+def _weigh(core: Core, gpu: Gpu, verification: Verification, reading: MemorySampled) -> None:
+    settings = core.settings
+    others = evidence.others_since(gpu, verification, reading, settings.verify_timeout_s)
+    opinion = judge(verification, gpu.ledger, reading, others, settings.verify_tolerance_bytes)
+    verification.settling = opinion.settling
+    verification.last_used_bytes = reading.used_bytes
+    if others.loading_bytes and not opinion.settling:
+        # nothing is granted before the load ends, so no request waits for this verdict
+        deadline_at = core.now + settings.verify_timeout_s
+        verification.deadline_at = max(verification.deadline_at, deadline_at)
+    elif opinion.judgement is not None:
+        _announce(core, gpu, verification, opinion.judgement, reading)
+        if opinion.judgement.resolved:
+            _resolve(core, gpu, verification, opinion.judgement)
+    elif opinion.settling:
+        confirm_at = reading.taken_at + settings.verify_confirm_s
+        verification.next_poll_at = max(core.now, confirm_at)
+        _set_poll(core, gpu)
+
+
+# -- the verdict ---------------------------------------------------------------------------------
 def _announce(
     core: Core,
     gpu: Gpu,
     verification: Verification,
     judgement: Judgement,
-    sample: MemorySampled | None = None,
+    reading: MemorySampled | None = None,
 ) -> None:
-    """Tell a verdict once; an unresolved one that repeats is silent."""
+    """Note a verdict; an unresolved one that repeats is noted once."""
     if verification.verdict is judgement.verdict and not judgement.resolved:
         return
     verification.verdict = judgement.verdict
@@ -202,7 +275,7 @@ def _announce(
         resolved=judgement.resolved,
         ms=(core.now - verification.confirmed_at) * 1e3,
         before_bytes=None if verification.baseline is None else verification.baseline.used_bytes,
-        after_bytes=None if sample is None else sample.used_bytes,
+        after_bytes=None if reading is None else reading.used_bytes,
         residue_bytes=judgement.residue_bytes,
         culprits=[
             {"pid": pid, "name": name, "bytes": count} for pid, name, count in judgement.culprits
@@ -211,6 +284,7 @@ def _announce(
 
 
 def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgement) -> None:
+    """Free the charge except for retained bytes, and tell everything that waits for it."""
     del gpu.verifications[verification.key]
     _set_poll(core, gpu)
     gpu.changed_at = core.now
@@ -223,11 +297,11 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
         core.record_residue(gpu, process, 0)
         return
     drift.on_verdict(core, gpu, verification)
-    residue = gpu.ledger.drop(
-        verification.lease, judgement.residue_bytes, verification.kept_bytes, core.now
+    retained_bytes = gpu.ledger.drop(
+        verification.lease, judgement.residue_bytes, verification.retained_bytes, core.now
     )
     gpu.left.append((core.now, held_bytes - gpu.ledger.filled_bytes(process)))
-    core.record_residue(gpu, process, residue)
+    core.record_residue(gpu, process, retained_bytes)
     core.forget(f"lease:{verification.lease}")
     _close_eviction(core, gpu, verification, judgement)
     costs.left(core, verification.consumer)
@@ -243,11 +317,9 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
 
 def _close_eviction(core: Core, gpu: Gpu, verification: Verification, judgement: Judgement) -> None:
     core.learn(verification.consumer, "verify_s", core.now - verification.confirmed_at)
-    for way_out in gpu.evictions:
-        if way_out.lease == verification.lease:
-            way_out.verdict, way_out.verdict_at = str(judgement.verdict), core.now
-            waiter = core.waiting.get(way_out.wanted_by) if way_out.wanted_by is not None else None
+    for eviction in gpu.evictions:
+        if eviction.lease == verification.lease:
+            eviction.verdict, eviction.verdict_at = str(judgement.verdict), core.now
+            waiter = core.waiting.get(eviction.wanted_by) if eviction.wanted_by else None
             for gpu_id in () if waiter is None else waiter.request.gpus:
-                core.wake(
-                    core.gpus[gpu_id]
-                )  # if this was not enough, it may be served on another card
+                core.wake(core.gpus[gpu_id])  # the waiter may fit on another GPU

@@ -1,7 +1,23 @@
-"""What a GPU backend can do for the daemon: say which cards there are, and read one of them.
+"""Interface of a GPU backend: list the GPUs, and read one of them.
 
-Calls block and may hang (a driver can): the host runs them in a thread of their own with a deadline. A probe never decides
-anything, and none of them creates a CUDA context.
+Calls block and may hang as drivers do: the host runs them in a thread of their own with a deadline.
+A probe never decides anything, and none creates a CUDA context.
+
+What sources can tell beside the total. The engine derives it from each reading
+(`events.MemorySampled`), since a driver may fail to list processes at any time:
+
+| source                                   | lists_processes | lists_bytes | pids are ours     |
+| ---------------------------------------- | --------------- | ----------- | ----------------- |
+| NVML on a host                           | yes             | yes         | yes               |
+| NVML under WSL2                          | yes             | no          | yes               |
+| NVML in a container, host's /proc known  | yes             | yes         | in this container |
+| NVML in a container, host's /proc hidden | no              | no          | no                |
+| unified: nvmap as root, or NVML's list   | yes             | yes         | yes               |
+| unified: neither                         | no              | no          | no                |
+| fake                                     | yes             | yes         | yes               |
+| fake with the fault `hide_processes`     | no              | no          | no                |
+
+A listed process that /proc does not show is named by its pid alone (`start_ticks` 0).
 """
 
 from dataclasses import dataclass
@@ -15,7 +31,8 @@ from vram_arbiter.schemas.ids import GpuId
 class Card:
     """One GPU as its backend names it. `reserved_bytes` the driver keeps for itself.
 
-    A card whose memory others live in too asks for more: `margin_bytes` is its least reserve, `noise_bytes` its least tolerance.
+    A GPU that shares the machine's memory needs more: `margin_bytes` is its least reserve,
+    `noise_bytes` its least tolerance.
     """
 
     id: GpuId
@@ -29,7 +46,10 @@ class Card:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One reading of one card. `used_bytes` leaves the driver's own reserve out; `processes` None: cannot be listed."""
+    """One reading of one GPU. `used_bytes` excludes the driver's own reserve.
+
+    `processes` is None where they cannot be listed.
+    """
 
     used_bytes: int
     total_bytes: int
@@ -39,9 +59,9 @@ class Reading:
 class GpuProbe(Protocol):
     """A backend. Every method blocks.
 
-    `cards` raises NoGpu where there is none. `sample` raises ProbeFailed when the reading fails (unknown, never free) and
-    UnknownGpu for a card that `cards` does not list. `close` may be called from another thread and ends a hanging `sample`
-    where the backend can.
+    `cards` raises NoGpu where there is none. `sample` raises ProbeFailed when the reading fails
+    (unknown, never free) and UnknownGpu for a GPU that `cards` does not list. `close` may be called
+    from another thread and ends a hanging `sample` where the backend can.
     """
 
     def cards(self) -> tuple[Card, ...]: ...

@@ -24,42 +24,42 @@ def reading(at: float, used: int, *uses: tuple[ProcessKey, int | None]) -> Memor
 
 # -- what is watched -----------------------------------------------------------------------------------------------------
 def test_what_was_given_up_counts_for_as_long_as_it_is_asked_for() -> None:
-    returning = PendingFree()
-    returning.give_up(A, 300, 10.0)
-    returning.give_up(B, 50, 12.0)
-    assert returning.since(9.0) == 350
-    assert returning.since(10.0) == 50
-    assert returning.since(9.0) == 50, "what is over is forgotten"
+    pending = PendingFree()
+    pending.give_up(A, 300, 10.0)
+    pending.give_up(B, 50, 12.0)
+    assert pending.since(9.0) == 350
+    assert pending.since(10.0) == 50
+    assert pending.since(9.0) == 50, "what is over is forgotten"
 
 
 def test_what_a_process_takes_again_is_not_on_its_way() -> None:
-    returning = PendingFree()
-    returning.give_up(A, 300, 10.0)
-    returning.give_up(A, -100, 11.0)
-    returning.give_up(B, -100, 11.0)
-    assert returning.since(9.0) == 200
-    assert returning.since(10.5) == 0, "it was given up at 10"
-    returning.give_up(A, 300, 10.0)
-    returning.give_up(A, -300, 11.0)
-    assert returning.since(9.0) == 0
+    pending = PendingFree()
+    pending.give_up(A, 300, 10.0)
+    pending.give_up(A, -100, 11.0)
+    pending.give_up(B, -100, 11.0)
+    assert pending.since(9.0) == 200
+    assert pending.since(10.5) == 0, "it was given up at 10"
+    pending.give_up(A, 300, 10.0)
+    pending.give_up(A, -300, 11.0)
+    assert pending.since(9.0) == 0
 
 
 def test_two_readings_say_what_was_given_up_between_them() -> None:
-    returning = PendingFree()
+    pending = PendingFree()
     before = reading(1.0, 900, (A, 500), (B, 300), (STRANGER, 100))
-    returning.watch(None, before, (), lambda _: 0)
-    returning.watch(before, reading(2.0, 900, (A, 400), (B, 200)), {B}, lambda _: 0)
-    assert returning.since(1.0) == 200, "100 of A's and the stranger's; B is being measured"
+    pending.watch(None, before, (), lambda _: 0)
+    pending.watch(before, reading(2.0, 900, (A, 400), (B, 200)), {B}, lambda _: 0)
+    assert pending.since(1.0) == 200, "100 of A's and the stranger's; B is being measured"
     hidden = MemorySampled(GPU, 3.0, 900, 1000, None)
-    returning.watch(before, hidden, (), lambda _: 0)
-    returning.watch(hidden, before, (), lambda _: 0)
-    assert returning.since(1.0) == 200, "such a reading says nothing of anybody"
+    pending.watch(before, hidden, (), lambda _: 0)
+    pending.watch(hidden, before, (), lambda _: 0)
+    assert pending.since(1.0) == 200, "such a reading says nothing of anybody"
 
 
 def test_a_holder_that_leaves_the_list_still_explains_what_it_is_booked() -> None:
-    returning = PendingFree()
-    returning.watch(reading(1.0, 500, (A, 500)), reading(2.0, 500), (), {A: 450}.__getitem__)
-    assert returning.since(1.0) == 50
+    pending = PendingFree()
+    pending.watch(reading(1.0, 500, (A, 500)), reading(2.0, 500), (), {A: 450}.__getitem__)
+    assert pending.since(1.0) == 50
 
 
 # -- what it means for the rest that nobody explains -----------------------------------------------------------------------
@@ -67,9 +67,9 @@ def test_a_holder_that_leaves_the_list_still_explains_what_it_is_booked() -> Non
 def test_a_rest_that_may_be_going_is_believed_as_far_as_it_was_there_before(lists: bool) -> None:
     books = GpuLedger(GpuInfo(GPU, 0, "card", 1000, 100), 10)
 
-    def observe(at: float, used: int, returning_bytes: int) -> tuple[int, int | None]:
+    def observe(at: float, used: int, pending_bytes: int) -> tuple[int, int | None]:
         sample = reading(at, used) if lists else MemorySampled(GPU, at, used, 1000, None)
-        books.observe(sample, quiet=True, returning_bytes=returning_bytes)
+        books.observe(sample, quiet=True, pending_bytes=pending_bytes)
         return books.unnamed_bytes, books.overhead_bytes
 
     assert observe(1.0, 400, 400) == (0, None), (

@@ -197,9 +197,9 @@ def test_a_process_that_is_known_by_its_pid_alone_is_no_stranger() -> None:
     assert ledger.booked_by(BROWSER) == 0
     reading = driver.card.read(driver.now)
     assert isinstance(reading, MemorySampled)
-    assert ledger.hidden_bytes(reading) == 0
+    assert ledger.unlisted_bytes(reading) == 0
     assert (
-        ledger.hidden_bytes(replace(reading, processes=(ProcessUse(det.process, "det", None),)))
+        ledger.unlisted_bytes(replace(reading, processes=(ProcessUse(det.process, "det", None),)))
         is None
     )
 
