@@ -400,7 +400,7 @@ def test_the_environment_is_checked() -> None:
     ):
         with pytest.raises(ConfigError, match="expected a number"):
             LlmConfig.from_environ(complete | {f"VRAM_REASONER_LLM_{name}": text})
-    with pytest.raises(ConfigError, match="no http"):
+    with pytest.raises(ConfigError, match="expected an http"):
         LlmConfig.from_environ(complete | {"VRAM_REASONER_LLM_BASE_URL": "file:///etc/passwd"})
     cloud = LlmConfig.from_environ(
         {"VRAM_REASONER_LLM_MODEL": "m"}, base_url=AnthropicPlanner.default_base_url
@@ -450,5 +450,5 @@ def test_a_key_that_no_header_carries_is_refused_and_not_shown() -> None:
         ) as caught:
             LlmConfig.from_environ(complete | {"VRAM_REASONER_LLM_BASE_URL": url})
         assert "secret" not in str(caught.value)
-    with pytest.raises(ConfigError, match="MAX_TOKENS is no number"):
+    with pytest.raises(ConfigError, match="MAX_TOKENS: expected a number"):
         LlmConfig.from_environ(complete | {"VRAM_REASONER_LLM_MAX_TOKENS": "0.5"})
