@@ -1,4 +1,4 @@
-"""Pages name what exists: paths of the tree in the text, and the targets of relative links."""
+"""Pages name what exists: paths and functions of the tree, and the targets of relative links."""
 
 import re
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 
 TREE = Path(__file__).parents[2]
 FOLDERS = "arbiter|clients|schemas|sidecars|runner|reasoner|configs|examples|docs|tests|src"
-PATH = re.compile(rf"`((?:{FOLDERS})/[\w./-]*|[\w-]+\.(?:md|toml|txt))(?:::\w+)?`")
+PATH = re.compile(rf"`((?:{FOLDERS})/[\w./-]*|[\w-]+\.(?:md|toml|txt))(?:::(\w+))?`")
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)(?:#([\w-]+))?\)")
 PAGES = sorted([*TREE.glob("*.md"), *(TREE / "docs").rglob("*.md")])
 
@@ -18,16 +18,22 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
+def defines(path: Path, name: str) -> bool:
+    """Return whether a Python file defines a function or class of this name."""
+    text = path.read_text(encoding="utf-8")
+    return re.search(rf"^ *(?:async def|def|class) {name}\b", text, re.MULTILINE) is not None
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(TREE)))
 def test_named_paths_exist(page: Path) -> None:
     """The changelog speaks of the past and may name what is gone."""
     if page.name == "CHANGELOG.md":
         pytest.skip("history")
-    text = page.read_text(encoding="utf-8")
-    roots = (TREE, TREE / "tests")
-    missing = [
-        name for name in PATH.findall(text) if not any((root / name).exists() for root in roots)
-    ]
+    missing = []
+    for name, function in PATH.findall(page.read_text(encoding="utf-8")):
+        found = [root / name for root in (TREE, TREE / "tests") if (root / name).exists()]
+        if not found or (function and not defines(found[0], function)):
+            missing.append(f"{name}::{function}")
     assert not missing
 
 
