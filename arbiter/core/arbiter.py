@@ -13,7 +13,7 @@
 It must not know how effects are performed, nor that a wire exists.
 """
 
-from collections.abc import Set
+from collections.abc import Callable, Mapping, Set
 from typing import Any
 
 from vram_arbiter.arbiter.core import invariants
@@ -52,6 +52,7 @@ from vram_arbiter.arbiter.core.features.resizing import Resizing
 from vram_arbiter.arbiter.core.features.standby import Standby
 from vram_arbiter.arbiter.core.inspection import Inspection
 from vram_arbiter.arbiter.core.model.state import Core, Refused
+from vram_arbiter.arbiter.core.model.turn import Turn
 from vram_arbiter.arbiter.core.report import explain, figures
 from vram_arbiter.arbiter.core.requests import (
     expiry,
@@ -60,14 +61,8 @@ from vram_arbiter.arbiter.core.requests import (
     refusals,
     requests,
     resume,
+    sessions,
     uses,
-)
-from vram_arbiter.arbiter.core.requests.sessions import (
-    concerns,
-    on_connected,
-    on_died,
-    on_journal_failed,
-    on_left,
 )
 from vram_arbiter.arbiter.core.scheduling import deadlock, grants
 from vram_arbiter.arbiter.core.settings import Settings
@@ -77,6 +72,54 @@ from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
 DUE_MAX = 64
 """Timers that one Tick serves. What is due beyond them is served by the next one, at once, so that thousands of waits that end together do
 not hold the loop."""
+
+
+def _on_reading(core: Core, sample: MemorySampled) -> None:
+    schedule.on_reading(core, sample)
+    if core.recovering is not None:
+        recovery.account_for_the_empty(core, sample)
+
+
+_FACTS: Mapping[type, Callable[[Core, Any], None]] = {
+    # 1.1 connections
+    ClientConnected: sessions.on_connected,
+    ClientLeft: sessions.on_left,
+    ProcessDied: sessions.on_died,
+    # 1.3 the machine
+    MemorySampled: _on_reading,
+    ProbeFailed: schedule.on_probe_failed,
+    JournalFailed: sessions.on_journal_failed,
+    Recovered: recovery.on_recovered,
+    Resumed: resume.on_resumed,
+}
+_REQUESTS: Mapping[type, Callable[[Core, Any], None]] = {
+    AcquireRequested: requests.acquire,
+    CancelRequested: requests.cancel,
+    ReadyReported: requests.ready,
+    UseBegan: uses.begin,
+    UseEnded: uses.end,
+    UseYielded: uses.yield_,
+    Renewed: requests.renew,
+    OomReported: requests.oom,
+    RevokeAcknowledged: requests.revoke_ack,
+    UnloadStarted: requests.unloading,
+    ReleaseReported: requests.release,
+    Reattached: recovery.on_reattached,
+    OperatorAsked: operators.on_operator,
+}
+"""1.2, beside those of features: each raises Refused before it has changed anything."""
+_DUE: Mapping[str, Callable[[Core, str], None]] = {
+    "ttl": expiry.on_expiry_due,
+    "wait": requests.on_wait_timeout,
+    "revoke": eviction.on_ladder_due,
+    "overstay": eviction.on_overstay_due,
+    "verify": schedule.on_poll_due,
+    "probe": schedule.on_probe_due,
+    "users": uses.on_users_due,
+    "recover": recovery.on_recover_due,
+    "plan": grants.on_plan_due,
+}
+"""1.4: kinds of timers; the other kinds are a feature's own."""
 
 
 class Arbiter:
@@ -95,7 +138,6 @@ class Arbiter:
         """What is to be done, in order. Raises InvariantViolation or IllegalTransition on a defect of the engine: stop then."""
         core = self._core
         core.now = max(core.now, now)
-        core.out = []
         self._happened(event)  # 1
         recovery.serve_if_accounted(core)  # 2
         deadlock.resolve(core)  # 3
@@ -105,7 +147,8 @@ class Arbiter:
         requests.answer_queued(core)
         self._keep_reading()  # 4
         invariants.check(core)  # 5
-        return core.out
+        turn, core.turn = core.turn, Turn()
+        return turn.effects
 
     def check_all(self) -> None:
         """Every invariant over everything, and the tables that the check of each event stands on. For tests' drivers: O(leases)."""
@@ -166,92 +209,29 @@ class Arbiter:
 
     def concerns(self, client: ClientId) -> bool:
         """Whether a lease, a request or a use is this client's (`sessions.concerns`)."""
-        return concerns(self._core, client)
+        return sessions.concerns(self._core, client)
 
     def _happened(self, event: Event) -> None:
-        core = self._core
-        match event:
-            # 1.1 connections
-            case ClientConnected():
-                on_connected(core, event)
-            case ClientLeft():
-                on_left(core, event)
-            case ProcessDied():
-                on_died(core, event.process)
-            # 1.3 the machine
-            case MemorySampled():
-                schedule.on_reading(core, event)
-                recovery.account_for_the_empty(core, event)
-            case ProbeFailed():
-                schedule.on_probe_failed(core, event)
-            case JournalFailed():
-                on_journal_failed(core, event)
-            case Recovered():
-                recovery.on_recovered(core, event)
-            case Resumed():
-                resume.on_resumed(core, event)
-            # 1.4 time
-            case Tick():
-                self._run_due()
-            # 1.2 requests
-            case _:
-                try:
-                    self._requested(event)
-                except Refused as refused:
-                    core.refuse(event.client, event.request, refused)
-                    if isinstance(event, AcquireRequested | Reacquired | ResizeAsked):
-                        refusals.note(core, event, refused)
+        if (fact := _FACTS.get(type(event))) is not None:  # 1.1, 1.3
+            fact(self._core, event)
+        elif isinstance(event, Tick):  # 1.4
+            self._run_due()
+        else:  # 1.2
+            self._requested(event)
 
-    def _requested(
-        self,
-        event: AcquireRequested
-        | CancelRequested
-        | ReadyReported
-        | UseBegan
-        | UseEnded
-        | UseYielded
-        | Renewed
-        | OomReported
-        | RevokeAcknowledged
-        | UnloadStarted
-        | ReleaseReported
-        | Reacquired
-        | ResizeAsked
-        | Reattached
-        | OperatorAsked,
-    ) -> None:
+    def _requested(self, event: Any) -> None:
         core = self._core
-        match event:
-            case AcquireRequested():
-                requests.acquire(core, event)
-            case CancelRequested():
-                requests.cancel(core, event)
-            case ReadyReported():
-                requests.ready(core, event)
-            case UseBegan():
-                uses.begin(core, event)
-            case UseEnded():
-                uses.end(core, event)
-            case UseYielded():
-                uses.yield_(core, event)
-            case Renewed():
-                requests.renew(core, event)
-            case OomReported():
-                requests.oom(core, event)
-            case RevokeAcknowledged():
-                requests.revoke_ack(core, event)
-            case UnloadStarted():
-                requests.unloading(core, event)
-            case ReleaseReported():
-                requests.release(core, event)
-            case ResizeAsked():
-                self._resizing.resize(core, event)
-            case Reacquired():
+        try:
+            if isinstance(event, Reacquired):
                 self._standby.reacquire(core, event)
-            case Reattached():
-                recovery.on_reattached(core, event)
-            case _:  # OperatorAsked
-                operators.on_operator(core, event)
+            elif isinstance(event, ResizeAsked):
+                self._resizing.resize(core, event)
+            else:
+                _REQUESTS[type(event)](core, event)
+        except Refused as refused:
+            core.refuse(event.client, event.request, refused)
+            if isinstance(event, AcquireRequested | Reacquired | ResizeAsked):
+                refusals.note(core, event, refused)
 
     def _run_due(self) -> None:
         core = self._core
@@ -260,32 +240,15 @@ class Arbiter:
             if due is None:
                 return
             kind, subject = due
-            match kind:
-                case "ttl":
-                    expiry.on_expiry_due(core, subject)
-                case "wait":
-                    requests.on_wait_timeout(core, subject)
-                case "revoke":
-                    eviction.on_ladder_due(core, subject)
-                case "overstay":
-                    eviction.on_overstay_due(core, subject)
-                case "verify":
-                    schedule.on_poll_due(core, subject)
-                case "probe":
-                    schedule.on_probe_due(core, subject)
-                case "users":
-                    uses.on_users_due(core, subject)
-                case "recover":
-                    recovery.on_recover_due(core, subject)
-                case "plan":  # a residency ended, or a waiter has aged
-                    core.wake(core.gpus[GpuId(subject)])
-                case _:
-                    owner = next(one for one in core.features if kind in one.timers)
-                    owner.on_timer(core, kind, subject)
+            if kind in _DUE:
+                _DUE[kind](core, subject)
+            else:
+                owner = next(one for one in core.features if kind in one.timers)
+                owner.on_timer(core, kind, subject)
 
     def _keep_reading(self) -> None:
         core = self._core
-        for gpu in core.gpus.values():
+        for gpu in core.turn.touched.values():
             if gpu.sees_loads():
                 core.read_again(gpu, core.settings.load_probe_s)
             elif ("probe", gpu.info.id) not in core.timers and core.active(gpu):

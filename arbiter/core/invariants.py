@@ -17,6 +17,7 @@ Numbers are those of ARCHITECTURE.md:
 
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import NOT_COUNTED, Core, Gpu
+from vram_arbiter.arbiter.core.model.turn import Turn
 
 _UNUSED = tuple(
     state for state in LeaseState if state not in (LeaseState.HELD, LeaseState.REVOKING)
@@ -35,14 +36,15 @@ class InvariantViolation(Exception):
 
 
 def check(core: Core) -> None:
-    """Raise InvariantViolation unless everything holds that the last event can have broken."""
-    for gpu in core.gpus.values():
-        granted = bool(core.granted) and _granted_on(core, gpu)
+    """Raise InvariantViolation unless everything holds that the event of this turn can have broken."""
+    granted_on = {gpu_id for _, gpu_id in core.turn.granted}
+    for gpu in core.turn.touched.values():
+        granted = gpu.info.id in granted_on
         _bytes(gpu, granted=granted)
         _residents(gpu, granted=granted)
         _charges(gpu)
-    if core.granted:
-        _tokens(core)
+        _head(core, gpu)
+    _tokens(core)
     _waiters(core)
     for feature in core.features:
         feature.check(core, everything=False)
@@ -60,7 +62,12 @@ def check_all(core: Core) -> None:
         for lease in gpu.residents.values():
             _unused(lease)
     core.counted = NOT_COUNTED
+    turn = core.turn
+    core.turn = Turn(
+        granted=turn.granted, touched={gpu.info.index: gpu for gpu in core.gpus.values()}
+    )
     check(core)
+    core.turn = turn
     for feature in core.features:
         feature.check(core, everything=True)
 
@@ -75,11 +82,6 @@ def _bytes(gpu: Gpu, *, granted: bool) -> None:
         raise InvariantViolation(
             1, f"granted on {gpu.info.id}, which now has {gpu.ledger.total_bytes()} bytes to bear"
         )
-
-
-def _granted_on(core: Core, gpu: Gpu) -> bool:
-    """Did this very event grant something here? What was found after a restart may be crowded without our doing."""
-    return any(gpu_id == gpu.info.id for _, gpu_id in core.granted)
 
 
 def _residents(gpu: Gpu, *, granted: bool) -> None:
@@ -138,11 +140,11 @@ def _charges(gpu: Gpu) -> None:
 
 
 def _tokens(core: Core) -> None:
-    for token, _ in core.granted:
+    for token, _ in core.turn.granted:
         if token <= core.last_token:
             raise InvariantViolation(5, f"token {token} after {core.last_token}")
         core.last_token = token
-    core.granted.clear()
+    core.turn.granted.clear()
 
 
 def _counts(core: Core, queued: int) -> None:
@@ -155,26 +157,26 @@ def _counts(core: Core, queued: int) -> None:
 
 
 def _waiters(core: Core) -> None:
-    queued = 0
-    for gpu in core.gpus.values():
-        queued += len(gpu.queue)
+    if not core.turn.touched:
+        return
+    queued = sum(len(gpu.queue) for gpu in core.gpus.values())
     if (queued, len(core.waiting)) != core.counted:
         _counts(core, queued)
-    for gpu in core.gpus.values():
-        head = gpu.queue.head()
-        if head is None:
-            continue
-        if head.id not in core.waiting:
-            raise InvariantViolation(
-                6, f"{head.id} is {head.state}, yet it is the head of {gpu.info.id}"
-            )
-        if head.request.extends is not None and head.request.extends not in gpu.residents:
-            raise InvariantViolation(
-                6, f"{head.id} waits to extend {head.request.extends}, which is not there"
-            )
-        if head.request.wait_timeout_s is not None and ("wait", head.id) not in core.timers:
-            raise InvariantViolation(6, f"{head.id} has a bound and no timer")
-        if ("probe", gpu.info.id) not in core.timers:
-            raise InvariantViolation(
-                6, f"nobody will read {gpu.info.id} again, and {head.id} waits"
-            )
+
+
+def _head(core: Core, gpu: Gpu) -> None:
+    head = gpu.queue.head()
+    if head is None:
+        return
+    if head.id not in core.waiting:
+        raise InvariantViolation(
+            6, f"{head.id} is {head.state}, yet it is the head of {gpu.info.id}"
+        )
+    if head.request.extends is not None and head.request.extends not in gpu.residents:
+        raise InvariantViolation(
+            6, f"{head.id} waits to extend {head.request.extends}, which is not there"
+        )
+    if head.request.wait_timeout_s is not None and ("wait", head.id) not in core.timers:
+        raise InvariantViolation(6, f"{head.id} has a bound and no timer")
+    if ("probe", gpu.info.id) not in core.timers:
+        raise InvariantViolation(6, f"nobody will read {gpu.info.id} again, and {head.id} waits")

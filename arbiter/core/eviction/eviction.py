@@ -193,7 +193,7 @@ def on_overstay_due(core: Core, lease_id: str) -> None:
         return
     kind: Literal["term", "kill"] = "kill" if eviction.signalled else "term"
     eviction.signalled = kind
-    core.out.append(Signal(holder.process, kind))
+    core.turn.effects.append(Signal(holder.process, kind))
     core.note(
         "signalled",
         holder,

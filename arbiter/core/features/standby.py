@@ -302,7 +302,7 @@ class Standby(Feature):
         _expect(core, lease)
         self._queue(core, lease, event.client, event.request, core.now, event.wait_timeout_s)
         costs.wanted(core, lease.spec.consumer)
-        core.unanswered.append(lease)
+        core.turn.unanswered.append(lease)
 
     def _queue(
         self,

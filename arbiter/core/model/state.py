@@ -11,7 +11,6 @@ from statistics import median
 from typing import Any
 
 from vram_arbiter.arbiter.core.effects import (
-    Effect,
     JournalDelete,
     JournalPut,
     Note,
@@ -35,6 +34,7 @@ from vram_arbiter.arbiter.core.model.lease import (
     Use,
 )
 from vram_arbiter.arbiter.core.model.residents import Residents
+from vram_arbiter.arbiter.core.model.turn import Turn
 from vram_arbiter.arbiter.core.model.verification import Verification
 from vram_arbiter.arbiter.core.scheduling.queue import WaitQueue
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
@@ -140,7 +140,6 @@ class Gpu:
     asked_at: float | None = None  # last Sample asked for, None if its answer is here
     changed_at: float = 0.0  # last grant, ready or verdict
     blocked: str = ""
-    dirty: bool = True
     pressed: bool = False  # a pressure note is out
 
     debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
@@ -166,7 +165,7 @@ class Core:
         self.features = features
         self.started_at = now
         self.now = now
-        self.out: list[Effect] = []
+        self.turn = Turn()
         ageing_s = settings.ageing_s_per_point if settings.scheduling.by_priority else 0.0
         self.gpus: dict[GpuId, Gpu] = {
             info.id: Gpu(
@@ -199,10 +198,6 @@ class Core:
         self.counted = (
             NOT_COUNTED  # waiters in queues, and all, when the invariants counted them last
         )
-        # of the event being handled: who began to use or to wait (`deadlock`), acquires, grants (`invariants`)
-        self.suspects: set[ProcessKey] = set()
-        self.unanswered: list[Lease] = []
-        self.granted: list[tuple[Token, GpuId | None]] = []
         self.last_client_at = now
         self.drain: Order | None = None  # an operator wants no new grants
         # None: serving; else the leases still to be accounted for
@@ -217,18 +212,20 @@ class Core:
         for consumer, medians in sorted(settings.learnt.items()):
             for phase, seconds in sorted(medians.items()):
                 self.learn(consumer, phase, seconds)
+        for gpu in self.gpus.values():
+            self.wake(gpu)
 
     # -- effects ---------------------------------------------------------------------------------------------------
     def reply(self, client: ClientId, request: RequestId, body: Mapping[str, Any]) -> None:
-        self.out.append(Reply(client, request, body))
+        self.turn.effects.append(Reply(client, request, body))
 
     def refuse(self, client: ClientId, request: RequestId, refused: Refused) -> None:
-        self.out.append(
+        self.turn.effects.append(
             Refuse(client, request, refused.code, refused.message, refused.hint, refused.details)
         )
 
     def push(self, lease: Lease, body: Mapping[str, Any]) -> None:
-        self.out.append(Push(self.voice_of(lease), body))
+        self.turn.effects.append(Push(self.voice_of(lease), body))
 
     def note(self, kind: str, lease: Lease | None = None, **data: Any) -> None:
         facts: dict[str, Any] = {}
@@ -236,19 +233,19 @@ class Core:
             facts = {"lease_id": lease.id, "consumer": lease.spec.consumer, "gpu": lease.gpu}
             if lease.request.traceparent is not None:
                 facts["traceparent"] = lease.request.traceparent
-        self.out.append(Note(kind, {**facts, **data}))
+        self.turn.effects.append(Note(kind, {**facts, **data}))
 
     def journal(self, key: str, record: Mapping[str, Any], *, gates: bool = False) -> None:
-        self.out.append(JournalPut(key, record, gates))
+        self.turn.effects.append(JournalPut(key, record, gates))
 
     def forget(self, key: str) -> None:
-        self.out.append(JournalDelete(key))
+        self.turn.effects.append(JournalDelete(key))
 
     def want_sample(self, gpu: Gpu, not_before: float) -> None:
         """Ask for a reading that begins at `not_before` or later, unless such a one is under way."""
         if gpu.asked_at is None or gpu.asked_at < not_before:
             gpu.asked_at = self.now
-            self.out.append(Sample(gpu.info.id))
+            self.turn.effects.append(Sample(gpu.info.id))
 
     def read_again(self, gpu: Gpu, after_s: float) -> None:
         """The next background reading comes in `after_s` at the latest."""
@@ -290,8 +287,9 @@ class Core:
         return self.gpus[lease.gpu]
 
     def wake(self, gpu: Gpu) -> None:
-        """Something changed that a waiter of this card may have waited for."""
-        gpu.dirty = True
+        """Serve the queue of a GPU in this turn: something changed that a waiter there may wait for."""
+        self.turn.dirty[gpu.info.index] = gpu
+        self.turn.touch(gpu)
 
     def join(self, client: Client) -> None:
         """A connection begins."""
@@ -370,7 +368,7 @@ class Core:
         lease.uses.paused.pop((use.process, use.id), None)
         lease.uses[use.process, use.id] = use
         self.users.setdefault(use.process, {})[lease.id, use.id] = lease
-        self.suspects.add(use.process)
+        self.turn.suspects.add(use.process)
         for feature in self.features:
             feature.on_used(lease)
 
@@ -408,7 +406,7 @@ class Core:
         self.waiting[lease.id] = lease
         for owner in (lease.process, lease.request.uid):
             self._waiting_by[owner] = self._waiting_by.get(owner, 0) + 1
-        self.suspects.add(lease.process)
+        self.turn.suspects.add(lease.process)
         if lease.request.wait_timeout_s is not None:
             self.timers.set(
                 ("wait", lease.id), lease.request.arrived_at + lease.request.wait_timeout_s

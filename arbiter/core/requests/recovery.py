@@ -50,6 +50,8 @@ EMPTY_JOURNAL = LeaseId("journal")
 def on_recovered(core: Core, event: Recovered) -> None:
     """Charge everything that the journal names, then wait for the holders. Records of a card that is gone are dropped."""
     core.recovering = set()
+    for known in core.gpus.values():
+        core.turn.touch(known)
     held = dict(sorted(event.records.items()))
     doubt = held.pop(DOUBT_KEY, None)
     if (drain := held.pop(operators.DRAIN_KEY, None)) is not None:

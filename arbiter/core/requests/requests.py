@@ -137,7 +137,7 @@ def acquire(core: Core, event: AcquireRequested) -> None:
     if spec.gang is None:
         crashes.check(core, spec, load_peak, gpus)
     lease = new_lease(core, event, client, spec, load_peak, steady, gpus)
-    core.unanswered.append(lease)
+    core.turn.unanswered.append(lease)
     if not any(feature.hold_back(core, lease) for feature in core.features):
         core.enqueue(lease)
 
@@ -185,7 +185,7 @@ def new_lease(
 
 def answer_queued(core: Core) -> None:
     """After the scheduling: whoever was not granted at once is told that it waits, and why."""
-    for lease in core.unanswered:
+    for lease in core.turn.unanswered:
         if (
             lease.state is LeaseState.QUEUED
             and not lease.request.answered
@@ -197,7 +197,6 @@ def answer_queued(core: Core) -> None:
                 "queued", lease, position=view["position"], reason=explain.wait_reason(core, lease)
             )
             core.reply(lease.client, lease.request.id, {"state": "queued", "lease": view})
-    core.unanswered.clear()
 
 
 def _known_by(core: Core, event: AcquireRequested, client: Client) -> Lease | None:

@@ -6,7 +6,13 @@ out); `bye` gives everything back; death ends everything, and what was held is m
 
 from dataclasses import replace
 
-from vram_arbiter.arbiter.core.events import BYE, ClientConnected, ClientLeft, JournalFailed
+from vram_arbiter.arbiter.core.events import (
+    BYE,
+    ClientConnected,
+    ClientLeft,
+    JournalFailed,
+    ProcessDied,
+)
 from vram_arbiter.arbiter.core.model.lease import EXPIRING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Client, Core, Refused
 from vram_arbiter.arbiter.core.requests.expiry import lose
@@ -14,7 +20,7 @@ from vram_arbiter.arbiter.core.requests.recovery import account_for
 from vram_arbiter.arbiter.core.requests.requests import cancel_waiter, let_go
 from vram_arbiter.arbiter.core.requests.uses import end_use
 from vram_arbiter.arbiter.core.verification.schedule import on_process_died
-from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey
+from vram_arbiter.schemas.ids import ClientId, LeaseId
 
 
 def on_connected(core: Core, event: ClientConnected) -> None:
@@ -29,6 +35,7 @@ def on_connected(core: Core, event: ClientConnected) -> None:
     core.instances[instance] = event.client
     core.last_client_at = core.now
     for gpu in core.gpus.values():
+        core.turn.touch(gpu)
         if gpu.sample is None or core.now - gpu.sample.taken_at > core.settings.sample_max_age_s:
             core.want_sample(gpu, core.now - core.settings.sample_max_age_s)
 
@@ -98,8 +105,9 @@ def _concerned(core: Core, own: list[Lease]) -> list[Lease]:
     )
 
 
-def on_died(core: Core, process: ProcessKey) -> None:
+def on_died(core: Core, event: ProcessDied) -> None:
     """Everything of a process ends. Its bytes become debts, measured gone before they count as free."""
+    process = event.process
     core.refusals.pop(process, None)
     gone = [client for client in core.clients.values() if client.process == process]
     for client in gone:

@@ -25,9 +25,7 @@ HINT = "`yield` the use, release first, or mark the wait `independent`"
 
 def resolve(core: Core) -> None:
     """Deny waiters until no circle is left. Each is answered like any request that is refused, or by push if it waited already."""
-    if not core.suspects:
-        return
-    suspects, core.suspects = core.suspects, set()
+    suspects = core.turn.suspects
     while any(
         core.users.get(process) and _is_looked_at(_waits_of(core, process)) for process in suspects
     ):

@@ -22,19 +22,19 @@ from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.scheduling import policy
 from vram_arbiter.arbiter.core.verification.evidence import note_pressure
-from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.ids import GpuId, LeaseId
 
 
 def schedule(core: Core) -> None:
-    """Serve every card that changed. A grant on one card may free a waiter's place on another, so until nothing is dirty."""
-    pending = True
-    while pending:
-        pending = False
-        for gpu in core.gpus.values():
-            if gpu.dirty:
-                gpu.dirty = False
-                pending = True
-                _serve(core, gpu)
+    """Serve every dirty GPU. A grant on one may free a waiter's place on another, so until none is dirty."""
+    gpu: Gpu | None = None
+    while (gpu := core.turn.next_dirty(gpu)) is not None:
+        _serve(core, gpu)
+
+
+def on_plan_due(core: Core, gpu_id: str) -> None:
+    """Look at a GPU again: a residency ended, a waiter aged, or the GPU has been quiet for long enough."""
+    core.wake(core.gpus[GpuId(gpu_id)])
 
 
 def _serve(core: Core, gpu: Gpu) -> None:
@@ -189,7 +189,7 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
         core.now,
     )
     gpu.changed_at = core.now
-    core.granted.append((token, gpu.info.id))
+    core.turn.granted.append((token, gpu.info.id))
     lease.expires_at = core.now + lease.spec.ttl_s
     core.timers.set(("ttl", lease.id), lease.expires_at)
     core.record_lease(lease, gates=True)

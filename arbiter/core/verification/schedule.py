@@ -89,6 +89,7 @@ def _begin_for_retained(core: Core, gpu: Gpu, process: ProcessKey) -> None:
 
 def _begin(core: Core, gpu: Gpu, verification: Verification) -> None:
     gpu.verifications[verification.key] = verification
+    core.turn.touch(gpu)
     _read_soon(core, gpu, verification)
 
 

@@ -35,7 +35,7 @@ class Broken:
         self.gpu: Gpu = self.core.gpus[GpuId("GPU-0")]
         self.held: Lease = self.core.leases[held]
         self.queued: Lease = next(iter(self.core.waiting.values()))
-        self.core.granted.clear()
+        self.core.turn.granted.clear()
         invariants.check(self.core)
 
 
@@ -56,7 +56,7 @@ def over_budget(b: Broken) -> None:
 
 
 def granted_under_pressure(b: Broken) -> None:
-    b.core.granted.append((Token(1, 99), b.gpu.info.id))
+    b.core.turn.granted.append((Token(1, 99), b.gpu.info.id))
     b.gpu.ledger.unnamed_bytes = 4 * GIB
 
 
@@ -65,14 +65,14 @@ def beside_exclusive(b: Broken) -> None:
     b.gpu.residents[b.held.id] = b.held
     b.gpu.ledger.charge(b.queued.id, X, 1, 1, 0.0)
     b.gpu.residents[b.queued.id] = b.queued
-    b.core.granted.append((Token(1, 99), b.gpu.info.id))
+    b.core.turn.granted.append((Token(1, 99), b.gpu.info.id))
 
 
 def beside_exclusive_debt(b: Broken) -> None:
     b.driver.card.silent = True
     b.held.spec = replace(b.held.spec, exclusive=True)
     b.driver.post(ProcessDied(b.held.process))
-    b.core.granted.append((Token(1, 99), b.gpu.info.id))
+    b.core.turn.granted.append((Token(1, 99), b.gpu.info.id))
 
 
 def two_loads(b: Broken) -> None:
@@ -81,7 +81,7 @@ def two_loads(b: Broken) -> None:
     b.queued.state = LeaseState.LOADING
     b.gpu.ledger.charge(b.queued.id, X, 1, 1, 0.0)
     b.gpu.residents[b.queued.id] = b.queued
-    b.core.granted.append((Token(1, 99), b.gpu.info.id))
+    b.core.turn.granted.append((Token(1, 99), b.gpu.info.id))
 
 
 def unloads_in_use(b: Broken) -> None:
@@ -103,7 +103,7 @@ def charged_for_ever(b: Broken) -> None:
 
 
 def token_shrinks(b: Broken) -> None:
-    b.core.granted.append((Token(1, 1), GpuId("GPU-1")))
+    b.core.turn.granted.append((Token(1, 1), GpuId("GPU-1")))
 
 
 def waiter_in_no_queue(b: Broken) -> None:
@@ -156,6 +156,7 @@ def test_a_broken_state_is_found(
 ) -> None:
     broken = Broken()
     breaks(broken)
+    broken.core.turn.touch(broken.gpu)
     with pytest.raises(InvariantViolation, match=says) as caught:
         check(broken.core)
     assert caught.value.number == number

@@ -349,6 +349,7 @@ def test_the_invariant_of_a_growth() -> None:
     core = state_of(driver.arbiter)
     growth = core.leases[driver.arbiter.inspect().feature(Resizing).growths[lease]]
     growth.request.extends = LeaseId("gone")
+    core.turn.touch(core.gpus[GpuId("GPU-0")])
     with pytest.raises(InvariantViolation, match="which is not there"):
         invariants.check(core)
 

@@ -178,7 +178,7 @@ def test_invariants_of_what_is_away() -> None:
     driver = CoreDriver(8 * GIB)
     _, lease, _, _ = sent_away(driver)
     core = state_of(driver.arbiter)
-    core.granted.clear()
+    core.turn.granted.clear()
     one = core.leases[lease]
     one.state = LeaseState.HELD
     with pytest.raises(InvariantViolation, match="counts as away"):
